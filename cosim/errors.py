@@ -1,0 +1,63 @@
+"""The whole error tree: every failure a user can meet is one of these, with one clear sentence."""
+
+from __future__ import annotations
+
+
+class CosimError(Exception):
+    """Base of every error cosim raises on purpose; `exit_code` is what the command line returns."""
+
+    exit_code = 4
+
+
+class BadInput(CosimError):
+    """The user's input is wrong: names the file, the field and the value where they are known.
+
+    `BadInput("missing net file", file="a.sumocfg", field="net-file", value="x.net.xml")` reads
+    `a.sumocfg: net-file='x.net.xml': missing net file`.
+    """
+
+    exit_code = 2
+
+    def __init__(
+        self,
+        problem: str,
+        *,
+        file: object = None,
+        field: str | None = None,
+        value: object = None,
+    ) -> None:
+        self.problem = problem
+        self.file = None if file is None else str(file)
+        self.field = field
+        self.value = value
+        where = [] if self.file is None else [self.file]
+        if field is not None:
+            where.append(field if value is None else f"{field}={value!r}")
+        elif value is not None:
+            where.append(repr(value))
+        super().__init__(": ".join([*where, problem]))
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return _rebuild_bad_input, (self.problem, self.file, self.field, self.value)
+
+
+def _rebuild_bad_input(problem: str, file: object, field: str | None, value: object) -> BadInput:
+    return BadInput(problem, file=file, field=field, value=value)
+
+
+class SimulationError(CosimError):
+    """SUMO failed while running: carries SUMO's own words, taken from its stderr."""
+
+    exit_code = 3
+
+
+class SimulationCrashed(SimulationError):
+    """The worker process that held the simulation died (signal, limit) or did not answer in time."""
+
+
+class SimulationInUse(SimulationError):
+    """A second simulation was started in this process: libsumo would silently replace the first."""
+
+
+class WeightsMismatch(BadInput):
+    """A checkpoint's layout (names, shapes, hash) is not the one that the network needs."""

@@ -1,0 +1,232 @@
+"""The road as pure data: lanes with centre lines, how they connect, and the paths ahead of a vehicle."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from cosim.types import Floats
+
+PATH_HORIZON = 400.0  # m: further than any AV drives within the 4 s horizon, and than arms are long
+
+
+@dataclass(frozen=True)
+class Lane:
+    """One SUMO lane. Index 0 of an edge is the rightmost; `left`/`right`/`successors` index RoadMap.lanes."""
+
+    id: str
+    edge: str
+    index: int
+    shape: Floats  # [p,2] m, centre line
+    length: float  # m, SUMO's length: lane positions run from 0 to here
+    width: float  # m
+    speed_limit: float  # m/s
+    successors: tuple[int, ...] = ()  # lanes that follow directly (internal lanes included)
+    left: int = -1
+    right: int = -1
+    internal: bool = False  # lies inside a junction
+
+
+@dataclass(frozen=True)
+class LanePath:
+    """A lane's centre line followed ahead through its successors.
+
+    `arc` starts at 0 at the beginning of the first lane; SUMO lane positions are scaled to it.
+    """
+
+    points: Floats  # [p,2] m
+    arc: Floats  # [p] m, distance along `points`
+    lanes: tuple[int, ...]  # lanes passed, in order
+    lane_start: Floats  # [len(lanes)] m, arc where each lane begins
+    dead_end: bool  # ends because the lane (or its use for this route) ends, not at the horizon
+    leaves: bool  # ends because the route is finished there (the vehicle arrives)
+
+    @property
+    def length(self) -> float:
+        """m"""
+        return float(self.arc[-1])
+
+    def pose(self, arc: Floats) -> tuple[Floats, Floats, Floats]:
+        """Positions and headings at arc lengths. [k] m -> x [k] m, y [k] m, heading [k] rad.
+
+        Beyond either end the path goes on straight.
+        """
+        a = np.asarray(arc, dtype=np.float64)
+        i = np.clip(np.searchsorted(self.arc, a, side="right") - 1, 0, len(self.arc) - 2)
+        d = self.points[i + 1] - self.points[i]  # [k,2]
+        span = np.maximum(self.arc[i + 1] - self.arc[i], 1e-9)
+        s = ((a - self.arc[i]) / span)[:, None]
+        p = self.points[i] + s * d
+        return p[:, 0], p[:, 1], np.arctan2(d[:, 1], d[:, 0])
+
+    def project(self, x: float, y: float, around: float | None = None) -> tuple[float, float]:
+        """Nearest arc length and signed lateral offset (left positive) of a point, both in m.
+
+        `around`: search only within 60 m of this arc length (for paths that cross themselves).
+        """
+        a, b = self.points[:-1], self.points[1:]
+        d = b - a
+        span2 = np.maximum((d * d).sum(1), 1e-12)
+        s = np.clip(((x - a[:, 0]) * d[:, 0] + (y - a[:, 1]) * d[:, 1]) / span2, 0.0, 1.0)
+        q = a + s[:, None] * d
+        distance2 = (x - q[:, 0]) ** 2 + (y - q[:, 1]) ** 2
+        if around is not None:
+            distance2 = np.where(np.abs(self.arc[:-1] - around) > 60.0, distance2 + 1e6, distance2)
+        i = int(np.argmin(distance2))
+        span = float(np.sqrt(span2[i]))
+        lateral = float((d[i, 0] * (y - a[i, 1]) - d[i, 1] * (x - a[i, 0])) / span)
+        return float(self.arc[i] + s[i] * span), lateral
+
+
+class RouteAhead(NamedTuple):
+    """An AV's own route knowledge at one decision (contract, Observation)."""
+
+    paths: tuple[LanePath | None, LanePath | None, LanePath | None]  # left, keep, right; None: no lane
+    arc: float  # m, the vehicle centre's place along every path
+    conflict_distance: float  # m to the conflict zone along the present lane; inf when none is ahead
+    speed_limit: float  # m/s
+
+    def to_end(self, side: int) -> float:
+        """m until the path ends in a dead end; inf when it does not (side 0 left, 1 keep, 2 right)."""
+        path = self.paths[side]
+        if path is None:
+            return 0.0
+        return path.length - self.arc if path.dead_end else float("inf")
+
+
+@dataclass(frozen=True)
+class ConflictZone:
+    """Where streams meet: a set of lanes (indices into RoadMap.lanes)."""
+
+    name: str
+    lanes: frozenset[int]
+
+
+@dataclass(frozen=True)
+class RoadMap:
+    """Every lane of a net. Paths are cached, so asking again is free."""
+
+    lanes: tuple[Lane, ...]
+    zones: tuple[ConflictZone, ...] = ()
+    junctions: tuple[Floats, ...] = ()  # [p,2] m, outlines
+    _paths: dict[tuple[int, tuple[str, ...] | None], LanePath] = field(default_factory=dict, repr=False)
+    index: dict[str, int] = field(default_factory=dict, repr=False)
+
+    def __post_init__(self) -> None:
+        self.index.update({lane.id: i for i, lane in enumerate(self.lanes)})
+
+    def path(self, lane: int, route: tuple[str, ...] | None = None) -> LanePath:
+        """The way ahead from the start of `lane`.
+
+        `route`: edges from the lane's own edge on (internal edges left out); the path follows them and
+        dead-ends where the lane does not lead on. Without a route (other drivers' is unknown) it takes
+        the straightest successor.
+        """
+        key = (lane, route)
+        found = self._paths.get(key)
+        if found is None:
+            found = self._paths[key] = self._follow(lane, route)
+        return found
+
+    def ahead(self, lane: int, lane_position: float, length: float, route: tuple[str, ...]) -> RouteAhead:
+        """Route knowledge of a vehicle of `length` m whose front bumper is at `lane_position` m of `lane`."""
+        here = self.lanes[lane]
+        keep = self.path(lane, route)
+        sides = []
+        for other in (here.left, lane, here.right):
+            sides.append(None if other < 0 else self.path(other, route))
+        own = float(keep.lane_start[1]) if len(keep.lanes) > 1 else keep.length
+        scale = own / max(here.length, 1e-6)
+        arc = (lane_position - 0.5 * length) * scale
+        conflict = np.inf
+        for zone in self.zones:
+            for k, passed in enumerate(keep.lanes):
+                if passed in zone.lanes:
+                    conflict = min(conflict, max(0.0, float(keep.lane_start[k]) - arc - 0.5 * length))
+                    break
+        return RouteAhead((sides[0], sides[1], sides[2]), arc, float(conflict), here.speed_limit)
+
+    def _follow(self, first: int, route: tuple[str, ...] | None) -> LanePath:
+        lanes = [first]
+        total = _polyline_length(self.lanes[first].shape)
+        place = 0  # where on the route we are
+        dead_end = leaves = False
+        while total < PATH_HORIZON + _polyline_length(self.lanes[first].shape):
+            lane = self.lanes[lanes[-1]]
+            if route is not None and place >= len(route) - 1 and not lane.internal:
+                leaves = True
+                break
+            step = self._successor(lane, route, place)
+            if step is None:
+                dead_end = True
+                if route is None and not lane.successors:
+                    beside = [self.lanes[o] for o in (lane.left, lane.right) if o >= 0]
+                    dead_end = any(other.successors for other in beside)
+                    leaves = not dead_end
+                break
+            following, place = step
+            if following in lanes:  # a ring: once round is far enough
+                break
+            lanes.append(following)
+            total += _polyline_length(self.lanes[following].shape)
+        return _join([self.lanes[i] for i in lanes], tuple(lanes), dead_end, leaves)
+
+    def _successor(
+        self, lane: Lane, route: tuple[str, ...] | None, place: int
+    ) -> tuple[int, int] | None:
+        if not lane.successors:
+            return None
+        if route is None:
+            ahead = _heading(lane.shape, -1)
+            turns = [abs(_wrap(self._exit_heading(s) - ahead)) for s in lane.successors]
+            return lane.successors[int(np.argmin(turns))], place
+        wanted = route[place + 1] if place + 1 < len(route) else None
+        for s in lane.successors:
+            if self._leads_to(s, wanted):
+                return s, place if self.lanes[s].internal else place + 1
+        return None
+
+    def _leads_to(self, lane: int, edge: str | None) -> bool:
+        """Whether the lane is on `edge`, or is an internal lane that ends there."""
+        seen = 0
+        while self.lanes[lane].internal and self.lanes[lane].successors and seen < 8:
+            lane = self.lanes[lane].successors[0]
+            seen += 1
+        return self.lanes[lane].edge == edge
+
+    def _exit_heading(self, lane: int) -> float:
+        return _heading(self.lanes[lane].shape, -1)
+
+
+def _polyline_length(shape: Floats) -> float:
+    return float(np.sqrt((np.diff(shape, axis=0) ** 2).sum(1)).sum())
+
+
+def _heading(shape: Floats, at: int) -> float:
+    d = shape[-1] - shape[-2] if at == -1 else shape[1] - shape[0]
+    return float(np.arctan2(d[1], d[0]))
+
+
+def _wrap(angle: float) -> float:
+    return float((angle + np.pi) % (2 * np.pi) - np.pi)
+
+
+def _join(lanes: Sequence[Lane], indices: tuple[int, ...], dead_end: bool, leaves: bool) -> LanePath:
+    pieces = []
+    starts = []
+    total = 0.0
+    for lane in lanes:
+        starts.append(total)
+        pieces.append(lane.shape if not pieces else lane.shape[1:])
+        total += _polyline_length(lane.shape)
+    points = np.concatenate(pieces)
+    step = np.sqrt((np.diff(points, axis=0) ** 2).sum(1))
+    keep = np.concatenate([[True], step > 1e-6])
+    if keep.sum() < 2:
+        keep[-1] = True
+    points = points[keep]
+    arc = np.concatenate([[0.0], np.cumsum(np.sqrt((np.diff(points, axis=0) ** 2).sum(1)))])
+    return LanePath(points, arc, indices, np.array(starts), dead_end, leaves)

@@ -1,0 +1,314 @@
+"""The data that crosses rooms: pure numpy, SI units, radians counter-clockwise from east, vehicle centres.
+
+Letters in shapes: `n` vehicles, `N` past frames, `M` predicted frames, `C, H, W` map channels, rows
+(across the road) and columns (along it), `R, F` kinematic rows and features, `A` = 5 meta-actions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from cosim.road import RoadMap, RouteAhead
+
+Floats = npt.NDArray[np.float64]
+Floats32 = npt.NDArray[np.float32]
+Bools = npt.NDArray[np.bool_]
+Ints = npt.NDArray[np.int64]
+Bytes = npt.NDArray[np.uint8]
+
+
+class MetaAction(IntEnum):
+    """The discrete meta-actions of paper P, equation (4), in its order."""
+
+    LANE_LEFT = 0
+    IDLE = 1
+    LANE_RIGHT = 2
+    ACCELERATE = 3
+    DECELERATE = 4
+
+
+class Kind(IntEnum):
+    """Who drives: a human-driven vehicle (HV) or an autonomous one (AV)."""
+
+    HV = 0
+    AV = 1
+
+
+class Preset:
+    """Names of the two guards (docs/units_and_frames.md): every result says which one was on."""
+
+    UNGUARDED = "unguarded"
+    GUARDED = "guarded"
+    ALL = (UNGUARDED, GUARDED)
+
+
+@dataclass(frozen=True, slots=True)
+class Collision:
+    """One pair of vehicles that touched, reported once per pair and episode.
+
+    `source` is "sumo" (SUMO reported it) or "box" (only our oriented-box check saw it);
+    `kind` is SUMO's word (collision, side, junction) or "overlap" for ours.
+    """
+
+    time: float  # s
+    collider: str
+    victim: str
+    collider_is_av: bool
+    victim_is_av: bool
+    kind: str
+    source: str
+    lane: str
+    x: float  # m
+    y: float  # m
+    involves_mission: bool = False
+    av_caused: bool = False  # an AV was the collider, or had just cut in
+
+
+@dataclass(frozen=True, slots=True)
+class Events:
+    """What happened since the last snapshot; ids in SUMO's order."""
+
+    collisions: tuple[Collision, ...] = ()
+    departed: tuple[str, ...] = ()
+    arrived: tuple[str, ...] = ()
+    teleported: tuple[str, ...] = ()
+    emergency_stopped: tuple[str, ...] = ()
+
+
+NO_EVENTS = Events()
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """Every vehicle on the road at one moment, sorted by id.
+
+    Shapes: all arrays [n]. Units: m, s, rad (counter-clockwise from east), m/s, m/s2.
+    """
+
+    time: float  # s
+    ids: tuple[str, ...]
+    kind: npt.NDArray[np.int8]  # [n] Kind
+    mission: Bools  # [n] is a mission vehicle
+    x: Floats  # [n] m, vehicle centre
+    y: Floats  # [n] m, vehicle centre
+    heading: Floats  # [n] rad
+    speed: Floats  # [n] m/s
+    accel: Floats  # [n] m/s2
+    length: Floats  # [n] m
+    width: Floats  # [n] m
+    lane: npt.NDArray[np.int32]  # [n] index into RoadMap.lanes, -1 off every lane
+    lane_position: Floats  # [n] m, of the front bumper along the lane
+    events: Events = NO_EVENTS
+
+    @cached_property
+    def row(self) -> dict[str, int]:
+        """Vehicle id -> row in the arrays."""
+        return {name: i for i, name in enumerate(self.ids)}
+
+    @property
+    def n(self) -> int:
+        return len(self.ids)
+
+
+class Observation(NamedTuple):
+    """One frame as one AV sees it, paper P equation (5): the VelocityMap and the kinematic matrix."""
+
+    velocity_map: Bytes  # [C,H,W] pixel * 255
+    kinematics: Floats32  # [R,F]
+    valid: Bools  # [R]
+
+
+# Columns of the kinematic matrix, in the ego's frame at the newest frame of the history
+# (x ahead, y to the left), so that one history lives in one fixed frame and series are smooth.
+KINEMATIC_FEATURES = ("x", "y", "speed", "heading", "length", "width", "is_av", "is_mission")
+
+
+class History(NamedTuple):
+    """What one AV knows at a decision: N frames, oldest first, and its own route.
+
+    Rows follow the vehicle, not its rank: `ids[r]` names the vehicle of row r in every frame
+    ("" for an empty row); `valid[k, r]` says whether it was perceived at frame k. Row 0 is the ego.
+    """
+
+    velocity_map: Bytes  # [N,C,H,W] pixel * 255; each in the ego's frame at its own time
+    kinematics: Floats32  # [N,R,F] see KINEMATIC_FEATURES; m, m/s, rad (heading unwrapped)
+    valid: Bools  # [N,R]
+    ids: tuple[str, ...]  # R names, for explanation and V2V; never a network input
+    lane: npt.NDArray[np.int32]  # [R] each vehicle's lane (map-matched), newest frame; -1 unknown
+    lane_position: Floats  # [R] m, front bumper along that lane
+    pose: Floats  # [3] the ego's x m, y m, heading rad in the world, at the newest frame
+    target_speed: float  # m/s, the ego's present command (its speed while uncommanded)
+    lane_changing: int  # +1 / -1 while a change to the left / right is under way, else 0
+    route: RouteAhead  # lane centre lines ahead, dead ends, distance to the conflict zone
+    time: float  # s
+
+    @property
+    def ego_speed(self) -> float:
+        """m/s at the newest frame."""
+        return float(self.kinematics[-1, 0, 2])
+
+
+class Decision(NamedTuple):
+    """What a policy chose for one AV, with everything needed to explain it ([A] arrays may be None)."""
+
+    action: MetaAction
+    q: Floats32 | None = None  # [A] action values
+    safety_score: Floats32 | None = None  # [A] s, weighted time to collision (P, algorithm 2)
+    unsafe: Bools | None = None  # [A]
+    ttc: Floats32 | None = None  # [A] s, the smallest time to collision along the horizon
+    blamed: str | None = None  # the vehicle that made the preferred action unsafe
+    vetoed: bool = False  # the preferred action was masked
+    fallback: bool = False  # every action was unsafe: the highest score was taken
+
+
+class Command(NamedTuple):
+    """What one AV shall do until the next decision."""
+
+    vehicle: str
+    target_speed: float  # m/s
+    lane_offset: int  # -1 right, 0 keep, +1 left
+    hold: float  # s
+
+
+class Receipt(NamedTuple):
+    """What became of a command: lane changes are never dropped silently."""
+
+    vehicle: str
+    executed: bool
+    blocked: str | None = None  # why not
+
+
+class Transition(NamedTuple):
+    """One step of one AV, as learners store it."""
+
+    history: History
+    action: MetaAction
+    reward: float
+    next_history: History | None  # None when the AV is gone
+    terminated: bool
+    truncated: bool
+
+
+@dataclass(frozen=True, slots=True)
+class ObservationConfig:
+    """What an AV sees. Defaults: the compact size (docs/units_and_frames.md); `PAPER` is P and T's."""
+
+    height: int = 32  # pixels across the road
+    width: int = 128  # pixels along the road
+    metres_across: float = 1.0  # m per pixel
+    metres_along: float = 2.0  # m per pixel
+    channels: tuple[str, ...] = ("av", "hv", "road", "mission")
+    frames: int = 10  # N
+    rows: int = 16  # R, the ego and up to 15 others
+    row_range: float = 125.0  # m, vehicles further away get no row
+    perception_range: float = 125.0  # m, what one AV's own sensors reach
+    share_perception: bool = True  # V2V: an AV also knows what its allies perceive
+    maps: bool = True  # False: no VelocityMaps are drawn (for policies that use none)
+
+
+COMPACT = ObservationConfig()
+PAPER = ObservationConfig(height=64, width=512, metres_across=0.5, metres_along=0.5)
+SMOKE = ObservationConfig(height=16, metres_across=2.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """The three clocks (contract): simulation step, frame, decision, all in s."""
+
+    step: float = 0.1
+    frame: float = 0.2
+    decision: float = 0.4
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyContext:
+    """What a policy is told when an episode starts."""
+
+    road: RoadMap
+    timing: Timing
+    observation: ObservationConfig
+    svo: float  # rad, the social value orientation phi
+    rng: np.random.Generator
+    share_intentions: bool = True  # V2V: AVs decide front to back and know the choices before theirs
+
+
+class Policy(Protocol):
+    """Who commands the AVs. One object serves every AV of an episode."""
+
+    name: str
+    observation: ObservationConfig  # what it wants to see
+    av_parameters: Mapping[str, str]  # SUMO parameters its AVs drive with while uncommanded
+    label: str  # shown beside every result, e.g. "untrained"; "" when there is nothing to warn of
+
+    def reset(self, context: PolicyContext) -> None:
+        """A new episode begins."""
+
+    def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
+        """One decision per AV it wants to command; an AV left out is driven by SUMO's IDM."""
+
+
+class Simulator(Protocol):
+    """The world behind the loop: SUMO (`cosim.simulation.sumo`) or the in-memory fake."""
+
+    road: RoadMap
+
+    def reset(self, seed: int) -> Snapshot:
+        """Start the episode `seed`, run its warm-up, return the first snapshot (events empty)."""
+
+    def advance(self, commands: Sequence[Command]) -> tuple[tuple[Receipt, ...], tuple[Snapshot, ...]]:
+        """Hold the commands for one decision; one snapshot per frame, the newest last."""
+
+    def route(self, vehicle: str) -> tuple[str, ...]:
+        """The edges the vehicle still has to drive, its present edge first (own route knowledge)."""
+
+    def commanded(self, vehicle: str) -> tuple[float | None, int]:
+        """Present target speed in m/s (None while uncommanded) and lane change under way (+1, 0, -1)."""
+
+    def counts(self) -> dict[str, int]:
+        """`loaded`, `inserted`, `waiting` (never inserted so far) vehicles since the start."""
+
+    def close(self) -> None:
+        """End the simulation; safe to call twice."""
+
+
+@dataclass(frozen=True, slots=True)
+class Metric:
+    """One figure of a result with its unit and which direction is better ("higher", "lower", "")."""
+
+    value: float | int | bool | None  # None is NA, never 0
+    unit: str
+    better: str
+
+
+@dataclass(frozen=True)
+class EpisodeResult:
+    """Everything one episode yields; `document()` is what `cosim run --json` prints."""
+
+    scenario: str
+    demand: str
+    policy: str
+    label: str
+    behavior: str
+    driver_model: str
+    preset: str
+    svo_deg: float
+    seed: int
+    steps: int  # decisions taken
+    trace_hash: str
+    metrics: dict[str, Metric]
+    collisions: tuple[Collision, ...]
+    timings: dict[str, float]  # s: simulation, observation, decision, reset, total
+    validity: tuple[str, ...]  # reasons why the result is not comparable; empty when it is
+    manifest: dict[str, Any] = field(default_factory=dict)
+
+    def value(self, name: str) -> float | int | bool | None:
+        """The bare value of one metric."""
+        return self.metrics[name].value

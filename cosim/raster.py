@@ -59,9 +59,10 @@ def channel_indices(config: ObservationConfig) -> npt.NDArray[np.int64]:
     return np.array(found, np.int64)
 
 
-@njit(cache=True, fastmath=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, fastmath=True, nogil=True)
 def draw_scene(
-    out: Bytes,  # [B,C,H,W] overwritten
+    out: Bytes,  # [S,C,H,W]; the slots named are overwritten
+    slots: npt.NDArray[np.int64],  # [B] where in `out` each ego's frame goes
     ego: npt.NDArray[np.int64],  # [B] row of each ego among the vehicles
     x: Floats,  # [n] m, world
     y: Floats,  # [n] m
@@ -80,13 +81,14 @@ def draw_scene(
     cells_y: float,
     cell: float,
 ) -> None:
-    """One frame of every ego, all looking at the same vehicles."""
-    for b in range(out.shape[0]):
+    """One frame of every ego, all looking at the same vehicles (the ego itself is always drawn)."""
+    for b in range(ego.shape[0]):
         e = ego[b]
-        out[b] = 0
+        frame = out[slots[b]]
+        frame[:] = 0
         if channels[2] >= 0:
             _sample_road(
-                out[b, channels[2]], x[e], y[e], heading[e], across, along, cells, cells_x, cells_y, cell
+                frame[channels[2]], x[e], y[e], heading[e], across, along, cells, cells_x, cells_y, cell
             )
         c, s = np.cos(heading[e]), np.sin(heading[e])
         for j in range(x.shape[0]):
@@ -94,7 +96,7 @@ def draw_scene(
                 continue
             dx, dy = x[j] - x[e], y[j] - y[e]
             _draw_vehicle(
-                out[b],
+                frame,
                 c * dx + s * dy,
                 c * dy - s * dx,
                 heading[j] - heading[e],
@@ -110,7 +112,7 @@ def draw_scene(
             )
 
 
-@njit(cache=True, fastmath=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, fastmath=True, nogil=True)
 def draw_rows(
     out: Bytes,  # [B,C,H,W] overwritten
     rows: Floats,  # [B,R,8] KINEMATIC_FEATURES in any one frame per b (m, m/s, rad); row 0 the ego
@@ -164,7 +166,7 @@ def draw_rows(
             )
 
 
-@njit(cache=True, fastmath=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, fastmath=True, nogil=True)
 def _draw_vehicle(
     out: Bytes,  # [C,H,W]
     ahead: float,  # m, centre in the ego frame
@@ -218,7 +220,7 @@ def _draw_vehicle(
                 out[second, v, u] = value
 
 
-@njit(cache=True, fastmath=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, fastmath=True, nogil=True)
 def _sample_road(
     out: Bytes,  # [H,W]
     x: float,
@@ -242,10 +244,7 @@ def _sample_road(
         px = (x + c * back - s * left - cells_x) / cell
         py = (y + s * back + c * left - cells_y) / cell
         inside = (
-            0 <= px < columns
-            and 0 <= py < rows
-            and 0 <= px + last_x < columns
-            and 0 <= py + last_y < rows
+            0 <= px < columns and 0 <= py < rows and 0 <= px + last_x < columns and 0 <= py + last_y < rows
         )
         if inside:
             for u in range(width):
@@ -259,7 +258,7 @@ def _sample_road(
                     out[v, u] = 0
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _draw_lane(cells: Bytes, shape: Floats, half: float, cell: float, value: int) -> None:
     """Fill everything within `half` m of the centre line [p,2] (round joints close the outer bends)."""
     rows, columns = cells.shape

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -43,6 +42,8 @@ class LanePath:
     lane_start: Floats  # [len(lanes)] m, arc where each lane begins
     dead_end: bool  # ends because the lane (or its use for this route) ends, not at the horizon
     leaves: bool  # ends because the route is finished there (the vehicle arrives)
+    scale: float  # arc length per SUMO lane position on the first lane
+    conflict: float  # m, arc where the conflict zone begins; inf when the path meets none
 
     @property
     def length(self) -> float:
@@ -135,19 +136,11 @@ class RoadMap:
         """Route knowledge of a vehicle of `length` m whose front bumper is at `lane_position` m of `lane`."""
         here = self.lanes[lane]
         keep = self.path(lane, route)
-        sides = []
-        for other in (here.left, lane, here.right):
-            sides.append(None if other < 0 else self.path(other, route))
-        own = float(keep.lane_start[1]) if len(keep.lanes) > 1 else keep.length
-        scale = own / max(here.length, 1e-6)
-        arc = (lane_position - 0.5 * length) * scale
-        conflict = np.inf
-        for zone in self.zones:
-            for k, passed in enumerate(keep.lanes):
-                if passed in zone.lanes:
-                    conflict = min(conflict, max(0.0, float(keep.lane_start[k]) - arc - 0.5 * length))
-                    break
-        return RouteAhead((sides[0], sides[1], sides[2]), arc, float(conflict), here.speed_limit)
+        left = None if here.left < 0 else self.path(here.left, route)
+        right = None if here.right < 0 else self.path(here.right, route)
+        arc = (lane_position - 0.5 * length) * keep.scale
+        conflict = max(keep.conflict - arc - 0.5 * length, 0.0)
+        return RouteAhead((left, keep, right), arc, conflict, here.speed_limit)
 
     def _follow(self, first: int, route: tuple[str, ...] | None) -> LanePath:
         lanes = [first]
@@ -172,11 +165,9 @@ class RoadMap:
                 break
             lanes.append(following)
             total += _polyline_length(self.lanes[following].shape)
-        return _join([self.lanes[i] for i in lanes], tuple(lanes), dead_end, leaves)
+        return self._join(tuple(lanes), dead_end, leaves)
 
-    def _successor(
-        self, lane: Lane, route: tuple[str, ...] | None, place: int
-    ) -> tuple[int, int] | None:
+    def _successor(self, lane: Lane, route: tuple[str, ...] | None, place: int) -> tuple[int, int] | None:
         if not lane.successors:
             return None
         if route is None:
@@ -200,6 +191,37 @@ class RoadMap:
     def _exit_heading(self, lane: int) -> float:
         return _heading(self.lanes[lane].shape, -1)
 
+    def _join(self, indices: tuple[int, ...], dead_end: bool, leaves: bool) -> LanePath:
+        pieces = []
+        starts = []  # m
+        total = 0.0
+        for i in indices:
+            shape = self.lanes[i].shape
+            starts.append(total)
+            pieces.append(shape if not pieces else shape[1:])
+            total += _polyline_length(shape)
+        points = np.concatenate(pieces)
+        step = np.sqrt((np.diff(points, axis=0) ** 2).sum(1))
+        keep = np.concatenate([[True], step > 1e-6])
+        if keep.sum() < 2:
+            keep[-1] = True
+        points = points[keep]
+        arc = np.concatenate([[0.0], np.cumsum(np.sqrt((np.diff(points, axis=0) ** 2).sum(1)))])
+        conflict = [
+            start for start, i in zip(starts, indices, strict=True) if any(i in z.lanes for z in self.zones)
+        ]
+        first = self.lanes[indices[0]]
+        return LanePath(
+            points,
+            arc,
+            indices,
+            np.array(starts),
+            dead_end,
+            leaves,
+            scale=_polyline_length(first.shape) / max(first.length, 1e-6),
+            conflict=min(conflict, default=np.inf),
+        )
+
 
 def _polyline_length(shape: Floats) -> float:
     return float(np.sqrt((np.diff(shape, axis=0) ** 2).sum(1)).sum())
@@ -212,21 +234,3 @@ def _heading(shape: Floats, at: int) -> float:
 
 def _wrap(angle: float) -> float:
     return float((angle + np.pi) % (2 * np.pi) - np.pi)
-
-
-def _join(lanes: Sequence[Lane], indices: tuple[int, ...], dead_end: bool, leaves: bool) -> LanePath:
-    pieces = []
-    starts = []
-    total = 0.0
-    for lane in lanes:
-        starts.append(total)
-        pieces.append(lane.shape if not pieces else lane.shape[1:])
-        total += _polyline_length(lane.shape)
-    points = np.concatenate(pieces)
-    step = np.sqrt((np.diff(points, axis=0) ** 2).sum(1))
-    keep = np.concatenate([[True], step > 1e-6])
-    if keep.sum() < 2:
-        keep[-1] = True
-    points = points[keep]
-    arc = np.concatenate([[0.0], np.cumsum(np.sqrt((np.diff(points, axis=0) ** 2).sum(1)))])
-    return LanePath(points, arc, indices, np.array(starts), dead_end, leaves)

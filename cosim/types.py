@@ -259,9 +259,10 @@ class Simulator(Protocol):
     """The world behind the loop: SUMO (`cosim.simulation.sumo`) or the in-memory fake."""
 
     road: RoadMap
+    goal_lanes: frozenset[int]  # being on one of them fulfils the mission
 
-    def reset(self, seed: int) -> Snapshot:
-        """Start the episode `seed`, run its warm-up, return the first snapshot (events empty)."""
+    def reset(self, seed: int) -> tuple[Snapshot, ...]:
+        """Start the episode `seed` and drive its warm-up; the warm-up's last frames, newest last."""
 
     def advance(self, commands: Sequence[Command]) -> tuple[tuple[Receipt, ...], tuple[Snapshot, ...]]:
         """Hold the commands for one decision; one snapshot per frame, the newest last."""
@@ -273,7 +274,7 @@ class Simulator(Protocol):
         """Present target speed in m/s (None while uncommanded) and lane change under way (+1, 0, -1)."""
 
     def counts(self) -> dict[str, int]:
-        """`loaded`, `inserted`, `waiting` (never inserted so far) vehicles since the start."""
+        """Vehicles since the start: `inserted`, and `waiting` ones that found no room so far."""
 
     def close(self) -> None:
         """End the simulation; safe to call twice."""

@@ -1,0 +1,48 @@
+"""Every policy by name: the explicit table that `--policy` reads."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable
+
+from cosim.errors import BadInput
+from cosim.types import Policy
+
+
+def _prediction_aware(name: str) -> Callable[[], Policy]:
+    def build() -> Policy:
+        from policy.agents.prediction_aware import PredictionAware  # torch: only when it is asked for
+
+        return PredictionAware(name)
+
+    return build
+
+
+def _rules() -> dict[str, Callable[[], Policy]]:
+    from policy.agents.altruist_rule import AltruistRule
+    from policy.agents.idm import Idm, IdmCourteous
+    from policy.agents.keep_lane import KeepLane
+    from policy.agents.random import Random
+
+    return {c.name: c for c in (Idm, IdmCourteous, KeepLane, Random, AltruistRule)}
+
+
+POLICIES: dict[str, Callable[[], Policy]] = {
+    **_rules(),
+    "vfn-p": _prediction_aware("vfn-p"),
+    "vfn": _prediction_aware("vfn"),
+}
+
+
+def check_name(name: str) -> None:
+    """Raises BadInput naming the nearest known name."""
+    if name not in POLICIES:
+        near = difflib.get_close_matches(name, POLICIES, n=1)
+        hint = f" (did you mean '{near[0]}'?)" if near else ""
+        raise BadInput(f"unknown policy{hint}; known: {', '.join(POLICIES)}", field="--policy", value=name)
+
+
+def make(name: str) -> Policy:
+    """A fresh policy. Raises BadInput for an unknown name."""
+    check_name(name)
+    return POLICIES[name]()

@@ -1,0 +1,126 @@
+"""How one result is shown: a JSON document for machines, a short table for people, a run folder to keep."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from cosim.errors import BadInput
+from cosim.types import EpisodeResult, Metric
+
+HEADLINE = (
+    "crashed",
+    "collisions",
+    "av_caused_collisions",
+    "teleports",
+    "emergency_stops",
+    "mission_success",
+    "mission_time_s",
+    "dt_mean_m",
+    "dt_av_m",
+    "dt_mission_m",
+    "min_ttc_s",
+    "hard_brakings_av",
+    "veto_rate",
+    "vehicles_inserted",
+    "vehicles_never_inserted",
+)
+
+
+def document(result: EpisodeResult) -> dict[str, Any]:
+    """The JSON document of `cosim run --json`: metrics flat by name, their units beside them, NA as null."""
+    return {
+        "scenario": result.scenario,
+        "demand": result.demand,
+        "policy": result.policy,
+        "policy_label": result.label,
+        "behavior": result.behavior,
+        "driver_model": result.driver_model,
+        "preset": result.preset,
+        "svo_deg": result.svo_deg,
+        "seed": result.seed,
+        "steps": result.steps,
+        **{name: _plain(metric.value) for name, metric in result.metrics.items()},
+        "trace_hash": result.trace_hash,
+        "timings": {name: round(value, 6) for name, value in result.timings.items()},
+        "comparable": not result.validity,
+        "not_comparable_because": list(result.validity),
+        "collision_list": [_collision(asdict(c)) for c in result.collisions],
+        "units": {name: metric.unit for name, metric in result.metrics.items()},
+        "better": {name: metric.better for name, metric in result.metrics.items()},
+        "manifest": result.manifest,
+    }
+
+
+def table(result: EpisodeResult) -> str:
+    """A short table with units."""
+    label = f" ({result.label})" if result.label else ""
+    lines = [
+        f"{result.scenario} / {result.demand} / {result.policy}{label}",
+        f"  behaviour {result.behavior}, drivers {result.driver_model}, preset {result.preset}, "
+        f"svo {result.svo_deg:g} deg, seed {result.seed}, {result.steps} decisions",
+    ]
+    for name in HEADLINE:
+        if name in result.metrics:
+            lines.append(f"  {name:<24} {_text(result.metrics[name])}")
+    for c in result.collisions:
+        who = "AV-caused" if c.av_caused else "not AV-caused"
+        lines.append(f"  collision at {c.time:.1f} s: {c.collider} hit {c.victim} on {c.lane} ({c.kind}, {who})")
+    lines += [f"  not comparable: {reason}" for reason in result.validity]
+    lines.append(f"  trace_hash               {result.trace_hash}")
+    times = ", ".join(f"{name.removesuffix('_s')} {value:.2f} s" for name, value in result.timings.items())
+    lines.append(f"  time spent               {times}")
+    return "\n".join(lines)
+
+
+def prepare_folder(path: str) -> Path:
+    """Make the run folder now, so that a bad path fails before the simulation. Raises BadInput."""
+    folder = Path(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BadInput(f"cannot make this folder: {error.strerror}", field="--out", value=path) from None
+    if not os.access(folder, os.W_OK):
+        raise BadInput("cannot write into this folder", field="--out", value=path)
+    return folder
+
+
+def write_folder(folder: Path, result: EpisodeResult) -> None:
+    """`result.json`, `manifest.json` and `metrics.txt`; each appears whole or not at all."""
+    whole = document(result)
+    texts = {
+        "manifest.json": json.dumps(whole["manifest"], indent=2),
+        "metrics.txt": table(result),
+        "result.json": json.dumps(whole, indent=2),
+    }
+    try:
+        for name, text in texts.items():
+            draft = folder / f".{name}.part"
+            draft.write_text(text + "\n")
+            draft.replace(folder / name)
+    except OSError as error:
+        raise BadInput(f"cannot write: {error.strerror}", file=folder, field="--out") from None
+
+
+def _plain(value: float | int | bool | None) -> float | int | bool | None:
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _collision(fields: dict[str, Any]) -> dict[str, Any]:
+    return {k: _plain(v) if isinstance(v, float) else v for k, v in fields.items()}
+
+
+def _text(metric: Metric) -> str:
+    value = metric.value
+    if value is None:
+        return "NA"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    shown = f"{value:.3g}" if isinstance(value, float) and abs(value) < 100 else f"{value:.0f}"
+    return f"{shown} {metric.unit}".rstrip()

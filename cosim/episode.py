@@ -1,0 +1,216 @@
+"""The straight loop: observe, decide, command, advance. Everything else in cosim walks this one path."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import time
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from cosim.actions import to_commands
+from cosim.manifest import manifest
+from cosim.metrics import MetricContext, Metrics
+from cosim.observation import Observer
+from cosim.scenario import Scenario
+from cosim.seeding import generator
+from cosim.types import (
+    Collision,
+    Decision,
+    EpisodeResult,
+    History,
+    Metric,
+    ObservationConfig,
+    Policy,
+    PolicyContext,
+    Receipt,
+    Simulator,
+    Snapshot,
+)
+
+Progress = Callable[[float, float], None]  # simulated s so far, of s in all
+
+
+class Episode:
+    """Many episodes, one after another, of one scenario on one simulator.
+
+    `start` and `advance` return what every AV on the road observes; decisions given to `advance` are
+    commanded, AVs without one are driven by SUMO. `terminated` after a collision of an AV or the mission
+    vehicle, `truncated` when the scenario's duration is over (contract.md, Episode).
+    """
+
+    def __init__(self, scenario: Scenario, simulator: Simulator, observation: ObservationConfig) -> None:
+        self.scenario = scenario
+        self.simulator = simulator
+        self.observation = observation
+        self._observer = Observer(simulator.road, observation)
+        self._metrics = Metrics()
+
+    def start(self, seed: int) -> dict[str, History]:
+        """Begin the episode `seed`: warm-up driven, clock at 0."""
+        began = time.perf_counter()
+        frames = self.simulator.reset(seed)
+        self.timings = dict.fromkeys(("reset_s", "simulation_s", "observation_s", "decision_s"), 0.0)
+        self.timings["reset_s"] = time.perf_counter() - began
+        self.seed = seed
+        self.steps = 0
+        self.snapshot: Snapshot = frames[-1]
+        self.receipts: tuple[Receipt, ...] = ()
+        self.frames: tuple[Snapshot, ...] = frames
+        self.terminated = self.truncated = False
+        self._begin = self.snapshot.time
+        self._collisions: list[Collision] = []
+        self._tally: dict[str, int] = dict.fromkeys(
+            ("decisions", "vetoes", "fallbacks", "lane_changes", "lane_changes_blocked"), 0
+        )
+        self._hash = hashlib.sha256()
+        self._inserted_before = self.simulator.counts()["inserted"]
+        context = MetricContext(
+            road=self.simulator.road,
+            timing=self.scenario.timing,
+            mission_kind=self.scenario.mission.kind,
+            goal=self.simulator.goal_lanes,
+            duration=self.scenario.duration,
+        )
+        self._metrics.reset(self.snapshot, context)
+        self._observer.reset()
+        return self._observe(frames)
+
+    def advance(self, decisions: Mapping[str, Decision]) -> dict[str, History]:
+        """Carry the decisions out for one decision period."""
+        self._trace(decisions)
+        self._count(decisions)
+        commands = to_commands(decisions, self._histories, self.scenario.timing.decision)
+        began = time.perf_counter()
+        self.receipts, self.frames = self.simulator.advance(commands)
+        self.timings["simulation_s"] += time.perf_counter() - began
+        self.snapshot = self.frames[-1]
+        self.steps += 1
+        for command, receipt in zip(commands, self.receipts, strict=True):
+            self._tally["lane_changes"] += bool(command.lane_offset and receipt.executed)
+            self._tally["lane_changes_blocked"] += not receipt.executed
+        for frame in self.frames:
+            self._metrics.add(frame)
+            self._collisions += frame.events.collisions
+            self.terminated |= any(
+                c.collider_is_av or c.victim_is_av or c.involves_mission for c in frame.events.collisions
+            )
+        self.truncated = not self.terminated and self.elapsed >= self.scenario.duration - 1e-6
+        return self._observe(self.frames)
+
+    @property
+    def over(self) -> bool:
+        return self.terminated or self.truncated
+
+    @property
+    def elapsed(self) -> float:
+        """Counted time in s."""
+        return self.snapshot.time - self._begin
+
+    def trace_hash(self) -> str:
+        """SHA-256 over every decision so far (contract.md, Reproducibility)."""
+        return self._hash.hexdigest()
+
+    def result(self, policy: str, label: str = "", svo: float = 0.0) -> EpisodeResult:
+        """The figures of the episode so far; `svo` in rad."""
+        counts = self.simulator.counts()
+        metrics = self._metrics.result()
+        decided = self._tally["decisions"]
+        metrics |= {
+            "vehicles_inserted": Metric(counts["inserted"], "vehicles", ""),
+            "vehicles_never_inserted": Metric(counts["waiting"], "vehicles", "lower"),
+            "veto_rate": Metric(self._tally["vetoes"] / decided if decided else None, "share", "lower"),
+            "fallback_rate": Metric(
+                self._tally["fallbacks"] / decided if decided else None, "share", "lower"
+            ),
+            "lane_changes_commanded": Metric(self._tally["lane_changes"], "changes", ""),
+            "commands_blocked": Metric(self._tally["lane_changes_blocked"], "commands", "lower"),
+        }
+        s = self.scenario
+        return EpisodeResult(
+            scenario=s.name,
+            demand=s.demand_name,
+            policy=policy,
+            label=label,
+            behavior=s.behavior,
+            driver_model=s.driver_model,
+            preset=s.preset,
+            svo_deg=round(math.degrees(svo), 6),
+            seed=self.seed,
+            steps=self.steps,
+            trace_hash=self.trace_hash(),
+            metrics=metrics,
+            collisions=tuple(self._collisions),
+            timings=dict(self.timings),
+            validity=self._validity(metrics),
+            manifest=manifest(s, self.seed),
+        )
+
+    # ---- inside ----
+
+    def _observe(self, frames: tuple[Snapshot, ...]) -> dict[str, History]:
+        began = time.perf_counter()
+        for frame in frames:
+            self._observer.add(frame)
+        self._histories = self._observer.histories(self.simulator.route, self.simulator.commanded)
+        self.timings["observation_s"] += time.perf_counter() - began
+        return self._histories
+
+    def _trace(self, decisions: Mapping[str, Decision]) -> None:
+        s, update = self.snapshot, self._hash.update
+        update("\n".join(s.ids).encode())
+        for array in (s.x, s.y, s.speed, s.heading):
+            update(np.ascontiguousarray(array, np.float64).tobytes())
+        update(s.lane.tobytes())
+        update(repr(sorted((name, int(d.action)) for name, d in decisions.items())).encode())
+
+    def _count(self, decisions: Mapping[str, Decision]) -> None:
+        self._tally["decisions"] += len(decisions)
+        self._tally["vetoes"] += sum(d.vetoed for d in decisions.values())
+        self._tally["fallbacks"] += sum(d.fallback for d in decisions.values())
+
+    def _validity(self, metrics: Mapping[str, Metric]) -> tuple[str, ...]:
+        """Why this result must not be compared with others; empty when nothing speaks against it."""
+        reasons = []
+        waiting, inserted = metrics["vehicles_never_inserted"].value, metrics["vehicles_inserted"].value
+        if inserted == 0:
+            reasons.append(
+                "no vehicle was ever inserted: the demand is empty for this time, or its routes are"
+            )
+        if waiting:
+            reasons.append(f"{waiting} vehicles found no room and were never inserted: demand above capacity")
+        if teleports := metrics["teleports"].value:
+            reasons.append(f"{teleports} vehicles were teleported by SUMO")
+        if self.steps and not self._tally["decisions"] and not self._had_avs():
+            reasons.append("no AV was ever on the road")
+        return tuple(reasons)
+
+    def _had_avs(self) -> bool:
+        return self._metrics.had_avs
+
+
+def run_episode(
+    episode: Episode, policy: Policy, seed: int, *, svo: float, progress: Progress | None = None
+) -> EpisodeResult:
+    """Drive one whole episode with one policy; `svo` (phi) in rad."""
+    began = time.perf_counter()
+    histories = episode.start(seed)
+    policy.reset(
+        PolicyContext(
+            road=episode.simulator.road,
+            timing=episode.scenario.timing,
+            observation=episode.observation,
+            svo=svo,
+            rng=generator(seed, "policy"),
+        )
+    )
+    while not episode.over:
+        before = time.perf_counter()
+        decisions = policy.decide(histories)
+        episode.timings["decision_s"] += time.perf_counter() - before
+        histories = episode.advance(decisions)
+        if progress is not None:
+            progress(episode.elapsed, episode.scenario.duration)
+    episode.timings["total_s"] = time.perf_counter() - began
+    return episode.result(policy.name, policy.label, svo)

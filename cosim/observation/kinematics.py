@@ -1,0 +1,111 @@
+"""The kinematic matrix: who gets a row, and the rows of every past frame in one fixed ego frame."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from cosim.types import Bools, Floats, Floats32
+
+
+@njit(cache=True, nogil=True)
+def perceived(
+    x: Floats,  # [n] m
+    y: Floats,  # [n] m
+    egos: npt.NDArray[np.int64],  # [B] rows of the AVs
+    reach: float,  # m, of one AV's own sensors
+    share: bool,  # V2V: allies pass on what they perceive
+    seen: Bools,  # [B,n] out
+) -> None:
+    """Who is perceived by whom."""
+    n = x.shape[0]
+    for b in range(egos.shape[0]):
+        for j in range(n):
+            dx, dy = x[j] - x[egos[b]], y[j] - y[egos[b]]
+            seen[b, j] = dx * dx + dy * dy <= reach * reach
+    if share:
+        for j in range(n):
+            anyone = False
+            for b in range(egos.shape[0]):
+                anyone = anyone or seen[b, j]
+            if anyone:
+                for b in range(egos.shape[0]):
+                    seen[b, j] = True
+
+
+@njit(cache=True, nogil=True)
+def choose_rows(
+    x: Floats,  # [n] m
+    y: Floats,  # [n] m
+    egos: npt.NDArray[np.int64],  # [B]
+    seen: Bools,  # [B,n]
+    row_range: float,  # m
+    rows: npt.NDArray[np.int64],  # [B,R] out: vehicle of each row, -1 for none; row 0 the ego
+) -> None:
+    """The ego and the nearest perceived vehicles within `row_range`, by distance."""
+    n, wanted = x.shape[0], rows.shape[1]
+    nearest = np.empty(wanted, np.float64)
+    for b in range(egos.shape[0]):
+        e = egos[b]
+        rows[b] = -1
+        rows[b, 0] = e
+        count = 1
+        for j in range(n):
+            if j == e or not seen[b, j]:
+                continue
+            d2 = (x[j] - x[e]) ** 2 + (y[j] - y[e]) ** 2
+            if d2 > row_range * row_range:
+                continue
+            if count == wanted and d2 >= nearest[count - 1]:
+                continue
+            k = count if count < wanted else wanted - 1
+            while k > 1 and nearest[k - 1] > d2:
+                nearest[k] = nearest[k - 1]
+                rows[b, k] = rows[b, k - 1]
+                k -= 1
+            nearest[k] = d2
+            rows[b, k] = j
+            count = min(count + 1, wanted)
+
+
+@njit(cache=True, nogil=True)
+def fill_rows(
+    past: Floats,  # [N,S,4] x m, y m, speed m/s, unwrapped heading rad per slot; nan where absent
+    slots: npt.NDArray[np.int64],  # [n] slot of each present vehicle
+    rows: npt.NDArray[np.int64],  # [B,R]
+    fixed: Floats,  # [n,4] length m, width m, is_av, is_mission
+    kinematics: Floats32,  # [B,N,R,8] out, KINEMATIC_FEATURES
+    valid: Bools,  # [B,N,R] out
+) -> None:
+    """Every past frame of every row, in the ego's frame at the newest frame."""
+    frames = past.shape[0]
+    for b in range(rows.shape[0]):
+        ego = slots[rows[b, 0]]
+        x0, y0, h0 = past[frames - 1, ego, 0], past[frames - 1, ego, 1], past[frames - 1, ego, 3]
+        c, s = np.cos(h0), np.sin(h0)
+        for r in range(rows.shape[1]):
+            j = rows[b, r]
+            if j < 0:
+                for k in range(frames):
+                    valid[b, k, r] = False
+                    for f in range(8):
+                        kinematics[b, k, r, f] = 0.0
+                continue
+            slot = slots[j]
+            turn = past[frames - 1, slot, 3] - h0
+            base = (turn + np.pi) % (2 * np.pi) - np.pi - turn - h0  # newest heading in (-pi, pi]
+            for k in range(frames):
+                here = not np.isnan(past[k, slot, 0])
+                valid[b, k, r] = here
+                if not here:
+                    for f in range(8):
+                        kinematics[b, k, r, f] = 0.0
+                    continue
+                dx, dy = past[k, slot, 0] - x0, past[k, slot, 1] - y0
+                kinematics[b, k, r, 0] = c * dx + s * dy
+                kinematics[b, k, r, 1] = c * dy - s * dx
+                kinematics[b, k, r, 2] = past[k, slot, 2]
+                kinematics[b, k, r, 3] = past[k, slot, 3] + base
+                for f in range(4):
+                    kinematics[b, k, r, 4 + f] = fixed[j, f]

@@ -1,0 +1,111 @@
+"""Turns snapshots into one History per AV: the first station of every decision."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from cosim.observation.kinematics import choose_rows, fill_rows, perceived
+from cosim.observation.past import KinematicPast, MapPast
+from cosim.raster import RoadRaster, channel_indices, draw_scene, rasterize_road
+from cosim.road import RoadMap
+from cosim.types import KINEMATIC_FEATURES, Bools, History, Ints, Kind, ObservationConfig, Snapshot
+
+RouteOf = Callable[[str], tuple[str, ...]]  # AV id -> edges ahead, the present one first
+CommandOf = Callable[[str], tuple[float | None, int]]  # AV id -> target speed m/s, lane change under way
+
+
+class Observer:
+    """Holds the past of one episode. `add` once per frame, `histories` once per decision.
+
+    Arrays inside a History are views or fresh copies that stay valid for at least 2 N further frames.
+    """
+
+    def __init__(self, road: RoadMap, config: ObservationConfig) -> None:
+        self._road = road
+        self._config = config
+        self._raster: RoadRaster | None = rasterize_road(road) if config.maps else None
+        self._channels = channel_indices(config)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything: a new episode begins."""
+        self._past = KinematicPast(self._config.frames)
+        self._maps = MapPast(self._config) if self._config.maps else None
+        self._newest: Snapshot | None = None
+
+    def add(self, snapshot: Snapshot) -> None:
+        """Append one frame: the kinematics of all, the maps of every AV on the road."""
+        self._past.add(snapshot)
+        self._newest = snapshot
+        self._egos: Ints = np.flatnonzero(snapshot.kind == Kind.AV)
+        c = self._config
+        self._seen: Bools = np.zeros((len(self._egos), snapshot.n), np.bool_)
+        perceived(snapshot.x, snapshot.y, self._egos, c.perception_range, c.share_perception, self._seen)
+        if self._maps is None or self._raster is None:
+            return
+        avs = [snapshot.ids[i] for i in self._egos]
+        block, slots = self._maps.next_frame(avs)
+        raster = self._raster
+        draw_scene(
+            block,
+            slots,
+            self._egos,
+            snapshot.x,
+            snapshot.y,
+            snapshot.heading,
+            snapshot.speed,
+            snapshot.length,
+            snapshot.width,
+            snapshot.kind == Kind.AV,
+            snapshot.mission,
+            self._seen,
+            self._channels,
+            c.metres_across,
+            c.metres_along,
+            raster.cells,
+            raster.x,
+            raster.y,
+            raster.cell,
+        )
+
+    def histories(self, route: RouteOf, commanded: CommandOf) -> dict[str, History]:
+        """One History per AV on the road, at the newest frame."""
+        s, c = self._newest, self._config
+        if s is None or not len(self._egos):
+            return {}
+        count = len(self._egos)
+        rows = np.empty((count, c.rows), np.int64)
+        choose_rows(s.x, s.y, self._egos, self._seen, c.row_range, rows)
+        kinematics = np.empty((count, c.frames, c.rows, len(KINEMATIC_FEATURES)), np.float32)
+        valid = np.empty((count, c.frames, c.rows), np.bool_)
+        fixed = np.stack([s.length, s.width, s.kind == Kind.AV, s.mission], axis=1).astype(np.float64)
+        fill_rows(self._past.view, self._past.slots, rows, fixed, kinematics, valid)
+        lanes = np.where(rows >= 0, s.lane[rows], -1).astype(np.int32)  # [B,R]
+        positions = np.where(rows >= 0, s.lane_position[rows], 0.0)  # [B,R] m
+        pose = np.stack([s.x, s.y, s.heading], axis=1)[self._egos]  # [B,3]
+        no_maps = np.zeros((c.frames, len(c.channels), 0, 0), np.uint8)
+        result = {}
+        names = (*s.ids, "")
+        for b, e in enumerate(self._egos):
+            name = s.ids[e]
+            if lanes[b, 0] < 0:  # off every lane: it cannot be commanded now
+                continue
+            target, change = commanded(name)
+            result[name] = History(
+                velocity_map=no_maps if self._maps is None else self._maps.view(name),
+                kinematics=kinematics[b],
+                valid=valid[b],
+                ids=tuple([names[j] for j in rows[b]]),
+                lane=lanes[b],
+                lane_position=positions[b],
+                pose=pose[b],
+                target_speed=float(s.speed[e]) if target is None else target,
+                lane_changing=change,
+                route=self._road.ahead(
+                    int(lanes[b, 0]), float(positions[b, 0]), float(s.length[e]), route(name)
+                ),
+                time=s.time,
+            )
+        return result

@@ -1,0 +1,120 @@
+"""Commands become libsumo calls, each with a receipt that says whether it was carried out, and why not."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import libsumo
+
+from cosim.actions import MAX_DECEL, tracked_speed
+from cosim.simulation.fleet import AV_IDM
+from cosim.types import Command, Preset, Receipt
+
+LANE_CHANGE_TIME = 2.0  # s, contract.md; the same as SUMO's --lanechange.duration
+# SUMO's bit fields (https://sumo.dlr.de/docs/TraCI/Change_Vehicle_State.html): 6 keeps only the physical
+# acceleration limits, so the agent can crash; 31 and 512 let SUMO's own safety override the agent.
+SPEED_MODE = {Preset.UNGUARDED: 6, Preset.GUARDED: 31}
+LANE_CHANGE_MODE = {Preset.UNGUARDED: 0, Preset.GUARDED: 512}
+SUMO_SPEED_MODE, SUMO_LANE_CHANGE_MODE = 31, 1621  # SUMO's defaults
+SETTLED = 1e-3  # m/s: closer to its target an AV needs no new command
+
+
+@dataclass(slots=True)
+class Controlled:
+    """What the loop remembers of one commanded AV."""
+
+    target: float  # m/s
+    change: int = 0  # lane change under way: +1 left, -1 right
+    change_until: float = -1.0  # s
+    last_change: float = -1e9  # s, start of the last lane change (attribution of cut-ins)
+    requested: float = -1.0  # m/s, the last speed handed to SUMO
+
+
+class Commander:
+    """Holds every commanded AV at its target speed, step by step, and starts lane changes."""
+
+    def __init__(self, preset: str, step: float) -> None:
+        self._preset = preset
+        self._step = step  # s
+        self.controlled: dict[str, Controlled] = {}
+
+    def take(self, command: Command, now: float) -> Receipt:
+        """Start one command at time `now` (s). A vehicle is taken over from SUMO at its first command."""
+        name = command.vehicle
+        try:
+            lane = libsumo.vehicle.getLaneID(name)
+        except libsumo.TraCIException:
+            return Receipt(name, False, "not on the road")
+        state = self.controlled.get(name)
+        if state is None:
+            state = self.controlled[name] = Controlled(command.target_speed)
+            libsumo.vehicle.setSpeedMode(name, SPEED_MODE[self._preset])
+            libsumo.vehicle.setLaneChangeMode(name, LANE_CHANGE_MODE[self._preset])
+            libsumo.vehicle.setDecel(name, MAX_DECEL)
+        state.target = command.target_speed
+        if now >= state.change_until - 1e-9:
+            state.change = 0
+        if command.lane_offset == 0:
+            return Receipt(name, True)
+        why = self._cannot_change(name, lane, state, command.lane_offset)
+        if why is not None:
+            return Receipt(name, False, why)
+        libsumo.vehicle.changeLaneRelative(name, command.lane_offset, command.hold)
+        state.change = command.lane_offset
+        state.change_until = now + LANE_CHANGE_TIME
+        state.last_change = now
+        return Receipt(name, True)
+
+    def release(self, commanded: Sequence[Command]) -> None:
+        """AVs that got no command this time are handed back to SUMO's own driver."""
+        names = {c.vehicle for c in commanded}
+        for name in [n for n in self.controlled if n not in names]:
+            del self.controlled[name]
+            libsumo.vehicle.setSpeed(name, -1.0)
+            libsumo.vehicle.setSpeedMode(name, SUMO_SPEED_MODE)
+            libsumo.vehicle.setLaneChangeMode(name, SUMO_LANE_CHANGE_MODE)
+            libsumo.vehicle.setDecel(name, AV_IDM["Decel"])
+
+    def confirm(self, receipts: Sequence[Receipt], commands: Sequence[Command]) -> tuple[Receipt, ...]:
+        """After the hold: a lane change that did not begin was refused by SUMO's guard."""
+        confirmed = list(receipts)
+        for k, (receipt, command) in enumerate(zip(receipts, commands, strict=True)):
+            if not command.lane_offset or not receipt.executed:
+                continue
+            name, state = command.vehicle, self.controlled.get(command.vehicle)
+            if state is None or name not in libsumo.vehicle.getIDList():
+                continue
+            if abs(libsumo.vehicle.getLateralLanePosition(name)) < 0.05:
+                state.change, state.change_until = 0, -1.0
+                state.last_change = -1e9
+                confirmed[k] = Receipt(name, False, f"refused by SUMO's lane-change safety ({self._preset})")
+        return tuple(confirmed)
+
+    def drive(self) -> None:
+        """Before every simulation step: track the target speeds."""
+        vehicle = libsumo.vehicle
+        for name, state in self.controlled.items():
+            speed = vehicle.getSpeed(name)
+            wanted = tracked_speed(speed, state.target, self._step)
+            if abs(wanted - state.requested) > SETTLED:
+                vehicle.setSpeed(name, wanted)
+                state.requested = wanted
+
+    def forget(self, name: str) -> None:
+        """The vehicle left the road."""
+        self.controlled.pop(name, None)
+
+    def _cannot_change(self, name: str, lane: str, state: Controlled, offset: int) -> str | None:
+        if state.change:
+            return "a lane change is under way"
+        if lane.startswith(":"):
+            return "inside a junction"
+        edge, _, index = lane.rpartition("_")
+        target = int(index) + offset
+        if not 0 <= target < libsumo.edge.getLaneNumber(edge):
+            return "no lane on that side"
+        allowed = libsumo.lane.getAllowed(f"{edge}_{target}")
+        if allowed and libsumo.vehicle.getVehicleClass(name) not in allowed:
+            return "the lane is closed to this vehicle class"
+        return None

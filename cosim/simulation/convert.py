@@ -1,0 +1,166 @@
+"""SUMO's conventions end here: front bumper and degrees clockwise from north become centre and radians."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import libsumo
+import numpy as np
+
+from cosim.errors import BadInput
+from cosim.road import ConflictZone, Lane, RoadMap
+from cosim.scenario import Zone
+from cosim.types import Events, Kind, Snapshot
+
+MOTOR_CLASSES = {"passenger", "private", "taxi", "bus", "truck", "trailer", "delivery", "motorcycle"}
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """What does not change while a vehicle drives."""
+
+    kind: Kind
+    mission: bool
+    length: float  # m
+    width: float  # m
+
+
+class SnapshotReader:
+    """Reads every vehicle with plain getters (measured faster than subscriptions, sumo-facts.md)."""
+
+    def __init__(self, road: RoadMap) -> None:
+        self._lane_index = road.index
+        self._ids: tuple[str, ...] = ()
+        self._static: tuple[np.ndarray, ...] = ()
+        self._front = np.zeros(0)  # [n] m, half lengths
+
+    def forget(self) -> None:
+        """The bodies changed (a new episode, a new mission vehicle)."""
+        self._ids = ()
+
+    def read(self, bodies: dict[str, Body], events: Events) -> Snapshot:
+        """One snapshot of every vehicle on the road, sorted by id."""
+        vehicle = libsumo.vehicle
+        ids = tuple(sorted(vehicle.getIDList()))
+        if ids != self._ids or not self._static:
+            present = [bodies[i] for i in ids]
+            self._static = (
+                np.array([b.kind for b in present], np.int8),
+                np.array([b.mission for b in present], np.bool_),
+                np.array([b.length for b in present], np.float64),
+                np.array([b.width for b in present], np.float64),
+            )
+            self._front = 0.5 * self._static[2]
+            self._ids = ids
+        kind, mission, length, width = self._static
+        position, angle = vehicle.getPosition, vehicle.getAngle
+        speed, accel = vehicle.getSpeed, vehicle.getAcceleration
+        lane_id, lane_position = vehicle.getLaneID, vehicle.getLanePosition
+        index = self._lane_index
+        front = np.array([position(i) for i in ids], np.float64).reshape(-1, 2)  # [n,2] m
+        heading = np.radians(90.0 - np.array([angle(i) for i in ids], np.float64))  # [n] rad
+        heading = (heading + np.pi) % (2 * np.pi) - np.pi
+        return Snapshot(
+            time=libsumo.simulation.getTime(),
+            ids=ids,
+            kind=kind,
+            mission=mission,
+            x=front[:, 0] - self._front * np.cos(heading),
+            y=front[:, 1] - self._front * np.sin(heading),
+            heading=heading,
+            speed=np.array([speed(i) for i in ids], np.float64),
+            accel=np.array([accel(i) for i in ids], np.float64),
+            length=length,
+            width=width,
+            lane=np.array([index.get(lane_id(i), -1) for i in ids], np.int32),
+            lane_position=np.array([lane_position(i) for i in ids], np.float64),
+            events=events,
+        )
+
+
+def read_road(zones: Sequence[Zone], scenario_file: object) -> RoadMap:
+    """The loaded net as a RoadMap: every lane a motor vehicle may use.
+
+    Raises BadInput when a conflict zone names an edge that the net does not have.
+    """
+    get = libsumo.lane
+    ids = [i for i in get.getIDList() if not (a := get.getAllowed(i)) or MOTOR_CLASSES.intersection(a)]
+    place = {name: k for k, name in enumerate(ids)}
+    lanes = []
+    for name in ids:
+        edge, _, number = name.rpartition("_")
+        successors = []
+        for link in get.getLinks(name):
+            follower = link[4] or link[0]
+            if follower in place:
+                successors.append(place[follower])
+        shape = np.array(get.getShape(name), np.float64)[:, :2]
+        lanes.append(
+            Lane(
+                id=name,
+                edge=edge,
+                index=int(number),
+                shape=shape,
+                length=get.getLength(name),
+                width=get.getWidth(name),
+                speed_limit=get.getMaxSpeed(name),
+                successors=tuple(dict.fromkeys(successors)),
+                left=-1 if name.startswith(":") else place.get(f"{edge}_{int(number) + 1}", -1),
+                right=-1 if name.startswith(":") else place.get(f"{edge}_{int(number) - 1}", -1),
+                internal=name.startswith(":"),
+            )
+        )
+    found = tuple(_zone(z, lanes, scenario_file) for z in zones)
+    outlines = tuple(
+        np.array(shape, np.float64)[:, :2]
+        for j in libsumo.junction.getIDList()
+        if not j.startswith(":") and len(shape := libsumo.junction.getShape(j)) > 2
+    )
+    road = RoadMap(tuple(lanes), found, outlines)
+    return road if found else replace(road, zones=(_struggling_zone(road),))
+
+
+def struggling_lanes(road: RoadMap) -> frozenset[int]:
+    """Lanes whose driver needs somebody's help: they end beside others that go on, or must give way.
+
+    This is how the mission vehicle of a user's own net is found when nobody names one.
+    """
+    result = set()
+    for i, lane in enumerate(road.lanes):
+        if lane.internal:
+            continue
+        if not lane.successors:
+            if any(o >= 0 and road.lanes[o].successors for o in (lane.left, lane.right)):
+                result.add(i)
+            continue
+        links = libsumo.lane.getLinks(lane.id)
+        if links and all(not link[1] and link[3] for link in links):
+            result.add(i)
+    return frozenset(result)
+
+
+def _struggling_zone(road: RoadMap) -> ConflictZone:
+    """Without a scenario.yaml the conflict lies where a minor approach or an ending lane meets others."""
+    lanes: set[int] = set()
+    for i in struggling_lanes(road):
+        lane = road.lanes[i]
+        if lane.successors:
+            lanes.update(lane.successors)
+        else:
+            lanes.update(o for o in (lane.left, lane.right) if o >= 0)
+    return ConflictZone("found", frozenset(lanes))
+
+
+def _zone(zone: Zone, lanes: Sequence[Lane], scenario_file: object) -> ConflictZone:
+    members = set()
+    for edge in zone.edges:
+        mine = {
+            k
+            for k, lane in enumerate(lanes)
+            if lane.edge == edge or (edge.startswith(":") and lane.edge.startswith(f"{edge}_"))
+        }
+        if not mine:
+            raise BadInput("the net has no such edge", file=scenario_file, field="conflict_zones", value=edge)
+        members |= mine
+    return ConflictZone(zone.name, frozenset(members))

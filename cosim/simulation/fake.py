@@ -1,0 +1,208 @@
+"""An in-memory Simulator without SUMO: a straight road, IDM followers, commanded AVs. For tests, also yours."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from cosim.actions import tracked_speed
+from cosim.road import Lane, RoadMap
+from cosim.types import Collision, Command, Events, Kind, Receipt, Snapshot, Timing
+
+LANE_WIDTH = 3.2  # m, SUMO's default
+LATERAL_SPEED = LANE_WIDTH / 2.0  # m/s: a lane change takes 2 s (contract.md)
+
+
+@dataclass(slots=True)
+class FakeVehicle:
+    """One vehicle of the fake world; `x` is the front bumper's place along the road in m."""
+
+    id: str
+    x: float
+    lane: int  # 0 rightmost
+    speed: float  # m/s
+    is_av: bool = False
+    mission: bool = False
+    desired: float = 25.0  # m/s, of an HV (and of an AV nobody commands)
+    target: float | None = None  # m/s, once commanded
+    goal_lane: int = -1  # while a lane change is under way
+    offset: float = 0.0  # m, lateral, from the centre of `lane`
+    accel: float = 0.0
+    length: float = 5.0
+    width: float = 2.0
+
+
+class FakeSimulator:
+    """`cosim.types.Simulator` on a straight road of `lanes` lanes and `length` m.
+
+    `vehicles` start each episode as given; `seed` only jitters their places by +-1 m.
+    """
+
+    def __init__(
+        self,
+        vehicles: Sequence[FakeVehicle],
+        *,
+        lanes: int = 2,
+        length: float = 2000.0,
+        speed_limit: float = 25.0,
+        timing: Timing = Timing(),
+        goal: Sequence[int] = (),
+    ) -> None:
+        self.road = straight_road(lanes, length, speed_limit)
+        self.goal_lanes = frozenset(goal)
+        self._template = tuple(vehicles)
+        self._timing = timing
+        self._length = length
+        self._vehicles: dict[str, FakeVehicle] = {}
+        self._time = 0.0
+        self._hit: set[frozenset[str]] = set()
+
+    def reset(self, seed: int) -> tuple[Snapshot, ...]:
+        """One frame: everyone at the start."""
+        rng = np.random.default_rng(seed)
+        self._time = 0.0
+        self._hit.clear()
+        self._vehicles = {}
+        for v in self._template:
+            copy = FakeVehicle(v.id, v.x + rng.uniform(-1, 1), v.lane, v.speed, v.is_av, v.mission, v.desired)
+            copy.length, copy.width = v.length, v.width
+            self._vehicles[v.id] = copy
+        return (self._snapshot(),)
+
+    def advance(self, commands: Sequence[Command]) -> tuple[tuple[Receipt, ...], tuple[Snapshot, ...]]:
+        """Hold the commands for one decision."""
+        receipts = tuple(self._take(c) for c in commands)
+        per_frame = round(self._timing.frame / self._timing.step)
+        frames = []
+        for k in range(1, round(self._timing.decision / self._timing.step) + 1):
+            self._step()
+            if k % per_frame == 0:
+                frames.append(self._snapshot())
+        return receipts, tuple(frames)
+
+    def route(self, vehicle: str) -> tuple[str, ...]:
+        """The one edge there is."""
+        return ("road",)
+
+    def commanded(self, vehicle: str) -> tuple[float | None, int]:
+        """Target speed in m/s and the lane change under way."""
+        v = self._vehicles[vehicle]
+        return v.target, 0 if v.goal_lane < 0 else int(np.sign(v.goal_lane - v.lane))
+
+    def counts(self) -> dict[str, int]:
+        """Everybody is inserted at once."""
+        return {"inserted": len(self._template), "waiting": 0}
+
+    def close(self) -> None:
+        """Nothing to free."""
+
+    def _take(self, command: Command) -> Receipt:
+        v = self._vehicles.get(command.vehicle)
+        if v is None:
+            return Receipt(command.vehicle, False, "not on the road")
+        v.target = command.target_speed
+        if command.lane_offset == 0:
+            return Receipt(v.id, True)
+        if v.goal_lane >= 0:
+            return Receipt(v.id, False, "a lane change is under way")
+        if not 0 <= v.lane + command.lane_offset < len(self.road.lanes):
+            return Receipt(v.id, False, "no lane on that side")
+        v.goal_lane = v.lane + command.lane_offset
+        return Receipt(v.id, True)
+
+    def _step(self) -> None:
+        step = self._timing.step
+        old = {v.id: v.speed for v in self._vehicles.values()}
+        for v in self._vehicles.values():
+            if v.target is not None:
+                wanted = tracked_speed(v.speed, v.target, step)
+            else:
+                wanted = max(v.speed + self._idm(v, old) * step, 0.0)
+            v.accel = (wanted - v.speed) / step
+            v.speed = wanted
+        for v in list(self._vehicles.values()):
+            v.x += v.speed * step
+            if v.goal_lane >= 0:
+                side = 1 if v.goal_lane > v.lane else -1
+                v.offset += side * LATERAL_SPEED * step
+                if abs(v.offset) >= LANE_WIDTH / 2 and v.offset * side > 0:
+                    v.lane, v.offset = v.goal_lane, v.offset - side * LANE_WIDTH
+                    v.goal_lane = -1
+            elif abs(v.offset) > 1e-9:
+                v.offset -= float(np.sign(v.offset)) * min(abs(v.offset), LATERAL_SPEED * step)
+            if v.x > self._length:
+                del self._vehicles[v.id]
+        self._time = round(self._time + step, 9)
+
+    def _idm(self, v: FakeVehicle, speeds: dict[str, float]) -> float:
+        """IDM with Table II's moderate parameters, m/s2."""
+        free = 1.0 - (v.speed / v.desired) ** 4
+        ahead = [o for o in self._vehicles.values() if o.lane == v.lane and o.x > v.x]
+        if not ahead:
+            return 3.0 * free
+        leader = min(ahead, key=lambda o: o.x)
+        gap = max(leader.x - leader.length - v.x, 0.1)
+        dv = v.speed - speeds[leader.id]
+        wanted = 2.0 + max(0.0, v.speed + v.speed * dv / (2 * np.sqrt(3.0 * 7.0)))
+        return max(3.0 * (free - (wanted / gap) ** 2), -9.0)
+
+    def _snapshot(self) -> Snapshot:
+        vs = [self._vehicles[name] for name in sorted(self._vehicles)]
+        centre_y = np.array([(v.lane + 0.5) * LANE_WIDTH + v.offset for v in vs])
+        return Snapshot(
+            time=self._time,
+            ids=tuple(v.id for v in vs),
+            kind=np.array([Kind.AV if v.is_av else Kind.HV for v in vs], np.int8),
+            mission=np.array([v.mission for v in vs], np.bool_),
+            x=np.array([v.x - v.length / 2 for v in vs]),
+            y=centre_y,
+            heading=np.zeros(len(vs)),
+            speed=np.array([v.speed for v in vs]),
+            accel=np.array([v.accel for v in vs]),
+            length=np.array([v.length for v in vs]),
+            width=np.array([v.width for v in vs]),
+            lane=np.array([v.lane for v in vs], np.int32),
+            lane_position=np.array([v.x for v in vs]),
+            events=Events(collisions=tuple(self._collisions(vs, centre_y))),
+        )
+
+    def _collisions(self, vs: list[FakeVehicle], y: np.ndarray) -> list[Collision]:
+        found = []
+        for i, a in enumerate(vs):
+            for j in range(i + 1, len(vs)):
+                b = vs[j]
+                if abs(y[i] - y[j]) >= (a.width + b.width) / 2:
+                    continue
+                if a.x - a.length >= b.x or b.x - b.length >= a.x or frozenset((a.id, b.id)) in self._hit:
+                    continue
+                self._hit.add(frozenset((a.id, b.id)))
+                hits, hit = (a, b) if a.x < b.x else (b, a)
+                found.append(
+                    Collision(
+                        self._time, hits.id, hit.id, hits.is_av, hit.is_av, "overlap", "box",
+                        f"road_{hits.lane}", hits.x, float(y[i]), hits.mission or hit.mission, hits.is_av,
+                    )
+                )  # fmt: skip
+        return found
+
+
+def straight_road(lanes: int, length: float, speed_limit: float) -> RoadMap:
+    """A straight road eastwards: edge `road`, lane 0 at the right (y = 1.6 m), in m and m/s."""
+    return RoadMap(
+        tuple(
+            Lane(
+                id=f"road_{k}",
+                edge="road",
+                index=k,
+                shape=np.array([[0.0, (k + 0.5) * LANE_WIDTH], [length, (k + 0.5) * LANE_WIDTH]]),
+                length=length,
+                width=LANE_WIDTH,
+                speed_limit=speed_limit,
+                left=k + 1 if k + 1 < lanes else -1,
+                right=k - 1,
+            )
+            for k in range(lanes)
+        )
+    )

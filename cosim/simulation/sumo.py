@@ -1,0 +1,276 @@
+"""Starts SUMO through libsumo and advances it one decision at a time: the only simulation of its process."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import libsumo
+
+from cosim.errors import BadInput, SimulationError, SimulationInUse
+from cosim.road import RoadMap
+from cosim.scenario import Scenario
+from cosim.simulation.collisions import CollisionWatch
+from cosim.simulation.commands import Commander
+from cosim.simulation.convert import Body, SnapshotReader, read_road, struggling_lanes
+from cosim.simulation.drivers import Drivers
+from cosim.simulation.fleet import Fleet
+from cosim.simulation.stderr import SumoStderr
+from cosim.types import Collision, Command, Events, Kind, Receipt, Snapshot
+
+SUMO_ERRORS = (libsumo.TraCIException, libsumo.FatalTraCIError)
+
+# Ours, where a user's file does not say otherwise. A teleport would be a vehicle out of thin air.
+DEFAULTS = {
+    "lanechange.duration": "2",  # continuous lateral motion, contract.md
+    "time-to-teleport": "-1",
+    "default.speeddev": "0",
+}
+# Ours whatever the file says: collisions must be seen (sumo-facts: never `collision.action none`).
+FORCED = {
+    "collision.action": "warn",
+    "collision.check-junctions": "true",
+    "collision.mingap-factor": "0",
+    "no-step-log": "true",
+    "no-warnings": "true",
+    "duration-log.disable": "true",
+    "xml-validation": "never",  # cosim.vet has read the files already
+}
+
+_in_use = False
+
+
+class SumoSimulator:
+    """`cosim.types.Simulator` on SUMO. Raises SimulationInUse when this process already holds one.
+
+    `history` frames are returned by `reset`, so that an agent starts with a full past.
+    """
+
+    def __init__(
+        self, scenario: Scenario, *, av_parameters: Mapping[str, str] | None = None, history: int = 10
+    ) -> None:
+        global _in_use
+        if _in_use or libsumo.isLoaded():
+            raise SimulationInUse(
+                "this process already runs a simulation, and libsumo would silently replace it: "
+                "use one process per simulation (cosim.envs and cosim.open do)"
+            )
+        self._scenario = scenario
+        self._av_parameters = dict(av_parameters or {})
+        self._history = history
+        self._stderr = SumoStderr()
+        self._started = False
+        _in_use = True
+        timing = scenario.timing
+        self._steps_per_frame = round(timing.frame / timing.step)
+        self._steps_per_decision = round(timing.decision / timing.step)
+        self._bodies: dict[str, Body] = {}
+        self._watch = CollisionWatch()
+        try:
+            self._load(seed=0)
+            self.road: RoadMap = read_road(scenario.zones, scenario.config)
+            self.goal_lanes, self._struggling = self._goal()
+        except BaseException:
+            self.close()
+            raise
+        self._lane_ids = [lane.id for lane in self.road.lanes]
+        self._reader = SnapshotReader(self.road)
+
+    def reset(self, seed: int) -> tuple[Snapshot, ...]:
+        """Load the episode `seed` anew, drive the warm-up; the last `history` frames, newest last."""
+        self._load(seed)
+        self._seed = seed
+        self._drivers = Drivers(self._scenario.behavior, self._scenario.driver_model, seed)
+        self._fleet = Fleet(self._scenario, self._drivers, self._av_parameters)
+        self._commander = Commander(self._scenario.preset, self._scenario.timing.step)
+        self._bodies.clear()
+        self._routes: dict[str, tuple[str, ...]] = {}
+        self._watch.reset()
+        self._reader.forget()
+        self._mission_found = bool(self._scenario.mission.vehicles) or self._scenario.mission.kind == "none"
+        self._inserted = 0
+        self._clear_events()
+        steps = round(self._scenario.warmup / self._scenario.timing.step)
+        first_kept = steps - (self._history - 1) * self._steps_per_frame
+        frames = []
+        with self._stderr:
+            for k in range(1, steps + 1):
+                self._step()
+                if k >= first_kept and (steps - k) % self._steps_per_frame == 0:
+                    frames.append(self._snapshot())
+        if not frames:
+            frames.append(self._snapshot())
+        return tuple(frames)
+
+    def advance(self, commands: Sequence[Command]) -> tuple[tuple[Receipt, ...], tuple[Snapshot, ...]]:
+        """Hold the commands for one decision; one snapshot per frame. Raises SimulationError."""
+        frames = []
+        with self._stderr:
+            now = libsumo.simulation.getTime()
+            self._commander.release(commands)
+            receipts = tuple(self._commander.take(c, now) for c in commands)
+            for k in range(1, self._steps_per_decision + 1):
+                self._commander.drive()
+                self._step()
+                if k % self._steps_per_frame == 0:
+                    frames.append(self._snapshot())
+            receipts = self._commander.confirm(receipts, commands)
+        return receipts, tuple(frames)
+
+    def route(self, vehicle: str) -> tuple[str, ...]:
+        """The edges still ahead, the present one first."""
+        index = max(libsumo.vehicle.getRouteIndex(vehicle), 0)
+        edges = self._routes.get(vehicle)
+        if edges is None:
+            edges = self._routes[vehicle] = tuple(libsumo.vehicle.getRoute(vehicle))
+        return edges[index:] if index else edges
+
+    def commanded(self, vehicle: str) -> tuple[float | None, int]:
+        """Target speed in m/s (None while SUMO drives) and the lane change under way."""
+        state = self._commander.controlled.get(vehicle)
+        if state is None:
+            return None, 0
+        under_way = libsumo.simulation.getTime() < state.change_until - 1e-9
+        return state.target, state.change if under_way else 0
+
+    def counts(self) -> dict[str, int]:
+        """Vehicles since the start: `inserted`, and `waiting` ones that found no room (never inserted)."""
+        return {
+            "inserted": self._inserted,
+            "waiting": len(libsumo.simulation.getPendingVehicles()),
+        }
+
+    def close(self) -> None:
+        """End SUMO and free the process for another simulation."""
+        global _in_use
+        if self._stderr is None:
+            return
+        if self._started:
+            with self._stderr:
+                libsumo.close()
+        self._started = False
+        self._stderr.close()
+        self._stderr = None  # type: ignore[assignment]
+        _in_use = False
+
+    # ---- inside ----
+
+    def _load(self, seed: int) -> None:
+        arguments = self._arguments(seed)
+        try:
+            with self._stderr:
+                if self._started:
+                    libsumo.load(arguments)
+                else:
+                    libsumo.start(["sumo", *arguments])
+                    self._started = True
+        except SUMO_ERRORS as error:
+            self._started = libsumo.isLoaded()
+            raise self._explain(error, starting=True) from None
+
+    def _arguments(self, seed: int) -> list[str]:
+        s = self._scenario
+        additional = [*s.additional]
+        if not s.built_in:
+            additional.append(Path(__file__).parents[2] / "sumo_scenarios" / "types.add.xml")
+        options = {
+            "net-file": str(s.net),
+            "route-files": ",".join(map(str, s.demand)),
+            "additional-files": ",".join(map(str, additional)),
+            "begin": f"{s.begin:g}",
+            "step-length": f"{s.timing.step:g}",
+            "seed": str(seed % (2**31 - 1)),
+            **DEFAULTS,
+            **dict(s.options),
+            **FORCED,
+        }
+        return [text for key, value in options.items() if value for text in (f"--{key}", value)]
+
+    def _explain(self, error: Exception, *, starting: bool = False) -> Exception:
+        words = self._stderr.take() or str(error)
+        if starting:  # everything SUMO refuses before the first step is wrong input
+            return BadInput(f"SUMO refuses it: {words}", file=self._scenario.config)
+        return SimulationError(f"{self._scenario.config}: SUMO failed: {words}")
+
+    def _step(self) -> None:
+        simulation = libsumo.simulation
+        try:
+            libsumo.simulationStep()
+        except SUMO_ERRORS as error:
+            raise self._explain(error) from None
+        now = simulation.getTime()
+        departed = simulation.getDepartedIDList()
+        if departed:
+            self._inserted += len(departed)
+            self._departed += departed
+            for name in departed:
+                self._bodies[name] = self._fleet.welcome(name, self._seed)
+        arrived = simulation.getArrivedIDList()
+        if arrived:
+            self._arrived += arrived
+            for name in arrived:
+                self._commander.forget(name)
+                self._routes.pop(name, None)
+        if simulation.getCollidingVehiclesNumber():
+            self._collisions += self._watch.from_sumo(self._bodies, self._commander.controlled, now)
+        teleported = simulation.getStartingTeleportIDList()
+        if teleported:
+            self._teleported += teleported
+        stopped = simulation.getEmergencyStoppingVehiclesIDList()
+        if stopped:
+            self._stopped += stopped
+        self._drivers.step(now)
+
+    def _snapshot(self) -> Snapshot:
+        events = Events(
+            tuple(self._collisions),
+            tuple(self._departed),
+            tuple(self._arrived),
+            tuple(self._teleported),
+            tuple(self._stopped),
+        )
+        self._clear_events()
+        snapshot = self._reader.read(self._bodies, events)
+        if not self._mission_found:
+            snapshot = self._find_mission(snapshot)
+        extra = self._watch.from_boxes(snapshot, self._bodies, self._commander.controlled, self._lane_ids)
+        if extra:
+            collisions = events.collisions + tuple(extra)
+            snapshot = replace(snapshot, events=replace(events, collisions=collisions))
+        return snapshot
+
+    def _clear_events(self) -> None:
+        self._collisions: list[Collision] = []
+        self._departed: list[str] = []
+        self._arrived: list[str] = []
+        self._teleported: list[str] = []
+        self._stopped: list[str] = []
+
+    def _goal(self) -> tuple[frozenset[int], frozenset[int]]:
+        """Lanes on which the mission is fulfilled, and lanes that make a vehicle the mission vehicle."""
+        mission = self._scenario.mission
+        if mission.kind == "auto":
+            struggling = struggling_lanes(self.road)
+            free = frozenset(
+                i for i, lane in enumerate(self.road.lanes) if not lane.internal and i not in struggling
+            )
+            return free, struggling
+        goal = frozenset(i for i, lane in enumerate(self.road.lanes) if lane.edge in mission.goal)
+        missing = [e for e in mission.goal if not any(lane.edge == e for lane in self.road.lanes)]
+        if missing:
+            raise BadInput(
+                "the net has no such edge", file=self._scenario.config, field="mission.goal", value=missing[0]
+            )
+        return goal, frozenset()
+
+    def _find_mission(self, snapshot: Snapshot) -> Snapshot:
+        """Nobody named one: the first HV (by id) that drives on a lane that ends or must give way."""
+        for i, name in enumerate(snapshot.ids):
+            if snapshot.kind[i] == Kind.HV and int(snapshot.lane[i]) in self._struggling:
+                body = self._bodies[name]
+                self._bodies[name] = Body(body.kind, True, body.length, body.width)
+                self._mission_found = True
+                self._reader.forget()
+                return self._reader.read(self._bodies, snapshot.events)
+        return snapshot

@@ -1,0 +1,159 @@
+"""One object in a process of its own, supervised: SUMO may die, the caller must not.
+
+A net that SUMO cannot bear kills the process that imported libsumo (sumo-facts, Traps). So whatever drives
+a simulation lives in a spawned worker, called through a pipe; its death or silence becomes an exception.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import tempfile
+import traceback
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from cosim.errors import CosimError, SimulationCrashed
+
+_CONTEXT = multiprocessing.get_context("spawn")
+
+
+class Worker:
+    """`factory(*arguments)` built in a spawned process; `call` runs one of its methods there.
+
+    Everything that crosses must be picklable. `timeout` is the longest silence in s that a call may keep
+    (progress counts as a sign of life). Raises whatever CosimError the method raised, SimulationCrashed when
+    the process died or stayed silent. A worker whose process is gone stays gone: make a new one.
+    """
+
+    def __init__(
+        self, factory: Callable[..., Any], *arguments: Any, timeout: float = 300.0, name: str = "cosim"
+    ) -> None:
+        self._timeout = timeout
+        handle, path = tempfile.mkstemp(prefix="cosim-worker-", suffix=".stderr")
+        os.close(handle)
+        self._stderr = Path(path)
+        self._pipe, theirs = _CONTEXT.Pipe()
+        self._process = _CONTEXT.Process(
+            target=_serve, args=(theirs, factory, arguments, path), name=name, daemon=True
+        )
+        self._process.start()
+        theirs.close()
+        self._closed = False
+        try:
+            self._answer("start", None)
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def pid(self) -> int | None:
+        """The process id of the worker."""
+        return self._process.pid
+
+    def call(
+        self, method: str, *arguments: Any, progress: Callable[..., None] | None = None, **options: Any
+    ) -> Any:
+        """Run one method in the worker. `progress` receives what the method passes to its own `progress`."""
+        if self._closed:
+            raise SimulationCrashed("the simulation's process has ended already")
+        try:
+            self._pipe.send((method, arguments, options, progress is not None))
+        except (BrokenPipeError, OSError):
+            raise self._died(method) from None
+        return self._answer(method, progress)
+
+    def close(self) -> None:
+        """Ask the worker to end, and see to it that it does. Safe to call twice."""
+        if self._closed:
+            return
+        self._closed = True
+        with contextlib.suppress(BrokenPipeError, OSError):
+            self._pipe.send(None)
+        self._process.join(5.0)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
+        self._pipe.close()
+        self._stderr.unlink(missing_ok=True)
+
+    def __enter__(self) -> Worker:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def __del__(self) -> None:
+        with contextlib.suppress(Exception):
+            self.close()
+
+    def _answer(self, method: str, progress: Callable[..., None] | None) -> Any:
+        while True:
+            try:
+                if not self._pipe.poll(self._timeout):
+                    self._process.kill()
+                    self._process.join()
+                    error = SimulationCrashed(
+                        f"no sign of life for {self._timeout:g} s during '{method}': process killed"
+                    )
+                    self.close()
+                    raise error
+                kind, value = self._pipe.recv()
+            except (EOFError, ConnectionResetError):
+                raise self._died(method) from None
+            if kind == "progress":
+                if progress is not None:
+                    progress(*value)
+            elif kind == "error":
+                raise value
+            else:
+                return value
+
+    def _died(self, method: str) -> SimulationCrashed:
+        self._process.join(5.0)
+        code = self._process.exitcode
+        how = f"exit code {code}"
+        if code is not None and code < 0:
+            how = f"killed by {signal.Signals(-code).name}"
+        last = self._stderr.read_text("utf-8", "replace").strip().splitlines()[-1:]
+        words = f"; last words: {last[0]}" if last else ""
+        self.close()
+        return SimulationCrashed(f"the simulation's process died during '{method}' ({how}){words}")
+
+
+def _serve(pipe: Connection, factory: Callable[..., Any], arguments: tuple[Any, ...], stderr: str) -> None:
+    """The worker's whole life. Ends when the pipe breaks, so it never outlives its parent."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
+    with open(stderr, "wb", buffering=0) as file:
+        os.dup2(file.fileno(), 2)
+    target = None
+
+    def attempt(work: Callable[[], Any]) -> bool:
+        try:
+            pipe.send(("value", work()))
+            return True
+        except CosimError as error:
+            pipe.send(("error", error))
+        except Exception as error:  # a bug of ours: the caller needs to see where
+            words = "".join(traceback.format_exception(error)).rstrip()
+            pipe.send(("error", CosimError(f"internal error in the simulation's process:\n{words}")))
+        return False
+
+    def build() -> None:
+        nonlocal target
+        target = factory(*arguments)
+
+    with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
+        if attempt(build):
+            while (message := pipe.recv()) is not None:
+                method, args, options, wants_progress = message
+                if wants_progress:
+                    options["progress"] = lambda *values: pipe.send(("progress", values))
+                attempt(lambda: getattr(target, method)(*args, **options))  # noqa: B023
+    if target is not None and hasattr(target, "close"):
+        with contextlib.suppress(Exception):
+            target.close()

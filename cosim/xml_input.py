@@ -1,0 +1,199 @@
+"""Read one XML file of unknown origin as a stream, so that nothing in it can hurt the process that reads.
+
+SUMO itself answers a bad file with "Process Error", with gigabytes of memory or with SIGSEGV
+(operations.md, hostile input); everything SUMO is handed therefore passes through `scan` first. The
+parser is expat with defusedxml's three refusals (entities, external references, foreign encodings) and
+caps on depth, token length and unpacked size; memory does not grow with the file.
+"""
+
+from __future__ import annotations
+
+import gzip
+import stat
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO
+from xml.parsers import expat
+
+from cosim.errors import BadInput
+
+MAX_DEPTH = 64  # SUMO's own files nest 6 deep; a million nested tags hang SUMO
+MAX_TOKEN = 64 << 20  # bytes between two parser events: expat buffers a tag until it is whole
+MAX_UNPACKED = 1 << 30  # bytes out of one .gz: a 3 GB bomb costs SUMO 4.2 GB of memory
+CHUNK = 1 << 18  # bytes
+
+Start = Callable[[str, dict[str, str], int], None]  # tag, attributes, line
+End = Callable[[str], None]
+
+_GZIP_MAGIC = b"\x1f\x8b"
+_UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
+
+
+def regular_file(path: Path, *, file: object, field: str) -> Path:
+    """`path` if it is a readable regular file.
+
+    Raises:
+        BadInput: missing, a folder, a FIFO or device (SUMO hangs on these), or not readable; names
+            `file` and `field` as the place where the path was written.
+    """
+    try:
+        mode = path.stat().st_mode
+        if stat.S_ISREG(mode):
+            with path.open("rb"):
+                return path
+    except FileNotFoundError:
+        raise BadInput("no such file", file=file, field=field, value=str(path)) from None
+    except OSError as error:
+        problem = (error.strerror or "cannot be read").lower()
+        raise BadInput(problem, file=file, field=field, value=str(path)) from None
+    except ValueError as error:  # a NUL byte in the name
+        raise BadInput(str(error), file=file, field=field, value=str(path)) from None
+    kind = "a folder" if stat.S_ISDIR(mode) else "not a regular file"
+    raise BadInput(f"is {kind}, a file is needed", file=file, field=field, value=str(path))
+
+
+def scan(path: Path, roots: tuple[str, ...], start: Start, end: End | None = None) -> str:
+    """Call `start` for every element (the root included) and `end` when it closes; return the root's tag.
+
+    Plain and gzip-packed files are told apart by their first bytes, as SUMO does. `roots`: the root tags
+    that are right here; empty for any.
+
+    Raises:
+        BadInput: not readable, not UTF-8, truncated or malformed (with line and column), wrong root,
+            entities, external references, too deep, too large.
+    """
+    parser = expat.ParserCreate()
+    parser.buffer_text = True
+    _refuse_entities(parser, path)
+    stack: list[str] = []
+    root: list[str] = []
+
+    def opened(tag: str, attributes: dict[str, str]) -> None:
+        if not stack:
+            if roots and tag not in roots:
+                wanted = " or ".join(f"<{name}>" for name in roots)
+                raise BadInput(f"wrong root element, {wanted} is needed", file=path, field="root", value=tag)
+            root.append(tag)
+        stack.append(tag)
+        if len(stack) > MAX_DEPTH:
+            raise BadInput(
+                f"elements nest deeper than {MAX_DEPTH} (line {parser.CurrentLineNumber})",
+                file=path,
+                field="element",
+                value=tag,
+            )
+        start(tag, attributes, parser.CurrentLineNumber)
+
+    def closed(tag: str) -> None:
+        stack.pop()
+        if end is not None:
+            end(tag)
+
+    parser.StartElementHandler = opened
+    parser.EndElementHandler = closed
+    fed = 0
+    try:
+        for chunk in _chunks(path):
+            fed += len(chunk)
+            parser.Parse(chunk, False)
+            if fed - max(parser.CurrentByteIndex, 0) > MAX_TOKEN:
+                problem = f"a single tag or comment is longer than {MAX_TOKEN >> 20} MiB"
+                raise BadInput(problem, file=path, field="line", value=parser.CurrentLineNumber)
+        parser.Parse(b"", True)
+    except expat.ExpatError as error:
+        raise _malformed(error, path, fed, stack) from None
+    return root[0]
+
+
+def _chunks(path: Path) -> Iterator[bytes]:
+    """The unpacked bytes of a plain or gzip file."""
+    regular_file(path, file=path, field="file")
+    with path.open("rb") as raw:
+        head = raw.read(2)
+        raw.seek(0)
+        if head in _UTF16_MARKS:
+            raise BadInput("is not UTF-8", file=path, field="encoding", value="UTF-16")
+        if head != _GZIP_MAGIC:
+            while chunk := raw.read(CHUNK):
+                yield chunk
+            return
+        yield from _unpacked(raw, path)
+
+
+def _unpacked(raw: IO[bytes], path: Path) -> Iterator[bytes]:
+    total = 0
+    with gzip.GzipFile(fileobj=raw) as unpacked:
+        while True:
+            try:
+                chunk = unpacked.read(CHUNK)
+            except (OSError, EOFError, zlib.error) as error:
+                problem = f"broken gzip file ({str(error).rstrip('.').lower()})"
+                raise BadInput(problem, file=path, field="gzip byte", value=total) from None
+            if not chunk:
+                return
+            total += len(chunk)
+            if total > MAX_UNPACKED:
+                problem = f"unpacks to more than {MAX_UNPACKED >> 20} MiB"
+                raise BadInput(problem, file=path, field="unpacked size", value=total)
+            yield chunk
+
+
+def _refuse_entities(parser: expat.XMLParserType, path: Path) -> None:
+    """Billion laughs and file disclosure: no entity may be declared, no external part referenced."""
+
+    def entity(name: str, *_: object) -> None:
+        raise BadInput("entities may not be declared", file=path, field="ENTITY", value=name)
+
+    def doctype(name: str, system: str | None, public: str | None, _internal: bool) -> None:
+        if system is not None or public is not None:
+            raise BadInput(
+                "external references are refused", file=path, field="DOCTYPE", value=system or name
+            )
+
+    def external(_context: str, _base: str | None, system: str | None, public: str | None) -> int:
+        raise BadInput("external references are refused", file=path, field="entity", value=system or public)
+
+    def declaration(_version: str, encoding: str | None, _standalone: int) -> None:
+        if encoding is not None and encoding.lower() not in ("utf-8", "utf8", "us-ascii", "ascii"):
+            raise BadInput("is not UTF-8: save it as UTF-8", file=path, field="encoding", value=encoding)
+
+    parser.EntityDeclHandler = entity
+    parser.UnparsedEntityDeclHandler = entity
+    parser.ExternalEntityRefHandler = external
+    parser.StartDoctypeDeclHandler = doctype
+    parser.XmlDeclHandler = declaration
+
+
+def _malformed(error: expat.ExpatError, path: Path, fed: int, stack: list[str]) -> BadInput:
+    """expat's error in a user's words, with the place."""
+    messages = expat.errors.messages
+    place = f"line {error.lineno}, column {error.offset + 1}"
+    if error.code == expat.errors.codes[expat.errors.XML_ERROR_INVALID_TOKEN]:
+        bad = _first_undecodable(path)
+        if bad is not None:
+            return BadInput(f"is not UTF-8 ({place})", file=path, field="byte", value=bad)
+    if fed == 0:
+        return BadInput("the file is empty", file=path, field="size", value=0)
+    if error.code == expat.errors.codes[expat.errors.XML_ERROR_NO_ELEMENTS] or (
+        stack and error.code == expat.errors.codes[expat.errors.XML_ERROR_UNCLOSED_TOKEN]
+    ):
+        inside = f" inside <{stack[-1]}>" if stack else ""
+        return BadInput(f"truncated: the file ends{inside}", file=path, field="line", value=error.lineno)
+    problem = f"not well-formed XML: {messages[error.code]} ({place})"
+    return BadInput(problem, file=path, field="line", value=error.lineno)
+
+
+def _first_undecodable(path: Path) -> str | None:
+    """The first byte that is not UTF-8, in hexadecimal; None when all are."""
+    tail = b""
+    for chunk in _chunks(path):
+        data = tail + chunk
+        try:
+            data.decode("utf-8")
+            tail = b""
+        except UnicodeDecodeError as error:
+            if error.end < len(data) or len(data) - error.start > 3:
+                return f"0x{data[error.start]:02x}"
+            tail = data[error.start :]  # a character cut by the chunk's end
+    return f"0x{tail[0]:02x}" if tail else None

@@ -1,0 +1,129 @@
+"""Read a YAML file field by field: every field is checked, and an error names file, field and value."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from cosim.errors import BadInput
+from cosim.sumocfg import nearest
+from cosim.xml_input import regular_file
+
+
+class Section:
+    """One mapping of a YAML file; `where` is its dotted name ("" for the file itself).
+
+    Each getter returns its default when the field is absent, and raises BadInput when it is of the wrong
+    type or out of range. Fields that are not in `known` are refused with the nearest name.
+    """
+
+    def __init__(self, file: Path, values: object, known: Iterable[str], where: str = "") -> None:
+        self._file = file
+        self._where = where
+        if not isinstance(values, dict):
+            raise BadInput("a mapping is needed", file=file, field=where or "file", value=values)
+        self._values: dict[Any, Any] = values
+        allowed = tuple(known)
+        for name in values:
+            if name not in allowed:
+                hint = nearest(str(name), allowed) or f", there are: {', '.join(allowed)}"
+                raise BadInput(f"unknown field{hint}", file=file, field=self._name(str(name)))
+
+    def text(self, name: str, default: str | None = None) -> str | None:
+        """A string."""
+        value = self._values.get(name)
+        if value is None:
+            return default
+        return value if isinstance(value, str) else self._refuse(name, value, "text is needed")
+
+    def choice(self, name: str, allowed: Iterable[str], default: str) -> str:
+        """One of the words `allowed`."""
+        value = self.text(name, default) or default
+        words = tuple(allowed)
+        if value not in words:
+            hint = nearest(value, words) or f", there are: {', '.join(words)}"
+            self._refuse(name, value, f"unknown{hint}")
+        return value
+
+    def pattern(self, name: str, default: str | None = None) -> str | None:
+        """A regular expression."""
+        value = self.text(name, default)
+        if value is not None:
+            check_pattern(value, self._file, self._name(name))
+        return value
+
+    def number(
+        self, name: str, default: float | None = None, *, low: float = -math.inf, above: bool = False
+    ) -> float | None:
+        """A finite number, at least `low` (more than `low` if `above`)."""
+        value = self._values.get(name)
+        if value is None:
+            return default
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            return self._refuse(name, value, "a finite number is needed")
+        if value < low or (above and value == low):
+            bound = f"more than {low:g}" if above else f"at least {low:g}"
+            return self._refuse(name, value, f"must be {bound}")
+        return float(value)
+
+    def names(self, name: str) -> tuple[str, ...]:
+        """A list of strings; one string stands for a list of one."""
+        value = self._values.get(name, ())
+        if isinstance(value, str):
+            return (value,)
+        if not isinstance(value, list | tuple) or not all(isinstance(item, str) for item in value):
+            return self._refuse(name, value, "a list of names is needed")
+        return tuple(value)
+
+    def section(self, name: str, known: Iterable[str]) -> Section:
+        """The mapping below `name`; an empty one when it is absent."""
+        value = self._values.get(name)
+        return Section(self._file, {} if value is None else value, known, self._name(name))
+
+    def sections(self, name: str, known: Iterable[str]) -> tuple[Section, ...]:
+        """The list of mappings below `name`."""
+        value = self._values.get(name, [])
+        if not isinstance(value, list):
+            return self._refuse(name, value, "a list is needed")
+        known = tuple(known)
+        return tuple(
+            Section(self._file, item, known, f"{self._name(name)}[{i}]") for i, item in enumerate(value)
+        )
+
+    def _name(self, field: str) -> str:
+        return f"{self._where}.{field}" if self._where else field
+
+    def _refuse(self, name: str, value: object, problem: str) -> Any:
+        raise BadInput(problem, file=self._file, field=self._name(name), value=value)
+
+
+def read(path: Path, known: Iterable[str]) -> Section:
+    """The YAML file `path`, which must be one mapping with no fields but `known`.
+
+    Raises:
+        BadInput: missing, not UTF-8, not YAML (with the line), or not such a mapping.
+    """
+    regular_file(path, file=path, field="file")
+    try:
+        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except UnicodeDecodeError as error:
+        raise BadInput("is not UTF-8", file=path, field="byte", value=error.start) from None
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        problem = f"not YAML: {getattr(error, 'problem', None) or 'malformed'}"
+        line = None if mark is None else mark.line + 1
+        raise BadInput(problem, file=path, field="line", value=line) from None
+    return Section(path, values, known)
+
+
+def check_pattern(pattern: str, file: object, field: str) -> None:
+    """Raises BadInput unless `pattern` is a regular expression."""
+    try:
+        re.compile(pattern)
+    except re.error as error:
+        raise BadInput(f"not a regular expression: {error}", file=file, field=field, value=pattern) from None

@@ -1,0 +1,168 @@
+"""A scripted altruist: the AV best placed opens the gap for the mission vehicle, everybody else drives IDM.
+
+It shows what altruism can gain without learning anything (docs/results/altruism.md) and is the yardstick
+for the learned policies. AVs share what they know (V2V), so one guide is chosen for all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from cosim.road import LanePath, RoadMap
+from cosim.types import Decision, History, MetaAction, PolicyContext
+from policy.agents.idm import NO_MAPS
+
+
+@dataclass(frozen=True, slots=True)
+class AltruistConfig:
+    """When the guide yields and how much. Distances in m, speeds in m/s."""
+
+    behind_min: float = -5.0  # a guide this far ahead of the mission vehicle can still fall back
+    behind_max: float = 80.0  # further back its gap would come too late
+    upstream_min: float = 60.0  # junctions: stopping at the line does not help, the gap opens upstream
+    upstream_max: float = 260.0
+    crawl: float = 4.0  # the guide's speed upstream of a junction
+    pace_below: float = 5.0  # beside an ending lane the guide drives this much slower than the other
+    pace_min: float = 5.0  # and never slower than this
+    clear_ahead: float = 15.0  # a free left lane: nobody from here ahead ...
+    clear_behind: float = 25.0  # ... to there behind
+
+
+@dataclass(frozen=True, slots=True)
+class Need:
+    """How one AV stands to the mission vehicle."""
+
+    av: str
+    behind: float  # m, how far behind the mission vehicle it will arrive where their ways meet
+    crossing: bool  # their ways cross at a junction (else their lanes lie side by side)
+    from_right: bool  # the mission vehicle's lane lies to the right
+    speed: float  # m/s, of the mission vehicle
+
+
+class AltruistRule:
+    """Left if the left lane is free, else slower; at junctions slower, far upstream."""
+
+    name = "altruist-rule"
+    label = ""
+    observation = NO_MAPS
+    av_parameters: Mapping[str, str] = {}
+
+    def __init__(self, config: AltruistConfig = AltruistConfig()) -> None:
+        self._config = config
+
+    def reset(self, context: PolicyContext) -> None:
+        """A new episode: nobody has been served yet."""
+        self._road = context.road
+        self._served: set[str] = set()
+        self._guide: dict[str, str] = {}  # mission vehicle -> guide
+
+    def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
+        """At most one command per mission vehicle: the guide's."""
+        decisions: dict[str, Decision] = {}
+        needs: dict[str, list[Need]] = {}
+        for av, history in histories.items():
+            for row in np.flatnonzero(history.valid[-1] & (history.kinematics[-1, :, 7] > 0.5)):
+                mission = history.ids[row]
+                need = None if mission in self._served else self._need(av, history, int(row))
+                if need is not None:
+                    needs.setdefault(mission, []).append(need)
+        for mission, candidates in needs.items():
+            if mission in self._served:
+                continue
+            guide = self._choose(mission, candidates)
+            if guide is not None:
+                self._guide[mission] = guide.av
+                decisions[guide.av] = Decision(self._yield(guide, histories[guide.av]))
+        return decisions
+
+    def _need(self, av: str, history: History, row: int) -> Need | None:
+        """Whether this AV's way meets the mission vehicle's, and where; None when it does not."""
+        road, own = self._road, history.route.paths[1]
+        lane = int(history.lane[row])
+        if own is None or lane < 0:
+            return None
+        mission = history.ids[row]
+        theirs = road.path(lane)
+        place = float(history.lane_position[row]) * theirs.scale  # m, their front bumper
+        speed = float(history.kinematics[-1, row, 2])
+        if np.isfinite(theirs.conflict) and np.isfinite(own.conflict):
+            if lane in own.lanes or road.lanes[lane].internal:
+                if self._guide.get(mission) is not None or road.lanes[lane].internal:
+                    self._served.add(mission)
+                return None
+            if not _same_approach(road, own, theirs):
+                behind = history.route.conflict_distance - max(theirs.conflict - place, 0.0)
+                return Need(av, behind, True, False, speed)
+        if lane in own.lanes[:3] and self._guide.get(mission) == av:
+            self._served.add(mission)  # it drives in our lane now
+            return None
+        beside = _meeting(road, own, theirs)
+        if beside is None:
+            return None
+        mine, other, right = beside
+        return Need(av, (mine - history.route.arc) - (other - place), False, right, speed)
+
+    def _choose(self, mission: str, candidates: list[Need]) -> Need | None:
+        c = self._config
+        present = {n.av: n for n in candidates}
+        chosen = present.get(self._guide.get(mission, ""))
+        if chosen is not None and (chosen.crossing or c.behind_min <= chosen.behind <= 2 * c.behind_max):
+            return chosen
+        fitting = [
+            n
+            for n in candidates
+            if (
+                c.upstream_min <= n.behind <= c.upstream_max
+                if n.crossing
+                else c.behind_min <= n.behind <= c.behind_max
+            )
+        ]
+        return min(fitting, key=lambda n: n.behind, default=None)
+
+    def _yield(self, need: Need, history: History) -> MetaAction:
+        c = self._config
+        if need.crossing:
+            wanted = c.crawl
+        else:
+            if need.from_right and self._left_is_free(history):
+                return MetaAction.LANE_LEFT
+            wanted = max(need.speed - c.pace_below, c.pace_min)
+        if history.target_speed > wanted + 2.5:
+            return MetaAction.DECELERATE
+        if history.target_speed < wanted - 2.5:
+            return MetaAction.ACCELERATE
+        return MetaAction.IDLE
+
+    def _left_is_free(self, history: History) -> bool:
+        c = self._config
+        left = history.route.paths[0]
+        if left is None or history.route.to_end(0) < 100.0 or history.lane_changing:
+            return False
+        for row in np.flatnonzero(history.valid[-1])[1:]:
+            if int(history.lane[row]) in left.lanes[:2]:
+                ahead, speed = history.kinematics[-1, row, 0], history.kinematics[-1, row, 2]
+                closing = max(float(speed) - history.ego_speed, 0.0) * 3.0  # m in 3 s
+                if -c.clear_behind - closing < ahead < c.clear_ahead:
+                    return False
+        return True
+
+
+def _same_approach(road: RoadMap, own: LanePath, theirs: LanePath) -> bool:
+    """Whether both come along the same edge, lanes apart."""
+    edges = {road.lanes[i].edge for i in own.lanes if not road.lanes[i].internal}
+    return road.lanes[theirs.lanes[0]].edge in edges
+
+
+def _meeting(road: RoadMap, own: LanePath, theirs: LanePath) -> tuple[float, float, bool] | None:
+    """Where their lane comes to lie beside ours: arc on our path, arc on theirs, and whether on our right."""
+    place = {lane: float(start) for lane, start in zip(own.lanes, own.lane_start, strict=True)}
+    for lane, start in zip(theirs.lanes, theirs.lane_start, strict=True):
+        left, right = road.lanes[lane].left, road.lanes[lane].right
+        if left in place:
+            return place[left], float(start), True
+        if right in place:
+            return place[right], float(start), False
+    return None

@@ -1,0 +1,33 @@
+"""Predicted states of many vehicles, and the integral that turns speed and heading into position."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from cosim.types import Bools, Floats
+
+
+class KinematicForecast(NamedTuple):
+    """Predicted states of V vehicles at M frames ahead; zeros where `valid` is False."""
+
+    x: Floats  # [V,M] m
+    y: Floats  # [V,M] m
+    speed: Floats  # [V,M] m/s, never negative
+    heading: Floats  # [V,M] rad, unwrapped
+    speed_std: Floats  # [V,M] m/s, zero for predictors that do not know their error
+    heading_std: Floats  # [V,M] rad
+    along_std: Floats  # [V,M] m, of the position in driving direction
+    across_std: Floats  # [V,M] m
+    valid: Bools  # [V] was perceived in the newest frame
+
+
+def integrate_position(now: Floats, speed: Floats, heading: Floats, dt: float) -> tuple[Floats, Floats]:
+    """P, eq. (9), trapezoid rule: now [V,>=4] x y speed heading; speed, heading [V,M] -> x, y [V,M] m."""
+    v = np.concatenate([now[:, 2:3], speed], 1)
+    h = np.concatenate([now[:, 3:4], heading], 1)
+    vx, vy = v * np.cos(h), v * np.sin(h)
+    x = now[:, :1] + np.cumsum(0.5 * dt * (vx[:, 1:] + vx[:, :-1]), 1)
+    y = now[:, 1:2] + np.cumsum(0.5 * dt * (vy[:, 1:] + vy[:, :-1]), 1)
+    return x, y

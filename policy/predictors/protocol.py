@@ -1,0 +1,19 @@
+"""What every kinematic predictor promises: a history of states in, the next frames of states out."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from cosim.types import Bools, Floats
+from policy.forecast import KinematicForecast
+
+
+class Predictor(Protocol):
+    """A kinematic predictor (P, figure 5). Stateless: the same history gives the same forecast."""
+
+    name: str
+    horizon: int  # M, frames ahead
+    dt: float  # s between frames
+
+    def predict(self, kinematics: Floats, valid: Bools) -> KinematicForecast:
+        """kinematics [V,N,>=4] x m, y m, speed m/s, heading rad (unwrapped), oldest first; valid [V,N]."""

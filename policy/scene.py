@@ -1,0 +1,104 @@
+"""What all AVs know together: every vehicle once, in world coordinates, with the rows that refer to it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from cosim.types import KINEMATIC_FEATURES, Bools, Floats, Floats32, History, Ints
+
+
+class Scene(NamedTuple):
+    """B deciding AVs and the V vehicles that any of them knows."""
+
+    agents: tuple[str, ...]  # [B] sorted by id
+    histories: tuple[History, ...]  # [B]
+    vehicles: tuple[str, ...]  # [V] names
+    state: Floats  # [V,N,8] KINEMATIC_FEATURES in the world: m, m/s, rad (heading unwrapped)
+    valid: Bools  # [V,N]
+    lane: npt.NDArray[np.int32]  # [V] newest frame, -1 unknown
+    lane_position: Floats  # [V] m, front bumper
+    row: Ints  # [B,R] vehicle of each kinematic row, -1 for an empty one; row 0 the ego
+    pose: Floats  # [B,3] each AV's x m, y m, heading rad
+
+    @property
+    def ego(self) -> Ints:
+        """[B] each AV's place among the vehicles."""
+        return np.asarray(self.row[:, 0])
+
+
+def join(histories: Mapping[str, History], share: bool = True) -> Scene:
+    """Join the histories of AVs that decide together.
+
+    `share`: V2V, the AVs' knowledge of a vehicle is pooled; otherwise each keeps its own copy of it.
+    """
+    agents = tuple(sorted(histories))
+    each = tuple(histories[a] for a in agents)
+    kinematics = np.stack([h.kinematics for h in each])  # [B,N,R,8]
+    valid = np.stack([h.valid for h in each])  # [B,N,R]
+    pose = np.stack([h.pose for h in each])
+    rows = np.full((len(each), kinematics.shape[2]), -1, np.int64)
+    found: dict[tuple[str, str], int] = {}
+    names: list[str] = []
+    source: list[tuple[int, int]] = []
+    for b, history in enumerate(each):
+        for r, name in enumerate(history.ids):
+            if not name:
+                continue
+            key = (name, "" if share else agents[b])
+            k = found.get(key)
+            if k is None:
+                k = found[key] = len(names)
+                names.append(name)
+                source.append((b, r))
+            rows[b, r] = k
+    at = np.array(source, np.int64)
+    state = to_world(kinematics, pose)[at[:, 0], :, at[:, 1]]  # [V,N,8]
+    return Scene(
+        agents,
+        each,
+        tuple(names),
+        state,
+        valid[at[:, 0], :, at[:, 1]],
+        np.stack([h.lane for h in each])[at[:, 0], at[:, 1]],
+        np.stack([h.lane_position for h in each])[at[:, 0], at[:, 1]],
+        rows,
+        pose,
+    )
+
+
+def to_world(kinematics: Floats32 | Floats, pose: Floats) -> Floats:
+    """[B,N,R,8] in each ego's frame, pose [B,3] -> the same in the world (m, m/s, rad)."""
+    world = kinematics.astype(np.float64)
+    c, s = np.cos(pose[:, 2])[:, None, None], np.sin(pose[:, 2])[:, None, None]
+    x, y = world[..., 0].copy(), world[..., 1].copy()
+    world[..., 0] = pose[:, 0, None, None] + c * x - s * y
+    world[..., 1] = pose[:, 1, None, None] + s * x + c * y
+    world[..., 3] += pose[:, 2, None, None]
+    return world
+
+
+def rows_ahead(scene: Scene, x: Floats, y: Floats, speed: Floats, heading: Floats) -> tuple[Floats, Bools]:
+    """Predicted vehicles as kinematic rows. x, y, speed, heading [V,M] in the world.
+
+    Returns rows [B,M,R,8] in each ego's frame at the newest frame (m, m/s, rad) and who has one [B,R].
+    """
+    known = (scene.row >= 0) & scene.valid[np.maximum(scene.row, 0), -1]  # [B,R]
+    who = np.maximum(scene.row, 0)
+    b, r = who.shape
+    rows = np.zeros((b, x.shape[1], r, len(KINEMATIC_FEATURES)))
+    dx = x[who] - scene.pose[:, 0, None, None]  # [B,R,M]
+    dy = y[who] - scene.pose[:, 1, None, None]
+    c, s = np.cos(scene.pose[:, 2])[:, None, None], np.sin(scene.pose[:, 2])[:, None, None]
+    # headings of one vehicle continue its own history row: the same multiple of 2 pi
+    base = np.stack([h.kinematics[-1, :, 3] for h in scene.histories]) - scene.state[who, -1, 3]  # [B,R]
+    rows[..., 0] = (c * dx + s * dy).transpose(0, 2, 1)
+    rows[..., 1] = (c * dy - s * dx).transpose(0, 2, 1)
+    rows[..., 2] = speed[who].transpose(0, 2, 1)
+    rows[..., 3] = (heading[who] + base[..., None]).transpose(0, 2, 1)
+    rows[..., 4:] = scene.state[who, -1, 4:][:, None]
+    rows *= known[:, None, :, None]
+    return rows, known

@@ -1,0 +1,30 @@
+"""The five worlds as data: find a world's folder by its name (no simulator is touched here)."""
+
+from __future__ import annotations
+
+import difflib
+from pathlib import Path
+
+from cosim.errors import BadInput
+
+ROOT = Path(__file__).resolve().parent
+BEHAVIORS = ROOT / "behaviors.yaml"  # Table II and its IDM + LC2013 mapping
+
+
+def names() -> tuple[str, ...]:
+    """Names of the worlds, sorted: every folder here that holds a `scenario.yaml`."""
+    return tuple(sorted(p.parent.name for p in ROOT.glob("*/scenario.yaml")))
+
+
+def folder(name: str) -> Path:
+    """The folder of the world `name`.
+
+    Raises:
+        BadInput: there is no such world; the sentence names the nearest one there is.
+    """
+    known = names()
+    if name in known:
+        return ROOT / name
+    near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    hint = f"did you mean {near[0]!r}?" if near else f"there are: {', '.join(known)}"
+    raise BadInput(f"no such scenario; {hint}", field="scenario", value=name)

@@ -27,6 +27,8 @@ class Lane:
     left: int = -1
     right: int = -1
     internal: bool = False  # lies inside a junction
+    start: str = ""  # junction where its edge begins (its own junction for an internal lane)
+    end: str = ""  # junction where its edge ends
 
 
 @dataclass(frozen=True)
@@ -114,6 +116,7 @@ class RoadMap:
     zones: tuple[ConflictZone, ...] = ()
     junctions: tuple[Floats, ...] = ()  # [p,2] m, outlines
     _paths: dict[tuple[int, tuple[str, ...] | None], LanePath] = field(default_factory=dict, repr=False)
+    _near: dict[str, frozenset[str]] = field(default_factory=dict, repr=False)
     index: dict[str, int] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
@@ -131,6 +134,37 @@ class RoadMap:
         if found is None:
             found = self._paths[key] = self._follow(lane, route)
         return found
+
+    def connected(self, a: int, b: int) -> bool:
+        """Whether vehicles on lanes `a` and `b` can touch: roads on a bridge and below it do not.
+
+        True when b's edge is reached from a's within 100 m of road; also when either is off every lane.
+        """
+        if a < 0 or b < 0 or self.lanes[a].edge == self.lanes[b].edge:
+            return True
+        edge = self.lanes[a].edge
+        near = self._near.get(edge)
+        if near is None:
+            near = self._near[edge] = self._edges_near(self.lanes[a])
+        return self.lanes[b].edge in near
+
+    def _edges_near(self, lane: Lane, reach: float = 100.0) -> frozenset[str]:
+        at: dict[str, list[Lane]] = {}
+        for other in self.lanes:
+            at.setdefault(other.start, []).append(other)
+            at.setdefault(other.end, []).append(other)
+        found, seen = {lane.edge}, {lane.start: 0.0, lane.end: 0.0}
+        waiting = [lane.start, lane.end]
+        while waiting:
+            junction = waiting.pop()
+            for other in at.get(junction, ()):
+                found.add(other.edge)
+                far = other.end if other.start == junction else other.start
+                distance = seen[junction] + other.length
+                if distance < min(reach, seen.get(far, np.inf)):
+                    seen[far] = distance
+                    waiting.append(far)
+        return frozenset(found)
 
     def ahead(self, lane: int, lane_position: float, length: float, route: tuple[str, ...]) -> RouteAhead:
         """Route knowledge of a vehicle of `length` m whose front bumper is at `lane_position` m of `lane`."""
@@ -192,7 +226,7 @@ class RoadMap:
         return _heading(self.lanes[lane].shape, -1)
 
     def _join(self, indices: tuple[int, ...], dead_end: bool, leaves: bool) -> LanePath:
-        pieces = []
+        pieces: list[Floats] = []
         starts = []  # m
         total = 0.0
         for i in indices:

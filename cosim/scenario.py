@@ -10,6 +10,7 @@ from pathlib import Path
 import sumo_scenarios
 from cosim import sumocfg, yaml_input
 from cosim.errors import BadInput
+from cosim.sumocfg import one_of
 from cosim.types import Preset, Timing
 from cosim.xml_input import regular_file
 
@@ -66,7 +67,7 @@ class Scenario:
     begin: float = 0.0  # s
     warmup: float = 0.0  # s, not counted
     duration: float = 60.0  # s, counted
-    timing: Timing = Timing()
+    timing: Timing = Timing()  # noqa: RUF009 - frozen, so one instance serves all
     preset: str = Preset.UNGUARDED
     mission: Mission = Mission()
     zones: tuple[Zone, ...] = ()
@@ -114,9 +115,9 @@ def load(
         behavior = _default_behavior(scenario)
     return replace(
         scenario,
-        behavior=_one_of(behavior, BEHAVIORS, "--behavior"),
-        driver_model=_one_of(driver_model, DRIVER_MODELS, "--driver-model"),
-        preset=_one_of(scenario.preset if preset is None else preset, Preset.ALL, "--preset"),
+        behavior=one_of(behavior, BEHAVIORS, "--behavior"),
+        driver_model=one_of(driver_model, DRIVER_MODELS, "--driver-model"),
+        preset=one_of(scenario.preset if preset is None else preset, Preset.ALL, "--preset"),
         fleet=scenario.fleet if fleet is None else _checked_fleet(fleet),
     )
 
@@ -168,8 +169,8 @@ def _foreign(what: str) -> Scenario:
     path = Path(what)
     names = sumo_scenarios.names()
     if not path.exists() and path.suffix != ".sumocfg":
-        hint = sumocfg.nearest(what, names) or f", there are: {', '.join(names)} (or a .sumocfg's path)"
-        raise BadInput(f"no such scenario{hint}", field="scenario", value=what)
+        problem = f"no such scenario{sumocfg.hint(what, names)}"
+        raise BadInput(problem, field="scenario", value=what)
     config = sumocfg.read(regular_file(path, file=None, field="scenario"))
     if config.end is not None and config.end <= config.begin:
         raise BadInput("ends before it begins", file=path, field="end", value=f"{config.end:g}")
@@ -196,9 +197,8 @@ def _with_demand(scenario: Scenario, wanted: Sequence[str]) -> Scenario:
         elif Path(item).exists() or item.endswith((".xml", ".gz")):
             files.append(regular_file(Path(item).absolute(), file=None, field="--demand"))
         else:
-            there = f", there are: {', '.join(known)}" if known else " or file"
-            hint = sumocfg.nearest(item, known) or there
-            raise BadInput(f"no such demand{hint}", field="--demand", value=item)
+            problem = f"no such demand{sumocfg.hint(item, known)}"
+            raise BadInput(problem, field="--demand", value=item)
         names.append(_demand_name(files[-1]))
     return replace(scenario, demand=tuple(files), demand_name="+".join(names))
 
@@ -278,13 +278,6 @@ def _checked_fleet(fleet: Fleet, file: object = None, prefix: str = "--av-") -> 
         field = "--penetration" if file is None else f"{prefix}penetration"
         raise BadInput("must be between 0 and 1", file=file, field=field, value=share)
     return fleet
-
-
-def _one_of(value: str, allowed: Sequence[str], field: str) -> str:
-    if value not in allowed:
-        hint = sumocfg.nearest(value, allowed) or f", there are: {', '.join(allowed)}"
-        raise BadInput(f"unknown{hint}", field=field, value=value)
-    return value
 
 
 def _demand_name(path: Path) -> str:

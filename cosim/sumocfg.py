@@ -197,10 +197,21 @@ def time_of(value: str, file: object, field: str) -> float:
     return sign * sum(abs(n) * w for n, w in zip(reversed(numbers), weights, strict=False))
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
-    """ ", did you mean 'x'?" for the known name nearest to `name`; "" when nothing is near."""
-    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
-    return f", did you mean {close[0]!r}?" if close else ""
+def hint(name: str, known: Iterable[str]) -> str:
+    """ ", did you mean 'x'?" for the known name nearest to `name`; all of them when nothing is near."""
+    names = list(known)
+    close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+    if close:
+        return f", did you mean {close[0]!r}?"
+    return f", there are: {', '.join(names)}" if 0 < len(names) <= 12 else ""
+
+
+def one_of(value: str, allowed: Iterable[str], field: str, file: object = None) -> str:
+    """`value` if it is one of the words `allowed`; raises BadInput with the nearest one."""
+    words = tuple(allowed)
+    if value not in words:
+        raise BadInput(f"unknown{hint(value, words)}", file=file, field=field, value=value)
+    return value
 
 
 def _values(path: Path) -> dict[str, str]:
@@ -221,18 +232,16 @@ def _values(path: Path) -> dict[str, str]:
     return values
 
 
-def files(value: str, folder: Path, file: Path, field: str) -> tuple[Path, ...]:
+def files(value: str, folder: Path, file: object, field: str) -> tuple[Path, ...]:
     """SUMO's comma (or space) separated list of files, absolute, each one checked to be there."""
     # Spaces separate only where the whole is not a file: folders may have spaces in their names.
-    names = [name.strip() for name in value.split(",") if name.strip()]
     found: list[Path] = []
-    for name in names:
-        whole = folder / name
-        parts = [name] if whole.exists() else name.split()
-        for part in parts:
-            if not (folder / part).exists():
-                raise BadInput("no such file", file=file, field=field, value=part)
-            found.append(regular_file((folder / part).absolute(), file=file, field=field))
+    for name in filter(None, map(str.strip, value.split(","))):
+        for part in [name] if (folder / name).exists() else name.split():
+            try:
+                found.append(regular_file((folder / part).absolute(), file=file, field=field))
+            except BadInput as error:
+                raise BadInput(error.problem, file=file, field=field, value=part) from None
     return tuple(found)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 
 from cosim.errors import BadInput
-from cosim.sumocfg import nearest
+from cosim.sumocfg import hint, one_of
 from cosim.xml_input import regular_file
 
 
@@ -31,24 +31,21 @@ class Section:
         allowed = tuple(known)
         for name in values:
             if name not in allowed:
-                hint = nearest(str(name), allowed) or f", there are: {', '.join(allowed)}"
-                raise BadInput(f"unknown field{hint}", file=file, field=self._name(str(name)))
+                problem = f"unknown field{hint(str(name), allowed)}"
+                raise BadInput(problem, file=file, field=self._name(str(name)), value=values[name])
 
     def text(self, name: str, default: str | None = None) -> str | None:
         """A string."""
         value = self._values.get(name)
         if value is None:
             return default
-        return value if isinstance(value, str) else self._refuse(name, value, "text is needed")
+        if not isinstance(value, str):
+            raise self._wrong(name, value, "text is needed")
+        return value
 
     def choice(self, name: str, allowed: Iterable[str], default: str) -> str:
         """One of the words `allowed`."""
-        value = self.text(name, default) or default
-        words = tuple(allowed)
-        if value not in words:
-            hint = nearest(value, words) or f", there are: {', '.join(words)}"
-            self._refuse(name, value, f"unknown{hint}")
-        return value
+        return one_of(self.text(name) or default, allowed, self._name(name), self._file)
 
     def pattern(self, name: str, default: str | None = None) -> str | None:
         """A regular expression."""
@@ -65,10 +62,10 @@ class Section:
         if value is None:
             return default
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            return self._refuse(name, value, "a finite number is needed")
+            raise self._wrong(name, value, "a finite number is needed")
         if value < low or (above and value == low):
             bound = f"more than {low:g}" if above else f"at least {low:g}"
-            return self._refuse(name, value, f"must be {bound}")
+            raise self._wrong(name, value, f"must be {bound}")
         return float(value)
 
     def names(self, name: str) -> tuple[str, ...]:
@@ -77,7 +74,7 @@ class Section:
         if isinstance(value, str):
             return (value,)
         if not isinstance(value, list | tuple) or not all(isinstance(item, str) for item in value):
-            return self._refuse(name, value, "a list of names is needed")
+            raise self._wrong(name, value, "a list of names is needed")
         return tuple(value)
 
     def section(self, name: str, known: Iterable[str]) -> Section:
@@ -89,7 +86,7 @@ class Section:
         """The list of mappings below `name`."""
         value = self._values.get(name, [])
         if not isinstance(value, list):
-            return self._refuse(name, value, "a list is needed")
+            raise self._wrong(name, value, "a list is needed")
         known = tuple(known)
         return tuple(
             Section(self._file, item, known, f"{self._name(name)}[{i}]") for i, item in enumerate(value)
@@ -98,8 +95,8 @@ class Section:
     def _name(self, field: str) -> str:
         return f"{self._where}.{field}" if self._where else field
 
-    def _refuse(self, name: str, value: object, problem: str) -> Any:
-        raise BadInput(problem, file=self._file, field=self._name(name), value=value)
+    def _wrong(self, name: str, value: object, problem: str) -> BadInput:
+        return BadInput(problem, file=self._file, field=self._name(name), value=value)
 
 
 def read(path: Path, known: Iterable[str]) -> Section:

@@ -6,6 +6,7 @@ import libsumo
 import numpy as np
 
 from cosim.geometry import boxes, overlap
+from cosim.road import RoadMap
 from cosim.simulation.commands import Controlled
 from cosim.simulation.convert import Body
 from cosim.types import Collision, Kind, Snapshot
@@ -43,7 +44,7 @@ class CollisionWatch:
         return found
 
     def from_boxes(
-        self, snapshot: Snapshot, bodies: dict[str, Body], controlled: dict[str, Controlled], lanes: list[str]
+        self, snapshot: Snapshot, road: RoadMap, bodies: dict[str, Body], controlled: dict[str, Controlled]
     ) -> list[Collision]:
         """Overlaps of an AV's box with anyone's that SUMO did not report (26 of 28 it does)."""
         avs = np.flatnonzero(snapshot.kind == Kind.AV)
@@ -55,7 +56,7 @@ class CollisionWatch:
         for k, j in np.argwhere(touching):
             i = avs[k]
             pair = frozenset((snapshot.ids[i], snapshot.ids[j]))
-            if pair in self._seen:
+            if pair in self._seen or not road.connected(int(snapshot.lane[i]), int(snapshot.lane[j])):
                 continue
             self._seen.add(pair)
             dx, dy = snapshot.x[j] - snapshot.x[i], snapshot.y[j] - snapshot.y[i]
@@ -67,7 +68,7 @@ class CollisionWatch:
             else:
                 first = i_sees > 0
             a, b = (i, j) if first else (j, i)
-            lane = lanes[snapshot.lane[a]] if snapshot.lane[a] >= 0 else ""
+            lane = road.lanes[snapshot.lane[a]].id if snapshot.lane[a] >= 0 else ""
             x, y = float(snapshot.x[a]), float(snapshot.y[a])
             found.append(
                 _collision(

@@ -13,6 +13,7 @@ from cosim.road import ConflictZone, Lane, RoadMap
 from cosim.scenario import Zone
 from cosim.types import Events, Kind, Snapshot
 
+GIVE_WAY = "mswZ"  # link states: minor, stop, all-way stop, zipper (SUMO, Networks/SUMO_Road_Networks)
 MOTOR_CLASSES = {"passenger", "private", "taxi", "bus", "truck", "trailer", "delivery", "motorcycle"}
 
 
@@ -109,6 +110,8 @@ def read_road(zones: Sequence[Zone], scenario_file: object) -> RoadMap:
                 left=-1 if name.startswith(":") else place.get(f"{edge}_{int(number) + 1}", -1),
                 right=-1 if name.startswith(":") else place.get(f"{edge}_{int(number) - 1}", -1),
                 internal=name.startswith(":"),
+                start=libsumo.edge.getFromJunction(edge),
+                end=libsumo.edge.getToJunction(edge),
             )
         )
     found = tuple(_zone(z, lanes, scenario_file) for z in zones)
@@ -135,7 +138,7 @@ def struggling_lanes(road: RoadMap) -> frozenset[int]:
                 result.add(i)
             continue
         links = libsumo.lane.getLinks(lane.id)
-        if links and all(not link[1] and link[3] for link in links):
+        if links and all(link[5] in GIVE_WAY for link in links):
             result.add(i)
     return frozenset(result)
 

@@ -74,7 +74,6 @@ class SumoSimulator:
         except BaseException:
             self.close()
             raise
-        self._lane_ids = [lane.id for lane in self.road.lanes]
         self._reader = SnapshotReader(self.road)
 
     def reset(self, seed: int) -> tuple[Snapshot, ...]:
@@ -234,7 +233,7 @@ class SumoSimulator:
         snapshot = self._reader.read(self._bodies, events)
         if not self._mission_found:
             snapshot = self._find_mission(snapshot)
-        extra = self._watch.from_boxes(snapshot, self._bodies, self._commander.controlled, self._lane_ids)
+        extra = self._watch.from_boxes(snapshot, self.road, self._bodies, self._commander.controlled)
         if extra:
             collisions = events.collisions + tuple(extra)
             snapshot = replace(snapshot, events=replace(events, collisions=collisions))

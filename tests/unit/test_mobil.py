@@ -92,7 +92,7 @@ def test_an_aggressive_driver_takes_a_gap_that_a_conservative_one_refuses() -> N
 
 
 def test_full_politeness_refuses_a_change_that_costs_the_follower_more_than_it_gains() -> None:
-    s = Situation(car(22.0), Beside(60.0, car(22.0)), None, Beside(200.0, car(24.0)), Beside(18.0, car(24.0)))
+    s = Situation(car(22.0), Beside(60.0, car(22.0)), None, Beside(200.0, car(24.0)), Beside(30.0, car(24.0)))
     a = accelerations(s)
     own, cost = a.ego_after - a.ego, a.new_follower - a.new_follower_after
     assert own > 0.1

@@ -1,181 +1,30 @@
-"""Oriented boxes and the conflict measures built on them: one place for the mask, the reward and the report.
+"""The compiled kernels behind `cosim.geometry`: boxes as tuples, one pair at a time.
 
-Every measure treats a vehicle as its oriented rectangle (`Boxes`) that drives on in a straight line along
-its heading. Two rectangles overlap exactly when their projections overlap on all four edge normals
-(separating axis theorem, Gottschalk et al. 1996, "OBBTree"), so under constant velocities the time of first
-contact is the latest of the four entry times, provided that it lies before the earliest of the four exit
-times. Cars that pass in the next lane therefore have no time to collision at all, where a radial measure
-(distance over closing speed) would warn. All inputs broadcast: [k,1] boxes against [1,n] boxes give [k,n].
+A box is the tuple (x, y, cos heading, sin heading, length, width, speed): m, m, -, -, m, m, m/s.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numba
 import numpy as np
 import numpy.typing as npt
 
-from cosim.road import RoadMap
-from cosim.types import Bools, Floats, Ints, Snapshot
-
-Number = float | npt.NDArray[Any]
-INF = np.inf
+from cosim.types import Bools, Floats, Ints
 
 FOLLOWING_COSINE = float(np.cos(np.radians(15.0)))  # headings closer than 15 degrees: following, not crossing
 _ONCOMING_COSINE = -float(np.cos(np.radians(45.0)))  # headings more than 135 degrees apart: head-on
 _PARALLEL = 1e-12  # m/s or cosine below which a projection counts as standing still
-_HORIZON = 120.0  # s, how far ahead `deceleration_to_avoid_crash` looks
-
-
-class Boxes(NamedTuple):
-    """Oriented rectangles that drive along their heading; arrays of any broadcastable shapes."""
-
-    x: Number  # m, centre
-    y: Number  # m, centre
-    heading: Number  # rad, counter-clockwise from east
-    length: Number  # m, along the heading
-    width: Number  # m
-    speed: Number = 0.0  # m/s, along the heading
-
-
-def boxes(snapshot: Snapshot, rows: npt.NDArray[Any] | None = None) -> Boxes:
-    """The vehicles of a snapshot ([n], or [k] with `rows`) as boxes; m, rad, m/s."""
-    s = snapshot
-    if rows is None:
-        return Boxes(s.x, s.y, s.heading, s.length, s.width, s.speed)
-    return Boxes(s.x[rows], s.y[rows], s.heading[rows], s.length[rows], s.width[rows], s.speed[rows])
-
-
-def overlap(a: Boxes, b: Boxes) -> Bools:
-    """Whether the rectangles of `a` and `b` overlap (touching edges do not); broadcast shape, bool."""
-    return cast(Bools, _overlap_ufunc(*_poses(a), *_poses(b)))
-
-
-def overlapping_pairs(all_boxes: Boxes) -> Ints:
-    """Rows of every pair of the n boxes ([n] each) that overlaps: [p,2], the lower row first."""
-    return cast(Ints, _overlapping_pairs(*_columns(all_boxes)))
-
-
-def time_to_collision(a: Boxes, b: Boxes, cap: float = INF) -> Floats:
-    """Time until the swept rectangles first touch, in s; broadcast shape.
-
-    Both keep their velocity. 0 where they overlap already; `cap` (default inf) where they never touch or
-    only later than `cap`.
-    """
-    return cast(Floats, _ttc_ufunc(*_motions(a), *_motions(b), cap))
-
-
-def pairs_time_to_collision(all_boxes: Boxes, rows: npt.NDArray[Any], cap: float = INF) -> Floats:
-    """Time to collision of vehicles `rows` [k] with all n vehicles of `all_boxes` ([n] each): [k,n] s.
-
-    A vehicle has `cap` with itself. See `time_to_collision`.
-    """
-    rows = np.asarray(rows, dtype=np.int64)
-    return cast(Floats, _pairs_ttc(*_columns(all_boxes), rows, float(cap)))
-
-
-def deceleration_to_avoid_crash(a: Boxes, b: Boxes) -> Floats:
-    """DRAC (deceleration rate to avoid a crash), in m/s2; broadcast shape.
-
-    The smallest constant deceleration with which one of the two, braking alone along its heading while the
-    other keeps its velocity, avoids every overlap of the swept rectangles. When the follower of an aligned
-    pair brakes this is dv^2 / (2 gap) (Almqvist et al. 1991; SUMO's SSM device); when paths cross it is what
-    lets the other clear the crossing first, or stops short of it. Oncoming pairs (headings more than
-    135 degrees apart), where one alone cannot help, may share the braking:
-    (v_a^2 + v_b^2) / (2 closing distance). 0 without a time to collision, inf where they overlap.
-    """
-    return cast(Floats, _drac_ufunc(*_motions(a), *_motions(b)))
-
-
-class LaneGraph(NamedTuple):
-    """Which lane follows which, for walking ahead quickly; l lanes as in RoadMap.lanes."""
-
-    following: Ints  # [l] the lane one drives on to, -1 at the end
-    length: Floats  # [l] m
-
-
-def lane_graph(road: RoadMap) -> LaneGraph:
-    """The straightest successor of every lane (another vehicle's route is unknown): [l], [l] m."""
-    following = [
-        path.lanes[1] if len(path.lanes) > 1 else -1 for path in map(road.path, range(len(road.lanes)))
-    ]
-    return LaneGraph(
-        np.array(following, dtype=np.int64), np.array([lane.length for lane in road.lanes], dtype=np.float64)
-    )
-
-
-def gap_ahead(
-    snapshot: Snapshot, graph: LaneGraph, rows: npt.NDArray[Any], reach: float = 125.0
-) -> tuple[Floats, Ints]:
-    """Bumper-to-bumper gap to the next vehicle in the same corridor and that vehicle's row.
-
-    The corridor is the vehicle's lane and the lanes that follow it. rows [k] -> gap [k] m (inf when nobody
-    is within `reach` m, negative when bumpers overlap), leader's row [k] (-1 for nobody).
-    """
-    s = snapshot
-    return cast(
-        tuple[Floats, Ints],
-        _gap_ahead(s.lane, s.lane_position, s.length, np.asarray(rows, np.int64), *graph, float(reach)),
-    )
-
-
-def headway(gap: Floats, speed: Floats, slowest: float = 0.5) -> Floats:
-    """Time headway gap / speed in s (net, bumper to bumper); [k] m, [k] m/s -> [k] s.
-
-    inf without a leader and below `slowest` m/s, where a quotient would only measure standing in a queue.
-    """
-    return np.where(speed > slowest, np.maximum(gap, 0.0) / np.maximum(speed, slowest), INF)
-
-
-def post_encroachment_time(a: Boxes, b: Boxes, interval: float, longest: float = 5.0) -> float:
-    """PET in s of two trajectories ([T] each, NaN while absent) sampled every `interval` s.
-
-    The time from the moment the first vehicle leaves a spot to the moment the second reaches it (Allen et
-    al. 1978), smallest over all spots; inf when there is none up to `longest` s. Only spots count where the
-    headings differ by more than 15 degrees: crossing and merging, not following. Between samples the vehicles
-    move at constant velocity, so the result does not depend on the sampling to first order.
-    """
-    trail = np.stack([_trail(a), _trail(b)], axis=1)  # [T,2,5]
-    sizes = np.array([[np.max(v.length), np.max(v.width)] for v in (a, b)], dtype=np.float64)  # [2,2] m
-    relevant = np.ones(2, dtype=np.bool_)
-    back = int(np.ceil(longest / interval))
-    best = INF
-    for t in range(1, len(trail)):
-        window = trail[max(0, t - back) : t + 1]
-        best = min(best, float(encroachment(window, len(window) - 1, sizes, relevant, interval)))
-    return best if best <= longest else INF
-
-
-def _trail(b: Boxes) -> Floats:
-    heading = np.asarray(b.heading, dtype=np.float64)
-    parts = np.broadcast_arrays(b.x, b.y, np.cos(heading), np.sin(heading), b.speed)
-    return np.stack(parts, axis=-1).astype(np.float64)  # [T,5]
-
-
-def _poses(b: Boxes) -> tuple[Any, ...]:
-    return b.x, b.y, np.cos(b.heading), np.sin(b.heading), b.length, b.width
-
-
-def _motions(b: Boxes) -> tuple[Any, ...]:
-    return *_poses(b), b.speed
-
-
-def _columns(b: Boxes) -> tuple[npt.NDArray[Any], ...]:
-    shape = np.shape(b.x)
-    return tuple(np.ascontiguousarray(np.broadcast_to(m, shape), dtype=np.float64) for m in _motions(b))
-
-
-# ---- kernels -------------------------------------------------------------------------------------------
-# A box is the tuple (x, y, cos heading, sin heading, length, width, speed): m, m, -, -, m, m, m/s.
+_HORIZON = 120.0  # s, how far ahead the deceleration to avoid a crash looks
 
 Box = tuple[float, float, float, float, float, float, float]
 _numba = cast(Any, numba)  # its decorators are not typed
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-def _compiled(function: Function) -> Function:
+def compiled(function: Function) -> Function:
     """numba's njit, cached on disk where a cache folder can be written (a read-only image has none)."""
     try:
         return cast(Function, _numba.njit(cache=True, error_model="numpy")(function))
@@ -183,20 +32,20 @@ def _compiled(function: Function) -> Function:
         return cast(Function, _numba.njit(error_model="numpy")(function))
 
 
-def _ufunc(inputs: int, result: str) -> Callable[[Function], Function]:
+def _ufunc(inputs: int, result: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """A broadcasting numpy ufunc of `inputs` float64 arguments, compiled by numba."""
     signature = f"{result}({', '.join(['float64'] * inputs)})"
 
-    def compile_it(function: Function) -> Function:
+    def compile_it(function: Callable[..., Any]) -> Callable[..., Any]:
         try:
-            return cast(Function, _numba.vectorize([signature], cache=True)(function))
+            return cast(Callable[..., Any], _numba.vectorize([signature], cache=True)(function))
         except RuntimeError:
-            return cast(Function, _numba.vectorize([signature])(function))
+            return cast(Callable[..., Any], _numba.vectorize([signature])(function))
 
     return compile_it
 
 
-@_compiled
+@compiled
 def _slab(p: float, w: float, r: float) -> tuple[float, float]:
     """When |p + w t| < r: (entry, exit) in s, for a projected distance p m that changes by w m/s."""
     if abs(w) < _PARALLEL:
@@ -208,7 +57,7 @@ def _slab(p: float, w: float, r: float) -> tuple[float, float]:
     return min(first, second), max(first, second)
 
 
-@_compiled
+@compiled
 def _contact(a: Box, b: Box, vx: float, vy: float) -> tuple[float, float]:
     """(entry, exit) in s of two boxes while b drifts by (vx, vy) m/s relative to a."""
     dx, dy = b[0] - a[0], b[1] - a[1]
@@ -223,7 +72,7 @@ def _contact(a: Box, b: Box, vx: float, vy: float) -> tuple[float, float]:
     return max(t0, e), min(t1, x)
 
 
-@_compiled
+@compiled
 def _overlap(a: Box, b: Box) -> bool:
     dx, dy = b[0] - a[0], b[1] - a[1]
     reach = 0.5 * (a[4] + a[5] + b[4] + b[5])  # at least the sum of the half diagonals
@@ -239,7 +88,7 @@ def _overlap(a: Box, b: Box) -> bool:
     )
 
 
-@_compiled
+@compiled
 def _ttc(a: Box, b: Box, cap: float) -> float:
     dx, dy = b[0] - a[0], b[1] - a[1]
     vx, vy = b[6] * b[2] - a[6] * a[2], b[6] * b[3] - a[6] * a[3]
@@ -256,7 +105,7 @@ def _ttc(a: Box, b: Box, cap: float) -> float:
     return min(max(entry, 0.0), cap)
 
 
-@_compiled
+@compiled
 def _needed(t: float, room: float, v: float) -> float:
     """Deceleration (m/s2) with which a car at v m/s has driven at most `room` m at time t s."""
     if room >= v * t:
@@ -266,7 +115,7 @@ def _needed(t: float, room: float, v: float) -> float:
     return v * v / (2.0 * room) if room > 0.0 else np.inf  # it must stop before t
 
 
-@_compiled
+@compiled
 def _lone_deceleration(a: Box, b: Box) -> float:
     """Smallest constant deceleration of `a` that avoids `b`, which keeps its velocity; inf when none does.
 
@@ -336,7 +185,7 @@ def _lone_deceleration(a: Box, b: Box) -> float:
     return worst
 
 
-@_compiled
+@compiled
 def _drac(a: Box, b: Box) -> float:
     ttc = _ttc(a, b, np.inf)
     if ttc <= 0.0:
@@ -353,7 +202,7 @@ def _drac(a: Box, b: Box) -> float:
 
 # fmt: off
 @_ufunc(12, "boolean")
-def _overlap_ufunc(
+def overlap_ufunc(
     ax: float, ay: float, ac: float, as_: float, al: float, aw: float,
     bx: float, by: float, bc: float, bs: float, bl: float, bw: float,
 ) -> bool:
@@ -361,7 +210,7 @@ def _overlap_ufunc(
 
 
 @_ufunc(15, "float64")
-def _ttc_ufunc(
+def ttc_ufunc(
     ax: float, ay: float, ac: float, as_: float, al: float, aw: float, av: float,
     bx: float, by: float, bc: float, bs: float, bl: float, bw: float, bv: float, cap: float,
 ) -> float:
@@ -369,46 +218,51 @@ def _ttc_ufunc(
 
 
 @_ufunc(14, "float64")
-def _drac_ufunc(
+def drac_ufunc(
     ax: float, ay: float, ac: float, as_: float, al: float, aw: float, av: float,
     bx: float, by: float, bc: float, bs: float, bl: float, bw: float, bv: float,
 ) -> float:
     return _drac((ax, ay, ac, as_, al, aw, av), (bx, by, bc, bs, bl, bw, bv))
 
 
-@_compiled
-def _pairs_ttc(
-    x: Floats, y: Floats, c: Floats, s: Floats, length: Floats, width: Floats, v: Floats,
-    rows: Ints, cap: float,
-) -> Floats:
-    out = np.empty((len(rows), len(x)))
-    for k in range(len(rows)):
-        i = rows[k]
-        a = (x[i], y[i], c[i], s[i], length[i], width[i], v[i])
-        for j in range(len(x)):
-            out[k, j] = cap if j == i else _ttc(a, (x[j], y[j], c[j], s[j], length[j], width[j], v[j]), cap)
-    return out
-
-
-@_compiled
-def _overlapping_pairs(
-    x: Floats, y: Floats, c: Floats, s: Floats, length: Floats, width: Floats, v: Floats
-) -> Ints:
-    found = []
-    for i in range(len(x)):
-        a = (x[i], y[i], c[i], s[i], length[i], width[i], v[i])
-        for j in range(i + 1, len(x)):
-            if _overlap(a, (x[j], y[j], c[j], s[j], length[j], width[j], v[j])):
-                found.append((i, j))
-    out = np.empty((len(found), 2), dtype=np.int64)
-    for k in range(len(found)):
-        out[k, 0], out[k, 1] = found[k]
-    return out
 # fmt: on
 
 
-@_compiled
-def _gap_ahead(
+@compiled
+def _box(table: Floats, i: int) -> Box:
+    """Row i of a table of boxes [n,7]."""
+    return table[i, 0], table[i, 1], table[i, 2], table[i, 3], table[i, 4], table[i, 5], table[i, 6]
+
+
+@compiled
+def pairs_ttc(table: Floats, rows: Ints, cap: float) -> Floats:
+    """See `cosim.geometry.pairs_time_to_collision`."""
+    n = len(table)
+    out = np.empty((len(rows), n))
+    for k in range(len(rows)):
+        a = _box(table, rows[k])
+        for j in range(n):
+            out[k, j] = cap if j == rows[k] else _ttc(a, _box(table, j), cap)
+    return out
+
+
+@compiled
+def pairs_overlap(table: Floats) -> Ints:
+    """See `cosim.geometry.overlapping_pairs`."""
+    n = len(table)
+    out = np.empty((n * (n - 1) // 2, 2), dtype=np.int64)
+    found = 0
+    for i in range(n):
+        a = _box(table, i)
+        for j in range(i + 1, n):
+            if _overlap(a, _box(table, j)):
+                out[found, 0], out[found, 1] = i, j
+                found += 1
+    return out[:found].copy()
+
+
+@compiled
+def lane_gaps(
     lane: npt.NDArray[np.int32],
     position: Floats,
     length: Floats,
@@ -436,7 +290,7 @@ def _gap_ahead(
     return gaps, leaders
 
 
-@_compiled
+@compiled
 def encroachment(trail: Floats, newest: int, sizes: Floats, relevant: Bools, interval: float) -> float:
     """Smallest post-encroachment time (s, inf for none) that ends at the newest frame of a ring of frames.
 

@@ -1,0 +1,163 @@
+"""Oriented boxes and the conflict measures built on them: one place for the mask, the reward and the report.
+
+Every measure treats a vehicle as its oriented rectangle (`Boxes`) that drives on in a straight line along
+its heading. Two rectangles overlap exactly when their projections overlap on all four edge normals
+(separating axis theorem, Gottschalk et al. 1996, "OBBTree"), so under constant velocities the time of first
+contact is the latest of the four entry times, provided that it lies before the earliest of the four exit
+times. Cars that pass in the next lane therefore have no time to collision at all, where a radial measure
+(distance over closing speed) would warn. All inputs broadcast: [k,1] boxes against [1,n] boxes give [k,n].
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from cosim.geometry import kernels
+from cosim.geometry.kernels import encroachment
+from cosim.road import RoadMap
+from cosim.types import Bools, Floats, Ints, Snapshot
+
+Number = float | npt.NDArray[Any]
+INF = np.inf
+
+
+class Boxes(NamedTuple):
+    """Oriented rectangles that drive along their heading; arrays of any broadcastable shapes."""
+
+    x: Number  # m, centre
+    y: Number  # m, centre
+    heading: Number  # rad, counter-clockwise from east
+    length: Number  # m, along the heading
+    width: Number  # m
+    speed: Number = 0.0  # m/s, along the heading
+
+
+def boxes(snapshot: Snapshot, rows: npt.NDArray[Any] | None = None) -> Boxes:
+    """The vehicles of a snapshot ([n], or [k] with `rows`) as boxes; m, rad, m/s."""
+    s = snapshot
+    if rows is None:
+        return Boxes(s.x, s.y, s.heading, s.length, s.width, s.speed)
+    return Boxes(s.x[rows], s.y[rows], s.heading[rows], s.length[rows], s.width[rows], s.speed[rows])
+
+
+def overlap(a: Boxes, b: Boxes) -> Bools:
+    """Whether the rectangles of `a` and `b` overlap (touching edges do not); broadcast shape, bool."""
+    return cast(Bools, kernels.overlap_ufunc(*_poses(a), *_poses(b)))
+
+
+def overlapping_pairs(all_boxes: Boxes) -> Ints:
+    """Rows of every pair of the n boxes ([n] each) that overlaps: [p,2], the lower row first."""
+    return kernels.pairs_overlap(_table(all_boxes))
+
+
+def time_to_collision(a: Boxes, b: Boxes, cap: float = INF) -> Floats:
+    """Time until the swept rectangles first touch, in s; broadcast shape.
+
+    Both keep their velocity. 0 where they overlap already; `cap` (default inf) where they never touch or
+    only later than `cap`.
+    """
+    return cast(Floats, kernels.ttc_ufunc(*_motions(a), *_motions(b), cap))
+
+
+def pairs_time_to_collision(all_boxes: Boxes, rows: npt.NDArray[Any], cap: float = INF) -> Floats:
+    """Time to collision of vehicles `rows` [k] with all n vehicles of `all_boxes` ([n] each): [k,n] s.
+
+    A vehicle has `cap` with itself. See `time_to_collision`.
+    """
+    rows = np.asarray(rows, dtype=np.int64)
+    return kernels.pairs_ttc(_table(all_boxes), rows, float(cap))
+
+
+def deceleration_to_avoid_crash(a: Boxes, b: Boxes) -> Floats:
+    """DRAC (deceleration rate to avoid a crash), in m/s2; broadcast shape.
+
+    The smallest constant deceleration with which one of the two, braking alone along its heading while the
+    other keeps its velocity, avoids every overlap of the swept rectangles. When the follower of an aligned
+    pair brakes this is dv^2 / (2 gap) (Almqvist et al. 1991; SUMO's SSM device); when paths cross it is what
+    lets the other clear the crossing first, or stops short of it. Oncoming pairs (headings more than
+    135 degrees apart), where one alone cannot help, may share the braking:
+    (v_a^2 + v_b^2) / (2 closing distance). 0 without a time to collision, inf where they overlap.
+    """
+    return cast(Floats, kernels.drac_ufunc(*_motions(a), *_motions(b)))
+
+
+class LaneGraph(NamedTuple):
+    """Which lane follows which, for walking ahead quickly; l lanes as in RoadMap.lanes."""
+
+    following: Ints  # [l] the lane one drives on to, -1 at the end
+    length: Floats  # [l] m
+
+
+def lane_graph(road: RoadMap) -> LaneGraph:
+    """The straightest successor of every lane (another vehicle's route is unknown): [l], [l] m."""
+    following = [
+        path.lanes[1] if len(path.lanes) > 1 else -1 for path in map(road.path, range(len(road.lanes)))
+    ]
+    return LaneGraph(
+        np.array(following, dtype=np.int64), np.array([lane.length for lane in road.lanes], dtype=np.float64)
+    )
+
+
+def gap_ahead(
+    snapshot: Snapshot, graph: LaneGraph, rows: npt.NDArray[Any], reach: float = 125.0
+) -> tuple[Floats, Ints]:
+    """Bumper-to-bumper gap to the next vehicle in the same corridor and that vehicle's row.
+
+    The corridor is the vehicle's lane and the lanes that follow it. rows [k] -> gap [k] m (inf when nobody
+    is within `reach` m, negative when bumpers overlap), leader's row [k] (-1 for nobody).
+    """
+    s = snapshot
+    return kernels.lane_gaps(
+        s.lane, s.lane_position, s.length, np.asarray(rows, np.int64), *graph, float(reach)
+    )
+
+
+def headway(gap: Floats, speed: Floats, slowest: float = 0.5) -> Floats:
+    """Time headway gap / speed in s (net, bumper to bumper); [k] m, [k] m/s -> [k] s.
+
+    inf without a leader and below `slowest` m/s, where a quotient would only measure standing in a queue.
+    """
+    return np.where(speed > slowest, np.maximum(gap, 0.0) / np.maximum(speed, slowest), INF)
+
+
+def post_encroachment_time(a: Boxes, b: Boxes, interval: float, longest: float = 5.0) -> float:
+    """PET in s of two trajectories ([T] each, NaN while absent) sampled every `interval` s.
+
+    The time from the moment the first vehicle leaves a spot to the moment the second reaches it (Allen et
+    al. 1978), smallest over all spots; inf when there is none up to `longest` s. Only spots count where the
+    headings differ by more than 15 degrees: crossing and merging, not following. Between samples the vehicles
+    move at constant velocity, so the result does not depend on the sampling to first order.
+    """
+    trail = np.stack([_trail(a), _trail(b)], axis=1)  # [T,2,5]
+    sizes = np.array([[np.max(v.length), np.max(v.width)] for v in (a, b)], dtype=np.float64)  # [2,2] m
+    relevant = np.ones(2, dtype=np.bool_)
+    back = int(np.ceil(longest / interval))
+    best = INF
+    for t in range(1, len(trail)):
+        window = trail[max(0, t - back) : t + 1]
+        best = min(best, float(encroachment(window, len(window) - 1, sizes, relevant, interval)))
+    return best if best <= longest else INF
+
+
+def _trail(b: Boxes) -> Floats:
+    heading = np.asarray(b.heading, dtype=np.float64)
+    parts = np.broadcast_arrays(b.x, b.y, np.cos(heading), np.sin(heading), b.speed)
+    return np.stack(parts, axis=-1).astype(np.float64)  # [T,5]
+
+
+def _poses(b: Boxes) -> tuple[Any, ...]:
+    return b.x, b.y, np.cos(b.heading), np.sin(b.heading), b.length, b.width
+
+
+def _motions(b: Boxes) -> tuple[Any, ...]:
+    return *_poses(b), b.speed
+
+
+def _table(b: Boxes) -> Floats:
+    table = np.empty((np.size(b.x), 7), dtype=np.float64)
+    for k, column in enumerate(_motions(b)):
+        table[:, k] = column
+    return table

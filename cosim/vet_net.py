@@ -12,6 +12,8 @@ from cosim.errors import BadInput
 from cosim.vet_rules import NET, SHAPES, problem, shape_problem
 from cosim.xml_input import scan
 
+_CROSSING = re.compile(r":(.+)_c\d+")  # netconvert's name for the crossings of a junction
+
 
 @dataclass(frozen=True, slots=True)
 class Net:
@@ -157,8 +159,9 @@ class _NetReader:
 
     def _check_junctions(self, connections: Mapping[str, int]) -> None:
         """A junction's right-of-way table has one row for each connection through it (and crossing)."""
+        crossings = Counter(m[1] for m in map(_CROSSING.fullmatch, self._lanes) if m)
         for junction, rows in self._requests.items():
-            wanted = connections.get(junction, 0) + self._crossings(junction)
+            wanted = connections.get(junction, 0) + crossings[junction]
             if rows != wanted:
                 problem_ = (
                     f"has {rows} right-of-way rows for {wanted} connections: rebuild it with netconvert"
@@ -169,10 +172,6 @@ class _NetReader:
                 if not self._has_lane(lane):
                     problem_ = f"no such lane in the net (junction {junction})"
                     raise BadInput(problem_, file=self._path, field="junction.intLanes", value=lane)
-
-    def _crossings(self, junction: str) -> int:
-        prefix = f":{junction}_c"
-        return sum(1 for edge in self._lanes if edge.startswith(prefix) and edge[len(prefix) :].isdigit())
 
     def _has_lane(self, lane: str) -> bool:
         edge, _, index = lane.rpartition("_")

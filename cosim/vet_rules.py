@@ -42,7 +42,8 @@ def _each(rule: Number, names: str) -> dict[str, Number]:
     return dict.fromkeys(names.split(), rule)
 
 
-def _words(names: str) -> frozenset[str]:
+def words(names: str) -> frozenset[str]:
+    """ "a b c" -> {a, b, c}"""
     return frozenset(names.split())
 
 
@@ -64,14 +65,14 @@ NET: Mapping[str, Mapping[str, Number]] = {
 SHAPES = frozenset({"shape", "customShape", "outlineShape"})
 
 # Lane-change attributes SUMO 1.28 knows. The first group moves LC2013; the second only SL2015.
-LC2013 = _words(
+LC2013 = words(
     "lcStrategic lcStrategicLookahead lcCooperative lcCooperativeSpeed lcCooperativeRoundabout lcSpeedGain "
     "lcSpeedGainRight lcSpeedGainLookahead lcSpeedGainRemainTime lcSpeedGainUrgency lcKeepRight "
     "lcKeepRightAcceptanceTime lcOpposite lcAssertive lcLookaheadLeft lcOvertakeRight "
     "lcOvertakeDeltaSpeedFactor lcSigma lcMaxSpeedLatStanding lcMaxSpeedLatFactor lcMaxDistLatStanding "
     "lcContRight lcCooperativeHelpTime lcCooperativeHelpThreshold lcCooperativeMinSpeed"
 )
-SL2015_ONLY = _words(
+SL2015_ONLY = words(
     "lcSublane lcPushy lcPushyGap lcImpatience lcTimeToImpatience lcAccelLat lcTurnAlignmentDistance "
     "lcLaneDiscipline"
 )
@@ -93,10 +94,10 @@ _CAR_FOLLOWING = (  # every remaining number of SUMO's car-following models: onl
     "gapControlGainSpeed gapControlGainSpace collisionAvoidanceGainSpeed collisionAvoidanceGainSpace "
     "collisionAvoidanceOverride tauCACCToACC applyDriverState cc1 cc2 cc3 cc4 cc5 cc6 cc7 cc8 cc9 c1 ccDecel "
     "constSpacing kp lambda omegaN tauEngine xi lanesCount ccAccel ploegKp ploegKd ploegH flatbedKa "
-    "flatbedKv flatbedKp flatbedD flatbedH collisionMinGapFactor speedControlGainCACC gapClosingControlGainGap "
-    "gapClosingControlGainGapDot gapControlGainGap gapControlGainGapDot collisionAvoidanceGainGap "
-    "collisionAvoidanceGainGapDot timeToTeleport timeToTeleportBidi boardingFactor sigmaleader sigmagap "
-    "sigmaerror epsilonacc taccmax treaction"
+    "flatbedKv flatbedKp flatbedD flatbedH collisionMinGapFactor speedControlGainCACC "
+    "gapClosingControlGainGap gapClosingControlGainGapDot gapControlGainGap gapControlGainGapDot "
+    "collisionAvoidanceGainGap collisionAvoidanceGainGapDot timeToTeleport timeToTeleportBidi "
+    "boardingFactor sigmaleader sigmagap sigmaerror epsilonacc taccmax treaction"
 )
 VEHICLE_TYPE: Mapping[str, Number] = {
     **_each(FINITE, " ".join(LANE_CHANGE)),
@@ -119,7 +120,7 @@ VEHICLE_TYPE: Mapping[str, Number] = {
     "impatience": WORD_OR_FINITE,
 }
 # Further attributes of a vType that are text; any other name is a slip of the pen worth a warning.
-VEHICLE_TYPE_TEXT = _words(
+VEHICLE_TYPE_TEXT = words(
     "id refId vClass emissionClass maneuverAngleTimes guiShape color carFollowModel laneChangeModel "
     "latAlignment hasDriverState imgFile osgFile trainType vehdynamics maxvehpreview Mflatness Mbegin "
     "maxAccelProfile desAccelProfile parkingBadges speedTable tractionTable resistanceTable resCoef_constant "

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cosim.geometry import kernels
-from cosim.geometry.kernels import encroachment
+from cosim.geometry.kernels import encroachment as encroachment
 from cosim.road import RoadMap
 from cosim.types import Bools, Floats, Ints, Snapshot
 
@@ -84,6 +84,16 @@ def deceleration_to_avoid_crash(a: Boxes, b: Boxes) -> Floats:
     return cast(Floats, kernels.drac_ufunc(*_motions(a), *_motions(b)))
 
 
+def largest_deceleration_to_avoid_crash(
+    all_boxes: Boxes, rows: npt.NDArray[Any], horizon: float = 120.0
+) -> float:
+    """Largest finite DRAC (m/s2) of vehicles `rows` [k] with any of the n; 0 without a conflict.
+
+    Only conflicts with a time to collision below `horizon` s count. See `deceleration_to_avoid_crash`.
+    """
+    return kernels.largest_drac(_table(all_boxes), np.asarray(rows, dtype=np.int64), horizon)
+
+
 class LaneGraph(NamedTuple):
     """Which lane follows which, for walking ahead quickly; l lanes as in RoadMap.lanes."""
 
@@ -138,7 +148,7 @@ def post_encroachment_time(a: Boxes, b: Boxes, interval: float, longest: float =
     best = INF
     for t in range(1, len(trail)):
         window = trail[max(0, t - back) : t + 1]
-        best = min(best, float(encroachment(window, len(window) - 1, sizes, relevant, interval)))
+        best = min(best, float(encroachment(window, len(window) - 1, 2, sizes, relevant, interval)))
     return best if best <= longest else INF
 
 

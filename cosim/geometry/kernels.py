@@ -15,6 +15,8 @@ import numpy.typing as npt
 from cosim.types import Bools, Floats, Ints
 
 FOLLOWING_COSINE = float(np.cos(np.radians(15.0)))  # headings closer than 15 degrees: following, not crossing
+_STRAIGHT_COSINE = float(np.cos(np.radians(5.0)))  # a trail that stays within 5 degrees is straight
+_SAME_COURSE_COSINE = float(np.cos(np.radians(10.0)))  # 10 + 5 degrees: every spot of it is following
 _ONCOMING_COSINE = -float(np.cos(np.radians(45.0)))  # headings more than 135 degrees apart: head-on
 _PARALLEL = 1e-12  # m/s or cosine below which a projection counts as standing still
 _HORIZON = 120.0  # s, how far ahead the deceleration to avoid a crash looks
@@ -93,11 +95,13 @@ def _ttc(a: Box, b: Box, cap: float) -> float:
     dx, dy = b[0] - a[0], b[1] - a[1]
     vx, vy = b[6] * b[2] - a[6] * a[2], b[6] * b[3] - a[6] * a[3]
     reach = 0.5 * (a[4] + a[5] + b[4] + b[5])  # at least the sum of the half diagonals
-    closing = dx * vx + dy * vy
-    if closing >= 0.0 and dx * dx + dy * dy >= reach * reach:
-        return cap  # apart and drawing away from each other
+    apart, drift = dx * dx + dy * dy, vx * vx + vy * vy
+    if dx * vx + dy * vy >= 0.0 and apart >= reach * reach:
+        return cap  # drawing away from each other
+    if apart > 2.0 * (reach * reach + cap * cap * drift):  # 2 (r^2 + q^2) >= (r + q)^2
+        return cap  # too far to touch within `cap`
     miss = dx * vy - dy * vx
-    if miss * miss >= reach * reach * (vx * vx + vy * vy) and (vx != 0.0 or vy != 0.0):
+    if miss * miss >= reach * reach * drift and drift > 0.0:
         return cap  # the centres' closest approach is too far
     entry, leave = _contact(a, b, vx, vy)
     if entry >= leave or leave <= 0.0:
@@ -247,6 +251,22 @@ def pairs_ttc(table: Floats, rows: Ints, cap: float) -> Floats:
 
 
 @compiled
+def largest_drac(table: Floats, rows: Ints, horizon: float) -> float:
+    """See `cosim.geometry.largest_deceleration_to_avoid_crash`."""
+    largest = 0.0
+    for i in rows:
+        a = _box(table, i)
+        for j in range(len(table)):
+            if j != i:
+                b = _box(table, j)
+                if 0.0 < _ttc(a, b, horizon) < horizon:
+                    needed = _drac(a, b)
+                    if needed < np.inf:
+                        largest = max(largest, needed)
+    return largest
+
+
+@compiled
 def pairs_overlap(table: Floats) -> Ints:
     """See `cosim.geometry.overlapping_pairs`."""
     n = len(table)
@@ -291,23 +311,39 @@ def lane_gaps(
 
 
 @compiled
-def encroachment(trail: Floats, newest: int, sizes: Floats, relevant: Bools, interval: float) -> float:
+def _trail_bounds(trail: Floats, newest: int, m: int) -> tuple[Floats, Floats]:
+    """Each trail without its newest frame: x and y bounds [m,4] m; direction if straight, else 0 [m,2]."""
+    bounds, course = np.empty((m, 4)), np.zeros((m, 2))
+    for a in range(m):
+        x0, x1, y0, y1 = np.inf, -np.inf, np.inf, -np.inf
+        c, s, straight = 0.0, 0.0, True
+        for age in range(1, trail.shape[0]):
+            k = newest - age
+            x, y = trail[k, a, 0], trail[k, a, 1]  # a negative k counts from the ring's end
+            if not np.isnan(x):
+                x0, x1, y0, y1 = min(x0, x), max(x1, x), min(y0, y), max(y1, y)
+                if c == 0.0 and s == 0.0:
+                    c, s = trail[k, a, 2], trail[k, a, 3]
+                straight = straight and c * trail[k, a, 2] + s * trail[k, a, 3] > _STRAIGHT_COSINE
+        bounds[a, 0], bounds[a, 1], bounds[a, 2], bounds[a, 3] = x0, x1, y0, y1
+        if straight:
+            course[a, 0], course[a, 1] = c, s
+    return bounds, course
+
+
+@compiled
+def encroachment(
+    trail: Floats, newest: int, m: int, sizes: Floats, relevant: Bools, interval: float
+) -> float:
     """Smallest post-encroachment time (s, inf for none) that ends at the newest frame of a ring of frames.
 
-    trail [K,m,5] (x m, y m, cos heading, sin heading, speed m/s; NaN while absent), `newest` its newest
-    frame, the frame after it (cyclically) the oldest; sizes [m,2] length and width in m; pairs without a
-    `relevant` [m] vehicle are left out; `interval` s between frames. See `post_encroachment_time`.
+    trail [K,>=m,5] of the first m vehicles (x m, y m, cos heading, sin heading, speed m/s; NaN while absent),
+    `newest` its newest frame, the frame after it (cyclically) the oldest; sizes [>=m,2] length and width in
+    m; pairs without a `relevant` [>=m] vehicle are left out; `interval` s between frames. See
+    `post_encroachment_time`.
     """
-    frames, m = trail.shape[0], trail.shape[1]
-    bounds = np.empty((m, 4))  # m, of each vehicle's trail
-    for a in range(m):
-        bounds[a] = np.inf, -np.inf, np.inf, -np.inf
-        for k in range(frames):
-            if k != newest and not np.isnan(trail[k, a, 0]):
-                bounds[a, 0] = min(bounds[a, 0], trail[k, a, 0])
-                bounds[a, 1] = max(bounds[a, 1], trail[k, a, 0])
-                bounds[a, 2] = min(bounds[a, 2], trail[k, a, 1])
-                bounds[a, 3] = max(bounds[a, 3], trail[k, a, 1])
+    frames = trail.shape[0]
+    bounds, course = _trail_bounds(trail, newest, m)
     best = np.inf
     for b in range(m):
         if np.isnan(trail[newest, b, 0]):
@@ -317,6 +353,8 @@ def encroachment(trail: Floats, newest: int, sizes: Floats, relevant: Bools, int
         for a in range(m):
             reach = 0.5 * (sizes[a, 0] + sizes[a, 1] + sizes[b, 0] + sizes[b, 1])
             if a == b or not (relevant[a] or relevant[b]):
+                continue
+            if course[a, 0] * c + course[a, 1] * s > _SAME_COURSE_COSINE:
                 continue
             if x < bounds[a, 0] - reach or x > bounds[a, 1] + reach:
                 continue

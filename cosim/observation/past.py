@@ -1,4 +1,4 @@
-"""The last N frames of every vehicle in the world frame, and of every AV's maps: written once, read as views."""
+"""The last N frames of every vehicle and of every AV's maps: written once, read as views."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from cosim.types import Bytes, Floats, Ints, ObservationConfig, Snapshot
 
-STRETCH = 4  # map tapes are this many histories long, so that a history is always one contiguous view
+STRETCH = 6  # tapes are this many histories long, so that a history is always one contiguous view
 
 
 class KinematicPast:
@@ -29,11 +29,11 @@ class KinematicPast:
 
     def add(self, snapshot: Snapshot) -> None:
         """Append one frame."""
-        if snapshot.ids is not self._ids:
-            self._assign(snapshot)
         if self._end == len(self._tape):
             self._tape[: self._frames] = self._tape[-self._frames :]
             self._end = self._frames
+        if snapshot.ids is not self._ids:
+            self._assign(snapshot)
         before = self._tape[self._end - 1, self.slots, 3]
         turn = snapshot.heading - np.where(np.isnan(before), snapshot.heading, before)
         heading = snapshot.heading - 2 * np.pi * np.round(turn / (2 * np.pi))
@@ -47,9 +47,7 @@ class KinematicPast:
 
     def _assign(self, snapshot: Snapshot) -> None:
         for name in self._slot.keys() - snapshot.row.keys():
-            slot = self._slot.pop(name)
-            self._tape[:, slot] = np.nan
-            self._free.append(slot)
+            self._free.append(self._slot.pop(name))
         for name in snapshot.ids:
             if name not in self._slot:
                 if not self._free:
@@ -57,7 +55,8 @@ class KinematicPast:
                     more = np.full((len(self._tape), have, 4), np.nan)
                     self._tape = np.concatenate([self._tape, more], axis=1)
                     self._free.extend(range(have, 2 * have))
-                self._slot[name] = self._free.pop()
+                slot = self._slot[name] = self._free.pop()
+                self._tape[self._end - self._frames : self._end, slot] = np.nan
         self.slots = np.array([self._slot[name] for name in snapshot.ids], np.int64)
         self._ids = snapshot.ids
 
@@ -76,9 +75,11 @@ class MapPast:
     def next_frame(self, avs: list[str]) -> tuple[Bytes, npt.NDArray[np.int64]]:
         """The block [S,C,H,W] to draw the new frame into, and the slot of each AV (a new AV's past is 0)."""
         for name in self._slot.keys() - set(avs):
-            slot = self._slot.pop(name)
-            self._tape[:, slot] = 0
-            self._free.append(slot)
+            self._free.append(self._slot.pop(name))
+        if self._end == len(self._tape):
+            used = list(self._slot.values())
+            self._tape[: self._frames, used] = self._tape[-self._frames :, used]
+            self._end = self._frames
         for name in avs:
             if name not in self._slot:
                 if not self._free:
@@ -86,10 +87,8 @@ class MapPast:
                     more = np.zeros((len(self._tape), max(have, 8), *self._shape), np.uint8)
                     self._tape = np.concatenate([self._tape, more], axis=1)
                     self._free.extend(range(self._tape.shape[1] - 1, have - 1, -1))
-                self._slot[name] = self._free.pop()
-        if self._end == len(self._tape):
-            self._tape[: self._frames] = self._tape[-self._frames :]
-            self._end = self._frames
+                slot = self._slot[name] = self._free.pop()
+                self._tape[self._end - self._frames : self._end, slot] = 0
         self._end += 1
         return self._tape[self._end - 1], np.array([self._slot[name] for name in avs], np.int64)
 

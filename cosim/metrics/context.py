@@ -1,0 +1,72 @@
+"""What every metric is told when an episode starts, what a metric is, and how vehicles are followed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from cosim.road import RoadMap
+from cosim.types import Bools, Ints, Kind, Metric, Snapshot, Timing
+
+
+@dataclass(frozen=True)
+class MetricContext:
+    """The episode's frame: road, clocks, and what the mission vehicle is to reach."""
+
+    road: RoadMap
+    timing: Timing
+    mission_kind: str  # merge, exit, roundabout, intersection, auto or none
+    goal: frozenset[int]  # lanes (indices into RoadMap.lanes) on which the mission has succeeded
+    duration: float  # s, counted
+
+
+class EpisodeMetric(Protocol):
+    """One file, one idea: sees every frame of an episode and yields its figures."""
+
+    def reset(self, first: Snapshot, context: MetricContext) -> None:
+        """A new episode; `first` is its first frame (time 0 of the counted time)."""
+
+    def add(self, snapshot: Snapshot) -> None:
+        """The next frame; `snapshot.events` hold what happened since the frame before."""
+
+    def result(self) -> dict[str, Metric]:
+        """Name -> figure, so far; NA is None."""
+
+
+def watched(snapshot: Snapshot) -> Bools:
+    """[n] the vehicles whose conflicts are counted: AVs and mission vehicles."""
+    return np.asarray((snapshot.kind == Kind.AV) | snapshot.mission)
+
+
+def rows_in_both(before: Snapshot, after: Snapshot) -> tuple[Ints, Ints]:
+    """Rows of the vehicles present in both frames: [c] in `before`, [c] in `after`."""
+    if before.ids == after.ids:
+        every = np.arange(after.n)
+        return every, every
+    then = before.row
+    pairs = [(then[name], row) for row, name in enumerate(after.ids) if name in then]
+    both = np.array(pairs, dtype=np.int64).reshape(-1, 2)
+    return both[:, 0], both[:, 1]
+
+
+class Slots:
+    """Gives every vehicle of an episode a lasting number, in order of appearance."""
+
+    def __init__(self) -> None:
+        self.of: dict[str, int] = {}
+        self._ids: tuple[str, ...] = ()
+        self._rows: Ints = np.zeros(0, dtype=np.int64)
+
+    def __len__(self) -> int:
+        return len(self.of)
+
+    def rows(self, ids: Sequence[str]) -> Ints:
+        """[n] the numbers of these vehicles; new ones get the next free numbers."""
+        names = tuple(ids)
+        if names != self._ids:
+            self._rows = np.array([self.of.setdefault(name, len(self.of)) for name in names], dtype=np.int64)
+            self._ids = names
+        return self._rows

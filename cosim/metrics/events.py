@@ -1,0 +1,24 @@
+"""Teleports and emergency stops: three different things with collisions, so three figures (sumo-facts.md)."""
+
+from __future__ import annotations
+
+from cosim.metrics.context import MetricContext
+from cosim.types import Metric, Snapshot
+
+
+class TrafficEvents:
+    """Counts distinct vehicles, since SUMO repeats an emergency stop every step that it lasts."""
+
+    def reset(self, first: Snapshot, context: MetricContext) -> None:  # noqa: ARG002
+        self._teleported: set[str] = set()
+        self._stopped: set[str] = set()
+
+    def add(self, snapshot: Snapshot) -> None:
+        self._teleported.update(snapshot.events.teleported)
+        self._stopped.update(snapshot.events.emergency_stopped)
+
+    def result(self) -> dict[str, Metric]:
+        return {
+            "teleports": Metric(len(self._teleported), "vehicles", "lower"),
+            "emergency_stops": Metric(len(self._stopped), "vehicles", "lower"),
+        }

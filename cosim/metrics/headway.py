@@ -1,0 +1,39 @@
+"""Headway: the time gap that AVs keep to the vehicle ahead in their corridor, mean and smallest."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cosim.geometry import gap_ahead, headway, lane_graph
+from cosim.metrics.context import MetricContext
+from cosim.types import Kind, Metric, Snapshot
+
+
+class Headway:
+    """Net time headway (bumper to bumper) over all AV frames with somebody within 125 m ahead."""
+
+    def reset(self, first: Snapshot, context: MetricContext) -> None:
+        self._graph = lane_graph(context.road)
+        self._sum = 0.0  # s
+        self._counted = 0
+        self._smallest = np.inf  # s
+        self.add(first)
+
+    def add(self, snapshot: Snapshot) -> None:
+        av = np.flatnonzero(snapshot.kind == Kind.AV)
+        if not len(av):
+            return
+        gap, _ = gap_ahead(snapshot, self._graph, av)
+        time = headway(gap, snapshot.speed[av])
+        time = time[time < np.inf]
+        if len(time):
+            self._sum += float(time.sum())
+            self._counted += len(time)
+            self._smallest = min(self._smallest, float(time.min()))
+
+    def result(self) -> dict[str, Metric]:
+        mean, smallest = (self._sum / self._counted, self._smallest) if self._counted else (None, None)
+        return {
+            "mean_headway_s": Metric(mean, "s", ""),
+            "min_headway_s": Metric(smallest, "s", "higher"),
+        }

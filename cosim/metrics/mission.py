@@ -1,0 +1,58 @@
+"""Mission: did the vehicle that needs somebody's help get where it wanted, and when."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cosim.metrics.context import MetricContext
+from cosim.types import Metric, Snapshot
+
+STANDING = 0.1  # m/s, SUMO's own threshold of a halting vehicle
+
+
+class MissionSuccess:
+    """Success is being on a goal lane without a collision before it (contract.md, Episode).
+
+    With several mission vehicles all of them have to succeed, and the time is that of the last. NA without
+    a mission, without a goal, or while no mission vehicle has been seen.
+    """
+
+    def reset(self, first: Snapshot, context: MetricContext) -> None:
+        self._goal = np.array(sorted(context.goal), dtype=np.int32)
+        self._applies = context.mission_kind != "none" and bool(context.goal)
+        self._begin = first.time
+        self._reached: dict[str, float | None] = {}  # id -> s from the episode's start
+        self._crashed: set[str] = set()
+        self._standing: set[str] = set()
+        self.add(first)
+
+    def add(self, snapshot: Snapshot) -> None:
+        if not self._applies:
+            return
+        for collision in snapshot.events.collisions:  # they came before this frame's positions
+            self._crashed.update((collision.collider, collision.victim))
+        self._standing.difference_update(snapshot.events.arrived)
+        for row in np.flatnonzero(snapshot.mission):
+            name = snapshot.ids[row]
+            if self._reached.setdefault(name, None) is not None:
+                continue
+            if snapshot.speed[row] <= STANDING:
+                self._standing.add(name)
+            else:
+                self._standing.discard(name)
+            if name not in self._crashed and bool((self._goal == snapshot.lane[row]).any()):
+                self._reached[name] = snapshot.time - self._begin
+
+    def result(self) -> dict[str, Metric]:
+        success = failed = when = None
+        if self._reached:
+            times = [time for time in self._reached.values() if time is not None]
+            success = len(times) == len(self._reached)
+            when = max(times) if success else None
+            # a failure that is final for the eye: it stands, typically at the end of its lane
+            failed = any(self._reached[name] is None for name in self._standing)
+        return {
+            "mission_success": Metric(success, "bool", "higher"),
+            "mission_failed_at_end": Metric(failed, "bool", "lower"),
+            "mission_time_s": Metric(when, "s", "lower"),
+        }

@@ -1,0 +1,197 @@
+"""Rolls vehicles out along real centre lines: where a predicted speed takes them (numba kernels).
+
+A vehicle follows one path (a polyline) at a given speed profile; its sideways offset from that path closes
+at a given rate (a lane change, or what is left of one). Its box is turned into the direction of motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from cosim.road import LanePath
+from cosim.types import Floats, Ints, MetaAction
+
+# The meaning of the meta-actions (contract.md, Vehicles), as cosim.actions carries them out; a test
+# compares the two.
+SPEED_STEP = 5.0  # m/s between grid levels
+SPEED_MARGIN = 2.0  # m/s above the limit
+TIME_CONSTANT = 0.6  # s
+MAX_DECEL = 8.0  # m/s2
+MAX_ACCEL = 3.0  # m/s2
+LANE_CHANGE_TIME = 2.0  # s
+STEP = 0.1  # s, with which SUMO tracks the target speed
+
+
+class Paths(NamedTuple):
+    """Polylines packed one behind the other for the kernels."""
+
+    points: Floats  # [p,2] m
+    arc: Floats  # [p] m
+    start: Ints  # [k+1] where each path begins
+
+
+class Rollout(NamedTuple):
+    """Trajectories; frame 0 is now."""
+
+    x: Floats  # [k,T+1] m
+    y: Floats  # [k,T+1] m
+    heading: Floats  # [k,T+1] rad
+    speed: Floats  # [k,T+1] m/s
+    arc: Floats  # [k,T+1] m along the path
+
+
+def pack(paths: Sequence[LanePath]) -> Paths:
+    """Put paths into one array."""
+    start = np.zeros(len(paths) + 1, np.int64)
+    np.cumsum([len(p.arc) for p in paths], out=start[1:])
+    if not paths:
+        return Paths(np.zeros((0, 2)), np.zeros(0), start)
+    return Paths(np.concatenate([p.points for p in paths]), np.concatenate([p.arc for p in paths]), start)
+
+
+def next_target(target: float, action: int, speed_limit: float) -> float:
+    """Target speed after `action` (m/s): the grid 0, 5, 10, ... up to the limit, and the limit + 2."""
+    top = speed_limit + SPEED_MARGIN
+    level = target / SPEED_STEP
+    if action == MetaAction.ACCELERATE:
+        return min((np.floor(level + 1e-6) + 1.0) * SPEED_STEP, top)
+    if action == MetaAction.DECELERATE:
+        return min(max((np.ceil(level - 1e-6) - 1.0) * SPEED_STEP, 0.0), top)
+    return top if target >= top else min(round(level) * SPEED_STEP, top)
+
+
+def tracked_speeds(speed: float, targets: Floats, frames: int, dt: float) -> Floats:
+    """Speeds while tracking target speeds [k] m/s from `speed`: [k,frames+1] m/s, every `dt` s."""
+    per_frame = max(round(dt / STEP), 1)
+    h = dt / per_frame
+    now = np.full(len(targets), float(speed))
+    out = np.empty((len(targets), frames + 1))
+    out[:, 0] = now
+    for k in range(1, frames + 1):
+        for _ in range(per_frame):
+            accel = np.clip((targets - now) / TIME_CONSTANT, -MAX_DECEL, MAX_ACCEL)
+            now = np.maximum(now + accel * h, 0.0)
+        out[:, k] = now
+    return out
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def project(
+    points: Floats, arc: Floats, first: int, last: int, x: float, y: float, around: float
+) -> tuple[float, float]:
+    """Nearest arc length and signed offset (left positive) of (x, y) on points[first:last], within 60 m
+    of arc length `around` (nan: anywhere). The path goes on straight beyond its ends."""
+    best, best_arc, best_offset = np.inf, 0.0, 0.0
+    for i in range(first, last - 1):
+        if arc[i + 1] < around - 60.0 or arc[i] > around + 60.0:
+            continue
+        dx, dy = points[i + 1, 0] - points[i, 0], points[i + 1, 1] - points[i, 1]
+        span2 = dx * dx + dy * dy
+        px, py = x - points[i, 0], y - points[i, 1]
+        t = (px * dx + py * dy) / span2
+        low = -1e9 if i == first else 0.0
+        high = 1e9 if i == last - 2 else 1.0
+        t = min(max(t, low), high)
+        ex, ey = px - t * dx, py - t * dy
+        d2 = ex * ex + ey * ey
+        if d2 < best:
+            best = d2
+            span = np.sqrt(span2)
+            best_arc = arc[i] + t * span
+            cross = dx * py - dy * px
+            best_offset = np.sqrt(d2) if cross > 0.0 else -np.sqrt(d2)
+    return best_arc, best_offset
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def project_many(
+    points: Floats, arc: Floats, start: Ints, x: Floats, y: Floats, around: Floats
+) -> tuple[Floats, Floats]:
+    """`project` of point k onto path k: [k] -> arc [k] m, offset [k] m."""
+    n = x.shape[0]
+    out_arc, out_offset = np.empty(n), np.empty(n)
+    for k in range(n):
+        out_arc[k], out_offset[k] = project(
+            points, arc, start[k], start[k + 1], x[k], y[k], around[k]
+        )
+    return out_arc, out_offset
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def project_all(points: Floats, arc: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+    """`project` of every point [k] onto one path."""
+    n = x.shape[0]
+    out_arc, out_offset = np.empty(n), np.empty(n)
+    for k in range(n):
+        out_arc[k], out_offset[k] = project(points, arc, 0, arc.shape[0], x[k], y[k], np.nan)
+    return out_arc, out_offset
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def roll(
+    points: Floats,
+    arc: Floats,
+    start: Ints,
+    begin: Floats,  # [k] m, arc now
+    offset: Floats,  # [k] m, sideways now
+    rate: Floats,  # [k] m/s >= 0, at which the offset closes
+    speed: Floats,  # [k,T+1] m/s
+    stop: Floats,  # [k] m, arc at which the vehicle's centre has to stand; inf for none
+    brake: float,  # m/s2 with which it gets there
+    dt: float,
+    x: Floats,  # [k,T+1] out
+    y: Floats,
+    heading: Floats,
+    out_speed: Floats,
+    out_arc: Floats,
+) -> None:
+    """Vehicle k along path k."""
+    frames = speed.shape[1]
+    for k in range(begin.shape[0]):
+        first, last = start[k], start[k + 1]
+        s, i = begin[k], first
+        v = speed[k, 0]
+        side = 1.0 if offset[k] > 0.0 else -1.0
+        for t in range(frames):
+            if t > 0:
+                v_next = speed[k, t]
+                room = stop[k] - s
+                if room < 200.0:
+                    v_next = min(v_next, np.sqrt(max(2.0 * brake * room, 0.0)))
+                s = min(s + 0.5 * dt * (v + v_next), max(stop[k], s))
+                v = v_next
+            while i < last - 2 and arc[i + 1] < s:
+                i += 1
+            dx, dy = points[i + 1, 0] - points[i, 0], points[i + 1, 1] - points[i, 1]
+            span = np.sqrt(dx * dx + dy * dy)
+            ux, uy = dx / span, dy / span
+            ahead = s - arc[i]
+            left = abs(offset[k]) - rate[k] * dt * t
+            drift = -side * rate[k] if left > 0.0 and rate[k] > 0.0 else 0.0
+            left = side * max(left, 0.0)
+            x[k, t] = points[i, 0] + ux * ahead - uy * left
+            y[k, t] = points[i, 1] + uy * ahead + ux * left
+            turn = np.arctan2(drift, max(v, 4.0))  # a standing car does not turn on the spot
+            heading[k, t] = np.arctan2(uy, ux) + turn
+            out_speed[k, t] = v
+            out_arc[k, t] = s
+
+
+def roll_out(
+    paths: Paths,
+    begin: Floats,
+    offset: Floats,
+    rate: Floats,
+    speed: Floats,
+    stop: Floats,
+    brake: float,
+    dt: float,
+) -> Rollout:
+    """`roll` into fresh arrays; see there for the arguments."""
+    out = Rollout(*(np.empty_like(speed) for _ in range(5)))
+    roll(paths.points, paths.arc, paths.start, begin, offset, rate, speed, stop, brake, dt, *out)
+    return out

@@ -1,0 +1,136 @@
+"""Where the others go: every vehicle's predicted speed carried along its real lane."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from cosim.road import LanePath, RoadMap
+from cosim.types import Bools, Floats
+from policy.forecast import KinematicForecast
+from policy.motion import Rollout, pack, project_many, roll_out
+from policy.scene import Scene
+
+
+@dataclass(frozen=True, slots=True)
+class TrafficConfig:
+    """How others are carried along their lanes."""
+
+    frames: int = 28  # 5.6 s: a contact within the critical time after the 4 s horizon is seen
+    dt: float = 0.2  # s
+    drift_rate: float = 0.4  # m/s sideways, above which a vehicle is changing lanes
+    drift_offset: float = 0.2  # m from the centre line, below which nobody is changing lanes yet
+    drift_limits: tuple[float, float] = (0.8, 2.4)  # m/s sideways of a change; SUMO's takes 1.6 m/s
+    settle_rate: float = 0.5  # m/s with which a resting offset closes
+    stop_brake: float = 4.0  # m/s2 towards the end of a lane
+    speed_factor: float = 1.2  # nobody is predicted faster than this times the limit (or as fast as now)
+
+
+class Traffic(NamedTuple):
+    """V vehicles of a scene, rolled out."""
+
+    rollout: Rollout  # [V,T+1]
+    length: Floats  # [V] m
+    width: Floats  # [V] m
+    stream: tuple[LanePath | None, ...]  # [V] the path each follows (its target lane's, when changing)
+    drifting: Bools  # [V] changes lanes now
+    known: Bools  # [V] perceived in the newest frame
+
+
+def predict_traffic(
+    scene: Scene, forecast: KinematicForecast, road: RoadMap, config: TrafficConfig
+) -> Traffic:
+    """Carry the forecast speeds along the lanes.
+
+    A vehicle keeps its lane and takes the straightest way (its route is unknown); one that drifts sideways
+    goes where it drifts, so a merging car sits in the neighbour lane only once it really moves there; where
+    the lane ends it stops. Vehicles off every lane go where the forecast says.
+    """
+    c = config
+    count, frames = len(scene.vehicles), c.frames
+    now = scene.state[:, -1]  # [V,8]
+    known = forecast.valid & (scene.lane >= -1)
+    speed = np.empty((count, frames + 1))
+    m = min(forecast.speed.shape[1], frames)
+    speed[:, 0] = now[:, 2]
+    speed[:, 1 : m + 1] = forecast.speed[:, :m]
+    speed[:, m + 1 :] = forecast.speed[:, m - 1 : m]
+    on_lane = np.flatnonzero(known & (scene.lane >= 0))
+    lanes = [int(k) for k in scene.lane[on_lane]]
+    paths = [road.path(k) for k in lanes]
+    scale = np.array([p.scale for p in paths])
+    arc = (scene.lane_position[on_lane] - 0.5 * now[on_lane, 4]) * scale
+    offset, drift = _sideways(scene, on_lane, paths, arc, c)
+    for i, k in enumerate(lanes):
+        beside = road.lanes[k].left if offset[i] > 0.0 else road.lanes[k].right
+        if drift[i] * offset[i] > 0.0 and beside >= 0:  # moving away from its own centre line
+            paths[i] = road.path(beside)
+    packed = pack(paths)
+    arc, offset = project_many(*packed, now[on_lane, 0], now[on_lane, 1], arc)
+    moving = np.abs(drift) > 0.0
+    rate = np.where(moving, np.clip(np.abs(drift), *c.drift_limits), c.settle_rate)
+    end = np.array([p.length if p.dead_end else np.inf for p in paths])
+    limit = np.array([road.lanes[k].speed_limit for k in lanes]) * c.speed_factor
+    top = np.maximum(limit, now[on_lane, 2])[:, None] if len(lanes) else np.zeros((0, 1))
+    along = roll_out(
+        packed,
+        arc,
+        offset,
+        rate,
+        np.minimum(speed[on_lane], top),
+        end - 0.5 * now[on_lane, 4],
+        c.stop_brake,
+        c.dt,
+    )
+    out = Rollout(*(np.zeros((count, frames + 1)) for _ in range(5)))
+    for whole, part in zip(out, along, strict=True):
+        whole[on_lane] = part
+    lost = np.flatnonzero(known & (scene.lane < 0))
+    if len(lost):
+        _straight(out, now, forecast, speed, lost, m, c.dt)
+    stream: list[LanePath | None] = [None] * count
+    drifting = np.zeros(count, np.bool_)
+    for i, v in enumerate(on_lane):
+        stream[v] = paths[i]
+    drifting[on_lane] = moving
+    return Traffic(out, now[:, 4], now[:, 5], tuple(stream), drifting, known)
+
+
+def _sideways(
+    scene: Scene, rows: np.ndarray, paths: list[LanePath], arc: Floats, c: TrafficConfig
+) -> tuple[Floats, Floats]:
+    """Offset from the own centre line [k] m, and sideways speed [k] m/s (0 unless it is a lane change)."""
+    packed = pack(paths)
+    now = scene.state[rows, -1]
+    _, offset = project_many(*packed, now[:, 0], now[:, 1], arc)
+    back = min(2, scene.state.shape[1] - 1)
+    before = scene.state[rows, -1 - back]
+    seen = scene.valid[rows, -1 - back] & (back > 0)
+    _, earlier = project_many(*packed, before[:, 0], before[:, 1], arc)
+    drift = np.where(seen, (offset - earlier) / max(back * c.dt, c.dt), 0.0)
+    changing = (np.abs(drift) > c.drift_rate) & (np.abs(offset) > c.drift_offset)
+    return offset, np.where(changing, drift, 0.0)
+
+
+def _straight(
+    out: Rollout,
+    now: Floats,
+    forecast: KinematicForecast,
+    speed: Floats,
+    rows: np.ndarray,
+    m: int,
+    dt: float,
+) -> None:
+    """Vehicles off every lane: the forecast's own positions, then straight on."""
+    out.x[rows, 0], out.y[rows, 0], out.heading[rows, 0] = now[rows, 0], now[rows, 1], now[rows, 3]
+    out.x[rows, 1 : m + 1], out.y[rows, 1 : m + 1] = forecast.x[rows, :m], forecast.y[rows, :m]
+    out.heading[rows, 1 : m + 1] = forecast.heading[rows, :m]
+    later = dt * np.arange(1, out.x.shape[1] - m)
+    last = forecast.heading[rows, m - 1 : m]
+    v = speed[rows, m : m + 1]
+    out.x[rows, m + 1 :] = out.x[rows, m : m + 1] + v * np.cos(last) * later
+    out.y[rows, m + 1 :] = out.y[rows, m : m + 1] + v * np.sin(last) * later
+    out.heading[rows, m + 1 :] = last
+    out.speed[rows] = speed[rows]

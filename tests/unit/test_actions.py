@@ -1,0 +1,44 @@
+"""Meta-actions on the target-speed grid."""
+
+import pytest
+
+from cosim.actions import next_target, tracked_speed
+from cosim.types import MetaAction
+
+UP, DOWN, IDLE = MetaAction.ACCELERATE, MetaAction.DECELERATE, MetaAction.IDLE
+
+
+def test_the_grid_rises_in_steps_of_five_to_the_limit_plus_two() -> None:
+    levels = [0.0]
+    while levels[-1] < 27.0:
+        levels.append(next_target(levels[-1], UP, 25.0))
+    assert levels == [0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 27.0]
+    assert next_target(27.0, UP, 25.0) == 27.0
+
+
+def test_braking_from_the_top_goes_back_to_the_grid_and_ends_at_standstill() -> None:
+    assert next_target(27.0, DOWN, 25.0) == 25.0
+    assert next_target(25.0, DOWN, 25.0) == 20.0
+    assert next_target(0.0, DOWN, 25.0) == 0.0
+
+
+def test_a_first_idle_rounds_the_present_speed_to_the_grid() -> None:
+    assert next_target(23.1, IDLE, 25.0) == 25.0
+    assert next_target(22.0, MetaAction.LANE_LEFT, 25.0) == 20.0
+
+
+def test_a_lower_limit_ahead_lowers_the_top() -> None:
+    assert next_target(25.0, IDLE, 13.9) == pytest.approx(15.9)
+
+
+def test_tracking_brakes_with_eight_and_accelerates_with_three_at_most() -> None:
+    assert tracked_speed(25.0, 0.0, 0.1) == pytest.approx(24.2)
+    assert tracked_speed(10.0, 25.0, 0.1) == pytest.approx(10.3)
+    assert tracked_speed(20.3, 20.0, 0.1) == pytest.approx(20.25)
+
+
+def test_a_step_of_five_down_takes_about_two_seconds() -> None:
+    speed, steps = 25.0, 0
+    while speed > 20.2:
+        speed, steps = tracked_speed(speed, 20.0, 0.1), steps + 1
+    assert 15 <= steps <= 25

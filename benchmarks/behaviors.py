@@ -35,7 +35,6 @@ from cosim.simulation.drivers import (
     DriverClass,
     Drivers,
     load_behaviors,
-    write_idm_type,
 )
 from cosim.simulation.mobil import (
     LEFT,
@@ -98,7 +97,7 @@ class Traffic:
 
 
 def build_highway(folder: Path) -> None:
-    """Net and IDM base type in `folder`; needs netconvert (extra `tools`)."""
+    """The net in `folder`; needs netconvert (extra `tools`)."""
     import sumo
 
     nodes = f'<nodes><node id="a" x="0" y="0"/><node id="b" x="{LENGTH}" y="0"/></nodes>'
@@ -109,7 +108,6 @@ def build_highway(folder: Path) -> None:
     netconvert = Path(sumo.SUMO_HOME) / "bin" / "netconvert"
     files = ["-n", "n.nod.xml", "-e", "e.edg.xml", "-o", "net.xml"]
     subprocess.run([netconvert, *files], cwd=folder, check=True, capture_output=True)
-    write_idm_type(folder)
 
 
 def _flow(folder: Path, driver: DriverClass, duration: float) -> Path:
@@ -134,7 +132,7 @@ def measure(
     flow = _flow(folder, inserted_as, WARM_UP + duration)
     options = "--step-length 0.1 --lanechange.duration 2 --no-step-log --no-warnings --time-to-teleport -1 "
     options += "--collision.action warn --collision.mingap-factor 0 --max-depart-delay 10"
-    net, types = str(folder / "net.xml"), str(folder / "cosim_idm.add.xml")
+    net, types = str(folder / "net.xml"), str(BEHAVIORS_FILE.parent / "types.add.xml")
     libsumo.start(["sumo", "-n", net, "-r", str(flow), "-a", types, *options.split(), "--seed", str(seed)])
     try:
         return _drive(Drivers(behavior, model, seed, behaviors), duration)

@@ -80,11 +80,10 @@ _REFUSED = {
     "random": "an episode is repeatable by its --seed; SUMO's --random is not",
     "remote-port": "cosim steps the simulation itself; nobody else can connect",
     "num-clients": "cosim steps the simulation itself; nobody else can connect",
-    "save-configuration": "SUMO would write its options and stop instead of running",
-    "save-template": "SUMO would write its options and stop instead of running",
-    "save-schema": "SUMO would write its schema and stop instead of running",
-    "save-commented": "SUMO would write its options and stop instead of running",
-    "help": "SUMO would print its help and stop instead of running",
+    "save-configuration": "SUMO would write its options and stop",
+    "save-template": "SUMO would write its options and stop",
+    "save-schema": "SUMO would write its schema and stop",
+    "help": "SUMO would print its help and stop",
     "version": "use `cosim doctor`",
     "mesosim": "the mesoscopic model has no vehicle positions",
     "lateral-resolution": "LC2013, which is what drives here, has no sublane model",
@@ -122,6 +121,7 @@ def read(path: Path) -> SumoConfig:
             continue
         if name == "mesosim" and boolean(value):
             raise BadInput(_REFUSED["mesosim"], file=path, field=name, value=value)
+        _check_finite(value, path, name)
         if not keeps(name):
             ignored.append(f"{name}={value}{_reason(name)}")
         elif name in FILE_OPTIONS:
@@ -165,6 +165,7 @@ def command_line(arguments: Sequence[str]) -> dict[str, str]:
             raise BadInput(_REFUSED[name], field=f"--{name}", value=value)
         if name == "collision.action" and value != "warn":
             raise BadInput("collisions are counted, never removed", field=f"--{name}", value=value)
+        _check_finite(value, None, f"--{name}")
         options[name] = value
     return options
 
@@ -194,7 +195,8 @@ def time_of(value: str, file: object, field: str) -> float:
         raise BadInput("is not a time (seconds or H:M:S)", file=file, field=field, value=value)
     sign = -1.0 if parts[0].strip().startswith("-") else 1.0
     weights = (1.0, 60.0, 3600.0, 86400.0)
-    return sign * sum(abs(n) * w for n, w in zip(reversed(numbers), weights, strict=False))
+    seconds = sum(abs(n) * w for n, w in zip(reversed(numbers), weights, strict=False))
+    return sign * seconds
 
 
 def hint(name: str, known: Iterable[str]) -> str:
@@ -243,6 +245,12 @@ def files(value: str, folder: Path, file: object, field: str) -> tuple[Path, ...
             except BadInput as error:
                 raise BadInput(error.problem, file=file, field=field, value=part) from None
     return tuple(found)
+
+
+def _check_finite(value: str, file: object, field: str) -> None:
+    """SUMO takes `scale` NaN without a word."""
+    if value.strip().lstrip("+-").lower() in ("nan", "inf", "infinity"):
+        raise BadInput("must be finite", file=file, field=field, value=value)
 
 
 def _reason(name: str) -> str:

@@ -115,9 +115,7 @@ def project_many(
     n = x.shape[0]
     out_arc, out_offset = np.empty(n), np.empty(n)
     for k in range(n):
-        out_arc[k], out_offset[k] = project(
-            points, arc, start[k], start[k + 1], x[k], y[k], around[k]
-        )
+        out_arc[k], out_offset[k] = project(points, arc, start[k], start[k + 1], x[k], y[k], around[k])
     return out_arc, out_offset
 
 

@@ -32,19 +32,19 @@ class SnapshotReader:
 
     def __init__(self, road: RoadMap) -> None:
         self._lane_index = road.index
-        self._ids: tuple[str, ...] = ()
+        self._ids: tuple[str, ...] | None = None
         self._static: tuple[np.ndarray, ...] = ()
         self._front = np.zeros(0)  # [n] m, half lengths
 
     def forget(self) -> None:
         """The bodies changed (a new episode, a new mission vehicle)."""
-        self._ids = ()
+        self._ids = None
 
     def read(self, bodies: dict[str, Body], events: Events) -> Snapshot:
         """One snapshot of every vehicle on the road, sorted by id."""
         vehicle = libsumo.vehicle
         ids = tuple(sorted(vehicle.getIDList()))
-        if ids != self._ids or not self._static:
+        if ids != self._ids:
             present = [bodies[i] for i in ids]
             self._static = (
                 np.array([b.kind for b in present], np.int8),

@@ -51,12 +51,8 @@ LC2013_ATTRIBUTES = frozenset(
 )
 
 # A vehicle cannot be given another car-following model while it drives, except through its type. A network
-# whose types do not use IDM gets this one as an additional file (`write_idm_type`).
+# whose types do not use IDM gets this one as an additional file (sumo_scenarios/types.add.xml).
 IDM_TYPE = "cosim.idm"
-IDM_TYPE_XML = f"""<additional>
-    <vType id="{IDM_TYPE}" carFollowModel="IDM" laneChangeModel="LC2013" delta="4" speedDev="0"/>
-</additional>
-"""
 
 EMERGENCY_DECELERATION = 9.0  # m/s2, what tyres give: even a gentle driver's last resort (SUMO's default)
 
@@ -210,13 +206,6 @@ def _driver_class(read: _Reader, name: str, value: Any) -> DriverClass:
 # ---------------------------------------------------------------- into SUMO
 
 
-def write_idm_type(folder: Path) -> Path:
-    """Write the additional file that brings the IDM base type; returns its path."""
-    path = folder / "cosim_idm.add.xml"
-    path.write_text(IDM_TYPE_XML, encoding="utf-8")
-    return path
-
-
 def derive_idm_type(original: str, name: str) -> None:
     """Make vehicle type `name`: IDM with the size, class, maximum speed and looks of type `original`.
 
@@ -230,7 +219,6 @@ def derive_idm_type(original: str, name: str) -> None:
         get.setWidth(name, get.getWidth(original))
         get.setHeight(name, get.getHeight(original))
         get.setMaxSpeed(name, get.getMaxSpeed(original))
-        get.setMaxSpeedLat(name, get.getMaxSpeedLat(original))
         get.setShapeClass(name, get.getShapeClass(original))
         get.setColor(name, get.getColor(original))
     elif get.getImperfection(original) == -1.0:  # SUMO's IDM has no driver imperfection and says -1
@@ -238,7 +226,7 @@ def derive_idm_type(original: str, name: str) -> None:
     else:
         raise BadInput(
             "Table II needs the IDM car-following model, which this type does not use; "
-            "load the file written by write_idm_type",
+            f"load {IDM_TYPE} from sumo_scenarios/types.add.xml",
             field="vType",
             value=original,
         )
@@ -313,16 +301,20 @@ class Drivers:
         name = self._types.get((original, driver.name))
         if name is None:
             name = f"{original}/{driver.name}"
-            derive_idm_type(original, name)
+            draft = f"{name}/draft"
+            derive_idm_type(original, draft)
             set_, idm = libsumo.vehicletype, driver.idm
-            set_.setTau(name, idm.time_headway)
-            set_.setMinGap(name, idm.minimum_gap)
-            set_.setAccel(name, idm.max_acceleration)
+            set_.setTau(draft, idm.time_headway)
+            set_.setMinGap(draft, idm.minimum_gap)
+            set_.setAccel(draft, idm.max_acceleration)
             # Emergency deceleration first: SUMO warns when it is below the comfortable one.
-            set_.setEmergencyDecel(name, max(EMERGENCY_DECELERATION, idm.comfortable_deceleration))
-            set_.setDecel(name, idm.comfortable_deceleration)
-            set_.setApparentDecel(name, idm.comfortable_deceleration)
-            set_.setActionStepLength(name, libsumo.simulation.getDeltaT(), True)
-            set_.setSpeedDeviation(name, 0.0)
+            set_.setEmergencyDecel(draft, max(EMERGENCY_DECELERATION, idm.comfortable_deceleration))
+            set_.setDecel(draft, idm.comfortable_deceleration)
+            set_.setApparentDecel(draft, idm.comfortable_deceleration)
+            set_.setActionStepLength(draft, libsumo.simulation.getDeltaT(), True)
+            set_.setSpeedDeviation(draft, 0.0)
+            # SUMO's IDM keeps the 2 sqrt(a b) of its construction: setAccel and setDecel change a and b, but
+            # not d* (measured: -0.06 instead of -0.44 m/s2). Copying the type constructs the model anew.
+            set_.copy(draft, name)
             self._types[original, driver.name] = name
         return name

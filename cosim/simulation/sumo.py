@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import libsumo
+import numpy as np
 
 from cosim.errors import BadInput, SimulationError, SimulationInUse
 from cosim.road import RoadMap
@@ -17,7 +18,7 @@ from cosim.simulation.convert import Body, SnapshotReader, read_road, struggling
 from cosim.simulation.drivers import Drivers
 from cosim.simulation.fleet import Fleet
 from cosim.simulation.stderr import SumoStderr
-from cosim.types import Collision, Command, Events, Kind, Receipt, Snapshot
+from cosim.types import Bools, Collision, Command, Events, Kind, Receipt, Snapshot
 
 SUMO_ERRORS = (libsumo.TraCIException, libsumo.FatalTraCIError)
 
@@ -246,13 +247,18 @@ class SumoSimulator:
         self._teleported: list[str] = []
         self._stopped: list[str] = []
 
-    def _goal(self) -> tuple[frozenset[int], frozenset[int]]:
-        """Lanes on which the mission is fulfilled, and lanes that make a vehicle the mission vehicle."""
+    def _goal(self) -> tuple[frozenset[int], Bools]:
+        """Lanes on which the mission is fulfilled; [lanes + 1] which make a vehicle the mission vehicle.
+
+        The last entry answers for lane -1 (off every lane).
+        """
         mission = self._scenario.mission
+        struggling = np.zeros(len(self.road.lanes) + 1, np.bool_)
         if mission.kind == "auto":
-            struggling = struggling_lanes(self.road)
+            found = struggling_lanes(self.road)
+            struggling[list(found)] = True
             free = frozenset(
-                i for i, lane in enumerate(self.road.lanes) if not lane.internal and i not in struggling
+                i for i, lane in enumerate(self.road.lanes) if not lane.internal and i not in found
             )
             return free, struggling
         goal = frozenset(i for i, lane in enumerate(self.road.lanes) if lane.edge in mission.goal)
@@ -261,15 +267,15 @@ class SumoSimulator:
             raise BadInput(
                 "the net has no such edge", file=self._scenario.config, field="mission.goal", value=missing[0]
             )
-        return goal, frozenset()
+        return goal, struggling
 
     def _find_mission(self, snapshot: Snapshot) -> Snapshot:
         """Nobody named one: the first HV (by id) that drives on a lane that ends or must give way."""
-        for i, name in enumerate(snapshot.ids):
-            if snapshot.kind[i] == Kind.HV and int(snapshot.lane[i]) in self._struggling:
-                body = self._bodies[name]
-                self._bodies[name] = Body(body.kind, True, body.length, body.width)
-                self._mission_found = True
-                self._reader.forget()
-                return self._reader.read(self._bodies, snapshot.events)
-        return snapshot
+        candidates = np.flatnonzero(self._struggling[snapshot.lane] & (snapshot.kind == Kind.HV))
+        if not len(candidates):
+            return snapshot
+        name = snapshot.ids[candidates[0]]
+        self._bodies[name] = replace(self._bodies[name], mission=True)
+        self._mission_found = True
+        self._reader.forget()
+        return self._reader.read(self._bodies, snapshot.events)

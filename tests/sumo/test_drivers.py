@@ -12,11 +12,12 @@ import pytest
 import sumo
 
 from cosim.errors import BadInput
-from cosim.simulation.drivers import IDM_TYPE, Drivers, load_behaviors, write_idm_type
-from cosim.simulation.mobil import STRATEGIC_ONLY
+from cosim.simulation.drivers import BEHAVIORS_FILE, IDM_TYPE, Drivers, load_behaviors
+from cosim.simulation.mobil import STRATEGIC_ONLY, idm_acceleration
 
 CLASSES = ("aggressive", "moderate", "conservative")
 TEST_SEED = 200_000
+BASE_TYPE_FILE = BEHAVIORS_FILE.parent / "types.add.xml"
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +36,6 @@ def highway(tmp_path_factory: pytest.TempPathFactory) -> Path:
         '<flow id="f" type="car" route="r" begin="0" end="600" period="exp(1.0)" departLane="random"'
         ' departSpeed="max"/></routes>'
     )
-    write_idm_type(folder)
     return folder
 
 
@@ -44,7 +44,7 @@ def start(highway: Path) -> Iterator[object]:
     """Starts SUMO on the highway; closes it after the test."""
 
     def begin(seed: int = TEST_SEED, base_type: bool = True) -> None:
-        extra = ["-a", str(highway / "cosim_idm.add.xml")] if base_type else []
+        extra = ["-a", str(BASE_TYPE_FILE)] if base_type else []
         options = "--step-length 0.1 --lanechange.duration 2 --no-step-log --no-warnings "
         options += "--time-to-teleport -1 --collision.action warn --collision.mingap-factor 0"
         net, flow = str(highway / "net.xml"), str(highway / "flow.rou.xml")
@@ -137,6 +137,26 @@ def test_the_car_following_is_the_idm_of_the_equation(start) -> None:
     libsumo.simulationStep()
     gained = (libsumo.vehicle.getSpeed(vehicle) - 0.6 * desired) / 0.1
     assert gained == pytest.approx(1.0 - 0.6**4, abs=0.01)
+
+
+@pytest.mark.parametrize("behavior", CLASSES)
+def test_a_driver_closing_up_on_a_slower_leader_brakes_as_the_idm_equation_says(start, behavior) -> None:
+    """The interaction term holds sqrt(a b) of the class, not of the vehicle's original type."""
+    start()
+    drivers = Drivers(behavior, "lc2013", TEST_SEED)
+    for name, place in (("back", "100"), ("front", "205")):
+        libsumo.vehicle.add(name, "r", "car", departLane="1", departPos=place, departSpeed="20")
+    libsumo.simulationStep()
+    for name in ("back", "front"):
+        drivers.apply(name)
+        libsumo.vehicle.setLaneChangeMode(name, 0)
+    libsumo.vehicle.setPreviousSpeed("front", 15.0)
+    get, idm = libsumo.vehicle, load_behaviors().classes[behavior].idm
+    gap = get.getLeader("back", 0.0)[1] + idm.minimum_gap
+    speed, desired = get.getSpeed("back"), get.getAllowedSpeed("back")
+    libsumo.simulationStep()
+    expected = idm_acceleration(idm, speed, desired, gap, 15.0)
+    assert (get.getSpeed("back") - speed) / 0.1 == pytest.approx(expected, abs=0.02)
 
 
 def test_without_the_idm_base_type_a_foreign_car_following_model_is_refused_by_name(start) -> None:

@@ -1,0 +1,143 @@
+"""The prediction-aware agent: chain of predictions, value network, safety prioritizer (P, figure 2)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from cosim.errors import BadInput
+from cosim.raster import RoadRaster, rasterize_road
+from cosim.road import RoadMap
+from cosim.types import COMPACT, PAPER, Decision, History, ObservationConfig, PolicyContext
+from policy.chain import ChainConfig, predict
+from policy.checkpoint import load
+from policy.hpn import HPN, HpnConfig
+from policy.predictors import make_predictor
+from policy.safety import SafetyConfig, prioritize
+from policy.scene import join
+from policy.tensors import to_batch, to_numpy
+from policy.traffic import TrafficConfig, predict_traffic
+from policy.vfn import VFN, VfnConfig
+
+UNTRAINED = "untrained"
+
+
+@dataclass(frozen=True, slots=True)
+class AgentConfig:
+    """Everything that makes up one agent. Defaults: compact size, `vfn-p`."""
+
+    observation: ObservationConfig = COMPACT
+    predicted_maps: bool = True  # False: the VFN sees the history only (Table III, `vfn`)
+    predictor: str = "gp-indirect"  # of the mask and of the chain's kinematics; `cs` for `vfn`
+    chain: ChainConfig = ChainConfig()
+    hpn: HpnConfig = HpnConfig()
+    vfn: VfnConfig = VfnConfig()
+    safety: SafetyConfig = SafetyConfig()
+    traffic: TrafficConfig = TrafficConfig()
+    init_seed: int = 0  # of untrained weights: the same in every process
+    bf16: bool = False  # autocast; off, so that results do not depend on the processor
+    weights: Path | None = None  # a checkpoint of policy.checkpoint; None: untrained
+    note: str = field(default="")  # goes into the label
+
+
+def compact(name: str) -> AgentConfig:
+    """The compact configuration of `vfn-p` or `vfn` (contract.md, Approaches of Table III)."""
+    return _config(name, COMPACT, ChainConfig(), HpnConfig(), "temporal")
+
+
+def paper(name: str) -> AgentConfig:
+    """The paper-size configuration: 64 x 512, one frame a step, M = 20, T's Table 1 read literally."""
+    hpn = HpnConfig(height=64, width=512, block=1, reading="pool")
+    return _config(name, PAPER, ChainConfig(every=1), hpn, "literal")
+
+
+def _config(
+    name: str, observation: ObservationConfig, chain: ChainConfig, hpn: HpnConfig, strides: str
+) -> AgentConfig:
+    if name not in ("vfn-p", "vfn"):
+        raise BadInput("no such prediction-aware policy (vfn-p, vfn)", field="policy", value=name)
+    predicted = name == "vfn-p"
+    vfn = VfnConfig(
+        height=observation.height,
+        width=observation.width,
+        channels=len(observation.channels),
+        frames=observation.frames + (chain.hypotheses if predicted else 0),
+        rows=observation.rows,
+        strides="literal" if strides == "literal" else "temporal",
+    )
+    return AgentConfig(
+        observation=observation,
+        predicted_maps=predicted,
+        predictor="gp-indirect" if predicted else "cs",
+        chain=chain,
+        hpn=hpn,
+        vfn=vfn,
+    )
+
+
+class PredictionAware:
+    """`cosim.types.Policy`: commands every AV.
+
+    The weights are seeded, so an untrained agent is the same everywhere; `label` says that it is untrained.
+    Decides for all AVs at once: prediction and action values in one batch, the prioritizer front to back.
+    """
+
+    def __init__(self, name: str = "vfn-p", config: AgentConfig | None = None) -> None:
+        self.name = name
+        self.config = c = config or compact(name)
+        self.observation = c.observation
+        self.av_parameters: Mapping[str, str] = {}
+        generator_state = torch.random.get_rng_state()
+        torch.manual_seed(c.init_seed)  # module initialisers know no generator
+        self.vfn = VFN(c.vfn).eval()
+        self.hpn = HPN(c.hpn).eval() if c.predicted_maps and c.chain.source == "hpn" else None
+        torch.random.set_rng_state(generator_state)
+        self.label = c.note or UNTRAINED
+        if c.weights is not None:
+            networks = {"vfn": self.vfn} | ({"hpn": self.hpn} if self.hpn is not None else {})
+            configs = {"vfn": c.vfn} | ({"hpn": c.hpn} if self.hpn is not None else {})
+            load(c.weights, networks, configs)
+            self.label = c.note
+        self.vfn.to(memory_format=torch.channels_last_3d)  # type: ignore[call-overload]
+        if self.hpn is not None:
+            self.hpn.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self._road: RoadMap | None = None
+        self._raster: RoadRaster | None = None
+
+    def reset(self, context: PolicyContext) -> None:
+        """A new episode. Raises BadInput when the observation is not the one the networks were built for."""
+        if context.observation != self.observation:
+            raise BadInput("the observation is not the one this agent needs", field="observation")
+        if self._road is not context.road:
+            self._road = context.road
+            self._raster = rasterize_road(context.road) if self.config.predicted_maps else None
+        self._context = context
+        self._predictor = make_predictor(
+            self.config.predictor, self.config.chain.horizon, context.timing.frame
+        )
+
+    def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
+        """One decision for every AV, each explained (`cosim.types.Decision`)."""
+        if not histories:
+            return {}
+        c, context = self.config, self._context
+        scene = join(histories, context.observation.share_perception)
+        forecast = self._predictor.predict(scene.state, scene.valid)
+        with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=c.bf16):
+            batch = to_batch(scene.histories, context.svo)
+            maps, kinematics = batch.maps, batch.kinematics
+            if c.predicted_maps:
+                assert self._raster is not None
+                ahead = predict(c.chain, c.observation, self._raster, self.hpn, scene, batch, forecast)
+                every = c.chain.every
+                maps = torch.cat([maps, ahead.maps[:, every - 1 :: every]], 1)
+                kinematics = torch.cat([kinematics, ahead.kinematics[:, every - 1 :: every]], 1)
+            q = to_numpy(self.vfn(maps, kinematics, batch.route, batch.phi))
+        if not np.isfinite(q).all():
+            raise FloatingPointError("the value network returned values that are not finite")
+        traffic = predict_traffic(scene, forecast, context.road, c.traffic)
+        return prioritize(q, scene, traffic, context.road, c.safety, context.share_intentions)

@@ -1,0 +1,392 @@
+"""The safety prioritizer (P, algorithms 2 and 3): masks the actions that would lead to a collision.
+
+Algorithm 2 rolls the ego out under each meta-action along its real lane centre lines, the others by their
+predicted speeds along theirs, and finds when their (swept, oriented) boxes first touch. With first contact
+at T, the time to collision at step h of the horizon is T - h, capped. Two further limits look at what a
+time to collision cannot see, because it is infinite at equal speeds: a leader that brakes hard, and the new
+follower that a lane change asks to brake. Algorithm 3 takes the best action that is left.
+
+AVs decide front to back, each knowing the rollouts chosen before it (V2V intentions, switchable).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from cosim.geometry import Boxes, time_to_collision
+from cosim.road import LanePath, RoadMap
+from cosim.types import Bools, Decision, Floats, Floats32, History, MetaAction
+from policy.motion import (
+    LANE_CHANGE_TIME,
+    MAX_DECEL,
+    Paths,
+    Rollout,
+    next_target,
+    pack,
+    project,
+    project_all,
+    roll_out,
+    tracked_speeds,
+)
+from policy.scene import Scene
+from policy.traffic import Traffic
+
+ACTIONS = tuple(MetaAction)
+SIDE = {MetaAction.LANE_LEFT: 0, MetaAction.LANE_RIGHT: 2}  # index into RouteAhead.paths
+LANE_END = "(lane end)"
+ROAD_EDGE = "(no lane)"
+
+
+@dataclass(frozen=True, slots=True)
+class SafetyConfig:
+    """Thresholds (contract.md, What is not in the papers) and the driving limits behind them."""
+
+    safe_th: float = 3.0  # s, P: safe_th
+    critical_th: float = 1.5  # s, P: critical_th
+    decay: float = 0.5  # 1/s, lambda of the weights
+    cap: float = 10.0  # s, time to collision counts no further
+    horizon: float = 4.0  # s, P, Table I
+    dt: float = 0.2  # s
+    margin_length: float = 1.0  # m, added to the ego's box along
+    margin_width: float = 0.3  # m, and across: tracking is never exact
+    reaction: float = 0.4  # s until the next decision can brake
+    leader_brake: float = 8.0  # m/s2, a leader's hardest expected braking
+    standstill_gap: float = 1.0  # m left between standing cars
+    follower_reaction: float = 0.5  # s of a new follower
+    follower_brake: float = 3.0  # m/s2, the most that a lane change may ask of it
+    follower_gap: float = 2.0  # m, at least
+    lane_half: float = 1.6  # m from a centre line within which a vehicle is in that lane
+    same_way: float = 1.05  # rad, headings closer than this (60 degrees) drive the same way
+    # among equally valued actions: T's ego keeps going, else gives way, else evades
+    ties: tuple[MetaAction, ...] = (
+        MetaAction.IDLE,
+        MetaAction.DECELERATE,
+        MetaAction.ACCELERATE,
+        MetaAction.LANE_LEFT,
+        MetaAction.LANE_RIGHT,
+    )
+
+    @property
+    def frames(self) -> int:
+        """Steps of a rollout: far enough to see a contact `critical_th` after the horizon."""
+        return int(np.ceil((self.horizon + self.critical_th) / self.dt - 1e-9))
+
+
+class Evaluation(NamedTuple):
+    """Algorithm 2 for one AV."""
+
+    ttc: Floats  # [A] s until first contact under the action, capped
+    score: Floats  # [A] s, P's weighted time to collision; -1 for impossible actions
+    unsafe: Bools  # [A]
+    blamed: tuple[str | None, ...]  # [A] who makes it unsafe
+    rollout: Rollout  # [A,T+1] the ego under each action
+
+
+def prioritize(
+    q: Floats32,
+    scene: Scene,
+    traffic: Traffic,
+    road: RoadMap,
+    config: SafetyConfig,
+    share_intentions: bool = True,
+) -> dict[str, Decision]:
+    """Decide for every AV of the scene. q [B,A] action values.
+
+    With `share_intentions` the rollouts of the AVs ahead replace their predictions; `traffic` is not changed.
+    """
+    ours = Rollout(*(array.copy() for array in traffic.rollout)) if share_intentions else traffic.rollout
+    traffic = traffic._replace(rollout=ours)
+    intended = np.zeros(len(scene.vehicles), np.bool_)
+    name_row = {name: k for k, name in enumerate(scene.vehicles)}
+    decisions: dict[str, Decision] = {}
+    for b in front_to_back(scene, config):
+        evaluation = evaluate(b, scene, traffic, road, config, intended)
+        decision = select(q[b], evaluation, config)
+        decisions[scene.agents[b]] = decision
+        if share_intentions:
+            me = name_row[scene.agents[b]]
+            intended[me] = True
+            for mine, chosen in zip(ours, evaluation.rollout, strict=True):
+                mine[me] = chosen[decision.action]
+    return {agent: decisions[agent] for agent in scene.agents}
+
+
+def select(q: Floats32, evaluation: Evaluation, config: SafetyConfig) -> Decision:
+    """Algorithm 3: the best valued safe action; if there is none, the one with the highest score."""
+    order = sorted(config.ties, key=lambda a: -float(q[a]))  # stable: ties in the configured order
+    preferred = order[0]
+    safe = [a for a in order if not evaluation.unsafe[a]]
+    fallback = not safe
+    chosen = safe[0] if safe else max(order, key=lambda a: float(evaluation.score[a]))
+    return Decision(
+        chosen,
+        q=np.asarray(q, np.float32),
+        safety_score=evaluation.score.astype(np.float32),
+        unsafe=evaluation.unsafe,
+        ttc=evaluation.ttc.astype(np.float32),
+        blamed=evaluation.blamed[preferred],
+        vetoed=bool(evaluation.unsafe[preferred]),
+        fallback=fallback,
+    )
+
+
+def evaluate(
+    b: int,
+    scene: Scene,
+    traffic: Traffic,
+    road: RoadMap,
+    config: SafetyConfig,
+    intended: Bools,
+) -> Evaluation:
+    """Algorithm 2 for AV `b`, all five actions at once; `intended` [V]: whose rollout is a shared intention."""
+    c, history = config, scene.histories[b]
+    me = int(scene.ego[b])
+    length = float(traffic.length[me])
+    ways = _ways(history, road, int(scene.lane[me]))
+    paths = [w.path for w in ways]
+    packed = pack(paths)
+    x, y = float(history.pose[0]), float(history.pose[1])
+    place = [
+        project(packed.points, packed.arc, packed.start[k], packed.start[k + 1], x, y, history.route.arc)
+        for k in range(len(paths))
+    ]
+    ego = _roll_ego(history, paths, packed, place, scene.state[me, -1], c)
+    others = _others(b, me, scene, traffic, road)
+    contact = np.full(len(ACTIONS), np.inf)  # s
+    limit = np.full(len(ACTIONS), np.inf)  # score allowed by the leader and follower limits
+    blamed: list[str | None] = [None] * len(ACTIONS)
+    if len(others):
+        touch = _first_contact(ego, traffic, me, others, c)  # [A,O] s
+        for a, way in enumerate(ways):
+            near = _Neighbours.of(way.path, ego.arc[a, 0], length, others, traffic, scene.state[me, -1], c)
+            times = np.where(near.behind, np.inf, touch[a])  # followers brake: checked below for changes
+            first = int(np.argmin(times))
+            contact[a] = times[first]
+            if np.isfinite(times[first]):
+                blamed[a] = scene.vehicles[others[first]]
+            allowed, who = _margin(a, way.changes, ego, near, traffic, others, intended, c)
+            if allowed < c.safe_th:
+                limit[a] = allowed
+                if contact[a] > c.horizon + c.critical_th:
+                    blamed[a] = scene.vehicles[others[who]]
+    for a, way in enumerate(ways):
+        if way.path.dead_end:  # an obstacle at its end
+            over = ego.arc[a] + 0.5 * length + 0.5 > way.path.length
+            if over.any() and c.dt * int(np.argmax(over)) < contact[a]:
+                contact[a], blamed[a] = c.dt * int(np.argmax(over)), LANE_END
+    steps = c.dt * np.arange(1, round(c.horizon / c.dt) + 1)  # [M] s
+    weight = np.exp(-c.decay * (steps - steps[0]))
+    remaining = np.clip(contact[:, None] - steps, 0.0, c.cap)  # [A,M]: T - h
+    score = np.minimum(remaining @ weight / weight.sum(), limit)
+    unsafe = (score < c.safe_th) | (remaining.min(1) < c.critical_th)
+    for a, way in enumerate(ways):
+        if way.forbidden is not None:
+            unsafe[a], score[a], blamed[a] = True, -1.0, way.forbidden
+    blamed = [who if bad else None for who, bad in zip(blamed, unsafe, strict=True)]
+    return Evaluation(np.minimum(contact, c.cap), score, unsafe, tuple(blamed), ego)
+
+
+def front_to_back(scene: Scene, config: SafetyConfig) -> list[int]:
+    """The order in which AVs decide: always the one with the fewest undecided AVs ahead of it.
+
+    `a` is ahead of `b` when it lies before b's nose and drives the same way; on crossing ways the one that is
+    nearer to the conflict zone is. Equal counts go by id.
+    """
+    count = len(scene.agents)
+    x, y, heading = scene.pose.T
+    dx, dy = x[None, :] - x[:, None], y[None, :] - y[:, None]  # [b,a] of a as seen from b
+    ahead_by = dx * np.cos(heading)[:, None] + dy * np.sin(heading)[:, None]
+    turn = np.abs((heading[None, :] - heading[:, None] + np.pi) % (2 * np.pi) - np.pi)
+    near = dx * dx + dy * dy < 150.0**2  # m: further away nobody cares
+    conflict = np.array([h.route.conflict_distance for h in scene.histories])
+    same = turn < config.same_way
+    ahead = near & np.where(same, ahead_by > 0.0, conflict[None, :] < conflict[:, None])
+    np.fill_diagonal(ahead, False)
+    order: list[int] = []
+    waiting = ahead.sum(1).astype(np.int64)
+    for _ in range(count):
+        b = int(np.argmin(waiting))
+        order.append(b)
+        waiting -= ahead[:, b]
+        waiting[b] = np.iinfo(np.int64).max // 2
+    return order
+
+
+class _Way(NamedTuple):
+    """Where one action leads."""
+
+    path: LanePath
+    changes: bool  # to another lane
+    forbidden: str | None  # why it cannot be done
+
+
+def _ways(history: History, road: RoadMap, lane: int) -> list[_Way]:
+    """[A] the path of every action. While a lane change is under way all of them end in its target lane."""
+    left, keep, right = history.route.paths
+    assert keep is not None
+    under_way = history.lane_changing
+    if under_way:
+        # the lane index flips half way: before that the target lane is the neighbour
+        _, offset = project(keep.points, keep.arc, 0, len(keep.arc), *history.pose[:2], history.route.arc)
+        side = left if under_way > 0 else right
+        if offset * under_way > 0.05 and side is not None:
+            keep = side
+    ways = []
+    for action in ACTIONS:
+        index = SIDE.get(action)
+        if index is None:
+            ways.append(_Way(keep, False, None))
+            continue
+        target = history.route.paths[index]
+        if target is None or under_way or road.lanes[lane].internal:
+            ways.append(_Way(keep, False, ROAD_EDGE if target is None else "(lane change under way)"))
+            continue
+        worse = target.dead_end and (
+            not keep.dead_end or target.length - history.route.arc < keep.length - history.route.arc - 1.0
+        )
+        ways.append(_Way(target, True, LANE_END if worse else None))
+    return ways
+
+
+def _roll_ego(
+    history: History,
+    paths: list[LanePath],
+    packed: Paths,
+    place: list[tuple[float, float]],
+    now: Floats,
+    c: SafetyConfig,
+) -> Rollout:
+    """The ego under every action [A,T+1]."""
+    targets = np.array(
+        [next_target(history.target_speed, a, history.route.speed_limit) for a in ACTIONS], np.float64
+    )
+    speed = tracked_speeds(float(now[2]), targets, c.frames, c.dt)
+    offset = np.array([p[1] for p in place])
+    wide = np.abs(offset) > 0.5 * c.lane_half  # a lane change, new or under way, at SUMO's sideways speed
+    rate = np.where(wide, np.maximum(np.abs(offset), 2 * c.lane_half) / LANE_CHANGE_TIME, 1.0)
+    return roll_out(
+        packed,
+        np.array([p[0] for p in place]),
+        offset,
+        rate,
+        speed,
+        np.full(len(paths), np.inf),
+        MAX_DECEL,
+        c.dt,
+    )
+
+
+def _others(b: int, me: int, scene: Scene, traffic: Traffic, road: RoadMap) -> npt.NDArray[np.int64]:
+    """Vehicles that this AV knows and can touch."""
+    rows = scene.row[b, 1:]
+    rows = rows[rows >= 0]
+    rows = rows[traffic.known[rows]]
+    lane = int(scene.lane[me])
+    return np.array([k for k in rows if road.connected(lane, int(scene.lane[k]))], np.int64)
+
+
+def _first_contact(
+    ego: Rollout, traffic: Traffic, me: int, others: npt.NDArray[np.int64], c: SafetyConfig
+) -> Floats:
+    """When the ego's box first touches each other's: [A,O] s, inf for never.
+
+    Between two frames both boxes keep their velocity, so nothing is jumped over.
+    """
+    r = traffic.rollout
+    mine = Boxes(
+        ego.x[:, None],
+        ego.y[:, None],
+        ego.heading[:, None],
+        traffic.length[me] + c.margin_length,
+        traffic.width[me] + c.margin_width,
+        ego.speed[:, None],
+    )
+    frames = ego.x.shape[1]
+    theirs = Boxes(
+        r.x[None, others, :frames],
+        r.y[None, others, :frames],
+        r.heading[None, others, :frames],
+        traffic.length[others][None, :, None],
+        traffic.width[others][None, :, None],
+        r.speed[None, others, :frames],
+    )
+    ttc = time_to_collision(mine, theirs, c.dt)  # [A,O,T+1], c.dt where nothing happens before the next frame
+    hit = ttc < c.dt
+    step = np.argmax(hit, 2)
+    when = c.dt * step + np.take_along_axis(ttc, step[:, :, None], 2)[:, :, 0]
+    return np.where(hit.any(2), when, np.inf)
+
+
+class _Neighbours(NamedTuple):
+    """The others as they stand to one path of the ego now."""
+
+    in_lane: Bools  # [O] in the path's lane, or moving into it
+    gap: Floats  # [O] m, bumper to bumper; negative when side by side
+    ahead: Bools  # [O] drives before the ego
+    behind: Bools  # [O] follows the ego in this lane
+
+    @staticmethod
+    def of(
+        path: LanePath,
+        arc: float,
+        length: float,
+        others: npt.NDArray[np.int64],
+        traffic: Traffic,
+        now: Floats,
+        c: SafetyConfig,
+    ) -> _Neighbours:
+        """`arc`: the ego's place on the path, m; `now`: its state."""
+        r = traffic.rollout
+        theirs, offset = project_all(path.points, path.arc, r.x[others, 0], r.y[others, 0])
+        soon = min(5, r.x.shape[1] - 1)  # 1 s ahead: who drifts in is in
+        _, later = project_all(path.points, path.arc, r.x[others, soon], r.y[others, soon])
+        turn = np.abs((r.heading[others, 0] - now[3] + np.pi) % (2 * np.pi) - np.pi)
+        same = turn < c.same_way
+        in_lane = same & (np.minimum(np.abs(offset), np.abs(later)) < c.lane_half)
+        distance = theirs - arc
+        gap = np.abs(distance) - 0.5 * (length + traffic.length[others])
+        return _Neighbours(in_lane, gap, in_lane & (distance > 0), in_lane & (distance < 0) & (gap > 0))
+
+
+def _margin(
+    action: int,
+    changes: bool,
+    ego: Rollout,
+    near: _Neighbours,
+    traffic: Traffic,
+    others: npt.NDArray[np.int64],
+    intended: Bools,
+    c: SafetyConfig,
+) -> tuple[float, int]:
+    """The score (s) that the leader and, for lane changes, the new follower leave, and who limits it.
+
+    Leader: if it brakes with `leader_brake` from now on, and the ego with full force after one more decision,
+    they must not touch. Follower: it must not have to brake harder than `follower_brake`. At the limit the
+    score is safe_th, below it falls with the gap. Decelerating never makes either worse.
+    """
+    best, who = np.inf, 0
+    speed = traffic.rollout.speed[others, 0]
+    if action != MetaAction.DECELERATE:
+        after = float(ego.speed[action, round(c.reaction / c.dt)])
+        travelled = float(ego.arc[action, round(c.reaction / c.dt)] - ego.arc[action, 0])
+        need = travelled + after**2 / (2 * MAX_DECEL) - speed**2 / (2 * c.leader_brake) + c.standstill_gap
+        # a connected leader tells when it brakes, in time to brake with it
+        hold = near.ahead & ~intended[others] & (near.gap < need)
+        if hold.any():
+            ratio = np.where(hold, np.maximum(near.gap, 0.0) / np.maximum(need, 1e-6), np.inf)
+            who = int(np.argmin(ratio))
+            best = 0.999 * c.safe_th * float(ratio[who])
+    if changes:
+        closing = np.maximum(speed - ego.speed[action, 0], 0.0)
+        need = c.follower_gap + speed * c.follower_reaction + closing**2 / (2 * c.follower_brake)
+        hold = near.behind & (near.gap < need)
+        if hold.any():
+            ratio = np.where(hold, np.maximum(near.gap, 0.0) / np.maximum(need, 1e-6), np.inf)
+            k = int(np.argmin(ratio))
+            if 0.999 * c.safe_th * float(ratio[k]) < best:
+                best, who = 0.999 * c.safe_th * float(ratio[k]), k
+    return best, who

@@ -1,0 +1,338 @@
+"""Bad input is refused before SUMO sees it, with file, field and value; good input passes."""
+
+import gzip
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from cosim import vet as vetting
+from cosim import xml_input
+from cosim.errors import BadInput
+from cosim.scenario import Fleet, load
+from cosim.vet import VetReport, vet
+
+NET = """<net version="1.20">
+  <location netOffset="0,0" convBoundary="0,0,1000,0" origBoundary="0,0,1000,0" projParameter="!"/>
+  <edge id=":b_0" function="internal">
+    <lane id=":b_0_0" index="0" speed="25" length="0.1" shape="500,-4.8 500,-4.8"/>
+    <lane id=":b_0_1" index="1" speed="25" length="0.1" shape="500,-1.6 500,-1.6"/>
+  </edge>
+  <edge id="ab" from="a" to="b" priority="-1">
+    <lane id="ab_0" index="0" speed="25" length="500" shape="0,-4.8 500,-4.8"/>
+    <lane id="ab_1" index="1" speed="25" length="500" shape="0,-1.6 500,-1.6"/>
+  </edge>
+  <edge id="bc" from="b" to="c" priority="-1">
+    <lane id="bc_0" index="0" speed="25" length="500" shape="500,-4.8 1000,-4.8"/>
+    <lane id="bc_1" index="1" speed="25" length="500" shape="500,-1.6 1000,-1.6"/>
+  </edge>
+  <junction id="a" type="dead_end" x="0" y="0" incLanes="" intLanes="" shape="0,0 0,-6.4"/>
+  <junction id="b" type="priority" x="500" y="0" incLanes="ab_0 ab_1" intLanes=":b_0_0 :b_0_1"
+            shape="500,0 500,-6.4">
+    <request index="0" response="00" foes="00" cont="0"/>
+    <request index="1" response="00" foes="00" cont="0"/>
+  </junction>
+  <junction id="c" type="dead_end" x="1000" y="0" incLanes="bc_0 bc_1" intLanes="" shape="1000,-6.4 1000,0"/>
+  <connection from="ab" to="bc" fromLane="0" toLane="0" via=":b_0_0" dir="s" state="M"/>
+  <connection from="ab" to="bc" fromLane="1" toLane="1" via=":b_0_1" dir="s" state="M"/>
+  <connection from=":b_0" to="bc" fromLane="0" toLane="0" dir="s" state="M"/>
+  <connection from=":b_0" to="bc" fromLane="1" toLane="1" dir="s" state="M"/>
+</net>"""
+ROUTES = """<routes>
+  <vType id="car" carFollowModel="IDM" length="5" tau="1.2" speedFactor="normc(1,0.1,0.2,2)" lcSpeedGain="3"/>
+  <route id="r" edges="ab bc"/>
+  <vehicle id="v0" type="car" route="r" depart="0" departPos="-20" departSpeed="max" departLane="best"/>
+  <flow id="f" type="car" route="r" begin="0:00:01" end="10" period="exp(0.5)"/>
+  <trip id="t0" from="ab" to="bc" depart="3"><stop lane="bc_1" endPos="-5" duration="3"/></trip>
+  <vehicle id="v1" depart="triggered"><route edges="ab bc"/></vehicle>
+</routes>"""
+ADDITIONAL = """<additional>
+  <inductionLoop id="x" lane="ab_0" pos="10" period="60" file="loop.xml"/>
+  <vType id="truck" length="12"/>
+</additional>"""
+
+Case = Callable[..., VetReport]
+
+
+@pytest.fixture
+def case(tmp_path: Path) -> Case:
+    """Write the three files (or the bytes given instead), load the scenario and vet it."""
+
+    def run(
+        net: str | bytes = NET,
+        routes: str | bytes = ROUTES,
+        additional: str | bytes = ADDITIONAL,
+        fleet: Fleet | None = None,
+    ) -> VetReport:
+        for name, text in (("n.net.xml", net), ("r.rou.xml", routes), ("a.add.xml", additional)):
+            (tmp_path / name).write_bytes(text.encode() if isinstance(text, str) else text)
+        config = tmp_path / "c.sumocfg"
+        config.write_text(
+            '<configuration><net-file value="n.net.xml"/><route-files value="r.rou.xml"/>'
+            '<additional-files value="a.add.xml"/></configuration>'
+        )
+        return vet(load(str(config), fleet=fleet))
+
+    return run
+
+
+def refused(run: Callable[[], object], file: str, field: str, value: object, word: str) -> None:
+    """`run` raises BadInput that names all three, in one line."""
+    with pytest.raises(BadInput) as caught:
+        run()
+    error = caught.value
+    assert Path(error.file or "").name == file
+    assert error.field == field
+    assert str(error.value) == str(value)
+    assert word in str(error)
+    assert "\n" not in str(error)
+
+
+def test_good_files_pass_and_are_counted(case: Case) -> None:
+    report = case()
+    assert (report.edges, report.vehicles, report.flows, report.warnings) == (2, 3, 1, ())
+    assert report.outputs == ("loop.xml",)
+
+
+def test_gzip_files_pass_whatever_their_names_say(case: Case) -> None:
+    packed = case(net=gzip.compress(NET.encode()), routes=gzip.compress(ROUTES.encode()))
+    assert packed.vehicles == 3
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "field", "value", "word"),
+    [
+        (' version="1.20"', "", "net.version", "", "missing"),
+        ('version="1.20"', 'version="99.0"', "net.version", "99.0", "version"),
+        ('version="1.20"', 'version="new"', "net.version", "new", "version"),
+        ("</net>", "", "line", 32, "truncated"),
+        ("<net ", "<routes ", "root", "routes", "wrong root"),
+        (
+            'speed="25" length="500" shape="0,-4.8',
+            'speed="-25" length="500" shape="0,-4.8',
+            "lane.speed",
+            "-25",
+            "",
+        ),
+        ('length="500" shape="0,-4.8', 'length="nan" shape="0,-4.8', "lane.length", "nan", "finite"),
+        ('length="500" shape="0,-4.8', 'length="0" shape="0,-4.8', "lane.length", "0", "more than 0"),
+        ('length="500" shape="0,-4.8', 'length="" shape="0,-4.8', "lane.length", "", "not a number"),
+        ('shape="0,-4.8 500,-4.8"', 'shape="0,-4.8 inf,-4.8"', "lane.shape", "0,-4.8 inf,-4.8", "finite"),
+        ('shape="0,-4.8 500,-4.8"', 'shape="0,-4.8"', "lane.shape", "0,-4.8", "two points"),
+        ('id="ab_1" index="1"', 'id="ab_2" index="2"', "lane.index", "2", "1 is due"),
+        ('id="ab_1" index="1"', 'id="zz_1" index="1"', "lane.id", "zz_1", "ab_1"),
+        ('<edge id="bc"', '<edge id="ab"', "edge.id", "ab", "twice"),
+        (
+            'to="bc" fromLane="1" toLane="1" via',
+            'to="bx" fromLane="1" toLane="1" via',
+            "connection.to",
+            "bx",
+            "edge",
+        ),
+        (
+            'fromLane="1" toLane="1" via',
+            'fromLane="1" toLane="4" via',
+            "connection.toLane",
+            "4",
+            "no such lane",
+        ),
+        ('via=":b_0_1"', 'via=":b_9_1"', "connection.via", ":b_9_1", "no such lane"),
+        (
+            'intLanes=":b_0_0 :b_0_1"',
+            'intLanes=":b_0_0 :b_7_1"',
+            "junction.intLanes",
+            ":b_7_1",
+            "no such lane",
+        ),
+        (
+            '<connection from="ab" to="bc" fromLane="1" toLane="1" via=":b_0_1" dir="s" state="M"/>',
+            "",
+            "junction.id",
+            "b",
+            "2 right-of-way rows for 1 connections",
+        ),
+    ],
+)
+def test_a_bad_net_is_refused(case: Case, old: str, new: str, field: str, value: object, word: str) -> None:
+    assert old in NET
+    refused(lambda: case(net=NET.replace(old, new, 1)), "n.net.xml", field, value, word)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "field", "value", "word"),
+    [
+        ('edges="ab bc"', 'edges="ab bd"', "route.edges", "bd", "did you mean 'bc'?"),
+        ('to="bc" depart', 'to="xy" depart', "trip.to", "xy", "no such edge in n.net.xml"),
+        ('lane="bc_1"', 'lane="bc_2"', "stop.lane", "bc_2", "no such lane"),
+        ('type="car" route="r" depart', 'type="cra" route="r" depart', "vehicle.type", "cra", "'car'"),
+        ('route="r" begin', 'route="q" begin', "flow.route", "q", "no such route"),
+        ('id="t0"', 'id="v0"', "trip.id", "v0", "twice, first in line 4"),
+        ('length="5"', 'length="-5"', "vType.length", "-5", "more than 0"),
+        ('length="5"', 'length="NaN"', "vType.length", "NaN", "finite"),
+        ('tau="1.2"', 'tau="inf"', "vType.tau", "inf", "finite"),
+        ('tau="1.2"', 'accel="-1"', "vType.accel", "-1", "more than 0"),
+        ('tau="1.2"', 'minGap="-0.1"', "vType.minGap", "-0.1", "at least 0"),
+        ('tau="1.2"', 'sigma="1.5"', "vType.sigma", "1.5", "at most 1"),
+        ("normc(1,0.1,0.2,2)", "normc(1,nan,0.2,2)", "vType.speedFactor", "normc(1,nan,0.2,2)", "finite"),
+        ('lcSpeedGain="3"', 'lcSpeedGian="3"', "vType.lcSpeedGian", "3", "did you mean 'lcSpeedGain'?"),
+        ('lcSpeedGain="3"', 'lcfoo="3"', "vType.lcfoo", "3", "unknown lane-change attribute"),
+        ('lcSpeedGain="3"', 'lcAssertive="-3"', "vType.lcAssertive", "-3", "at least 0"),
+        ('lcSpeedGain="3"', 'jmTimegapMinr="3"', "vType.jmTimegapMinr", "3", "'jmTimegapMinor'"),
+        ('depart="3"', 'depart="-3"', "trip.depart", "-3", "at least 0"),
+        ('depart="3"', 'depart="nan"', "trip.depart", "nan", "finite"),
+        ('departPos="-20"', 'departPos="nan"', "vehicle.departPos", "nan", "finite"),
+        ('departSpeed="max"', 'departSpeed="-1"', "vehicle.departSpeed", "-1", "at least 0"),
+        ('departLane="best"', 'departLane="-1"', "vehicle.departLane", "-1", "at least 0"),
+        ('end="10"', 'end="-10"', "flow.end", "-10", "at least 0"),
+        ('period="exp(0.5)"', 'vehsPerHour="-9"', "flow.vehsPerHour", "-9", "at least 0"),
+        ('period="exp(0.5)"', 'number="2000000"', "flow.number", "2000000", "at most"),
+        ("</routes>", '<include href="gone.xml"/></routes>', "include.href", "gone.xml", "no such file"),
+        ("</routes>", '<include href="r.rou.xml"/></routes>', "include.href", None, "never end"),
+        ("<routes>", "<net>", "root", "net", "<routes>"),
+    ],
+)
+def test_bad_demand_is_refused(
+    case: Case, tmp_path: Path, old: str, new: str, field: str, value: object, word: str
+) -> None:
+    text = ROUTES.replace(old, new, 1)
+    assert text != ROUTES
+    if old == "<routes>":
+        text = text.replace("</routes>", "</net>")
+    wanted = str(tmp_path / "r.rou.xml") if value is None else value
+    refused(lambda: case(routes=text), "r.rou.xml", field, wanted, word)
+
+
+@pytest.mark.parametrize(
+    ("text", "field", "value", "word"),
+    [
+        ("<net/>", "root", "net", "wrong root"),
+        (
+            '<additional><e1Detector id="d" lane="zz_0"/></additional>',
+            "e1Detector.lane",
+            "zz_0",
+            "no such lane",
+        ),
+        ('<additional><vType id="t" width="nan"/></additional>', "vType.width", "nan", "finite"),
+        (
+            '<a><vType id="t"><carFollowing-IDM tau="-1"/></vType></a>',
+            "carFollowing-IDM.tau",
+            "-1",
+            "more than",
+        ),
+    ],
+)
+def test_a_bad_additional_file_is_refused(case: Case, text: str, field: str, value: str, word: str) -> None:
+    refused(lambda: case(additional=text), "a.add.xml", field, value, word)
+
+
+@pytest.mark.parametrize(
+    ("content", "field", "value", "word"),
+    [
+        (b"", "size", 0, "empty"),
+        (b"not xml at all", "line", 1, "not well-formed"),
+        (b"<routes><vehicle id='a'</routes>", "line", 1, "not well-formed"),
+        (b"<routes>\n<vehicle id='\xe4'/></routes>", "byte", "0xe4", "not UTF-8 (line 2"),
+        (b"<?xml version='1.0' encoding='ISO-8859-1'?><routes/>", "encoding", "ISO-8859-1", "not UTF-8"),
+        ("<routes/>".encode("utf-16"), "encoding", "UTF-16", "not UTF-8"),
+        (b"<!DOCTYPE r [<!ENTITY a 'ha'>]><routes>&a;</routes>", "ENTITY", "a", "entities"),
+        (b"<!DOCTYPE r [<!ENTITY % a SYSTEM 'file:///etc/passwd'>]><routes/>", "ENTITY", "a", "entities"),
+        (
+            b"<!DOCTYPE r SYSTEM 'http://example.org/x.dtd'><routes/>",
+            "DOCTYPE",
+            "http://example.org/x.dtd",
+            "ext",
+        ),
+        (gzip.compress(ROUTES.encode())[:-30], "gzip byte", 0, "broken gzip"),
+        (b"\x1f\x8b" + b"garbage" * 9, "gzip byte", 0, "broken gzip"),
+        (b"<routes>" + b"<param>" * 100_000, "element", "param", "deeper than 64"),
+        (b"<routes>" + b"<param key='a'/>" * 3, "line", 1, "inside <routes>"),
+    ],
+)
+def test_hostile_bytes_are_refused(case: Case, content: bytes, field: str, value: object, word: str) -> None:
+    refused(lambda: case(routes=content), "r.rou.xml", field, value, word)
+
+
+def test_a_billion_laughs_are_not_laughed(case: Case) -> None:
+    levels = "".join(f"<!ENTITY l{i} '{f'&l{i - 1};' * 10}'>" for i in range(1, 10))
+    bomb = f"<!DOCTYPE r [<!ENTITY l0 'ha'>{levels}]><routes>&l9;</routes>"
+    refused(lambda: case(routes=bomb), "r.rou.xml", "ENTITY", "l0", "entities")
+
+
+def test_a_gzip_bomb_stops_at_the_cap(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(xml_input, "MAX_UNPACKED", 1 << 20)
+    bomb = gzip.compress(b"<routes>" + b" " * (4 << 20) + b"</routes>")
+    with pytest.raises(BadInput, match="unpacks to more than 1 MiB"):
+        case(routes=bomb)
+
+
+def test_one_endless_tag_is_refused(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(xml_input, "MAX_TOKEN", 1 << 20)
+    with pytest.raises(BadInput, match="longer than 1 MiB"):
+        case(routes=b"<routes><!-- " + b"a" * (3 << 20))
+
+
+def test_a_fifo_is_refused_instead_of_waited_for(case: Case, tmp_path: Path) -> None:
+    case()
+    (tmp_path / "a.add.xml").unlink()
+    os.mkfifo(tmp_path / "a.add.xml")
+    with pytest.raises(BadInput, match="regular file"):
+        vet(load(str(tmp_path / "c.sumocfg")))
+
+
+def test_the_av_type_must_be_in_the_demand(case: Case) -> None:
+    assert case(fleet=Fleet(type="car")).vehicles == 3
+    assert case(fleet=Fleet(type="truck")).vehicles == 3  # from the additional file
+    refused(lambda: case(fleet=Fleet(type="cra")), "c.sumocfg", "fleet.type", "cra", "'car'")
+
+
+def test_unsorted_departures_are_a_warning_because_sumo_drops_them(case: Case) -> None:
+    late = '<vehicle id="late" route="r" depart="50"/><vehicle id="early" route="r" depart="20"/></routes>'
+    (warning,) = case(routes=ROUTES.replace("</routes>", late)).warnings
+    assert "drops 1 of them (early)" in warning
+    loaded_whole = ADDITIONAL.replace("</additional>", late.replace("</routes>", "</additional>"))
+    assert case(additional=loaded_whole).warnings == ()
+
+
+def test_a_route_without_a_connection_is_a_warning(case: Case) -> None:
+    (warning,) = case(routes=ROUTES.replace('edges="ab bc"', 'edges="bc ab"', 1)).warnings
+    assert "no connection from 'bc' to 'ab'" in warning
+
+
+def test_attributes_that_do_nothing_are_warnings(case: Case) -> None:
+    text = ROUTES.replace('tau="1.2"', 'tau="1.2" minGab="2" lcSublane="1"')
+    first, second = case(routes=text).warnings
+    assert "'minGab', did you mean 'minGap'?" in first
+    assert "lcSublane only work with SL2015" in second
+
+
+def test_the_same_vehicle_in_two_files_is_refused(case: Case) -> None:
+    twice = '<additional><vehicle id="v0" route="r" depart="9"/></additional>'
+    refused(lambda: case(additional=twice), "r.rou.xml", "vehicle.id", "v0", "is also in")
+
+
+def test_an_include_is_vetted_too(case: Case, tmp_path: Path) -> None:
+    (tmp_path / "types.xml").write_text('<routes><vType id="bus" length="-1"/></routes>')
+    text = ROUTES.replace("<routes>", '<routes><include href="types.xml"/>')
+    refused(lambda: case(routes=text), "types.xml", "vType.length", "-1", "more than 0")
+
+
+def test_a_file_is_read_again_only_when_it_has_changed(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    reads: list[Path] = []
+    whole = vetting.read_net
+
+    def counted(path: Path) -> object:
+        reads.append(path)
+        return whole(path)
+
+    monkeypatch.setattr(vetting, "read_net", counted)
+    vetting._net.cache_clear()
+    case()
+    scenario = load(str(reads[0].parent / "c.sumocfg"))
+    vet(scenario)
+    vet(scenario)
+    assert len(reads) == 1
+    reads[0].write_text(NET.replace('speed="25"', 'speed="-2.5"'))
+    with pytest.raises(BadInput, match=r"lane\.speed"):
+        vet(scenario)
+    assert len(reads) == 2

@@ -80,7 +80,8 @@ class HPN(nn.Module):
         )
         if c.correct:
             last = self.decoder[2]
-            assert isinstance(last, nn.ConvTranspose2d) and last.bias is not None
+            assert isinstance(last, nn.ConvTranspose2d)
+            assert last.bias is not None
             nn.init.zeros_(last.weight)
             nn.init.zeros_(last.bias)
 

@@ -6,6 +6,7 @@ at a given rate (a lane change, or what is left of one). Its box is turned into 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -58,9 +59,9 @@ def next_target(target: float, action: int, speed_limit: float) -> float:
     top = speed_limit + SPEED_MARGIN
     level = target / SPEED_STEP
     if action == MetaAction.ACCELERATE:
-        return min((np.floor(level + 1e-6) + 1.0) * SPEED_STEP, top)
+        return min((math.floor(level + 1e-6) + 1.0) * SPEED_STEP, top)
     if action == MetaAction.DECELERATE:
-        return min(max((np.ceil(level - 1e-6) - 1.0) * SPEED_STEP, 0.0), top)
+        return min(max((math.ceil(level - 1e-6) - 1.0) * SPEED_STEP, 0.0), top)
     return top if target >= top else min(round(level) * SPEED_STEP, top)
 
 
@@ -79,7 +80,7 @@ def tracked_speeds(speed: float, targets: Floats, frames: int, dt: float) -> Flo
     return out
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def project(
     points: Floats, arc: Floats, first: int, last: int, x: float, y: float, around: float
 ) -> tuple[float, float]:
@@ -107,7 +108,7 @@ def project(
     return best_arc, best_offset
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def project_many(
     points: Floats, arc: Floats, start: Ints, x: Floats, y: Floats, around: Floats
 ) -> tuple[Floats, Floats]:
@@ -119,7 +120,7 @@ def project_many(
     return out_arc, out_offset
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def project_all(points: Floats, arc: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
     """`project` of every point [k] onto one path."""
     n = x.shape[0]
@@ -129,7 +130,7 @@ def project_all(points: Floats, arc: Floats, x: Floats, y: Floats) -> tuple[Floa
     return out_arc, out_offset
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def roll(
     points: Floats,
     arc: Floats,

@@ -142,7 +142,10 @@ def evaluate(
     config: SafetyConfig,
     intended: Bools,
 ) -> Evaluation:
-    """Algorithm 2 for AV `b`, all five actions at once; `intended` [V]: whose rollout is a shared intention."""
+    """Algorithm 2 for AV `b`, all five actions at once.
+
+    `intended` [V]: whose rollout is a shared intention, not a prediction.
+    """
     c, history = config, scene.histories[b]
     me = int(scene.ego[b])
     length = float(traffic.length[me])
@@ -231,7 +234,8 @@ def _ways(history: History, road: RoadMap, lane: int) -> list[_Way]:
     under_way = history.lane_changing
     if under_way:
         # the lane index flips half way: before that the target lane is the neighbour
-        _, offset = project(keep.points, keep.arc, 0, len(keep.arc), *history.pose[:2], history.route.arc)
+        x, y = float(history.pose[0]), float(history.pose[1])
+        _, offset = project(keep.points, keep.arc, 0, len(keep.arc), x, y, history.route.arc)
         side = left if under_way > 0 else right
         if offset * under_way > 0.05 and side is not None:
             keep = side

@@ -7,6 +7,7 @@ import json
 import math
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 from cosim.errors import CosimError
 from cosim.scenario import Fleet
@@ -50,12 +51,12 @@ def parser() -> argparse.ArgumentParser:
         help="drive one episode of a scenario",
         description="Drive one episode. Everything after -- goes to SUMO as it stands.",
     )
-    run.add_argument("what", metavar="WHAT", help="a scenario's name (cosim scenarios) or a path to any .sumocfg")
+    run.add_argument("what", metavar="WHAT", help="a scenario's name (cosim scenarios) or any .sumocfg")
     run.add_argument(
         "--demand", action="append", default=[], metavar="NAME|FILE", help="demand by name, or route files"
     )
     run.add_argument("--policy", default="idm", metavar="NAME", help="who commands the AVs (default idm)")
-    run.add_argument("--svo", type=_degrees, default=45.0, metavar="DEG", help="social value orientation, 0..90")
+    run.add_argument("--svo", type=_degrees, default=45.0, metavar="DEG", help="SVO angle, 0..90")
     run.add_argument("--behavior", choices=BEHAVIORS, help="Table II class of the human drivers")
     run.add_argument("--driver-model", choices=DRIVER_MODELS, default="lc2013")
     run.add_argument("--preset", choices=Preset.ALL, help="who guards the AVs (default: the scenario's)")
@@ -64,7 +65,7 @@ def parser() -> argparse.ArgumentParser:
     fleet.add_argument("--av-ids", metavar="REGEX", help="AVs are the vehicles whose id matches")
     fleet.add_argument("--penetration", type=_share, metavar="P", help="this share of vehicles are AVs, 0..1")
     run.add_argument("--seed", type=_seed, default=200_000, metavar="N")
-    run.add_argument("--duration", type=_positive, metavar="S", help="counted seconds (default: the scenario's)")
+    run.add_argument("--duration", type=_positive, metavar="S", help="counted s (default: the scenario's)")
     run.add_argument("--out", metavar="DIR", help="write the run folder here")
     run.add_argument("--json", action="store_true", help="print exactly one JSON document on stdout")
     run.set_defaults(work=_run)
@@ -123,7 +124,7 @@ def _scenarios(args: argparse.Namespace) -> int:
     from cosim.scenario import load
     from sumo_scenarios import names
 
-    rows = []
+    rows: list[dict[str, Any]] = []
     for name in names():
         s = load(name)
         rows.append(

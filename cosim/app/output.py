@@ -64,12 +64,11 @@ def table(result: EpisodeResult) -> str:
         f"  behaviour {result.behavior}, drivers {result.driver_model}, preset {result.preset}, "
         f"svo {result.svo_deg:g} deg, seed {result.seed}, {result.steps} decisions",
     ]
-    for name in HEADLINE:
-        if name in result.metrics:
-            lines.append(f"  {name:<24} {_text(result.metrics[name])}")
+    shown = [name for name in HEADLINE if name in result.metrics]
+    lines += [f"  {name:<24} {_text(result.metrics[name])}" for name in shown]
     for c in result.collisions:
-        who = "AV-caused" if c.av_caused else "not AV-caused"
-        lines.append(f"  collision at {c.time:.1f} s: {c.collider} hit {c.victim} on {c.lane} ({c.kind}, {who})")
+        who = f"{c.kind}, {'AV-caused' if c.av_caused else 'not AV-caused'}"
+        lines.append(f"  collision at {c.time:.1f} s: {c.collider} hit {c.victim} on {c.lane} ({who})")
     lines += [f"  not comparable: {reason}" for reason in result.validity]
     lines.append(f"  trace_hash               {result.trace_hash}")
     times = ", ".join(f"{name.removesuffix('_s')} {value:.2f} s" for name, value in result.timings.items())

@@ -98,7 +98,7 @@ def _ttc(a: Box, b: Box, cap: float) -> float:
     apart, drift = dx * dx + dy * dy, vx * vx + vy * vy
     if dx * vx + dy * vy >= 0.0 and apart >= reach * reach:
         return cap  # drawing away from each other
-    if apart > 2.0 * (reach * reach + cap * cap * drift):  # 2 (r^2 + q^2) >= (r + q)^2
+    if cap < _HORIZON and apart > 2.0 * (reach * reach + cap * cap * drift):  # 2 (r^2 + q^2) >= (r + q)^2
         return cap  # too far to touch within `cap`
     miss = dx * vy - dy * vx
     if miss * miss >= reach * reach * drift and drift > 0.0:
@@ -144,7 +144,7 @@ def _lone_deceleration(a: Box, b: Box) -> float:
     )
     low, high, slope = np.empty(4), np.empty(4), np.empty(4)
     lines = 0
-    t0, t1 = 0.0, _HORIZON
+    t0, t1 = 0.0, 10.0 * _HORIZON  # braking lasts twice the time to collision at most
     for k in range(4):
         g = advance[k]
         if abs(g) < 1e-9:

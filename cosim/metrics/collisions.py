@@ -9,7 +9,7 @@ from cosim.types import Collision, Metric, Snapshot
 class Collisions:
     """Every pair of vehicles counts once an episode; contract.md, Episode."""
 
-    def reset(self, first: Snapshot, context: MetricContext) -> None:  # noqa: ARG002
+    def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._pairs: dict[frozenset[str], Collision] = {}
 
     def add(self, snapshot: Snapshot) -> None:

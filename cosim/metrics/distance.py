@@ -16,7 +16,7 @@ class Distance:
     warm-up) they are all that ever appeared. The mission vehicle counts whenever it appears.
     """
 
-    def reset(self, first: Snapshot, context: MetricContext) -> None:  # noqa: ARG002
+    def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._slots = Slots()
         self._driven: Floats = np.zeros(64)  # [slots] m
         self._is_av: Bools = np.zeros(64, dtype=np.bool_)

@@ -17,7 +17,7 @@ class DecelerationRate:
     NA when no such vehicle was there, 0 when none was ever on a collision course.
     """
 
-    def reset(self, first: Snapshot, context: MetricContext) -> None:  # noqa: ARG002
+    def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._largest: float | None = None
         self.add(first)
 

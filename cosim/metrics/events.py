@@ -9,7 +9,7 @@ from cosim.types import Metric, Snapshot
 class TrafficEvents:
     """Counts distinct vehicles, since SUMO repeats an emergency stop every step that it lasts."""
 
-    def reset(self, first: Snapshot, context: MetricContext) -> None:  # noqa: ARG002
+    def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._teleported: set[str] = set()
         self._stopped: set[str] = set()
 

@@ -11,7 +11,7 @@ THRESHOLD = 3.0  # m/s2, about 0.3 g: the usual bound of hard-braking events in 
 class HardBraking:
     """An event begins at a frame whose mean deceleration exceeds the threshold, unless one goes on."""
 
-    def reset(self, first: Snapshot, context: MetricContext) -> None:  # noqa: ARG002
+    def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._before = first
         self._braking: frozenset[str] = frozenset()
         self._all = self._av = 0

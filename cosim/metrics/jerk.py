@@ -11,7 +11,7 @@ from cosim.types import Floats, Kind, Metric, Snapshot
 class Jerk:
     """Second difference of the speeds of three frames in a row, mean over AVs and time."""
 
-    def reset(self, first: Snapshot, context: MetricContext) -> None:  # noqa: ARG002
+    def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._slots = Slots()
         self._speed: Floats = np.full(64, np.nan)  # [slots] m/s at the frame before, NaN while absent
         self._accel: Floats = np.full(64, np.nan)  # [slots] m/s2, mean up to the frame before

@@ -15,7 +15,7 @@ HORIZON = 10.0  # s, beyond it straight-line extrapolation says nothing (papers.
 class TimeToCollision:
     """Swept oriented boxes at constant velocity; `min_ttc_s` is NA when nobody came within 10 s."""
 
-    def reset(self, first: Snapshot, context: MetricContext) -> None:  # noqa: ARG002
+    def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._smallest = HORIZON
         self._critical = self._counted = 0  # vehicle-frames
         self.add(first)

@@ -1,4 +1,4 @@
-"""An in-memory Simulator without SUMO: a straight road, IDM followers, commanded AVs. For tests, also yours."""
+"""An in-memory Simulator without SUMO: a straight road, IDM followers, commanded AVs. For your tests."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ class FakeSimulator:
         gap = max(leader.x - leader.length - v.x, 0.1)
         dv = v.speed - speeds[leader.id]
         wanted = 2.0 + max(0.0, v.speed + v.speed * dv / (2 * np.sqrt(3.0 * 7.0)))
-        return max(3.0 * (free - (wanted / gap) ** 2), -9.0)
+        return float(max(3.0 * (free - (wanted / gap) ** 2), -9.0))
 
     def _snapshot(self) -> Snapshot:
         vs = [self._vehicles[name] for name in sorted(self._vehicles)]

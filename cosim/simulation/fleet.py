@@ -59,7 +59,7 @@ class Fleet:
         if self._rule.penetration is not None:
             return uniform(seed, "av", vehicle) < self._rule.penetration
         if self._rule.type is not None:
-            name = libsumo.vehicle.getTypeID(vehicle)
+            name: str = libsumo.vehicle.getTypeID(vehicle)
             return name == self._rule.type or name.startswith(f"{self._rule.type}@")
         return False
 

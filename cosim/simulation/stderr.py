@@ -11,7 +11,7 @@ class SumoStderr:
     """A context manager that sends file descriptor 2 to a hidden file while SUMO works."""
 
     def __init__(self) -> None:
-        self._file = tempfile.TemporaryFile()
+        self._file = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the simulator
         self._real = os.dup(2)
 
     def __enter__(self) -> SumoStderr:

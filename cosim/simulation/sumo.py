@@ -61,7 +61,7 @@ class SumoSimulator:
         self._av_parameters = dict(av_parameters or {})
         self._history = history
         self._stderr = SumoStderr()
-        self._started = False
+        self._started = self._closed = False
         _in_use = True
         timing = scenario.timing
         self._steps_per_frame = round(timing.frame / timing.step)
@@ -144,14 +144,13 @@ class SumoSimulator:
     def close(self) -> None:
         """End SUMO and free the process for another simulation."""
         global _in_use
-        if self._stderr is None:
+        if self._closed:
             return
+        self._closed = True
         if self._started:
             with self._stderr:
                 libsumo.close()
-        self._started = False
         self._stderr.close()
-        self._stderr = None  # type: ignore[assignment]
         _in_use = False
 
     # ---- inside ----

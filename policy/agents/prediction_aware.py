@@ -33,15 +33,15 @@ class AgentConfig:
     observation: ObservationConfig = COMPACT
     predicted_maps: bool = True  # False: the VFN sees the history only (Table III, `vfn`)
     predictor: str = "gp-indirect"  # of the mask and of the chain's kinematics; `cs` for `vfn`
-    chain: ChainConfig = ChainConfig()
-    hpn: HpnConfig = HpnConfig()
-    vfn: VfnConfig = VfnConfig()
-    safety: SafetyConfig = SafetyConfig()
-    traffic: TrafficConfig = TrafficConfig()
+    chain: ChainConfig = field(default_factory=ChainConfig)
+    hpn: HpnConfig = field(default_factory=HpnConfig)
+    vfn: VfnConfig = field(default_factory=VfnConfig)
+    safety: SafetyConfig = field(default_factory=SafetyConfig)
+    traffic: TrafficConfig = field(default_factory=TrafficConfig)
     init_seed: int = 0  # of untrained weights: the same in every process
     bf16: bool = False  # autocast; off, so that results do not depend on the processor
     weights: Path | None = None  # a checkpoint of policy.checkpoint; None: untrained
-    note: str = field(default="")  # goes into the label
+    note: str = ""  # goes into the label
 
 
 def compact(name: str) -> AgentConfig:

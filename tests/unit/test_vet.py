@@ -106,7 +106,7 @@ def test_gzip_files_pass_whatever_their_names_say(case: Case) -> None:
         (' version="1.20"', "", "net.version", "", "missing"),
         ('version="1.20"', 'version="99.0"', "net.version", "99.0", "version"),
         ('version="1.20"', 'version="new"', "net.version", "new", "version"),
-        ("</net>", "", "line", 32, "truncated"),
+        ("</net>", "", "line", 26, "truncated"),
         ("<net ", "<routes ", "root", "routes", "wrong root"),
         (
             'speed="25" length="500" shape="0,-4.8',

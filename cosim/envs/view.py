@@ -1,0 +1,163 @@
+"""What an agent outside the simulation's process sees of one AV, and how it crosses the pipe cheaply.
+
+A `History` carries the lane paths of its route: too much to pickle at every decision. A `View` holds what
+an agent needs of them as plain arrays, and of the N maps only the new ones cross (`Unpacker` keeps the rest).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from cosim.actions import LANE_OFFSET
+from cosim.types import Bools, Bytes, Floats, Floats32, History, MetaAction
+
+LOOK_AHEAD = np.arange(0.0, 101.0, 10.0)  # [P] m ahead of the centre: 4 s at 25 m/s, the horizon
+SIDES = ("left", "keep", "right")
+
+
+class View(NamedTuple):
+    """One AV at one decision: a `History` whose route is turned into arrays (m, m/s, rad, s).
+
+    P = 11 points 0, 10, ... 100 m ahead. Sides are left, keep, right. Masks are advice, not a guard: a
+    masked lane change is answered by a receipt that says why it was not carried out.
+    """
+
+    velocity_map: Bytes  # [N,C,H,W] pixel * 255, oldest first; [N,C,0,0] without maps
+    kinematics: Floats32  # [N,R,F] see cosim.types.KINEMATIC_FEATURES; row 0 is the AV itself
+    valid: Bools  # [N,R] whether that row was perceived at that frame
+    ids: tuple[str, ...]  # R names, "" for an empty row
+    pose: Floats  # [3] x m, y m, heading rad in the world
+    target_speed: float  # m/s, the present command (the speed while SUMO drives)
+    lane_changing: int  # +1 / -1 while a change to the left / right is under way, else 0
+    speed_limit: float  # m/s
+    to_dead_end: Floats  # [3] m until the lane stops leading on; inf: it does not, 0: there is no lane
+    conflict_distance: float  # m to the conflict zone along the present lane; inf when none is ahead
+    lane_exists: Bools  # [3]
+    centre_lines: Floats32  # [3,P,2] m in the AV's frame (x ahead, y left); 0 where there is no lane
+    action_mask: Bools  # [A] False for a lane change towards no lane, or while one is under way
+    time: float  # s
+
+    @property
+    def ego_speed(self) -> float:
+        """m/s"""
+        return float(self.kinematics[-1, 0, 2])
+
+
+class Packed(NamedTuple):
+    """Views of B AVs as a few stacked arrays: what is pickled."""
+
+    avs: tuple[str, ...]  # B
+    maps: Bytes  # [B - newcomers, k, C,H,W] the k new frames of AVs whose earlier maps were sent before
+    new_maps: Bytes  # [newcomers, N, C,H,W]
+    newcomers: tuple[str, ...]
+    kinematics: Floats32  # [B,N,R,F]
+    valid: Bools  # [B,N,R]
+    ids: tuple[tuple[str, ...], ...]
+    numbers: Floats  # [B,11] pose 3, target speed, change, limit, dead ends 3, conflict, time
+    lanes: Bools  # [B,3]
+    lines: Floats32  # [B,3,P,2]
+
+
+class Packer:
+    """The simulation's side: remembers whose maps the other side holds."""
+
+    def __init__(self) -> None:
+        self._sent: frozenset[str] = frozenset()
+
+    def pack(self, histories: Mapping[str, History], fresh: int | None) -> Packed:
+        """`fresh`: frames since the last packing; None sends whole histories (a new episode)."""
+        avs = tuple(histories)
+        known = [name for name in avs if fresh is not None and name in self._sent]
+        newcomers = tuple(name for name in avs if name not in known)
+        self._sent = frozenset(avs)
+        everyone = list(histories.values())
+        empty = np.zeros((0, 0, 0, 0, 0), np.uint8)
+        lines, exists = _lines(everyone)
+        keep = fresh or 0
+        return Packed(
+            avs=avs,
+            maps=np.stack([histories[n].velocity_map[-keep:] for n in known]) if known else empty,
+            new_maps=np.stack([histories[n].velocity_map for n in newcomers]) if newcomers else empty,
+            newcomers=newcomers,
+            kinematics=np.stack([h.kinematics for h in everyone]) if everyone else empty.astype(np.float32),
+            valid=np.stack([h.valid for h in everyone]) if everyone else empty.astype(np.bool_),
+            ids=tuple(h.ids for h in everyone),
+            numbers=np.array([_numbers(h) for h in everyone], np.float64).reshape(-1, 11),
+            lanes=exists,
+            lines=lines,
+        )
+
+
+class Unpacker:
+    """The agent's side: puts the new maps behind the ones it has."""
+
+    def __init__(self) -> None:
+        self._maps: dict[str, Bytes] = {}
+
+    def unpack(self, packed: Packed) -> dict[str, View]:
+        """AV id -> View; every array is the caller's own."""
+        maps = dict(zip(packed.newcomers, packed.new_maps, strict=True))
+        known = (name for name in packed.avs if name not in maps)
+        for name, fresh in zip(known, packed.maps, strict=True):
+            maps[name] = np.concatenate([self._maps[name][len(fresh) :], fresh])
+        self._maps = maps
+        return {name: self._view(packed, b, name) for b, name in enumerate(packed.avs)}
+
+    def _view(self, packed: Packed, b: int, name: str) -> View:
+        x, y, heading, target, change, limit, left, keep, right, conflict, time = packed.numbers[b].tolist()
+        lanes = packed.lanes[b]
+        mask = np.ones(len(MetaAction), np.bool_)
+        for action, offset in LANE_OFFSET.items():
+            mask[action] = not change and lanes[1 - offset]
+        return View(
+            velocity_map=self._maps[name],
+            kinematics=packed.kinematics[b],
+            valid=packed.valid[b],
+            ids=packed.ids[b],
+            pose=np.array([x, y, heading]),
+            target_speed=target,
+            lane_changing=int(change),
+            speed_limit=limit,
+            to_dead_end=np.array([left, keep, right]),
+            conflict_distance=conflict,
+            lane_exists=lanes,
+            centre_lines=packed.lines[b],
+            action_mask=mask,
+            time=time,
+        )
+
+
+def _numbers(h: History) -> tuple[float, ...]:
+    route = h.route
+    ends = (route.to_end(0), route.to_end(1), route.to_end(2))
+    return (
+        *h.pose,
+        h.target_speed,
+        h.lane_changing,
+        route.speed_limit,
+        *ends,
+        route.conflict_distance,
+        h.time,
+    )
+
+
+def _lines(histories: list[History]) -> tuple[Floats32, Bools]:
+    """Centre lines ahead in each AV's frame [B,3,P,2] m and which lanes there are [B,3]."""
+    lines = np.zeros((len(histories), len(SIDES), len(LOOK_AHEAD), 2), np.float32)
+    exists = np.zeros((len(histories), len(SIDES)), np.bool_)
+    for b, h in enumerate(histories):
+        x0, y0, heading = h.pose
+        c, s = np.cos(heading), np.sin(heading)
+        arc = h.route.arc + LOOK_AHEAD
+        for side, path in enumerate(h.route.paths):
+            if path is None:
+                continue
+            exists[b, side] = True
+            dx = np.interp(arc, path.arc, path.points[:, 0]) - x0  # a path that ends stays at its end
+            dy = np.interp(arc, path.arc, path.points[:, 1]) - y0
+            lines[b, side, :, 0] = c * dx + s * dy
+            lines[b, side, :, 1] = c * dy - s * dx
+    return lines, exists

@@ -49,6 +49,7 @@ class _NetReader:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._lanes: dict[str, int] = {}
+        self._origins: dict[str, str] = {}  # edge -> junction it comes from; not for internal ones
         self._ends: dict[str, str] = {}  # edge -> junction it leads to
         self._junctions: dict[str, str] = {}  # junction -> type
         self._requests: Counter[str] = Counter()  # junction -> rows of its right-of-way table
@@ -108,8 +109,10 @@ class _NetReader:
                     )
             if via and not self._has_lane(via):
                 self._refuse("connection", "via", via, "no such lane in the net", None, line)
-            if a in self._ends and not a.startswith(":") and not b.startswith(":"):  # ":J_w0" is a sidewalk
+            if a in self._ends and not b.startswith(":"):  # ":J_w0" is a sidewalk
                 counts[self._ends[a]] += 1
+        self._check_ends()
+        self._check_inside()
         self._check_junctions(counts)
         if not self._lanes:
             raise BadInput("holds no edge", file=self._path, field="net", value=0)
@@ -136,8 +139,14 @@ class _NetReader:
             self._refuse("edge", "id", edge, "is there twice", None, line)
         self._edge = edge
         self._lanes[edge] = 0
-        if "to" in attributes:
-            self._ends[edge] = attributes["to"]
+        if edge.startswith(":"):
+            if attributes.get("function") not in ("internal", "crossing", "walkingarea"):
+                self._refuse(
+                    "edge", "function", attributes.get("function", ""), "must be internal", edge, line
+                )
+            return
+        for name, ends in (("from", self._origins), ("to", self._ends)):
+            ends[edge] = self._need("edge", name, attributes, line)
 
     def _lane(self, attributes: dict[str, str], line: int) -> None:
         lane = self._need("lane", "id", attributes, line)
@@ -148,7 +157,7 @@ class _NetReader:
             return
         expected = self._lanes[self._edge]
         internal = self._edge.startswith(":")  # netconvert itself repeats an index inside junctions
-        if attributes["index"] != str(expected) and not internal:
+        if attributes["index"] != str(expected) and not (internal and int(attributes["index"]) < expected):
             gap = f"lane indices must run 0, 1, 2, ...: {expected} is due"
             self._refuse("lane", "index", attributes["index"], gap, lane, line)
         if lane != f"{self._edge}_{expected}":
@@ -156,6 +165,25 @@ class _NetReader:
         if len(attributes["shape"].split()) < 2:
             self._refuse("lane", "shape", attributes["shape"], "needs at least two points", lane, line)
         self._lanes[self._edge] = expected + 1
+
+    def _check_ends(self) -> None:
+        """Every edge runs from a junction that is there to one that is there."""
+        for field, ends in (("edge.from", self._origins), ("edge.to", self._ends)):
+            for edge, junction in ends.items():
+                if junction not in self._junctions:
+                    problem_ = f"no such junction in the net (edge {edge})"
+                    raise BadInput(problem_, file=self._path, field=field, value=junction)
+
+    def _check_inside(self) -> None:
+        """A lane inside a junction that a connection uses must lead out of it again: SUMO follows it blindly."""
+        leaving = {(a, i) for a, _, i, _ in self._links if a.startswith(":")}
+        with_via = {self._ends[a] for (a, *_), (_, via) in self._links.items() if via and a in self._ends}
+        for (a, b, _, _), (line, via) in self._links.items():
+            edge, _, index = via.rpartition("_")
+            if via and (edge, index) not in leaving:
+                self._refuse("connection", "via", via, "no connection leads on from this lane", None, line)
+            if not via and not b.startswith(":") and self._ends.get(a) in with_via:
+                self._refuse("connection", "via", "", f"is missing, {a} to {b}", None, line)
 
     def _check_junctions(self, connections: Mapping[str, int]) -> None:
         """A junction's right-of-way table has one row for each connection through it (and crossing)."""

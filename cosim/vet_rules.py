@@ -23,11 +23,13 @@ class Number:
     words: bool = False  # text that is not a number is SUMO's to judge
     time: bool = False  # H:M:S is legal too
     distribution: bool = False  # "normc(1,0.1,0.2,2)" is legal too
+    whole: bool = False  # digits only
 
 
 FINITE = Number()
 POSITIVE = Number(0.0, above=True)
 NON_NEGATIVE = Number(0.0)
+INDEX = Number(0.0, whole=True)
 SHARE = Number(0.0, high=1.0)
 TIME = Number(0.0, time=True)
 WORD_OR_TIME = Number(0.0, words=True, time=True)
@@ -50,13 +52,14 @@ def words(names: str) -> frozenset[str]:
 NET: Mapping[str, Mapping[str, Number]] = {
     "lane": {
         **_each(POSITIVE, "length width"),
-        **_each(NON_NEGATIVE, "speed index"),
+        **_each(NON_NEGATIVE, "speed"),
+        **_each(INDEX, "index"),
         **_each(FINITE, "endOffset"),
     },
     "edge": _each(FINITE, "priority length"),
     "junction": _each(FINITE, "x y z radius"),
     "connection": {
-        **_each(NON_NEGATIVE, "fromLane toLane"),
+        **_each(INDEX, "fromLane toLane"),
         **_each(FINITE, "linkIndex contPos visibility speed length"),
     },
     "phase": _each(TIME, "duration"),
@@ -180,6 +183,8 @@ def problem(value: str, rule: Number) -> str | None:
         return "must be finite"
     if number < rule.low or (rule.above and number == rule.low):
         return f"must be {'more than' if rule.above else 'at least'} {rule.low:g}"
+    if rule.whole and not (value.isascii() and value.isdigit()):
+        return "must be a whole number"
     if number > rule.high:
         return f"must be at most {rule.high:g}"
     return None

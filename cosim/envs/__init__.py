@@ -1,0 +1,31 @@
+"""Environments on the one loop: `cosim.open`, Gymnasium ids `cosim/...-v0`, PettingZoo's `parallel_env`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import gymnasium
+
+if TYPE_CHECKING:
+    from cosim.envs.gym import SumoEnv
+    from cosim.envs.parallel import SumoParallelEnv, parallel_env
+    from cosim.envs.session import Session, StepResult, open
+    from cosim.envs.view import View
+
+__all__ = ["Session", "StepResult", "SumoEnv", "SumoParallelEnv", "View", "open", "parallel_env"]
+
+_WORLDS = ("Merge", "Exit", "Roundabout", "Intersection", "Highway")
+_HOME = {"SumoEnv": "gym", "SumoParallelEnv": "parallel", "parallel_env": "parallel", "View": "view"}
+
+
+def __getattr__(name: str) -> object:
+    if name not in __all__:
+        raise AttributeError(f"module 'cosim.envs' has no attribute {name!r}")
+    from importlib import import_module
+
+    return getattr(import_module(f"cosim.envs.{_HOME.get(name, 'session')}"), name)
+
+
+for _world in _WORLDS:
+    gymnasium.register(f"cosim/{_world}-v0", "cosim.envs.gym:SumoEnv", kwargs={"config": _world.lower()})
+gymnasium.register("cosim/Sumo-v0", "cosim.envs.gym:SumoEnv")  # give it config="my.sumocfg"

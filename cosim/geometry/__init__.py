@@ -45,7 +45,8 @@ def boxes(snapshot: Snapshot, rows: npt.NDArray[Any] | None = None) -> Boxes:
 
 def overlap(a: Boxes, b: Boxes) -> Bools:
     """Whether the rectangles of `a` and `b` overlap (touching edges do not); broadcast shape, bool."""
-    return cast(Bools, kernels.overlap_ufunc(*_poses(a), *_poses(b)))
+    with _quiet():
+        return cast(Bools, kernels.overlap_ufunc(*_poses(a), *_poses(b)))
 
 
 def overlapping_pairs(all_boxes: Boxes) -> Ints:
@@ -59,7 +60,8 @@ def time_to_collision(a: Boxes, b: Boxes, cap: float = INF) -> Floats:
     Both keep their velocity. 0 where they overlap already; `cap` (default inf) where they never touch or
     only later than `cap`.
     """
-    return cast(Floats, kernels.ttc_ufunc(*_motions(a), *_motions(b), cap))
+    with _quiet():
+        return cast(Floats, kernels.ttc_ufunc(*_motions(a), *_motions(b), cap))
 
 
 def pairs_time_to_collision(all_boxes: Boxes, rows: npt.NDArray[Any], cap: float = INF) -> Floats:
@@ -79,9 +81,10 @@ def deceleration_to_avoid_crash(a: Boxes, b: Boxes) -> Floats:
     pair brakes this is dv^2 / (2 gap) (Almqvist et al. 1991; SUMO's SSM device); when paths cross it is what
     lets the other clear the crossing first, or stops short of it. Oncoming pairs (headings more than
     135 degrees apart), where one alone cannot help, may share the braking:
-    (v_a^2 + v_b^2) / (2 closing distance). 0 without a time to collision, inf where they overlap.
+    (v_a^2 + v_b^2) / (2 closing distance). 0 without a time to collision below 120 s, inf where they overlap.
     """
-    return cast(Floats, kernels.drac_ufunc(*_motions(a), *_motions(b)))
+    with _quiet():
+        return cast(Floats, kernels.drac_ufunc(*_motions(a), *_motions(b)))
 
 
 def largest_deceleration_to_avoid_crash(
@@ -150,6 +153,11 @@ def post_encroachment_time(a: Boxes, b: Boxes, interval: float, longest: float =
         window = trail[max(0, t - back) : t + 1]
         best = min(best, float(encroachment(window, len(window) - 1, 2, sizes, relevant, interval)))
     return best if best <= longest else INF
+
+
+def _quiet() -> np.errstate:
+    """The compiler evaluates branches that are not taken, which raises floating-point flags for nothing."""
+    return np.errstate(invalid="ignore", divide="ignore", over="ignore")
 
 
 def _trail(b: Boxes) -> Floats:

@@ -64,8 +64,8 @@ def test_cars_bumper_to_bumper_do_not_overlap_but_ten_centimetres_closer_they_do
 
 
 def test_a_turned_box_in_the_corner_of_the_bounding_circle_does_not_overlap() -> None:
-    assert not overlap(car(0, 0, 0, 0), car(3.6, 2.6, 45, 0))
-    assert overlap(car(0, 0, 0, 0), car(3.0, 2.0, 45, 0))
+    assert not overlap(car(0, 0, 0, 0), car(0.0, 3.6, 45, 0))  # half heights 1 + 2.47
+    assert overlap(car(0, 0, 0, 0), car(0.0, 3.4, 45, 0))
 
 
 @many
@@ -196,7 +196,7 @@ def test_the_pair_matrix_equals_the_pairs_and_ignores_oneself() -> None:
 
 
 @many
-@given(gap=st.floats(1.0, 100.0), fast=st.floats(5.0, 40.0), share=st.floats(0.0, 0.95))
+@given(gap=st.floats(1.0, 100.0), fast=st.floats(5.0, 40.0), share=st.floats(0.0, 0.7))
 def test_drac_of_a_follower_is_closing_speed_squared_over_twice_the_gap(
     gap: float, fast: float, share: float
 ) -> None:
@@ -281,7 +281,8 @@ def on_lanes(lane: list[int], position: list[float], speed: list[float]) -> Snap
     n = len(lane)
     return Snapshot(
         time=0.0, ids=tuple(f"v{k}" for k in range(n)), kind=np.ones(n, np.int8),
-        mission=np.zeros(n, np.bool_), x=np.array(position), y=np.zeros(n), heading=np.zeros(n), speed=np.array(speed), accel=np.zeros(n),
+        mission=np.zeros(n, np.bool_), x=np.array(position), y=np.zeros(n), heading=np.zeros(n),
+        speed=np.array(speed), accel=np.zeros(n),
         length=np.full(n, 5.0), width=np.full(n, 2.0), lane=np.array(lane, np.int32),
         lane_position=np.array(position),
     )  # fmt: skip

@@ -1,0 +1,153 @@
+"""The Gymnasium face of the loop: one learning AV among humans and other AVs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+
+import cosim.envs.session as sessions
+from cosim.envs import spaces
+from cosim.envs.session import Session, StepResult
+from cosim.envs.spaces import Observation
+from cosim.envs.view import View
+from cosim.errors import BadInput
+from cosim.scenario import Scenario
+from cosim.sumocfg import one_of
+from cosim.types import COMPACT, Bytes, ObservationConfig
+
+if TYPE_CHECKING:
+    from cosim.envs.host import PolicyFactory
+
+TRAINING_SEEDS = 100_000  # seeds 0 to 99,999 are for training (contract.md); tests begin at 200,000
+NEAREST = "nearest"
+
+
+class SumoEnv(gymnasium.Env[Observation, np.int64]):
+    """One AV learns, one step is one decision (0.4 s); the reward is its SVO reward (cosim.rewards).
+
+    Who learns: `learner="nearest"` is, at the end of the warm-up, the AV that is nearest upstream of the
+    conflict zone (ties, and roads without a zone: the first by id); or the id of an AV, here or in
+    `reset(options={"learner": id})`. Where no AV is on the road yet, the reset drives on until one is.
+    The other AVs are driven by `others` (a policy factory) or by SUMO's IDM.
+
+    `terminated`: the learner or the mission vehicle crashed. `truncated`: the duration is over, the learner
+    left the road, or another AV's collision ended the episode; `info["ended"]` says which.
+    `reset(seed=s)` is the very episode that `cosim run --seed s` drives; without a seed the next one is drawn
+    from the training seeds. Each environment has a process of its own: close it. `words` are `cosim.open`'s.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 2.5}  # noqa: RUF012 - gymnasium's own form
+
+    def __init__(
+        self,
+        config: str | Scenario,
+        *,
+        learner: str = NEAREST,
+        others: PolicyFactory | None = None,
+        observation: ObservationConfig = COMPACT,
+        flatten: str | None = None,
+        render_mode: str | None = None,
+        **words: Any,
+    ) -> None:
+        if flatten is not None:
+            one_of(flatten, ("kinematics",), "flatten")
+            observation = replace(observation, maps=False)
+        if render_mode is not None:
+            one_of(render_mode, self.metadata["render_modes"], "render_mode")
+        self.render_mode = render_mode
+        self.action_space = spaces.action_space()
+        self.observation_space = spaces.observation_space(observation, flatten)
+        self._config, self._flatten, self._wanted = observation, flatten, learner
+        self._session: Session = sessions.open(config, others=others, observation=observation, **words)
+        self.learner = ""
+
+    @property
+    def session(self) -> Session:
+        """What is underneath: snapshot, road, result."""
+        return self._session
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin an episode. Raises BadInput when no AV ever appears, or not the one that was named."""
+        super().reset(seed=seed)
+        if seed is None:
+            seed = int(self.np_random.integers(TRAINING_SEEDS))
+        views = self._session.reset(seed)
+        wanted = str((options or {}).get("learner", self._wanted))
+        while not (found := choose_learner(views, wanted)):
+            if self._session.over:
+                raise no_av(seed, None if wanted == NEAREST else wanted)
+            views = self._session.act({}).observations
+        self.learner = found
+        self._view = views[found]
+        return self._observation(), {"action_mask": self.action_masks(), "learner": found, "seed": seed}
+
+    def step(self, action: np.int64) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """One decision of the learner."""
+        name = self.learner
+        step = self._session.act({name: int(action)}, see=(name,))
+        self._view = step.observations.get(name, self._view)  # gone: what it saw last
+        reason = step.ended.get(name, "")
+        terminated = step.terminated[name] and reason.startswith("collision")
+        truncated = bool(reason) and not terminated
+        info = self._info(step)
+        if reason:
+            result = self._session.result()
+            info["ended"] = reason
+            info["episode_metrics"] = {key: metric.value for key, metric in result.metrics.items()}
+            info["trace_hash"] = result.trace_hash
+        return self._observation(), step.rewards[name], terminated, truncated, info
+
+    def action_masks(self) -> npt.NDArray[np.int8]:
+        """[5] 0 for a lane change that cannot be: no lane there, or one is under way (sb3-contrib's name)."""
+        return spaces.action_mask(self._view)
+
+    def render(self) -> Bytes | None:
+        """[160, 640, 3] RGB from above, the learner in the middle looking to the right."""
+        return self._session.picture(self.learner) if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """End the simulation and its process."""
+        if hasattr(self, "_session"):
+            self._session.close()
+
+    # ---- inside ----
+
+    def _observation(self) -> Observation:
+        return spaces.observation(self._view, self._config, self._flatten)
+
+    def _info(self, step: StepResult) -> dict[str, Any]:
+        receipt = step.receipts.get(self.learner)
+        return {
+            "action_mask": self.action_masks(),
+            "reward_terms": step.terms[self.learner]._asdict(),
+            "executed": receipt is not None and receipt.executed,
+            "blocked": (receipt and receipt.blocked) or "",
+            "time": step.info["elapsed"],
+        }
+
+
+def choose_learner(views: Mapping[str, View], wanted: str) -> str:
+    """The AV that learns ("" while it is not on the road): see SumoEnv."""
+    if wanted != NEAREST:
+        return wanted if wanted in views else ""
+    # an AV that is in the zone or past it has a distance of 0 or inf
+    upstream = {n: v.conflict_distance for n, v in views.items() if 0.0 < v.conflict_distance < np.inf}
+    return min(upstream or views, key=lambda n: (upstream.get(n, 0.0), n), default="")
+
+
+def no_av(seed: int, name: str | None) -> BadInput:
+    """Nobody to learn: how to get one."""
+    if name is not None:
+        return BadInput(f"this AV was never on the road in episode {seed}", field="learner", value=name)
+    return BadInput(
+        "no AV was ever on the road: give fleet=Fleet(penetration=...) or a demand with AVs",
+        field="seed",
+        value=seed,
+    )

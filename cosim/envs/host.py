@@ -1,0 +1,234 @@
+"""The simulation's side of a session: lives in the worker process, walks the one loop of `cosim.episode`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+from cosim.envs.view import Packed, Packer
+from cosim.episode import Episode
+from cosim.errors import BadInput
+from cosim.rewards import RewardConfig, RewardTerms, rewards
+from cosim.road import RoadMap
+from cosim.scenario import Scenario
+from cosim.seeding import generator
+from cosim.types import (
+    Bytes,
+    Decision,
+    EpisodeResult,
+    Events,
+    Kind,
+    MetaAction,
+    ObservationConfig,
+    Policy,
+    PolicyContext,
+    Receipt,
+    Simulator,
+    Snapshot,
+)
+
+SimulatorFactory = Callable[[Scenario, Mapping[str, str], int], Simulator]  # ..., AV parameters, frames kept
+PolicyFactory = Callable[[], Policy]
+
+
+class Reply(NamedTuple):
+    """What one reset or act sends back."""
+
+    packed: Packed
+    rewards: dict[str, RewardTerms]  # of every AV that was on the road before
+    ended: dict[str, str]  # AVs whose part ended in this step, and why
+    receipts: tuple[Receipt, ...]
+    events: Events  # of the whole decision (after a reset: of the warm-up)
+    avs: tuple[str, ...]  # AVs on the road now
+    time: float  # s
+    elapsed: float  # s, counted
+    steps: int  # decisions so far
+    terminated: bool
+    truncated: bool
+
+
+class Host:
+    """One scenario, any number of episodes; the caller commands the AVs it names in `act`.
+
+    `others` commands those that are left (it sees only these); without it SUMO drives them.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        observation: ObservationConfig,
+        svo: float,
+        reward: RewardConfig,
+        others: PolicyFactory | None,
+        simulator: SimulatorFactory | None,
+    ) -> None:
+        self._others = None if others is None else others()
+        self._svo = svo  # rad
+        self._reward = reward
+        wanted = observation if self._others is None else _common(observation, self._others)
+        parameters = {} if self._others is None else self._others.av_parameters
+        self._simulator = (simulator or _sumo)(scenario, parameters, wanted.frames)
+        self._episode = Episode(scenario, self._simulator, wanted)
+        self._packer = Packer()
+        self._painter: Callable[[Snapshot, str | None], Bytes] | None = None
+        self._started = False
+
+    def reset(self, seed: int) -> Reply:
+        """Begin the episode `seed` and drive its warm-up."""
+        self._histories = self._episode.start(seed)
+        self._started = True
+        if self._others is not None:
+            _single_thread()
+            self._others.reset(
+                PolicyContext(
+                    road=self._simulator.road,
+                    timing=self._episode.scenario.timing,
+                    observation=self._episode.observation,
+                    svo=self._svo,
+                    rng=generator(seed, "policy"),
+                )
+            )
+        return self._reply(self._packer.pack(self._histories, None), {}, {})
+
+    def act(self, actions: Mapping[str, int], see: Collection[str] | None) -> Reply:
+        """One decision. `see`: AVs whose views are wanted (None: all)."""
+        episode = self._episode
+        before = episode.snapshot
+        decisions = {name: Decision(MetaAction(action)) for name, action in actions.items()}
+        if self._others is not None:
+            theirs = {name: h for name, h in self._histories.items() if name not in actions}
+            decisions |= self._others.decide(theirs)
+        # sorted: SUMO takes commands in the order given, which must not hang on a caller's dict order
+        decisions = {name: decisions[name] for name in self._histories if name in decisions}
+        self._histories = episode.advance(decisions)
+        after, events = episode.snapshot, _merged(episode.frames)
+        avs = _avs(before)
+        earned = rewards(
+            before,
+            after,
+            avs,
+            {name: d.action for name, d in decisions.items()},
+            self._svo,
+            self._reward,
+            events.collisions,
+        )
+        seen = self._histories
+        if see is not None:
+            seen = {name: h for name, h in seen.items() if name in see}
+        packed = self._packer.pack(seen, len(episode.frames))
+        return self._reply(packed, earned, self._ended(avs, after, events))
+
+    def result(self, policy: str) -> EpisodeResult:
+        """The figures of the episode so far."""
+        self._check_started()
+        label = "" if self._others is None else self._others.label
+        return self._episode.result(policy, label, self._svo)
+
+    def snapshot(self) -> Snapshot:
+        """Every vehicle as it is now."""
+        self._check_started()
+        return self._episode.snapshot
+
+    def road(self) -> RoadMap:
+        """The net's lanes."""
+        return self._simulator.road
+
+    def picture(self, av: str | None) -> Bytes:
+        """[rows, columns, 3] the road around one AV (or around the first vehicle) from above."""
+        from cosim.envs.picture import Painter
+
+        self._check_started()
+        if self._painter is None:
+            self._painter = Painter(self._simulator.road).paint
+        return self._painter(self._episode.snapshot, av)
+
+    def close(self) -> None:
+        """End the simulation."""
+        self._simulator.close()
+
+    # ---- inside ----
+
+    def _check_started(self) -> None:
+        if not self._started:
+            raise BadInput("no episode has begun: call reset first")
+
+    def _reply(self, packed: Packed, earned: dict[str, RewardTerms], ended: dict[str, str]) -> Reply:
+        e = self._episode
+        return Reply(
+            packed,
+            earned,
+            ended,
+            e.receipts,
+            _merged(e.frames),
+            _avs(e.snapshot),
+            e.snapshot.time,
+            e.elapsed,
+            e.steps,
+            e.terminated,
+            e.truncated,
+        )
+
+    def _ended(self, avs: tuple[str, ...], after: Snapshot, events: Events) -> dict[str, str]:
+        crashed = {name for c in events.collisions for name in (c.collider, c.victim)}
+        mission = any(c.involves_mission for c in events.collisions)
+        ended = {}
+        for name in avs:
+            if name in crashed:
+                ended[name] = "collision"
+            elif mission:
+                ended[name] = "collision of the mission vehicle"
+            elif name in events.teleported:
+                ended[name] = "teleported"
+            elif name not in after.row:
+                ended[name] = "arrived"
+            elif self._episode.terminated:
+                ended[name] = "collision of another AV"
+            elif self._episode.truncated:
+                ended[name] = "duration"
+        return ended
+
+
+def _avs(snapshot: Snapshot) -> tuple[str, ...]:
+    return tuple(name for name, kind in zip(snapshot.ids, snapshot.kind, strict=True) if kind == Kind.AV)
+
+
+def _merged(frames: tuple[Snapshot, ...]) -> Events:
+    """The events of several frames as one."""
+    every = [frame.events for frame in frames]
+    return Events(
+        *(
+            tuple(item for events in every for item in getattr(events, name))
+            for name in ("collisions", "departed", "arrived", "teleported", "emergency_stopped")
+        )
+    )
+
+
+def _common(observation: ObservationConfig, others: Policy) -> ObservationConfig:
+    """One observer serves both: the caller's observation, with maps when either side wants them."""
+    theirs = others.observation
+    if theirs == observation or theirs == replace(observation, maps=True):
+        return theirs
+    if not theirs.maps:
+        return observation
+    raise BadInput(
+        f"the other AVs' policy '{others.name}' looks at {theirs.height} x {theirs.width} pixels and "
+        f"{theirs.frames} frames, the session at {observation.height} x {observation.width} and "
+        f"{observation.frames}: give both the same observation",
+        field="observation",
+    )
+
+
+def _sumo(scenario: Scenario, av_parameters: Mapping[str, str], history: int) -> Simulator:
+    from cosim.simulation.sumo import SumoSimulator  # libsumo: only here, in the worker's process
+
+    return SumoSimulator(scenario, av_parameters=av_parameters, history=history)
+
+
+def _single_thread() -> None:
+    """One torch thread, deterministic kernels (contract.md, Reproducibility), where `others` uses torch."""
+    torch = sys.modules.get("torch")
+    if torch is not None:
+        torch.set_num_threads(1)
+        torch.use_deterministic_algorithms(True)

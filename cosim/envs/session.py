@@ -1,0 +1,282 @@
+"""A session: a scenario driven step by step by your own agent, the simulation in a process of its own."""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+from cosim.envs.view import Unpacker, View
+from cosim.errors import BadInput
+from cosim.rewards import RewardConfig, RewardTerms
+from cosim.scenario import Fleet, Scenario, load
+from cosim.sumocfg import hint
+from cosim.types import (
+    COMPACT,
+    Bytes,
+    EpisodeResult,
+    Events,
+    MetaAction,
+    ObservationConfig,
+    Receipt,
+    Snapshot,
+)
+from cosim.worker import Worker
+
+if TYPE_CHECKING:
+    from cosim.envs.host import Host, PolicyFactory, Reply, SimulatorFactory
+    from cosim.road import RoadMap
+
+FIRST_SEED = 0  # training seeds are 0-99,999 (contract.md)
+TIMEOUT = 120.0  # s without an answer; the first step of a machine compiles the kernels
+TERMINAL = ("collision", "collision of the mission vehicle", "arrived", "teleported")
+
+
+class StepResult(NamedTuple):
+    """What one `Session.act` (one decision, 0.4 s) brought; AVs are keyed by their ids.
+
+    `rewards`, `terms`, `terminated` and `truncated` have every AV that was on the road before the step.
+    An AV is `terminated` when it crashed, the mission vehicle crashed, it arrived or was teleported;
+    `truncated` when the duration is over or another AV's collision ended the episode; `ended` says which.
+    """
+
+    observations: dict[str, View]  # AVs on the road now
+    rewards: dict[str, float]
+    terms: dict[str, RewardTerms]
+    terminated: dict[str, bool]
+    truncated: dict[str, bool]
+    ended: dict[str, str]
+    receipts: dict[str, Receipt]  # of every command, lane changes that were blocked included
+    events: Events
+    info: dict[str, Any]  # time s, elapsed s, steps, over
+
+
+class Caller(Protocol):
+    """What a session needs of a worker."""
+
+    def call(self, method: str, *arguments: Any) -> Any: ...
+
+    def close(self) -> None: ...
+
+
+def open(
+    what: str | Scenario,
+    *,
+    demand: str | Sequence[str] = (),
+    behavior: str | None = None,
+    driver_model: str = "lc2013",
+    svo: float = 45.0,
+    preset: str | None = None,
+    fleet: Fleet | None = None,
+    duration: float | None = None,
+    options: Sequence[str] = (),
+    seed: int | None = None,
+    observation: ObservationConfig = COMPACT,
+    reward: RewardConfig | None = None,
+    others: PolicyFactory | None = None,
+    simulator: SimulatorFactory | None = None,
+    timeout: float = TIMEOUT,
+) -> Session:
+    """Open the scenario `what`: a world's name, a path to any .sumocfg, or a `Scenario`.
+
+    The same words mean the same as in `cosim run`; `svo` is in degrees (it weighs the reward). `seed` is the
+    first episode's. `others` builds a policy for the AVs you do not command (an importable function, run in
+    the simulation's process; without it SUMO's IDM drives them). `simulator` replaces SUMO, for tests
+    (`cosim.simulation.fake`). `timeout`: the longest silence in s before the process counts as hung.
+
+    Raises:
+        BadInput: naming file (or option), field and value.
+    """
+    if not 0.0 <= svo <= 90.0:
+        raise BadInput("must be an angle from 0 to 90 degrees", field="svo", value=svo)
+    scenario = what
+    if isinstance(scenario, str):
+        names = (demand,) if isinstance(demand, str) else tuple(demand)
+        scenario = load(
+            scenario,
+            demand=names,
+            behavior=behavior,
+            driver_model=driver_model,
+            preset=preset,
+            fleet=fleet,
+            duration=duration,
+            options=options,
+        )
+    if simulator is None:
+        from cosim.vet import vet
+
+        vet(scenario)
+    arguments = (scenario, observation, math.radians(svo), reward or RewardConfig(), others, simulator)
+    return Session(scenario, lambda: _caller(timeout, arguments), seed)
+
+
+class Session:
+    """One scenario in a supervised process; several sessions can live side by side. Made by `cosim.open`.
+
+    An AV without an action in `act` is driven by SUMO's IDM: also one that was commanded before, it is handed
+    back (the same rule as everywhere in cosim). When the process dies, the call that notices raises
+    SimulationCrashed; `reset` then starts a fresh process. Use it in a `with` statement, or close it.
+    """
+
+    def __init__(self, scenario: Scenario, connect: Callable[[], Caller], seed: int | None = None) -> None:
+        self.scenario = scenario
+        self._connect = connect
+        self._caller: Caller | None = connect()
+        self._unpacker = Unpacker()
+        self._next_seed = FIRST_SEED if seed is None else seed
+        self._views: dict[str, View] | None = None
+        self._closed = False
+        self.over = False
+
+    def reset(self, seed: int | None = None) -> dict[str, View]:
+        """Begin the episode `seed` (without one: the seed after the last) and drive its warm-up."""
+        seed = self._next_seed if seed is None else seed
+        if not 0 <= seed < 2**63:
+            raise BadInput("must be a whole number from 0 on", field="seed", value=seed)
+        self._next_seed = seed + 1
+        self.seed = seed
+        if self._caller is None and not self._closed:
+            self._caller = self._connect()
+        reply: Reply = self._call("reset", int(seed))
+        self._take(reply)
+        return self.observe()
+
+    def observe(self) -> dict[str, View]:
+        """What each AV on the road sees now (of those asked for in `act`); begins an episode if none has."""
+        if self._views is None:
+            self.reset()
+        assert self._views is not None
+        return dict(self._views)
+
+    def act(
+        self,
+        actions: Mapping[str, int],
+        *,
+        see: Sequence[str] | None = None,
+    ) -> StepResult:
+        """Carry out one meta-action per AV for one decision (0.4 s).
+
+        `see`: the AVs whose observation you want (all by default; fewer are faster). An AV without an action
+        is driven by `others`, or else by SUMO.
+
+        Raises:
+            BadInput: an id that is not an AV on the road, something that is no meta-action, no episode.
+            SimulationError, SimulationCrashed: SUMO failed, its process died or hung.
+        """
+        if self._views is None:
+            raise BadInput("no episode has begun: call reset first")
+        if self.over:
+            raise BadInput("the episode is over: call reset", field="seed", value=self.seed)
+        reply: Reply = self._call("act", self._checked(actions), see)
+        self._take(reply)
+        ended = reply.ended
+        return StepResult(
+            observations=self.observe(),
+            rewards={name: terms.total for name, terms in reply.rewards.items()},
+            terms=reply.rewards,
+            terminated={name: ended.get(name) in TERMINAL for name in reply.rewards},
+            truncated={name: name in ended and ended[name] not in TERMINAL for name in reply.rewards},
+            ended=ended,
+            receipts={receipt.vehicle: receipt for receipt in reply.receipts},
+            events=reply.events,
+            info={"time": reply.time, "elapsed": reply.elapsed, "steps": reply.steps, "over": self.over},
+        )
+
+    def result(self, policy: str = "external") -> EpisodeResult:
+        """The metrics of the episode so far; `policy` is the name it goes by in the result."""
+        result: EpisodeResult = self._call("result", policy)
+        return result
+
+    def snapshot(self) -> Snapshot:
+        """Every vehicle on the road (the simulator's truth: what an agent must not see)."""
+        snapshot: Snapshot = self._call("snapshot")
+        return snapshot
+
+    def road(self) -> RoadMap:
+        """The net's lanes."""
+        road: RoadMap = self._call("road")
+        return road
+
+    def picture(self, av: str | None = None) -> Bytes:
+        """[160, 640, 3] RGB: 64 m x 256 m of road around `av` from above, looking to the right."""
+        picture: Bytes = self._call("picture", av)
+        return picture
+
+    @property
+    def pid(self) -> int | None:
+        """The simulation's process; None when it runs in this one or has ended."""
+        return getattr(self._caller, "pid", None)
+
+    def close(self) -> None:
+        """End the simulation and its process; safe to call twice."""
+        self._closed = True
+        if self._caller is not None:
+            self._caller.close()
+            self._caller = None
+
+    def __enter__(self) -> Session:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    # ---- inside ----
+
+    def _call(self, method: str, *arguments: Any) -> Any:
+        if self._caller is None:
+            raise BadInput("the session is closed" if self._closed else "its process has ended: call reset")
+        try:
+            return self._caller.call(method, *arguments)
+        except BadInput:
+            raise
+        except BaseException:  # SUMO failed, or Ctrl-C left an answer in the pipe: reset starts afresh
+            self._caller.close()
+            self._caller = None
+            self._views = None
+            raise
+
+    def _take(self, reply: Reply) -> None:
+        self._views = self._unpacker.unpack(reply.packed)
+        self.avs = reply.avs
+        self.events = reply.events
+        self.elapsed = reply.elapsed
+        self.over = reply.terminated or reply.truncated
+
+    def _checked(self, actions: Mapping[str, int]) -> dict[str, int]:
+        for name, action in actions.items():
+            if name not in self.avs:
+                problem = f"no AV of that name is on the road{hint(name, self.avs)}"
+                raise BadInput(problem, field="actions", value=name)
+            try:
+                MetaAction(action)
+            except ValueError:
+                known = ", ".join(f"{a.value} {a.name}" for a in MetaAction)
+                raise BadInput(f"is no meta-action ({known})", field=name, value=action) from None
+        return {name: int(action) for name, action in actions.items()}
+
+
+def _caller(timeout: float, arguments: tuple[Any, ...]) -> Caller:
+    """A worker process; in a daemonic process (gymnasium's AsyncVectorEnv, SB3's SubprocVecEnv), which may
+    have no children but is a process of its own already, the simulation itself."""
+    if multiprocessing.current_process().daemon:
+        return _InProcess(build_host(*arguments))
+    return Worker(build_host, *arguments, timeout=timeout, name="cosim-session")
+
+
+class _InProcess:
+    def __init__(self, host: Host) -> None:
+        self._host = host
+
+    def call(self, method: str, *arguments: Any) -> Any:
+        return getattr(self._host, method)(*arguments)
+
+    def close(self) -> None:
+        self._host.close()
+
+
+def build_host(*arguments: Any) -> Host:
+    """Runs in the worker: the loop, numba and libsumo are imported there, not here."""
+    from cosim.envs.host import Host
+
+    return Host(*arguments)

@@ -1,0 +1,60 @@
+"""Shared by all tests: SUMO worlds of a few vehicles, each simulation in a process of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from cosim.scenario import Fleet, Mission, Scenario, load
+from cosim.simulation.sumo import SumoSimulator
+from cosim.worker import Worker
+
+TYPES = """<routes>
+    <vType id="hv" length="5" width="2" carFollowModel="IDM" tau="1" minGap="2" accel="3" decel="7"
+           emergencyDecel="9" sigma="0" speedDev="0" lcKeepRight="0" lcSpeedGain="0" lcCooperative="0"
+           lcStrategic="1"/>
+    <vType id="av" length="5" width="2" carFollowModel="IDM" tau="0.8" minGap="2" accel="3" decel="7"
+           emergencyDecel="9" sigma="0" speedDev="0" lcKeepRight="0" lcCooperative="0"/>
+    <route id="main" edges="main_in main_acc main_out"/>
+"""
+
+Start = Callable[..., Worker]
+
+
+def vehicle(name: str, kind: str, x: float, lane: int = 0, speed: float = 20.0, more: str = "") -> str:
+    """One vehicle on the merge world's main road, its front bumper `x` m after the start."""
+    return (
+        f'<vehicle id="{name}" type="{kind}" route="main" depart="0" departPos="{x}" departLane="{lane}" '
+        f'departSpeed="{speed}" {more}/>'
+    )
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Start]:
+    """`start(vehicles, preset=...)`: a worker that holds a SumoSimulator with just these vehicles."""
+    workers: list[Worker] = []
+
+    def begin(vehicles: list[str], **changes: object) -> Worker:
+        demand = tmp_path / f"demand{len(workers)}.rou.xml"
+        demand.write_text(TYPES + "\n".join(vehicles) + "</routes>")
+        scenario: Scenario = replace(
+            load("merge"),
+            demand=(demand,),
+            warmup=0.1,
+            behavior="as-is",
+            mission=Mission(kind="none"),
+            fleet=Fleet(type="av"),
+            options=(("insertion-checks", "none"), ("extrapolate-departpos", "false")),
+        )
+        scenario = replace(scenario, **changes)  # type: ignore[arg-type]
+        worker = Worker(SumoSimulator, scenario, timeout=60.0)
+        workers.append(worker)
+        worker.call("reset", 0)
+        return worker
+
+    yield begin
+    for worker in workers:
+        worker.close()

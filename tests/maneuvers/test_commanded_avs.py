@@ -1,0 +1,151 @@
+"""Commanded AVs in real SUMO: what a meta-action does to the car, and what becomes of refused ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from conftest import Start, vehicle
+from cosim.types import Collision, Command, Receipt, Snapshot
+from cosim.worker import Worker
+
+HOLD = 0.4  # s
+
+
+def drive(
+    worker: Worker, commands: list[Command], decisions: int = 1
+) -> tuple[list[tuple[Receipt, ...]], list[Snapshot]]:
+    """The same commands for some decisions: receipts of each, all frames."""
+    receipts, frames = [], []
+    for _ in range(decisions):
+        r, f = worker.call("advance", commands)
+        receipts.append(r)
+        frames += f
+    return receipts, frames
+
+
+def of(frames: list[Snapshot], name: str, field: str) -> np.ndarray:
+    return np.array([getattr(f, field)[f.row[name]] for f in frames if name in f.row])
+
+
+def collisions(frames: list[Snapshot]) -> list[Collision]:
+    return [c for f in frames for c in f.events.collisions]
+
+
+def test_braking_by_two_steps_uses_eight_at_most_and_settles_ten_below(start: Start) -> None:
+    worker = start([vehicle("a", "av", 100.0, speed=20.0)])
+    _, frames = drive(worker, [Command("a", 10.0, 0, HOLD)], 10)
+    speed = of(frames, "a", "speed")
+    assert of(frames, "a", "accel").min() == pytest.approx(-8.0, abs=1e-6)
+    assert speed[-1] == pytest.approx(10.0, abs=0.1)
+    assert (np.diff(speed) <= 1e-9).all(), "it never speeds up again on the way"
+
+
+def test_accelerating_is_limited_to_three(start: Start) -> None:
+    worker = start([vehicle("a", "av", 100.0, speed=10.0)])
+    _, frames = drive(worker, [Command("a", 25.0, 0, HOLD)], 5)
+    assert of(frames, "a", "accel").max() == pytest.approx(3.0, abs=1e-6)
+    assert of(frames, "a", "speed")[-1] == pytest.approx(10.0 + 3.0 * 2.0, abs=0.1)
+
+
+def test_a_lane_change_takes_two_seconds_and_turns_the_car_meanwhile(start: Start) -> None:
+    worker = start([vehicle("a", "av", 100.0, speed=20.0)])
+    first, early = drive(worker, [Command("a", 20.0, 1, HOLD)])
+    rest, late = drive(worker, [Command("a", 20.0, 0, HOLD)], 6)
+    y = of(early + late, "a", "y")
+    assert first[0][0].executed
+    assert all(r[0].executed for r in rest)
+    assert y[9] - y[0] == pytest.approx(3.2 * 1.8 / 2.0, abs=0.25), "1.6 m/s sideways"
+    assert y[-1] == pytest.approx(y[-2], abs=0.05), "and then straight on"
+    assert of(early + late, "a", "heading").max() > 0.05
+    assert of(late, "a", "lane")[-1] != of(early, "a", "lane")[0]
+
+
+def test_a_second_lane_change_meanwhile_and_one_off_the_road_are_refused_with_a_reason(start: Start) -> None:
+    worker = start([vehicle("a", "av", 100.0)])
+    drive(worker, [Command("a", 20.0, 1, HOLD)])
+    (during,), _ = drive(worker, [Command("a", 20.0, -1, HOLD)])
+    assert during[0] == Receipt("a", False, "a lane change is under way")
+    drive(worker, [Command("a", 20.0, 0, HOLD)], 5)
+    (off,), _ = drive(worker, [Command("a", 20.0, 1, HOLD)])
+    assert off[0] == Receipt("a", False, "no lane on that side")
+
+
+def test_a_command_for_a_car_that_is_not_there_says_so(start: Start) -> None:
+    worker = start([vehicle("a", "av", 100.0)])
+    (receipts,), _ = drive(worker, [Command("ghost", 20.0, 0, HOLD)])
+    assert receipts == (Receipt("ghost", False, "not on the road"),)
+
+
+def test_unguarded_the_agent_can_run_into_a_stopped_car_and_is_blamed_once(start: Start) -> None:
+    stop = '><stop lane="main_in_0" endPos="200" duration="100"/></vehicle>'
+    stopped = vehicle("s", "hv", 190.0, speed=0.0).removesuffix("/>") + stop
+    worker = start([vehicle("a", "av", 100.0, speed=20.0), stopped])
+    _, frames = drive(worker, [Command("a", 20.0, 0, HOLD)], 16)
+    (crash,) = collisions(frames)
+    assert (crash.collider, crash.victim) == ("a", "s")
+    assert crash.collider_is_av
+    assert not crash.victim_is_av
+    assert crash.av_caused
+    assert crash.lane == "main_in_0"
+
+
+def test_guarded_the_same_agent_is_stopped_by_sumo(start: Start) -> None:
+    stop = '><stop lane="main_in_0" endPos="200" duration="100"/></vehicle>'
+    stopped = vehicle("s", "hv", 190.0, speed=0.0).removesuffix("/>") + stop
+    worker = start([vehicle("a", "av", 100.0, speed=20.0), stopped], preset="guarded")
+    _, frames = drive(worker, [Command("a", 20.0, 0, HOLD)], 25)
+    assert not collisions(frames)
+    assert of(frames, "a", "speed")[-1] < 0.5
+
+
+def test_unguarded_a_change_into_a_neighbour_crashes_guarded_it_is_refused(start: Start) -> None:
+    cars = [vehicle("a", "av", 100.0, lane=0), vehicle("b", "hv", 101.0, lane=1)]
+    _, frames = drive(start(cars), [Command("a", 20.0, 1, HOLD)], 6)
+    crash = collisions(frames)[0]
+    assert {crash.collider, crash.victim} == {"a", "b"}
+    (receipts, *_), frames = drive(start(cars, preset="guarded"), [Command("a", 20.0, 1, HOLD)], 6)
+    assert not collisions(frames)
+    assert not receipts[0].executed
+    assert "lane-change safety" in str(receipts[0].blocked)
+
+
+def test_cutting_in_close_before_a_faster_car_is_the_av_s_fault(start: Start) -> None:
+    cars = [vehicle("a", "av", 112.0, lane=0, speed=10.0), vehicle("h", "hv", 102.0, lane=1, speed=25.0)]
+    worker = start(cars)
+    _, frames = drive(worker, [Command("a", 10.0, 1, HOLD)], 6)
+    crash = collisions(frames)[0]
+    assert {crash.collider, crash.victim} == {"a", "h"}
+    assert crash.av_caused
+
+
+def test_an_av_that_is_released_follows_its_leader_again(start: Start) -> None:
+    cars = [vehicle("a", "av", 100.0, speed=20.0), vehicle("l", "hv", 130.0, speed=12.0, more='arrivalSpeed="12"')]
+    worker = start(cars)
+    drive(worker, [Command("a", 20.0, 0, HOLD)])
+    _, frames = drive(worker, [], 20)
+    assert not collisions(frames)
+    assert worker.call("commanded", "a") == (None, 0)
+    gap = of(frames, "l", "x") - of(frames, "a", "x") - 5.0
+    assert gap.min() > 1.0
+
+
+def test_an_av_that_reaches_the_end_of_its_lane_stops_and_that_is_no_crash(start: Start) -> None:
+    ramp = (
+        '<route id="up" edges="ramp main_acc main_out"/><vehicle id="a" type="av" route="up" depart="0" '
+        'departPos="420" departSpeed="20"/>'
+    )
+    worker = start([ramp])
+    _, frames = drive(worker, [Command("a", 20.0, 0, HOLD)], 40)
+    assert not collisions(frames)
+    assert of(frames, "a", "speed")[-1] < 0.1
+    assert any("a" in f.events.emergency_stopped for f in frames)
+
+
+def test_the_centre_is_half_a_length_behind_sumo_s_front_bumper(start: Start) -> None:
+    worker = start([vehicle("a", "av", 100.0, speed=0.0)], warmup=0.1)
+    snapshot = worker.call("reset", 1)[-1]
+    row = snapshot.row["a"]
+    along = snapshot.lane_position[row]
+    assert snapshot.x[row] == pytest.approx(-600.0 + along - 2.5, abs=0.01)
+    assert snapshot.heading[row] == pytest.approx(0.0, abs=1e-6)

@@ -175,13 +175,17 @@ class _NetReader:
                     raise BadInput(problem_, file=self._path, field=field, value=junction)
 
     def _check_inside(self) -> None:
-        """A lane inside a junction that a connection uses must lead out of it again: SUMO follows it blindly."""
-        leaving = {(a, i) for a, _, i, _ in self._links if a.startswith(":")}
+        """A lane inside a junction that a connection uses must lead out of it: SUMO follows it blindly."""
+        leaving = {link for link in self._links if link[0].startswith(":")}
         with_via = {self._ends[a] for (a, *_), (_, via) in self._links.items() if via and a in self._ends}
-        for (a, b, _, _), (line, via) in self._links.items():
+        for (a, b, _, j), (line, via) in self._links.items():
             edge, _, index = via.rpartition("_")
-            if via and (edge, index) not in leaving:
-                self._refuse("connection", "via", via, "no connection leads on from this lane", None, line)
+            if via and (edge, b, index, j) not in leaving:
+                self._refuse("connection", "via", via, f"leads from {a} to nowhere near {b}_{j}", None, line)
+            if via and a in self._ends and not via.startswith(f":{self._ends[a]}_"):
+                self._refuse("connection", "via", via, f"is not in junction {self._ends[a]}", None, line)
+            if via and a.startswith(":") and via not in self._junctions:
+                self._refuse("connection", "via", via, "no such internal junction in the net", None, line)
             if not via and not b.startswith(":") and self._ends.get(a) in with_via:
                 self._refuse("connection", "via", "", f"is missing, {a} to {b}", None, line)
 

@@ -24,6 +24,7 @@ TIME_CONSTANT = 0.6  # s
 MAX_DECEL = 8.0  # m/s2
 MAX_ACCEL = 3.0  # m/s2
 LANE_CHANGE_TIME = 2.0  # s
+SLOW = 3.0  # m/s: below, a car changing lanes is taken to stand no more askew than at this speed
 STEP = 0.1  # s, with which SUMO tracks the target speed
 
 
@@ -43,6 +44,7 @@ class Rollout(NamedTuple):
     heading: Floats  # [k,T+1] rad
     speed: Floats  # [k,T+1] m/s
     arc: Floats  # [k,T+1] m along the path
+    offset: Floats  # [k,T+1] m beside the path, left positive
 
 
 def pack(paths: Sequence[LanePath]) -> Paths:
@@ -147,6 +149,7 @@ def roll(
     heading: Floats,
     out_speed: Floats,
     out_arc: Floats,
+    out_offset: Floats,
 ) -> None:
     """Vehicle k along path k."""
     frames = speed.shape[1]
@@ -155,6 +158,8 @@ def roll(
         s, i = begin[k], first
         v = speed[k, 0]
         side = 1.0 if offset[k] > 0.0 else -1.0
+        left = abs(offset[k])
+        drift = min(min(rate[k], v), left / dt)
         for t in range(frames):
             if t > 0:
                 v_next = speed[k, t]
@@ -163,21 +168,21 @@ def roll(
                     v_next = min(v_next, np.sqrt(max(2.0 * brake * room, 0.0)))
                 s = min(s + 0.5 * dt * (v + v_next), max(stop[k], s))
                 v = v_next
+                drift = min(min(rate[k], v), left / dt)  # nobody slides sideways faster than ahead
+                left -= drift * dt
             while i < last - 2 and arc[i + 1] < s:
                 i += 1
             dx, dy = points[i + 1, 0] - points[i, 0], points[i + 1, 1] - points[i, 1]
             span = np.sqrt(dx * dx + dy * dy)
             ux, uy = dx / span, dy / span
             ahead = s - arc[i]
-            left = abs(offset[k]) - rate[k] * dt * t
-            drift = -side * rate[k] if left > 0.0 and rate[k] > 0.0 else 0.0
-            left = side * max(left, 0.0)
-            x[k, t] = points[i, 0] + ux * ahead - uy * left
-            y[k, t] = points[i, 1] + uy * ahead + ux * left
-            turn = np.arctan2(drift, max(v, 4.0))  # a standing car does not turn on the spot
-            heading[k, t] = np.arctan2(uy, ux) + turn
+            beside = side * left
+            x[k, t] = points[i, 0] + ux * ahead - uy * beside
+            y[k, t] = points[i, 1] + uy * ahead + ux * beside
+            heading[k, t] = np.arctan2(uy, ux) - side * np.arctan2(drift, max(v, SLOW))
             out_speed[k, t] = v
             out_arc[k, t] = s
+            out_offset[k, t] = beside
 
 
 def roll_out(
@@ -191,6 +196,6 @@ def roll_out(
     dt: float,
 ) -> Rollout:
     """`roll` into fresh arrays; see there for the arguments."""
-    out = Rollout(*(np.empty_like(speed) for _ in range(5)))
+    out = Rollout(*(np.empty_like(speed) for _ in range(6)))
     roll(paths.points, paths.arc, paths.start, begin, offset, rate, speed, stop, brake, dt, *out)
     return out

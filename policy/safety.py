@@ -39,6 +39,9 @@ ACTIONS = tuple(MetaAction)
 SIDE = {MetaAction.LANE_LEFT: 0, MetaAction.LANE_RIGHT: 2}  # index into RouteAhead.paths
 LANE_END = "(lane end)"
 ROAD_EDGE = "(no lane)"
+UNDER_WAY = "(lane change under way)"
+TOO_SLOW = "(too slow to change lanes)"
+STRADDLING = "(stands across two lanes)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +62,8 @@ class SafetyConfig:
     follower_reaction: float = 0.5  # s of a new follower
     follower_brake: float = 3.0  # m/s2, the most that a lane change may ask of it
     follower_gap: float = 2.0  # m, at least
+    lane_change_speed: float = 3.0  # m/s: slower, a car cannot get sideways within a lane change's time
+    straddle: float = 0.6  # m beside the centre line: a car that stands there blocks two lanes
     lane_half: float = 1.6  # m from a centre line within which a vehicle is in that lane
     same_way: float = 1.05  # rad, headings closer than this (60 degrees) drive the same way
     # among equally valued actions: T's ego keeps going, else gives way, else evades
@@ -121,7 +126,9 @@ def select(q: Floats32, evaluation: Evaluation, config: SafetyConfig) -> Decisio
     preferred = order[0]
     safe = [a for a in order if not evaluation.unsafe[a]]
     fallback = not safe
-    chosen = safe[0] if safe else max(order, key=lambda a: float(evaluation.score[a]))
+    # equal scores: better slower than as preferred
+    last = max(order, key=lambda a: (float(evaluation.score[a]), a == MetaAction.DECELERATE))
+    chosen = safe[0] if safe else last
     return Decision(
         chosen,
         q=np.asarray(q, np.float32),
@@ -176,6 +183,10 @@ def evaluate(
                 limit[a] = allowed
                 if contact[a] > c.horizon + c.critical_th:
                     blamed[a] = scene.vehicles[others[who]]
+    for a in map(int, np.flatnonzero(_straddles(ego, c))):
+        if 0.9 * c.safe_th < limit[a]:
+            limit[a] = 0.9 * c.safe_th
+            blamed[a] = blamed[a] or STRADDLING
     for a, way in enumerate(ways):
         if way.path.dead_end:  # an obstacle at its end
             over = ego.arc[a] + 0.5 * length + 0.5 > way.path.length
@@ -187,8 +198,11 @@ def evaluate(
     score = np.minimum(remaining @ weight / weight.sum(), limit)
     unsafe = (score < c.safe_th) | (remaining.min(1) < c.critical_th)
     for a, way in enumerate(ways):
-        if way.forbidden is not None:
-            unsafe[a], score[a], blamed[a] = True, -1.0, way.forbidden
+        forbidden = way.forbidden
+        if way.changes and ego.speed[a, : round(LANE_CHANGE_TIME / c.dt)].min() < c.lane_change_speed:
+            forbidden = TOO_SLOW
+        if forbidden is not None:
+            unsafe[a], score[a], blamed[a] = True, -1.0, forbidden
     blamed = [who if bad else None for who, bad in zip(blamed, unsafe, strict=True)]
     return Evaluation(np.minimum(contact, c.cap), score, unsafe, tuple(blamed), ego)
 
@@ -247,7 +261,7 @@ def _ways(history: History, road: RoadMap, lane: int) -> list[_Way]:
             continue
         target = history.route.paths[index]
         if target is None or under_way or road.lanes[lane].internal:
-            ways.append(_Way(keep, False, ROAD_EDGE if target is None else "(lane change under way)"))
+            ways.append(_Way(keep, False, ROAD_EDGE if target is None else UNDER_WAY))
             continue
         worse = target.dead_end and (
             not keep.dead_end or target.length - history.route.arc < keep.length - history.route.arc - 1.0
@@ -284,6 +298,12 @@ def _roll_ego(
     )
 
 
+def _straddles(ego: Rollout, c: SafetyConfig) -> Bools:
+    """[A] whether the ego would come to a stop across two lanes."""
+    standing = (ego.speed < 1.0) & (np.abs(ego.offset) > c.straddle)
+    return np.asarray(standing.any(1))
+
+
 def _others(b: int, me: int, scene: Scene, traffic: Traffic, road: RoadMap) -> npt.NDArray[np.int64]:
     """Vehicles that this AV knows and can touch."""
     rows = scene.row[b, 1:]
@@ -300,13 +320,32 @@ def _first_contact(
 
     Between two frames both boxes keep their velocity, so nothing is jumped over.
     """
+    touch = _sweep(ego, traffic, me, others, c.margin_length, c.margin_width, c.dt)
+    close = (touch == 0.0).any(
+        0
+    )  # within the margin already: only the cars themselves can tell actions apart
+    if close.any():
+        touch[:, close] = _sweep(ego, traffic, me, others[close], 0.0, 0.0, c.dt)
+    return touch
+
+
+def _sweep(
+    ego: Rollout,
+    traffic: Traffic,
+    me: int,
+    others: npt.NDArray[np.int64],
+    longer: float,
+    wider: float,
+    dt: float,
+) -> Floats:
+    """`_first_contact` with the ego's box made `longer` and `wider` (m)."""
     r = traffic.rollout
     mine = Boxes(
         ego.x[:, None],
         ego.y[:, None],
         ego.heading[:, None],
-        traffic.length[me] + c.margin_length,
-        traffic.width[me] + c.margin_width,
+        traffic.length[me] + longer,
+        traffic.width[me] + wider,
         ego.speed[:, None],
     )
     frames = ego.x.shape[1]
@@ -318,10 +357,10 @@ def _first_contact(
         traffic.width[others][None, :, None],
         r.speed[None, others, :frames],
     )
-    ttc = time_to_collision(mine, theirs, c.dt)  # [A,O,T+1], c.dt where nothing happens before the next frame
-    hit = ttc < c.dt
+    ttc = time_to_collision(mine, theirs, dt)  # [A,O,T+1], dt where nothing happens before the next frame
+    hit = ttc < dt
     step = np.argmax(hit, 2)
-    when = c.dt * step + np.take_along_axis(ttc, step[:, :, None], 2)[:, :, 0]
+    when = dt * step + np.take_along_axis(ttc, step[:, :, None], 2)[:, :, 0]
     return np.where(hit.any(2), when, np.inf)
 
 

@@ -84,7 +84,7 @@ def predict_traffic(
         c.stop_brake,
         c.dt,
     )
-    out = Rollout(*(np.zeros((count, frames + 1)) for _ in range(5)))
+    out = Rollout(*(np.zeros((count, frames + 1)) for _ in range(6)))
     for whole, part in zip(out, along, strict=True):
         whole[on_lane] = part
     lost = np.flatnonzero(known & (scene.lane < 0))

@@ -24,16 +24,18 @@ if TYPE_CHECKING:
     from cosim.envs.host import PolicyFactory
 
 TRAINING_SEEDS = 100_000  # seeds 0 to 99,999 are for training (contract.md); tests begin at 200,000
-NEAREST = "nearest"
+MISSION, NEAREST = "mission", "nearest"
 
 
 class SumoEnv(gymnasium.Env[Observation, np.int64]):
     """One AV learns, one step is one decision (0.4 s); the reward is its SVO reward (cosim.rewards).
 
-    Who learns: `learner="nearest"` is, at the end of the warm-up, the AV that is nearest upstream of the
-    conflict zone (ties, and roads without a zone: the first by id); or the id of an AV, here or in
-    `reset(options={"learner": id})`. Where no AV is on the road yet, the reset drives on until one is.
-    The other AVs are driven by `others` (a policy factory) or by SUMO's IDM.
+    Who learns is settled at the end of the warm-up. `learner="mission"`: the AV that reaches the conflict
+    zone next after the mission vehicle does, so the one that would have to yield; where there is none, and
+    with `learner="nearest"`: the AV nearest upstream of the conflict zone (ties, and roads without a zone:
+    the first by id). Or the id of an AV. `reset(options={"learner": ...})` says otherwise for one episode.
+    Where no AV is on the road yet, the reset drives on until one is. The other AVs are driven by `others`
+    (a policy factory) or by SUMO's IDM.
 
     `terminated`: the learner or the mission vehicle crashed. `truncated`: the duration is over, the learner
     left the road, or another AV's collision ended the episode; `info["ended"]` says which.
@@ -47,7 +49,7 @@ class SumoEnv(gymnasium.Env[Observation, np.int64]):
         self,
         config: str | Scenario,
         *,
-        learner: str = NEAREST,
+        learner: str = MISSION,
         others: PolicyFactory | None = None,
         observation: ObservationConfig = COMPACT,
         flatten: str | None = None,
@@ -80,9 +82,9 @@ class SumoEnv(gymnasium.Env[Observation, np.int64]):
             seed = int(self.np_random.integers(TRAINING_SEEDS))
         views = self._session.reset(seed)
         wanted = str((options or {}).get("learner", self._wanted))
-        while not (found := choose_learner(views, wanted)):
+        while not (found := self._choose(views, wanted)):
             if self._session.over:
-                raise no_av(seed, None if wanted == NEAREST else wanted)
+                raise no_av(seed, None if wanted in (MISSION, NEAREST) else wanted)
             views = self._session.act({}).observations
         self.learner = found
         self._view = views[found]
@@ -119,6 +121,13 @@ class SumoEnv(gymnasium.Env[Observation, np.int64]):
 
     # ---- inside ----
 
+    def _choose(self, views: Mapping[str, View], wanted: str) -> str:
+        """The AV that learns; "" while it is not on the road."""
+        if wanted not in (MISSION, NEAREST):
+            return wanted if wanted in views else ""
+        partner = self._session.partner() if wanted == MISSION and views else ""
+        return partner if partner in views else nearest_upstream(views)
+
     def _observation(self) -> Observation:
         return spaces.observation(self._view, self._config, self._flatten)
 
@@ -133,11 +142,9 @@ class SumoEnv(gymnasium.Env[Observation, np.int64]):
         }
 
 
-def choose_learner(views: Mapping[str, View], wanted: str) -> str:
-    """The AV that learns ("" while it is not on the road): see SumoEnv."""
-    if wanted != NEAREST:
-        return wanted if wanted in views else ""
-    # an AV that is in the zone or past it has a distance of 0 or inf
+def nearest_upstream(views: Mapping[str, View]) -> str:
+    """The AV with the shortest way to the conflict zone; those in it (0 m) or past it (inf) do not count
+    unless there are no others. "" without any AV."""
     upstream = {n: v.conflict_distance for n, v in views.items() if 0.0 < v.conflict_distance < np.inf}
     return min(upstream or views, key=lambda n: (upstream.get(n, 0.0), n), default="")
 

@@ -7,6 +7,8 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
+
 from cosim.envs.view import Packed, Packer
 from cosim.episode import Episode
 from cosim.errors import BadInput
@@ -131,6 +133,27 @@ class Host:
         self._check_started()
         return self._episode.snapshot
 
+    def partner(self) -> str:
+        """The AV that reaches the conflict zone next after the mission vehicle does, at present speeds: the
+        one that would have to yield. "" without a mission vehicle or zone ahead, or without such an AV."""
+        self._check_started()
+        s, road = self._episode.snapshot, self._simulator.road
+
+        def arrival(row: np.intp) -> float:  # s
+            if s.lane[row] < 0:
+                return float("inf")
+            name = s.ids[row]
+            place, length = float(s.lane_position[row]), float(s.length[row])
+            ahead = road.ahead(int(s.lane[row]), place, length, self._simulator.route(name))
+            return ahead.conflict_distance / max(float(s.speed[row]), 1.0)
+
+        waiting = [t for row in np.flatnonzero(s.mission) if (t := arrival(row)) < float("inf")]
+        if not waiting:
+            return ""
+        avs = [(t, s.ids[row]) for row in np.flatnonzero(s.kind == Kind.AV) if (t := arrival(row)) > 0.0]
+        later = [(t, name) for t, name in avs if min(waiting) <= t < float("inf")]
+        return min(later, default=(0.0, ""))[1]
+
     def road(self) -> RoadMap:
         """The net's lanes."""
         return self._simulator.road
@@ -191,7 +214,7 @@ class Host:
 
 
 def _avs(snapshot: Snapshot) -> tuple[str, ...]:
-    return tuple(name for name, kind in zip(snapshot.ids, snapshot.kind, strict=True) if kind == Kind.AV)
+    return tuple(snapshot.ids[row] for row in np.flatnonzero(snapshot.kind == Kind.AV))
 
 
 def _merged(frames: tuple[Snapshot, ...]) -> Events:

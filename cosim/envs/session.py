@@ -193,6 +193,12 @@ class Session:
         snapshot: Snapshot = self._call("snapshot")
         return snapshot
 
+    def partner(self) -> str:
+        """The AV that reaches the conflict zone next after the mission vehicle does, at present speeds: the
+        one that would have to yield; "" when there is none."""
+        partner: str = self._call("partner")
+        return partner
+
     def road(self) -> RoadMap:
         """The net's lanes."""
         road: RoadMap = self._call("road")

@@ -2,7 +2,7 @@
 
     python examples/train_sb3_dqn.py --steps 5000
 
-One AV learns (the one that meets the mission vehicle), the others are driven by SUMO's IDM, nothing guards it.
+One AV learns (the one that meets the mission vehicle), nothing guards it; SUMO's IDM drives the others.
 A few thousand steps teach it to stay out of trouble; altruism takes far more (docs/results/).
 """
 
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import gymnasium
 
-import cosim.envs
+import cosim.envs  # noqa: F401 - registers the ids
 
 if TYPE_CHECKING:
     from stable_baselines3 import DQN

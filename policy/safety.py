@@ -25,10 +25,12 @@ from policy.motion import (
     MAX_DECEL,
     Paths,
     Rollout,
+    fronts,
     next_target,
     pack,
     project,
     project_all,
+    project_many,
     roll_out,
     tracked_speeds,
 )
@@ -63,7 +65,7 @@ class SafetyConfig:
     follower_brake: float = 3.0  # m/s2, the most that a lane change may ask of it
     follower_gap: float = 2.0  # m, at least
     lane_change_speed: float = 3.0  # m/s: slower, a car cannot get sideways within a lane change's time
-    straddle: float = 0.6  # m beside the centre line: a car that stands there blocks two lanes
+    straddle: float = 1.0  # m beside the centre line: a car whose rear stands there blocks two lanes
     lane_half: float = 1.6  # m from a centre line within which a vehicle is in that lane
     same_way: float = 1.05  # rad, headings closer than this (60 degrees) drive the same way
     # among equally valued actions: T's ego keeps going, else gives way, else evades
@@ -159,12 +161,7 @@ def evaluate(
     ways = _ways(history, road, int(scene.lane[me]))
     paths = [w.path for w in ways]
     packed = pack(paths)
-    x, y = float(history.pose[0]), float(history.pose[1])
-    place = [
-        project(packed.points, packed.arc, packed.start[k], packed.start[k + 1], x, y, history.route.arc)
-        for k in range(len(paths))
-    ]
-    ego = _roll_ego(history, paths, packed, place, scene.state[me, -1], c)
+    ego = _roll_ego(history, packed, scene.state[me, -1], c)
     others = _others(b, me, scene, traffic, road)
     contact = np.full(len(ACTIONS), np.inf)  # s
     limit = np.full(len(ACTIONS), np.inf)  # score allowed by the leader and follower limits
@@ -172,7 +169,9 @@ def evaluate(
     if len(others):
         touch = _first_contact(ego, traffic, me, others, c)  # [A,O] s
         for a, way in enumerate(ways):
-            near = _Neighbours.of(way.path, ego.arc[a, 0], length, others, traffic, scene.state[me, -1], c)
+            near = _Neighbours.of(
+                way.path, ego.arc[a, 0] - 0.5 * length, length, others, traffic, scene.state[me, -1], c
+            )
             times = np.where(near.behind, np.inf, touch[a])  # followers brake: checked below for changes
             first = int(np.argmin(times))
             contact[a] = times[first]
@@ -189,7 +188,7 @@ def evaluate(
             blamed[a] = blamed[a] or STRADDLING
     for a, way in enumerate(ways):
         if way.path.dead_end:  # an obstacle at its end
-            over = ego.arc[a] + 0.5 * length + 0.5 > way.path.length
+            over = ego.arc[a] + 0.5 > way.path.length
             if over.any() and c.dt * int(np.argmax(over)) < contact[a]:
                 contact[a], blamed[a] = c.dt * int(np.argmax(over)), LANE_END
     steps = c.dt * np.arange(1, round(c.horizon / c.dt) + 1)  # [M] s
@@ -248,7 +247,9 @@ def _ways(history: History, road: RoadMap, lane: int) -> list[_Way]:
     under_way = history.lane_changing
     if under_way:
         # the lane index flips half way: before that the target lane is the neighbour
-        x, y = float(history.pose[0]), float(history.pose[1])
+        x, y, heading = history.pose
+        half = 0.5 * float(history.kinematics[-1, 0, 4])
+        x, y = x + half * np.cos(heading), y + half * np.sin(heading)  # front
         _, offset = project(keep.points, keep.arc, 0, len(keep.arc), x, y, history.route.arc)
         side = left if under_way > 0 else right
         if offset * under_way > 0.05 and side is not None:
@@ -270,29 +271,26 @@ def _ways(history: History, road: RoadMap, lane: int) -> list[_Way]:
     return ways
 
 
-def _roll_ego(
-    history: History,
-    paths: list[LanePath],
-    packed: Paths,
-    place: list[tuple[float, float]],
-    now: Floats,
-    c: SafetyConfig,
-) -> Rollout:
-    """The ego under every action [A,T+1]."""
+def _roll_ego(history: History, packed: Paths, now: Floats, c: SafetyConfig) -> Rollout:
+    """The ego (state `now` [8]) under every action [A,T+1]."""
+    count = len(ACTIONS)
     targets = np.array(
         [next_target(history.target_speed, a, history.route.speed_limit) for a in ACTIONS], np.float64
     )
     speed = tracked_speeds(float(now[2]), targets, c.frames, c.dt)
-    offset = np.array([p[1] for p in place])
-    wide = np.abs(offset) > 0.5 * c.lane_half  # a lane change, new or under way, at SUMO's sideways speed
-    rate = np.where(wide, np.maximum(np.abs(offset), 2 * c.lane_half) / LANE_CHANGE_TIME, 1.0)
+    x, y = fronts(np.repeat(now[None], count, 0))
+    arc, offset = project_many(*packed, x, y, np.full(count, history.route.arc))
+    wide = np.abs(offset) > 0.3  # a lane change, new or under way
+    rate = np.where(wide, 2 * c.lane_half / LANE_CHANGE_TIME, 0.3)
     return roll_out(
         packed,
-        np.array([p[0] for p in place]),
+        arc,
         offset,
+        np.full(count, now[3]),
         rate,
+        np.full(count, now[4]),
         speed,
-        np.full(len(paths), np.inf),
+        np.full(count, np.inf),
         MAX_DECEL,
         c.dt,
     )
@@ -300,7 +298,7 @@ def _roll_ego(
 
 def _straddles(ego: Rollout, c: SafetyConfig) -> Bools:
     """[A] whether the ego would come to a stop across two lanes."""
-    standing = (ego.speed < 1.0) & (np.abs(ego.offset) > c.straddle)
+    standing = (ego.speed < 1.0) & (np.abs(ego.rear) > c.straddle)
     return np.asarray(standing.any(1))
 
 

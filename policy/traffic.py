@@ -10,7 +10,7 @@ import numpy as np
 from cosim.road import LanePath, RoadMap
 from cosim.types import Bools, Floats
 from policy.forecast import KinematicForecast
-from policy.motion import Rollout, pack, project_many, roll_out
+from policy.motion import Rollout, fronts, pack, project_many, roll_out
 from policy.scene import Scene
 
 
@@ -23,7 +23,7 @@ class TrafficConfig:
     drift_rate: float = 0.4  # m/s sideways, above which a vehicle is changing lanes
     drift_offset: float = 0.2  # m from the centre line, below which nobody is changing lanes yet
     drift_limits: tuple[float, float] = (0.8, 2.4)  # m/s sideways of a change; SUMO's takes 1.6 m/s
-    settle_rate: float = 0.5  # m/s with which a resting offset closes
+    settle_rate: float = 0.3  # m/s with which a resting offset closes
     stop_brake: float = 4.0  # m/s2 towards the end of a lane
     speed_factor: float = 1.2  # nobody is predicted faster than this times the limit (or as fast as now)
 
@@ -61,14 +61,14 @@ def predict_traffic(
     lanes = [int(k) for k in scene.lane[on_lane]]
     paths = [road.path(k) for k in lanes]
     scale = np.array([p.scale for p in paths])
-    arc = (scene.lane_position[on_lane] - 0.5 * now[on_lane, 4]) * scale
+    arc = scene.lane_position[on_lane] * scale  # m, front bumper
     offset, drift = _sideways(scene, on_lane, paths, arc, c)
     for i, k in enumerate(lanes):
         beside = road.lanes[k].left if offset[i] > 0.0 else road.lanes[k].right
         if drift[i] * offset[i] > 0.0 and beside >= 0:  # moving away from its own centre line
             paths[i] = road.path(beside)
     packed = pack(paths)
-    arc, offset = project_many(*packed, now[on_lane, 0], now[on_lane, 1], arc)
+    arc, offset = project_many(*packed, *fronts(now[on_lane]), arc)
     moving = np.abs(drift) > 0.0
     rate = np.where(moving, np.clip(np.abs(drift), *c.drift_limits), c.settle_rate)
     end = np.array([p.length if p.dead_end else np.inf for p in paths])
@@ -78,9 +78,11 @@ def predict_traffic(
         packed,
         arc,
         offset,
+        now[on_lane, 3],
         rate,
+        now[on_lane, 4],
         np.minimum(speed[on_lane], top),
-        end - 0.5 * now[on_lane, 4],
+        end - 0.5,
         c.stop_brake,
         c.dt,
     )
@@ -101,14 +103,14 @@ def predict_traffic(
 def _sideways(
     scene: Scene, rows: np.ndarray, paths: list[LanePath], arc: Floats, c: TrafficConfig
 ) -> tuple[Floats, Floats]:
-    """Offset from the own centre line [k] m, and sideways speed [k] m/s (0 unless it is a lane change)."""
+    """The front's offset from the own centre line [k] m, and its sideways speed [k] m/s (0 unless it is a
+    lane change)."""
     packed = pack(paths)
-    now = scene.state[rows, -1]
-    _, offset = project_many(*packed, now[:, 0], now[:, 1], arc)
+    _, offset = project_many(*packed, *fronts(scene.state[rows, -1]), arc)
     back = min(2, scene.state.shape[1] - 1)
     before = scene.state[rows, -1 - back]
     seen = scene.valid[rows, -1 - back] & (back > 0)
-    _, earlier = project_many(*packed, before[:, 0], before[:, 1], arc)
+    _, earlier = project_many(*packed, *fronts(before), arc)
     drift = np.where(seen, (offset - earlier) / max(back * c.dt, c.dt), 0.0)
     changing = (np.abs(drift) > c.drift_rate) & (np.abs(offset) > c.drift_offset)
     return offset, np.where(changing, drift, 0.0)

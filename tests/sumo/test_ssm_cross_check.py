@@ -1,4 +1,4 @@
-"""Our time to collision, DRAC and post-encroachment time against SUMO's own SSM device, on the same drives."""
+"""Our time to collision, DRAC and post-encroachment time against SUMO's SSM device, on the same drives."""
 
 from __future__ import annotations
 
@@ -133,6 +133,12 @@ def drive(net: Path, folder: Path, speeds: dict[str, float], **departures: objec
     return Drive(boxes["ego"], boxes["foe"], ttc, drac, pet)
 
 
+def every_other(b: Boxes) -> Boxes:
+    return Boxes(
+        *(np.asarray(v)[::2] for v in (b.x, b.y, b.heading)), b.length, b.width, np.asarray(b.speed)[::2]
+    )
+
+
 def spans(conflict: ElementTree.Element, tag: str) -> list[float]:
     element = conflict.find(tag)
     assert element is not None
@@ -193,11 +199,8 @@ def test_the_post_encroachment_time_of_a_crossing_agrees_with_the_ssm_device(
     )  # fmt: skip
     assert 1.0 < seen.pet < 3.0
     assert post_encroachment_time(seen.ego, seen.foe, STEP) == pytest.approx(seen.pet, abs=1e-3)
-    every_other = [
-        Boxes(b.x[::2], b.y[::2], b.heading[::2], LENGTH, WIDTH, b.speed[::2])  # type: ignore[index]
-        for b in (seen.ego, seen.foe)
-    ]
-    # at the frame rate of the metrics too
-    assert post_encroachment_time(*every_other, 2 * STEP) == pytest.approx(seen.pet, abs=1e-3)
+    assert post_encroachment_time(every_other(seen.ego), every_other(seen.foe), 2 * STEP) == pytest.approx(
+        seen.pet, abs=1e-3
+    )  # at the metrics' frame rate too
     assert not np.isfinite(time_to_collision(seen.ego, seen.foe)).any()
     assert np.isnan(seen.ttc).all()

@@ -41,6 +41,7 @@ _SYNONYMS = {
     "C": "save-configuration",
     "save-config": "save-configuration",
 }
+_AS_OURS = {("step-length", "0.1"), ("collision.action", "warn")}  # nothing is lost with these
 INPUTS = ("net-file", "route-files", "additional-files")
 CLOCK = ("begin", "end", "step-length")
 # Options whose value is a list of files to read; relative to the configuration's folder.
@@ -122,6 +123,8 @@ def read(path: Path) -> SumoConfig:
         if name == "mesosim" and boolean(value):
             raise BadInput(_REFUSED["mesosim"], file=path, field=name, value=value)
         _check_finite(value, path, name)
+        if (name, value) in _AS_OURS:
+            continue
         if not keeps(name):
             ignored.append(f"{name}={value}{_reason(name)}")
         elif name in FILE_OPTIONS:

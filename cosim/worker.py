@@ -9,10 +9,13 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import os
+import pickle
 import signal
+import sys
 import tempfile
+import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -20,6 +23,7 @@ from typing import Any
 from cosim.errors import CosimError, SimulationCrashed
 
 _CONTEXT = multiprocessing.get_context("spawn")
+_STARTING = threading.Lock()
 
 
 class Worker:
@@ -41,7 +45,8 @@ class Worker:
         self._process = _CONTEXT.Process(
             target=_serve, args=(theirs, factory, arguments, path), name=name, daemon=True
         )
-        self._process.start()
+        with _script_left_out(factory, arguments):
+            self._process.start()
         theirs.close()
         self._closed = False
         try:
@@ -52,8 +57,8 @@ class Worker:
 
     @property
     def pid(self) -> int | None:
-        """The process id of the worker."""
-        return self._process.pid
+        """The process id of the worker; None once it is closed."""
+        return None if self._closed else self._process.pid
 
     def call(
         self, method: str, *arguments: Any, progress: Callable[..., None] | None = None, **options: Any
@@ -78,6 +83,7 @@ class Worker:
         if self._process.is_alive():
             self._process.kill()
             self._process.join()
+        self._process.close()  # frees its descriptors now, not when the garbage collector comes
         self._pipe.close()
         self._stderr.unlink(missing_ok=True)
 
@@ -123,6 +129,26 @@ class Worker:
         words = f"; last words: {last[0]}" if last else ""
         self.close()
         return SimulationCrashed(f"the simulation's process died during '{method}' ({how}){words}")
+
+
+@contextlib.contextmanager
+def _script_left_out(*needed: object) -> Iterator[None]:
+    """Keep multiprocessing from running the caller's script once more in the worker, which needs nothing of
+    it unless something `needed` is defined there: so scripts need no `if __name__ == "__main__"`, and what
+    a trainer imports (torch) is not imported again beside every simulation."""
+    main = sys.modules["__main__"]
+    if b"__main__" in pickle.dumps(needed):
+        yield
+        return
+    with _STARTING:
+        hidden = {name: getattr(main, name, None) for name in ("__spec__", "__file__")}
+        for name in hidden:
+            setattr(main, name, None)
+        try:
+            yield
+        finally:
+            for name, value in hidden.items():
+                setattr(main, name, value)
 
 
 def _serve(pipe: Connection, factory: Callable[..., Any], arguments: tuple[Any, ...], stderr: str) -> None:

@@ -31,11 +31,11 @@ class ChainConfig:
 
 
 class Prediction(NamedTuple):
-    """Every predicted frame of every AV."""
+    """The M = horizon / every hypotheses of every AV."""
 
-    maps: torch.Tensor  # [B,horizon,C,H,W] float32 in [0,1], each in the predicted ego's frame
-    kinematics: torch.Tensor  # [B,horizon,R,F+1] scaled; by the GP (P, eq. 10)
-    rows: Floats  # [B,horizon,R,8] the same in m, m/s, rad in the ego's frame at the newest frame
+    maps: torch.Tensor  # [B,M,C,H,W] float32 in [0,1], each in the predicted ego's frame
+    kinematics: torch.Tensor  # [B,M,R,F+1] scaled; by the GP (P, eq. 10)
+    rows: Floats  # [B,horizon,R,8] every frame in m, m/s, rad, in the ego's frame at the newest frame
     valid: Bools  # [B,R]
 
 
@@ -73,30 +73,52 @@ def predict(
     `forecast`: the predicted states of all vehicles of `scene` in the world, at least `horizon` frames.
     Without an `hpn` the maps rendered from the forecast are returned.
     """
-    m = config.horizon
+    m, device = config.horizon, str(batch.maps.device)
     rows, valid = rows_ahead(
         scene, forecast.x[:, :m], forecast.y[:, :m], forecast.speed[:, :m], forecast.heading[:, :m]
     )
-    mask = np.repeat(valid[:, None], m, 1)
-    kinematics = kinematic_tensor(rows, mask, str(batch.maps.device))
+    kinematics = kinematic_tensor(rows, np.repeat(valid[:, None], m, 1), device)
+    rendered = None
     if hpn is None or hpn.config.correct:
-        rendered = map_tensor(render(rows, valid, scene.pose, observation, raster), str(batch.maps.device))
+        rendered = render(rows, valid, scene.pose, observation, raster)
         if hpn is None:
-            return Prediction(rendered, kinematics, rows, valid)
-    else:
-        rendered = None
-    n, block = hpn.config.frames, hpn.config.block
-    seen_maps, seen_kinematics = batch.maps[:, -n:], batch.kinematics[:, -n:]
-    maps = []
+            wanted = slice(config.every - 1, None, config.every)
+            return Prediction(map_tensor(rendered[:, wanted], device), kinematics[:, wanted], rows, valid)
+    n, block, channels = hpn.config.seen, hpn.config.block, batch.maps.shape[2]
+    b, _, _, h, w = batch.maps.shape
+    # channels_last from here on: every frame is a group of channels, the window a few such groups
+    past = [_grouped(batch.maps[:, -n:])]
+    moved = batch.kinematics[:, -n:]
+    guesses = []
     for start in range(0, m, block):
-        ahead = rendered[:, start : start + block] if rendered is not None else None
-        if ahead is not None and ahead.shape[1] < block:
-            ahead = torch.cat([ahead, ahead[:, -1:].expand(-1, block - ahead.shape[1], -1, -1, -1)], 1)
-        guess, _ = hpn(seen_maps, seen_kinematics, ahead)  # its own K is replaced by the GP's
-        guess = guess.clamp(0.0, 1.0)
-        maps.append(guess)
+        drawn = None
+        if rendered is not None:
+            ahead = rendered[:, start : start + block]
+            if ahead.shape[1] < block:  # the horizon ends within this block
+                ahead = np.concatenate([ahead, np.repeat(ahead[:, -1:], block - ahead.shape[1], 1)], 1)
+            drawn = _grouped(torch.from_numpy(ahead).to(device)).to(torch.float32).mul_(1.0 / 255.0)
+        guess, _ = hpn(past, moved, drawn)  # its own K is replaced by the GP's (eq. 10)
+        guess = guess.clamp_(0.0, 1.0)
+        frames = guess.view(b, block, channels, h, w)
+        guesses += [frames[:, k] for k in range(block) if (start + k + 1) % config.every == 0]
         if start + block < m:
-            seen_maps = torch.cat([seen_maps, guess], 1)[:, -n:]
-            known = kinematics[:, start : start + block]
-            seen_kinematics = torch.cat([seen_kinematics, known], 1)[:, -n:]
-    return Prediction(torch.cat(maps, 1)[:, :m], kinematics, rows, valid)
+            past = _newest([*past, guess], n * channels)
+            moved = torch.cat([moved, kinematics[:, start : start + block]], 1)[:, -n:]
+    maps = torch.stack(guesses[: config.hypotheses], 1)
+    return Prediction(maps, kinematics[:, config.every - 1 :: config.every], rows, valid)
+
+
+def _grouped(maps: torch.Tensor) -> torch.Tensor:
+    """[B,T,C,H,W] -> [B,T*C,H,W] in channels_last."""
+    return maps.flatten(1, 2).contiguous(memory_format=torch.channels_last)
+
+
+def _newest(groups: list[torch.Tensor], wanted: int) -> list[torch.Tensor]:
+    """The last `wanted` channels of channel groups [B,.,H,W], oldest first."""
+    kept: list[torch.Tensor] = []
+    for group in reversed(groups):
+        kept.insert(0, group[:, -wanted:])
+        wanted -= kept[0].shape[1]
+        if wanted <= 0:
+            break
+    return kept

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -24,17 +25,23 @@ class HpnConfig:
     frames: int = 10  # N, 2 s of history (P, Table I)
     rows: int = 16
     block: int = 5  # frames predicted per step; 1 is the paper's (contract.md, Time)
-    reading: Literal["s2fc", "pool"] = "s2fc"  # compute.md: stride 2 then FC, or stride 2 with pooling
+    reading: Literal["s2fc", "pool"] = "pool"  # compute.md: stride 2 then FC, or stride 2 with pooling
     history: bool = True  # False: the current frame only (P, figure 6)
     correct: bool = True  # see the rendered next map and predict its correction (compute.md: what works)
+    skips: bool = True  # add encoder features to the decoder's: P has none; False with correct=False is P's
     features: tuple[int, int, int] = (32, 64, 64)  # P, section IV-C.1
     hidden: int = 128  # P: FC layers of the K branch
     latent: int = 512  # P, Table I
 
     @property
     def seen(self) -> int:
-        """Frames that enter the network."""
+        """Past frames that enter the network."""
         return self.frames if self.history else 1
+
+    @property
+    def inputs(self) -> int:
+        """Map channels that enter the network."""
+        return (self.seen + (self.block if self.correct else 0)) * self.channels
 
 
 class HPN(nn.Module):
@@ -47,12 +54,11 @@ class HPN(nn.Module):
     def __init__(self, config: HpnConfig) -> None:
         super().__init__()
         self.config = c = config
-        inputs = c.seen * c.channels + (c.block * c.channels if c.correct else 0)
         size = (c.height, c.width)
         before: list[tuple[int, int]] = []  # what each convolution sees
         convolved: list[tuple[int, int]] = []  # what it yields, before pooling
         pools: list[tuple[int, int]] = []
-        widths = [inputs, *c.features]
+        widths = [c.inputs, *c.features]
         self.encoder = nn.ModuleList()
         for k in range(3):
             self.encoder.append(nn.Conv2d(widths[k], widths[k + 1], 3, stride=2, padding=1))
@@ -86,35 +92,38 @@ class HPN(nn.Module):
             nn.init.zeros_(last.bias)
 
     def forward(
-        self, maps: torch.Tensor, kinematics: torch.Tensor, rendered: torch.Tensor | None = None
+        self, past: Sequence[torch.Tensor], kinematics: torch.Tensor, rendered: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """maps [B,N,C,H,W], kinematics [B,N,R,F+1], rendered [B,block,C,H,W] (with `correct`).
+        """One prediction step.
 
-        Returns the next maps [B,block,C,H,W] (not clamped; 0..1 once trained) and kinematics
-        [B,block,R,4] x y speed heading (scaled as the input is).
+        past: maps of the `seen` frames, oldest first, as one or more groups [B,k*C,H,W] of whole frames;
+        kinematics [B,seen,R,F+1]; rendered [B,block*C,H,W]: with `correct`, of the frames to predict.
+        Returns the next maps [B,block*C,H,W] (not clamped) and kinematics [B,block,R,4] x y speed heading
+        (scaled as the input is). Fastest in channels_last.
         """
         c = self.config
-        b = maps.shape[0]
-        stack = maps[:, -c.seen :].reshape(b, -1, c.height, c.width)
-        if c.correct:
-            if rendered is None:
-                raise ValueError("this HPN corrects a rendered map: it needs one")
-            stack = torch.cat([stack, rendered.reshape(b, -1, c.height, c.width)], 1)
-        z = stack.contiguous(memory_format=torch.channels_last)
+        if c.correct != (rendered is not None):
+            raise ValueError("a rendered map is needed exactly when the network corrects one")
+        b = kinematics.shape[0]
+        z = torch.cat([*past, rendered] if rendered is not None else list(past), 1)
+        skips: list[torch.Tensor] = []
         for convolution, pool in zip(self.encoder, self._pools, strict=True):
-            z = functional.relu(convolution(z))
+            z = functional.relu_(convolution(z))
+            skips.append(z)
             if pool != (1, 1):
                 z = functional.max_pool2d(z, pool)
-        moved = self.kinematics_in(kinematics[:, -c.seen :].flatten(1))
+        moved = self.kinematics_in(kinematics.flatten(1))
         latent = functional.relu(self.to_latent(z.flatten(1) + moved))  # P: elementwise addition
         z = functional.relu(self.from_latent(latent)).reshape(b, *self._core)
+        z = z.contiguous(memory_format=torch.channels_last)
         for k, convolution in enumerate(self.decoder):
             if self._pools[2 - k] != (1, 1):  # undo the pooling
                 z = functional.interpolate(z, size=self._convolved[2 - k], mode="nearest")
+            if c.skips:
+                z = z + skips[2 - k]
             z = convolution(z, output_size=list(self._before[2 - k]))
             if k < 2:
-                z = functional.relu(z)
-        out = z.reshape(b, c.block, c.channels, c.height, c.width)
-        if c.correct and rendered is not None:
-            out = out + rendered
-        return out, self.kinematics_out(latent).reshape(b, c.block, c.rows, PREDICTED)
+                z = functional.relu_(z)
+        if rendered is not None:
+            z = z + rendered
+        return z, self.kinematics_out(latent).reshape(b, c.block, c.rows, PREDICTED)

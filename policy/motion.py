@@ -68,18 +68,20 @@ def next_target(target: float, action: int, speed_limit: float) -> float:
     return top if target >= top else min(round(level) * SPEED_STEP, top)
 
 
+@njit(cache=True, nogil=True)
 def tracked_speeds(speed: float, targets: Floats, frames: int, dt: float) -> Floats:
     """Speeds while tracking target speeds [k] m/s from `speed`: [k,frames+1] m/s, every `dt` s."""
     per_frame = max(round(dt / STEP), 1)
     h = dt / per_frame
-    now = np.full(len(targets), float(speed))
-    out = np.empty((len(targets), frames + 1))
-    out[:, 0] = now
-    for k in range(1, frames + 1):
-        for _ in range(per_frame):
-            accel = np.clip((targets - now) / TIME_CONSTANT, -MAX_DECEL, MAX_ACCEL)
-            now = np.maximum(now + accel * h, 0.0)
-        out[:, k] = now
+    out = np.empty((targets.shape[0], frames + 1))
+    for k in range(targets.shape[0]):
+        v = speed
+        out[k, 0] = v
+        for t in range(1, frames + 1):
+            for _ in range(per_frame):
+                accel = min(max((targets[k] - v) / TIME_CONSTANT, -MAX_DECEL), MAX_ACCEL)
+                v = max(v + accel * h, 0.0)
+            out[k, t] = v
     return out
 
 
@@ -153,8 +155,9 @@ def roll(
     start: Ints,
     begin: Floats,  # [k] m, arc of the front now
     offset: Floats,  # [k] m, front beside the path now
+    aim: Floats,  # [k] m, offset at which it ends up
     heading: Floats,  # [k] rad, now
-    rate: Floats,  # [k] m/s >= 0, at which the offset closes
+    rate: Floats,  # [k] m/s >= 0, at which it gets there
     length: Floats,  # [k] m
     speed: Floats,  # [k,T+1] m/s
     stop: Floats,  # [k] m, arc at which the front has to stand; inf for none
@@ -173,8 +176,8 @@ def roll(
         first, last = start[k], start[k + 1]
         s, front, rear = begin[k], start[k], start[k]
         v = speed[k, 0]
-        side = 1.0 if offset[k] > 0.0 else -1.0
-        left = abs(offset[k])
+        side = 1.0 if offset[k] > aim[k] else -1.0
+        left = abs(offset[k] - aim[k])  # still to go
         turn = 0.0
         for t in range(frames):
             if t > 0:
@@ -201,20 +204,22 @@ def roll(
                 turn = (heading[k] - along + np.pi) % (2.0 * np.pi) - np.pi
                 turn = min(max(turn, -0.8), 0.8)
             h = along + turn
-            fx -= np.sin(along) * side * left
-            fy += np.cos(along) * side * left
+            beside = aim[k] + side * left
+            fx -= np.sin(along) * beside
+            fy += np.cos(along) * beside
             x[k, t] = fx - 0.5 * length[k] * np.cos(h)
             y[k, t] = fy - 0.5 * length[k] * np.sin(h)
             out_heading[k, t] = h
             out_speed[k, t] = v
             out_arc[k, t] = s
-            out_rear[k, t] = side * left - length[k] * np.sin(turn)
+            out_rear[k, t] = beside - length[k] * np.sin(turn)
 
 
 def roll_out(
     paths: Paths,
     begin: Floats,
     offset: Floats,
+    aim: Floats,
     heading: Floats,
     rate: Floats,
     length: Floats,
@@ -225,7 +230,7 @@ def roll_out(
 ) -> Rollout:
     """`roll` into fresh arrays; see there for the arguments."""
     out = Rollout(*(np.empty_like(speed) for _ in range(6)))
-    roll(*paths, begin, offset, heading, rate, length, speed, stop, brake, dt, *out)
+    roll(*paths, begin, offset, aim, heading, rate, length, speed, stop, brake, dt, *out)
     return out
 
 

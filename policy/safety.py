@@ -57,7 +57,7 @@ class SafetyConfig:
     horizon: float = 4.0  # s, P, Table I
     dt: float = 0.2  # s
     margin_length: float = 1.0  # m, added to the ego's box along
-    margin_width: float = 0.3  # m, and across: tracking is never exact
+    margin_width: float = 0.6  # m, and across: half of the room between cars in neighbouring lanes
     reaction: float = 0.4  # s until the next decision can brake
     leader_brake: float = 8.0  # m/s2, a leader's hardest expected braking
     standstill_gap: float = 1.0  # m left between standing cars
@@ -168,10 +168,13 @@ def evaluate(
     blamed: list[str | None] = [None] * len(ACTIONS)
     if len(others):
         touch = _first_contact(ego, traffic, me, others, c)  # [A,O] s
+        seen: dict[int, _Neighbours] = {}
         for a, way in enumerate(ways):
-            near = _Neighbours.of(
-                way.path, ego.arc[a, 0] - 0.5 * length, length, others, traffic, scene.state[me, -1], c
-            )
+            near = seen.get(id(way.path))
+            if near is None:
+                arc = ego.arc[a, 0] - 0.5 * length  # m, centre
+                near = _Neighbours.of(way.path, arc, length, others, traffic, scene.state[me, -1], c)
+                seen[id(way.path)] = near
             times = np.where(near.behind, np.inf, touch[a])  # followers brake: checked below for changes
             first = int(np.argmin(times))
             contact[a] = times[first]
@@ -286,6 +289,7 @@ def _roll_ego(history: History, packed: Paths, now: Floats, c: SafetyConfig) -> 
         packed,
         arc,
         offset,
+        np.zeros(count),
         np.full(count, now[3]),
         rate,
         np.full(count, now[4]),
@@ -403,31 +407,31 @@ def _margin(
     intended: Bools,
     c: SafetyConfig,
 ) -> tuple[float, int]:
-    """The score (s) that the leader and, for lane changes, the new follower leave, and who limits it.
+    """The score (s) that the gaps around the ego leave, and which of the others limits it.
 
     Leader: if it brakes with `leader_brake` from now on, and the ego with full force after one more decision,
-    they must not touch. Follower: it must not have to brake harder than `follower_brake`. At the limit the
-    score is safe_th, below it falls with the gap. Decelerating never makes either worse.
+    they must not touch; one that shares its intentions tells when it brakes, in time to brake with it.
+    A lane change further needs the place beside the ego, and a new follower that need not brake harder than
+    `follower_brake`. At the limit the score is safe_th, below it falls with the gap. Decelerating never makes
+    a gap smaller.
     """
-    best, who = np.inf, 0
     speed = traffic.rollout.speed[others, 0]
+    ratio = np.full(len(others), np.inf)  # of the gap there is to the gap needed
     if action != MetaAction.DECELERATE:
-        after = float(ego.speed[action, round(c.reaction / c.dt)])
-        travelled = float(ego.arc[action, round(c.reaction / c.dt)] - ego.arc[action, 0])
-        need = travelled + after**2 / (2 * MAX_DECEL) - speed**2 / (2 * c.leader_brake) + c.standstill_gap
-        # a connected leader tells when it brakes, in time to brake with it
-        hold = near.ahead & ~intended[others] & (near.gap < need)
-        if hold.any():
-            ratio = np.where(hold, np.maximum(near.gap, 0.0) / np.maximum(need, 1e-6), np.inf)
-            who = int(np.argmin(ratio))
-            best = 0.999 * c.safe_th * float(ratio[who])
+        soon = round(c.reaction / c.dt)
+        before, after = float(ego.speed[action, 0]), float(ego.speed[action, soon])
+        travelled = float(ego.arc[action, soon] - ego.arc[action, 0])
+        stopping = np.where(
+            intended[others], before**2 / (2 * MAX_DECEL), travelled + after**2 / (2 * MAX_DECEL)
+        )
+        need = np.maximum(stopping - speed**2 / (2 * c.leader_brake), 0.0) + c.standstill_gap
+        ratio = np.where(near.ahead, near.gap / need, ratio)
     if changes:
         closing = np.maximum(speed - ego.speed[action, 0], 0.0)
         need = c.follower_gap + speed * c.follower_reaction + closing**2 / (2 * c.follower_brake)
-        hold = near.behind & (near.gap < need)
-        if hold.any():
-            ratio = np.where(hold, np.maximum(near.gap, 0.0) / np.maximum(need, 1e-6), np.inf)
-            k = int(np.argmin(ratio))
-            if 0.999 * c.safe_th * float(ratio[k]) < best:
-                best, who = 0.999 * c.safe_th * float(ratio[k]), k
-    return best, who
+        ratio = np.where(near.behind, near.gap / need, ratio)
+        ratio = np.where(near.in_lane & (near.gap < c.standstill_gap), 0.0, ratio)
+    who = int(np.argmin(ratio))
+    if ratio[who] >= 1.0:
+        return np.inf, who
+    return 0.999 * c.safe_th * max(float(ratio[who]), 0.0), who

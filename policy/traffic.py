@@ -63,10 +63,14 @@ def predict_traffic(
     scale = np.array([p.scale for p in paths])
     arc = scene.lane_position[on_lane] * scale  # m, front bumper
     offset, drift = _sideways(scene, on_lane, paths, arc, c)
+    aim = np.zeros(len(lanes))  # m beside the path
     for i, k in enumerate(lanes):
         beside = road.lanes[k].left if offset[i] > 0.0 else road.lanes[k].right
-        if drift[i] * offset[i] > 0.0 and beside >= 0:  # moving away from its own centre line
-            paths[i] = road.path(beside)
+        if drift[i] * offset[i] > 0.0:  # moving away from its own centre line
+            if beside >= 0:
+                paths[i] = road.path(beside)
+            else:  # inside junctions lanes know no neighbours
+                aim[i] = np.copysign(max(road.lanes[k].width, abs(offset[i])), offset[i])
     packed = pack(paths)
     arc, offset = project_many(*packed, *fronts(now[on_lane]), arc)
     moving = np.abs(drift) > 0.0
@@ -78,6 +82,7 @@ def predict_traffic(
         packed,
         arc,
         offset,
+        aim,
         now[on_lane, 3],
         rate,
         now[on_lane, 4],

@@ -51,7 +51,7 @@ class VFN(nn.Module):
         self.config = c = config
         shape = (c.frames, c.height, c.width)
         widths = (c.channels, *c.features)
-        self.convolutions = nn.ModuleList()
+        layers: list[nn.Conv3d] = []
         for k, (stride, wanted) in enumerate(zip(STRIDES[c.strides], KERNELS, strict=True)):
             if c.strides == "temporal":
                 padding = tuple((n - 1) // 2 for n in wanted)
@@ -60,10 +60,11 @@ class VFN(nn.Module):
             else:
                 padding = (0, 0, 0)
                 kernel = tuple(min(n, s) for n, s in zip(wanted, shape, strict=True))
-            self.convolutions.append(nn.Conv3d(widths[k], widths[k + 1], kernel, stride, padding))  # type: ignore[arg-type]
+            layers.append(nn.Conv3d(widths[k], widths[k + 1], kernel, stride, padding))  # type: ignore[arg-type]
             shape = tuple(  # type: ignore[assignment]
                 (s + 2 * p - n) // d + 1 for s, p, n, d in zip(shape, padding, kernel, stride, strict=True)
             )
+        self.per_frame, self.second, self.third = layers
         self.flat = c.features[2] * shape[0] * shape[1] * shape[2]
         self.hidden = nn.Linear(self.flat, c.hidden)
         self.kinematics = nn.Sequential(
@@ -81,9 +82,16 @@ class VFN(nn.Module):
         self, maps: torch.Tensor, kinematics: torch.Tensor, route: torch.Tensor, phi: torch.Tensor
     ) -> torch.Tensor:
         """The joined representation [B,joined]; arguments as in `forward`."""
-        z = maps.permute(0, 2, 1, 3, 4).contiguous(memory_format=torch.channels_last_3d)  # [B,C,T,H,W]
-        for convolution in self.convolutions:
-            z = functional.relu(convolution(z))
+        b, t = maps.shape[:2]
+        # a (1,8,8) kernel is a 2D convolution of every frame: no need to turn the maps around first
+        first = self.per_frame
+        z = functional.conv2d(
+            maps.flatten(0, 1), first.weight[:, :, 0], first.bias, first.stride[1:], first.padding[1:]
+        )
+        z = functional.relu_(z).view(b, t, *z.shape[1:]).transpose(1, 2)  # [B,32,T,h,w]
+        z = z.contiguous(memory_format=torch.channels_last_3d)
+        z = functional.relu_(self.second(z))
+        z = functional.relu_(self.third(z))
         z = functional.relu(self.hidden(z.flatten(1)))
         moved = self.kinematics(torch.cat([kinematics.flatten(1), route], 1))
         return functional.relu(self.joined(torch.cat([z, moved, phi], 1)))

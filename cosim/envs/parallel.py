@@ -19,7 +19,7 @@ from cosim.scenario import Scenario
 from cosim.sumocfg import one_of
 from cosim.types import COMPACT, Bytes, ObservationConfig
 
-MAX_AGENTS = 16  # slots: more AVs than any of our worlds has on the road; further ones are driven by SUMO
+MAX_AGENTS = 32  # slots: about twice the AVs on the road in our worlds; SUMO drives any further ones
 NATIVE_RANDOM = 0  # the seed of the seeds, until reset(seed=...) gives another
 
 Step = tuple[

@@ -77,6 +77,7 @@ def open(
     others: PolicyFactory | None = None,
     simulator: SimulatorFactory | None = None,
     timeout: float = TIMEOUT,
+    worker: bool = True,
 ) -> Session:
     """Open the scenario `what`: a world's name, a path to any .sumocfg, or a `Scenario`.
 
@@ -84,6 +85,7 @@ def open(
     first episode's. `others` builds a policy for the AVs you do not command (an importable function, run in
     the simulation's process; without it SUMO's IDM drives them). `simulator` replaces SUMO, for tests
     (`cosim.simulation.fake`). `timeout`: the longest silence in s before the process counts as hung.
+    `worker=False` runs the simulation in this process, for debugging: one at a time, and its death is yours.
 
     Raises:
         BadInput: naming file (or option), field and value.
@@ -108,7 +110,16 @@ def open(
 
         vet(scenario)
     arguments = (scenario, observation, math.radians(svo), reward or RewardConfig(), others, simulator)
-    return Session(scenario, lambda: _caller(timeout, arguments), seed)
+    # a daemonic process (gymnasium's AsyncVectorEnv, SB3's SubprocVecEnv) may have no children, but is a
+    # process of its own already
+    in_process = not worker or multiprocessing.current_process().daemon
+
+    def connect() -> Caller:
+        if in_process:
+            return _InProcess(build_host(*arguments))
+        return Worker(build_host, *arguments, timeout=timeout, name="cosim-session")
+
+    return Session(scenario, connect, seed)
 
 
 class Session:
@@ -262,15 +273,9 @@ class Session:
         return {name: int(action) for name, action in actions.items()}
 
 
-def _caller(timeout: float, arguments: tuple[Any, ...]) -> Caller:
-    """A worker process; in a daemonic process (gymnasium's AsyncVectorEnv, SB3's SubprocVecEnv), which may
-    have no children but is a process of its own already, the simulation itself."""
-    if multiprocessing.current_process().daemon:
-        return _InProcess(build_host(*arguments))
-    return Worker(build_host, *arguments, timeout=timeout, name="cosim-session")
-
-
 class _InProcess:
+    """A `Caller` without a process of its own."""
+
     def __init__(self, host: Host) -> None:
         self._host = host
 

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cosim.envs.view import View
-from cosim.types import KINEMATIC_FEATURES, Floats32, MetaAction, ObservationConfig
+from cosim.types import KINEMATIC_FEATURES, Floats, Floats32, MetaAction, ObservationConfig
 
 Observation = dict[str, npt.NDArray[np.generic]] | Floats32
 Space = gymnasium.Space[Observation]
@@ -22,10 +22,17 @@ SCALE = {
 }  # fmt: skip
 BOUND = 4.0
 EGO_FEATURES = (
-    "target_speed", "speed_limit", "lane_changing",
+    "speed", "target_speed", "speed_limit", "lane_changing",
     "to_dead_end_left", "to_dead_end_keep", "to_dead_end_right", "conflict_distance",
+    "gap_ahead_left", "gap_ahead_keep", "gap_ahead_right",  # to whoever is next along that lane
+    "gap_behind_left", "gap_behind_keep", "gap_behind_right",
+    "faster_ahead_left", "faster_ahead_keep", "faster_ahead_right",  # its speed less one's own
+    "faster_behind_left", "faster_behind_keep", "faster_behind_right",
 )  # fmt: skip
 SPEED = 25.0  # m/s that count as 1
+GAP = 50.0  # m that count as 1; NO_GAP is what an empty lane counts as
+NO_GAP = 100.0
+HALF_LANE = 1.6  # m to either side of a centre line
 FAR = 400.0  # m that count as 1, and beyond: no dead end, no conflict (cosim.road.PATH_HORIZON)
 _SCALE = np.array([SCALE[name] for name in KINEMATIC_FEATURES], np.float32)  # [F]
 
@@ -75,11 +82,34 @@ def kinematics(matrix: Floats32) -> Floats32:
 
 
 def ego(view: View) -> Floats32:
-    """[E] EGO_FEATURES: the AV's own command and what its route knows."""
-    speeds = np.array([view.target_speed, view.speed_limit]) / SPEED
+    """[E] EGO_FEATURES: the AV's own command, what its route knows, who drives next on the three lanes."""
+    speeds = np.array([view.ego_speed, view.target_speed, view.speed_limit]) / SPEED
     distances = np.minimum([*view.to_dead_end, view.conflict_distance], FAR) / FAR
-    bounded = np.clip([*speeds, view.lane_changing, *distances], -BOUND, BOUND)
-    return np.asarray(bounded, np.float32)
+    gaps, faster = neighbours(view)
+    features = [*speeds, view.lane_changing, *distances, *(gaps / GAP).ravel(), *(faster / SPEED).ravel()]
+    return np.asarray(np.clip(features, -BOUND, BOUND), np.float32)
+
+
+def neighbours(view: View) -> tuple[Floats, Floats]:
+    """Bumper gaps [2,3] m and speed differences [2,3] m/s of those next ahead and behind; left, keep, right.
+
+    Who is within half a lane of a centre line is on it, as IDM and MOBIL count neighbours. Beside: a gap of
+    0; an empty or missing lane: NO_GAP and 0.
+    """
+    gaps, faster = np.full((2, 3), NO_GAP), np.zeros((2, 3))
+    others = view.kinematics[-1, 1:][view.valid[-1, 1:]]  # [r,F]
+    x, y, speed, _, length = others[:, :5].T
+    gap = np.maximum(np.abs(x) - 0.5 * (length + view.kinematics[-1, 0, 4]), 0.0)
+    for side in np.flatnonzero(view.lane_exists):
+        line = view.centre_lines[side]
+        on = np.abs(y - np.interp(x, line[:, 0], line[:, 1])) < HALF_LANE
+        for k, beyond in enumerate((x >= 0.0, x < 0.0)):
+            rows = np.flatnonzero(on & beyond)
+            if len(rows):
+                next_one = rows[np.argmin(gap[rows])]
+                gaps[k, side] = min(float(gap[next_one]), NO_GAP)
+                faster[k, side] = speed[next_one] - view.ego_speed
+    return gaps, faster
 
 
 def action_mask(view: View) -> npt.NDArray[np.int8]:

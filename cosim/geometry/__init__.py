@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cosim.geometry import kernels
-from cosim.geometry.kernels import encroachment as encroachment
+from cosim.geometry.kernels import encroachment
 from cosim.road import RoadMap
 from cosim.types import Bools, Floats, Ints, Snapshot
 
@@ -87,14 +87,22 @@ def deceleration_to_avoid_crash(a: Boxes, b: Boxes) -> Floats:
         return cast(Floats, kernels.drac_ufunc(*_motions(a), *_motions(b)))
 
 
-def largest_deceleration_to_avoid_crash(
-    all_boxes: Boxes, rows: npt.NDArray[Any], horizon: float = 120.0
-) -> float:
-    """Largest finite DRAC (m/s2) of vehicles `rows` [k] with any of the n; 0 without a conflict.
+class Conflicts(NamedTuple):
+    """The worst of each watched vehicle with anybody, at one moment; k watched vehicles."""
 
-    Only conflicts with a time to collision below `horizon` s count. See `deceleration_to_avoid_crash`.
+    rows: Ints  # [k]
+    time_to_collision: Floats  # [k] s, the smallest; the horizon when there is none
+    deceleration: Floats  # [k] m/s2, the largest finite DRAC; 0 without a conflict or when overlapping only
+
+
+def conflicts(all_boxes: Boxes, watched: Bools, horizon: float = 10.0) -> Conflicts:
+    """Conflicts of the `watched` [n] vehicles with any of the n (arrays [n] each), up to `horizon` s ahead.
+
+    The same as `time_to_collision` and `deceleration_to_avoid_crash` over all pairs, in one pass.
     """
-    return kernels.largest_drac(_table(all_boxes), np.asarray(rows, dtype=np.int64), horizon)
+    columns = tuple(np.asarray(v, dtype=np.float64) for v in all_boxes)
+    found = kernels.watched_conflicts(*columns, watched, float(horizon))  # type: ignore[call-arg, arg-type]
+    return Conflicts(*found)
 
 
 class LaneGraph(NamedTuple):

@@ -1,10 +1,13 @@
 """The compiled kernels behind `cosim.geometry`: boxes as tuples, one pair at a time.
 
 A box is the tuple (x, y, cos heading, sin heading, length, width, speed): m, m, -, -, m, m, m/s.
+All in one file on purpose: numba's cache on disk notices a change of the file a kernel stands in, not of
+the files it calls into.
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
@@ -35,16 +38,20 @@ def compiled(function: Function) -> Function:
 
 
 def _ufunc(inputs: int, result: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """A broadcasting numpy ufunc of `inputs` float64 arguments, compiled by numba."""
+    """A broadcasting numpy ufunc of `inputs` float64 arguments, compiled by numba when first called."""
     signature = f"{result}({', '.join(['float64'] * inputs)})"
 
-    def compile_it(function: Callable[..., Any]) -> Callable[..., Any]:
-        try:
-            return cast(Callable[..., Any], _numba.vectorize([signature], cache=True)(function))
-        except RuntimeError:
-            return cast(Callable[..., Any], _numba.vectorize([signature])(function))
+    def compile_later(function: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.cache
+        def made() -> Callable[..., Any]:
+            try:
+                return cast(Callable[..., Any], _numba.vectorize([signature], cache=True)(function))
+            except RuntimeError:  # no cache folder, see `compiled`
+                return cast(Callable[..., Any], _numba.vectorize([signature])(function))
 
-    return compile_it
+        return lambda *arguments: made()(*arguments)
+
+    return compile_later
 
 
 @compiled
@@ -251,19 +258,34 @@ def pairs_ttc(table: Floats, rows: Ints, cap: float) -> Floats:
 
 
 @compiled
-def largest_drac(table: Floats, rows: Ints, horizon: float) -> float:
-    """See `cosim.geometry.largest_deceleration_to_avoid_crash`."""
-    largest = 0.0
+def watched_conflicts(
+    x: Floats,
+    y: Floats,
+    heading: Floats,
+    length: Floats,
+    width: Floats,
+    speed: Floats,
+    watched: Bools,
+    horizon: float,
+) -> tuple[Ints, Floats, Floats]:
+    """See `cosim.geometry.conflicts`."""
+    n = len(x)
+    cosine, sine = np.cos(heading), np.sin(heading)
+    nearest, hardest = np.full(n, horizon), np.zeros(n)
+    rows = np.flatnonzero(watched)
     for i in rows:
-        a = _box(table, i)
-        for j in range(len(table)):
-            if j != i:
-                b = _box(table, j)
-                if 0.0 < _ttc(a, b, horizon) < horizon:
-                    needed = _drac(a, b)
-                    if needed < np.inf:
-                        largest = max(largest, needed)
-    return largest
+        a = (x[i], y[i], cosine[i], sine[i], length[i], width[i], speed[i])
+        for j in range(n):
+            if j == i or (j < i and watched[j]):
+                continue  # both watched: done when it was j's turn
+            b = (x[j], y[j], cosine[j], sine[j], length[j], width[j], speed[j])
+            ttc = _ttc(a, b, horizon)
+            if ttc < horizon:
+                needed = _drac(a, b) if ttc > 0.0 else 0.0
+                needed = needed if needed < np.inf else 0.0
+                nearest[i], hardest[i] = min(nearest[i], ttc), max(hardest[i], needed)
+                nearest[j], hardest[j] = min(nearest[j], ttc), max(hardest[j], needed)
+    return rows, nearest[rows], hardest[rows]
 
 
 @compiled
@@ -329,6 +351,23 @@ def _trail_bounds(trail: Floats, newest: int, m: int) -> tuple[Floats, Floats]:
         if straight:
             course[a, 0], course[a, 1] = c, s
     return bounds, course
+
+
+@compiled
+def record(
+    trail: Floats,
+    newest: int,
+    slot: Ints,
+    x: Floats,
+    y: Floats,
+    heading: Floats,
+    speed: Floats,
+) -> None:
+    """Write a frame of vehicles (numbers `slot` [n]) into a ring of frames, see `encroachment`."""
+    trail[newest] = np.nan
+    for k in range(len(slot)):
+        row = trail[newest, slot[k]]
+        row[0], row[1], row[2], row[3], row[4] = x[k], y[k], np.cos(heading[k]), np.sin(heading[k]), speed[k]
 
 
 @compiled

@@ -3,13 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, field
+from typing import Any, Protocol, TypeVar, cast
 
 import numpy as np
+import numpy.typing as npt
 
+from cosim.geometry import Conflicts, boxes, conflicts
 from cosim.road import RoadMap
 from cosim.types import Bools, Ints, Kind, Metric, Snapshot, Timing
+
+Table = TypeVar("Table", bound=npt.NDArray[Any])
+AV = int(Kind.AV)  # comparing arrays with an IntEnum member costs five times as much
+HORIZON = 10.0  # s, further ahead straight-line extrapolation says nothing (papers.md: cap ttc)
+
+
+class ConflictView:
+    """The conflicts of a frame, worked out once for all the metrics that look at them."""
+
+    def __init__(self) -> None:
+        self._snapshot: Snapshot | None = None
+
+    def of(self, snapshot: Snapshot) -> Conflicts:
+        """Conflicts of AVs and mission vehicles with anybody, up to `HORIZON` ahead."""
+        if snapshot is not self._snapshot:
+            self._conflicts = conflicts(boxes(snapshot), watched(snapshot), HORIZON)
+            self._snapshot = snapshot
+        return self._conflicts
 
 
 @dataclass(frozen=True)
@@ -21,6 +41,7 @@ class MetricContext:
     mission_kind: str  # merge, exit, roundabout, intersection, auto or none
     goal: frozenset[int]  # lanes (indices into RoadMap.lanes) on which the mission has succeeded
     duration: float  # s, counted
+    conflicts: ConflictView = field(default_factory=ConflictView, compare=False, repr=False)
 
 
 class EpisodeMetric(Protocol):
@@ -38,7 +59,7 @@ class EpisodeMetric(Protocol):
 
 def watched(snapshot: Snapshot) -> Bools:
     """[n] the vehicles whose conflicts are counted: AVs and mission vehicles."""
-    return np.asarray((snapshot.kind == Kind.AV) | snapshot.mission)
+    return np.asarray((snapshot.kind == AV) | snapshot.mission)
 
 
 def rows_in_both(before: Snapshot, after: Snapshot) -> tuple[Ints, Ints]:
@@ -70,3 +91,14 @@ class Slots:
             self._rows = np.array([self.of.setdefault(name, len(self.of)) for name in names], dtype=np.int64)
             self._ids = names
         return self._rows
+
+
+def grown(table: Table, needed: int, fill: float, axis: int = 0) -> Table:
+    """The table itself while `needed` entries fit along `axis`, else a copy with room for twice as many."""
+    if table.shape[axis] >= needed:
+        return table
+    shape = list(table.shape)
+    shape[axis] = 2 * needed
+    larger = np.full(shape, fill, dtype=table.dtype)
+    larger[(slice(None),) * axis + (slice(table.shape[axis]),)] = table
+    return cast(Table, larger)

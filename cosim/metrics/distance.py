@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
-from cosim.metrics.context import MetricContext, Slots, rows_in_both
-from cosim.types import Bools, Floats, Kind, Metric, Snapshot
+from cosim.geometry.kernels import compiled
+from cosim.metrics.context import AV, MetricContext, Slots, grown
+from cosim.types import Bools, Floats, Ints, Metric, Snapshot
 
 
 class Distance:
@@ -18,42 +20,55 @@ class Distance:
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._slots = Slots()
-        self._driven: Floats = np.zeros(64)  # [slots] m
-        self._is_av: Bools = np.zeros(64, dtype=np.bool_)
-        self._is_mission: Bools = np.zeros(64, dtype=np.bool_)
-        self._before = first
+        # [slots,5]: frame last seen, speed m/s then, distance driven m, is an AV, is a mission vehicle
+        self._tally: Floats = np.zeros((64, 5))
+        self._frame = 0
+        self._time = first.time
         self._started = first.n
         self.add(first)
 
     def add(self, snapshot: Snapshot) -> None:
-        s, before = snapshot, self._before
-        slot = self._slots.rows(s.ids)  # [n]
-        if len(self._slots) > len(self._driven):
-            self._grow()
-        then, now = rows_in_both(before, s)
-        # trapezoid of the speeds: positions would count a teleport's jump as driven
-        self._driven[slot[now]] += 0.5 * (before.speed[then] + s.speed[now]) * (s.time - before.time)
-        self._is_av[slot] = s.kind == Kind.AV
-        self._is_mission[slot] |= s.mission
-        self._before = s
+        s = snapshot
+        slot = self._slots.rows(s.ids)
+        self._tally = grown(self._tally, len(self._slots), 0.0)
+        elapsed = s.time - self._time
+        self._time = s.time
+        self._frame += 1
+        _drive(s.kind, s.mission, s.speed, slot, self._tally, self._frame, elapsed)
 
     def result(self) -> dict[str, Metric]:
         seen = len(self._slots)
         counted = np.arange(seen) < (self._started or seen)
-        driven, av, mission = self._driven[:seen], self._is_av[:seen], self._is_mission[:seen]
+        driven = self._tally[:seen, 2]
+        av, mission = self._tally[:seen, 3] > 0.0, self._tally[:seen, 4] > 0.0
         return {
-            "dt_mean_m": _mean(driven[counted], "higher"),
-            "dt_av_m": _mean(driven[counted & av], "higher"),
-            "dt_hv_m": _mean(driven[counted & ~av], "higher"),
-            "dt_mission_m": _mean(driven[mission], "higher"),
+            "dt_mean_m": _mean(driven[counted]),
+            "dt_av_m": _mean(driven[counted & av]),
+            "dt_hv_m": _mean(driven[counted & ~av]),
+            "dt_mission_m": _mean(driven[mission]),
         }
 
-    def _grow(self) -> None:
-        more = 2 * len(self._slots)
-        self._driven = np.concatenate([self._driven, np.zeros(more)])
-        self._is_av = np.concatenate([self._is_av, np.zeros(more, dtype=np.bool_)])
-        self._is_mission = np.concatenate([self._is_mission, np.zeros(more, dtype=np.bool_)])
+
+@compiled
+def _drive(
+    kind: npt.NDArray[np.int8],
+    mission: Bools,
+    speed: Floats,
+    slot: Ints,
+    tally: Floats,
+    frame: int,
+    elapsed: float,
+) -> None:
+    """Add the trapezoid of the speeds to everybody's distance; positions would count a teleport's jump."""
+    for k in range(len(slot)):
+        row = tally[slot[k]]
+        if frame > 1 and row[0] == frame - 1:
+            row[2] += 0.5 * (row[1] + speed[k]) * elapsed
+        row[0], row[1] = frame, speed[k]
+        row[3] = 1.0 if kind[k] == AV else 0.0
+        if mission[k]:
+            row[4] = 1.0
 
 
-def _mean(values: Floats, better: str) -> Metric:
-    return Metric(float(values.mean()) if len(values) else None, "m", better)
+def _mean(values: Floats) -> Metric:
+    return Metric(float(values.mean()) if len(values) else None, "m", "higher")

@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-
-from cosim.geometry import boxes, largest_deceleration_to_avoid_crash
-from cosim.metrics.context import MetricContext, watched
+from cosim.metrics.context import MetricContext
 from cosim.types import Metric, Snapshot
-
-HORIZON = 10.0  # s, conflicts further ahead are no conflicts yet (as for time to collision)
 
 
 class DecelerationRate:
@@ -18,14 +13,14 @@ class DecelerationRate:
     """
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
+        self._conflicts = context.conflicts
         self._largest: float | None = None
         self.add(first)
 
     def add(self, snapshot: Snapshot) -> None:
-        rows = np.flatnonzero(watched(snapshot))
-        if len(rows):
-            needed = largest_deceleration_to_avoid_crash(boxes(snapshot), rows, HORIZON)
-            self._largest = max(self._largest or 0.0, needed)
+        needed = self._conflicts.of(snapshot).deceleration  # [k] m/s2
+        if len(needed):
+            self._largest = max(self._largest or 0.0, float(needed.max()))
 
     def result(self) -> dict[str, Metric]:
         return {"max_drac_mps2": Metric(self._largest, "m/s2", "lower")}

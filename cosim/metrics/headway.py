@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from cosim.geometry import gap_ahead, headway, lane_graph
-from cosim.metrics.context import MetricContext
-from cosim.types import Kind, Metric, Snapshot
+from cosim.metrics.context import AV, MetricContext
+from cosim.types import Metric, Snapshot
 
 
 class Headway:
@@ -20,16 +20,15 @@ class Headway:
         self.add(first)
 
     def add(self, snapshot: Snapshot) -> None:
-        av = np.flatnonzero(snapshot.kind == Kind.AV)
+        av = np.flatnonzero(snapshot.kind == AV)
         if not len(av):
             return
         gap, _ = gap_ahead(snapshot, self._graph, av)
-        time = headway(gap, snapshot.speed[av])
-        time = time[time < np.inf]
-        if len(time):
-            self._sum += float(time.sum())
-            self._counted += len(time)
-            self._smallest = min(self._smallest, float(time.min()))
+        for time in headway(gap, snapshot.speed[av]).tolist():
+            if time < np.inf:
+                self._sum += time
+                self._counted += 1
+                self._smallest = min(self._smallest, time)
 
     def result(self) -> dict[str, Metric]:
         mean, smallest = (self._sum / self._counted, self._smallest) if self._counted else (None, None)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
-from cosim.metrics.context import MetricContext, Slots
-from cosim.types import Floats, Kind, Metric, Snapshot
+from cosim.geometry.kernels import compiled
+from cosim.metrics.context import AV, MetricContext, Slots, grown
+from cosim.types import Floats, Ints, Metric, Snapshot
 
 
 class Jerk:
@@ -13,34 +15,44 @@ class Jerk:
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._slots = Slots()
-        self._speed: Floats = np.full(64, np.nan)  # [slots] m/s at the frame before, NaN while absent
-        self._accel: Floats = np.full(64, np.nan)  # [slots] m/s2, mean up to the frame before
+        # [slots,3]: the frame's number, speed m/s then, mean acceleration m/s2 up to then (NaN unknown)
+        self._last: Floats = np.full((64, 3), np.nan)
+        self._frame = 0
         self._time = first.time
         self._sum = 0.0  # m/s3
         self._counted = 0
         self.add(first)
 
     def add(self, snapshot: Snapshot) -> None:
+        slot = self._slots.rows(snapshot.ids)
+        self._last = grown(self._last, len(self._slots), np.nan)
         elapsed = snapshot.time - self._time
         self._time = snapshot.time
-        av = np.flatnonzero(snapshot.kind == Kind.AV)
-        slot = self._slots.rows(snapshot.ids)[av]
-        if len(self._slots) > len(self._speed):
-            more = np.full(2 * len(self._slots), np.nan)
-            self._speed = np.concatenate([self._speed, more])
-            self._accel = np.concatenate([self._accel, more])
-        speed = snapshot.speed[av]
-        fresh_speed, fresh_accel = np.full_like(self._speed, np.nan), np.full_like(self._accel, np.nan)
-        fresh_speed[slot] = speed
-        if elapsed > 0.0:
-            accel = (speed - self._speed[slot]) / elapsed
-            jerk = np.abs(accel - self._accel[slot]) / elapsed  # [AVs] m/s3, NaN before a third frame
-            known = jerk == jerk
-            self._sum += float(jerk[known].sum())
-            self._counted += int(known.sum())
-            fresh_accel[slot] = accel
-        self._speed, self._accel = fresh_speed, fresh_accel
+        self._frame += 1
+        total, counted = _jerks(snapshot.kind, snapshot.speed, slot, self._last, self._frame, elapsed)
+        self._sum += total
+        self._counted += counted
 
     def result(self) -> dict[str, Metric]:
         mean = self._sum / self._counted if self._counted else None
         return {"mean_abs_jerk_mps3": Metric(mean, "m/s3", "lower")}
+
+
+@compiled
+def _jerks(
+    kind: npt.NDArray[np.int8], speed: Floats, slot: Ints, last: Floats, frame: int, elapsed: float
+) -> tuple[float, int]:
+    """Sum (m/s3) and number of the AVs' jerks in this frame; `last` [slots,3] is brought up to date."""
+    total, counted = 0.0, 0
+    for k in range(len(slot)):
+        if kind[k] != AV:
+            continue
+        memory = last[slot[k]]
+        accel = np.nan
+        if memory[0] == frame - 1 and elapsed > 0.0:
+            accel = (speed[k] - memory[1]) / elapsed
+            if not np.isnan(memory[2]):
+                total += abs(accel - memory[2]) / elapsed
+                counted += 1
+        memory[0], memory[1], memory[2] = frame, speed[k], accel
+    return total, counted

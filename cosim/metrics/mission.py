@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from cosim.metrics.context import MetricContext
 from cosim.types import Metric, Snapshot
 
@@ -18,7 +16,7 @@ class MissionSuccess:
     """
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
-        self._goal = np.array(sorted(context.goal), dtype=np.int32)
+        self._goal = context.goal
         self._applies = context.mission_kind != "none" and bool(context.goal)
         self._begin = first.time
         self._reached: dict[str, float | None] = {}  # id -> s from the episode's start
@@ -31,8 +29,9 @@ class MissionSuccess:
             return
         for collision in snapshot.events.collisions:  # they came before this frame's positions
             self._crashed.update((collision.collider, collision.victim))
-        self._standing.difference_update(snapshot.events.arrived)
-        for row in np.flatnonzero(snapshot.mission):
+        if snapshot.events.arrived:
+            self._standing.difference_update(snapshot.events.arrived)
+        for row in snapshot.mission.nonzero()[0].tolist():
             name = snapshot.ids[row]
             if self._reached.setdefault(name, None) is not None:
                 continue
@@ -40,7 +39,7 @@ class MissionSuccess:
                 self._standing.add(name)
             else:
                 self._standing.discard(name)
-            if name not in self._crashed and bool((self._goal == snapshot.lane[row]).any()):
+            if name not in self._crashed and int(snapshot.lane[row]) in self._goal:
                 self._reached[name] = snapshot.time - self._begin
 
     def result(self) -> dict[str, Metric]:

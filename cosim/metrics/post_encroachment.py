@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from cosim.geometry import encroachment
-from cosim.metrics.context import MetricContext, Slots, watched
-from cosim.types import Metric, Snapshot
+from cosim.geometry.kernels import encroachment, record
+from cosim.metrics.context import MetricContext, Slots, grown, watched
+from cosim.types import Ints, Metric, Snapshot
 
 LONGEST = 5.0  # s, a later passage is no encounter any more (Allen et al. 1978 look at 1 to 5 s)
 
@@ -22,21 +22,21 @@ class PostEncroachment:
         self._sizes = np.zeros((64, 2))  # [slots,2] m
         self._watched = np.zeros(64, dtype=np.bool_)
         self._newest = -1
+        self._known: Ints | None = None
         self._smallest = np.inf
         self.add(first)
 
     def add(self, snapshot: Snapshot) -> None:
         s = snapshot
         slot = self._slots.rows(s.ids)  # [n]
-        if len(self._slots) > len(self._sizes):
-            self._grow()
+        self._sizes = grown(self._sizes, len(self._slots), 0.0)
+        self._watched = grown(self._watched, len(self._slots), False)
+        self._trail = grown(self._trail, len(self._slots), np.nan, axis=1)
         self._newest = (self._newest + 1) % self._frames
-        frame = self._trail[self._newest]
-        frame[:] = np.nan
-        frame[slot, 0], frame[slot, 1] = s.x, s.y
-        frame[slot, 2], frame[slot, 3] = np.cos(s.heading), np.sin(s.heading)
-        frame[slot, 4] = s.speed
-        self._sizes[slot, 0], self._sizes[slot, 1] = s.length, s.width
+        record(self._trail, self._newest, slot, s.x, s.y, s.heading, s.speed)
+        if slot is not self._known:  # somebody came or left
+            self._sizes[slot, 0], self._sizes[slot, 1] = s.length, s.width
+            self._known = slot
         self._watched[slot] |= watched(s)
         found = encroachment(
             self._trail, self._newest, len(self._slots), self._sizes, self._watched, self._interval
@@ -46,9 +46,3 @@ class PostEncroachment:
     def result(self) -> dict[str, Metric]:
         value = float(self._smallest) if self._smallest <= LONGEST else None
         return {"min_pet_s": Metric(value, "s", "higher")}
-
-    def _grow(self) -> None:
-        old, more = len(self._sizes), 2 * len(self._slots)
-        self._trail = np.concatenate([self._trail, np.full((self._frames, more, 5), np.nan)], axis=1)
-        self._sizes = np.concatenate([self._sizes, np.zeros((more, 2))])
-        self._watched = np.concatenate([self._watched, np.zeros(old + more, dtype=np.bool_)])[: old + more]

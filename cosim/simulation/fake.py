@@ -73,6 +73,10 @@ class FakeSimulator:
 
     def advance(self, commands: Sequence[Command]) -> tuple[tuple[Receipt, ...], tuple[Snapshot, ...]]:
         """Hold the commands for one decision."""
+        named = {c.vehicle for c in commands}
+        for v in self._vehicles.values():
+            if v.id not in named:
+                v.target = None  # handed back to IDM, as in SUMO
         receipts = tuple(self._take(c) for c in commands)
         per_frame = round(self._timing.frame / self._timing.step)
         frames = []

@@ -133,9 +133,8 @@ class PredictionAware:
             if c.predicted_maps:
                 assert self._raster is not None
                 ahead = predict(c.chain, c.observation, self._raster, self.hpn, scene, batch, forecast)
-                every = c.chain.every
-                maps = torch.cat([maps, ahead.maps[:, every - 1 :: every]], 1)
-                kinematics = torch.cat([kinematics, ahead.kinematics[:, every - 1 :: every]], 1)
+                maps = torch.cat([maps, ahead.maps], 1)
+                kinematics = torch.cat([kinematics, ahead.kinematics], 1)
             q = to_numpy(self.vfn(maps, kinematics, batch.route, batch.phi))
         if not np.isfinite(q).all():
             raise FloatingPointError("the value network returned values that are not finite")

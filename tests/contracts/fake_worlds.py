@@ -1,10 +1,10 @@
-"""Small worlds without SUMO for the environments' tests: importable, so that a worker process can build them."""
+"""Small worlds without SUMO for the environments' tests: importable, so that a worker can build them."""
 
 from __future__ import annotations
 
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 from cosim.scenario import Mission, Scenario, load
@@ -17,7 +17,7 @@ def scenario(duration: float = 4.0) -> Scenario:
     return replace(load("merge"), warmup=0.0, duration=duration, mission=Mission(kind="none"))
 
 
-def platoon(_: Scenario, parameters: Mapping[str, str], frames: int) -> FakeSimulator:
+def platoon(*_: object) -> FakeSimulator:
     """Three AVs with room around them, and a human behind."""
     return FakeSimulator(
         [
@@ -29,7 +29,7 @@ def platoon(_: Scenario, parameters: Mapping[str, str], frames: int) -> FakeSimu
     )
 
 
-def wall(_: Scenario, parameters: Mapping[str, str], frames: int) -> FakeSimulator:
+def wall(*_: object) -> FakeSimulator:
     """AV `a` drives towards a standing human 30 m ahead; AV `b` is far away."""
     return FakeSimulator(
         [
@@ -40,7 +40,7 @@ def wall(_: Scenario, parameters: Mapping[str, str], frames: int) -> FakeSimulat
     )
 
 
-def short_road(_: Scenario, parameters: Mapping[str, str], frames: int) -> FakeSimulator:
+def short_road(*_: object) -> FakeSimulator:
     """AV `a` leaves a road of 320 m after about a second; AV `b` stays."""
     return FakeSimulator(
         [FakeVehicle("a", 300.0, 0, 20.0, is_av=True), FakeVehicle("b", 100.0, 0, 20.0, is_av=True)],
@@ -48,7 +48,7 @@ def short_road(_: Scenario, parameters: Mapping[str, str], frames: int) -> FakeS
     )
 
 
-def nobody(_: Scenario, parameters: Mapping[str, str], frames: int) -> FakeSimulator:
+def nobody(*_: object) -> FakeSimulator:
     """Humans only."""
     return FakeSimulator([FakeVehicle("human", 100.0, 0, 20.0)])
 
@@ -68,11 +68,11 @@ class Dying(FakeSimulator):
         os.abort()
 
 
-def hanging(_: Scenario, parameters: Mapping[str, str], frames: int) -> FakeSimulator:
+def hanging(*_: object) -> FakeSimulator:
     """One AV in a world that hangs."""
     return Hanging([FakeVehicle("a", 100.0, 0, 20.0, is_av=True)])
 
 
-def dying(_: Scenario, parameters: Mapping[str, str], frames: int) -> FakeSimulator:
+def dying(*_: object) -> FakeSimulator:
     """One AV in a world that dies."""
     return Dying([FakeVehicle("a", 100.0, 0, 20.0, is_av=True)])

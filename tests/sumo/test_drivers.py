@@ -32,7 +32,9 @@ def highway(tmp_path_factory: pytest.TempPathFactory) -> Path:
     files = ["-n", "n.nod.xml", "-e", "e.edg.xml", "-o", "net.xml"]
     subprocess.run([netconvert, *files], cwd=folder, check=True, capture_output=True)
     (folder / "flow.rou.xml").write_text(
-        '<routes><vType id="car" length="4.5" width="2"/><route id="r" edges="e"/>'
+        '<routes><vType id="car" length="4.5" width="2"/>'
+        '<vType id="idm_car" carFollowModel="IDM" length="4.5" width="2" maxSpeed="12"/>'
+        '<route id="r" edges="e"/>'
         '<flow id="f" type="car" route="r" begin="0" end="600" period="exp(1.0)" departLane="random"'
         ' departSpeed="max"/></routes>'
     )
@@ -166,6 +168,29 @@ def test_without_the_idm_base_type_a_foreign_car_following_model_is_refused_by_n
         libsumo.simulationStep()
     with pytest.raises(BadInput, match="car"):
         Drivers("moderate", "lc2013", 1).apply(libsumo.simulation.getDepartedIDList()[0])
+
+
+def test_a_type_that_already_uses_idm_needs_no_base_type_and_keeps_its_body(start) -> None:
+    start(base_type=False)
+    libsumo.vehicle.add("slow", "r", "idm_car", departLane="1", departPos="100", departSpeed="10")
+    libsumo.simulationStep()
+    Drivers("conservative", "lc2013", TEST_SEED).apply("slow")
+    assert libsumo.vehicle.getTau("slow") == 3.0
+    assert libsumo.vehicle.getMaxSpeed("slow") == 12.0
+    assert libsumo.vehicle.getLength("slow") == 4.5
+
+
+def test_a_lane_change_of_a_human_driver_takes_two_seconds(start) -> None:
+    start()
+    libsumo.vehicle.add("alone", "r", "car", departLane="0", departPos="300", departSpeed="20")
+    libsumo.simulationStep()
+    Drivers("moderate", "lc2013", TEST_SEED).apply("alone")
+    libsumo.vehicle.changeLaneRelative("alone", 1, 0.0)
+    moving = 0
+    for _ in range(40):
+        libsumo.simulationStep()
+        moving += libsumo.vehicle.getLateralSpeed("alone") != 0.0
+    assert moving == pytest.approx(20, abs=1)
 
 
 def test_as_is_touches_nothing(start) -> None:

@@ -134,9 +134,8 @@ def drive(net: Path, folder: Path, speeds: dict[str, float], **departures: objec
 
 
 def every_other(b: Boxes) -> Boxes:
-    return Boxes(
-        *(np.asarray(v)[::2] for v in (b.x, b.y, b.heading)), b.length, b.width, np.asarray(b.speed)[::2]
-    )
+    x, y, heading, speed = (np.asarray(v)[::2] for v in (b.x, b.y, b.heading, b.speed))
+    return Boxes(x, y, heading, b.length, b.width, speed)
 
 
 def spans(conflict: ElementTree.Element, tag: str) -> list[float]:

@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 
 from cosim.geometry import (
     Boxes,
+    conflicts,
     deceleration_to_avoid_crash,
     gap_ahead,
     headway,
     lane_graph,
-    largest_deceleration_to_avoid_crash,
     overlap,
     overlapping_pairs,
     pairs_time_to_collision,
@@ -251,14 +251,24 @@ def test_at_a_crossing_braking_with_the_drac_just_avoids_the_crash(
         assert collides_when_braking(b, a, 0.9 * drac)
 
 
-def test_the_largest_drac_leaves_out_pairs_nobody_watches() -> None:
+def test_the_worst_conflicts_of_the_watched_equal_those_of_all_their_pairs() -> None:
+    rng = np.random.default_rng(200_002)
+    n = 30
     crowd = Boxes(
-        np.array([0.0, 25.0, 500.0, 515.0]), np.zeros(4), np.zeros(4), np.full(4, 5.0), np.full(4, 2.0),
-        np.array([20.0, 10.0, 30.0, 0.0]),
+        rng.uniform(0, 300, n), rng.uniform(0, 15, n), rng.normal(0, 0.2, n), np.full(n, 5.0),
+        np.full(n, 2.0), rng.uniform(0, 30, n),
     )  # fmt: skip
-    assert largest_deceleration_to_avoid_crash(crowd, np.array([0])) == pytest.approx(100.0 / 40.0)
-    assert largest_deceleration_to_avoid_crash(crowd, np.array([2])) == pytest.approx(900.0 / 20.0)
-    assert largest_deceleration_to_avoid_crash(crowd, np.array([0]), horizon=1.0) == 0.0  # 2 s away
+    watched = rng.random(n) < 0.4
+    rows = np.flatnonzero(watched)
+    ours = Boxes(*(np.asarray(v)[rows, None] for v in crowd))
+    ttc = pairs_time_to_collision(crowd, rows, cap=10.0)  # [k,n]
+    drac = deceleration_to_avoid_crash(ours, crowd)
+    drac[~np.isfinite(drac) | (ttc >= 10.0)] = 0.0  # oneself and touching cars; too far ahead
+    seen = conflicts(crowd, watched, horizon=10.0)
+    assert np.array_equal(seen.rows, rows)
+    assert seen.time_to_collision == pytest.approx(ttc.min(axis=1))
+    assert seen.deceleration == pytest.approx(drac.max(axis=1))
+    assert (seen.deceleration > 0.0).sum() >= 3
 
 
 # ---- gap and headway -----------------------------------------------------------------------------------

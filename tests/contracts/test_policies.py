@@ -1,0 +1,37 @@
+"""Every policy that `--policy` knows keeps the same contract."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+from policy_contract import PolicyContract
+
+from cosim.errors import BadInput
+from cosim.types import Policy
+from policy.agents import POLICIES, make
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _one_thread() -> Iterator[None]:
+    """Torch as `cosim run` uses it (contract.md, Reproducibility)."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+class TestPolicies(PolicyContract):
+    @pytest.fixture(scope="class", params=POLICIES)
+    def policy(self, request: pytest.FixtureRequest) -> Policy:
+        return make(request.param)
+
+    def test_it_goes_by_the_name_of_the_table(self, policy: Policy) -> None:
+        assert type(policy) is type(make(policy.name))
+
+
+def test_an_unknown_policy_is_answered_with_the_nearest_one() -> None:
+    with pytest.raises(BadInput, match=r"--policy='altruist_rule'.*did you mean 'altruist-rule'"):
+        make("altruist_rule")

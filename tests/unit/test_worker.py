@@ -1,0 +1,168 @@
+"""The supervised process: what its object raises, how it dies, and that nothing of it stays."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from cosim.errors import BadInput, CosimError, SimulationCrashed, SimulationError
+from cosim.worker import Worker
+
+
+class Servant:
+    """What the worker holds in these tests."""
+
+    def __init__(self, bequest: str | None = None) -> None:
+        self._bequest = bequest
+
+    def pid(self) -> int:
+        return os.getpid()
+
+    def add(self, a: int, b: int = 0) -> int:
+        return a + b
+
+    def count(self, to: int, progress: Callable[..., None]) -> str:
+        for k in range(to):
+            time.sleep(0.15)
+            progress(k, to)
+        return "done"
+
+    def refuse(self) -> None:
+        raise BadInput("must be even", file="a.xml", field="n", value=3)
+
+    def fail(self) -> None:
+        raise SimulationError("SUMO says no")
+
+    def stumble(self) -> None:
+        raise ZeroDivisionError("a bug of ours")
+
+    def sleep(self) -> None:
+        time.sleep(60.0)
+
+    def murmur_and_die(self) -> None:
+        os.write(2, b"Error: the net is broken\n")
+        os.kill(os.getpid(), signal.SIGSEGV)
+
+    def leave(self) -> None:
+        os._exit(3)
+
+    def shout(self) -> str:
+        print("Warning: of no concern", file=sys.stderr, flush=True)
+        return "ok"
+
+    def close(self) -> None:
+        if self._bequest is not None:
+            Path(self._bequest).write_text("closed")
+
+
+def unwilling() -> Servant:
+    """A factory that refuses."""
+    raise BadInput("no such thing", field="what", value="x")
+
+
+@pytest.fixture
+def worker() -> Iterator[Worker]:
+    with Worker(Servant, timeout=30.0) as worker:
+        yield worker
+
+
+def gone(pid: int | None) -> bool:
+    return not Path(f"/proc/{pid}").exists()
+
+
+def test_methods_run_in_another_process_and_answer(worker: Worker) -> None:
+    assert worker.call("pid") == worker.pid != os.getpid()
+    assert worker.call("add", 2, b=3) == 5
+
+
+def test_our_errors_come_back_whole_and_the_worker_goes_on(worker: Worker) -> None:
+    with pytest.raises(BadInput, match=r"a\.xml: n=3: must be even") as caught:
+        worker.call("refuse")
+    assert (caught.value.file, caught.value.field, caught.value.value) == ("a.xml", "n", 3)
+    with pytest.raises(SimulationError, match="SUMO says no"):
+        worker.call("fail")
+    assert worker.call("add", 1) == 1
+
+
+def test_a_bug_says_where_it_is(worker: Worker) -> None:
+    with pytest.raises(CosimError, match=r"(?s)internal error.*stumble.*ZeroDivisionError: a bug of ours"):
+        worker.call("stumble")
+    assert worker.call("add", 1) == 1
+
+
+def test_progress_is_passed_on_and_counts_as_a_sign_of_life() -> None:
+    seen: list[tuple[int, int]] = []
+    with Worker(Servant, timeout=30.0) as worker:
+        worker._timeout = 0.4  # shorter than the 0.75 s the call takes in all
+        assert worker.call("count", 5, progress=lambda k, n: seen.append((k, n))) == "done"
+    assert seen == [(k, 5) for k in range(5)]
+
+
+def test_a_killed_process_is_named_with_its_signal_and_last_words(worker: Worker) -> None:
+    with pytest.raises(SimulationCrashed, match=r"SIGSEGV.*last words: Error: the net is broken"):
+        worker.call("murmur_and_die")
+    with pytest.raises(SimulationCrashed, match="ended already"):
+        worker.call("add", 1)
+
+
+def test_a_process_that_was_killed_between_calls_is_noticed(worker: Worker) -> None:
+    assert worker.pid is not None
+    os.kill(worker.pid, signal.SIGKILL)
+    time.sleep(0.1)
+    with pytest.raises(SimulationCrashed, match="SIGKILL"):
+        worker.call("add", 1)
+
+
+def test_a_process_that_leaves_is_told_from_one_that_was_killed(worker: Worker) -> None:
+    with pytest.raises(SimulationCrashed, match="exit code 3"):
+        worker.call("leave")
+
+
+def test_a_silent_process_is_killed_after_the_timeout() -> None:
+    worker = Worker(Servant, timeout=30.0)
+    pid = worker.pid
+    worker._timeout = 0.3
+    began = time.monotonic()
+    with pytest.raises(SimulationCrashed, match=r"no sign of life for 0\.3 s during 'sleep'"):
+        worker.call("sleep")
+    assert time.monotonic() - began < 5.0
+    assert gone(pid)
+
+
+def test_a_factory_that_refuses_leaves_no_process() -> None:
+    children = Path(f"/proc/self/task/{os.getpid()}/children")
+    before = children.read_text().split()
+    with pytest.raises(BadInput, match="what='x': no such thing"):
+        Worker(unwilling)
+    assert children.read_text().split() == before
+
+
+def test_closing_closes_the_object_the_process_and_the_files(tmp_path: Path) -> None:
+    files = len(os.listdir("/proc/self/fd"))
+    worker = Worker(Servant, str(tmp_path / "bequest"))
+    pid = worker.pid
+    worker.close()
+    worker.close()
+    assert (tmp_path / "bequest").read_text() == "closed"
+    assert gone(pid)
+    assert not worker._stderr.exists()
+    del worker  # multiprocessing frees its own two descriptors with the object
+    assert len(os.listdir("/proc/self/fd")) <= files
+
+
+def test_two_workers_are_two_processes(worker: Worker) -> None:
+    with Worker(Servant) as other:
+        assert worker.call("pid") != other.call("pid")
+
+
+def test_what_the_process_prints_on_stderr_stays_out_of_ours(
+    worker: Worker, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert worker.call("shout") == "ok"
+    assert capfd.readouterr().err == ""

@@ -144,7 +144,7 @@ def write_attributes(path: Path, name: str, values: Mapping[str, float]) -> None
 
 # ---------------------------------------------------------------- report
 
-# s per test seed, two seeds each: chosen so that the whole report takes less than three minutes on one core.
+# s per test seed, two seeds each: the whole report takes about three minutes on one core.
 REPORT_DURATION = {"aggressive": 100.0, "moderate": 200.0, "conservative": 3000.0, MIXED: 240.0}
 BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
 
@@ -216,7 +216,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     what.add_argument("--calibrate", action="store_true", help="fit LC2013 to MOBIL on tuning seeds")
     parser.add_argument("--classes", nargs="+", choices=CLASSES, default=CLASSES, help="classes to fit")
     parser.add_argument(
-        "--cache", type=Path, default=Path("behaviors_calibration.json"), help="evaluations so far"
+        "--cache",
+        type=Path,
+        default=Path(tempfile.gettempdir()) / "cosim_behaviors_calibration.json",
+        help="evaluations so far, to continue an interrupted fit; delete it after a change of the code",
     )
     parser.add_argument("--population", type=int, default=5, help="of differential evolution, per parameter")
     parser.add_argument("--generations", type=int, default=2)

@@ -235,27 +235,31 @@ def _sample_road(
 ) -> None:
     height, width = out.shape
     rows, columns = cells.shape
+    flat = cells.ravel()
     c, s = np.cos(heading), np.sin(heading)
-    step_x, step_y = c * along / cell, s * along / cell
+    # fixed point, 16 bits after the point: the inner loop is additions and one look-up
+    step_x, step_y = int(65536 * c * along / cell), int(65536 * s * along / cell)
     back = (0.5 - 0.5 * width) * along
-    last_x, last_y = step_x * (width - 1), step_y * (width - 1)
     for v in range(height):
         left = (0.5 * height - v - 0.5) * across
-        px = (x + c * back - s * left - cells_x) / cell
-        py = (y + s * back + c * left - cells_y) / cell
-        inside = (
-            0 <= px < columns and 0 <= py < rows and 0 <= px + last_x < columns and 0 <= py + last_y < rows
-        )
-        if inside:
+        px = int(np.floor(65536 * (x + c * back - s * left - cells_x) / cell))
+        py = int(np.floor(65536 * (y + s * back + c * left - cells_y) / cell))
+        end_x, end_y = (px + step_x * (width - 1)) >> 16, (py + step_y * (width - 1)) >> 16
+        inside = 0 <= px and 0 <= py and (px >> 16) < columns and (py >> 16) < rows
+        if inside and 0 <= end_x < columns and 0 <= end_y < rows:
             for u in range(width):
-                out[v, u] = cells[int(py + u * step_y), int(px + u * step_x)]
+                out[v, u] = flat[np.uintp((py >> 16) * columns + (px >> 16))]
+                px += step_x
+                py += step_y
         else:
             for u in range(width):
-                fx, fy = px + u * step_x, py + u * step_y
+                fx, fy = px >> 16, py >> 16
                 if 0 <= fx < columns and 0 <= fy < rows:
-                    out[v, u] = cells[int(fy), int(fx)]
+                    out[v, u] = flat[np.uintp(fy * columns + fx)]
                 else:
                     out[v, u] = 0
+                px += step_x
+                py += step_y
 
 
 @njit(cache=True, nogil=True)

@@ -106,6 +106,11 @@ def scan(path: Path, roots: tuple[str, ...], start: Start, end: End | None = Non
     return root[0]
 
 
+def content(path: Path) -> bytes:
+    """The whole of a plain or gzip file, unpacked; raises BadInput like `scan`."""
+    return b"".join(_chunks(path))
+
+
 def _chunks(path: Path) -> Iterator[bytes]:
     """The unpacked bytes of a plain or gzip file."""
     regular_file(path, file=path, field="file")

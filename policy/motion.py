@@ -86,6 +86,26 @@ def tracked_speeds(speed: float, targets: Floats, frames: int, dt: float) -> Flo
 
 
 @njit(cache=True, nogil=True)
+def braking_speeds(speed: float, target: float, frames: int, dt: float, period: float) -> Floats:
+    """Speeds [frames+1] m/s when the target (m/s, already lowered once) falls one level every `period` s."""
+    out = np.empty(frames + 1)
+    v = speed
+    out[0] = v
+    per_frame = max(round(dt / STEP), 1)
+    per_level = max(round(period / STEP), 1)
+    k = 0
+    for t in range(1, frames + 1):
+        for _ in range(per_frame):
+            if k > 0 and k % per_level == 0:
+                target = max(target - SPEED_STEP, 0.0)
+            k += 1
+            accel = min(max((target - v) / TIME_CONSTANT, -MAX_DECEL), MAX_ACCEL)
+            v = max(v + accel * dt / per_frame, 0.0)
+        out[t] = v
+    return out
+
+
+@njit(cache=True, nogil=True)
 def project(
     points: Floats, arc: Floats, first: int, last: int, x: float, y: float, around: float
 ) -> tuple[float, float]:

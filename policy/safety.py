@@ -11,6 +11,7 @@ AVs decide front to back, each knowing the rollouts chosen before it (V2V intent
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -23,8 +24,9 @@ from cosim.types import Bools, Decision, Floats, Floats32, History, MetaAction
 from policy.motion import (
     LANE_CHANGE_TIME,
     MAX_DECEL,
-    Paths,
+    SPEED_STEP,
     Rollout,
+    braking_speeds,
     fronts,
     next_target,
     pack,
@@ -58,6 +60,7 @@ class SafetyConfig:
     dt: float = 0.2  # s
     margin_length: float = 1.0  # m, added to the ego's box along
     margin_width: float = 0.6  # m, and across: half of the room between cars in neighbouring lanes
+    reach: float = 125.0  # m, as the kinematic rows
     reaction: float = 0.4  # s until the next decision can brake
     leader_brake: float = 8.0  # m/s2, a leader's hardest expected braking
     standstill_gap: float = 1.0  # m left between standing cars
@@ -68,7 +71,8 @@ class SafetyConfig:
     straddle: float = 1.0  # m beside the centre line: a car whose rear stands there blocks two lanes
     lane_half: float = 1.6  # m from a centre line within which a vehicle is in that lane
     same_way: float = 1.05  # rad, headings closer than this (60 degrees) drive the same way
-    # among equally valued actions: T's ego keeps going, else gives way, else evades
+    resume_below: float = 0.5  # of the speed limit: slower commands are not kept among equal values
+    # among equally valued actions: keep going, else give way, else evade
     ties: tuple[MetaAction, ...] = (
         MetaAction.IDLE,
         MetaAction.DECELERATE,
@@ -79,8 +83,9 @@ class SafetyConfig:
 
     @property
     def frames(self) -> int:
-        """Steps of a rollout: far enough to see a contact `critical_th` after the horizon."""
-        return int(np.ceil((self.horizon + self.critical_th) / self.dt - 1e-9))
+        """Steps of a rollout: far enough to see every contact that either threshold asks about."""
+        seen = max(self.horizon + self.critical_th, self.safe_th + 0.5 * self.horizon)  # s
+        return int(np.ceil(seen / self.dt - 1e-9))
 
 
 class Evaluation(NamedTuple):
@@ -90,7 +95,7 @@ class Evaluation(NamedTuple):
     score: Floats  # [A] s, P's weighted time to collision; -1 for impossible actions
     unsafe: Bools  # [A]
     blamed: tuple[str | None, ...]  # [A] who makes it unsafe
-    rollout: Rollout  # [A,T+1] the ego under each action
+    rollout: Rollout  # [A,T+1] the ego under each action, as its allies are told
 
 
 def prioritize(
@@ -104,7 +109,10 @@ def prioritize(
     """Decide for every AV of the scene. q [B,A] action values.
 
     With `share_intentions` the rollouts of the AVs ahead replace their predictions; `traffic` is not changed.
+    It must reach `config.frames` steps ahead (ValueError).
     """
+    if traffic.rollout.x.shape[1] != config.frames + 1:
+        raise ValueError(f"traffic must be predicted {config.frames} frames ahead")
     ours = Rollout(*(array.copy() for array in traffic.rollout)) if share_intentions else traffic.rollout
     traffic = traffic._replace(rollout=ours)
     intended = np.zeros(len(scene.vehicles), np.bool_)
@@ -112,7 +120,7 @@ def prioritize(
     decisions: dict[str, Decision] = {}
     for b in front_to_back(scene, config):
         evaluation = evaluate(b, scene, traffic, road, config, intended)
-        decision = select(q[b], evaluation, config)
+        decision = select(q[b], evaluation, config, _ties(scene.histories[b], config))
         decisions[scene.agents[b]] = decision
         if share_intentions:
             me = name_row[scene.agents[b]]
@@ -122,9 +130,21 @@ def prioritize(
     return {agent: decisions[agent] for agent in scene.agents}
 
 
-def select(q: Floats32, evaluation: Evaluation, config: SafetyConfig) -> Decision:
-    """Algorithm 3: the best valued safe action; if there is none, the one with the highest score."""
-    order = sorted(config.ties, key=lambda a: -float(q[a]))  # stable: ties in the configured order
+def _ties(history: History, c: SafetyConfig) -> tuple[MetaAction, ...]:
+    """Order of equally valued actions: an AV that once gave way does not crawl or stand for ever."""
+    if history.target_speed < c.resume_below * history.route.speed_limit:
+        return (MetaAction.ACCELERATE, *(a for a in c.ties if a != MetaAction.ACCELERATE))
+    return c.ties
+
+
+def select(
+    q: Floats32, evaluation: Evaluation, config: SafetyConfig, ties: Sequence[MetaAction] = ()
+) -> Decision:
+    """Algorithm 3: the best valued safe action; if there is none, the one with the highest score.
+
+    `ties`: the order of equally valued actions (default: the configured one).
+    """
+    order = sorted(ties or config.ties, key=lambda a: -float(q[a]))  # stable
     preferred = order[0]
     safe = [a for a in order if not evaluation.unsafe[a]]
     fallback = not safe
@@ -160,9 +180,9 @@ def evaluate(
     length = float(traffic.length[me])
     ways = _ways(history, road, int(scene.lane[me]))
     paths = [w.path for w in ways]
-    packed = pack(paths)
-    ego = _roll_ego(history, packed, scene.state[me, -1], c)
-    others = _others(b, me, scene, traffic, road)
+    futures = _roll_ego(history, paths, scene.state[me, -1], c)
+    ego = futures.under
+    others = _others(b, me, scene, traffic, road, c.reach)
     contact = np.full(len(ACTIONS), np.inf)  # s
     limit = np.full(len(ACTIONS), np.inf)  # score allowed by the leader and follower limits
     blamed: list[str | None] = [None] * len(ACTIONS)
@@ -180,7 +200,7 @@ def evaluate(
             contact[a] = times[first]
             if np.isfinite(times[first]):
                 blamed[a] = scene.vehicles[others[first]]
-            allowed, who = _margin(a, way.changes, ego, near, traffic, others, intended, c)
+            allowed, who = _margin(a, way.changes, futures, near, traffic, others, intended, c)
             if allowed < c.safe_th:
                 limit[a] = allowed
                 if contact[a] > c.horizon + c.critical_th:
@@ -206,7 +226,7 @@ def evaluate(
         if forbidden is not None:
             unsafe[a], score[a], blamed[a] = True, -1.0, forbidden
     blamed = [who if bad else None for who, bad in zip(blamed, unsafe, strict=True)]
-    return Evaluation(np.minimum(contact, c.cap), score, unsafe, tuple(blamed), ego)
+    return Evaluation(np.minimum(contact, c.cap), score, unsafe, tuple(blamed), futures.intention)
 
 
 def front_to_back(scene: Scene, config: SafetyConfig) -> list[int]:
@@ -274,29 +294,50 @@ def _ways(history: History, road: RoadMap, lane: int) -> list[_Way]:
     return ways
 
 
-def _roll_ego(history: History, packed: Paths, now: Floats, c: SafetyConfig) -> Rollout:
-    """The ego (state `now` [8]) under every action [A,T+1]."""
-    count = len(ACTIONS)
-    targets = np.array(
-        [next_target(history.target_speed, a, history.route.speed_limit) for a in ACTIONS], np.float64
-    )
-    speed = tracked_speeds(float(now[2]), targets, c.frames, c.dt)
+class _Ego(NamedTuple):
+    """The ego's possible futures."""
+
+    under: Rollout  # [A,T+1] what each action is judged by
+    intention: Rollout  # [A,T+1] what the allies are told
+    lag: Floats  # [A] s until braking begins: the target speed may be far above the speed
+
+
+def _roll_ego(history: History, paths: list[LanePath], now: Floats, c: SafetyConfig) -> _Ego:
+    """The ego (state `now` [8]) under every action, along the path of each.
+
+    An action is held, as P's algorithm 2 says. Decelerating again and again means braking to a standstill, so
+    Decelerate is judged by that: it is safe as long as braking helps. The allies are told of one step of it.
+    """
+    speed, limit = float(now[2]), history.route.speed_limit
+    targets = np.array([next_target(history.target_speed, a, limit) for a in ACTIONS], np.float64)
+    slower = ACTIONS.index(MetaAction.DECELERATE)
+    rows = [*range(len(ACTIONS)), slower]  # the last one: Decelerate once
+    packed = pack([paths[k] for k in rows])
+    count = len(rows)
+    speeds = tracked_speeds(speed, targets[rows], c.frames, c.dt)
+    speeds[slower] = braking_speeds(speed, targets[slower], c.frames, c.dt, c.reaction)
     x, y = fronts(np.repeat(now[None], count, 0))
     arc, offset = project_many(*packed, x, y, np.full(count, history.route.arc))
     wide = np.abs(offset) > 0.3  # a lane change, new or under way
-    rate = np.where(wide, 2 * c.lane_half / LANE_CHANGE_TIME, 0.3)
-    return roll_out(
+    out = roll_out(
         packed,
         arc,
         offset,
         np.zeros(count),
         np.full(count, now[3]),
-        rate,
+        np.where(wide, 2 * c.lane_half / LANE_CHANGE_TIME, 0.3),
         np.full(count, now[4]),
-        speed,
+        speeds,
         np.full(count, np.inf),
         MAX_DECEL,
         c.dt,
+    )
+    told = [*rows[:slower], len(ACTIONS), *rows[slower + 1 : -1]]
+    steps = np.ceil((targets - speed) / SPEED_STEP - 1e-6)  # decisions until the target is below the speed
+    return _Ego(
+        Rollout(*(array[: len(ACTIONS)] for array in out)),
+        Rollout(*(array[told] for array in out)),
+        c.reaction * np.maximum(steps, 0.0),
     )
 
 
@@ -306,10 +347,20 @@ def _straddles(ego: Rollout, c: SafetyConfig) -> Bools:
     return np.asarray(standing.any(1))
 
 
-def _others(b: int, me: int, scene: Scene, traffic: Traffic, road: RoadMap) -> npt.NDArray[np.int64]:
-    """Vehicles that this AV knows and can touch."""
-    rows = scene.row[b, 1:]
-    rows = rows[rows >= 0]
+def _others(
+    b: int, me: int, scene: Scene, traffic: Traffic, road: RoadMap, reach: float
+) -> npt.NDArray[np.int64]:
+    """Vehicles within `reach` m that this AV knows and can touch.
+
+    Its own rows; with shared perception also those of its allies, for rows are few in a queue.
+    """
+    if scene.shared:
+        x, y = traffic.rollout.x[:, 0], traffic.rollout.y[:, 0]
+        rows = np.flatnonzero((x - x[me]) ** 2 + (y - y[me]) ** 2 < reach**2)
+        rows = rows[rows != me]
+    else:
+        rows = scene.row[b, 1:]
+        rows = rows[rows >= 0]
     rows = rows[traffic.known[rows]]
     lane = int(scene.lane[me])
     return np.array([k for k in rows if road.connected(lane, int(scene.lane[k]))], np.int64)
@@ -400,7 +451,7 @@ class _Neighbours(NamedTuple):
 def _margin(
     action: int,
     changes: bool,
-    ego: Rollout,
+    futures: _Ego,
     near: _Neighbours,
     traffic: Traffic,
     others: npt.NDArray[np.int64],
@@ -415,14 +466,15 @@ def _margin(
     `follower_brake`. At the limit the score is safe_th, below it falls with the gap. Decelerating never makes
     a gap smaller.
     """
+    ego = futures.under
     speed = traffic.rollout.speed[others, 0]
     ratio = np.full(len(others), np.inf)  # of the gap there is to the gap needed
     if action != MetaAction.DECELERATE:
-        soon = round(c.reaction / c.dt)
-        before, after = float(ego.speed[action, 0]), float(ego.speed[action, soon])
-        travelled = float(ego.arc[action, soon] - ego.arc[action, 0])
+        told = intended[others]
         stopping = np.where(
-            intended[others], before**2 / (2 * MAX_DECEL), travelled + after**2 / (2 * MAX_DECEL)
+            told,
+            _stopping(ego, action, futures.lag[action], c),
+            _stopping(ego, action, futures.lag[action] + c.reaction, c),
         )
         need = np.maximum(stopping - speed**2 / (2 * c.leader_brake), 0.0) + c.standstill_gap
         ratio = np.where(near.ahead, near.gap / need, ratio)
@@ -435,3 +487,10 @@ def _margin(
     if ratio[who] >= 1.0:
         return np.inf, who
     return 0.999 * c.safe_th * max(float(ratio[who]), 0.0), who
+
+
+def _stopping(ego: Rollout, action: int, delay: float, c: SafetyConfig) -> float:
+    """m until standstill when the ego goes on under the action for `delay` s and then brakes."""
+    frame = min(round(delay / c.dt), ego.speed.shape[1] - 1)
+    travelled = float(ego.arc[action, frame] - ego.arc[action, 0])
+    return travelled + float(ego.speed[action, frame]) ** 2 / (2 * MAX_DECEL)

@@ -23,6 +23,7 @@ class Scene(NamedTuple):
     lane_position: Floats  # [V] m, front bumper
     row: Ints  # [B,R] vehicle of each kinematic row, -1 for an empty one; row 0 the ego
     pose: Floats  # [B,3] each AV's x m, y m, heading rad
+    shared: bool  # V2V: every AV knows all of these vehicles
 
     @property
     def ego(self) -> Ints:
@@ -67,6 +68,7 @@ def join(histories: Mapping[str, History], share: bool = True) -> Scene:
         np.stack([h.lane_position for h in each])[at[:, 0], at[:, 1]],
         rows,
         pose,
+        share,
     )
 
 

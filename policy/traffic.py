@@ -18,7 +18,6 @@ from policy.scene import Scene
 class TrafficConfig:
     """How others are carried along their lanes."""
 
-    frames: int = 28  # 5.6 s: a contact within the critical time after the 4 s horizon is seen
     dt: float = 0.2  # s
     drift_rate: float = 0.4  # m/s sideways, above which a vehicle is changing lanes
     drift_offset: float = 0.2  # m from the centre line, below which nobody is changing lanes yet
@@ -40,16 +39,16 @@ class Traffic(NamedTuple):
 
 
 def predict_traffic(
-    scene: Scene, forecast: KinematicForecast, road: RoadMap, config: TrafficConfig
+    scene: Scene, forecast: KinematicForecast, road: RoadMap, config: TrafficConfig, frames: int
 ) -> Traffic:
-    """Carry the forecast speeds along the lanes.
+    """Carry the forecast speeds along the lanes for `frames` frames (beyond the forecast: its last speed).
 
     A vehicle keeps its lane and takes the straightest way (its route is unknown); one that drifts sideways
     goes where it drifts, so a merging car sits in the neighbour lane only once it really moves there; where
     the lane ends it stops. Vehicles off every lane go where the forecast says.
     """
     c = config
-    count, frames = len(scene.vehicles), c.frames
+    count = len(scene.vehicles)
     now = scene.state[:, -1]  # [V,8]
     known = forecast.valid & (scene.lane >= -1)
     speed = np.empty((count, frames + 1))

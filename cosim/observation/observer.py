@@ -19,7 +19,7 @@ CommandOf = Callable[[str], tuple[float | None, int]]  # AV id -> target speed m
 class Observer:
     """Holds the past of one episode. `add` once per frame, `histories` once per decision.
 
-    Arrays inside a History are views or fresh copies that stay valid for at least 2 N further frames.
+    Arrays inside a History are views or fresh copies that stay valid for at least N further frames.
     """
 
     def __init__(self, road: RoadMap, config: ObservationConfig) -> None:
@@ -27,19 +27,21 @@ class Observer:
         self._config = config
         self._raster: RoadRaster | None = rasterize_road(road) if config.maps else None
         self._channels = channel_indices(config)
+        self._maps = MapPast(config) if config.maps else None
         self.reset()
 
     def reset(self) -> None:
         """Forget everything: a new episode begins."""
         self._past = KinematicPast(self._config.frames)
-        self._maps = MapPast(self._config) if self._config.maps else None
+        if self._maps is not None:
+            self._maps.clear()
         self._newest: Snapshot | None = None
 
     def add(self, snapshot: Snapshot) -> None:
         """Append one frame: the kinematics of all, the maps of every AV on the road."""
         self._past.add(snapshot)
         self._newest = snapshot
-        self._egos: Ints = np.flatnonzero(snapshot.kind == Kind.AV)
+        self._egos: Ints = np.flatnonzero(snapshot.kind == int(Kind.AV))
         c = self._config
         self._seen: Bools = np.zeros((len(self._egos), snapshot.n), np.bool_)
         perceived(snapshot.x, snapshot.y, self._egos, c.perception_range, c.share_perception, self._seen)
@@ -58,7 +60,7 @@ class Observer:
             snapshot.speed,
             snapshot.length,
             snapshot.width,
-            snapshot.kind == Kind.AV,
+            snapshot.kind == int(Kind.AV),
             snapshot.mission,
             self._seen,
             self._channels,
@@ -80,7 +82,7 @@ class Observer:
         choose_rows(s.x, s.y, self._egos, self._seen, c.row_range, rows)
         kinematics = np.empty((count, c.frames, c.rows, len(KINEMATIC_FEATURES)), np.float32)
         valid = np.empty((count, c.frames, c.rows), np.bool_)
-        fixed = np.stack([s.length, s.width, s.kind == Kind.AV, s.mission], axis=1).astype(np.float64)
+        fixed = np.stack([s.length, s.width, s.kind == int(Kind.AV), s.mission], axis=1).astype(np.float64)
         fill_rows(self._past.view, self._past.slots, rows, fixed, kinematics, valid)
         lanes = np.where(rows >= 0, s.lane[rows], -1).astype(np.int32)  # [B,R]
         positions = np.where(rows >= 0, s.lane_position[rows], 0.0)  # [B,R] m

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from cosim.types import Bytes, Floats, Ints, ObservationConfig, Snapshot
 
-STRETCH = 6  # tapes are this many histories long, so that a history is always one contiguous view
+STRETCH = 3  # tapes are this many histories long, so that a history is always one contiguous view
 
 
 class KinematicPast:
@@ -72,6 +72,11 @@ class MapPast:
         self._slot: dict[str, int] = {}
         self._free: list[int] = []
 
+    def clear(self) -> None:
+        """A new episode: nobody is known. The tape stays, so that its memory is touched only once."""
+        self._free.extend(self._slot.values())
+        self._slot.clear()
+
     def next_frame(self, avs: list[str]) -> tuple[Bytes, npt.NDArray[np.int64]]:
         """The block [S,C,H,W] to draw the new frame into, and the slot of each AV (a new AV's past is 0)."""
         for name in self._slot.keys() - set(avs):
@@ -93,5 +98,5 @@ class MapPast:
         return self._tape[self._end - 1], np.array([self._slot[name] for name in avs], np.int64)
 
     def view(self, av: str) -> Bytes:
-        """[N,C,H,W] oldest first; valid until the next STRETCH * N frames have been drawn."""
+        """[N,C,H,W] oldest first; stays as it is for N further frames at least."""
         return self._tape[self._end - self._frames : self._end, self._slot[av]]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import libsumo
 import numpy as np
 
-from cosim.geometry import boxes, overlap
+from cosim.geometry import boxes, overlapping_pairs
 from cosim.road import RoadMap
 from cosim.simulation.commands import Controlled
 from cosim.simulation.convert import Body
@@ -47,14 +47,10 @@ class CollisionWatch:
         self, snapshot: Snapshot, road: RoadMap, bodies: dict[str, Body], controlled: dict[str, Controlled]
     ) -> list[Collision]:
         """Overlaps of an AV's box with anyone's that SUMO did not report (26 of 28 it does)."""
-        avs = np.flatnonzero(snapshot.kind == Kind.AV)
-        if not len(avs):
-            return []
         found = []
-        touching = overlap(boxes(snapshot, avs[:, None]), boxes(snapshot))  # [a,n]
-        touching[np.arange(len(avs)), avs] = False
-        for k, j in np.argwhere(touching):
-            i = avs[k]
+        for i, j in overlapping_pairs(boxes(snapshot)):
+            if snapshot.kind[i] != int(Kind.AV) and snapshot.kind[j] != int(Kind.AV):
+                continue
             pair = frozenset((snapshot.ids[i], snapshot.ids[j]))
             if pair in self._seen or not road.connected(int(snapshot.lane[i]), int(snapshot.lane[j])):
                 continue

@@ -291,8 +291,8 @@ class Drivers:
         self.classes[vehicle] = driver.name
         return driver.name
 
-    def step(self, time: float) -> None:  # noqa: ARG002  the simulator's clock, for models that need it
-        """After every SUMO step: MOBIL's decisions; LC2013 decides inside SUMO."""
+    def step(self, time: float) -> None:
+        """After every SUMO step (`time` in s): MOBIL's decisions; LC2013 decides inside SUMO."""
         if self.mobil is not None:
             self.mobil.step()
 

@@ -24,7 +24,7 @@ class AltruistConfig:
     behind_max: float = 80.0  # further back its gap would come too late
     upstream_min: float = 60.0  # junctions: stopping at the line does not help, the gap opens upstream
     upstream_max: float = 260.0
-    crawl: float = 4.0  # the guide's speed upstream of a junction
+    crawl: float = 2.0  # the guide waits upstream of a junction (on the grid: it stops)
     pace_below: float = 5.0  # beside an ending lane the guide drives this much slower than the other
     pace_min: float = 5.0  # and never slower than this
     clear_ahead: float = 15.0  # a free left lane: nobody from here ahead ...

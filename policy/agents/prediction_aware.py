@@ -138,5 +138,5 @@ class PredictionAware:
             q = to_numpy(self.vfn(maps, kinematics, batch.route, batch.phi))
         if not np.isfinite(q).all():
             raise FloatingPointError("the value network returned values that are not finite")
-        traffic = predict_traffic(scene, forecast, context.road, c.traffic)
+        traffic = predict_traffic(scene, forecast, context.road, c.traffic, c.safety.frames)
         return prioritize(q, scene, traffic, context.road, c.safety, context.share_intentions)

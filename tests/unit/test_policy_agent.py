@@ -1,0 +1,104 @@
+"""The whole prediction-aware agent on a small scene: explained, repeatable, particular about its input."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from policy_scenes import Car, histories, straight_road
+
+from cosim.errors import BadInput
+from cosim.types import COMPACT, PAPER, SMOKE, Decision, MetaAction, PolicyContext, Timing
+from policy.agents.prediction_aware import AgentConfig, PredictionAware, compact, paper
+from policy.hpn import HpnConfig
+from policy.vfn import VfnConfig
+
+ROAD = straight_road(3)
+CARS = [
+    Car("a", 300.0, 1, 20.0, is_av=True),
+    Car("b", 250.0, 0, 20.0, is_av=True),
+    Car("slow", 340.0, 1, 8.0),
+    Car("new", 270.0, 2, 20.0, frames=1),
+]
+
+
+def context(agent: PredictionAware, svo: float = 0.0) -> PolicyContext:
+    return PolicyContext(ROAD, Timing(), agent.observation, svo, np.random.default_rng(0))
+
+
+def decide(agent: PredictionAware) -> dict[str, Decision]:
+    agent.reset(context(agent))
+    return agent.decide(histories(ROAD, CARS, agent.observation))
+
+
+@pytest.mark.parametrize("name", ["vfn-p", "vfn"])
+def test_every_av_gets_an_explained_decision(name: str) -> None:
+    agent = PredictionAware(name)
+    assert agent.label == "untrained"
+    decisions = decide(agent)
+    assert list(decisions) == ["a", "b"]
+    for decision in decisions.values():
+        for explained in (decision.q, decision.ttc, decision.safety_score, decision.unsafe):
+            assert explained is not None
+            assert explained.shape == (5,)
+            assert np.isfinite(explained).all()
+    assert decisions["a"].action == MetaAction.DECELERATE
+    assert decisions["a"].vetoed
+    assert decisions["a"].blamed == "slow"
+    assert decisions["b"].action == MetaAction.IDLE
+
+
+def test_two_agents_built_alike_have_the_same_weights_and_leave_torchs_generator_alone() -> None:
+    torch.manual_seed(7)
+    expected = torch.rand(1)
+    torch.manual_seed(7)
+    first, second = PredictionAware("vfn-p"), PredictionAware("vfn-p")
+    assert torch.equal(torch.rand(1), expected)
+    for x, y in zip(first.vfn.parameters(), second.vfn.parameters(), strict=True):
+        assert torch.equal(x, y)
+
+
+def test_the_network_decides_where_the_mask_allows_it() -> None:
+    agent = PredictionAware("vfn-p")
+    with torch.no_grad():
+        agent.vfn.value.bias[MetaAction.ACCELERATE] = 1.0
+    decisions = decide(agent)
+    assert decisions["b"].action == MetaAction.ACCELERATE
+    assert decisions["a"].action == MetaAction.DECELERATE, "closing on a slow car it may not"
+
+
+def test_it_refuses_an_observation_it_was_not_built_for() -> None:
+    agent = PredictionAware("vfn-p")
+    with pytest.raises(BadInput, match="observation"):
+        agent.reset(dataclasses.replace(context(agent), observation=PAPER))
+
+
+def test_weights_that_went_wrong_do_not_drive() -> None:
+    agent = PredictionAware("vfn-p")
+    with torch.no_grad():
+        agent.vfn.value.bias[0] = float("nan")
+    with pytest.raises(FloatingPointError):
+        decide(agent)
+
+
+def test_smoke_size_runs_the_same_path() -> None:
+    config = AgentConfig(
+        observation=SMOKE, hpn=HpnConfig(height=16), vfn=VfnConfig(height=16), chain=compact("vfn-p").chain
+    )
+    decisions = decide(PredictionAware("vfn-p", config))
+    assert decisions["a"].action == MetaAction.DECELERATE
+
+
+def test_the_paper_configuration_is_the_papers() -> None:
+    config = paper("vfn-p")
+    assert (config.observation.height, config.observation.width) == (64, 512)
+    assert config.chain.hypotheses == 20
+    assert config.hpn.block == 1
+    assert config.vfn.frames == 30
+    assert config.vfn.strides == "literal"
+    assert compact("vfn-p").observation == COMPACT
+    assert compact("vfn").predictor == "cs"
+    with pytest.raises(BadInput, match="policy='conv2d'"):
+        compact("conv2d")

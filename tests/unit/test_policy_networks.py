@@ -1,0 +1,159 @@
+"""HPN and VFN: shapes at every size, what an untrained network says, what is masked stays unread."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from policy_scenes import Car, histories, straight_road
+
+from cosim.types import KINEMATIC_FEATURES
+from policy.hpn import HPN, HpnConfig
+from policy.tensors import KINEMATIC_INPUTS, ROUTE_INPUTS, kinematic_tensor, to_batch
+from policy.vfn import VFN, VfnConfig
+
+
+def step(config: HpnConfig, batch: int = 2) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Random input, the predicted maps and kinematics, and the rendered maps shown to the network."""
+    torch.manual_seed(0)
+    network = HPN(config).eval()
+    past = torch.rand(batch, config.seen * config.channels, config.height, config.width)
+    rendered = torch.rand(batch, config.block * config.channels, config.height, config.width)
+    kinematics = torch.rand(batch, config.seen, config.rows, KINEMATIC_INPUTS)
+    with torch.inference_mode():
+        maps, moved = network([past], kinematics, rendered if config.correct else None)
+    return maps, moved, rendered
+
+
+@pytest.mark.parametrize("reading", ["pool", "s2fc"])
+@pytest.mark.parametrize(("height", "width", "block"), [(16, 128, 5), (32, 128, 5), (64, 512, 1)])
+@pytest.mark.parametrize("correct", [True, False])
+def test_the_hpn_predicts_the_next_maps_and_kinematics_at_every_size(
+    reading: str, height: int, width: int, block: int, correct: bool
+) -> None:
+    config = HpnConfig(height, width, block=block, reading=reading, correct=correct, skips=correct)  # type: ignore[arg-type]
+    maps, moved, _ = step(config, batch=1)
+    assert maps.shape == (1, block * 4, height, width)
+    assert moved.shape == (1, block, 16, 4)
+
+
+def test_at_paper_size_the_pooled_reading_needs_no_layer_to_reach_the_latent_dimension() -> None:
+    network = HPN(HpnConfig(64, 512, block=1, correct=False, skips=False))
+    parameters = sum(p.numel() for p in network.parameters())
+    assert 0.40e6 < parameters < 0.46e6, "compute.md: 0.44 M"
+
+
+def test_an_untrained_correction_changes_nothing() -> None:
+    maps, _, rendered = step(HpnConfig())
+    torch.testing.assert_close(maps, rendered, rtol=0.0, atol=0.0)
+
+
+def test_the_hpn_without_history_sees_the_current_frame_only() -> None:
+    config = HpnConfig(history=False)
+    assert config.seen == 1
+    assert step(config)[0].shape == (2, 20, 32, 128)
+
+
+def test_a_network_that_corrects_asks_for_the_rendered_map() -> None:
+    network = HPN(HpnConfig())
+    with pytest.raises(ValueError, match="rendered"):
+        network([torch.zeros(1, 40, 32, 128)], torch.zeros(1, 10, 16, KINEMATIC_INPUTS))
+
+
+def test_window_groups_are_as_good_as_one_stack() -> None:
+    torch.manual_seed(0)
+    network = HPN(HpnConfig(correct=False)).eval()
+    past = torch.rand(1, 40, 32, 128)
+    kinematics = torch.rand(1, 10, 16, KINEMATIC_INPUTS)
+    with torch.inference_mode():
+        whole, _ = network([past], kinematics)
+        parts, _ = network([past[:, :20], past[:, 20:]], kinematics)
+    torch.testing.assert_close(whole, parts)
+
+
+@pytest.mark.parametrize("strides", ["temporal", "literal"])
+@pytest.mark.parametrize(("height", "width", "frames"), [(16, 128, 14), (32, 128, 14), (32, 128, 10)])
+def test_the_vfn_values_five_actions_at_every_size(
+    strides: str, height: int, width: int, frames: int
+) -> None:
+    network = VFN(VfnConfig(height, width, frames=frames, strides=strides)).eval()  # type: ignore[arg-type]
+    q = values(network, height, width, frames)
+    assert q.shape == (2, 5)
+    assert (q == 0.0).all(), "untrained: every action is worth the same"
+
+
+def values(network: VFN, height: int, width: int, frames: int, phi: float = 0.0) -> torch.Tensor:
+    torch.manual_seed(1)
+    maps = torch.rand(2, frames, 4, height, width)
+    kinematics = torch.rand(2, frames, 16, KINEMATIC_INPUTS)
+    route = torch.rand(2, ROUTE_INPUTS)
+    direction = torch.tensor([[np.cos(phi), np.sin(phi)]], dtype=torch.float32).expand(2, 2)
+    with torch.inference_mode():
+        q: torch.Tensor = network(maps, kinematics, route, direction)
+    return q
+
+
+def test_the_vfn_hears_the_social_value_orientation_and_sees_the_maps() -> None:
+    torch.manual_seed(0)
+    network = VFN(VfnConfig()).eval()
+    torch.nn.init.normal_(network.value.weight)
+    egoist, altruist = values(network, 32, 128, 14, 0.0), values(network, 32, 128, 14, np.pi / 2)
+    assert not torch.equal(egoist, altruist)
+    with torch.inference_mode():
+        features = network.features(
+            torch.zeros(2, 14, 4, 32, 128),
+            torch.zeros(2, 14, 16, KINEMATIC_INPUTS),
+            torch.zeros(2, ROUTE_INPUTS),
+            torch.zeros(2, 2),
+        )
+        blind = network.value(features)
+    assert features.shape == (2, 256)
+    assert not torch.equal(blind, egoist)
+
+
+def test_gradients_reach_every_layer_of_both_networks() -> None:
+    torch.manual_seed(0)
+    hpn, vfn = HPN(HpnConfig(16, 128)), VFN(VfnConfig(16, 128))
+    torch.nn.init.normal_(vfn.value.weight)
+    torch.nn.init.normal_(hpn.decoder[2].weight)  # type: ignore[arg-type]
+    maps, moved = hpn(
+        [torch.rand(2, 40, 16, 128)], torch.rand(2, 10, 16, KINEMATIC_INPUTS), torch.rand(2, 20, 16, 128)
+    )
+    q = vfn(
+        torch.rand(2, 14, 4, 16, 128),
+        torch.rand(2, 14, 16, KINEMATIC_INPUTS),
+        torch.rand(2, ROUTE_INPUTS),
+        torch.rand(2, 2),
+    )
+    (maps.square().mean() + moved.square().mean() + q.square().mean()).backward()
+    for network in (hpn, vfn):
+        for name, parameter in network.named_parameters():
+            assert parameter.grad is not None, name
+            assert parameter.grad.abs().sum() > 0, name
+
+
+def test_masked_and_nan_rows_reach_no_network() -> None:
+    rows = np.full((1, 10, 16, len(KINEMATIC_FEATURES)), 50.0, np.float32)
+    valid = np.ones((1, 10, 16), bool)
+    valid[0, :, 3] = False
+    rows[0, 4, 7, 2] = np.nan
+    tensor = kinematic_tensor(rows, valid)
+    assert torch.isfinite(tensor).all()
+    assert (tensor[0, :, 3] == 0).all()
+    assert (tensor[0, 4, 7] == 0).all()
+    assert tensor[0, 5, 7, -1] == 1.0
+
+
+def test_the_ego_is_told_where_its_lanes_end() -> None:
+    road = straight_road(3, dead_end=0, at=400.0)
+    on_it, beside = (histories(road, [Car("e", 300.0, lane, 20.0, is_av=True)])["e"] for lane in (0, 1))
+    batch = to_batch([on_it, beside], np.pi / 4)
+    assert batch.maps.shape == (2, 10, 4, 32, 128)
+    assert batch.route.shape == (2, ROUTE_INPUTS)
+    per_lane = (ROUTE_INPUTS - 5) // 3
+    left, keep, right = (batch.route[:, 5 + k * per_lane : 8 + k * per_lane] for k in range(3))
+    assert keep[:, 1].tolist() == [1.0, 0.0], "only the right lane dead-ends"
+    assert keep[0, 2] == pytest.approx(0.5), "100 m ahead, of 200"
+    assert right[:, 0].tolist() == [0.0, 1.0]
+    assert left[:, 0].tolist() == [1.0, 1.0]
+    torch.testing.assert_close(batch.phi[0], torch.full((2,), float(np.sqrt(0.5))))

@@ -12,7 +12,7 @@ from cosim import sumocfg, yaml_input
 from cosim.errors import BadInput
 from cosim.sumocfg import one_of
 from cosim.types import Preset, Timing
-from cosim.xml_input import regular_file
+from cosim.xml_input import is_there, regular_file
 
 BEHAVIORS = ("conservative", "moderate", "aggressive", "mixed", "as-is")
 DRIVER_MODELS = ("lc2013", "mobil")
@@ -67,7 +67,7 @@ class Scenario:
     begin: float = 0.0  # s
     warmup: float = 0.0  # s, not counted
     duration: float = 60.0  # s, counted
-    timing: Timing = Timing()  # noqa: RUF009 - frozen, so one instance serves all
+    timing: Timing = Timing()
     preset: str = Preset.UNGUARDED
     mission: Mission = Mission()
     zones: tuple[Zone, ...] = ()
@@ -168,7 +168,7 @@ def _foreign(what: str) -> Scenario:
     """Somebody's .sumocfg: its own duration, types and options; our clocks."""
     path = Path(what)
     names = sumo_scenarios.names()
-    if not path.exists() and path.suffix != ".sumocfg":
+    if not is_there(path) and path.suffix != ".sumocfg":
         problem = f"no such scenario{sumocfg.hint(what, names)}"
         raise BadInput(problem, field="scenario", value=what)
     config = sumocfg.read(regular_file(path, file=None, field="scenario"))
@@ -194,7 +194,7 @@ def _with_demand(scenario: Scenario, wanted: Sequence[str]) -> Scenario:
     for item in wanted:
         if item in known:
             files.append(known[item])
-        elif Path(item).exists() or item.endswith((".xml", ".gz")):
+        elif is_there(Path(item)) or item.endswith((".xml", ".gz")):
             files.append(regular_file(Path(item).absolute(), file=None, field="--demand"))
         else:
             problem = f"no such demand{sumocfg.hint(item, known)}"
@@ -230,7 +230,7 @@ def _with_sumo_options(scenario: Scenario, chosen: Mapping[str, str]) -> Scenari
     others = {k: v for k, v in chosen.items() if k not in (*sumocfg.INPUTS, *sumocfg.CLOCK)}
     return replace(
         scenario,
-        net=files["net-file"][0] if "net-file" in files else scenario.net,
+        net=(*files.get("net-file", ()), scenario.net)[0],
         demand=files.get("route-files", scenario.demand),
         additional=files.get("additional-files", scenario.additional),
         begin=begin,

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cosim.errors import BadInput
-from cosim.xml_input import regular_file, scan
+from cosim.xml_input import is_there, regular_file, scan
 
 # SUMO's own synonyms (sumo --help).
 _SYNONYMS = {
@@ -114,8 +114,9 @@ def read(path: Path) -> SumoConfig:
     path = path.absolute()
     values = _values(path)
     folder = path.parent
-    if "net-file" not in values:
-        raise BadInput("names no net", file=path, field="net-file")
+    net = files(values.get("net-file", ""), folder, path, "net-file")
+    if len(net) != 1:
+        raise BadInput("one net is needed", file=path, field="net-file", value=values.get("net-file", ""))
     kept, ignored = [], []
     for name, value in values.items():
         if name in INPUTS or name in ("begin", "end"):
@@ -134,7 +135,7 @@ def read(path: Path) -> SumoConfig:
     end = time_of(values["end"], path, "end") if "end" in values else None
     return SumoConfig(
         path=path,
-        net=files(values["net-file"], folder, path, "net-file")[0],
+        net=net[0],
         routes=files(values.get("route-files", ""), folder, path, "route-files"),
         additional=files(values.get("additional-files", ""), folder, path, "additional-files"),
         begin=time_of(values["begin"], path, "begin") if "begin" in values else 0.0,
@@ -242,7 +243,7 @@ def files(value: str, folder: Path, file: object, field: str) -> tuple[Path, ...
     # Spaces separate only where the whole is not a file: folders may have spaces in their names.
     found: list[Path] = []
     for name in filter(None, map(str.strip, value.split(","))):
-        for part in [name] if (folder / name).exists() else name.split():
+        for part in [name] if is_there(folder / name) else name.split():
             try:
                 found.append(regular_file((folder / part).absolute(), file=file, field=field))
             except BadInput as error:

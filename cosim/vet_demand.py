@@ -9,7 +9,16 @@ from pathlib import Path
 
 from cosim.errors import BadInput
 from cosim.sumocfg import hint, time_of
-from cosim.vet_rules import DEMAND, LANE_CHANGE, SL2015_ONLY, VEHICLE_TYPE, VEHICLE_TYPE_TEXT, problem, words
+from cosim.vet_rules import (
+    DEMAND,
+    LANE_CHANGE,
+    SL2015_ONLY,
+    VEHICLE_TYPE,
+    VEHICLE_TYPE_TEXT,
+    clip,
+    problem,
+    words,
+)
 from cosim.xml_input import regular_file, scan
 
 ROUTE_ROOTS = ("routes", "route-alternatives", "trips", "vehicles", "additional", "add")
@@ -130,7 +139,7 @@ class _DemandReader:
             self.found.outputs.append(attributes["value"])
         self._owners.append((tag, owner))
 
-    def end(self, tag: str) -> None:  # noqa: ARG002 - expat names the element that closes
+    def end(self, tag: str) -> None:
         self._owners.pop()
 
     def finish(self) -> Demand:
@@ -217,4 +226,4 @@ class _DemandReader:
 
     def _refuse(self, tag: str, name: str, value: str, wrong: str, owner: str, line: int) -> None:
         place = f"{owner}, line {line}" if owner else f"line {line}"
-        raise BadInput(f"{wrong} ({place})", file=self._path, field=f"{tag}.{name}", value=value)
+        raise BadInput(f"{wrong} ({place})", file=self._path, field=f"{tag}.{name}", value=clip(value))

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cosim.errors import BadInput
-from cosim.vet_rules import NET, SHAPES, problem, shape_problem
+from cosim.vet_rules import NET, SHAPES, clip, problem, shape_problem
 from cosim.xml_input import scan
 
 _CROSSING = re.compile(r":(.+)_c\d+")  # netconvert's name for the crossings of a junction
@@ -66,7 +66,7 @@ class _NetReader:
         rules = NET.get(tag)
         if rules is None:
             if tag == "request":
-                self._requests[self._junction] += 1
+                self._request(attributes, line)
             return
         for name, value in attributes.items():
             if name in rules:
@@ -83,7 +83,9 @@ class _NetReader:
             self._open_edge(attributes, line)
         elif tag == "junction":
             self._junction = self._need("junction", "id", attributes, line)
-            self._junctions[self._junction] = attributes.get("type", "")
+            kind = self._junctions[self._junction] = attributes.get("type", "")
+            if self._junction.startswith(":") != (kind == "internal"):
+                self._refuse(tag, "type", kind, "does not fit the junction's id", self._junction, line)
             self._inside[self._junction] = attributes.get("intLanes", "").split()
         elif tag == "connection":
             names = ("from", "to", "fromLane", "toLane")
@@ -166,6 +168,15 @@ class _NetReader:
             self._refuse("lane", "shape", attributes["shape"], "needs at least two points", lane, line)
         self._lanes[self._edge] = expected + 1
 
+    def _request(self, attributes: dict[str, str], line: int) -> None:
+        """A row of the right-of-way table: SUMO indexes with what it says."""
+        due = self._requests[self._junction]
+        self._requests[self._junction] += 1
+        for name, allowed in (("index", (str(due),)), ("cont", ("0", "1", "false", "true"))):
+            if attributes.get(name, allowed[0]) not in allowed:
+                problem_ = f"must be {' or '.join(allowed)}"
+                self._refuse("request", name, attributes[name], problem_, self._junction, line)
+
     def _check_ends(self) -> None:
         """Every edge runs from a junction that is there to one that is there."""
         for field, ends in (("edge.from", self._origins), ("edge.to", self._ends)):
@@ -216,4 +227,4 @@ class _NetReader:
 
     def _refuse(self, tag: str, name: str, value: str, wrong: str, owner: str | None, line: int) -> None:
         place = f"{owner}, line {line}" if owner else f"line {line}"
-        raise BadInput(f"{wrong} ({place})", file=self._path, field=f"{tag}.{name}", value=value)
+        raise BadInput(f"{wrong} ({place})", file=self._path, field=f"{tag}.{name}", value=clip(value))

@@ -204,3 +204,8 @@ def shape_problem(value: str) -> str | None:
     """What is wrong with a list of coordinates "x,y x,y[,z]"; None when it is fine."""
     bad = _NOT_A_SHAPE.search(value)
     return None if bad is None else "holds something that is not a finite number"
+
+
+def clip(value: str) -> str:
+    """A value as an error shows it: a shape may have a thousand points."""
+    return value if len(value) <= 80 else f"{value[:77]}..."

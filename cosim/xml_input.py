@@ -53,6 +53,14 @@ def regular_file(path: Path, *, file: object, field: str) -> Path:
     raise BadInput(f"is {kind}, a file is needed", file=file, field=field, value=str(path))
 
 
+def is_there(path: Path) -> bool:
+    """`path.exists()`, and False for names no system takes (too long, a NUL byte)."""
+    try:
+        return path.exists()
+    except (OSError, ValueError):
+        return False
+
+
 def scan(path: Path, roots: tuple[str, ...], start: Start, end: End | None = None) -> str:
     """Call `start` for every element (the root included) and `end` when it closes; return the root's tag.
 

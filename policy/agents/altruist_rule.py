@@ -27,8 +27,9 @@ class AltruistConfig:
     crawl: float = 2.0  # the guide waits upstream of a junction (on the grid: it stops)
     pace_below: float = 5.0  # beside an ending lane the guide drives this much slower than the other
     pace_min: float = 5.0  # and never slower than this
-    clear_ahead: float = 15.0  # a free left lane: nobody from here ahead ...
-    clear_behind: float = 25.0  # ... to there behind
+    clear: float = 10.0  # a free left lane: this much room ahead and behind,
+    clear_time: float = 0.8  # s of a follower's way on top,
+    closing_time: float = 3.0  # s of what the two close in on each other
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +58,7 @@ class AltruistRule:
         """A new episode: nobody has been served yet."""
         self._road = context.road
         self._served: set[str] = set()
-        self._guide: dict[str, str] = {}  # mission vehicle -> guide
+        self._guide: dict[str, Need] = {}  # mission vehicle -> its guide
 
     def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
         """At most one command per mission vehicle: the guide's."""
@@ -74,8 +75,10 @@ class AltruistRule:
                 continue
             guide = self._choose(mission, candidates)
             if guide is not None:
-                self._guide[mission] = guide.av
-                decisions[guide.av] = Decision(self._yield(guide, histories[guide.av]))
+                self._guide[mission] = guide
+                action = self._yield(guide, histories[guide.av])
+                if action is not None:
+                    decisions[guide.av] = Decision(action)
         return decisions
 
     def _need(self, av: str, history: History, row: int) -> Need | None:
@@ -86,29 +89,31 @@ class AltruistRule:
             return None
         mission = history.ids[row]
         theirs = road.path(lane)
+        guide = self._guide.get(mission)
         place = float(history.lane_position[row]) * theirs.scale  # m, their front bumper
         speed = float(history.kinematics[-1, row, 2])
-        if np.isfinite(theirs.conflict) and np.isfinite(own.conflict):
-            if lane in own.lanes or road.lanes[lane].internal:
-                if self._guide.get(mission) is not None or road.lanes[lane].internal:
-                    self._served.add(mission)
-                return None
-            if not _same_approach(road, own, theirs):
-                behind = history.route.conflict_distance - max(theirs.conflict - place, 0.0)
-                return Need(av, behind, True, False, speed)
-        if lane in own.lanes[:3] and self._guide.get(mission) == av:
-            self._served.add(mission)  # it drives in our lane now
-            return None
         beside = _meeting(road, own, theirs)
-        if beside is None:
+        if beside is not None:
+            if lane in own.lanes[:3] and guide is not None and guide.av == av:
+                self._served.add(mission)  # it drives in our lane now
+                return None
+            mine, other, right = beside
+            return Need(av, (mine - history.route.arc) - (other - place), False, right, speed)
+        if not (np.isfinite(theirs.conflict) and np.isfinite(own.conflict)):
             return None
-        mine, other, right = beside
-        return Need(av, (mine - history.route.arc) - (other - place), False, right, speed)
+        if guide is not None and guide.crossing and (road.lanes[lane].internal or lane in own.lanes):
+            self._served.add(mission)
+            return None
+        if _same_approach(road, own, theirs):
+            return None
+        behind = history.route.conflict_distance - max(theirs.conflict - place, 0.0)
+        return Need(av, behind, True, False, speed)
 
     def _choose(self, mission: str, candidates: list[Need]) -> Need | None:
         c = self._config
         present = {n.av: n for n in candidates}
-        chosen = present.get(self._guide.get(mission, ""))
+        before = self._guide.get(mission)
+        chosen = None if before is None else present.get(before.av)
         if chosen is not None and (chosen.crossing or c.behind_min <= chosen.behind <= 2 * c.behind_max):
             return chosen
         fitting = [
@@ -122,7 +127,8 @@ class AltruistRule:
         ]
         return min(fitting, key=lambda n: n.behind, default=None)
 
-    def _yield(self, need: Need, history: History) -> MetaAction:
+    def _yield(self, need: Need, history: History) -> MetaAction | None:
+        """What the guide does; None: it is so close to its leader that IDM shall drive."""
         c = self._config
         if need.crossing:
             wanted = c.crawl
@@ -130,24 +136,47 @@ class AltruistRule:
             if need.from_right and self._left_is_free(history):
                 return MetaAction.LANE_LEFT
             wanted = max(need.speed - c.pace_below, c.pace_min)
+        if history.lane_changing:
+            return MetaAction.IDLE
+        if self._too_close(history):
+            return None
         if history.target_speed > wanted + 2.5:
             return MetaAction.DECELERATE
-        if history.target_speed < wanted - 2.5:
-            return MetaAction.ACCELERATE
         return MetaAction.IDLE
 
     def _left_is_free(self, history: History) -> bool:
-        c = self._config
+        """Nobody there, nobody who would have to brake hard for us, nobody we would run into."""
+        c, speed = self._config, history.ego_speed
         left = history.route.paths[0]
         if left is None or history.route.to_end(0) < 100.0 or history.lane_changing:
             return False
-        for row in np.flatnonzero(history.valid[-1])[1:]:
-            if int(history.lane[row]) in left.lanes[:2]:
-                ahead, speed = history.kinematics[-1, row, 0], history.kinematics[-1, row, 2]
-                closing = max(float(speed) - history.ego_speed, 0.0) * 3.0  # m in 3 s
-                if -c.clear_behind - closing < ahead < c.clear_ahead:
-                    return False
+        for ahead, other in _along(history, left):
+            behind = c.clear + other * c.clear_time + max(other - speed, 0.0) * c.closing_time
+            front = c.clear + max(speed - other, 0.0) * c.closing_time
+            if -behind < ahead < front:
+                return False
         return True
+
+    def _too_close(self, history: History) -> bool:
+        """Closer to the leader than IDM's own wish (T = 0.8 s, d0 = 2 m, a = 3, b = 7 m/s2)."""
+        own, speed = history.route.paths[1], history.ego_speed
+        if own is None:
+            return False
+        for ahead, other in _along(history, own):
+            if ahead > 0.0:
+                wish = 2.0 + 0.8 * speed + speed * max(speed - other, 0.0) / (2.0 * 21.0**0.5)
+                if ahead - 5.0 < 1.1 * wish:
+                    return True
+        return False
+
+
+def _along(history: History, path: LanePath) -> list[tuple[float, float]]:
+    """Vehicles on the path's next lanes: m ahead of the ego (centres), m/s."""
+    rows = np.flatnonzero(history.valid[-1])[1:]
+    newest = history.kinematics[-1]
+    return [
+        (float(newest[r, 0]), float(newest[r, 2])) for r in rows if int(history.lane[r]) in path.lanes[:3]
+    ]
 
 
 def _same_approach(road: RoadMap, own: LanePath, theirs: LanePath) -> bool:

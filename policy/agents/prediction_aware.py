@@ -12,7 +12,7 @@ import torch
 from cosim.errors import BadInput
 from cosim.raster import RoadRaster, rasterize_road
 from cosim.road import RoadMap
-from cosim.types import COMPACT, PAPER, Decision, History, ObservationConfig, PolicyContext
+from cosim.types import COMPACT, PAPER, Decision, History, MetaAction, ObservationConfig, PolicyContext
 from policy.chain import ChainConfig, predict
 from policy.checkpoint import load
 from policy.hpn import HPN, HpnConfig
@@ -24,6 +24,7 @@ from policy.traffic import TrafficConfig, predict_traffic
 from policy.vfn import VFN, VfnConfig
 
 UNTRAINED = "untrained"
+RETRY = 2.0  # s, a lane change's time: so long a refused one is not tried again
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,6 +117,7 @@ class PredictionAware:
             self._road = context.road
             self._raster = rasterize_road(context.road) if self.config.predicted_maps else None
         self._context = context
+        self._asked: dict[str, tuple[MetaAction, float]] = {}  # lane changes commanded last, when (s)
         self._predictor = make_predictor(
             self.config.predictor, self.config.chain.horizon, context.timing.frame
         )
@@ -139,4 +141,23 @@ class PredictionAware:
         if not np.isfinite(q).all():
             raise FloatingPointError("the value network returned values that are not finite")
         traffic = predict_traffic(scene, forecast, context.road, c.traffic, c.safety.frames)
-        return prioritize(q, scene, traffic, context.road, c.safety, context.share_intentions)
+        decisions = prioritize(
+            q, scene, traffic, context.road, c.safety, context.share_intentions, self._refused(histories)
+        )
+        for name, decision in decisions.items():
+            if decision.action in (MetaAction.LANE_LEFT, MetaAction.LANE_RIGHT):
+                self._asked[name] = (decision.action, histories[name].time)
+        return decisions
+
+    def _refused(self, histories: Mapping[str, History]) -> dict[str, MetaAction]:
+        """Lane changes that were commanded within RETRY s and did not begin (a closed lane, a solid line)."""
+        refused = {}
+        for name, history in histories.items():
+            action, when = self._asked.get(name, (None, 0.0))
+            if action is None:
+                continue
+            if history.lane_changing or history.time - when > RETRY:
+                del self._asked[name]
+            else:
+                refused[name] = action
+        return refused

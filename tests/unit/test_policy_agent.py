@@ -69,6 +69,20 @@ def test_the_network_decides_where_the_mask_allows_it() -> None:
     assert decisions["a"].action == MetaAction.DECELERATE, "closing on a slow car it may not"
 
 
+def test_a_lane_change_that_did_not_begin_is_not_tried_again_at_once() -> None:
+    agent = PredictionAware("vfn-p")
+    with torch.no_grad():
+        agent.vfn.value.bias[MetaAction.LANE_LEFT] = 1.0
+    agent.reset(context(agent))
+    seen = histories(ROAD, CARS, agent.observation)
+    assert agent.decide(seen)["a"].action == MetaAction.LANE_LEFT
+    later = {name: h._replace(time=0.4) for name, h in seen.items()}
+    assert agent.decide(later)["a"].action != MetaAction.LANE_LEFT
+    assert agent.decide(later)["a"].blamed == "(lane change was refused)"
+    much_later = {name: h._replace(time=3.0) for name, h in seen.items()}
+    assert agent.decide(much_later)["a"].action == MetaAction.LANE_LEFT
+
+
 def test_it_refuses_an_observation_it_was_not_built_for() -> None:
     agent = PredictionAware("vfn-p")
     with pytest.raises(BadInput, match="observation"):

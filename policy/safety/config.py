@@ -1,0 +1,49 @@
+"""Thresholds of the safety prioritizer and the driving limits behind them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cosim.types import MetaAction
+
+
+@dataclass(frozen=True, slots=True)
+class SafetyConfig:
+    """Thresholds (contract.md, What is not in the papers) and the driving limits behind them."""
+
+    safe_th: float = 3.0  # s, P: safe_th
+    critical_th: float = 1.5  # s, P: critical_th
+    decay: float = 0.5  # 1/s, lambda of the weights
+    cap: float = 10.0  # s, time to collision counts no further
+    horizon: float = 4.0  # s, P, Table I
+    dt: float = 0.2  # s
+    margin_length: float = 1.0  # m, added to the ego's box along
+    margin_width: float = 0.6  # m, and across: half of the room between cars in neighbouring lanes
+    reach: float = 125.0  # m, as the kinematic rows
+    reaction: float = 0.4  # s until the next decision can brake
+    leader_brake: float = 8.0  # m/s2, a leader's hardest expected braking
+    standstill_gap: float = 1.0  # m left between standing cars
+    follower_reaction: float = 0.5  # s of a new follower
+    follower_brake: float = 3.0  # m/s2, the most that a lane change may ask of it
+    follower_gap: float = 2.0  # m, at least
+    lane_change_speed: float = 3.0  # m/s: slower, a car cannot get sideways within a lane change's time
+    straddle: float = 1.0  # m beside the centre line: a car whose rear stands there blocks two lanes
+    lane_half: float = 1.6  # m from a centre line within which a vehicle is in that lane
+    same_way: float = 1.05  # rad, headings closer than this (60 degrees) drive the same way
+    resume_below: float = 0.5  # of the speed limit: slower commands are not kept among equal values
+    # among equally valued actions: keep going, else give way, else evade
+    ties: tuple[MetaAction, ...] = (
+        MetaAction.IDLE,
+        MetaAction.DECELERATE,
+        MetaAction.ACCELERATE,
+        MetaAction.LANE_LEFT,
+        MetaAction.LANE_RIGHT,
+    )
+
+    @property
+    def frames(self) -> int:
+        """Steps of a rollout: far enough to see every contact that either threshold asks about."""
+        seen = max(self.horizon + self.critical_th, self.safe_th + 0.5 * self.horizon)  # s
+        return int(np.ceil(seen / self.dt - 1e-9))

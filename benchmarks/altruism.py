@@ -78,7 +78,12 @@ def table(world: str, demand: str, runs: dict[str, list[EpisodeResult]]) -> list
         caused = [bool(r.value("av_caused_collisions")) for r in results]
         figures = [
             mean([r.value(name) for r in results], digits)
-            for name, digits in (("dt_mission_m", 0), ("dt_av_m", 0), ("dt_mean_m", 0), ("hard_brakings_av", 1))
+            for name, digits in (
+                ("dt_mission_m", 0),
+                ("dt_av_m", 0),
+                ("dt_mean_m", 0),
+                ("hard_brakings_av", 1),
+            )
         ]
         odd = sum(bool(r.validity) for r in results)
         cells = [policy, rate(served), rate(crashed), rate(caused), *figures, str(odd)]

@@ -10,11 +10,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from cosim.errors import CosimError
-from cosim.scenario import Fleet
+from cosim.scenario import BEHAVIORS, DRIVER_MODELS, Fleet
 from cosim.types import Preset
-
-BEHAVIORS = ("conservative", "moderate", "aggressive", "mixed", "as-is")
-DRIVER_MODELS = ("lc2013", "mobil")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +11,7 @@ import libsumo
 import numpy as np
 
 from cosim.errors import BadInput, SimulationError, SimulationInUse
+from cosim.quiet import quiet
 from cosim.road import RoadMap
 from cosim.scenario import Scenario
 from cosim.simulation.collisions import CollisionWatch
@@ -57,7 +59,9 @@ class SumoSimulator:
                 "this process already runs a simulation, and libsumo would silently replace it: "
                 "use one process per simulation (cosim.envs and cosim.open do)"
             )
-        self._scenario = scenario
+        self._scratch = tempfile.TemporaryDirectory(prefix="cosim-")
+        # a user's detectors would write beside his scenario, and workers over one another
+        self._scenario = scenario if scenario.built_in else quiet(scenario, Path(self._scratch.name))
         self._av_parameters = dict(av_parameters or {})
         self._history = history
         self._stderr = SumoStderr()
@@ -151,6 +155,7 @@ class SumoSimulator:
             with self._stderr:
                 libsumo.close()
         self._stderr.close()
+        self._scratch.cleanup()
         _in_use = False
 
     # ---- inside ----
@@ -187,7 +192,7 @@ class SumoSimulator:
         return [text for key, value in options.items() if value for text in (f"--{key}", value)]
 
     def _explain(self, error: Exception, *, starting: bool = False) -> Exception:
-        words = self._stderr.take() or str(error)
+        words = " ".join((self._stderr.take() or str(error)).split())
         if starting:  # everything SUMO refuses before the first step is wrong input
             return BadInput(f"SUMO refuses it: {words}", file=self._scenario.config)
         return SimulationError(f"{self._scenario.config}: SUMO failed: {words}")

@@ -16,6 +16,9 @@ from cosim.types import Decision, History, MetaAction, PolicyContext
 from policy.agents.idm import NO_MAPS
 
 
+LANE = 3.2  # m, SUMO's lane width
+
+
 @dataclass(frozen=True, slots=True)
 class AltruistConfig:
     """When the guide yields and how much. Distances in m, speeds in m/s."""
@@ -29,6 +32,7 @@ class AltruistConfig:
     pace_min: float = 5.0  # and never slower than this
     clear: float = 10.0  # a free left lane: this much room ahead and behind,
     clear_time: float = 0.8  # s of a follower's way on top,
+    max_closing: float = 3.0  # m/s that a follower there may be faster,
     closing_time: float = 3.0  # s of what the two close in on each other
 
 
@@ -150,7 +154,9 @@ class AltruistRule:
         left = history.route.paths[0]
         if left is None or history.route.to_end(0) < 100.0 or history.lane_changing:
             return False
-        for ahead, other in _along(history, left):
+        for ahead, other in _along(history, left, side=LANE):
+            if ahead < 0.0 and other - speed > c.max_closing:
+                return False  # a guide that has slowed down already stays in its lane
             behind = c.clear + other * c.clear_time + max(other - speed, 0.0) * c.closing_time
             front = c.clear + max(speed - other, 0.0) * c.closing_time
             if -behind < ahead < front:
@@ -170,12 +176,17 @@ class AltruistRule:
         return False
 
 
-def _along(history: History, path: LanePath) -> list[tuple[float, float]]:
-    """Vehicles on the path's next lanes: m ahead of the ego (centres), m/s."""
-    rows = np.flatnonzero(history.valid[-1])[1:]
+def _along(history: History, path: LanePath, side: float = 0.0) -> list[tuple[float, float]]:
+    """Vehicles on the path's next lanes, or behind on its course: m ahead of the ego (centres), m/s.
+
+    Upstream a lane has other names, so behind it is the place that counts: `side` m to the left.
+    """
     newest = history.kinematics[-1]
     return [
-        (float(newest[r, 0]), float(newest[r, 2])) for r in rows if int(history.lane[r]) in path.lanes[:3]
+        (float(newest[r, 0]), float(newest[r, 2]))
+        for r in np.flatnonzero(history.valid[-1])[1:]
+        if int(history.lane[r]) in path.lanes[:3]
+        or (newest[r, 0] < 0.0 and abs(newest[r, 1] - side) < LANE / 2.0)
     ]
 
 

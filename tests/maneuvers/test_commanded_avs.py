@@ -120,7 +120,10 @@ def test_cutting_in_close_before_a_faster_car_is_the_av_s_fault(start: Start) ->
 
 
 def test_an_av_that_is_released_follows_its_leader_again(start: Start) -> None:
-    cars = [vehicle("a", "av", 100.0, speed=20.0), vehicle("l", "hv", 130.0, speed=12.0, more='arrivalSpeed="12"')]
+    cars = [
+        vehicle("a", "av", 100.0, speed=20.0),
+        vehicle("l", "hv", 130.0, speed=12.0, more='arrivalSpeed="12"'),
+    ]
     worker = start(cars)
     drive(worker, [Command("a", 20.0, 0, HOLD)])
     _, frames = drive(worker, [], 20)

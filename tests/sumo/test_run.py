@@ -35,7 +35,7 @@ def run(*arguments: str, expect: int = 0) -> subprocess.CompletedProcess[str]:
 
 def document(*arguments: str) -> dict[str, Any]:
     """The JSON document: exactly one on stdout."""
-    result: dict[str, Any] = json.loads(run(*arguments, "--json").stdout)
+    result: dict[str, Any] = json.loads(run(arguments[0], "--json", *arguments[1:]).stdout)
     return result
 
 
@@ -58,7 +58,9 @@ def test_the_document_has_every_promised_figure() -> None:
 
 
 def test_the_same_seed_in_fresh_processes_is_the_same_run_and_another_seed_is_not() -> None:
-    same = [document("merge", "--policy", "altruist-rule", "--duration", "10", "--seed", "200003") for _ in "ab"]
+    same = [
+        document("merge", "--policy", "altruist-rule", "--duration", "10", "--seed", "200003") for _ in "ab"
+    ]
     other = document("merge", "--policy", "altruist-rule", "--duration", "10", "--seed", "200004")
     assert same[0]["trace_hash"] == same[1]["trace_hash"]
     assert other["trace_hash"] != same[0]["trace_hash"]
@@ -74,7 +76,9 @@ def test_the_whole_agent_commands_every_av_and_says_that_it_is_untrained() -> No
 
 
 def test_somebody_else_s_scenario_runs_unmodified(a10kw: str) -> None:
-    found = document(a10kw, "--penetration", "0.2", "--policy", "idm", "--duration", "200", "--seed", "200000")
+    found = document(
+        a10kw, "--penetration", "0.2", "--policy", "idm", "--duration", "200", "--seed", "200000"
+    )
     assert found["scenario"] == "A10KW"
     assert found["behavior"] == "as-is"
     assert found["vehicles_inserted"] > 400

@@ -37,7 +37,9 @@ def look(snapshot: Snapshot, config: ObservationConfig = COMPACT, ego: str = "v0
     return observer.histories(lambda _: ("road",), lambda _: (None, 0))[ego]
 
 
-def pixel(history: History, channel: int, ahead: float, left: float, config: ObservationConfig = COMPACT) -> int:
+def pixel(
+    history: History, channel: int, ahead: float, left: float, config: ObservationConfig = COMPACT
+) -> int:
     """The newest map's pixel at a place in the ego frame (m)."""
     u = int(np.floor(ahead / config.metres_along + config.width / 2))
     v = int(np.floor(config.height / 2 - left / config.metres_across))
@@ -106,7 +108,9 @@ def test_any_number_of_channels() -> None:
 
 
 def test_rows_are_the_ego_then_the_nearest_in_the_ego_frame() -> None:
-    history = look(scene(x=[500.0, 480.0, 510.0, 900.0], y=[1.6, 1.6, 4.8, 1.6], heading=[0.0, 0.0, 0.1, 0.0]))
+    history = look(
+        scene(x=[500.0, 480.0, 510.0, 900.0], y=[1.6, 1.6, 4.8, 1.6], heading=[0.0, 0.0, 0.1, 0.0])
+    )
     assert history.ids[:3] == ("v0", "v2", "v1")
     assert history.valid[-1].sum() == 3, "400 m away is out of sight"
     assert history.kinematics[-1, 1, :4] == pytest.approx([10.0, 3.2, 20.0, 0.1], abs=1e-5)
@@ -151,7 +155,9 @@ def test_perception_is_shared_between_avs_unless_switched_off() -> None:
 
 
 def test_a_history_is_a_view_that_survives_the_next_frames() -> None:
-    simulator = FakeSimulator([FakeVehicle("a", 100.0, 0, 20.0, is_av=True), FakeVehicle("b", 140.0, 0, 20.0)])
+    simulator = FakeSimulator(
+        [FakeVehicle("a", 100.0, 0, 20.0, is_av=True), FakeVehicle("b", 140.0, 0, 20.0)]
+    )
     observer = Observer(simulator.road, COMPACT)
     for frame in simulator.reset(0):
         observer.add(frame)

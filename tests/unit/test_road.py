@@ -13,7 +13,9 @@ def merge_road() -> RoadMap:
     return RoadMap(
         (
             Lane("in_0", "in", 0, shape(0.0, 120.0, 0.0), 120.0, 3.2, 25.0, (), left=1, start="a", end="b"),
-            Lane("in_1", "in", 1, shape(0.0, 120.0, 3.2), 120.0, 3.2, 25.0, (2,), right=0, start="a", end="b"),
+            Lane(
+                "in_1", "in", 1, shape(0.0, 120.0, 3.2), 120.0, 3.2, 25.0, (2,), right=0, start="a", end="b"
+            ),
             Lane("out_0", "out", 0, shape(120.0, 400.0, 3.2), 280.0, 3.2, 25.0, (), start="b", end="c"),
         ),
         zones=(ConflictZone("join", frozenset({2})),),
@@ -59,7 +61,12 @@ def test_a_ring_is_followed_once_round_at_most() -> None:
     ring = tuple(
         Lane(f"r{k}_0", f"r{k}", 0, np.array(s), 20.0, 3.2, 10.0, ((k + 1) % 4,))
         for k, s in enumerate(
-            ([[0.0, 0.0], [20.0, 0.0]], [[20.0, 0.0], [20.0, 20.0]], [[20.0, 20.0], [0.0, 20.0]], [[0.0, 20.0], [0.0, 0.0]])
+            (
+                [[0.0, 0.0], [20.0, 0.0]],
+                [[20.0, 0.0], [20.0, 20.0]],
+                [[20.0, 20.0], [0.0, 20.0]],
+                [[0.0, 20.0], [0.0, 0.0]],
+            )
         )
     )
     assert RoadMap(ring).path(0).lanes == (0, 1, 2, 3)
@@ -69,7 +76,9 @@ def test_roads_at_different_heights_do_not_touch() -> None:
     level = np.array([[-500.0, 0.0], [500.0, 0.0]])
     below = Lane("low_0", "low", 0, level, 1000.0, 3.2, 25.0, start="w", end="e")
     above = Lane("high_0", "high", 0, level[:, ::-1].copy(), 1000.0, 3.2, 25.0, start="s", end="n")
-    ramp = Lane("ramp_0", "ramp", 0, np.array([[500.0, 0.0], [600.0, 50.0]]), 110.0, 3.2, 25.0, start="e", end="x")
+    ramp = Lane(
+        "ramp_0", "ramp", 0, np.array([[500.0, 0.0], [600.0, 50.0]]), 110.0, 3.2, 25.0, start="e", end="x"
+    )
     road = RoadMap((below, above, ramp))
     assert not road.connected(0, 1)
     assert road.connected(0, 2)

@@ -1,6 +1,6 @@
 """Who is served when somebody yields: every policy on the contested demand of every world, paired seeds.
 
-    python -m benchmarks.altruism [--seeds 200000:200040] [--scenario merge ...] [--policy idm ...] [--out FILE]
+    python -m benchmarks.altruism [--seeds 200000:200040] [--scenario merge] [--policy idm] [--out FILE]
 
 Writes docs/results/altruism.md (with --out) or prints it. Rates with Wilson 95 % intervals, means with
 bootstrap 95 % intervals; the distance ratio is of means over equal seeds.
@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
+from benchmarks.intervals import share
 from cosim.app.progress import Progress
 from cosim.app.runner import Runner
 from cosim.scenario import load
@@ -42,22 +43,18 @@ def episodes(
 
 
 def rate(hits: Sequence[bool]) -> str:
-    """`k/n = p % [low, high]`, Wilson 95 %."""
-    k, n = sum(hits), len(hits)
-    if not n:
-        return "NA"
-    low, high = stats.binomtest(k, n).proportion_ci(method="wilson")
-    return f"{k}/{n} = {100 * k / n:.0f} % [{100 * low:.0f}, {100 * high:.0f}]"
+    """`k/n = p % (low to high)`, Wilson 95 %."""
+    return f"{sum(hits)}/{len(hits)} = {share(sum(hits), len(hits)).text(0, 100.0)} %"
 
 
 def mean(values: Sequence[float], digits: int = 0) -> str:
-    """`mean [low, high]`, bootstrap 95 %."""
+    """`mean (low to high)`, bootstrap 95 %."""
     data = np.array([v for v in values if v is not None], float)
     if len(data) < 2 or np.ptp(data) == 0:
         return f"{data.mean():.{digits}f}" if len(data) else "NA"
     rng = np.random.default_rng(0)
     low, high = stats.bootstrap((data,), np.mean, rng=rng, n_resamples=2000).confidence_interval
-    return f"{data.mean():.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+    return f"{data.mean():.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
 
 
 def table(world: str, demand: str, runs: dict[str, list[EpisodeResult]]) -> list[str]:
@@ -68,8 +65,8 @@ def table(world: str, demand: str, runs: dict[str, list[EpisodeResult]]) -> list
         "",
         f"Behaviour {first.behavior}, drivers {first.driver_model}, preset {first.preset}.",
         "",
-        "| policy | mission success | crashed | AV-caused | mission vehicle m | AVs m | all m | hard brakings of AVs |"
-        " not comparable |",
+        "| policy | mission success | crashed | AV-caused | mission vehicle m | AVs m | all m |"
+        " hard brakings of AVs | not comparable |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for policy, results in runs.items():

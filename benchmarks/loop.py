@@ -3,9 +3,9 @@
     python -m benchmarks.loop [--scenario merge] [--demand dense] [--decisions 200] [--rounds 5] [--profile]
 
 Each round runs the same episode (same seed, same traffic: AVs driven by SUMO's IDM) twice, in fresh
-processes one after the other: bare, four `libsumo.simulationStep()` per decision and nothing else but
-giving newcomers their driver; and ours, the same steps plus two frames of VelocityMap and kinematics for every
-AV, with full history. Figures are medians over decisions; only the ratios mean anything elsewhere.
+processes one after the other: bare, four `libsumo.simulationStep()` per decision and nothing else but giving
+newcomers their driver; and ours, the same steps plus two frames of VelocityMap and kinematics for every AV,
+with full history. Figures are medians over decisions; only the ratios mean anything elsewhere.
 """
 
 from __future__ import annotations

@@ -172,7 +172,7 @@ class Episode:
 
     def _validity(self, metrics: Mapping[str, Metric]) -> tuple[str, ...]:
         """Why this result must not be compared with others; empty when nothing speaks against it."""
-        reasons = []
+        reasons = list(self.scenario.warnings)
         waiting, inserted = metrics["vehicles_never_inserted"].value, metrics["vehicles_inserted"].value
         if inserted == 0:
             reasons.append(

@@ -245,7 +245,7 @@ def _sample_road(
         px = int(np.floor(65536 * (x + c * back - s * left - cells_x) / cell))
         py = int(np.floor(65536 * (y + s * back + c * left - cells_y) / cell))
         end_x, end_y = (px + step_x * (width - 1)) >> 16, (py + step_y * (width - 1)) >> 16
-        inside = 0 <= px and 0 <= py and (px >> 16) < columns and (py >> 16) < rows
+        inside = px >= 0 and py >= 0 and (px >> 16) < columns and (py >> 16) < rows
         if inside and 0 <= end_x < columns and 0 <= end_y < rows:
             for u in range(width):
                 out[v, u] = flat[np.uintp((py >> 16) * columns + (px >> 16))]

@@ -77,6 +77,7 @@ class Scenario:
     driver_model: str = "lc2013"
     demands: Mapping[str, Path] | None = None  # name -> file, of a built-in world
     title: str = ""
+    warnings: tuple[str, ...] = ()  # what `cosim.vet` found odd: reasons not to compare the result
 
     @property
     def built_in(self) -> bool:

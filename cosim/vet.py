@@ -8,7 +8,7 @@ numbers are checked, and every name it refers to must exist. Files that have not
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -68,6 +68,15 @@ def vet(scenario: Scenario) -> VetReport:
         warnings=(*(w for d in demands for w in d.warnings), *_gaps(net, demands)),
         outputs=tuple(output for d in demands for output in d.outputs),
     )
+
+
+def vetted(scenario: Scenario) -> Scenario:
+    """The scenario with the vetting's warnings, which become reasons not to compare its results.
+
+    Raises:
+        BadInput: see `vet`.
+    """
+    return replace(scenario, warnings=vet(scenario).warnings)
 
 
 def _all(paths: Iterable[Path], config: Path, *, additional: bool = False) -> list[Demand]:

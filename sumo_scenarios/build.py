@@ -1,4 +1,4 @@
-"""Build every world's `net.net.xml` from its plain XML sources with netconvert (`python -m sumo_scenarios.build`).
+"""Build every world's `net.net.xml` from its plain XML sources: `python -m sumo_scenarios.build`.
 
 netconvert comes with the `eclipse-sumo` package (extra `tools`); the committed nets run without it.
 """

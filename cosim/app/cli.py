@@ -82,7 +82,7 @@ def _run(args: argparse.Namespace) -> int:
     from cosim.app.progress import Progress
     from cosim.app.runner import Runner
     from cosim.scenario import load
-    from cosim.vet import vet
+    from cosim.vet import vetted
     from cosim.worker import Worker
     from policy.agents import check_name
 
@@ -100,7 +100,7 @@ def _run(args: argparse.Namespace) -> int:
         duration=args.duration,
         options=args.sumo_options,
     )
-    vet(scenario)
+    scenario = vetted(scenario)
     folder = output.prepare_folder(args.out) if args.out else None
     progress = Progress(f"{scenario.name} {args.policy}", "s")
     with Worker(Runner, scenario, args.policy, math.radians(args.svo), name="cosim-run") as worker:

@@ -106,9 +106,9 @@ def open(
             options=options,
         )
     if simulator is None:
-        from cosim.vet import vet
+        from cosim.vet import vetted
 
-        vet(scenario)
+        scenario = vetted(scenario)
     arguments = (scenario, observation, math.radians(svo), reward or RewardConfig(), others, simulator)
     # a daemonic process (gymnasium's AsyncVectorEnv, SB3's SubprocVecEnv) may have no children, but is a
     # process of its own already

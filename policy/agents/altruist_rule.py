@@ -15,7 +15,6 @@ from cosim.road import LanePath, RoadMap
 from cosim.types import Decision, History, MetaAction, PolicyContext
 from policy.agents.idm import NO_MAPS
 
-
 LANE = 3.2  # m, SUMO's lane width
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
 from conftest import Start, vehicle
+
 from cosim.types import Collision, Command, Receipt, Snapshot
 from cosim.worker import Worker
 

@@ -90,7 +90,7 @@ def test_other_drivers_are_taken_to_go_straight_on() -> None:
     lanes = (
         Lane("a_0", "a", 0, east, 50.0, 3.2, 10.0, (1, 2)),
         Lane("left_0", "left", 0, np.array([[50.0, 0.0], [50.0, 50.0]]), 50.0, 3.2, 10.0),
-        Lane("on_0", "on", 0, east + [50.0, 0.0], 50.0, 3.2, 10.0),
+        Lane("on_0", "on", 0, east + np.array([50.0, 0.0]), 50.0, 3.2, 10.0),
     )
     assert RoadMap(lanes).path(0).lanes == (0, 2)
 

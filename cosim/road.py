@@ -208,11 +208,33 @@ class RoadMap:
             ahead = _heading(lane.shape, -1)
             turns = [abs(_wrap(self._exit_heading(s) - ahead)) for s in lane.successors]
             return lane.successors[int(np.argmin(turns))], place
+        fitting = self._fitting(lane, route, place)
+        if not fitting:
+            return None
+        best = fitting[0]
+        if len(fitting) > 1:  # the road widens: SUMO takes the lane that follows the route furthest
+            best = max(fitting, key=lambda s: self._reach(s, route, self._place_on(s, place), 300.0))
+        return best, self._place_on(best, place)
+
+    def _fitting(self, lane: Lane, route: tuple[str, ...], place: int) -> list[int]:
+        """Successors that lead to the route's next edge."""
         wanted = route[place + 1] if place + 1 < len(route) else None
-        for s in lane.successors:
-            if self._leads_to(s, wanted):
-                return s, place if self.lanes[s].internal else place + 1
-        return None
+        return [s for s in lane.successors if self._leads_to(s, wanted)]
+
+    def _place_on(self, lane: int, place: int) -> int:
+        return place if self.lanes[lane].internal else place + 1
+
+    def _reach(self, lane: int, route: tuple[str, ...], place: int, left: float) -> float:
+        """How many of the next `left` m of the route can be driven from the start of `lane` on, in m."""
+        here = self.lanes[lane]
+        own = _polyline_length(here.shape)
+        if own >= left or (place >= len(route) - 1 and not here.internal):
+            return left
+        further = (
+            self._reach(s, route, self._place_on(s, place), left - own)
+            for s in self._fitting(here, route, place)
+        )
+        return own + max(further, default=0.0)
 
     def _leads_to(self, lane: int, edge: str | None) -> bool:
         """Whether the lane is on `edge`, or is an internal lane that ends there."""

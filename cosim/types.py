@@ -163,8 +163,8 @@ class Decision(NamedTuple):
     q: Floats32 | None = None  # [A] action values
     safety_score: Floats32 | None = None  # [A] s, weighted time to collision (P, algorithm 2)
     unsafe: Bools | None = None  # [A]
-    ttc: Floats32 | None = None  # [A] s, the smallest time to collision along the horizon
-    blamed: str | None = None  # the vehicle that made the preferred action unsafe
+    ttc: Floats32 | None = None  # [A] s until first contact under the action, capped
+    blamed: str | None = None  # who made the preferred action unsafe: a vehicle, or why, in brackets
     vetoed: bool = False  # the preferred action was masked
     fallback: bool = False  # every action was unsafe: the highest score was taken
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from cosim.determinism import make_torch_deterministic
 from cosim.episode import Episode, run_episode
 from cosim.scenario import Scenario
 from cosim.simulation.sumo import SumoSimulator
@@ -23,7 +24,7 @@ class Runner:
         self._policy = make(policy)
         self._svo = svo
         wanted = observation or self._policy.observation
-        _single_thread()
+        make_torch_deterministic()
         self._simulator = SumoSimulator(
             scenario, av_parameters=self._policy.av_parameters, history=wanted.frames
         )
@@ -36,13 +37,3 @@ class Runner:
     def close(self) -> None:
         """End the simulation."""
         self._simulator.close()
-
-
-def _single_thread() -> None:
-    """Inference with one torch thread and deterministic kernels (contract.md, Reproducibility)."""
-    import sys
-
-    torch = sys.modules.get("torch")
-    if torch is not None:
-        torch.set_num_threads(1)
-        torch.use_deterministic_algorithms(True)

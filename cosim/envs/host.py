@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
+from cosim.determinism import make_torch_deterministic
 from cosim.envs.view import Packed, Packer
 from cosim.episode import Episode
 from cosim.errors import BadInput
@@ -82,7 +82,7 @@ class Host:
         self._histories = self._episode.start(seed)
         self._started = True
         if self._others is not None:
-            _single_thread()
+            make_torch_deterministic()
             self._others.reset(
                 PolicyContext(
                     road=self._simulator.road,
@@ -247,11 +247,3 @@ def _sumo(scenario: Scenario, av_parameters: Mapping[str, str], history: int) ->
     from cosim.simulation.sumo import SumoSimulator  # libsumo: only here, in the worker's process
 
     return SumoSimulator(scenario, av_parameters=av_parameters, history=history)
-
-
-def _single_thread() -> None:
-    """One torch thread, deterministic kernels (contract.md, Reproducibility), where `others` uses torch."""
-    torch = sys.modules.get("torch")
-    if torch is not None:
-        torch.set_num_threads(1)
-        torch.use_deterministic_algorithms(True)

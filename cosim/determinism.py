@@ -1,0 +1,15 @@
+"""One thread and deterministic kernels for whatever torch a policy brought (contract.md, Reproducibility)."""
+
+from __future__ import annotations
+
+import sys
+
+
+def make_torch_deterministic() -> None:
+    """Call once the policy is made. cosim never imports torch: without a policy that did, nothing happens."""
+    torch = sys.modules.get("torch")
+    if torch is None:
+        return
+    torch.set_num_threads(1)
+    torch.use_deterministic_algorithms(True)
+    torch.utils.deterministic.fill_uninitialized_memory = False  # costs 6 ms a decision, changes nothing

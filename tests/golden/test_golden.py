@@ -1,0 +1,58 @@
+"""Golden episodes: a change that moves traffic moves one of these, and must say so in CHANGELOG.md.
+
+`python tests/golden/test_golden.py` drives them anew and rewrites episodes.json.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cosim.app.runner import Runner
+from cosim.scenario import load
+from cosim.worker import Worker
+
+FILE = Path(__file__).with_name("episodes.json")
+SEED = 200_011
+EPISODES = [
+    (world, demand, policy)
+    for world in ("merge", "exit", "roundabout", "intersection", "highway")
+    for demand, policy in (("contested", "altruist-rule"), ("dense", "idm"))
+]
+FIGURES = (
+    "steps crashed collisions mission_success mission_time_s dt_mean_m dt_av_m dt_mission_m min_ttc_s "
+    "hard_brakings vehicles_inserted vehicles_never_inserted"
+)
+
+
+def drive(world: str, demand: str, policy: str) -> dict[str, Any]:
+    """The figures of one episode."""
+    with Worker(Runner, load(world, demand=[demand]), policy, math.pi / 4) as worker:
+        result = worker.call("run", SEED)
+    return {
+        name: result.steps if name == "steps" else result.value(name) for name in FIGURES.split()
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(("world", "demand", "policy"), EPISODES)
+def test_the_episode_is_the_golden_one(world: str, demand: str, policy: str) -> None:
+    golden = json.loads(FILE.read_text())[f"{world}/{demand}/{policy}"]
+    found = drive(world, demand, policy)
+    for name, value in golden.items():
+        if isinstance(value, float):
+            assert found[name] == pytest.approx(value, rel=1e-6), name
+        else:
+            assert found[name] == value, name
+
+
+def main() -> None:
+    """Rewrite the file."""
+    FILE.write_text(json.dumps({"/".join(e): drive(*e) for e in EPISODES}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

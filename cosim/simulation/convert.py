@@ -13,6 +13,12 @@ from cosim.road import ConflictZone, Lane, RoadMap
 from cosim.scenario import Zone
 from cosim.types import Events, Kind, Snapshot
 
+# The compiled getters: libsumo's Python wrappers around them double the cost of a read. The version
+# is pinned; a test compares them with the public ones.
+GETTERS = tuple(
+    getattr(libsumo._libsumo, f"vehicle_get{name}")
+    for name in ("Position", "Angle", "Speed", "Acceleration", "LaneID", "LanePosition")
+)
 GIVE_WAY = "mswZ"  # link states: minor, stop, all-way stop, zipper (SUMO, Networks/SUMO_Road_Networks)
 MOTOR_CLASSES = {"passenger", "private", "taxi", "bus", "truck", "trailer", "delivery", "motorcycle"}
 
@@ -42,8 +48,7 @@ class SnapshotReader:
 
     def read(self, bodies: dict[str, Body], events: Events) -> Snapshot:
         """One snapshot of every vehicle on the road, sorted by id."""
-        vehicle = libsumo.vehicle
-        ids = tuple(sorted(vehicle.getIDList()))
+        ids = tuple(sorted(libsumo.vehicle.getIDList()))
         if ids != self._ids:
             present = [bodies[i] for i in ids]
             self._static = (
@@ -55,9 +60,7 @@ class SnapshotReader:
             self._front = 0.5 * self._static[2]
             self._ids = ids
         kind, mission, length, width = self._static
-        position, angle = vehicle.getPosition, vehicle.getAngle
-        speed, accel = vehicle.getSpeed, vehicle.getAcceleration
-        lane_id, lane_position = vehicle.getLaneID, vehicle.getLanePosition
+        position, angle, speed, accel, lane_id, lane_position = GETTERS
         index = self._lane_index
         front = np.array([position(i) for i in ids], np.float64).reshape(-1, 2)  # [n,2] m
         heading = np.radians(90.0 - np.array([angle(i) for i in ids], np.float64))  # [n] rad

@@ -6,6 +6,7 @@ import hashlib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from statistics import NormalDist
 from typing import Any
@@ -136,6 +137,7 @@ class _Reader:
         return float(value)
 
 
+@lru_cache
 def load_behaviors(path: Path | str | None = None) -> Behaviors:
     """Read behaviors.yaml (default: the one that ships with the worlds).
 

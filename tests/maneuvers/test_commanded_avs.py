@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from conftest import Start, vehicle
 
+from cosim.scenario import Scenario, load
+from cosim.simulation.sumo import SumoSimulator
 from cosim.types import Collision, Command, Receipt, Snapshot
 from cosim.worker import Worker
 
@@ -152,3 +154,27 @@ def test_the_centre_is_half_a_length_behind_sumo_s_front_bumper(start: Start) ->
     along = snapshot.lane_position[row]
     assert snapshot.x[row] == pytest.approx(-600.0 + along - 2.5, abs=0.01)
     assert snapshot.heading[row] == pytest.approx(0.0, abs=1e-6)
+
+
+class Getters:
+    """Both ways to read the same vehicle, in the process that holds the simulation."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._simulator = SumoSimulator(scenario)
+
+    def read(self, name: str) -> list[tuple[object, object]]:
+        import libsumo
+
+        from cosim.simulation.convert import GETTERS
+
+        self._simulator.reset(0)
+        public = ("getPosition", "getAngle", "getSpeed", "getAcceleration", "getLaneID", "getLanePosition")
+        pairs = zip(GETTERS, public, strict=True)
+        return [(fast(name), getattr(libsumo.vehicle, slow)(name)) for fast, slow in pairs]
+
+
+def test_the_compiled_getters_read_what_the_public_ones_do() -> None:
+    with Worker(Getters, load("highway")) as worker:
+        pairs = worker.call("read", "right.0")
+    assert len(pairs) == 6
+    assert all(fast == slow for fast, slow in pairs)

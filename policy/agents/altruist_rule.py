@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -46,6 +47,14 @@ class Need:
     speed: float  # m/s, of the mission vehicle
 
 
+class Seen(NamedTuple):
+    """The mission vehicle as one AV perceives it and tells the others."""
+
+    lane: int  # index into RoadMap.lanes
+    lane_position: float  # m, front bumper
+    speed: float  # m/s
+
+
 class AltruistRule:
     """Left if the left lane is free, else slower; at junctions slower, far upstream."""
 
@@ -67,10 +76,9 @@ class AltruistRule:
         """At most one command per mission vehicle: the guide's."""
         decisions: dict[str, Decision] = {}
         needs: dict[str, list[Need]] = {}
-        for av, history in histories.items():
-            for row in np.flatnonzero(history.valid[-1] & (history.kinematics[-1, :, 7] > 0.5)):
-                mission = history.ids[row]
-                need = None if mission in self._served else self._need(av, history, int(row))
+        for mission, seen in _missions(histories).items():
+            for av, history in histories.items():
+                need = None if mission in self._served else self._need(av, history, mission, seen)
                 if need is not None:
                     needs.setdefault(mission, []).append(need)
         for mission, candidates in needs.items():
@@ -84,17 +92,14 @@ class AltruistRule:
                     decisions[guide.av] = Decision(action)
         return decisions
 
-    def _need(self, av: str, history: History, row: int) -> Need | None:
+    def _need(self, av: str, history: History, mission: str, seen: Seen) -> Need | None:
         """Whether this AV's way meets the mission vehicle's, and where; None when it does not."""
-        road, own = self._road, history.route.paths[1]
-        lane = int(history.lane[row])
+        road, own, lane, speed = self._road, history.route.paths[1], seen.lane, seen.speed
         if own is None or lane < 0:
             return None
-        mission = history.ids[row]
         theirs = road.path(lane)
         guide = self._guide.get(mission)
-        place = float(history.lane_position[row]) * theirs.scale  # m, their front bumper
-        speed = float(history.kinematics[-1, row, 2])
+        place = seen.lane_position * theirs.scale  # m, their front bumper
         beside = _meeting(road, own, theirs)
         if beside is not None:
             if lane in own.lanes[:3] and guide is not None and guide.av == av:
@@ -102,8 +107,8 @@ class AltruistRule:
                 return None
             mine, other, right = beside
             return Need(av, (mine - history.route.arc) - (other - place), False, right, speed)
-        if not (np.isfinite(theirs.conflict) and np.isfinite(own.conflict)):
-            return None
+        if not (np.isfinite(own.conflict) and _crosses_junction(road, theirs)):
+            return None  # not our affair: we drive beside the lane they want
         if guide is not None and guide.crossing and (road.lanes[lane].internal or lane in own.lanes):
             self._served.add(mission)
             return None
@@ -175,6 +180,16 @@ class AltruistRule:
         return False
 
 
+def _missions(histories: Mapping[str, History]) -> dict[str, Seen]:
+    """Every mission vehicle that any AV perceives (V2V: in a queue it is not among everybody's 15 rows)."""
+    found: dict[str, Seen] = {}
+    for history in histories.values():
+        for r in np.flatnonzero(history.valid[-1] & (history.kinematics[-1, :, 7] > 0.5)):
+            speed = float(history.kinematics[-1, r, 2])
+            found[history.ids[r]] = Seen(int(history.lane[r]), float(history.lane_position[r]), speed)
+    return found
+
+
 def _along(history: History, path: LanePath, side: float = 0.0) -> list[tuple[float, float]]:
     """Vehicles on the path's next lanes, or behind on its course: m ahead of the ego (centres), m/s.
 
@@ -187,6 +202,11 @@ def _along(history: History, path: LanePath, side: float = 0.0) -> list[tuple[fl
         if int(history.lane[r]) in path.lanes[:3]
         or (newest[r, 0] < 0.0 and abs(newest[r, 1] - side) < LANE / 2.0)
     ]
+
+
+def _crosses_junction(road: RoadMap, path: LanePath) -> bool:
+    """Whether the conflict zone that the path meets lies inside a junction."""
+    return any(road.lanes[i].internal and any(i in zone.lanes for zone in road.zones) for i in path.lanes)
 
 
 def _same_approach(road: RoadMap, own: LanePath, theirs: LanePath) -> bool:

@@ -146,11 +146,9 @@ class AltruistRule:
             wanted = max(need.speed - c.pace_below, c.pace_min)
         if history.lane_changing:
             return MetaAction.IDLE
-        if self._too_close(history):
-            return None
         if history.target_speed > wanted + 2.5:
-            return MetaAction.DECELERATE
-        return MetaAction.IDLE
+            return MetaAction.DECELERATE  # in a tight platoon too: braking opens the gap to the leader
+        return None if self._too_close(history) else MetaAction.IDLE
 
     def _left_is_free(self, history: History) -> bool:
         """Nobody there, nobody who would have to brake hard for us, nobody we would run into."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -12,15 +13,24 @@ import torch
 from cosim.errors import BadInput
 from cosim.raster import RoadRaster, rasterize_road
 from cosim.road import RoadMap
-from cosim.types import COMPACT, PAPER, Decision, History, MetaAction, ObservationConfig, PolicyContext
+from cosim.types import (
+    COMPACT,
+    PAPER,
+    Decision,
+    Floats32,
+    History,
+    MetaAction,
+    ObservationConfig,
+    PolicyContext,
+)
 from policy.chain import ChainConfig, predict
 from policy.checkpoint import load
 from policy.hpn import HPN, HpnConfig
 from policy.predictors import make_predictor
 from policy.safety import SafetyConfig, prioritize
-from policy.scene import join
+from policy.scene import Scene, join
 from policy.tensors import to_batch, to_numpy
-from policy.traffic import TrafficConfig, predict_traffic
+from policy.traffic import Traffic, TrafficConfig, predict_traffic
 from policy.vfn import VFN, VfnConfig
 
 UNTRAINED = "untrained"
@@ -80,6 +90,17 @@ def _config(
     )
 
 
+class Inputs(NamedTuple):
+    """What B AVs that decide together know and predict; T = N past and M predicted frames."""
+
+    scene: Scene
+    maps: torch.Tensor  # [B,T,C,H,W] in [0,1]
+    kinematics: torch.Tensor  # [B,T,R,F+1] scaled
+    route: torch.Tensor  # [B,.]
+    phi: torch.Tensor  # [B,2]
+    traffic: Traffic
+
+
 class PredictionAware:
     """`cosim.types.Policy`: commands every AV.
 
@@ -126,6 +147,11 @@ class PredictionAware:
         """One decision for every AV, each explained (`cosim.types.Decision`)."""
         if not histories:
             return {}
+        inputs = self.perceive(histories)
+        return self.choose(self.values(inputs), inputs)
+
+    def perceive(self, histories: Mapping[str, History]) -> Inputs:
+        """Predict the next seconds: what the value network and the prioritizer work on."""
         c, context = self.config, self._context
         scene = join(histories, context.observation.share_perception)
         forecast = self._predictor.predict(scene.state, scene.valid)
@@ -137,16 +163,27 @@ class PredictionAware:
                 ahead = predict(c.chain, c.observation, self._raster, self.hpn, scene, batch, forecast)
                 maps = torch.cat([maps, ahead.maps], 1)
                 kinematics = torch.cat([kinematics, ahead.kinematics], 1)
-            q = to_numpy(self.vfn(maps, kinematics, batch.route, batch.phi))
+        traffic = predict_traffic(scene, forecast, context.road, c.traffic, c.safety.frames)
+        return Inputs(scene, maps, kinematics, batch.route, batch.phi, traffic)
+
+    def values(self, inputs: Inputs) -> Floats32:
+        """The action values [B,A]. Raises FloatingPointError when one is not finite."""
+        with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=self.config.bf16):
+            q = to_numpy(self.vfn(inputs.maps, inputs.kinematics, inputs.route, inputs.phi))
         if not np.isfinite(q).all():
             raise FloatingPointError("the value network returned values that are not finite")
-        traffic = predict_traffic(scene, forecast, context.road, c.traffic, c.safety.frames)
+        return q
+
+    def choose(self, q: Floats32, inputs: Inputs) -> dict[str, Decision]:
+        """The safety prioritizer's choice by the action values q [B,A] (P, algorithm 3)."""
+        c, context, scene = self.config, self._context, inputs.scene
+        now = dict(zip(scene.agents, scene.histories, strict=True))
         decisions = prioritize(
-            q, scene, traffic, context.road, c.safety, context.share_intentions, self._refused(histories)
+            q, scene, inputs.traffic, context.road, c.safety, context.share_intentions, self._refused(now)
         )
         for name, decision in decisions.items():
             if decision.action in (MetaAction.LANE_LEFT, MetaAction.LANE_RIGHT):
-                self._asked[name] = (decision.action, histories[name].time)
+                self._asked[name] = (decision.action, now[name].time)
         return decisions
 
     def _refused(self, histories: Mapping[str, History]) -> dict[str, MetaAction]:

@@ -1,0 +1,104 @@
+"""Safe double Q-learning after P's algorithm 4: one update, and what must be kept to go on exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+from policy.training.replay import Batch
+from policy.vfn import VFN, VfnConfig
+
+
+@dataclass(frozen=True, slots=True)
+class DdqnConfig:
+    """Optimisation. Defaults: P, Table I."""
+
+    learning_rate: float = 5e-4
+    target_every: int = 300  # updates between copies of the online network
+    r_unsafe: float = -5.0  # value of an action that the prioritizer refused: a crash's (Alg. 4, line 13)
+    scale: float = 0.1  # of all rewards: action values of the order of 1
+    clip: float = 10.0  # largest gradient norm
+
+
+class Losses(NamedTuple):
+    """Of one update."""
+
+    td: float  # Huber loss of the n-step error
+    unsafe: float  # of the refused actions
+    q: float  # mean value of the actions carried out
+
+
+class Learner:
+    """Online and target network with their optimiser."""
+
+    def __init__(self, vfn: VfnConfig, config: DdqnConfig, seed: int, device: str = "cpu") -> None:
+        self.config, self.device = config, device
+        state = torch.random.get_rng_state()
+        torch.manual_seed(seed)  # module initialisers know no generator
+        self.online = VFN(vfn)
+        torch.random.set_rng_state(state)
+        self.target = VFN(vfn)
+        self.target.load_state_dict(self.online.state_dict())
+        for network in (self.online, self.target):
+            network.to(device=device, memory_format=torch.channels_last_3d)  # type: ignore[call-overload]
+        self.optimizer = torch.optim.Adam(self.online.parameters(), lr=config.learning_rate)
+        self.updates = 0
+
+    def update(self, batch: Batch) -> Losses:
+        """One step of double Q-learning (P, equations 2 and 3) with masked targets."""
+        c, device = self.config, self.device
+        action = torch.from_numpy(batch.action).to(device)
+        reward = torch.from_numpy(batch.reward).to(device) * c.scale
+        discount = torch.from_numpy(batch.discount).to(device)
+        allowed = torch.from_numpy(batch.allowed).to(device)
+        vetoed = torch.from_numpy(batch.vetoed).to(device)
+        with torch.no_grad():
+            best = self.online(*batch.later).masked_fill(~allowed, -torch.inf).argmax(1, keepdim=True)
+            goal = reward + discount * self.target(*batch.later).gather(1, best)[:, 0]
+        q = self.online(*batch.now)
+        chosen = q.gather(1, action[:, None])[:, 0]
+        td = functional.smooth_l1_loss(chosen, goal)
+        refused = vetoed >= 0
+        unsafe = torch.zeros((), device=device)
+        if bool(refused.any()):  # stored as terminal with reward r_unsafe (Alg. 4)
+            value = q[refused].gather(1, vetoed[refused][:, None])[:, 0]
+            worth = torch.full_like(value, c.r_unsafe * c.scale)
+            unsafe = functional.smooth_l1_loss(value, worth, reduction="sum") / len(q)
+        self.optimizer.zero_grad(set_to_none=True)
+        (td + unsafe).backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(self.online.parameters(), c.clip)
+        self.optimizer.step()
+        self.updates += 1
+        if self.updates % c.target_every == 0:
+            self.target.load_state_dict(self.online.state_dict())
+        return Losses(float(td.detach()), float(unsafe.detach()), float(chosen.detach().mean()))
+
+    # ---- to go on exactly ----
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """Networks and optimiser as named tensors (nothing is ever pickled)."""
+        out = {f"online.{k}": v for k, v in self.online.state_dict().items()}
+        out |= {f"target.{k}": v for k, v in self.target.state_dict().items()}
+        for index, slots in self.optimizer.state_dict()["state"].items():
+            out |= {f"adam.{index}.{name}": value for name, value in slots.items()}
+        return {name: value.detach().to("cpu").contiguous().clone() for name, value in out.items()}
+
+    def restore(self, tensors: Mapping[str, torch.Tensor], updates: int) -> None:
+        """Go on from what `tensors` gave after `updates` updates."""
+        for name, network in (("online", self.online), ("target", self.target)):
+            own = {k.removeprefix(f"{name}."): v for k, v in tensors.items() if k.startswith(f"{name}.")}
+            network.load_state_dict(own)
+        slots: dict[int, dict[str, torch.Tensor]] = {}
+        for key, value in tensors.items():
+            if key.startswith("adam."):
+                _, index, name = key.split(".")
+                slots.setdefault(int(index), {})[name] = value
+        whole = self.optimizer.state_dict()
+        whole["state"] = slots
+        self.optimizer.load_state_dict(whole)
+        self.updates = updates

@@ -1,0 +1,111 @@
+"""What one AV lived through in one episode, as learners store it: every frame once, no stack twice."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from cosim.types import Bools, Bytes, Floats32
+
+Ending = Literal["crashed", "left", "cut"]  # cut: the episode ended before the AV's drive did
+ENDINGS: tuple[Ending, ...] = ("crashed", "left", "cut")
+Halves = npt.NDArray[np.float16]
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """D decisions of one AV and the D + 1 states around them.
+
+    The past frames of state t are `frames[t * stride : t * stride + N]`: consecutive histories share all
+    but `stride` frames. Only the last state of a `crashed` trajectory has no value of its own.
+    """
+
+    episode: str  # scenario, demand and seed, to find it again
+    av: str
+    stride: int  # frames per decision
+    frames: Bytes  # [N + D * stride, C,H,W] pixel * 255
+    ahead: Bytes  # [D+1, M,C,H,W] predicted maps, pixel * 255
+    kinematics: Halves  # [D+1, T,R,F+1] scaled (policy.tensors)
+    route: Floats32  # [D+1, .]
+    unsafe: Bools  # [D+1, A] what the prioritizer masked
+    action: npt.NDArray[np.int8]  # [D] carried out
+    vetoed: npt.NDArray[np.int8]  # [D] the preferred action that was masked, or -1
+    terms: Floats32  # [D,3] reward terms: ego, AVs, HVs (equation 6)
+    interacting: Bools  # [D] near a mission vehicle, or vetoed: what a rebalanced replay wants more of
+    phi: float  # rad, the SVO it acted with
+    ending: Ending
+
+    def __len__(self) -> int:
+        return len(self.action)
+
+    @property
+    def past(self) -> int:
+        """N, the past frames of a state."""
+        return int(self.frames.shape[0] - len(self) * self.stride)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the arrays."""
+        return sum(a.nbytes for a in vars(self).values() if isinstance(a, np.ndarray))
+
+    def maps(self, t: int) -> list[Bytes]:
+        """The map groups of state `t`: past [N,C,H,W] and predicted [M,C,H,W] frames."""
+        start = t * self.stride
+        return [self.frames[start : start + self.past], self.ahead[t]]
+
+
+class States(NamedTuple):
+    """A batch of network inputs, as `policy.vfn.VFN` takes them."""
+
+    maps: torch.Tensor  # [B,T,C,H,W]
+    kinematics: torch.Tensor  # [B,T,R,F+1]
+    route: torch.Tensor  # [B,.]
+    phi: torch.Tensor  # [B,2]
+
+
+def states(chosen: list[tuple[Trajectory, int]], phi: Floats32, device: str = "cpu") -> States:
+    """Stack states (trajectory, t) for the network; phi [B] rad."""
+    first = chosen[0][0]
+    past, ahead = first.past, first.ahead.shape[1]
+    maps = np.empty((len(chosen), past + ahead, *first.frames.shape[1:]), np.uint8)
+    for row, (trajectory, t) in zip(maps, chosen, strict=True):
+        row[:past], row[past:] = trajectory.maps(t)
+    kinematics = np.stack([trajectory.kinematics[t] for trajectory, t in chosen]).astype(np.float32)
+    route = np.stack([trajectory.route[t] for trajectory, t in chosen])
+    return States(
+        torch.from_numpy(maps).to(device).to(torch.float32).mul_(1.0 / 255.0),
+        torch.from_numpy(kinematics).to(device),
+        torch.from_numpy(route).to(device),
+        torch.from_numpy(np.stack([np.cos(phi), np.sin(phi)], 1).astype(np.float32)).to(device),
+    )
+
+
+def save(path: Path, trajectories: list[Trajectory]) -> None:
+    """Write trajectories to one compressed .npz, whole or not at all: nothing in it is ever unpickled."""
+    arrays: dict[str, Any] = {"count": np.array(len(trajectories))}
+    for k, trajectory in enumerate(trajectories):
+        for name, value in vars(trajectory).items():
+            arrays[f"{k}.{name}"] = np.asarray(value)
+    draft = path.with_suffix(".part")
+    with draft.open("wb") as file:
+        np.savez_compressed(file, **arrays)
+    draft.replace(path)
+
+
+def load(path: Path) -> list[Trajectory]:
+    """What `save` wrote."""
+    with np.load(path, allow_pickle=False) as file:
+        return [
+            Trajectory(
+                **{
+                    name: value if (value := file[f"{k}.{name}"]).ndim else value.item()
+                    for name in Trajectory.__dataclass_fields__
+                }
+            )
+            for k in range(int(file["count"]))
+        ]

@@ -1,0 +1,191 @@
+"""The agent while it learns: explores, and writes down what its learning AVs see, do and are paid."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from cosim.rewards import RewardTerms
+from cosim.types import Decision, Floats32, History, MetaAction
+from policy.agents.prediction_aware import AgentConfig, Inputs, PredictionAware
+from policy.tensors import to_numpy
+from policy.training.experience import Ending, Trajectory
+from policy.vfn import VFN
+
+IS_MISSION = 7  # column of the kinematic matrix
+
+
+@dataclass(frozen=True, slots=True)
+class ExploreConfig:
+    """Who learns in an episode, and how it explores."""
+
+    learners: int = 4  # AVs that explore and are recorded; the others act with frozen weights (P, Alg. 4)
+    repeat: float = 2.0  # decisions a random action is kept on average: a gap does not open in 0.4 s
+    near: float = 60.0  # m to the mission vehicle within which a decision counts as interaction
+
+
+@dataclass
+class _Tape:
+    """One learning AV's record while the episode runs."""
+
+    frames: list[np.ndarray] = field(default_factory=list)
+    ahead: list[np.ndarray] = field(default_factory=list)
+    kinematics: list[np.ndarray] = field(default_factory=list)
+    route: list[np.ndarray] = field(default_factory=list)
+    unsafe: list[np.ndarray] = field(default_factory=list)
+    action: list[int] = field(default_factory=list)
+    vetoed: list[int] = field(default_factory=list)
+    terms: list[tuple[float, float, float]] = field(default_factory=list)
+    interacting: list[bool] = field(default_factory=list)
+
+
+class Explorer(PredictionAware):
+    """`PredictionAware` whose first few AVs explore with the learner's weights.
+
+    The others act greedily with `frozen` ones, so that one AV's lesson is not blurred by its neighbours'
+    (semi-sequential training, P algorithm 4; T, section IV). `episode` must be called after `reset`.
+    """
+
+    def __init__(self, name: str, config: AgentConfig, explore: ExploreConfig) -> None:
+        super().__init__(name, config)
+        self.explore = explore
+        self.frozen = VFN(config.vfn).eval()
+        self.frozen.load_state_dict(self.vfn.state_dict())
+
+    def episode(self, label: str, epsilon: float, rng: np.random.Generator) -> None:
+        """A new episode, with this much exploration (0 to 1)."""
+        self._label, self._epsilon, self._rng = label, epsilon, rng
+        self.learning: dict[str, _Tape] = {}
+        self._chosen = False
+        self._whim: dict[str, int] = {}  # random action an AV is keeping up
+        self.done: list[Trajectory] = []
+
+    def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
+        """As the agent's, with exploration; the states of learning AVs are recorded."""
+        if not histories:
+            return {}
+        inputs = self.perceive(histories)
+        if not self._chosen:
+            self._choose_learners(inputs)
+        decisions = self.choose(self._explored(self.values(inputs), inputs), inputs)
+        for b, av in enumerate(inputs.scene.agents):
+            if av in self.learning:
+                self._record(self.learning[av], b, inputs, decisions[av])
+        return decisions
+
+    def values(self, inputs: Inputs) -> Floats32:
+        """The learner's values for learning AVs, the frozen ones for the others."""
+        q = super().values(inputs)
+        others = [b for b, av in enumerate(inputs.scene.agents) if av not in self.learning]
+        if others and self._epsilon < 1.0:
+            with torch.inference_mode():
+                q[others] = to_numpy(
+                    self.frozen(
+                        *(t[others] for t in (inputs.maps, inputs.kinematics, inputs.route, inputs.phi))
+                    )
+                )
+        return q
+
+    def pay(self, terms: Mapping[str, RewardTerms], crashed: frozenset[str], present: frozenset[str]) -> None:
+        """What the last decision brought; `crashed` AVs and those no longer `present` have ended."""
+        for av, tape in list(self.learning.items()):
+            if av not in terms:
+                continue
+            t = terms[av]
+            tape.terms.append((t.ego, t.av_social, t.hv_social))
+            if av in crashed or av not in present:
+                # the state after the last decision was never seen: the one before stands in, unused
+                self._close(av, "crashed" if av in crashed else "left", again=True)
+
+    def finish(self) -> list[Trajectory]:
+        """The episode is over, its last state has been decided upon: every open record is cut there."""
+        for av in list(self.learning):
+            self._close(av, "cut", again=False)
+        return self.done
+
+    # ---- inside ----
+
+    def _choose_learners(self, inputs: Inputs) -> None:
+        """Those who see a mission vehicle first, then any."""
+        scene = inputs.scene
+        sees = [bool((h.kinematics[-1, :, IS_MISSION] * h.valid[-1] > 0.5).any()) for h in scene.histories]
+        luck = self._rng.random(len(scene.agents))
+        order = sorted(range(len(scene.agents)), key=lambda b: (not sees[b], luck[b]))
+        self.learning = {scene.agents[b]: _Tape() for b in sorted(order[: self.explore.learners])}
+        self._chosen = True
+
+    def _explored(self, q: Floats32, inputs: Inputs) -> Floats32:
+        """Random preferences in place of some learning AVs' values; the prioritizer still guards them."""
+        q = q.copy()
+        for b, av in enumerate(inputs.scene.agents):
+            if av not in self.learning:
+                continue
+            draws = self._rng.random(2)
+            if av in self._whim and draws[0] < 1.0 / self.explore.repeat:
+                del self._whim[av]
+            # started so often that a share epsilon of the decisions is random
+            start = self._epsilon / max(self.explore.repeat - self._epsilon * (self.explore.repeat - 1), 1.0)
+            if av not in self._whim and draws[1] < start:
+                self._whim[av] = int(self._rng.integers(len(MetaAction)))
+            if av in self._whim:
+                q[b] = self._rng.random(len(MetaAction)).astype(np.float32)
+                q[b, self._whim[av]] = 2.0
+        return q
+
+    def _record(self, tape: _Tape, b: int, inputs: Inputs, decision: Decision) -> None:
+        history, n = inputs.scene.histories[b], self.observation.frames
+        if tape.frames:
+            stride = self._stride
+            tape.frames.append(history.velocity_map[-stride:].copy())
+        else:
+            tape.frames.append(history.velocity_map.copy())
+        ahead = inputs.maps[b, n:]
+        tape.ahead.append((to_numpy(ahead) * 255.0 + 0.5).astype(np.uint8))
+        tape.kinematics.append(to_numpy(inputs.kinematics[b]).astype(np.float16))
+        tape.route.append(to_numpy(inputs.route[b]))
+        assert decision.unsafe is not None
+        assert decision.q is not None
+        tape.unsafe.append(np.array(decision.unsafe, np.bool_))
+        tape.action.append(int(decision.action))
+        preferred = int(np.argmax(decision.q))
+        tape.vetoed.append(preferred if decision.unsafe[preferred] else -1)
+        newest = history.kinematics[-1]
+        mission = history.valid[-1] & (newest[:, IS_MISSION] > 0.5)
+        close = mission & (np.hypot(newest[:, 0], newest[:, 1]) < self.explore.near)
+        tape.interacting.append(bool(close.any()) or tape.vetoed[-1] >= 0)
+
+    @property
+    def _stride(self) -> int:
+        timing = self._context.timing
+        return round(timing.decision / timing.frame)
+
+    def _close(self, av: str, ending: Ending, *, again: bool) -> None:
+        tape = self.learning.pop(av)
+        count = len(tape.terms)  # decisions that were paid
+        if count == 0:
+            return
+        if again:
+            tape.frames.append(tape.frames[-1][-self._stride :])
+            for states in (tape.ahead, tape.kinematics, tape.route, tape.unsafe):
+                states.append(states[-1])
+        self.done.append(
+            Trajectory(
+                episode=self._label,
+                av=av,
+                stride=self._stride,
+                frames=np.concatenate(tape.frames)[: self.observation.frames + count * self._stride],
+                ahead=np.stack(tape.ahead[: count + 1]),
+                kinematics=np.stack(tape.kinematics[: count + 1]),
+                route=np.stack(tape.route[: count + 1]),
+                unsafe=np.stack(tape.unsafe[: count + 1]),
+                action=np.array(tape.action[:count], np.int8),
+                vetoed=np.array(tape.vetoed[:count], np.int8),
+                terms=np.array(tape.terms, np.float32),
+                interacting=np.array(tape.interacting[:count], np.bool_),
+                phi=self._context.svo,
+                ending=ending,
+            )
+        )

@@ -1,0 +1,118 @@
+"""Replay of whole trajectories: n-step samples, drawn in equal parts from interaction and from cruising."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from cosim.types import Bools, Floats32, Ints
+from policy.training.experience import States, Trajectory, states
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayConfig:
+    """What is kept and how it is drawn."""
+
+    capacity: int = 30_000  # decisions; P's 8,000 (Table I) are 20 episodes of 4 learners. 0.1 MB each
+    batch: int = 64  # P, Table I
+    n_step: int = 8  # compute.md: one step did not learn altruism; 1 is the papers'
+    gamma: float = 0.97  # a decision of 0.4 s; P: 0.95
+    interaction: float = 0.5  # share of a batch near a mission vehicle or vetoed (P, Alg. 4: rebalanced)
+    relabel: float = 0.5  # share of a batch that is learned for another SVO than it was driven with
+    phi: tuple[float, float] = (0.0, 90.0)  # deg, what relabelling draws from; equal bounds: one SVO only
+
+
+class Batch(NamedTuple):
+    """B samples; `reward` is the discounted n-step return so far."""
+
+    now: States
+    later: States
+    action: Ints  # [B]
+    reward: Floats32  # [B]
+    discount: Floats32  # [B] gamma^k of the state `later`; 0 when the AV crashed before it
+    allowed: Bools  # [B,A] actions that were safe in `later` (all, where none was)
+    vetoed: Ints  # [B] the action the prioritizer refused in `now`, or -1
+    cos_sin: Floats32  # [B,2]
+
+
+class Replay:
+    """Newest trajectories up to `capacity` decisions."""
+
+    def __init__(self, config: ReplayConfig) -> None:
+        self.config = config
+        self.trajectories: deque[Trajectory] = deque()
+        self.size = 0
+        self._index: tuple[Ints, Ints] | None = None  # [*,2] (trajectory, t): interacting, cruising
+
+    def add(self, trajectories: list[Trajectory]) -> int:
+        """Store them; returns how many of the oldest were dropped."""
+        self.trajectories.extend(t for t in trajectories if len(t))
+        self.size += sum(map(len, trajectories))
+        dropped = 0
+        while self.size > self.config.capacity and len(self.trajectories) > 1:
+            self.size -= len(self.trajectories.popleft())
+            dropped += 1
+        self._index = None
+        return dropped
+
+    def sample(self, rng: np.random.Generator, device: str = "cpu") -> Batch:
+        """One batch. Raises ValueError while nothing is stored."""
+        if not self.size:
+            raise ValueError("the replay is empty")
+        c = self.config
+        near, far = self._places()
+        wanted = round(c.batch * c.interaction) if len(near) and len(far) else c.batch * (len(near) > 0)
+        picks = np.concatenate([_draw(near, wanted, rng), _draw(far, c.batch - wanted, rng)])
+        phi = np.array([self.trajectories[k].phi for k, _ in picks], np.float32)
+        fresh = np.radians(rng.uniform(*c.phi, len(picks))).astype(np.float32)
+        phi = np.where(rng.random(len(picks)) < c.relabel, fresh, phi)
+        return self._batch(picks, phi, device)
+
+    def _batch(self, picks: Ints, phi: Floats32, device: str) -> Batch:
+        c = self.config
+        weights = np.stack([np.cos(phi), np.sin(phi), np.sin(phi)], 1)  # [B,3] of the reward's terms
+        reward = np.zeros(len(picks), np.float32)
+        discount = np.zeros(len(picks), np.float32)
+        now, later = [], []
+        allowed = []
+        for b, (k, t) in enumerate(picks):
+            trajectory = self.trajectories[k]
+            end = min(t + c.n_step, len(trajectory))
+            powers = c.gamma ** np.arange(end - t)
+            reward[b] = powers @ (trajectory.terms[t:end] @ weights[b])
+            if end < len(trajectory) or trajectory.ending != "crashed":
+                discount[b] = c.gamma ** (end - t)
+            now.append((trajectory, int(t)))
+            later.append((trajectory, int(end)))
+            safe = ~trajectory.unsafe[end]
+            allowed.append(safe if safe.any() else np.ones_like(safe))
+        return Batch(
+            states(now, phi, device),
+            states(later, phi, device),
+            np.array([tr.action[t] for tr, t in now], np.int64),
+            reward,
+            discount,
+            np.stack(allowed),
+            np.array([tr.vetoed[t] for tr, t in now], np.int64),
+            np.stack([np.cos(phi), np.sin(phi)], 1),
+        )
+
+    def _places(self) -> tuple[Ints, Ints]:
+        if self._index is None:
+            rows = [
+                np.stack([np.full(len(t), k), np.arange(len(t))], 1) for k, t in enumerate(self.trajectories)
+            ]
+            every = np.concatenate(rows)
+            near = np.concatenate([t.interacting for t in self.trajectories])
+            self._index = every[near], every[~near]
+        return self._index
+
+
+def _draw(places: Ints, count: int, rng: np.random.Generator) -> Ints:
+    """`count` of the places, with replacement: [count,2]."""
+    if not count:
+        return np.zeros((0, 2), np.int64)
+    return places[rng.integers(len(places), size=count)]

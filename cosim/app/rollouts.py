@@ -50,45 +50,7 @@ class Rollout:
         episode, agent = self._episode(drive.lesson), self._agent
         self._weights("vfn", agent.vfn, drive.weights)
         self._weights("frozen", agent.frozen, drive.frozen)
-        histories = episode.start(drive.seed)
-        agent.reset(
-            PolicyContext(
-                road=episode.simulator.road,
-                timing=episode.scenario.timing,
-                observation=episode.observation,
-                svo=drive.svo,
-                rng=generator(drive.seed, "policy"),
-            )
-        )
-        label = f"{drive.lesson.scenario}/{drive.lesson.demand}/{drive.seed}"
-        agent.episode(label, drive.epsilon, generator(drive.seed, "explore"))
-        earned: list[float] = []
-        while True:
-            decisions = agent.decide(histories)  # the last state is decided upon too: its mask is needed
-            if episode.over:
-                break
-            before = episode.snapshot
-            histories = episode.advance(decisions)
-            collisions = [c for frame in episode.frames for c in frame.events.collisions]
-            actions = {av: decision.action for av, decision in decisions.items()}
-            terms = rewards(
-                before, episode.snapshot, tuple(decisions), actions, drive.svo, self._reward, collisions
-            )
-            earned += [t.total for t in terms.values()]
-            crashed = frozenset(v for c in collisions for v in (c.collider, c.victim))
-            agent.pay(terms, crashed, frozenset(histories))
-        trajectories = agent.finish()
-        result = episode.result(agent.name)
-        figures: dict[str, float | None] = {
-            name: None if (v := result.value(name)) is None else float(v) for name in FIGURES
-        }
-        # a crash ends the episode: the decisions that were not driven count as nothing earned
-        planned = round(episode.scenario.duration / episode.scenario.timing.decision)
-        avs = len(earned) / max(result.steps, 1)
-        figures["reward"] = float(np.sum(earned)) / max(avs * planned, 1.0)
-        figures["steps"] = float(result.steps)
-        figures |= {name: float(s) for name, s in episode.timings.items()}
-        return Drove(trajectories if drive.record else [], figures)
+        return drive_episode(episode, agent, drive, self._reward)
 
     def close(self) -> None:
         """End the simulation."""
@@ -112,6 +74,47 @@ class Rollout:
         if file and self._loaded.get(slot) != file:
             load_weights(Path(file), {"vfn": network}, {"vfn": self._agent.config.vfn})
             self._loaded[slot] = file
+
+
+def drive_episode(episode: Episode, agent: Explorer, drive: Drive, reward: RewardConfig) -> Drove:
+    """One whole episode with the learning agent; its networks are as they are."""
+    histories = episode.start(drive.seed)
+    agent.reset(
+        PolicyContext(
+            road=episode.simulator.road,
+            timing=episode.scenario.timing,
+            observation=episode.observation,
+            svo=drive.svo,
+            rng=generator(drive.seed, "policy"),
+        )
+    )
+    label = f"{drive.lesson.scenario}/{drive.lesson.demand}/{drive.seed}"
+    agent.episode(label, drive.epsilon, generator(drive.seed, "explore"))
+    earned: list[float] = []
+    while True:
+        decisions = agent.decide(histories)  # the last state is decided upon too: its mask is needed
+        if episode.over:
+            break
+        before = episode.snapshot
+        histories = episode.advance(decisions)
+        collisions = [c for frame in episode.frames for c in frame.events.collisions]
+        actions = {av: decision.action for av, decision in decisions.items()}
+        terms = rewards(before, episode.snapshot, tuple(decisions), actions, drive.svo, reward, collisions)
+        earned += [t.total for t in terms.values()]
+        crashed = frozenset(v for c in collisions for v in (c.collider, c.victim))
+        agent.pay(terms, crashed, frozenset(histories))
+    trajectories = agent.finish()
+    result = episode.result(agent.name)
+    figures: dict[str, float | None] = {
+        name: None if (v := result.value(name)) is None else float(v) for name in FIGURES
+    }
+    # a crash ends the episode: the decisions that were not driven count as nothing earned
+    planned = round(episode.scenario.duration / episode.scenario.timing.decision)
+    avs = len(earned) / max(result.steps, 1)
+    figures["reward"] = float(np.sum(earned)) / max(avs * planned, 1.0)
+    figures["steps"] = float(result.steps)
+    figures |= {name: float(s) for name, s in episode.timings.items()}
+    return Drove(trajectories if drive.record else [], figures)
 
 
 class Rollouts:

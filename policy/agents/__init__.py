@@ -8,6 +8,9 @@ from collections.abc import Callable
 from cosim.errors import BadInput
 from cosim.types import Policy
 
+# policy.agents.approaches has the table; its names alone are needed before torch is
+LEARNING = ("vfn-p", "vfn", "vfn-p-egoistic", "safe-dqn", "conv3d-dqn", "conv3d-a2c", "conv2d-dqn")
+
 
 def _prediction_aware(name: str) -> Callable[[], Policy]:
     def build() -> Policy:
@@ -29,8 +32,7 @@ def _rules() -> dict[str, Callable[[], Policy]]:
 
 POLICIES: dict[str, Callable[[], Policy]] = {
     **_rules(),
-    "vfn-p": _prediction_aware("vfn-p"),
-    "vfn": _prediction_aware("vfn"),
+    **{name: _prediction_aware(name) for name in LEARNING},
 }
 
 

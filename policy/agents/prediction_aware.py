@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,80 +13,27 @@ from cosim.errors import BadInput
 from cosim.raster import RoadRaster, rasterize_road
 from cosim.road import RoadMap
 from cosim.types import (
-    COMPACT,
-    PAPER,
     Decision,
     Floats32,
+    Forecast,
     History,
     MetaAction,
-    ObservationConfig,
     PolicyContext,
 )
-from policy.chain import ChainConfig, predict
+from policy.agents.approaches import AgentConfig, compact
+from policy.chain import predict
 from policy.checkpoint import load
-from policy.hpn import HPN, HpnConfig
+from policy.forecast import KinematicForecast
+from policy.hpn import HPN
 from policy.predictors import make_predictor
-from policy.safety import SafetyConfig, prioritize
+from policy.safety import prioritize
 from policy.scene import Scene, join
 from policy.tensors import to_batch, to_numpy
-from policy.traffic import Traffic, TrafficConfig, predict_traffic
-from policy.vfn import VFN, VfnConfig
+from policy.traffic import Traffic, predict_traffic
+from policy.vfn import VFN
 
 UNTRAINED = "untrained"
 RETRY = 2.0  # s, a lane change's time: so long a refused one is not tried again
-
-
-@dataclass(frozen=True, slots=True)
-class AgentConfig:
-    """Everything that makes up one agent. Defaults: compact size, `vfn-p`."""
-
-    observation: ObservationConfig = COMPACT
-    predicted_maps: bool = True  # False: the VFN sees the history only (Table III, `vfn`)
-    predictor: str = "gp-indirect"  # of the mask and of the chain's kinematics; `cs` for `vfn`
-    chain: ChainConfig = field(default_factory=ChainConfig)
-    hpn: HpnConfig = field(default_factory=HpnConfig)
-    vfn: VfnConfig = field(default_factory=VfnConfig)
-    safety: SafetyConfig = field(default_factory=SafetyConfig)
-    traffic: TrafficConfig = field(default_factory=TrafficConfig)
-    init_seed: int = 0  # of untrained weights: the same in every process
-    bf16: bool = False  # autocast; off, so that results do not depend on the processor
-    weights: Path | None = None  # a checkpoint of policy.checkpoint; None: untrained
-    note: str = ""  # goes into the label
-
-
-def compact(name: str) -> AgentConfig:
-    """The compact configuration of `vfn-p` or `vfn` (contract.md, Approaches of Table III)."""
-    return _config(name, COMPACT, ChainConfig(), HpnConfig(), "temporal")
-
-
-def paper(name: str) -> AgentConfig:
-    """The paper-size configuration: 64 x 512, one frame a step, M = 20, T's Table 1 read literally."""
-    hpn = HpnConfig(height=64, width=512, block=1, reading="pool")
-    return _config(name, PAPER, ChainConfig(every=1), hpn, "literal")
-
-
-def _config(
-    name: str, observation: ObservationConfig, chain: ChainConfig, hpn: HpnConfig, strides: str
-) -> AgentConfig:
-    if name not in ("vfn-p", "vfn"):
-        raise BadInput("no such prediction-aware policy (vfn-p, vfn)", field="policy", value=name)
-    predicted = name == "vfn-p"
-    vfn = VfnConfig(
-        height=observation.height,
-        width=observation.width,
-        channels=len(observation.channels),
-        frames=observation.frames + (chain.hypotheses if predicted else 0),
-        rows=observation.rows,
-        strides="literal" if strides == "literal" else "temporal",
-    )
-    return AgentConfig(
-        observation=observation,
-        predicted_maps=predicted,
-        predictor="gp-indirect" if predicted else "cs",
-        chain=chain,
-        hpn=hpn,
-        vfn=vfn,
-    )
 
 
 class Inputs(NamedTuple):
@@ -118,12 +64,14 @@ class PredictionAware:
         self.vfn = VFN(c.vfn).eval()
         self.hpn = HPN(c.hpn).eval() if c.predicted_maps and c.chain.source == "hpn" else None
         torch.random.set_rng_state(generator_state)
-        self.label = c.note or UNTRAINED
-        if c.weights is not None:
-            networks = {"vfn": self.vfn} | ({"hpn": self.hpn} if self.hpn is not None else {})
-            configs = {"vfn": c.vfn} | ({"hpn": c.hpn} if self.hpn is not None else {})
-            load(c.weights, networks, configs)
-            self.label = c.note
+        parts = {"value network": c.vfn_weights}
+        if c.vfn_weights is not None:
+            load(c.vfn_weights, {"vfn": self.vfn}, {"vfn": c.vfn})
+        if self.hpn is not None:
+            parts["HPN"] = c.hpn_weights
+            if c.hpn_weights is not None:
+                load(c.hpn_weights, {"hpn": self.hpn}, {"hpn": c.hpn})
+        self.label = c.note or _label(parts)
         self.vfn.to(memory_format=torch.channels_last_3d)  # type: ignore[call-overload]
         if self.hpn is not None:
             self.hpn.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -138,6 +86,7 @@ class PredictionAware:
             self._road = context.road
             self._raster = rasterize_road(context.road) if self.config.predicted_maps else None
         self._context = context
+        self._expected: tuple[tuple[str, ...], Traffic, KinematicForecast] | None = None
         self._asked: dict[str, tuple[MetaAction, float]] = {}  # lane changes commanded last, when (s)
         self._predictor = make_predictor(
             self.config.predictor, self.config.chain.horizon, context.timing.frame
@@ -164,6 +113,7 @@ class PredictionAware:
                 maps = torch.cat([maps, ahead.maps], 1)
                 kinematics = torch.cat([kinematics, ahead.kinematics], 1)
         traffic = predict_traffic(scene, forecast, context.road, c.traffic, c.safety.frames)
+        self._expected = scene.vehicles, traffic, forecast
         return Inputs(scene, maps, kinematics, batch.route, batch.phi, traffic)
 
     def values(self, inputs: Inputs) -> Floats32:
@@ -175,8 +125,14 @@ class PredictionAware:
         return q
 
     def choose(self, q: Floats32, inputs: Inputs) -> dict[str, Decision]:
-        """The safety prioritizer's choice by the action values q [B,A] (P, algorithm 3)."""
+        """The safety prioritizer's choice by the action values q [B,A] (P, algorithm 3); without a mask the
+        best valued action."""
         c, context, scene = self.config, self._context, inputs.scene
+        if not c.mask:
+            best = q.argmax(1)
+            return {
+                a: Decision(MetaAction(k), q=row) for a, k, row in zip(scene.agents, best, q, strict=True)
+            }
         now = dict(zip(scene.agents, scene.histories, strict=True))
         decisions = prioritize(
             q, scene, inputs.traffic, context.road, c.safety, context.share_intentions, self._refused(now)
@@ -185,6 +141,26 @@ class PredictionAware:
             if decision.action in (MetaAction.LANE_LEFT, MetaAction.LANE_RIGHT):
                 self._asked[name] = (decision.action, now[name].time)
         return decisions
+
+    @property
+    def last_forecast(self) -> Forecast | None:
+        """Where the mask expected everybody at the last decision, before intentions were shared."""
+        if self._expected is None:
+            return None
+        names, traffic, forecast = self._expected
+        first = {name: row for row, name in reversed(list(enumerate(names))) if traffic.known[row]}
+        rows = np.array(list(first.values()), np.int64)  # without V2V a vehicle has a row per AV: its first
+        m = min(forecast.x.shape[1], traffic.rollout.x.shape[1] - 1)
+        out, ahead = traffic.rollout, slice(1, m + 1)
+        return Forecast(
+            tuple(first),
+            out.x[rows, ahead],
+            out.y[rows, ahead],
+            out.heading[rows, ahead],
+            forecast.along_std[rows, :m],
+            forecast.across_std[rows, :m],
+            self._context.timing.frame,
+        )
 
     def _refused(self, histories: Mapping[str, History]) -> dict[str, MetaAction]:
         """Lane changes that were commanded within RETRY s and did not begin (a closed lane, a solid line)."""
@@ -198,3 +174,11 @@ class PredictionAware:
             else:
                 refused[name] = action
         return refused
+
+
+def _label(parts: Mapping[str, Path | None]) -> str:
+    """What to warn of: nothing, `untrained`, or which part is."""
+    missing = [part for part, weights in parts.items() if weights is None]
+    if len(missing) == len(parts):
+        return UNTRAINED
+    return f"{UNTRAINED} {', '.join(missing)}" if missing else ""

@@ -10,6 +10,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
+from policy.training.networks import adam_tensors, restore_adam, seeded
 from policy.training.replay import Batch
 from policy.vfn import VFN, VfnConfig
 
@@ -38,10 +39,7 @@ class Learner:
 
     def __init__(self, vfn: VfnConfig, config: DdqnConfig, seed: int, device: str = "cpu") -> None:
         self.config, self.device = config, device
-        state = torch.random.get_rng_state()
-        torch.manual_seed(seed)  # module initialisers know no generator
-        self.online = VFN(vfn)
-        torch.random.set_rng_state(state)
+        self.online: VFN = seeded(lambda: VFN(vfn), seed)
         self.target = VFN(vfn)
         self.target.load_state_dict(self.online.state_dict())
         for network in (self.online, self.target):
@@ -81,24 +79,10 @@ class Learner:
     # ---- to go on exactly ----
 
     def tensors(self) -> dict[str, torch.Tensor]:
-        """Networks and optimiser as named tensors (nothing is ever pickled)."""
-        out = {f"online.{k}": v for k, v in self.online.state_dict().items()}
-        out |= {f"target.{k}": v for k, v in self.target.state_dict().items()}
-        for index, slots in self.optimizer.state_dict()["state"].items():
-            out |= {f"adam.{index}.{name}": value for name, value in slots.items()}
-        return {name: value.detach().to("cpu").contiguous().clone() for name, value in out.items()}
+        """Networks and optimiser as named tensors."""
+        return adam_tensors({"online": self.online, "target": self.target}, self.optimizer)
 
     def restore(self, tensors: Mapping[str, torch.Tensor], updates: int) -> None:
         """Go on from what `tensors` gave after `updates` updates."""
-        for name, network in (("online", self.online), ("target", self.target)):
-            own = {k.removeprefix(f"{name}."): v for k, v in tensors.items() if k.startswith(f"{name}.")}
-            network.load_state_dict(own)
-        slots: dict[int, dict[str, torch.Tensor]] = {}
-        for key, value in tensors.items():
-            if key.startswith("adam."):
-                _, index, name = key.split(".")
-                slots.setdefault(int(index), {})[name] = value
-        whole = self.optimizer.state_dict()
-        whole["state"] = slots
-        self.optimizer.load_state_dict(whole)
+        restore_adam(tensors, {"online": self.online, "target": self.target}, self.optimizer)
         self.updates = updates

@@ -10,7 +10,8 @@ import torch
 
 from cosim.rewards import RewardTerms
 from cosim.types import Decision, Floats32, History, MetaAction
-from policy.agents.prediction_aware import AgentConfig, Inputs, PredictionAware
+from policy.agents.approaches import AgentConfig
+from policy.agents.prediction_aware import Inputs, PredictionAware
 from policy.tensors import to_numpy
 from policy.training.experience import Ending, Trajectory
 from policy.vfn import VFN
@@ -24,6 +25,7 @@ class ExploreConfig:
 
     learners: int = 4  # AVs that explore and are recorded; the others act with frozen weights (P, Alg. 4)
     repeat: float = 2.0  # decisions a random action is kept on average: a gap does not open in 0.4 s
+    sample: bool = False  # actions drawn from the network's preferences (A2C), not epsilon-greedy
     near: float = 60.0  # m to the mission vehicle within which a decision counts as interaction
 
 
@@ -120,6 +122,11 @@ class Explorer(PredictionAware):
     def _explored(self, q: Floats32, inputs: Inputs) -> Floats32:
         """Random preferences in place of some learning AVs' values; the prioritizer still guards them."""
         q = q.copy()
+        if self.explore.sample:  # the largest of preferences + Gumbel noise is a draw from their softmax
+            mine = [b for b, av in enumerate(inputs.scene.agents) if av in self.learning]
+            if self._epsilon > 0.0:
+                q[mine] += self._rng.gumbel(size=(len(mine), q.shape[1])).astype(np.float32)
+            return q
         for b, av in enumerate(inputs.scene.agents):
             if av not in self.learning:
                 continue
@@ -146,12 +153,13 @@ class Explorer(PredictionAware):
         tape.ahead.append((to_numpy(ahead) * 255.0 + 0.5).astype(np.uint8))
         tape.kinematics.append(to_numpy(inputs.kinematics[b]).astype(np.float16))
         tape.route.append(to_numpy(inputs.route[b]))
-        assert decision.unsafe is not None
         assert decision.q is not None
-        tape.unsafe.append(np.array(decision.unsafe, np.bool_))
+        free = np.zeros(len(MetaAction), np.bool_)  # without a prioritizer nothing is masked
+        unsafe = free if decision.unsafe is None else decision.unsafe
+        tape.unsafe.append(unsafe)
         tape.action.append(int(decision.action))
         preferred = int(np.argmax(decision.q))
-        tape.vetoed.append(preferred if decision.unsafe[preferred] else -1)
+        tape.vetoed.append(preferred if unsafe[preferred] else -1)
         newest = history.kinematics[-1]
         mission = history.valid[-1] & (newest[:, IS_MISSION] > 0.5)
         close = mission & (np.hypot(newest[:, 0], newest[:, 1]) < self.explore.near)

@@ -1,8 +1,9 @@
-"""Training of the value network (P, algorithm 4): drives on other processes, updates here, in lock step.
+"""Training of the value network (P, algorithm 4; T's A2C): drives elsewhere, updates here, in lock step.
 
-Iteration k updates the network on what is in the replay while the actors drive its episodes with the
-weights that iteration k began with; then the new trajectories join the replay. So every number depends on the
-configuration and the seed alone, not on which process was faster, and a killed run goes on exactly.
+DDQN: iteration k updates the network on what is in the replay while the actors drive its episodes with the
+weights that iteration k began with; then the new trajectories join the replay. A2C learns from fresh drives
+only: it waits for them. So every number depends on the configuration and the seed alone, not on which
+process was faster, and a killed run goes on exactly.
 """
 
 from __future__ import annotations
@@ -10,11 +11,11 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 from safetensors.torch import load_file, save_file
@@ -23,10 +24,11 @@ from cosim.errors import BadInput
 from cosim.seeding import generator, subseed, uniform
 from policy import checkpoint
 from policy.training import experience
+from policy.training.a2c import A2cConfig, A2cLearner
 from policy.training.ddqn import DdqnConfig, Learner, Losses
 from policy.training.experience import Trajectory
 from policy.training.replay import Replay, ReplayConfig
-from policy.vfn import VfnConfig
+from policy.vfn import VFN, VfnConfig
 
 TRAINING_SEEDS = 100_000  # 0 to 99,999 are for training, the next as many for validation (contract.md)
 
@@ -58,8 +60,10 @@ class VfnTraining:
     validate_every: int = 20  # iterations
     validation: int = 4  # episodes of every lesson, greedy, on tuning seeds
     save_every: int = 5  # iterations
+    learning: Literal["ddqn", "a2c"] = "ddqn"
     replay: ReplayConfig = field(default_factory=ReplayConfig)
     ddqn: DdqnConfig = field(default_factory=DdqnConfig)
+    a2c: A2cConfig = field(default_factory=A2cConfig)
 
 
 class Drive(NamedTuple):
@@ -111,7 +115,12 @@ class Trainer:
     ) -> None:
         self.config, self.vfn, self.folder, self.device = config, vfn, folder, device
         self._actors, self._log, self._about = actors, log, dict(about or {})
-        self.learner = Learner(vfn, config.ddqn, subseed(config.seed, "network") % 2**31, device)
+        start = subseed(config.seed, "network") % 2**31
+        self.learner: Learner | A2cLearner
+        if config.learning == "a2c":
+            self.learner = A2cLearner(vfn, config.a2c, start, device)
+        else:
+            self.learner = Learner(vfn, config.ddqn, start, device)
         self.replay = Replay(config.replay)
         self._files: list[tuple[str, int]] = []  # replay files, oldest first, and their trajectories
         self._gone = 0  # trajectories of the oldest file that have left the replay already
@@ -134,9 +143,13 @@ class Trainer:
             if k % c.validate_every == 0 and k > 0:
                 judged = [self._actors.submit(d) for d in self._validation(weights)]
             losses = self._learn(k)
-            learned = time.perf_counter() - began
             drove = [f.result() for f in driving]
-            self._keep(k, drove)
+            if isinstance(self.learner, A2cLearner):
+                fresh = [t for one in drove for t in one.trajectories]
+                learned = self.learner.learn(fresh, generator(c.seed, "order", str(k)))
+                losses = {} if learned is None else _named(learned._fields, learned)
+            else:
+                self._keep(k, drove)
             record = {
                 "iteration": k,
                 "updates": self.learner.updates,
@@ -147,7 +160,7 @@ class Trainer:
             }
             if judged:
                 record |= self._judge(k, [f.result().figures for f in judged])
-            record["learn_s"], record["iteration_s"] = learned, time.perf_counter() - began
+            record["iteration_s"] = time.perf_counter() - began
             self._write(record)
             self.iteration += 1
             if self.iteration % c.save_every == 0 or self.iteration == c.iterations:
@@ -157,13 +170,13 @@ class Trainer:
 
     def _learn(self, k: int) -> dict[str, float]:
         c = self.config
-        if self.replay.size < c.prefill:
+        if isinstance(self.learner, A2cLearner) or self.replay.size < c.prefill:
             return {}
         rng = generator(c.seed, "replay", str(k))
         losses = np.array(
             [self.learner.update(self.replay.sample(rng, self.device)) for _ in range(c.updates)]
         )
-        return {f"loss/{name}": float(v) for name, v in zip(Losses._fields, losses.mean(0), strict=True)}
+        return _named(Losses._fields, losses.mean(0))
 
     def _drives(self, k: int, weights: str, frozen: str) -> list[Drive]:
         c = self.config
@@ -194,7 +207,7 @@ class Trainer:
 
     def _epsilon(self, k: int) -> float:
         c = self.config
-        if self.replay.size < c.prefill:
+        if c.learning == "ddqn" and self.replay.size < c.prefill:
             return 1.0
         first, last = c.epsilon
         return first + (last - first) * min(k / c.epsilon_iterations, 1.0)
@@ -229,7 +242,7 @@ class Trainer:
                 "tuning_seeds": [TRAINING_SEEDS, self.config.validation],
             }
             card = checkpoint.read_card(source)
-            networks = {"vfn": Learner(self.vfn, self.config.ddqn, 0).online}
+            networks = {"vfn": VFN(self.vfn)}
             checkpoint.load(source, networks, {"vfn": self.vfn})
             checkpoint.save(
                 self.folder / "best.safetensors", networks, {"vfn": self.vfn}, measured, card["data"]
@@ -316,6 +329,10 @@ class Trainer:
             for name, value in record.items():
                 if isinstance(value, int | float) and math.isfinite(value):
                     self._log.add_scalar(name, value, record["iteration"])
+
+
+def _named(names: Sequence[str], values: Iterable[float]) -> dict[str, float]:
+    return {f"loss/{name}": float(v) for name, v in zip(names, values, strict=True)}
 
 
 def _drawn(lessons: Sequence[Lesson], luck: float) -> Lesson:

@@ -20,11 +20,12 @@ from cosim.scenario import Mission, Scenario
 from cosim.seeding import generator
 from cosim.simulation.fake import FakeSimulator, FakeVehicle
 from cosim.types import SMOKE, MetaAction
-from policy.agents.prediction_aware import AgentConfig
+from policy.agents.approaches import AgentConfig
 from policy.chain import ChainConfig
 from policy.safety import SafetyConfig
 from policy.tensors import KINEMATIC_INPUTS, ROUTE_INPUTS
 from policy.training import experience
+from policy.training.a2c import A2cConfig, A2cLearner
 from policy.training.ddqn import DdqnConfig, Learner
 from policy.training.experience import Trajectory
 from policy.training.explorer import ExploreConfig, Explorer
@@ -205,7 +206,12 @@ def agent(learners: int = 2) -> Explorer:
 
 def fake_episode(*vehicles: FakeVehicle) -> Episode:
     scenario = Scenario(
-        name="fake", config=Path(__file__), net=Path(__file__), demand=(), duration=8.0, mission=Mission(kind="none")
+        name="fake",
+        config=Path(__file__),
+        net=Path(__file__),
+        demand=(),
+        duration=8.0,
+        mission=Mission(kind="none"),
     )
     return Episode(scenario, FakeSimulator(vehicles, length=3000.0), SMOKE)
 
@@ -306,7 +312,45 @@ def test_a_killed_run_goes_on_exactly(tmp_path: Path) -> None:
     assert losses(tmp_path / "killed") == losses(tmp_path / "whole")
     assert len(losses(tmp_path / "whole")) == 9
     assert (tmp_path / "killed" / "best.safetensors").is_file()
-    assert len(list((tmp_path / "killed" / "replay").glob("*.npz"))) == 8  # 8 drives of 12 fit in 100; what left the replay is deleted
+    assert (
+        len(list((tmp_path / "killed" / "replay").glob("*.npz"))) == 8
+    )  # 8 drives of 12 fit in 100; what left the replay is deleted
+
+
+def test_a_killed_a2c_run_goes_on_exactly_too(tmp_path: Path) -> None:
+    config, critic = replace(SHORT, learning="a2c", iterations=5), replace(TINY, critic=True, kinematic=0)
+    Trainer(config, critic, Pretend(), tmp_path / "whole").run()
+    killed = Trainer(config, critic, Pretend(), tmp_path / "killed")
+
+    def die(done: float, _: float) -> None:
+        if done == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        killed.run(die)
+    again = Trainer(config, critic, Pretend(), tmp_path / "killed")
+    assert again.resume()
+    again.run()
+    assert losses(tmp_path / "killed") == losses(tmp_path / "whole")
+    assert losses(tmp_path / "whole")[0]["loss/entropy"] == pytest.approx(np.log(5.0), abs=0.05)
+
+
+def test_actor_and_critic_learn_which_action_pays() -> None:
+    """One place, one decision: accelerating pays 10, everything else nothing. Drives follow the policy."""
+    learner = A2cLearner(replace(TINY, critic=True), A2cConfig(learning_rate=3e-3, n_step=1), seed=0)
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        with torch.no_grad():
+            one = trajectory([0], [(0.0, 0.0, 0.0)])
+            preference, _ = learner.online.actor_critic(
+                *experience.states([(one, 0)], np.zeros(1, np.float32))
+            )
+        chances = preference.softmax(1)[0].double().numpy()
+        actions = rng.choice(5, size=32, p=chances / chances.sum())
+        pay = [(10.0 if a == MetaAction.ACCELERATE else 0.0, 0.0, 0.0) for a in actions]
+        drives = [trajectory([int(a)], [p], ending="crashed") for a, p in zip(actions, pay, strict=True)]
+        learner.learn(drives, rng)
+    assert chances[MetaAction.ACCELERATE] > 0.9
 
 
 def test_another_configuration_is_not_gone_on_with(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,9 @@ from policy_scenes import Car, histories, straight_road
 
 from cosim.errors import BadInput
 from cosim.types import COMPACT, PAPER, SMOKE, Decision, MetaAction, PolicyContext, Timing
-from policy.agents.prediction_aware import AgentConfig, PredictionAware, compact, paper
+from policy.agents import LEARNING
+from policy.agents.approaches import APPROACHES, AgentConfig, compact, paper
+from policy.agents.prediction_aware import PredictionAware
 from policy.hpn import HpnConfig
 from policy.vfn import VfnConfig
 
@@ -114,5 +117,24 @@ def test_the_paper_configuration_is_the_papers() -> None:
     assert config.vfn.strides == "literal"
     assert compact("vfn-p").observation == COMPACT
     assert compact("vfn").predictor == "cs"
-    with pytest.raises(BadInput, match="policy='conv2d'"):
-        compact("conv2d")
+    with pytest.raises(BadInput, match="policy='conv4d'"):
+        compact("conv4d")
+
+
+def test_every_approach_is_a_policy_and_sees_what_table_iii_says() -> None:
+    assert set(LEARNING) == set(APPROACHES)
+    for name in APPROACHES:
+        config = compact(name)
+        assert config.vfn.frames == (14 if name.startswith("vfn-p") else 10)
+        assert bool(config.vfn.kinematic) == name.startswith("vfn")
+        assert config.mask == name.startswith(("vfn", "safe"))
+
+
+def test_without_a_mask_the_best_valued_action_is_taken() -> None:
+    agent = PredictionAware("conv3d-dqn")
+    q = np.array([[0.0, 1.0, 3.0, 2.0, 0.0]], np.float32)
+    scene = SimpleNamespace(agents=("a",), histories=(None,))
+    agent._context = None  # type: ignore[assignment]
+    decision = agent.choose(q, SimpleNamespace(scene=scene))["a"]  # type: ignore[arg-type]
+    assert decision.action == MetaAction.LANE_RIGHT
+    assert decision.unsafe is None

@@ -11,7 +11,8 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from cosim.errors import BadInput, WeightsMismatch
-from policy.agents.prediction_aware import PredictionAware, compact
+from policy.agents.approaches import compact
+from policy.agents.prediction_aware import PredictionAware
 from policy.checkpoint import load, read_card, save, sha256
 from policy.vfn import VFN, VfnConfig
 
@@ -115,5 +116,5 @@ def test_an_agent_with_weights_is_no_longer_called_untrained(tmp_path: Path) -> 
     assert untrained.label == "untrained"
     path = tmp_path / "agent.safetensors"
     save(path, {"vfn": untrained.vfn}, {"vfn": config.vfn})
-    trained = PredictionAware("vfn", dataclasses.replace(config, weights=path))
+    trained = PredictionAware("vfn", dataclasses.replace(config, vfn_weights=path))
     assert trained.label == ""

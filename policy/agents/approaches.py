@@ -1,0 +1,104 @@
+"""The approaches of Table III as configurations of one agent: what each network sees, and what masks it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+from cosim.errors import BadInput
+from cosim.types import COMPACT, PAPER, ObservationConfig
+from policy.chain import ChainConfig
+from policy.checkpoint import SHIPPED
+from policy.hpn import HpnConfig
+from policy.safety import SafetyConfig
+from policy.traffic import TrafficConfig
+from policy.vfn import VfnConfig
+
+
+@dataclass(frozen=True, slots=True)
+class AgentConfig:
+    """Everything that makes up one agent. Defaults: compact size, `vfn-p`."""
+
+    observation: ObservationConfig = COMPACT
+    predicted_maps: bool = True  # False: the VFN sees the history only (Table III, `vfn`)
+    mask: bool = True  # False: no safety prioritizer, the best valued action is taken
+    predictor: str = "gp-indirect"  # of the mask and of the chain's kinematics; `cs` for `vfn`
+    chain: ChainConfig = field(default_factory=ChainConfig)
+    hpn: HpnConfig = field(default_factory=HpnConfig)
+    vfn: VfnConfig = field(default_factory=VfnConfig)
+    safety: SafetyConfig = field(default_factory=SafetyConfig)
+    traffic: TrafficConfig = field(default_factory=TrafficConfig)
+    init_seed: int = 0  # of untrained weights: the same in every process
+    bf16: bool = False  # autocast; off, so that results do not depend on the processor
+    vfn_weights: Path | None = None  # a checkpoint of policy.checkpoint; None: untrained
+    hpn_weights: Path | None = None
+    note: str = ""  # goes into the label
+
+
+@dataclass(frozen=True, slots=True)
+class Approach:
+    """One row of contract.md's table of approaches."""
+
+    extractor: Literal["conv3d", "conv2d"] = "conv3d"
+    kinematics: bool = True  # K and the route join the maps
+    predicted_maps: bool = True
+    mask: Literal["gp-indirect", "cs", "none"] = "gp-indirect"
+    learning: Literal["ddqn", "a2c"] = "ddqn"
+
+
+APPROACHES = {
+    "vfn-p": Approach(),
+    "vfn-p-egoistic": Approach(),  # the twin: the same agent, trained with phi = 0
+    "vfn": Approach(predicted_maps=False, mask="cs"),
+    "safe-dqn": Approach(kinematics=False, predicted_maps=False, mask="cs"),
+    "conv3d-dqn": Approach(kinematics=False, predicted_maps=False, mask="none"),
+    "conv3d-a2c": Approach(kinematics=False, predicted_maps=False, mask="none", learning="a2c"),
+    "conv2d-dqn": Approach("conv2d", kinematics=False, predicted_maps=False, mask="none"),
+}
+
+
+def compact(name: str) -> AgentConfig:
+    """The compact configuration of an approach, with the weights that are shipped for it."""
+    config = configure(name, COMPACT, ChainConfig(), HpnConfig(), VfnConfig())
+    return replace(config, vfn_weights=_shipped(name), hpn_weights=_shipped("hpn"))
+
+
+def paper(name: str) -> AgentConfig:
+    """The paper-size configuration: 64 x 512, one frame a step, M = 20, T's Table 1 read literally."""
+    hpn = HpnConfig(height=64, width=512, block=1, reading="pool")
+    return configure(name, PAPER, ChainConfig(every=1), hpn, VfnConfig(strides="literal"))
+
+
+def configure(
+    name: str, observation: ObservationConfig, chain: ChainConfig, hpn: HpnConfig, vfn: VfnConfig
+) -> AgentConfig:
+    """The approach `name` at any size; the VFN's inputs follow from it. Raises BadInput if unknown."""
+    if name not in APPROACHES:
+        raise BadInput(f"no such approach ({', '.join(APPROACHES)})", field="policy", value=name)
+    approach = APPROACHES[name]
+    return AgentConfig(
+        observation=observation,
+        predicted_maps=approach.predicted_maps,
+        mask=approach.mask != "none",
+        predictor="cs" if approach.mask == "none" else approach.mask,
+        chain=chain,
+        hpn=hpn,
+        vfn=replace(
+            vfn,
+            height=observation.height,
+            width=observation.width,
+            channels=len(observation.channels),
+            frames=observation.frames + (chain.hypotheses if approach.predicted_maps else 0),
+            rows=observation.rows,
+            extractor=approach.extractor,
+            kinematic=vfn.kinematic if approach.kinematics else 0,
+            critic=approach.learning == "a2c",
+        ),
+    )
+
+
+def _shipped(name: str) -> Path | None:
+    """The weights in the package; None while there are none."""
+    path = SHIPPED / f"{name}.safetensors"
+    return path if path.is_file() else None

@@ -1,0 +1,85 @@
+"""What turns a stack of maps into features: T's Conv3D (Table 1), and the Conv2D of the simplest baseline."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+Strides = Literal["literal", "temporal"]
+
+# T gives no strides: two readings (compute.md, VFN). `literal` has no padding, `temporal` halves time too.
+STRIDES: dict[str, tuple[tuple[int, int, int], ...]] = {
+    "literal": ((1, 4, 4), (1, 2, 2), (1, 1, 1)),
+    "temporal": ((1, 4, 4), (2, 2, 2), (2, 2, 2)),
+}
+KERNELS = ((1, 8, 8), (3, 4, 4), (3, 3, 3))  # T, Table 1
+
+
+class Conv3dMaps(nn.Module):
+    """Conv3D 32@(1,8,8), 64@(3,4,4), 64@(3,3,3): [B,T,C,H,W] -> [B,flat]."""
+
+    def __init__(
+        self,
+        frames: int,
+        channels: int,
+        height: int,
+        width: int,
+        features: tuple[int, int, int],
+        strides: Strides,
+    ) -> None:
+        super().__init__()
+        shape: tuple[int, ...] = (frames, height, width)
+        widths = (channels, *features)
+        layers: list[nn.Conv3d] = []
+        for k, (stride, wanted) in enumerate(zip(STRIDES[strides], KERNELS, strict=True)):
+            if strides == "temporal":
+                padding = tuple((n - 1) // 2 for n in wanted)
+                # a kernel never reaches beyond its (padded) input at the smaller sizes
+                kernel = tuple(min(n, s + 2 * p) for n, s, p in zip(wanted, shape, padding, strict=True))
+            else:
+                padding = (0, 0, 0)
+                kernel = tuple(min(n, s) for n, s in zip(wanted, shape, strict=True))
+            layers.append(nn.Conv3d(widths[k], widths[k + 1], kernel, stride, padding))  # type: ignore[arg-type]
+            shape = tuple(
+                (s + 2 * p - n) // d + 1 for s, p, n, d in zip(shape, padding, kernel, stride, strict=True)
+            )
+        self.per_frame, self.second, self.third = layers
+        self.flat = features[2] * shape[0] * shape[1] * shape[2]
+
+    def forward(self, maps: torch.Tensor) -> torch.Tensor:
+        """Fastest in channels_last_3d."""
+        b, t = maps.shape[:2]
+        # a (1,8,8) kernel is a 2D convolution of every frame: no need to turn the maps around first
+        first = self.per_frame
+        z = functional.conv2d(
+            maps.flatten(0, 1), first.weight[:, :, 0], first.bias, first.stride[1:], first.padding[1:]
+        )
+        z = functional.relu_(z).view(b, t, *z.shape[1:]).transpose(1, 2)  # [B,32,T,h,w]
+        z = z.contiguous(memory_format=torch.channels_last_3d)
+        z = functional.relu_(self.second(z))
+        z = functional.relu_(self.third(z))
+        return z.flatten(1)
+
+
+class Conv2dMaps(nn.Module):
+    """The frames as channels of one picture: the same kernels without time (contract.md, conv2d-dqn)."""
+
+    def __init__(
+        self, frames: int, channels: int, height: int, width: int, features: tuple[int, int, int]
+    ) -> None:
+        super().__init__()
+        widths, size = (frames * channels, *features), (height, width)
+        layers: list[nn.Module] = []
+        for k, (kernel, stride) in enumerate(((8, 4), (4, 2), (3, 2))):
+            layers += [nn.Conv2d(widths[k], widths[k + 1], kernel, stride, (kernel - 1) // 2), nn.ReLU()]
+            size = tuple((n + 2 * ((kernel - 1) // 2) - kernel) // stride + 1 for n in size)  # type: ignore[assignment]
+        self.layers = nn.Sequential(*layers)
+        self.flat = features[2] * size[0] * size[1]
+
+    def forward(self, maps: torch.Tensor) -> torch.Tensor:
+        """[B,T,C,H,W] -> [B,flat]."""
+        out: torch.Tensor = self.layers(maps.flatten(1, 2)).flatten(1)
+        return out

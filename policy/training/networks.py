@@ -1,0 +1,48 @@
+"""Networks made from a seed, and networks with their optimiser as named tensors: nothing is ever pickled."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TypeVar
+
+import torch
+from torch import nn
+
+Network = TypeVar("Network", bound=nn.Module)
+
+
+def seeded(build: Callable[[], Network], seed: int) -> Network:
+    """The module that `build` makes, its weights drawn from `seed`; torch's generator is left as it was."""
+    state = torch.random.get_rng_state()
+    torch.manual_seed(seed)  # module initialisers know no generator
+    network = build()
+    torch.random.set_rng_state(state)
+    return network
+
+
+def adam_tensors(
+    networks: Mapping[str, nn.Module], optimizer: torch.optim.Optimizer
+) -> dict[str, torch.Tensor]:
+    """Copies of every weight and of the optimiser's state, on the host."""
+    out = {f"{name}.{k}": v for name, network in networks.items() for k, v in network.state_dict().items()}
+    for index, slots in optimizer.state_dict()["state"].items():
+        out |= {f"adam.{index}.{name}": value for name, value in slots.items()}
+    return {name: value.detach().to("cpu").contiguous().clone() for name, value in out.items()}
+
+
+def restore_adam(
+    tensors: Mapping[str, torch.Tensor], networks: Mapping[str, nn.Module], optimizer: torch.optim.Optimizer
+) -> None:
+    """The other way round."""
+    for name, network in networks.items():
+        network.load_state_dict(
+            {k.removeprefix(f"{name}."): v for k, v in tensors.items() if k.startswith(f"{name}.")}
+        )
+    slots: dict[int, dict[str, torch.Tensor]] = {}
+    for key, value in tensors.items():
+        if key.startswith("adam."):
+            _, index, slot = key.split(".")
+            slots.setdefault(int(index), {})[slot] = value
+    whole = optimizer.state_dict()
+    whole["state"] = slots
+    optimizer.load_state_dict(whole)

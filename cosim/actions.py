@@ -5,51 +5,100 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from cosim.types import Command, Decision, History, MetaAction
+import numpy as np
+
+from cosim.compiled import compiled
+from cosim.types import LANE_OFFSET, Command, Decision, Floats, History, MetaAction
 
 SPEED_STEP = 5.0  # m/s between grid levels: "Decelerate" must be able to brake (compute.md)
 SPEED_MARGIN = 2.0  # m/s above the speed limit: the highest level
 TIME_CONSTANT = 0.6  # s, with which the target speed is tracked
 MAX_DECEL = 8.0  # m/s2
 MAX_ACCEL = 3.0  # m/s2
+LANE_CHANGE_TIME = 2.0  # s, the same as SUMO's --lanechange.duration
+STEP = 0.1  # s, with which a rollout tracks the target speed (SUMO's step, contract.md)
 
-LANE_OFFSET = {MetaAction.LANE_LEFT: 1, MetaAction.LANE_RIGHT: -1}
 
+def next_target(target: float, speed: float, action: int, speed_limit: float) -> float:
+    """The target speed after `action`, all in m/s; `speed` is the AV's present one.
 
-def next_target(target: float, action: int, speed_limit: float) -> float:
-    """The target speed after `action`, all in m/s.
-
-    The grid is 0, 5, 10, ... up to the limit, and the limit + 2 on top. A target off the grid (an AV
-    that was driven by SUMO so far) is first rounded to the grid.
+    The levels are 0, 5, 10, ... up to the limit, and the limit + 2 on top. Decelerate goes one level below
+    the lower of target and speed, Accelerate one above the higher: so Decelerate brakes at once, however far
+    the target had run ahead of the speed, and Accelerate ends a braking at once (each first rounds to the
+    nearest level, as HighwayEnv's meta-actions round the present speed). All others keep the target, on the
+    grid or not, and no target exceeds the top.
     """
-    top = speed_limit + SPEED_MARGIN
     if action == MetaAction.ACCELERATE:
-        return min(math.floor(target / SPEED_STEP + 1e-6) * SPEED_STEP + SPEED_STEP, top)
+        return _level_speed(_level(max(target, speed), speed_limit) + 1, speed_limit)
     if action == MetaAction.DECELERATE:
-        return min(max(math.ceil(target / SPEED_STEP - 1e-6) * SPEED_STEP - SPEED_STEP, 0.0), top)
-    if target >= top:
-        return top
-    return min(round(target / SPEED_STEP) * SPEED_STEP, top)
+        return _level_speed(_level(min(target, speed), speed_limit) - 1, speed_limit)
+    return min(target, speed_limit + SPEED_MARGIN)
 
 
+def _level(speed: float, speed_limit: float) -> int:
+    """The number of the level nearest to a speed; a level halfway between two counts up."""
+    below_top = math.floor(speed_limit / SPEED_STEP + 1e-6)  # the highest multiple of the step in the limit
+    if speed >= 0.5 * (below_top * SPEED_STEP + speed_limit + SPEED_MARGIN):
+        return below_top + 1
+    return min(math.floor(speed / SPEED_STEP + 0.5), below_top)
+
+
+def _level_speed(level: int, speed_limit: float) -> float:
+    """The speed of a level; beyond the ends the lowest and the highest."""
+    below_top = math.floor(speed_limit / SPEED_STEP + 1e-6)
+    return max(level, 0) * SPEED_STEP if level <= below_top else speed_limit + SPEED_MARGIN
+
+
+@compiled
 def tracked_speed(speed: float, target: float, step: float) -> float:
     """Speed in m/s one simulation step (s) later, tracking `target` with the contract's limits."""
     accel = (target - speed) / TIME_CONSTANT
     return max(speed + min(max(accel, -MAX_DECEL), MAX_ACCEL) * step, 0.0)
 
 
+@compiled
+def tracked_speeds(speed: float, targets: Floats, frames: int, dt: float) -> Floats:
+    """Speeds while tracking target speeds [k] m/s from `speed`: [k,frames+1] m/s, every `dt` s."""
+    steps = max(round(dt / STEP), 1)
+    out = np.empty((targets.shape[0], frames + 1))
+    for k in range(targets.shape[0]):
+        v = speed
+        out[k, 0] = v
+        for t in range(1, frames + 1):
+            for _ in range(steps):
+                v = tracked_speed(v, targets[k], dt / steps)
+            out[k, t] = v
+    return out
+
+
+@compiled
+def braking_speeds(speed: float, target: float, frames: int, dt: float, period: float) -> Floats:
+    """Speeds [frames+1] m/s when the target (m/s, already lowered once) falls one level every `period` s."""
+    out = np.empty(frames + 1)
+    v = speed
+    out[0] = v
+    steps = max(round(dt / STEP), 1)
+    per_level = max(round(period / STEP), 1)
+    k = 0
+    for t in range(1, frames + 1):
+        for _ in range(steps):
+            if k > 0 and k % per_level == 0:
+                target = max(target - SPEED_STEP, 0.0)
+            k += 1
+            v = tracked_speed(v, target, dt / steps)
+        out[t] = v
+    return out
+
+
 def to_commands(
     decisions: Mapping[str, Decision], histories: Mapping[str, History], hold: float
 ) -> list[Command]:
     """One command per decided AV, held for `hold` s."""
-    return [
-        Command(
-            vehicle,
-            next_target(
-                histories[vehicle].target_speed, decision.action, histories[vehicle].route.speed_limit
-            ),
-            LANE_OFFSET.get(decision.action, 0),
-            hold,
+    commands = []
+    for vehicle, decision in decisions.items():
+        history = histories[vehicle]
+        target = next_target(
+            history.target_speed, history.ego_speed, decision.action, history.route.speed_limit
         )
-        for vehicle, decision in decisions.items()
-    ]
+        commands.append(Command(vehicle, target, LANE_OFFSET.get(decision.action, 0), hold))
+    return commands

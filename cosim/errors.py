@@ -52,7 +52,20 @@ class SimulationError(CosimError):
 
 
 class SimulationCrashed(SimulationError):
-    """The worker process that held the simulation died (signal, limit) or did not answer in time."""
+    """The worker process that held the simulation died (signal, limit) or did not answer in time.
+
+    `exitcode` is the process's (negative: the signal that killed it; None: not known), `stderr` the end of
+    what it wrote there.
+    """
+
+    def __init__(self, problem: str, *, exitcode: int | None = None, stderr: str = "") -> None:
+        super().__init__(problem)
+        self.exitcode = exitcode
+        self.stderr = stderr
+
+
+class SimulationTimeout(SimulationCrashed):
+    """The worker process gave no sign of life for too long and was killed."""
 
 
 class SimulationInUse(SimulationError):

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from cosim.compiled import compiled, compiled_fast
 from cosim.road import RoadMap
 from cosim.types import Bools, Bytes, Floats, ObservationConfig
 
@@ -59,7 +59,7 @@ def channel_indices(config: ObservationConfig) -> npt.NDArray[np.int64]:
     return np.array(found, np.int64)
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@compiled_fast
 def draw_scene(
     out: Bytes,  # [S,C,H,W]; the slots named are overwritten
     slots: npt.NDArray[np.int64],  # [B] where in `out` each ego's frame goes
@@ -112,7 +112,7 @@ def draw_scene(
             )
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@compiled_fast
 def draw_rows(
     out: Bytes,  # [B,C,H,W] overwritten
     rows: Floats,  # [B,R,8] KINEMATIC_FEATURES in any one frame per b (m, m/s, rad); row 0 the ego
@@ -166,7 +166,7 @@ def draw_rows(
             )
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@compiled_fast
 def _draw_vehicle(
     out: Bytes,  # [C,H,W]
     ahead: float,  # m, centre in the ego frame
@@ -220,7 +220,7 @@ def _draw_vehicle(
                 out[second, v, u] = value
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@compiled_fast
 def _sample_road(
     out: Bytes,  # [H,W]
     x: float,
@@ -262,7 +262,7 @@ def _sample_road(
                 py += step_y
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _draw_lane(cells: Bytes, shape: Floats, half: float, cell: float, value: int) -> None:
     """Fill everything within `half` m of the centre line [p,2] (round joints close the outer bends)."""
     rows, columns = cells.shape

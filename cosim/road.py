@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
-from cosim.types import Floats
+from cosim.contact import Contact
+from cosim.types import Floats, Ints
 
 PATH_HORIZON = 400.0  # m: further than any AV drives within the 4 s horizon, and than arms are long
 
 
 @dataclass(frozen=True)
 class Lane:
-    """One SUMO lane. Index 0 of an edge is the rightmost; `left`/`right`/`successors` index RoadMap.lanes."""
+    """One SUMO lane. Index 0 of an edge is the rightmost; `left`/`right`/`successors` index RoadMap.lanes.
+
+    `left` and `right` are lanes that a car may change to; -1 where there is none or the change is forbidden.
+    """
 
     id: str
     edge: str
@@ -108,6 +113,13 @@ class ConflictZone:
     lanes: frozenset[int]
 
 
+class LaneGraph(NamedTuple):
+    """Which lane follows which, for walking ahead quickly; l lanes as in RoadMap.lanes."""
+
+    following: Ints  # [l] the lane one drives on to, -1 at the end
+    length: Floats  # [l] m
+
+
 @dataclass(frozen=True)
 class RoadMap:
     """Every lane of a net. Paths are cached, so asking again is free."""
@@ -116,7 +128,6 @@ class RoadMap:
     zones: tuple[ConflictZone, ...] = ()
     junctions: tuple[Floats, ...] = ()  # [p,2] m, outlines
     _paths: dict[tuple[int, tuple[str, ...] | None], LanePath] = field(default_factory=dict, repr=False)
-    _near: dict[str, frozenset[str]] = field(default_factory=dict, repr=False)
     index: dict[str, int] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
@@ -135,36 +146,22 @@ class RoadMap:
             found = self._paths[key] = self._follow(lane, route)
         return found
 
+    @cached_property
+    def contact(self) -> Contact:
+        """Which lanes' vehicles can touch: roads on a bridge and below it do not."""
+        return Contact(self.lanes)
+
     def connected(self, a: int, b: int) -> bool:
-        """Whether vehicles on lanes `a` and `b` can touch: roads on a bridge and below it do not.
+        """Whether vehicles on lanes `a` and `b` can touch; -1 (off every lane) touches all."""
+        return bool(self.contact.touch(a, np.array([b]))[0])
 
-        True when b's edge is reached from a's within 100 m of road; also when either is off every lane.
-        """
-        if a < 0 or b < 0 or self.lanes[a].edge == self.lanes[b].edge:
-            return True
-        edge = self.lanes[a].edge
-        near = self._near.get(edge)
-        if near is None:
-            near = self._near[edge] = self._edges_near(self.lanes[a])
-        return self.lanes[b].edge in near
-
-    def _edges_near(self, lane: Lane, reach: float = 100.0) -> frozenset[str]:
-        at: dict[str, list[Lane]] = {}
-        for other in self.lanes:
-            at.setdefault(other.start, []).append(other)
-            at.setdefault(other.end, []).append(other)
-        found, seen = {lane.edge}, {lane.start: 0.0, lane.end: 0.0}
-        waiting = [lane.start, lane.end]
-        while waiting:
-            junction = waiting.pop()
-            for other in at.get(junction, ()):
-                found.add(other.edge)
-                far = other.end if other.start == junction else other.start
-                distance = seen[junction] + other.length
-                if distance < min(reach, seen.get(far, np.inf)):
-                    seen[far] = distance
-                    waiting.append(far)
-        return frozenset(found)
+    @cached_property
+    def straight_on(self) -> LaneGraph:
+        """The straightest successor of every lane (another vehicle's route is unknown)."""
+        paths = map(self.path, range(len(self.lanes)))
+        following = [path.lanes[1] if len(path.lanes) > 1 else -1 for path in paths]
+        lengths = [lane.length for lane in self.lanes]
+        return LaneGraph(np.array(following, np.int64), np.array(lengths, np.float64))
 
     def ahead(self, lane: int, lane_position: float, length: float, route: tuple[str, ...]) -> RouteAhead:
         """Route knowledge of a vehicle of `length` m whose front bumper is at `lane_position` m of `lane`."""

@@ -35,6 +35,9 @@ class MetaAction(IntEnum):
     DECELERATE = 4
 
 
+LANE_OFFSET = {MetaAction.LANE_LEFT: 1, MetaAction.LANE_RIGHT: -1}  # as SUMO counts: left is up
+
+
 class Kind(IntEnum):
     """Who drives: a human-driven vehicle (HV) or an autonomous one (AV)."""
 
@@ -167,6 +170,21 @@ class Decision(NamedTuple):
     blamed: str | None = None  # who made the preferred action unsafe: a vehicle, or why, in brackets
     vetoed: bool = False  # the preferred action was masked
     fallback: bool = False  # every action was unsafe: the highest score was taken
+
+
+class Forecast(NamedTuple):
+    """What a policy expected of the vehicles it knew at its last decision: V vehicles, M frames ahead.
+
+    A policy that predicts may keep one as `last_forecast`; replays draw it, nothing else reads it.
+    """
+
+    ids: tuple[str, ...]  # V
+    x: Floats  # [V,M] m, vehicle centre
+    y: Floats  # [V,M] m
+    heading: Floats  # [V,M] rad
+    along_std: Floats  # [V,M] m, standard deviation in driving direction; 0 where it is not known
+    across_std: Floats  # [V,M] m
+    interval: float  # s between frames; the first one lies one interval ahead
 
 
 class Command(NamedTuple):

@@ -20,7 +20,9 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from cosim.errors import CosimError, SimulationCrashed
+from cosim.errors import CosimError, SimulationCrashed, SimulationTimeout
+
+STDERR_KEPT = 4000  # characters of a dead process's stderr that its error carries
 
 _CONTEXT = multiprocessing.get_context("spawn")
 _STARTING = threading.Lock()
@@ -30,14 +32,22 @@ class Worker:
     """`factory(*arguments)` built in a spawned process; `call` runs one of its methods there.
 
     Everything that crosses must be picklable. `timeout` is the longest silence in s that a call may keep
-    (progress counts as a sign of life). Raises whatever CosimError the method raised, SimulationCrashed when
-    the process died or stayed silent. A worker whose process is gone stays gone: make a new one.
+    (progress counts as a sign of life); `start_timeout` is the longest one before the first sign of life, of
+    the factory and of each call (default: the same). Raises whatever CosimError the method raised,
+    SimulationCrashed when the process died, SimulationTimeout when it stayed silent. A worker whose process
+    is gone stays gone: make a new one.
     """
 
     def __init__(
-        self, factory: Callable[..., Any], *arguments: Any, timeout: float = 300.0, name: str = "cosim"
+        self,
+        factory: Callable[..., Any],
+        *arguments: Any,
+        timeout: float = 300.0,
+        start_timeout: float | None = None,
+        name: str = "cosim",
     ) -> None:
         self._timeout = timeout
+        self._start_timeout = start_timeout
         handle, path = tempfile.mkstemp(prefix="cosim-worker-", suffix=".stderr")
         os.close(handle)
         self._stderr = Path(path)
@@ -72,6 +82,11 @@ class Worker:
             raise self._died(method) from None
         return self._answer(method, progress)
 
+    def kill(self) -> None:
+        """End the process at once; a call that another thread is waiting for raises SimulationCrashed."""
+        with contextlib.suppress(ValueError):  # closed in the meantime
+            self._process.kill()
+
     def close(self) -> None:
         """Ask the worker to end, and see to it that it does. Safe to call twice."""
         if self._closed:
@@ -98,17 +113,20 @@ class Worker:
             self.close()
 
     def _answer(self, method: str, progress: Callable[..., None] | None) -> Any:
+        patience = self._timeout if self._start_timeout is None else self._start_timeout
         while True:
             try:
-                if not self._pipe.poll(self._timeout):
+                if not self._pipe.poll(patience):
                     self._process.kill()
                     self._process.join()
-                    error = SimulationCrashed(
-                        f"no sign of life for {self._timeout:g} s during '{method}': process killed"
+                    error = SimulationTimeout(
+                        f"no sign of life for {patience:g} s during '{method}': process killed",
+                        stderr=self._last_words(),
                     )
                     self.close()
                     raise error
                 kind, value = self._pipe.recv()
+                patience = self._timeout
             except (EOFError, ConnectionResetError):
                 raise self._died(method) from None
             if kind == "progress":
@@ -125,10 +143,14 @@ class Worker:
         how = f"exit code {code}"
         if code is not None and code < 0:
             how = f"killed by {signal.Signals(-code).name}"
-        last = self._stderr.read_text("utf-8", "replace").strip().splitlines()[-1:]
-        words = f"; last words: {last[0]}" if last else ""
+        stderr = self._last_words()
+        words = f"; last words: {stderr.splitlines()[-1]}" if stderr else ""
         self.close()
-        return SimulationCrashed(f"the simulation's process died during '{method}' ({how}){words}")
+        problem = f"the simulation's process died during '{method}' ({how}){words}"
+        return SimulationCrashed(problem, exitcode=code, stderr=stderr)
+
+    def _last_words(self) -> str:
+        return self._stderr.read_text("utf-8", "replace").strip()[-STDERR_KEPT:]
 
 
 @contextlib.contextmanager

@@ -34,6 +34,14 @@ class Section:
                 problem = f"unknown field{hint(str(name), allowed)}"
                 raise BadInput(problem, file=file, field=self._name(str(name)), value=values[name])
 
+    def has(self, name: str) -> bool:
+        """Whether the field is there and not empty."""
+        return self._values.get(name) is not None
+
+    def raw(self, name: str) -> object:
+        """The value as YAML read it, for a field with a grammar of its own."""
+        return self._values.get(name)
+
     def text(self, name: str, default: str | None = None) -> str | None:
         """A string."""
         value = self._values.get(name)
@@ -76,6 +84,15 @@ class Section:
         if not isinstance(value, list | tuple) or not all(isinstance(item, str) for item in value):
             raise self._wrong(name, value, "a list of names is needed")
         return tuple(value)
+
+    def numbers(self, name: str, low: float, high: float) -> tuple[float, ...]:
+        """A list of numbers from `low` to `high`; one number stands for a list of one."""
+        value = self._values.get(name, ())
+        found = value if isinstance(value, list | tuple) else (value,)
+        for item in found:
+            if isinstance(item, bool) or not isinstance(item, int | float) or not low <= item <= high:
+                raise self._wrong(name, item, f"a number from {low:g} to {high:g} is needed")
+        return tuple(float(item) for item in found)
 
     def section(self, name: str, known: Iterable[str]) -> Section:
         """The mapping below `name`; an empty one when it is absent."""

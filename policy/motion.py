@@ -8,25 +8,14 @@ front changes lanes in 2 s at any speed, the box straightens only over the dista
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from cosim.compiled import compiled
 from cosim.road import LanePath
-from cosim.types import Floats, Ints, MetaAction
-
-# The meaning of the meta-actions (contract.md, Vehicles), as cosim.actions carries them out; a test
-# compares the two.
-SPEED_STEP = 5.0  # m/s between grid levels
-SPEED_MARGIN = 2.0  # m/s above the limit
-TIME_CONSTANT = 0.6  # s
-MAX_DECEL = 8.0  # m/s2
-MAX_ACCEL = 3.0  # m/s2
-LANE_CHANGE_TIME = 2.0  # s
-STEP = 0.1  # s, with which SUMO tracks the target speed
+from cosim.types import Floats, Ints
 
 
 class Paths(NamedTuple):
@@ -57,55 +46,7 @@ def pack(paths: Sequence[LanePath]) -> Paths:
     return Paths(np.concatenate([p.points for p in paths]), np.concatenate([p.arc for p in paths]), start)
 
 
-def next_target(target: float, action: int, speed_limit: float) -> float:
-    """Target speed after `action` (m/s): the grid 0, 5, 10, ... up to the limit, and the limit + 2."""
-    top = speed_limit + SPEED_MARGIN
-    level = target / SPEED_STEP
-    if action == MetaAction.ACCELERATE:
-        return min((math.floor(level + 1e-6) + 1.0) * SPEED_STEP, top)
-    if action == MetaAction.DECELERATE:
-        return min(max((math.ceil(level - 1e-6) - 1.0) * SPEED_STEP, 0.0), top)
-    return top if target >= top else min(round(level) * SPEED_STEP, top)
-
-
-@njit(cache=True, nogil=True)
-def tracked_speeds(speed: float, targets: Floats, frames: int, dt: float) -> Floats:
-    """Speeds while tracking target speeds [k] m/s from `speed`: [k,frames+1] m/s, every `dt` s."""
-    per_frame = max(round(dt / STEP), 1)
-    h = dt / per_frame
-    out = np.empty((targets.shape[0], frames + 1))
-    for k in range(targets.shape[0]):
-        v = speed
-        out[k, 0] = v
-        for t in range(1, frames + 1):
-            for _ in range(per_frame):
-                accel = min(max((targets[k] - v) / TIME_CONSTANT, -MAX_DECEL), MAX_ACCEL)
-                v = max(v + accel * h, 0.0)
-            out[k, t] = v
-    return out
-
-
-@njit(cache=True, nogil=True)
-def braking_speeds(speed: float, target: float, frames: int, dt: float, period: float) -> Floats:
-    """Speeds [frames+1] m/s when the target (m/s, already lowered once) falls one level every `period` s."""
-    out = np.empty(frames + 1)
-    v = speed
-    out[0] = v
-    per_frame = max(round(dt / STEP), 1)
-    per_level = max(round(period / STEP), 1)
-    k = 0
-    for t in range(1, frames + 1):
-        for _ in range(per_frame):
-            if k > 0 and k % per_level == 0:
-                target = max(target - SPEED_STEP, 0.0)
-            k += 1
-            accel = min(max((target - v) / TIME_CONSTANT, -MAX_DECEL), MAX_ACCEL)
-            v = max(v + accel * dt / per_frame, 0.0)
-        out[t] = v
-    return out
-
-
-@njit(cache=True, nogil=True)
+@compiled
 def project(
     points: Floats, arc: Floats, first: int, last: int, x: float, y: float, around: float
 ) -> tuple[float, float]:
@@ -133,7 +74,7 @@ def project(
     return best_arc, best_offset
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def project_many(
     points: Floats, arc: Floats, start: Ints, x: Floats, y: Floats, around: Floats
 ) -> tuple[Floats, Floats]:
@@ -145,7 +86,7 @@ def project_many(
     return out_arc, out_offset
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def project_all(points: Floats, arc: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
     """`project` of every point [k] onto one path."""
     n = x.shape[0]
@@ -155,7 +96,7 @@ def project_all(points: Floats, arc: Floats, x: Floats, y: Floats) -> tuple[Floa
     return out_arc, out_offset
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _at(points: Floats, arc: Floats, first: int, last: int, i: int, s: float) -> tuple[int, float, float]:
     """Segment, x, y at arc length s, looking from segment i on (either way); straight beyond the ends."""
     while i < last - 2 and arc[i + 1] < s:
@@ -168,7 +109,7 @@ def _at(points: Floats, arc: Floats, first: int, last: int, i: int, s: float) ->
     return i, x, y
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def roll(
     points: Floats,
     arc: Floats,

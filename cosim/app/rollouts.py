@@ -18,7 +18,7 @@ from cosim.seeding import generator
 from cosim.simulation.sumo import SumoSimulator
 from cosim.types import PolicyContext
 from cosim.worker import Worker
-from policy.agents.prediction_aware import AgentConfig
+from policy.agents.approaches import AgentConfig
 from policy.checkpoint import load as load_weights
 from policy.training.explorer import ExploreConfig, Explorer
 from policy.training.vfn import Drive, Drove, Lesson

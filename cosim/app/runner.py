@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
 
+from cosim.app.output import document
 from cosim.determinism import make_torch_deterministic
 from cosim.episode import Episode, run_episode
+from cosim.evaluation.replay.recorder import Recorder, Recording
 from cosim.scenario import Scenario
 from cosim.simulation.sumo import SumoSimulator
-from cosim.types import EpisodeResult, ObservationConfig
+from cosim.sumo_outputs import drafts
+from cosim.types import EpisodeResult, ObservationConfig, Policy
 from policy.agents import make
 
 
@@ -30,9 +34,47 @@ class Runner:
         )
         self._episode = Episode(scenario, self._simulator, wanted)
 
-    def run(self, seed: int, progress: Callable[[float, float], None] | None = None) -> EpisodeResult:
-        """One whole episode."""
-        return run_episode(self._episode, self._policy, seed, svo=self._svo, progress=progress)
+    def run(
+        self,
+        seed: int,
+        progress: Callable[[float, float], None] | None = None,
+        *,
+        outputs: Sequence[str] = (),
+        folder: Path | None = None,
+    ) -> EpisodeResult:
+        """One whole episode; SUMO's own `outputs` (`cosim.sumo_outputs`) go whole into `folder`."""
+        return self._drive(self._episode, self._policy, seed, progress, outputs, folder)
+
+    def record(
+        self,
+        seed: int,
+        progress: Callable[[float, float], None] | None = None,
+        *,
+        outputs: Sequence[str] = (),
+        folder: Path | None = None,
+    ) -> tuple[EpisodeResult, Recording]:
+        """`run`, watched: the same result, and what a replay draws."""
+        recorder = Recorder(self._simulator, self._policy)
+        episode = Episode(self._episode.scenario, recorder.simulator, self._episode.observation)
+        result = self._drive(episode, recorder.policy, seed, progress, outputs, folder)
+        return result, recorder.recording(document(result))
+
+    def _drive(
+        self,
+        episode: Episode,
+        policy: Policy,
+        seed: int,
+        progress: Callable[[float, float], None] | None,
+        outputs: Sequence[str],
+        folder: Path | None,
+    ) -> EpisodeResult:
+        with drafts(outputs, folder) as files:
+            self._simulator.write_outputs(files)
+            try:
+                return run_episode(episode, policy, seed, svo=self._svo, progress=progress)
+            finally:
+                if files:
+                    self._simulator.finish_outputs()
 
     def close(self) -> None:
         """End the simulation."""

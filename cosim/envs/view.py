@@ -11,8 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosim.actions import LANE_OFFSET
-from cosim.types import Bools, Bytes, Floats, Floats32, History, MetaAction
+from cosim.types import LANE_OFFSET, Bools, Bytes, Floats, Floats32, History, MetaAction
 
 LOOK_AHEAD = np.arange(0.0, 101.0, 10.0)  # [P] m ahead of the centre: 4 s at 25 m/s, the horizon
 SIDES = ("left", "keep", "right")

@@ -17,11 +17,12 @@ import numpy.typing as npt
 
 from cosim.geometry import kernels
 from cosim.geometry.kernels import encroachment
-from cosim.road import RoadMap
+from cosim.road import LaneGraph
 from cosim.types import Bools, Floats, Ints, Snapshot
 
 Number = float | npt.NDArray[Any]
 INF = np.inf
+EVERYWHERE: Bools = np.ones((1, 1), np.bool_)  # one road, on which all can touch
 
 
 class Boxes(NamedTuple):
@@ -95,31 +96,20 @@ class Conflicts(NamedTuple):
     deceleration: Floats  # [k] m/s2, the largest finite DRAC; 0 without a conflict or when overlapping only
 
 
-def conflicts(all_boxes: Boxes, watched: Bools, horizon: float = 10.0) -> Conflicts:
+def conflicts(
+    all_boxes: Boxes, watched: Bools, horizon: float = 10.0, roads: tuple[Ints, Bools] | None = None
+) -> Conflicts:
     """Conflicts of the `watched` [n] vehicles with any of the n (arrays [n] each), up to `horizon` s ahead.
 
-    The same as `time_to_collision` and `deceleration_to_avoid_crash` over all pairs, in one pass.
+    The same as `time_to_collision` and `deceleration_to_avoid_crash` over all pairs, in one pass. `roads`:
+    each vehicle's road [n] and which roads can touch [S,S] (`cosim.contact`); without them all can.
     """
-    columns = tuple(np.asarray(v, dtype=np.float64) for v in all_boxes)
-    found = kernels.watched_conflicts(*columns, watched, float(horizon))  # type: ignore[call-arg, arg-type]
-    return Conflicts(*found)
-
-
-class LaneGraph(NamedTuple):
-    """Which lane follows which, for walking ahead quickly; l lanes as in RoadMap.lanes."""
-
-    following: Ints  # [l] the lane one drives on to, -1 at the end
-    length: Floats  # [l] m
-
-
-def lane_graph(road: RoadMap) -> LaneGraph:
-    """The straightest successor of every lane (another vehicle's route is unknown): [l], [l] m."""
-    following = [
-        path.lanes[1] if len(path.lanes) > 1 else -1 for path in map(road.path, range(len(road.lanes)))
-    ]
-    return LaneGraph(
-        np.array(following, dtype=np.int64), np.array([lane.length for lane in road.lanes], dtype=np.float64)
+    x, y, heading, length, width, speed = (np.asarray(v, dtype=np.float64) for v in all_boxes)
+    number, touch = (np.zeros(len(x), np.int64), EVERYWHERE) if roads is None else roads
+    found = kernels.watched_conflicts(
+        x, y, heading, length, width, speed, watched, float(horizon), number, touch
     )
+    return Conflicts(*found)
 
 
 def gap_ahead(
@@ -152,14 +142,16 @@ def post_encroachment_time(a: Boxes, b: Boxes, interval: float, longest: float =
     headings differ by more than 15 degrees: crossing and merging, not following. Between samples the vehicles
     move at constant velocity, so the result does not depend on the sampling to first order.
     """
-    trail = np.stack([_trail(a), _trail(b)], axis=1)  # [T,2,5]
+    trail = np.stack([_trail(a), _trail(b)], axis=1)  # [T,2,6]
     sizes = np.array([[np.max(v.length), np.max(v.width)] for v in (a, b)], dtype=np.float64)  # [2,2] m
     relevant = np.ones(2, dtype=np.bool_)
     back = int(np.ceil(longest / interval))
     best = INF
     for t in range(1, len(trail)):
         window = trail[max(0, t - back) : t + 1]
-        best = min(best, float(encroachment(window, len(window) - 1, 2, sizes, relevant, interval)))
+        best = min(
+            best, float(encroachment(window, len(window) - 1, 2, sizes, relevant, interval, EVERYWHERE))
+        )
     return best if best <= longest else INF
 
 
@@ -170,8 +162,8 @@ def _quiet() -> np.errstate:
 
 def _trail(b: Boxes) -> Floats:
     heading = np.asarray(b.heading, dtype=np.float64)
-    parts = np.broadcast_arrays(b.x, b.y, np.cos(heading), np.sin(heading), b.speed)
-    return np.stack(parts, axis=-1).astype(np.float64)  # [T,5]
+    parts = np.broadcast_arrays(b.x, b.y, np.cos(heading), np.sin(heading), b.speed, 0.0)
+    return np.stack(parts, axis=-1).astype(np.float64)  # [T,6]
 
 
 def _poses(b: Boxes) -> tuple[Any, ...]:

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
 import numba
 import numpy as np
 import numpy.typing as npt
 
+from cosim.compiled import compiled
 from cosim.types import Bools, Floats, Ints
 
 FOLLOWING_COSINE = float(np.cos(np.radians(15.0)))  # headings closer than 15 degrees: following, not crossing
@@ -26,15 +27,6 @@ _HORIZON = 120.0  # s, how far ahead the deceleration to avoid a crash looks
 
 Box = tuple[float, float, float, float, float, float, float]
 _numba = cast(Any, numba)  # its decorators are not typed
-Function = TypeVar("Function", bound=Callable[..., Any])
-
-
-def compiled(function: Function) -> Function:
-    """numba's njit, cached on disk where a cache folder can be written (a read-only image has none)."""
-    try:
-        return cast(Function, _numba.njit(cache=True, error_model="numpy")(function))
-    except RuntimeError:
-        return cast(Function, _numba.njit(error_model="numpy")(function))
 
 
 def _ufunc(inputs: int, result: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
@@ -267,6 +259,8 @@ def watched_conflicts(
     speed: Floats,
     watched: Bools,
     horizon: float,
+    number: Ints,
+    touch: Bools,
 ) -> tuple[Ints, Floats, Floats]:
     """See `cosim.geometry.conflicts`."""
     n = len(x)
@@ -276,7 +270,7 @@ def watched_conflicts(
     for i in rows:
         a = (x[i], y[i], cosine[i], sine[i], length[i], width[i], speed[i])
         for j in range(n):
-            if j == i or (j < i and watched[j]):
+            if j == i or (j < i and watched[j]) or not touch[number[i], number[j]]:
                 continue  # both watched: done when it was j's turn
             b = (x[j], y[j], cosine[j], sine[j], length[j], width[j], speed[j])
             ttc = _ttc(a, b, horizon)
@@ -362,24 +356,26 @@ def record(
     y: Floats,
     heading: Floats,
     speed: Floats,
+    number: Ints,
 ) -> None:
-    """Write a frame of vehicles (numbers `slot` [n]) into a ring of frames, see `encroachment`."""
+    """Write a frame of vehicles (places `slot` [n]) into a ring of frames, see `encroachment`."""
     trail[newest] = np.nan
     for k in range(len(slot)):
         row = trail[newest, slot[k]]
         row[0], row[1], row[2], row[3], row[4] = x[k], y[k], np.cos(heading[k]), np.sin(heading[k]), speed[k]
+        row[5] = number[k]
 
 
 @compiled
 def encroachment(
-    trail: Floats, newest: int, m: int, sizes: Floats, relevant: Bools, interval: float
+    trail: Floats, newest: int, m: int, sizes: Floats, relevant: Bools, interval: float, touch: Bools
 ) -> float:
     """Smallest post-encroachment time (s, inf for none) that ends at the newest frame of a ring of frames.
 
-    trail [K,>=m,5] of the first m vehicles (x m, y m, cos heading, sin heading, speed m/s; NaN while absent),
-    `newest` its newest frame, the frame after it (cyclically) the oldest; sizes [>=m,2] length and width in
-    m; pairs without a `relevant` [>=m] vehicle are left out; `interval` s between frames. See
-    `post_encroachment_time`.
+    trail [K,>=m,6] of the first m vehicles (x m, y m, cos heading, sin heading, speed m/s, number of the
+    road; NaN while absent), `newest` its newest frame, the frame after it (cyclically) the oldest; sizes
+    [>=m,2] length and width in m; pairs without a `relevant` [>=m] vehicle are left out, and those whose
+    roads do not `touch` [S,S]; `interval` s between frames. See `post_encroachment_time`.
     """
     frames = trail.shape[0]
     bounds, course = _trail_bounds(trail, newest, m)
@@ -387,7 +383,7 @@ def encroachment(
     for b in range(m):
         if np.isnan(trail[newest, b, 0]):
             continue
-        x, y, c, s, v = trail[newest, b]
+        x, y, c, s, v, road = trail[newest, b]
         now = (x, y, c, s, sizes[b, 0], sizes[b, 1], v)
         for a in range(m):
             reach = 0.5 * (sizes[a, 0] + sizes[a, 1] + sizes[b, 0] + sizes[b, 1])
@@ -403,15 +399,15 @@ def encroachment(
                 k = (newest - age) % frames
                 if np.isnan(trail[k, a, 0]) or trail[k, a, 2] * c + trail[k, a, 3] * s > FOLLOWING_COSINE:
                     continue
-                xa, ya, ca, sa, va = trail[k, a]
+                xa, ya, ca, sa, va, other = trail[k, a]
                 then = (xa, ya, ca, sa, sizes[a, 0], sizes[a, 1], va)
-                if not _overlap(then, now):
+                if not _overlap(then, now) or not touch[int(road), int(other)]:
                     continue
                 _, leave = _contact(then, now, -va * ca, -va * sa)  # when a has left where b is now
                 before = (newest - 1) % frames
                 entry = interval  # when, since the frame before, b reached where a was
                 if not np.isnan(trail[before, b, 0]):
-                    xb, yb, cb, sb, vb = trail[before, b]
+                    xb, yb, cb, sb, vb, _ = trail[before, b]
                     came = (xb, yb, cb, sb, sizes[b, 0], sizes[b, 1], vb)
                     first, last = _contact(then, came, vb * cb, vb * sb)
                     if first < last:

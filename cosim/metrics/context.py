@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Protocol, TypeVar, cast
 
 import numpy as np
@@ -19,15 +20,21 @@ HORIZON = 10.0  # s, further ahead straight-line extrapolation says nothing (pap
 
 
 class ConflictView:
-    """The conflicts of a frame, worked out once for all the metrics that look at them."""
+    """The conflicts of a frame, worked out once for all the metrics that look at them.
 
-    def __init__(self) -> None:
+    Vehicles on roads that cannot touch (a bridge and what passes below it) have none with each other.
+    """
+
+    def __init__(self, road: RoadMap) -> None:
+        self._contact = road.contact
         self._snapshot: Snapshot | None = None
 
     def of(self, snapshot: Snapshot) -> Conflicts:
         """Conflicts of AVs and mission vehicles with anybody, up to `HORIZON` ahead."""
         if snapshot is not self._snapshot:
-            self._conflicts = conflicts(boxes(snapshot), watched(snapshot), HORIZON)
+            number = self._contact.numbers(snapshot.lane)
+            roads = number, self._contact.table
+            self._conflicts = conflicts(boxes(snapshot), watched(snapshot), HORIZON, roads)
             self._snapshot = snapshot
         return self._conflicts
 
@@ -41,7 +48,11 @@ class MetricContext:
     mission_kind: str  # merge, exit, roundabout, intersection, auto or none
     goal: frozenset[int]  # lanes (indices into RoadMap.lanes) on which the mission has succeeded
     duration: float  # s, counted
-    conflicts: ConflictView = field(default_factory=ConflictView, compare=False, repr=False)
+
+    @cached_property
+    def conflicts(self) -> ConflictView:
+        """Shared by the metrics of one episode."""
+        return ConflictView(self.road)
 
 
 class EpisodeMetric(Protocol):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cosim.geometry import gap_ahead, headway, lane_graph
+from cosim.geometry import gap_ahead, headway
 from cosim.metrics.context import AV, MetricContext
 from cosim.types import Metric, Snapshot
 
@@ -13,7 +13,7 @@ class Headway:
     """Net time headway (bumper to bumper) over all AV frames with somebody within 125 m ahead."""
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
-        self._graph = lane_graph(context.road)
+        self._graph = context.road.straight_on
         self._sum = 0.0  # s
         self._counted = 0
         self._smallest = np.inf  # s

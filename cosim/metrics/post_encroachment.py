@@ -16,9 +16,10 @@ class PostEncroachment:
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._interval = context.timing.frame  # s
+        self._contact = context.road.contact
         self._slots = Slots()
         self._frames = int(np.ceil(LONGEST / self._interval)) + 1
-        self._trail = np.full((self._frames, 64, 5), np.nan)  # x m, y m, cos, sin, m/s
+        self._trail = np.full((self._frames, 64, 6), np.nan)  # x m, y m, cos, sin, m/s, road
         self._sizes = np.zeros((64, 2))  # [slots,2] m
         self._watched = np.zeros(64, dtype=np.bool_)
         self._newest = -1
@@ -33,13 +34,20 @@ class PostEncroachment:
         self._watched = grown(self._watched, len(self._slots), False)
         self._trail = grown(self._trail, len(self._slots), np.nan, axis=1)
         self._newest = (self._newest + 1) % self._frames
-        record(self._trail, self._newest, slot, s.x, s.y, s.heading, s.speed)
+        number = self._contact.numbers(s.lane)
+        record(self._trail, self._newest, slot, s.x, s.y, s.heading, s.speed, number)
         if slot is not self._known:  # somebody came or left
             self._sizes[slot, 0], self._sizes[slot, 1] = s.length, s.width
             self._known = slot
         self._watched[slot] |= watched(s)
         found = encroachment(
-            self._trail, self._newest, len(self._slots), self._sizes, self._watched, self._interval
+            self._trail,
+            self._newest,
+            len(self._slots),
+            self._sizes,
+            self._watched,
+            self._interval,
+            self._contact.table,
         )
         self._smallest = min(self._smallest, found)
 

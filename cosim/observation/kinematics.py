@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
-from cosim.types import Bools, Floats, Floats32
+from cosim.compiled import compiled
+from cosim.geometry import gap_ahead
+from cosim.road import LaneGraph
+from cosim.types import Bools, Floats, Floats32, Ints, Snapshot
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def perceived(
     x: Floats,  # [n] m
     y: Floats,  # [n] m
@@ -34,18 +36,20 @@ def perceived(
                     seen[b, j] = True
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def choose_rows(
     x: Floats,  # [n] m
     y: Floats,  # [n] m
     egos: npt.NDArray[np.int64],  # [B]
     seen: Bools,  # [B,n]
     row_range: float,  # m
+    first: Bools,  # [B,n] who gets a row before all others
     rows: npt.NDArray[np.int64],  # [B,R] out: vehicle of each row, -1 for none; row 0 the ego
-) -> None:
-    """The ego and the nearest perceived vehicles within `row_range`, by distance."""
+) -> bool:
+    """The ego and the perceived vehicles within `row_range`, by distance; whether somebody found no row."""
     n, wanted = x.shape[0], rows.shape[1]
-    nearest = np.empty(wanted, np.float64)
+    rank = np.empty(wanted, np.float64)  # squared distance, less a lot for those who come first
+    full = False
     for b in range(egos.shape[0]):
         e = egos[b]
         rows[b] = -1
@@ -57,19 +61,45 @@ def choose_rows(
             d2 = (x[j] - x[e]) ** 2 + (y[j] - y[e]) ** 2
             if d2 > row_range * row_range:
                 continue
-            if count == wanted and d2 >= nearest[count - 1]:
+            if first[b, j]:
+                d2 -= 1e9
+            full = full or count == wanted
+            if count == wanted and d2 >= rank[count - 1]:
                 continue
             k = count if count < wanted else wanted - 1
-            while k > 1 and nearest[k - 1] > d2:
-                nearest[k] = nearest[k - 1]
+            while k > 1 and rank[k - 1] > d2:
+                rank[k] = rank[k - 1]
                 rows[b, k] = rows[b, k - 1]
                 k -= 1
-            nearest[k] = d2
+            rank[k] = d2
             rows[b, k] = j
             count = min(count + 1, wanted)
+        for k in range(2, count):  # those who came first take their places by distance
+            j, d2 = rows[b, k], rank[k] + (1e9 if first[b, rows[b, k]] else 0.0)
+            i = k
+            while i > 1 and rank[i - 1] + (1e9 if first[b, rows[b, i - 1]] else 0.0) > d2:
+                rank[i] = rank[i - 1]
+                rows[b, i] = rows[b, i - 1]
+                i -= 1
+            rank[i] = d2 - (1e9 if first[b, j] else 0.0)
+            rows[b, i] = j
+    return full
 
 
-@njit(cache=True, nogil=True)
+def never_left_out(snapshot: Snapshot, graph: LaneGraph, egos: Ints, reach: float) -> Bools:
+    """[B,n] the mission vehicles, and each ego's leader and follower along the lanes within `reach` m."""
+    first = np.repeat(snapshot.mission[None], len(egos), 0)
+    gap, leader = gap_ahead(snapshot, graph, np.arange(snapshot.n), reach)
+    for b, ego in enumerate(egos):
+        if leader[ego] >= 0:
+            first[b, leader[ego]] = True
+        behind = np.flatnonzero(leader == ego)
+        if len(behind):
+            first[b, behind[np.argmin(gap[behind])]] = True
+    return first
+
+
+@compiled
 def fill_rows(
     past: Floats,  # [N,S,4] x m, y m, speed m/s, unwrapped heading rad per slot; nan where absent
     slots: npt.NDArray[np.int64],  # [n] slot of each present vehicle

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from cosim.observation.kinematics import choose_rows, fill_rows, perceived
+from cosim.observation.kinematics import choose_rows, fill_rows, never_left_out, perceived
 from cosim.observation.past import KinematicPast, MapPast
 from cosim.raster import RoadRaster, channel_indices, draw_scene, rasterize_road
 from cosim.road import RoadMap
@@ -79,7 +79,10 @@ class Observer:
             return {}
         count = len(self._egos)
         rows = np.empty((count, c.rows), np.int64)
-        choose_rows(s.x, s.y, self._egos, self._seen, c.row_range, rows)
+        nobody = np.zeros((count, s.n), np.bool_)
+        if choose_rows(s.x, s.y, self._egos, self._seen, c.row_range, nobody, rows):
+            first = never_left_out(s, self._road.straight_on, self._egos, c.row_range)
+            choose_rows(s.x, s.y, self._egos, self._seen, c.row_range, first, rows)
         kinematics = np.empty((count, c.frames, c.rows, len(KINEMATIC_FEATURES)), np.float32)
         valid = np.empty((count, c.frames, c.rows), np.bool_)
         fixed = np.stack([s.length, s.width, s.kind == int(Kind.AV), s.mission], axis=1).astype(np.float64)

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import libsumo
 
-from cosim.actions import MAX_DECEL, tracked_speed
+from cosim.actions import LANE_CHANGE_TIME, MAX_DECEL, tracked_speed
+from cosim.simulation.convert import may_change
 from cosim.simulation.fleet import AV_IDM
 from cosim.types import Command, Preset, Receipt
 
-LANE_CHANGE_TIME = 2.0  # s, contract.md; the same as SUMO's --lanechange.duration
 # SUMO's bit fields (https://sumo.dlr.de/docs/TraCI/Change_Vehicle_State.html): 6 keeps only the physical
 # acceleration limits, so the agent can crash; 31 and 512 let SUMO's own safety override the agent.
 SPEED_MODE = {Preset.UNGUARDED: 6, Preset.GUARDED: 31}
@@ -114,7 +114,10 @@ class Commander:
         target = int(index) + offset
         if not 0 <= target < libsumo.edge.getLaneNumber(edge):
             return "no lane on that side"
+        kind = libsumo.vehicle.getVehicleClass(name)
         allowed = libsumo.lane.getAllowed(f"{edge}_{target}")
-        if allowed and libsumo.vehicle.getVehicleClass(name) not in allowed:
+        if allowed and kind not in allowed:
             return "the lane is closed to this vehicle class"
+        if not may_change(lane, offset, kind):
+            return "lane changes are forbidden here"
         return None

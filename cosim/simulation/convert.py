@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import libsumo
@@ -20,7 +20,8 @@ GETTERS = tuple(
     for name in ("Position", "Angle", "Speed", "Acceleration", "LaneID", "LanePosition")
 )
 GIVE_WAY = "mswZ"  # link states: minor, stop, all-way stop, zipper (SUMO, Networks/SUMO_Road_Networks)
-MOTOR_CLASSES = {"passenger", "private", "taxi", "bus", "truck", "trailer", "delivery", "motorcycle"}
+CAR = "passenger"  # SUMO's class of cars, AVs among them
+MOTOR_CLASSES = frozenset({CAR, "private", "taxi", "bus", "truck", "trailer", "delivery", "motorcycle"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,8 +111,8 @@ def read_road(zones: Sequence[Zone], scenario_file: object) -> RoadMap:
                 width=get.getWidth(name),
                 speed_limit=get.getMaxSpeed(name),
                 successors=tuple(dict.fromkeys(successors)),
-                left=-1 if name.startswith(":") else place.get(f"{edge}_{int(number) + 1}", -1),
-                right=-1 if name.startswith(":") else place.get(f"{edge}_{int(number) - 1}", -1),
+                left=_beside(name, place, 1),
+                right=_beside(name, place, -1),
                 internal=name.startswith(":"),
                 start=libsumo.edge.getFromJunction(edge),
                 end=libsumo.edge.getToJunction(edge),
@@ -125,6 +126,23 @@ def read_road(zones: Sequence[Zone], scenario_file: object) -> RoadMap:
     )
     road = RoadMap(tuple(lanes), found, outlines)
     return road if found else replace(road, zones=(_struggling_zone(road),))
+
+
+def may_change(lane: str, offset: int, vehicle_class: str) -> bool:
+    """Whether SUMO lets a vehicle of this class leave the lane to that side (+1 left), if there is a lane."""
+    return not lane.startswith(":") and vehicle_class in libsumo.lane.getChangePermissions(lane, offset)
+
+
+def _beside(lane: str, place: Mapping[str, int], offset: int) -> int:
+    """The lane to that side (+1 left) that a car may change to, -1 without one: a command that SUMO will
+    refuse is seen beforehand. Lanes closed to cars are asked on behalf of those that may use them."""
+    edge, _, number = lane.rpartition("_")
+    other = f"{edge}_{int(number) + offset}"
+    if other not in place:
+        return -1
+    here, there = (frozenset(libsumo.lane.getAllowed(i)) or MOTOR_CLASSES for i in (lane, other))
+    classes = {CAR} if CAR in here else MOTOR_CLASSES & here
+    return place[other] if any(may_change(lane, offset, c) for c in classes & there) else -1
 
 
 def struggling_lanes(road: RoadMap) -> frozenset[int]:

@@ -20,6 +20,7 @@ from cosim.simulation.convert import Body, SnapshotReader, read_road, struggling
 from cosim.simulation.drivers import Drivers
 from cosim.simulation.fleet import Fleet
 from cosim.simulation.stderr import SumoStderr
+from cosim.sumo_outputs import sumo_options
 from cosim.types import Bools, Collision, Command, Events, Kind, Receipt, Snapshot
 
 SUMO_ERRORS = (libsumo.TraCIException, libsumo.FatalTraCIError)
@@ -66,6 +67,7 @@ class SumoSimulator:
         self._history = history
         self._stderr = SumoStderr()
         self._started = self._closed = False
+        self._outputs: dict[str, Path] = {}
         _in_use = True
         timing = scenario.timing
         self._steps_per_frame = round(timing.frame / timing.step)
@@ -145,6 +147,22 @@ class SumoSimulator:
             "waiting": len(libsumo.simulation.getPendingVehicles()),
         }
 
+    def write_outputs(self, files: Mapping[str, Path]) -> None:
+        """SUMO's own outputs (name -> file, see `cosim.sumo_outputs`) of the episodes from the next on."""
+        self._outputs = dict(files)
+
+    def finish_outputs(self) -> None:
+        """End SUMO, which makes its files whole, and ask for no more; the next `reset` starts it again."""
+        self._outputs = {}
+        if self._started:
+            self._started = False
+            with self._stderr:
+                libsumo.close()
+
+    def driver_classes(self) -> dict[str, str]:
+        """Each HV's class of Table II (none where the traffic is as it is): for drawing, not for policies."""
+        return dict(self._drivers.classes)
+
     def close(self) -> None:
         """End SUMO and free the process for another simulation."""
         global _in_use
@@ -178,6 +196,7 @@ class SumoSimulator:
         additional = [*s.additional]
         if not s.built_in:
             additional.append(Path(__file__).parents[2] / "sumo_scenarios" / "types.add.xml")
+        settings, files = sumo_options(self._outputs, s)
         options = {
             "net-file": str(s.net),
             "route-files": ",".join(map(str, s.demand)),
@@ -186,8 +205,10 @@ class SumoSimulator:
             "step-length": f"{s.timing.step:g}",
             "seed": str(seed % (2**31 - 1)),
             **DEFAULTS,
+            **settings,
             **dict(s.options),
             **FORCED,
+            **files,
         }
         return [text for key, value in options.items() if value for text in (f"--{key}", value)]
 

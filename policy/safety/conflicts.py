@@ -7,10 +7,11 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from cosim.actions import MAX_DECEL
 from cosim.geometry import Boxes, time_to_collision
 from cosim.road import LanePath, RoadMap
 from cosim.types import Bools, Floats, MetaAction
-from policy.motion import MAX_DECEL, Rollout, project_all
+from policy.motion import Rollout, project_all
 from policy.safety.config import SafetyConfig
 from policy.safety.maneuver import Futures
 from policy.scene import Scene
@@ -32,8 +33,7 @@ def others_near(
         rows = scene.row[b, 1:]
         rows = rows[rows >= 0]
     rows = rows[traffic.known[rows]]
-    lane = int(scene.lane[me])
-    return np.array([k for k in rows if road.connected(lane, int(scene.lane[k]))], np.int64)
+    return np.asarray(rows[road.contact.touch(int(scene.lane[me]), scene.lane[rows])])
 
 
 def first_contact(
@@ -141,11 +141,7 @@ def gap_margin(
     ratio = np.full(len(others), np.inf)  # of the gap there is to the gap needed
     if action != MetaAction.DECELERATE:
         told = intended[others]
-        stopping = np.where(
-            told,
-            _stopping(ego, action, futures.lag[action], c),
-            _stopping(ego, action, futures.lag[action] + c.reaction, c),
-        )
+        stopping = np.where(told, _stopping(ego, action, 0.0, c), _stopping(ego, action, c.reaction, c))
         need = np.maximum(stopping - speed**2 / (2 * c.leader_brake), 0.0) + c.standstill_gap
         ratio = np.where(near.ahead, near.gap / need, ratio)
     if changes:

@@ -6,22 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cosim.actions import LANE_CHANGE_TIME, MAX_DECEL, braking_speeds, next_target, tracked_speeds
 from cosim.road import LanePath, RoadMap
 from cosim.types import Bools, Floats, History, MetaAction
-from policy.motion import (
-    LANE_CHANGE_TIME,
-    MAX_DECEL,
-    SPEED_STEP,
-    Rollout,
-    braking_speeds,
-    fronts,
-    next_target,
-    pack,
-    project,
-    project_many,
-    roll_out,
-    tracked_speeds,
-)
+from policy.motion import Rollout, fronts, pack, project, project_many, roll_out
 from policy.safety.config import SafetyConfig
 
 ACTIONS = tuple(MetaAction)
@@ -78,7 +66,6 @@ class Futures(NamedTuple):
 
     under: Rollout  # [A,T+1] what each action is judged by
     intention: Rollout  # [A,T+1] what the allies are told
-    lag: Floats  # [A] s until braking begins: the target speed may be far above the speed
 
 
 def roll_ego(history: History, paths: list[LanePath], now: Floats, c: SafetyConfig) -> Futures:
@@ -88,7 +75,7 @@ def roll_ego(history: History, paths: list[LanePath], now: Floats, c: SafetyConf
     Decelerate is judged by that: it is safe as long as braking helps. The allies are told of one step of it.
     """
     speed, limit = float(now[2]), history.route.speed_limit
-    targets = np.array([next_target(history.target_speed, a, limit) for a in ACTIONS], np.float64)
+    targets = np.array([next_target(history.target_speed, speed, a, limit) for a in ACTIONS], np.float64)
     slower = ACTIONS.index(MetaAction.DECELERATE)
     rows = [*range(len(ACTIONS)), slower]  # the last one: Decelerate once
     packed = pack([paths[k] for k in rows])
@@ -112,11 +99,8 @@ def roll_ego(history: History, paths: list[LanePath], now: Floats, c: SafetyConf
         c.dt,
     )
     told = [*rows[:slower], len(ACTIONS), *rows[slower + 1 : -1]]
-    steps = np.ceil((targets - speed) / SPEED_STEP - 1e-6)  # decisions until the target is below the speed
     return Futures(
-        Rollout(*(array[: len(ACTIONS)] for array in out)),
-        Rollout(*(array[told] for array in out)),
-        c.reaction * np.maximum(steps, 0.0),
+        Rollout(*(array[: len(ACTIONS)] for array in out)), Rollout(*(array[told] for array in out))
     )
 
 

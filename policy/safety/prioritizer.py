@@ -16,9 +16,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cosim.actions import LANE_CHANGE_TIME
 from cosim.road import RoadMap
 from cosim.types import Bools, Decision, Floats, Floats32, History, MetaAction
-from policy.motion import LANE_CHANGE_TIME, Rollout
+from policy.motion import Rollout
 from policy.safety.config import SafetyConfig
 from policy.safety.conflicts import Neighbours, first_contact, gap_margin, others_near
 from policy.safety.maneuver import (

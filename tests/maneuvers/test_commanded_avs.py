@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from conftest import Start, vehicle
 
+import cosim
+from cosim.geometry import boxes, overlapping_pairs
 from cosim.scenario import Scenario, load
 from cosim.simulation.sumo import SumoSimulator
 from cosim.types import Collision, Command, Receipt, Snapshot
@@ -73,6 +75,27 @@ def test_a_second_lane_change_meanwhile_and_one_off_the_road_are_refused_with_a_
     assert off[0] == Receipt("a", False, "no lane on that side")
 
 
+def test_where_lane_changes_are_forbidden_the_map_shows_no_lane_beside_and_the_receipt_says_why(
+    start: Start,
+) -> None:
+    """The entry edges, on which demand settles: changeLeft and changeRight allow nobody."""
+    entering = (
+        '<route id="far" edges="entry main_in main_acc main_out"/><vehicle id="a" type="av" route="far" '
+        'depart="0" departPos="20" departSpeed="20"/>'
+    )
+    (receipts,), frames = drive(start([entering]), [Command("a", 20.0, 1, HOLD)])
+    assert receipts == (Receipt("a", False, "lane changes are forbidden here"),)
+    assert np.ptp(of(frames, "a", "y")) == pytest.approx(0.0, abs=0.01)
+    with cosim.open("merge") as session:
+        lanes = {lane.id: lane for lane in session.road().lanes}
+    for name, left, right in (
+        ("entry_0", False, False),
+        ("entry_1", False, False),
+        ("main_in_0", True, False),
+    ):
+        assert (lanes[name].left >= 0, lanes[name].right >= 0) == (left, right)
+
+
 def test_a_command_for_a_car_that_is_not_there_says_so(start: Start) -> None:
     worker = start([vehicle("a", "av", 100.0)])
     (receipts,), _ = drive(worker, [Command("ghost", 20.0, 0, HOLD)])
@@ -119,6 +142,20 @@ def test_cutting_in_close_before_a_faster_car_is_the_av_s_fault(start: Start) ->
     crash = collisions(frames)[0]
     assert {crash.collider, crash.victim} == {"a", "h"}
     assert crash.av_caused
+
+
+def test_passing_the_tail_of_a_car_that_changed_lanes_at_a_crawl_is_no_crash(start: Start) -> None:
+    """SUMO leaves it 30 degrees askew, its tail in the lane it has left; its drivers do not see that tail."""
+    cars = [vehicle("slow", "av", 130.0, lane=0, speed=0.4), vehicle("a", "av", 110.0, lane=0, speed=0.0)]
+    worker = start(cars)
+    _, changing = drive(worker, [Command("slow", 0.4, 1, HOLD), Command("a", 0.0, 0, HOLD)])
+    _, waiting = drive(worker, [Command("slow", 0.4, 0, HOLD), Command("a", 0.0, 0, HOLD)], 5)
+    _, passing = drive(worker, [Command("slow", 0.4, 0, HOLD), Command("a", 5.0, 0, HOLD)], 20)
+    assert np.degrees(of(waiting, "slow", "heading").max()) > 25.0
+    both = [overlapping_pairs(boxes(f)) for f in passing]
+    assert any(len(pairs) for pairs in both), "the boxes as drawn do touch"
+    assert of(passing, "a", "x")[-1] > of(passing, "slow", "x")[-1], "it has passed"
+    assert not collisions(changing + waiting + passing)
 
 
 def test_an_av_that_is_released_follows_its_leader_again(start: Start) -> None:

@@ -76,9 +76,10 @@ def drive(
     mission: str = "none",
     goal: frozenset[int] = frozenset(),
     events: Mapping[int, Events] | None = None,
+    road: RoadMap | None = None,
 ) -> dict[str, float | int | bool | None]:
     """The figures of a scripted drive; `events`: frame number -> what happened before it."""
-    context = MetricContext(straight_road(), Timing(), mission, goal, seconds)
+    context = MetricContext(road or straight_road(), Timing(), mission, goal, seconds)
     metrics = Metrics()
     metrics.reset(frame(cars, 0.0), context)
     for k in range(1, round(seconds / FRAME) + 1):
@@ -125,6 +126,33 @@ def test_a_crossing_leaves_its_known_post_encroachment_time() -> None:
     seen = drive({"av": steady(-50.0, 20.0, kind=Kind.AV), "north": north})
     assert seen["min_pet_s"] == pytest.approx(0.65)
     assert seen["min_ttc_s"] is None  # at constant speed they never touch
+
+
+def test_a_car_on_a_bridge_is_in_no_conflict_with_one_below_it() -> None:
+    """The same two drives: on a crossing they nearly meet, on a bridge only the map does."""
+
+    def roads(southern_end: str) -> RoadMap:
+        east, north = np.array([[-900.0, 0.0], [900.0, 0.0]]), np.array([[0.0, -900.0], [0.0, 900.0]])
+        return RoadMap(
+            (
+                Lane("low_0", "low", 0, east, 1800.0, 3.2, 30.0, start="w", end="e"),
+                Lane("high_0", "high", 0, north, 1800.0, 3.2, 30.0, start=southern_end, end="n"),
+            )
+        )
+
+    def cars(away: float) -> dict[str, Car]:
+        north = Car(lambda _: 0.0, y=lambda t: away + 20.0 * t, heading_deg=90.0, lane=lambda _: 1)
+        return {"av": steady(-50.0, 20.0, kind=Kind.AV), "north": north}
+
+    meeting = drive(cars(-52.0), road=roads("w"))
+    assert meeting["min_ttc_s"] == pytest.approx(0.0, abs=0.2)
+    assert meeting["max_drac_mps2"] > 5.0  # type: ignore[operator]
+    assert drive(cars(-70.0), road=roads("w"))["min_pet_s"] == pytest.approx(0.65)
+    for away in (-52.0, -70.0):
+        bridge = drive(cars(away), road=roads("s"))
+        assert bridge["min_ttc_s"] is None
+        assert bridge["max_drac_mps2"] == 0.0
+        assert bridge["min_pet_s"] is None
 
 
 def test_conflicts_among_bystanders_are_not_the_avs() -> None:

@@ -25,7 +25,7 @@ def scene(**columns: list[float]) -> Snapshot:
         accel=np.zeros(n),
         length=np.full(n, 5.0),
         width=np.full(n, 2.0),
-        lane=np.zeros(n, np.int32),
+        lane=np.array(full.get("lane", [0] * n), np.int32),
         lane_position=np.array(full["x"], float) + 2.5,
     )
 
@@ -121,6 +121,26 @@ def test_more_vehicles_than_rows_keeps_the_nearest() -> None:
     history = look(scene(x=[500.0] + [500.0 + 5 * k for k in range(20, 0, -1)]))
     distances = history.kinematics[-1, 1:, 0]
     assert distances == pytest.approx(np.arange(5.0, 80.0, 5.0))
+
+
+def test_in_a_dense_queue_the_mission_vehicle_and_the_ego_s_own_leader_and_follower_keep_a_row() -> None:
+    """16 cars in the next lane are nearer than any of the three."""
+    beside = [500.0 + 4.0 * k for k in range(-8, 8)]
+    queue = scene(
+        x=[500.0, 560.0, 430.0, 610.0, 575.0, *beside],
+        y=[1.6, 1.6, 1.6, 8.0, 1.6, *[4.8] * 16],
+        lane=[0, 0, 0, 2, 0, *[1] * 16],
+        mission=[0, 0, 0, 1, 0, *[0] * 16],
+    )
+    history = look(queue)
+    assert history.ids[-3:] == ("v1", "v2", "v3"), "leader, follower, mission vehicle, by distance"
+    assert history.valid[-1].all()
+    distances = np.hypot(*history.kinematics[-1, :, :2].T)
+    assert (np.diff(distances) >= 0.0).all()
+    assert "v4" not in history.ids, "the leader's leader has no such right"
+    assert set(history.ids[1:13]) <= {f"v{k}" for k in range(5, 21)}, "the nearest of the others"
+    alone = look(queue, ObservationConfig(share_perception=False, perception_range=50.0))
+    assert {"v1", "v2", "v3"}.isdisjoint(alone.ids), "nobody sees further than before"
 
 
 def test_a_row_follows_its_vehicle_through_the_history() -> None:

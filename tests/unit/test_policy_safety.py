@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from policy_scenes import LANE_WIDTH, Car, histories, straight_road
 
-from cosim.actions import MAX_ACCEL, MAX_DECEL, SPEED_MARGIN, SPEED_STEP, TIME_CONSTANT, tracked_speed
-from cosim.actions import next_target as commanded_target
+from cosim.actions import braking_speeds, next_target, tracked_speed, tracked_speeds
 from cosim.road import RoadMap
 from cosim.types import Decision, MetaAction
 from policy import motion
@@ -262,21 +261,35 @@ def test_a_larger_threshold_masks_more(field: str) -> None:
 
 
 def test_the_mask_moves_the_ego_as_the_simulator_does() -> None:
-    assert (motion.SPEED_STEP, motion.SPEED_MARGIN) == (SPEED_STEP, SPEED_MARGIN)
-    assert (motion.TIME_CONSTANT, motion.MAX_DECEL, motion.MAX_ACCEL) == (TIME_CONSTANT, MAX_DECEL, MAX_ACCEL)
-    for limit in (13.9, 25.0, 33.3):
-        for target in np.arange(0.0, limit + 2.0, 0.7):
-            for action in MetaAction:
-                mine = motion.next_target(float(target), action, limit)
-                assert mine == pytest.approx(commanded_target(float(target), action, limit))
     for target in (0.0, 15.0, 27.0):
         speed, expected = 20.0, [20.0]
         for k in range(20):
             speed = tracked_speed(speed, target, 0.1)
             if k % 2:
                 expected.append(speed)
-        found = motion.tracked_speeds(20.0, np.array([target]), 10, 0.2)[0]
+        found = tracked_speeds(20.0, np.array([target]), 10, 0.2)[0]
         np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_the_mask_brakes_as_decelerating_at_every_decision_does() -> None:
+    speed, target, expected = 24.3, 25.0, [24.3]
+    for k in range(30):
+        if k % 4 == 0:
+            target = next_target(target, speed, SLOWER, 25.0)
+        speed = tracked_speed(speed, target, 0.1)
+        if k % 2:
+            expected.append(speed)
+    found = braking_speeds(24.3, next_target(25.0, 24.3, SLOWER, 25.0), 15, 0.2, 0.4)
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_a_target_far_above_the_speed_does_not_delay_braking() -> None:
+    """Wind-up: accelerating from 12 m/s towards 27, one Decelerate brakes, so a leader's stop is survived."""
+    road = straight_road(1)
+    cars = [Car("ego", 100.0, 0, 12.0, is_av=True, target=27.0), Car("wall", 160.0, 0, 0.0)]
+    decision = decide(cars, road)["ego"]
+    assert SLOWER not in masked(decision)
+    assert decision.action == SLOWER
 
 
 def test_a_rollout_follows_a_bend_and_a_car_trails_its_front() -> None:

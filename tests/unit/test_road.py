@@ -83,6 +83,7 @@ def test_roads_at_different_heights_do_not_touch() -> None:
     assert not road.connected(0, 1)
     assert road.connected(0, 2)
     assert road.connected(0, -1)
+    assert list(road.contact.touch(0, np.array([0, 1, 2, -1]))) == [True, False, True, True]
 
 
 def test_other_drivers_are_taken_to_go_straight_on() -> None:

@@ -1,0 +1,234 @@
+"""`cosim replay`: find an episode in a run folder, drive it once more, prove that it is the same, draw it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from cosim.app.progress import Progress
+from cosim.app.runner import Runner
+from cosim.errors import BadInput, CosimError
+from cosim.evaluation.case import Case
+from cosim.evaluation.replay.recorder import Recording
+from cosim.manifest import manifest
+from cosim.scenario import Scenario
+from cosim.sumocfg import CLOCK, INPUTS, command_line, hint, keeps
+from cosim.types import EpisodeResult
+from cosim.vet import vetted
+from cosim.worker import Worker
+
+MANIFEST = "manifest.json"
+CASE, OPTIONS = "case", "sumo_arguments"  # what `cosim run --out` adds to the manifest
+DRIVEN = "ok"  # status of an episode that was driven to its end
+
+
+class ReplayDiffers(CosimError):
+    """The episode driven again is not the recorded one: like a failed threshold, exit code 1."""
+
+    exit_code = 1
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """One episode as a run folder remembers it."""
+
+    case: Case
+    options: tuple[str, ...]  # SUMO's own, as typed after `--`
+    manifest: Mapping[str, Any]
+    trace_hash: str
+    folder: Path
+
+    @property
+    def name(self) -> str:
+        """Of the files that are drawn."""
+        return f"replay-{self.case.key}" if (self.folder / "episodes.parquet").exists() else "replay"
+
+
+def remembered(case: Case, options: Sequence[str]) -> dict[str, Any]:
+    """What a manifest has to hold beside the usual so that `find` finds the episode again.
+
+    Outputs are left out: a replay does not write them again.
+    """
+    kept: list[str] = []
+    for name, value in command_line(options).items():
+        if name in INPUTS:
+            value = ",".join(str(Path(part.strip()).absolute()) for part in value.split(","))
+        if name in (*INPUTS, *CLOCK) or keeps(name):
+            kept += [f"--{name}={value}"]
+    return {CASE: case.document(), OPTIONS: kept}
+
+
+def find(folder: Path, episode: str | None) -> Recorded:
+    """The episode in a folder of `cosim run --out` (`episode` may be None) or of `cosim evaluate`.
+
+    `episode`: the key, or the seed where only one episode has it.
+
+    Raises:
+        BadInput: no such folder, not a run folder, no such episode (with the nearest key), one that was not
+            driven to its end.
+    """
+    document = _json(folder / MANIFEST)
+    if "cells" in document:
+        return _of_batch(folder, document, episode)
+    if CASE not in document:
+        raise BadInput("was not written by this version of cosim run or evaluate", file=folder / MANIFEST)
+    recorded = Recorded(
+        Case.read(document[CASE]),
+        tuple(document.get(OPTIONS, ())),
+        document,
+        _json(folder / "result.json").get("trace_hash", ""),
+        folder,
+    )
+    if episode is not None and episode not in (recorded.case.key, str(recorded.case.seed)):
+        problem = f"this folder holds one episode, with seed {recorded.case.seed}"
+        raise BadInput(problem, field="EPISODE", value=episode)
+    return recorded
+
+
+def check_inputs(recorded: Recorded) -> tuple[Scenario, list[str]]:
+    """The scenario, its files being those that were driven then; warnings where versions are others.
+
+    Raises:
+        BadInput: a file has changed (named), or a setting of the scenario has.
+    """
+    scenario = vetted(recorded.case.scenario(recorded.options))
+    then, now = recorded.manifest, manifest(scenario, recorded.case.seed)
+    paths = {p.name: p for p in (scenario.config, scenario.net, *scenario.demand, *scenario.additional)}
+    for name, digest in now["files"].items():
+        before = then.get("files", {}).get(name)
+        if before != digest:
+            problem = "was not among the files of the recorded run"
+            if before is not None:
+                problem = f"has changed since it was driven (SHA-256 {before[:12]}..., now {digest[:12]}...)"
+            raise BadInput(problem, file=paths[name])
+    for name in sorted(then.get("files", {}).keys() - now["files"].keys()):
+        raise BadInput("belonged to the recorded run, and to this one no more", file=name)
+    for name in sorted(now.keys() - {"files", "versions", "seed", "options_not_passed_on"}):
+        if name in then and then[name] != now[name]:
+            problem = f"is {now[name]!r} now, it was {then[name]!r} when it was driven"
+            raise BadInput(problem, file=recorded.folder / MANIFEST, field=name)
+    versions = then.get("versions", {})
+    warnings = [
+        f"driven with {name} {before}, here is {now['versions'].get(name)}: the replay may differ"
+        for name, before in versions.items()
+        if name in now["versions"] and now["versions"][name] != before
+    ]
+    return scenario, warnings
+
+
+def drive(recorded: Recorded, scenario: Scenario, *, check: bool = True) -> tuple[EpisodeResult, Recording]:
+    """Drive it again, watched.
+
+    Raises:
+        ReplayDiffers: the trace hash is another one (only with `check`).
+    """
+    case = recorded.case
+    with _progress(f"replay {scenario.name} {case.policy}", "s") as progress:
+        worker = Worker(Runner, scenario, case.policy, math.radians(case.svo_deg), name="cosim-replay")
+        with worker:
+            result, recording = worker.call("record", case.seed, progress=progress)
+    if check and result.trace_hash != recorded.trace_hash:
+        raise ReplayDiffers(
+            f"the replay is not the recorded episode: trace hash {result.trace_hash[:16]}... after "
+            f"{result.steps} decisions, recorded was {recorded.trace_hash[:16]}... (--no-check draws it all "
+            "the same)"
+        )
+    return result, recording
+
+
+def draw(recording: Recording, html: Path | None, mp4: Path | None, follow: str | None = None) -> None:
+    """Write the page and the film, each whole or not at all.
+
+    Raises:
+        BadInput: `follow` is no vehicle of the episode; a file cannot be written.
+    """
+    names = list(dict.fromkeys(track.id for track in recording.tracks))
+    if follow is not None and follow not in names:
+        raise BadInput(f"no such vehicle{hint(follow, names)}", field="--follow", value=follow)
+    if html is not None:
+        from cosim.evaluation.replay.page import page
+
+        with _writing(html) as draft:
+            draft.write_text(page(recording), "utf-8")
+    if mp4 is not None:
+        from cosim.evaluation.replay.video import film
+
+        with _progress("film", "pictures") as progress, _writing(mp4) as draft:
+            film(recording, draft, follow=follow, progress=progress)
+
+
+def warn(lines: Sequence[str]) -> None:
+    """Warnings on stderr."""
+    for line in lines:
+        print(f"cosim: warning: {line}", file=sys.stderr)
+
+
+def _of_batch(folder: Path, document: Mapping[str, Any], episode: str | None) -> Recorded:
+    from pyarrow import parquet
+
+    table = folder / "episodes.parquet"
+    try:
+        rows = parquet.read_table(table, columns=["key", "cell", "seed", "status", "trace_hash"]).to_pylist()
+    except (OSError, ValueError, KeyError) as error:
+        raise BadInput(f"cannot be read: {str(error).splitlines()[0]}", file=table) from None
+    if episode is None:
+        raise BadInput(f"holds {len(rows)} episodes: name one by its key or seed", file=folder)
+    found = [r for r in rows if r["key"] == episode] or [r for r in rows if str(r["seed"]) == episode]
+    if not found:
+        raise BadInput(
+            f"no such episode{hint(episode, [r['key'] for r in rows])}", field="EPISODE", value=episode
+        )
+    if len(found) > 1:
+        keys = ", ".join(r["key"] for r in found[:4]) + (", ..." if len(found) > 4 else "")
+        raise BadInput(f"{len(found)} episodes have this seed: {keys}", field="EPISODE", value=episode)
+    row = found[0]
+    if row["status"] != DRIVEN:
+        problem = f"was not driven to its end (status {row['status']}): nothing to compare with"
+        raise BadInput(problem, field="EPISODE", value=row["key"])
+    cell = document["cells"][row["cell"]]
+    case = Case.read({**cell[CASE], "seed": row["seed"]})
+    return Recorded(replace(case, seed=row["seed"]), (), cell["manifest"], row["trace_hash"], folder)
+
+
+def _json(path: Path) -> dict[str, Any]:
+    try:
+        document = json.loads(path.read_text("utf-8"))
+    except FileNotFoundError:
+        problem = "no such file: a folder of cosim run --out or cosim evaluate is needed"
+        raise BadInput(problem, file=path) from None
+    except OSError as error:
+        raise BadInput(f"cannot be read: {error.strerror}", file=path) from None
+    except ValueError as error:
+        raise BadInput(f"not JSON: {error}", file=path) from None
+    if not isinstance(document, dict):
+        raise BadInput("not a JSON object", file=path)
+    return document
+
+
+@contextlib.contextmanager
+def _writing(path: Path) -> Iterator[Path]:
+    """A draft beside `path` that takes its place when the block ends well."""
+    draft = path.with_name(f".{path.name}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield draft
+        draft.replace(path)
+    except OSError as error:
+        raise BadInput(f"cannot write: {error.strerror or error}", file=path) from None
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _progress(title: str, unit: str) -> Iterator[Progress]:
+    progress = Progress(title, unit)
+    try:
+        yield progress
+    finally:
+        progress.done()

@@ -1,0 +1,11 @@
+"""The verbs of the command line, in the order `cosim --help` shows them.
+
+Each module has `add(verbs)`, which registers one sub-command and its flags, and `work(args) -> int`, which
+does it and returns the exit code. What a verb needs is imported inside `work`: `cosim --help` stays quick.
+"""
+
+from __future__ import annotations
+
+from cosim.app.verbs import doctor, evaluate, replay, run, scenarios
+
+VERBS = (run, evaluate, replay, scenarios, doctor)

@@ -1,0 +1,129 @@
+"""`cosim run`: drive one episode of one scenario with one policy."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+from cosim.app.verbs import arguments
+from cosim.errors import BadInput
+from cosim.evaluation.case import Case
+from cosim.scenario import BEHAVIORS, DRIVER_MODELS
+from cosim.types import Preset
+from cosim.xml_input import is_there
+
+
+def add(verbs: arguments.Verbs) -> None:
+    """Register the verb and its flags."""
+    run = verbs.add_parser(
+        "run",
+        help="drive one episode of a scenario",
+        description="Drive one episode. Everything after -- goes to SUMO as it stands.",
+    )
+    run.add_argument("what", metavar="WHAT", help="a scenario's name (cosim scenarios) or any .sumocfg")
+    run.add_argument(
+        "--demand", action="append", default=[], metavar="NAME|FILE", help="demand by name, or route files"
+    )
+    run.add_argument("--policy", default="idm", metavar="NAME", help="who commands the AVs (default idm)")
+    run.add_argument("--svo", type=arguments.degrees, default=45.0, metavar="DEG", help="SVO angle, 0..90")
+    run.add_argument("--behavior", choices=BEHAVIORS, help="Table II class of the human drivers")
+    run.add_argument("--driver-model", choices=DRIVER_MODELS, default="lc2013")
+    run.add_argument("--preset", choices=Preset.ALL, help="who guards the AVs (default: the scenario's)")
+    fleet = run.add_mutually_exclusive_group()
+    fleet.add_argument("--av-type", metavar="T", help="AVs are the vehicles of this vType")
+    fleet.add_argument("--av-ids", metavar="REGEX", help="AVs are the vehicles whose id matches")
+    fleet.add_argument(
+        "--penetration", type=arguments.share, metavar="P", help="this share of vehicles are AVs, 0..1"
+    )
+    run.add_argument("--seed", type=arguments.seed, default=200_000, metavar="N")
+    run.add_argument(
+        "--duration", type=arguments.positive, metavar="S", help="counted s (default: the scenario's)"
+    )
+    run.add_argument("--out", metavar="DIR", help="write the run folder here")
+    run.add_argument(
+        "--output",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="have SUMO write its NAME output (tripinfo, fcd, ssm, ...) to DIR/outputs; repeatable",
+    )
+    run.add_argument("--replay", action="store_true", help="draw DIR/replay.html and DIR/replay.mp4 too")
+    run.add_argument("--json", action="store_true", help="print exactly one JSON document on stdout")
+    run.set_defaults(work=work)
+
+
+def work(args: argparse.Namespace) -> int:
+    """Drive it in a worker process, show the result."""
+    from cosim import sumo_outputs
+    from cosim.app import output
+    from cosim.app.progress import Progress
+    from cosim.app.replay import draw, remembered
+    from cosim.app.runner import Runner
+    from cosim.vet import vetted
+    from cosim.worker import Worker
+    from policy.agents import check_name
+
+    for flag, wanted in (("--output", args.output), ("--replay", args.replay)):
+        if wanted and not args.out:
+            raise BadInput("needs a run folder to write into: --out DIR", field=flag)
+    check_name(args.policy)
+    case = case_of(args)
+    scenario = case.scenario(args.sumo_options)
+    sumo_outputs.check(case.outputs, scenario.options)
+    scenario = vetted(scenario)
+    folder = output.prepare_folder(args.out) if args.out else None
+    files = folder / "outputs" if folder is not None and case.outputs else None
+    progress = Progress(f"{scenario.name} {args.policy}", "s")
+    recording = None
+    try:
+        with Worker(Runner, scenario, case.policy, math.radians(case.svo_deg), name="cosim-run") as worker:
+            how = {"progress": progress, "outputs": case.outputs, "folder": files}
+            if args.replay:
+                result, recording = worker.call("record", case.seed, **how)
+            else:
+                result = worker.call("run", case.seed, **how)
+    finally:
+        if files is not None:  # what a simulation that died leaves behind
+            shutil.rmtree(files / sumo_outputs.DRAFT, ignore_errors=True)
+    progress.done()
+    result = replace(result, manifest=result.manifest | remembered(case, args.sumo_options))
+    if folder is not None:
+        output.write_folder(folder, result)
+        if recording is not None:
+            draw(recording, folder / "replay.html", folder / "replay.mp4")
+    if args.json:
+        print(json.dumps(output.document(result)))
+    else:
+        print(output.table(result))
+        if folder is not None:
+            print(f"  run folder               {folder}")
+    return 0
+
+
+def case_of(args: argparse.Namespace) -> Case:
+    """The episode that the flags describe; files by absolute path, so that it can be found again."""
+    return Case(
+        what=_place(args.what),
+        demand=tuple(map(_place, args.demand)),
+        policy=args.policy,
+        behavior=args.behavior,
+        driver_model=args.driver_model,
+        penetration=args.penetration,
+        av_type=args.av_type,
+        av_ids=args.av_ids,
+        svo_deg=args.svo,
+        preset=args.preset,
+        duration=args.duration,
+        seed=args.seed,
+        outputs=tuple(dict.fromkeys(args.output)),
+    )
+
+
+def _place(name: str) -> str:
+    """A file's absolute path; a name of ours, and whatever is wrong, as it is."""
+    is_file = ("." in name or "/" in name) and is_there(Path(name))
+    return str(Path(name).absolute()) if is_file else name

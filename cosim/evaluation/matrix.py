@@ -1,0 +1,115 @@
+"""The matrix of a spec: every cell loaded and vetted before anything is run."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from cosim import sumo_outputs
+from cosim.errors import BadInput
+from cosim.evaluation.case import Case
+from cosim.evaluation.spec import Spec
+from cosim.manifest import manifest
+from cosim.scenario import Scenario
+from cosim.vet import vetted
+
+CheckPolicy = Callable[[str], None]  # raises BadInput for a name that is none
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """Cases that differ in nothing but the seed."""
+
+    case: Case  # of the first seed
+    scenario: Scenario  # vetted unless `refused`
+    manifest: Mapping[str, Any]  # `cosim.manifest` without the seed
+    refused: str | None = None  # why SUMO must not see this net: every episode of the cell is bad_input
+
+    @property
+    def name(self) -> str:
+        return self.case.cell
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """All that is to be run: cells times seeds, in this order."""
+
+    cells: tuple[Cell, ...]
+    seeds: range
+
+    @property
+    def episodes(self) -> int:
+        return len(self.cells) * len(self.seeds)
+
+    @property
+    def spec_hash(self) -> str:
+        """SHA-256 of what is to be run, in whatever order and notation it was asked for."""
+        text = json.dumps([sorted(cell.case.text() for cell in self.cells), self.seeds[0], self.seeds[-1]])
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def cases(self) -> Iterator[tuple[Cell, Case]]:
+        """Every episode with its cell."""
+        for cell in self.cells:
+            for seed in self.seeds:
+                yield cell, cell.case.with_seed(seed)
+
+
+def cells(spec: Spec) -> Iterator[Case]:
+    """The case of every cell's first seed."""
+    axes = itertools.product(
+        spec.scenario,
+        spec.demand,
+        spec.behavior,
+        spec.driver_model,
+        spec.penetration,
+        spec.preset,
+        spec.policy,
+        spec.svo,
+    )
+    for what, demand, behavior, driver_model, penetration, preset, policy, svo in axes:
+        yield Case(
+            what=what,
+            demand=demand,
+            policy=policy,
+            behavior=behavior,
+            driver_model=driver_model,
+            penetration=penetration,
+            av_type=spec.av_type,
+            av_ids=spec.av_ids,
+            svo_deg=svo,
+            preset=preset,
+            duration=spec.duration,
+            seed=spec.seeds[0],
+            outputs=spec.output,
+        )
+
+
+def plan(cases: Iterable[Case], seeds: range, check_policy: CheckPolicy) -> Plan:
+    """Load and vet every cell.
+
+    A net that would kill SUMO costs its own cells only: they become `refused`.
+
+    Raises:
+        BadInput: anything else that is wrong with a cell: an unknown policy, demand or output, a demand file
+            that is malformed or whose edges are not in the net, a vehicle type that is not there.
+    """
+    found = []
+    for case in cases:
+        check_policy(case.policy)
+        scenario = case.scenario()
+        sumo_outputs.check(case.outputs, scenario.options)
+        refused = None
+        try:
+            scenario = vetted(scenario)
+        except BadInput as error:
+            if error.file != str(scenario.net):
+                raise
+            refused = str(error)
+        document = manifest(scenario, seeds[0])
+        del document["seed"]
+        found.append(Cell(replace(case, seed=seeds[0]), scenario, document, refused))
+    return Plan(tuple(found), seeds)

@@ -1,0 +1,1 @@
+"""Replays: an episode watched while it is driven, then drawn as an interactive page and as a film."""

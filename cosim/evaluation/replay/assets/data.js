@@ -1,0 +1,127 @@
+// Unpacks the recording that packing.py packed: differences become typed arrays, in m, s, rad, m/s.
+
+const ACTIONS = ["lane left", "idle", "lane right", "accelerate", "decelerate"];
+const GLYPHS = ["\u2190", "\u00b7", "\u2192", "\u2191", "\u2193"];
+
+function summed(steps, order = 1) {
+  const values = Float64Array.from(steps);
+  for (let n = 0; n < order; n++) for (let k = 1; k < values.length; k++) values[k] += values[k - 1];
+  return values;
+}
+
+function scaled(steps, unit, order = 1) { return summed(steps, order).map((v) => v * unit); }
+
+async function unpack(base64) {
+  const bytes = Uint8Array.from(atob(base64), (c) => c.charCodeAt(0));
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+  return read(await new Response(stream).json());
+}
+
+function read(raw) {
+  const begin = raw.begin / 1000;
+  const line = ([x, y]) => { // a polyline with its bounding box
+    const px = scaled(x, 0.01), py = scaled(y, 0.01);
+    return { x: px, y: py, box: [Math.min(...px), Math.min(...py), Math.max(...px), Math.max(...py)] };
+  };
+  const vehicles = raw.vehicles.map(([id, av, mission, driver, length, width], number) => ({
+    id, number, av: av === 1, mission: mission === 1, driver, length: length / 100, width: width / 100,
+    tracks: [], choices: [],
+  }));
+  for (const [v, first, x, y, heading, speed, accel, lane] of raw.tracks) {
+    vehicles[v].tracks.push({
+      first, last: first + x.length - 1, x: scaled(x, 0.01, 2), y: scaled(y, 0.01, 2),
+      heading: scaled(heading, 0.001), speed: scaled(speed, 0.01), accel: scaled(accel, 0.01), lane: summed(lane),
+    });
+  }
+  const decided = raw.decided.map((t) => t / 1000 - begin);
+  raw.choices.forEach((rows, k) => {
+    for (const [v, action, target, flags, blamed, blocked, q, score, ttc, unsafe] of rows) {
+      vehicles[v].choices.push({
+        k, t: decided[k], action, target: target / 100, vetoed: (flags & 1) > 0, fallback: (flags & 2) > 0,
+        blamed: raw.words[blamed], blocked: raw.words[blocked], q, score, ttc, unsafe,
+      });
+    }
+  });
+  const forecasts = raw.forecasts.map((rows) => rows && new Map(rows.map(([v, x, y, along, across]) => [v, {
+    x: scaled(x, 0.1), y: scaled(y, 0.1), along: scaled(along, 0.1), across: scaled(across, 0.1),
+  }])));
+  const times = summed(raw.times).map((t) => t / 1000 - begin);
+  return {
+    facts: raw.facts, times, end: times[times.length - 1], vehicles, decided, forecasts,
+    forecastInterval: raw.forecast_interval,
+    byId: new Map(vehicles.map((v) => [v.id, v])),
+    lanes: raw.lanes.map(([id, width, internal, shape]) => ({ id, width: width / 100, internal: internal === 1, ...line(shape) })),
+    junctions: raw.junctions.map(line), goal: new Set(raw.goal), zones: new Set(raw.zones),
+    collisions: raw.collisions.map((c) => ({ ...c, t: c.t / 1000 - begin })),
+  };
+}
+
+// The last index of an ascending array whose value is not above t; -1 before the first.
+function atOrBefore(sorted, t) {
+  let low = 0, high = sorted.length;
+  while (low < high) {
+    const middle = (low + high) >> 1;
+    if (sorted[middle] <= t + 1e-6) low = middle + 1; else high = middle;
+  }
+  return low - 1;
+}
+
+// Where a vehicle is at time t, between two frames on the straight line; null when it is not on the road.
+function stateOf(data, vehicle, t) {
+  const k = Math.max(atOrBefore(data.times, t), 0);
+  for (const track of vehicle.tracks) {
+    if (k < track.first || k > track.last) continue;
+    const i = k - track.first, j = Math.min(i + 1, track.last - track.first);
+    const span = k + 1 < data.times.length ? data.times[k + 1] - data.times[k] : 1;
+    const u = Math.min(Math.max((t - data.times[k]) / span, 0), 1);
+    const mix = (column) => column[i] + u * (column[j] - column[i]);
+    return { x: mix(track.x), y: mix(track.y), heading: mix(track.heading), speed: mix(track.speed),
+      accel: mix(track.accel), lane: track.lane[i] };
+  }
+  return null;
+}
+
+// What an AV decided last, while it still holds; null when SUMO drives it.
+function choiceOf(data, vehicle, t) {
+  const k = atOrBefore(data.decided, t);
+  let low = 0, high = vehicle.choices.length;
+  while (low < high) {
+    const middle = (low + high) >> 1;
+    if (vehicle.choices[middle].k <= k) low = middle + 1; else high = middle;
+  }
+  const choice = vehicle.choices[low - 1];
+  return choice && choice.k === k ? choice : null;
+}
+
+// What there is to jump to: collisions, the mission's success, refused commands, vetoes where they begin.
+function eventsOf(data) {
+  const found = data.collisions.map((c) => ({
+    t: c.t, kind: "bad", who: [c.collider, c.victim],
+    text: `${c.collider} hit ${c.victim} (${c.kind}${c.av_caused ? ", AV-caused" : ""})`,
+  }));
+  const figure = (name) => (data.facts.metrics.find(([n]) => n === name) || [])[1];
+  if (figure("mission_time_s") != null) {
+    found.push({ t: figure("mission_time_s"), kind: "good", who: data.vehicles.filter((v) => v.mission).map((v) => v.id),
+      text: "mission fulfilled" });
+  }
+  for (const v of data.vehicles) {
+    let before = null;
+    for (const c of v.choices) {
+      const goesOn = before && before.k === c.k - 1;
+      if (c.blocked && !(goesOn && before.blocked === c.blocked)) {
+        found.push({ t: c.t, kind: "warn", who: [v.id], text: `${v.id}: ${ACTIONS[c.action]} blocked, ${c.blocked}` });
+      }
+      if (c.fallback && !(goesOn && before.fallback)) {
+        found.push({ t: c.t, kind: "bad", who: [v.id], text: `${v.id}: no safe action, takes ${ACTIONS[c.action]}` });
+      } else if (c.vetoed && !(goesOn && before.vetoed && before.blamed === c.blamed)) {
+        found.push({ t: c.t, kind: "warn", who: [v.id, c.blamed], text: `${v.id}: ${preferred(c)} vetoed, blamed ${c.blamed}` });
+      }
+      before = c;
+    }
+  }
+  return found.sort((a, b) => a.t - b.t);
+}
+
+function preferred(choice) {
+  return choice.q ? ACTIONS[choice.q.indexOf(Math.max(...choice.q))] : "the preferred action";
+}

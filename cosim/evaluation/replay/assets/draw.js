@@ -1,0 +1,181 @@
+// Draws one moment: road, predictions, vehicles, who is blamed, collisions.
+
+const SIGMAS = 2; // half the width of a predicted interval, in standard deviations
+const VIEW_RANGE = 125; // m: what a chosen AV's own rows reach (contract)
+
+function colours() {
+  const style = getComputedStyle(document.documentElement);
+  const names = "ground road edge junction goal zone text quiet panel line pick halo av conservative moderate " +
+    "aggressive asis mission bad good warn";
+  return Object.fromEntries(names.split(" ").map((n) => [n, style.getPropertyValue(`--${n}`).trim()]));
+}
+
+function colourOf(vehicle, c) {
+  if (vehicle.mission) return c.mission;
+  if (vehicle.av) return c.av;
+  return c[vehicle.driver] || c.asis;
+}
+
+function drawRoad(ctx, data, view, c) {
+  view.inMetres(ctx);
+  ctx.lineJoin = "round";
+  ctx.fillStyle = c.junction;
+  for (const outline of data.junctions) if (view.sees(outline.box)) { trace(ctx, outline); ctx.closePath(); ctx.fill(); }
+  const seen = data.lanes.map((lane, k) => k).filter((k) => view.sees(data.lanes[k].box));
+  const line = Math.max(0.18, 0.8 / view.scale);
+  for (const internal of [true, false]) {
+    for (const k of seen) {
+      const lane = data.lanes[k];
+      if (lane.internal !== internal) continue;
+      if (!internal && view.scale > 1.2) {
+        ctx.strokeStyle = c.edge; ctx.lineWidth = lane.width + line; trace(ctx, lane); ctx.stroke();
+      }
+    }
+    for (const k of seen) {
+      const lane = data.lanes[k];
+      if (lane.internal !== internal) continue;
+      ctx.strokeStyle = data.goal.has(k) && data.goal.size < data.lanes.length / 2 ? c.goal : data.zones.has(k) ? c.zone : c.road;
+      ctx.lineWidth = Math.max(lane.width - (internal ? 0 : line), 1 / view.scale);
+      trace(ctx, lane); ctx.stroke();
+    }
+  }
+}
+
+function drawForecast(ctx, state, view, c, t) {
+  const { data, chosen } = state;
+  const k = atOrBefore(data.decided, t);
+  const forecast = data.forecasts[k];
+  if (!forecast) return;
+  const centre = chosen && chosen.av ? stateOf(data, chosen, t) : null;
+  view.inMetres(ctx);
+  for (const [number, path] of forecast) {
+    const vehicle = data.vehicles[number];
+    const now = stateOf(data, vehicle, data.decided[k]);
+    if (!now || (centre && Math.hypot(now.x - centre.x, now.y - centre.y) > VIEW_RANGE)) continue;
+    ctx.strokeStyle = ctx.fillStyle = colourOf(vehicle, c);
+    ctx.globalAlpha = 0.75; ctx.lineWidth = Math.max(0.25, 1.2 / view.scale);
+    ctx.beginPath(); ctx.moveTo(now.x, now.y);
+    for (let i = 0; i < path.x.length; i++) ctx.lineTo(path.x[i], path.y[i]);
+    ctx.stroke();
+    const every = Math.max(Math.round(1 / data.forecastInterval), 1);
+    for (let i = every - 1; i < path.x.length; i += every) { // one ellipse a second: the interval
+      const j = i ? i - 1 : 0;
+      const heading = i ? Math.atan2(path.y[i] - path.y[j], path.x[i] - path.x[j]) : now.heading;
+      ctx.globalAlpha = 0.13;
+      ctx.beginPath();
+      ctx.ellipse(path.x[i], path.y[i], Math.max(SIGMAS * path.along[i], 0.3), Math.max(SIGMAS * path.across[i], 0.3), heading, 0, 7);
+      ctx.fill();
+      ctx.globalAlpha = 0.5; ctx.lineWidth = Math.max(0.08, 0.6 / view.scale); ctx.stroke();
+    }
+  }
+  ctx.globalAlpha = 1;
+}
+
+function drawVehicle(ctx, vehicle, s, c, view, chosen) {
+  const l = Math.max(vehicle.length, 5 / view.scale), w = Math.max(vehicle.width, 3 / view.scale);
+  ctx.save();
+  view.inMetres(ctx);
+  ctx.translate(s.x, s.y); ctx.rotate(s.heading);
+  ctx.fillStyle = colourOf(vehicle, c);
+  ctx.strokeStyle = chosen ? c.pick : c.ground; ctx.lineWidth = Math.max(chosen ? 0.35 : 0.12, (chosen ? 2 : 0.6) / view.scale);
+  ctx.beginPath(); ctx.roundRect(-l / 2, -w / 2, l, w, [0.15 * w, 0.35 * w, 0.35 * w, 0.15 * w]); ctx.fill(); ctx.stroke();
+  if (view.scale > 2.2) {
+    ctx.fillStyle = c.halo; ctx.fillRect(0.12 * l, -0.38 * w, 0.13 * l, 0.76 * w); // windscreen: where the front is
+    if (s.accel < -1) { ctx.fillStyle = "#ff2020"; ctx.fillRect(-l / 2, -w / 2, 0.09 * l, w); } // brake lights
+    if (vehicle.av) { ctx.fillStyle = c.halo; ctx.beginPath(); ctx.arc(-0.16 * l, 0, 0.2 * w, 0, 7); ctx.fill(); } // sensor
+  }
+  ctx.restore();
+}
+
+function drawScene(ctx, state) {
+  const { data, view, c, t } = state;
+  view.inPixels(ctx);
+  ctx.fillStyle = c.ground; ctx.fillRect(0, 0, view.width, view.height);
+  drawRoad(ctx, data, view, c);
+  if (state.predictions) drawForecast(ctx, state, view, c, t);
+  state.shown = [];
+  for (const vehicle of data.vehicles) {
+    const s = stateOf(data, vehicle, t);
+    if (s && view.sees([s.x - 8, s.y - 8, s.x + 8, s.y + 8])) state.shown.push([vehicle, s]);
+  }
+  for (const [vehicle, s] of state.shown) drawVehicle(ctx, vehicle, s, c, view, vehicle === state.chosen);
+  view.inPixels(ctx);
+  for (const [vehicle, s] of state.shown) drawChoice(ctx, state, vehicle, s);
+  for (const [vehicle, s] of state.shown) {
+    if (vehicle === state.chosen || vehicle.mission || (state.labels && view.scale > 1.5)) {
+      const up = (Math.abs(Math.sin(s.heading)) * vehicle.length + vehicle.width) * 0.5 * view.scale + 9;
+      const [px, py] = view.toPixels(s.x, s.y);
+      caption(ctx, vehicle.id, px, py - up, vehicle === state.chosen ? c.pick : c.text, c);
+    }
+  }
+  for (const crash of data.collisions) if (crash.x != null && crash.t <= t + 0.05 && crash.t > t - 4) drawCrash(ctx, view, crash, c);
+  drawScale(ctx, view, c);
+}
+
+// The command on the roof, a ring where it was vetoed, and a line to whom the prioritizer blames.
+function drawChoice(ctx, state, vehicle, s) {
+  const { data, view, c, t } = state;
+  const choice = vehicle.av ? choiceOf(data, vehicle, t) : null;
+  if (!choice) return;
+  const [px, py] = view.toPixels(s.x, s.y);
+  if (choice.vetoed || choice.fallback) {
+    ctx.strokeStyle = choice.fallback ? c.bad : c.warn; ctx.lineWidth = 2;
+    ctx.beginPath(); ctx.arc(px, py, Math.max(0.62 * vehicle.length * view.scale, 6), 0, 7); ctx.stroke();
+    const other = data.byId.get(choice.blamed), o = other && stateOf(data, other, t);
+    if (o) {
+      ctx.setLineDash([5, 4]); ctx.beginPath(); ctx.moveTo(px, py); ctx.lineTo(...view.toPixels(o.x, o.y)); ctx.stroke();
+      ctx.setLineDash([]);
+    }
+  }
+  if (view.scale > 3 && choice.action !== 1) {
+    ctx.font = "bold 13px system-ui, sans-serif"; ctx.textAlign = "center"; ctx.textBaseline = "middle";
+    const glyph = choice.blocked ? "\u00d7" : GLYPHS[choice.action];
+    const below = (Math.abs(Math.sin(s.heading)) * vehicle.length + vehicle.width) * 0.5 * view.scale + 9;
+    halo(ctx, glyph, px, py + below, choice.blocked ? c.bad : c.av, c);
+  }
+}
+
+function halo(ctx, text, x, y, colour, c) {
+  ctx.strokeStyle = c.halo; ctx.lineWidth = 4; ctx.lineJoin = "round"; ctx.strokeText(text, x, y);
+  ctx.fillStyle = colour; ctx.fillText(text, x, y);
+}
+
+function caption(ctx, text, x, y, colour, c) {
+  ctx.font = "11px system-ui, sans-serif"; ctx.textAlign = "center"; ctx.textBaseline = "middle";
+  halo(ctx, text, x, y, colour, c);
+}
+
+function drawCrash(ctx, view, crash, c) {
+  const [px, py] = view.toPixels(crash.x, crash.y);
+  ctx.strokeStyle = c.bad; ctx.lineWidth = 3;
+  ctx.beginPath(); ctx.arc(px, py, 16, 0, 7);
+  ctx.moveTo(px - 9, py - 9); ctx.lineTo(px + 9, py + 9); ctx.moveTo(px - 9, py + 9); ctx.lineTo(px + 9, py - 9); ctx.stroke();
+  ctx.font = "bold 12px system-ui, sans-serif"; ctx.textAlign = "center";
+  halo(ctx, `${crash.collider} hit ${crash.victim}`, px, py - 25, c.bad, c);
+}
+
+function drawScale(ctx, view, c) {
+  const metres = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000].find((m) => m * view.scale > 60) || 5000;
+  const y = view.height - 14, right = view.width - 14, left = right - metres * view.scale;
+  ctx.strokeStyle = c.text; ctx.lineWidth = 1.5;
+  ctx.beginPath(); ctx.moveTo(left, y - 4); ctx.lineTo(left, y); ctx.lineTo(right, y); ctx.lineTo(right, y - 4); ctx.stroke();
+  caption(ctx, `${metres} m`, (left + right) / 2, y - 9, c.text, c);
+}
+
+// The whole net in small, where everybody is, and what the large picture shows.
+function drawMap(canvas, state) {
+  const small = state.map, { data, view, c } = state, ctx = canvas.getContext("2d");
+  small.inPixels(ctx); ctx.clearRect(0, 0, small.width, small.height);
+  small.inMetres(ctx); ctx.strokeStyle = c.quiet; ctx.globalAlpha = 0.45;
+  for (const lane of data.lanes) { ctx.lineWidth = Math.max(lane.width, 1 / small.scale); trace(ctx, lane); ctx.stroke(); }
+  ctx.globalAlpha = 1; small.inPixels(ctx);
+  for (const vehicle of data.vehicles) {
+    const s = stateOf(data, vehicle, state.t);
+    if (!s) continue;
+    const [px, py] = small.toPixels(s.x, s.y), r = vehicle.mission || vehicle === state.chosen ? 3 : 1.4;
+    ctx.fillStyle = colourOf(vehicle, c); ctx.beginPath(); ctx.arc(px, py, r, 0, 7); ctx.fill();
+  }
+  const w = view.width / 2 / view.scale, h = view.height / 2 / view.scale;
+  const [x0, y0] = small.toPixels(view.x - w, view.y + h), [x1, y1] = small.toPixels(view.x + w, view.y - h);
+  ctx.strokeStyle = c.pick; ctx.lineWidth = 1; ctx.strokeRect(x0, y0, Math.max(x1 - x0, 3), Math.max(y1 - y0, 3));
+}

@@ -1,0 +1,215 @@
+// Time, keys and pointer: what the user does, and one picture per animation frame.
+
+const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4, 8];
+const KEYS = [["space", "play, pause"], ["\u2190 \u2192", "one frame (shift: 2 s)"], ["home end", "first, last moment"],
+  ["[ ]", "event before, after"], ["< >", "slower, faster"], ["+ \u2212", "zoom (or the wheel)"], ["0", "the whole net"],
+  ["f", "follow the chosen vehicle"], ["m", "choose the mission vehicle"], ["n p", "next, previous vehicle in view"],
+  ["g", "predictions"], ["l", "names"], ["t", "dark or light"], ["esc", "choose nobody"], ["?", "these keys"]];
+
+function start(data) {
+  const $$ = (id) => document.getElementById(id);
+  const scene = $$("scene"), view = new View(scene), map = new View($$("map")), chart = new View($$("chart"));
+  const timeline = new View($$("timeline"));
+  const state = {
+    data, view, map, chart, t: 0, playing: false, rate: 1, chosen: null, following: false, labels: false,
+    predictions: data.forecasts.some(Boolean), events: eventsOf(data), shown: [], c: null, dirty: true,
+  };
+  const net = bounds(data.lanes.length ? data.lanes : [{ box: [0, 0, 100, 100] }]);
+
+  state.choose = (vehicle, follow = state.following) => {
+    state.chosen = vehicle; state.following = Boolean(vehicle) && follow;
+    $$("pick").value = vehicle ? vehicle.number : "";
+    if ($$("mine").checked) fillEvents(state);
+    touch();
+  };
+  state.seek = (t) => { state.t = Math.min(Math.max(t, 0), data.end); touch(); };
+  function touch() { state.dirty = true; }
+  function play(on = !state.playing) {
+    if (on && state.t >= data.end - 1e-6) state.t = 0;
+    state.playing = on; $$("play").textContent = on ? "pause" : "play"; touch();
+  }
+  function speed(rate) { state.rate = rate; $$("speed").value = rate; }
+  function step(frames) {
+    const k = atOrBefore(data.times, state.t), on = data.times[k] < state.t - 1e-6 && frames < 0 ? 1 : 0;
+    play(false); state.seek(data.times[Math.min(Math.max(k + frames + on, 0), data.times.length - 1)]);
+  }
+  function theme(dark) { document.documentElement.classList.toggle("dark", dark); state.c = colours(); fillLegend(state); touch(); }
+  function jump(direction) {
+    const wanted = $$("mine").checked && state.chosen ? state.events.filter((e) => e.who.includes(state.chosen.id)) : state.events;
+    const next = direction > 0 ? wanted.find((e) => e.t > state.t + 0.05) : wanted.filter((e) => e.t < state.t - 0.05).pop();
+    if (next) state.seek(next.t);
+  }
+  function neighbour(direction) {
+    const shown = state.shown.map(([v]) => v);
+    if (!shown.length) return;
+    const here = shown.indexOf(state.chosen);
+    state.choose(shown[(here + direction + shown.length) % shown.length]);
+  }
+  function follow(on) { state.following = on && Boolean(state.chosen); touch(); }
+  function fit() { follow(false); view.fit(net); touch(); }
+
+  function resize() {
+    for (const v of [view, map, chart, timeline]) v.resize();
+    map.fit(net); touch();
+  }
+
+  function picture(now) {
+    if (state.playing) {
+      state.t += ((now - (picture.before ?? now)) / 1000) * state.rate;
+      if (state.t >= data.end) { state.t = data.end; play(false); }
+      touch();
+    }
+    picture.before = now;
+    if (state.dirty) {
+      state.dirty = false;
+      const s = state.following && state.chosen && stateOf(data, state.chosen, state.t);
+      if (s) { view.x = s.x; view.y = s.y; }
+      drawScene(scene.getContext("2d"), state);
+      drawMap($$("map"), state); drawChart($$("chart"), state); drawTimeline();
+      fillDetails(state);
+      $$("follow").classList.toggle("on", state.following);
+      $$("clock").textContent = `${state.t.toFixed(1)} / ${data.end.toFixed(1)} s`;
+      $$("predictions").checked = state.predictions; $$("labels").checked = state.labels;
+    }
+    requestAnimationFrame(picture);
+  }
+
+  function drawTimeline() {
+    const ctx = $$("timeline").getContext("2d"), { c } = state, w = timeline.width, h = timeline.height;
+    const px = (t) => 6 + (t / (data.end || 1)) * (w - 12);
+    timeline.inPixels(ctx); ctx.clearRect(0, 0, w, h);
+    ctx.fillStyle = c.line; ctx.fillRect(6, h - 12, w - 12, 4);
+    ctx.fillStyle = c.av; ctx.fillRect(6, h - 12, px(state.t) - 6, 4);
+    for (const e of state.events) {
+      const tall = e.kind === "warn" ? 7 : 15, mine = !state.chosen || e.who.includes(state.chosen.id);
+      ctx.globalAlpha = mine ? 1 : 0.3; ctx.fillStyle = c[e.kind];
+      ctx.fillRect(px(e.t) - 1, h - 14 - tall, 2, tall);
+    }
+    ctx.globalAlpha = 1; ctx.fillStyle = c.pick;
+    ctx.beginPath(); ctx.arc(px(state.t), h - 10, 6, 0, 7); ctx.fill();
+  }
+
+  function nearest(event) {
+    const box = scene.getBoundingClientRect();
+    const [x, y] = view.toMetres(event.clientX - box.left, event.clientY - box.top);
+    let best = null, reach = Math.max(4, 14 / view.scale);
+    for (const [vehicle, s] of state.shown) {
+      const d = Math.hypot(s.x - x, s.y - y);
+      if (d < reach) { best = [vehicle, s]; reach = d; }
+    }
+    return best;
+  }
+
+  let drag = null;
+  const fingers = new Map();
+  scene.onpointerdown = (e) => {
+    scene.setPointerCapture(e.pointerId); fingers.set(e.pointerId, [e.clientX, e.clientY]);
+    drag = { x: e.clientX, y: e.clientY, moved: 0 };
+  };
+  scene.onpointermove = (e) => {
+    if (drag && fingers.has(e.pointerId)) {
+      if (fingers.size === 2) { // pinch
+        const [a, b] = [...fingers.values()], before = Math.hypot(a[0] - b[0], a[1] - b[1]);
+        fingers.set(e.pointerId, [e.clientX, e.clientY]);
+        const [p, q] = [...fingers.values()];
+        view.zoom(Math.hypot(p[0] - q[0], p[1] - q[1]) / Math.max(before, 1)); drag.moved = 99; touch(); return;
+      }
+      fingers.set(e.pointerId, [e.clientX, e.clientY]);
+      drag.moved += Math.abs(e.clientX - drag.x) + Math.abs(e.clientY - drag.y);
+      if (drag.moved > 4) { follow(false); view.pan(e.clientX - drag.x, -(e.clientY - drag.y)); scene.style.cursor = "grabbing"; touch(); }
+      drag.x = e.clientX; drag.y = e.clientY; return;
+    }
+    const found = nearest(e), tip = $$("tip");
+    tip.hidden = !found; scene.style.cursor = found ? "pointer" : "grab";
+    if (found) {
+      const [vehicle, s] = found, choice = vehicle.av && choiceOf(data, vehicle, state.t);
+      tip.textContent = `${vehicle.id}\n${describe(vehicle)}\n${s.speed.toFixed(1)} m/s` + (choice ? `, ${ACTIONS[choice.action]}` : "");
+      const box = scene.getBoundingClientRect();
+      tip.style.left = `${Math.min(e.clientX - box.left + 14, view.width - 190)}px`; tip.style.top = `${e.clientY - box.top + 14}px`;
+    }
+  };
+  scene.onpointerup = scene.onpointercancel = (e) => {
+    fingers.delete(e.pointerId);
+    if (drag && drag.moved <= 4 && e.type === "pointerup") {
+      const found = nearest(e);
+      if (found) state.choose(found[0], false); else state.choose(null);
+    }
+    if (!fingers.size) drag = null;
+    scene.style.cursor = "grab";
+  };
+  scene.ondblclick = (e) => { const found = nearest(e); if (found) state.choose(found[0], true); };
+  scene.onwheel = (e) => {
+    e.preventDefault();
+    const box = scene.getBoundingClientRect(), factor = Math.exp(-e.deltaY * (e.ctrlKey ? 0.01 : 0.0015));
+    if (state.following) view.zoom(factor); else view.zoom(factor, e.clientX - box.left, e.clientY - box.top);
+    touch();
+  };
+  const scrub = (canvas, at) => {
+    canvas.onpointerdown = (e) => { canvas.setPointerCapture(e.pointerId); at(e); };
+    canvas.onpointermove = (e) => { if (e.buttons) at(e); };
+  };
+  const inside = (canvas, e) => { const box = canvas.getBoundingClientRect(); return [e.clientX - box.left, e.clientY - box.top]; };
+  scrub($$("timeline"), (e) => state.seek(((inside($$("timeline"), e)[0] - 6) / (timeline.width - 12)) * data.end));
+  scrub($$("chart"), (e) => state.seek(((inside($$("chart"), e)[0] - 26) / (chart.width - 30)) * data.end));
+  scrub($$("map"), (e) => { follow(false); [view.x, view.y] = map.toMetres(...inside($$("map"), e)); touch(); });
+
+  $$("play").onclick = () => play(); $$("back").onclick = () => step(-1); $$("forth").onclick = () => step(1);
+  $$("fit").onclick = fit; $$("follow").onclick = () => follow(!state.following);
+  $$("theme").onclick = () => theme(!document.documentElement.classList.contains("dark"));
+  $$("help").onclick = () => ($$("keys").open ? $$("keys").close() : $$("keys").showModal());
+  $$("keys").onclick = () => $$("keys").close();
+  $$("predictions").onchange = (e) => { state.predictions = e.target.checked; touch(); };
+  $$("labels").onchange = (e) => { state.labels = e.target.checked; touch(); };
+  $$("mine").onchange = () => fillEvents(state);
+  $$("speed").onchange = (e) => speed(Number(e.target.value));
+  $$("pick").onchange = (e) => { state.choose(e.target.value === "" ? null : data.vehicles[e.target.value], true); e.target.blur(); };
+
+  const keys = {
+    " ": () => play(), ArrowLeft: (e) => (e.shiftKey ? state.seek(state.t - 2) : step(-1)),
+    ArrowRight: (e) => (e.shiftKey ? state.seek(state.t + 2) : step(1)), Home: () => state.seek(0), End: () => state.seek(data.end),
+    "[": () => jump(-1), "]": () => jump(1), "+": () => { view.zoom(1.3); touch(); }, "=": () => { view.zoom(1.3); touch(); },
+    "-": () => { view.zoom(1 / 1.3); touch(); }, 0: fit, f: () => follow(!state.following), n: () => neighbour(1), p: () => neighbour(-1),
+    "<": () => speed(SPEEDS[Math.max(SPEEDS.indexOf(state.rate) - 1, 0)]), ">": () => speed(SPEEDS[Math.min(SPEEDS.indexOf(state.rate) + 1, SPEEDS.length - 1)]),
+    ",": () => keys["<"](), ".": () => keys[">"](), g: () => { state.predictions = !state.predictions; touch(); },
+    l: () => { state.labels = !state.labels; touch(); }, t: () => $$("theme").click(), m: () => { const v = data.vehicles.find((k) => k.mission); if (v) state.choose(v, true); },
+    Escape: () => state.choose(null), "?": () => $$("help").click(),
+  };
+  window.onkeydown = (e) => {
+    if (e.ctrlKey || e.metaKey || e.altKey || e.target.tagName === "SELECT") return;
+    const act = keys[e.key];
+    if (act) { e.preventDefault(); act(e); }
+  };
+
+  for (const rate of SPEEDS) $$("speed").append(new Option(`${rate} \u00d7`, rate));
+  speed(1);
+  $$("pick").append(new Option("nobody", ""));
+  const order = [...data.vehicles].sort((a, b) => b.mission - a.mission || b.av - a.av || a.id.localeCompare(b.id, "en", { numeric: true }));
+  for (const v of order) $$("pick").append(new Option(`${v.id} (${v.mission ? "mission" : v.av ? "AV" : v.driver})`, v.number));
+  const table = element("table");
+  for (const [key, what] of KEYS) {
+    const row = element("tr"), cell = element("td");
+    for (const one of key.split(" ")) cell.append(element("kbd", one), " ");
+    row.append(cell, element("td", what)); table.append(row);
+  }
+  $$("keys").append(table);
+  $$("predictions").parentElement.hidden = !state.predictions;
+  $$("busy").hidden = true;
+  fillHead(data); fillFigures(data); fillEvents(state);
+  theme(matchMedia("(prefers-color-scheme: dark)").matches);
+  new ResizeObserver(resize).observe($$("stage"));
+  resize();
+  const first = order.find((v) => stateOf(data, v, 0)) || order[0];
+  view.scale = view.width / 170;
+  if (first) { state.choose(first, true); const s = stateOf(data, first, 0) || { x: first.tracks[0].x[0], y: first.tracks[0].y[0] }; view.x = s.x; view.y = s.y; }
+  else view.fit(net);
+  const asked = new URLSearchParams(location.hash.slice(1)); // replay.html#t=12.4&v=av.3&zoom=8
+  if (data.byId.has(asked.get("v"))) state.choose(data.byId.get(asked.get("v")), true);
+  if (asked.has("zoom")) view.scale = Number(asked.get("zoom")) || view.scale;
+  if (asked.has("t")) state.seek(Number(asked.get("t")) || 0);
+  window.replay = state; // for whoever looks at it from the console, and for tests
+  requestAnimationFrame(picture);
+}
+
+unpack(document.getElementById("data").textContent.trim()).then(start).catch((error) => {
+  document.getElementById("busy").textContent = `This page could not be drawn: ${error.message}`;
+});

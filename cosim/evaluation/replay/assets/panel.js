@@ -1,0 +1,199 @@
+// The panel at the side: who the chosen vehicle is, what it decided and why, its speed over time.
+
+function element(tag, text, className) {
+  const found = document.createElement(tag);
+  if (text !== undefined) found.textContent = text;
+  if (className) found.className = className;
+  return found;
+}
+
+function describe(vehicle) {
+  const who = vehicle.av ? "autonomous (AV)" : `human, ${vehicle.driver}`;
+  return vehicle.mission ? `${who}, mission vehicle` : who;
+}
+
+function number(value, digits, unit = "") {
+  return value === null || value === undefined ? "\u2013" : `${value.toFixed(digits)}${unit}`;
+}
+
+function link(state, id) { // a vehicle's name to click on, or plain words such as "[lane end]"
+  const other = state.data.byId.get(id);
+  if (!other) return document.createTextNode(id || "");
+  const found = element("a", id);
+  found.onclick = () => state.choose(other);
+  return found;
+}
+
+function paragraph(state, ...parts) {
+  const found = element("p");
+  for (const part of parts) found.append(part instanceof Node ? part : document.createTextNode(part));
+  return found;
+}
+
+function fillDetails(state) {
+  const { data, chosen, t } = state, box = document.getElementById("details");
+  box.replaceChildren();
+  if (!chosen) { box.append(element("p", "Click a vehicle, or choose one above.", "quiet")); return; }
+  box.append(element("p", describe(chosen)));
+  const s = stateOf(data, chosen, t);
+  if (!s) { box.append(element("p", "not on the road now", "quiet")); return; }
+  const lane = s.lane >= 0 ? data.lanes[s.lane].id : "off every lane";
+  box.append(element("p", `${s.speed.toFixed(1)} m/s (${(3.6 * s.speed).toFixed(0)} km/h), ` +
+    `${s.accel.toFixed(1)} m/s\u00b2, lane ${lane}`));
+  if (!chosen.av) return;
+  const choice = choiceOf(data, chosen, t);
+  if (!choice) { box.append(element("p", "nobody commands it: SUMO's IDM drives", "quiet")); return; }
+  fillChoice(state, box, choice);
+}
+
+function fillChoice(state, box, choice) {
+  box.append(paragraph(state, `decided at ${choice.t.toFixed(1)} s: `, element("b", ACTIONS[choice.action]),
+    `, target ${choice.target.toFixed(1)} m/s`));
+  if (choice.fallback) box.append(element("p", "no action was safe: the one with the highest safety score", "bad"));
+  if (choice.vetoed) {
+    const line = paragraph(state, `${preferred(choice)} vetoed; blamed: `, link(state, choice.blamed));
+    line.className = "warn"; box.append(line);
+  }
+  box.append(choice.blocked ? element("p", `command blocked: ${choice.blocked}`, "bad")
+    : element("p", "command executed", "quiet"));
+  if (!choice.q && !choice.score) return;
+  const table = element("table"), head = element("tr");
+  for (const name of ["action", "Q", "score s", "TTC s", ""]) head.append(element("th", name));
+  table.append(head);
+  const best = choice.q ? choice.q.indexOf(Math.max(...choice.q)) : -1;
+  ACTIONS.forEach((name, a) => {
+    const row = element("tr");
+    const unsafe = choice.unsafe && choice.unsafe[a];
+    row.className = `${a === choice.action ? "chosen" : ""} ${unsafe ? "unsafe" : ""}`;
+    row.append(element("td", name), element("td", choice.q ? number(choice.q[a], 3) : ""),
+      element("td", choice.score ? number(choice.score[a], 2) : ""), element("td", choice.ttc ? number(choice.ttc[a], 1) : ""),
+      element("td", [unsafe ? "unsafe" : "", a === best ? "best Q" : ""].filter(Boolean).join(", ")));
+    table.append(row);
+  });
+  box.append(table);
+}
+
+// Speed and target over the whole episode, the actions beneath; a click jumps there.
+function drawChart(canvas, state) {
+  const { data, chosen, c } = state, small = state.chart, ctx = canvas.getContext("2d");
+  small.inPixels(ctx); ctx.clearRect(0, 0, small.width, small.height);
+  if (!chosen) return;
+  const left = 26, bottom = small.height - 20, wide = small.width - left - 4;
+  const top = Math.max(10, ...chosen.tracks.map((k) => Math.max(...k.speed)), ...chosen.choices.map((k) => k.target));
+  const px = (t) => left + (t / data.end) * wide, py = (v) => bottom - (v / top) * (bottom - 8);
+  ctx.font = "10px system-ui, sans-serif"; ctx.fillStyle = c.quiet; ctx.textAlign = "right"; ctx.textBaseline = "middle";
+  ctx.strokeStyle = c.line; ctx.lineWidth = 1;
+  for (const v of [0, top / 2, top]) {
+    ctx.fillText(v.toFixed(0), left - 4, py(v));
+    ctx.beginPath(); ctx.moveTo(left, py(v)); ctx.lineTo(left + wide, py(v)); ctx.stroke();
+  }
+  ctx.save(); ctx.textAlign = "left"; ctx.fillText("m/s", 0, bottom + 10); ctx.restore();
+  ctx.strokeStyle = colourOf(chosen, c); ctx.lineWidth = 1.6;
+  for (const track of chosen.tracks) {
+    ctx.beginPath();
+    track.speed.forEach((v, i) => ctx.lineTo(px(data.times[track.first + i]), py(v)));
+    ctx.stroke();
+  }
+  const hold = data.decided.length > 1 ? data.decided[1] - data.decided[0] : 0.4;
+  const shades = { 0: c.aggressive, 2: c.moderate, 3: c.good, 4: c.bad };
+  for (const choice of chosen.choices) {
+    ctx.strokeStyle = c.quiet; ctx.beginPath();
+    ctx.moveTo(px(choice.t), py(choice.target)); ctx.lineTo(px(choice.t + hold), py(choice.target)); ctx.stroke();
+    if (choice.action !== 1) {
+      ctx.fillStyle = shades[choice.action];
+      ctx.fillRect(px(choice.t), bottom + 4, Math.max(px(hold) - px(0), 1.5), 6);
+    }
+    if (choice.vetoed) { ctx.fillStyle = choice.fallback ? c.bad : c.warn; ctx.fillRect(px(choice.t), bottom + 13, Math.max(px(hold) - px(0), 1.5), 4); }
+  }
+  ctx.strokeStyle = c.pick; ctx.lineWidth = 1;
+  ctx.beginPath(); ctx.moveTo(px(state.t), 2); ctx.lineTo(px(state.t), bottom + 18); ctx.stroke();
+}
+
+function fillLegend(state) {
+  const { data, c } = state, box = document.getElementById("legend");
+  box.replaceChildren();
+  const entry = (text, draw) => {
+    const canvas = element("canvas"), ratio = window.devicePixelRatio || 1;
+    canvas.width = 30 * ratio; canvas.height = 16 * ratio;
+    const ctx = canvas.getContext("2d");
+    ctx.setTransform(ratio, 0, 0, ratio, 0, 0);
+    draw(ctx);
+    box.append(canvas, element("span", text));
+  };
+  const car = (colour, av) => (ctx) => {
+    ctx.fillStyle = colour; ctx.beginPath(); ctx.roundRect(3, 3, 24, 10, 3); ctx.fill();
+    ctx.fillStyle = c.halo; ctx.fillRect(18, 4, 3, 8);
+    if (av) { ctx.beginPath(); ctx.arc(11, 8, 2, 0, 7); ctx.fill(); }
+  };
+  if (data.vehicles.some((v) => v.mission)) entry("mission vehicle", car(c.mission));
+  if (data.vehicles.some((v) => v.av)) entry("AV (arrow: its command)", car(c.av, true));
+  const classes = new Set(data.vehicles.filter((v) => !v.av).map((v) => v.driver));
+  for (const name of ["conservative", "moderate", "aggressive", "as-is"]) {
+    if (classes.has(name)) entry(`human, ${name}`, car(name === "as-is" ? c.asis : c[name]));
+  }
+  const ring = (colour) => (ctx) => {
+    ctx.strokeStyle = colour; ctx.lineWidth = 2; ctx.beginPath(); ctx.arc(10, 8, 6, 0, 7); ctx.stroke();
+    ctx.setLineDash([3, 2]); ctx.beginPath(); ctx.moveTo(10, 8); ctx.lineTo(29, 8); ctx.stroke();
+  };
+  if (data.vehicles.some((v) => v.choices.some((k) => k.vetoed))) entry("preferred action vetoed; line to who is blamed", ring(c.warn));
+  if (data.vehicles.some((v) => v.choices.some((k) => k.fallback))) entry("no action was safe", ring(c.bad));
+  if (data.forecasts.some(Boolean)) {
+    entry(`predicted path, every second \u00b1${SIGMAS} standard deviations`, (ctx) => {
+      ctx.strokeStyle = ctx.fillStyle = c.av; ctx.beginPath(); ctx.moveTo(0, 8); ctx.lineTo(30, 8); ctx.stroke();
+      ctx.globalAlpha = 0.3; ctx.beginPath(); ctx.ellipse(20, 8, 9, 5, 0, 0, 7); ctx.fill();
+    });
+  }
+  if (data.collisions.length) entry("collision", (ctx) => {
+    ctx.strokeStyle = c.bad; ctx.lineWidth = 2; ctx.beginPath(); ctx.arc(15, 8, 6, 0, 7);
+    ctx.moveTo(11, 4); ctx.lineTo(19, 12); ctx.moveTo(11, 12); ctx.lineTo(19, 4); ctx.stroke();
+  });
+  const patch = (colour) => (ctx) => { ctx.fillStyle = colour; ctx.fillRect(2, 4, 26, 8); };
+  if (data.zones.size) entry("conflict zone", patch(c.zone));
+  if (data.goal.size && data.goal.size < data.lanes.length / 2) entry("lanes where the mission is fulfilled", patch(c.goal));
+}
+
+function fillEvents(state) {
+  const list = document.getElementById("events"), all = state.events, most = 400;
+  const mine = document.getElementById("mine").checked && state.chosen;
+  const wanted = mine ? all.filter((e) => e.who.includes(state.chosen.id)) : all;
+  list.replaceChildren();
+  for (const event of wanted.slice(0, most)) {
+    const row = element("li");
+    row.append(element("time", `${event.t.toFixed(1)} s`), element("span", event.text, event.kind));
+    row.onclick = () => {
+      const who = event.who.map((id) => state.data.byId.get(id)).find((v) => v && v.av) || state.data.byId.get(event.who[0]);
+      if (who) state.choose(who, true);
+      state.seek(event.t);
+    };
+    list.append(row);
+  }
+  if (wanted.length > most) list.append(element("li", `and ${wanted.length - most} more`, "quiet"));
+  if (!wanted.length) list.append(element("li", "none", "quiet"));
+  document.getElementById("count").textContent = `(${wanted.length})`;
+}
+
+function fillFigures(data) {
+  const table = document.getElementById("figures");
+  const shown = (v) => v === null ? "NA" : v === true ? "yes" : v === false ? "no" :
+    Number.isInteger(v) ? String(v) : v.toPrecision(4);
+  const rows = [...data.facts.metrics, ["seed", data.facts.seed, ""], ["svo", data.facts.svo_deg, "deg"]];
+  for (const [name, value, unit] of rows) {
+    const row = element("tr");
+    row.append(element("td", name), element("td", `${shown(value)} ${unit === "bool" ? "" : unit}`));
+    table.append(row);
+  }
+  const row = element("tr"), cell = element("td", `trace ${data.facts.trace_hash}`);
+  cell.colSpan = 2; cell.style.overflowWrap = "anywhere"; row.append(cell); table.append(row);
+}
+
+function fillHead(data) {
+  const f = data.facts, chips = document.getElementById("chips");
+  document.getElementById("title").textContent = `${f.scenario} / ${f.demand} / ${f.policy}`;
+  const chip = (text, kind = "") => chips.append(element("span", text, `chip ${kind}`));
+  const figure = (name) => (f.metrics.find(([n]) => n === name) || [])[1];
+  if (f.policy_label) chip(f.policy_label, "warn");
+  chip(`seed ${f.seed}`); chip(f.preset); chip(`humans ${f.behavior}, ${f.driver_model}`); chip(`svo ${f.svo_deg}\u00b0`);
+  if (figure("crashed") != null) chip(figure("crashed") ? `${figure("collisions")} collision(s)` : "no collision", figure("crashed") ? "bad" : "good");
+  if (figure("mission_success") != null) chip(figure("mission_success") ? "mission fulfilled" : "mission not fulfilled", figure("mission_success") ? "good" : "bad");
+  for (const reason of f.not_comparable_because || []) chip(reason, "warn");
+}

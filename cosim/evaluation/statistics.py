@@ -1,0 +1,238 @@
+"""Values with 95 % intervals: shares, rates, means, quantiles, and differences of pairs on equal seeds.
+
+What is used where, and how it was checked: docs/evaluation_statistics.md. NA is nan in here, never 0.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import stats
+from scipy.optimize import brentq
+
+CONFIDENCE = 0.95
+Z = float(stats.norm.ppf(0.5 + CONFIDENCE / 2.0))
+RESAMPLES = 2000  # the bounds of a mean then wander by some 2 % of the interval's width from seed to seed
+BATCH = 2_000_000  # resampled values held at once: 16 MB
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """A value and its 95 % interval; nan where there is none."""
+
+    value: float
+    low: float
+    high: float
+
+    @property
+    def known(self) -> bool:
+        """Whether there is a value at all."""
+        return not math.isnan(self.value)
+
+    def text(self, digits: int, scale: float = 1.0) -> str:
+        """`value (low to high)`; "-" for NA, the bare value where no interval can be given."""
+        if not self.known:
+            return "-"
+        value, low, high = (f"{scale * x:.{digits}f}" for x in (self.value, self.low, self.high))
+        return value if math.isnan(self.low) else f"{value} ({low} to {high})"
+
+    def document(self) -> dict[str, float | None]:
+        """For JSON: nan and infinities as null."""
+        pairs = (("value", self.value), ("low", self.low), ("high", self.high))
+        return {name: x if math.isfinite(x) else None for name, x in pairs}
+
+
+NA = Figure(math.nan, math.nan, math.nan)
+
+
+# ---- one sample ----
+
+
+def share(hits: int, count: int) -> Figure:
+    """A proportion with Wilson's interval (1927), which is sound at 0 and at small counts."""
+    if count == 0:
+        return NA
+    found = stats.binomtest(hits, count).proportion_ci(CONFIDENCE, method="wilson")
+    return Figure(hits / count, float(found.low), float(found.high))
+
+
+def rule_of_three(count: int) -> float:
+    """Upper 95 % bound of a proportion that was never seen in `count` trials: 3 / count (Hanley 1983).
+
+    nan for 0 trials. One-sided, hence a little below Wilson's two-sided bound.
+    """
+    return min(3.0 / count, 1.0) if count else math.nan
+
+
+def rate(count: int, exposure: float) -> Figure:
+    """Events per unit of exposure with the exact Poisson interval (Garwood 1936)."""
+    tail = (1.0 - CONFIDENCE) / 2.0
+    low = stats.chi2.ppf(tail, 2 * count) / 2 if count else 0.0
+    high = stats.chi2.ppf(1.0 - tail, 2 * count + 2) / 2
+    return Figure(count / exposure, float(low) / exposure, float(high) / exposure)
+
+
+def mean(values: Sequence[float] | Array, seed: int = 0) -> Figure:
+    """A mean with its BCa bootstrap interval (Efron 1987); nan values are left out.
+
+    Bounds: nan with fewer than two values; the value itself when all are equal (nothing to resample).
+    `seed` fixes the resampling: equal values, equal figure.
+    """
+    data = np.asarray(values, np.float64)
+    data = data[~np.isnan(data)]
+    return _bootstrap((data,), _mean, seed)
+
+
+def quantile(values: Sequence[float] | Array, q: float) -> Figure:
+    """A quantile of independent values with its order-statistic interval; nan values are left out."""
+    ordered = np.sort([v for v in values if not math.isnan(v)])
+    if len(ordered) < 2:
+        return NA
+    tail = (1.0 - CONFIDENCE) / 2.0
+    low, high = (int(stats.binom.ppf(p, len(ordered), q)) for p in (tail, 1.0 - tail))
+    last = len(ordered) - 1
+    return Figure(
+        float(np.quantile(ordered, q)), float(ordered[min(low, last)]), float(ordered[min(high, last)])
+    )
+
+
+def median_of_blocks(samples: Sequence[tuple[int, float]]) -> Figure:
+    """Median of autocorrelated (block, value) samples: percentile bootstrap over whole blocks (minutes)."""
+    blocks: dict[int, list[float]] = {}
+    for block, value in samples:
+        blocks.setdefault(block, []).append(value)
+    parts = [np.asarray(v) for v in blocks.values()]
+    if not parts:
+        return NA
+    rng = np.random.default_rng(0)
+    medians = [
+        np.median(np.concatenate([parts[i] for i in rng.integers(0, len(parts), len(parts))]))
+        for _ in range(200)
+    ]
+    value = float(np.median(np.concatenate(parts)))
+    return Figure(value, float(np.quantile(medians, 0.025)), float(np.quantile(medians, 0.975)))
+
+
+# ---- pairs on equal seeds: entry i of `before` and of `after` is the same traffic ----
+
+
+def paired_share(before: Sequence[bool], after: Sequence[bool]) -> Figure:
+    """Difference of two proportions, after - before, with Tango's score interval (1998).
+
+    Unlike the usual ones it keeps its width when no pair differs, and its coverage at small counts.
+    """
+    lost, gained = discordant(before, after)
+    return _tango(gained, lost, len(before))
+
+
+def discordant(before: Sequence[bool], after: Sequence[bool]) -> tuple[int, int]:
+    """How many pairs went from yes to no, and from no to yes."""
+    pairs = list(zip(before, after, strict=True))
+    return sum(b and not a for b, a in pairs), sum(a and not b for b, a in pairs)
+
+
+def mcnemar(lost: int, gained: int) -> float:
+    """Exact two-sided p of "as many pairs change one way as the other" (McNemar 1947); 1 when none does."""
+    if lost + gained == 0:
+        return 1.0
+    return float(stats.binomtest(gained, lost + gained, 0.5).pvalue)
+
+
+def paired_mean(before: Sequence[float] | Array, after: Sequence[float] | Array, seed: int = 0) -> Figure:
+    """Mean of the differences after - before, BCa bootstrap over pairs; pairs with a nan are left out."""
+    b, a = _complete(before, after)
+    return _bootstrap((a - b,), _mean, seed)
+
+
+def paired_change(before: Sequence[float] | Array, after: Sequence[float] | Array, seed: int = 0) -> Figure:
+    """Relative change of the mean, mean(after) / mean(before) - 1, bootstrapped over pairs.
+
+    inf or -inf when the mean before is 0 and that after is not; no bounds where a resample could say so.
+    """
+    b, a = _complete(before, after)
+    if len(b) and b.mean() == 0.0:
+        change = 0.0 if a.mean() == 0.0 else math.copysign(math.inf, a.mean())
+        return Figure(change, math.nan if change else 0.0, math.nan if change else 0.0)
+    return _bootstrap((b, a), _change, seed)
+
+
+# ---- inside ----
+
+
+def _complete(before: Sequence[float] | Array, after: Sequence[float] | Array) -> tuple[Array, Array]:
+    b, a = np.asarray(before, np.float64), np.asarray(after, np.float64)
+    both = ~(np.isnan(b) | np.isnan(a))
+    return b[both], a[both]
+
+
+def _mean(values: Array, axis: int = -1) -> Array:
+    return np.asarray(values.mean(axis=axis))
+
+
+def _change(before: Array, after: Array, axis: int = -1) -> Array:
+    with np.errstate(divide="ignore", invalid="ignore"):  # a resample may hold nothing but zeros
+        return np.asarray(after.mean(axis=axis) / before.mean(axis=axis) - 1.0)
+
+
+def _bootstrap(samples: tuple[Array, ...], statistic: Callable[..., Array], seed: int) -> Figure:
+    """BCa over the common index of the samples; percentiles where BCa is not defined."""
+    count = len(samples[0])
+    if count == 0:
+        return NA
+    value = float(statistic(*samples))
+    if all(np.ptp(s) == 0.0 for s in samples):
+        same = value if count > 1 else math.nan
+        return Figure(value, same, same)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # DegenerateDataWarning: answered below
+        found = stats.bootstrap(
+            samples,
+            statistic,
+            paired=True,
+            vectorized=True,
+            n_resamples=RESAMPLES,
+            batch=max(1, BATCH // count),
+            confidence_level=CONFIDENCE,
+            method="BCa",
+            rng=np.random.default_rng(seed),
+        )
+    if not np.isfinite(found.bootstrap_distribution).all():
+        return Figure(value, math.nan, math.nan)
+    low, high = (float(x) for x in found.confidence_interval)
+    if math.isnan(low) or math.isnan(high):
+        tail = 50.0 * (1.0 - CONFIDENCE)
+        low, high = (float(x) for x in np.percentile(found.bootstrap_distribution, [tail, 100.0 - tail]))
+    return Figure(value, low, high)
+
+
+def _tango(gained: int, lost: int, count: int) -> Figure:
+    """Score interval of (gained - lost) / count: the differences d that a score test does not refuse.
+
+    Tango, Statistics in Medicine 17 (1998) 891-908, equation (10) for the variance under d.
+    """
+    if count == 0:
+        return NA
+    value = (gained - lost) / count
+
+    def score(d: float) -> float:
+        """(gained - lost - n d) over its standard deviation when d is the truth."""
+        b = -gained - lost + (2 * count - gained + lost) * d
+        c = -lost * d * (1.0 - d)
+        root = math.sqrt(max(b * b - 8.0 * count * c, 0.0))
+        # the larger root of 2 n q^2 + b q + c, without cancellation: P(yes to no) under d
+        q = -2.0 * c / (b + root) if b > 0.0 else (root - b) / (4.0 * count)
+        variance = count * (2.0 * q + d * (1.0 - d))
+        off = gained - lost - count * d
+        return off / math.sqrt(variance) if variance > 0.0 else math.copysign(math.inf, off) if off else 0.0
+
+    edge = 1.0 - 1e-9  # at -1 and 1 the variance is 0
+    low = -1.0 if value <= -edge else brentq(lambda d: score(d) - Z, -edge, value)
+    high = 1.0 if value >= edge else brentq(lambda d: score(d) + Z, value, edge)
+    return Figure(value, float(low), float(high))

@@ -1,0 +1,101 @@
+"""Tasks and their outcomes, and who gets which task next: all that an engine knows of the work it spreads."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter, deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+OK, SIM_CRASH, TIMEOUT, BAD_INPUT = STATUSES = ("ok", "sim_crash", "timeout", "bad_input")
+FAULT = "fault"  # our own code failed: says nothing about the task, which should be done again once mended
+
+
+class Progress(Protocol):
+    """A sign of life: how much is done, of how much."""
+
+    def __call__(self, done: float, total: float) -> None: ...
+
+
+class Hosted(Protocol):
+    """What lives in a worker process."""
+
+    @property
+    def run(self) -> Callable[..., Any]:
+        """`run(*task.arguments, progress=...)` does one task, calling `progress` now and then: the sign of
+        life that the watchdog waits for. Everything in and out must be picklable.
+
+        Raises BadInput or SimulationError; anything else is a fault of ours.
+        """
+
+    def close(self) -> None:
+        """The process ends."""
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """One piece of work. Tasks of one `group` are cheap to do one after the other in the same process."""
+
+    key: str  # unique among the tasks given to an engine
+    group: str
+    arguments: tuple[Any, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What became of one task; `value` is what `Hosted.run` returned, None unless `status` is ok."""
+
+    key: str
+    status: str  # one of STATUSES, or FAULT
+    value: Any = None
+    error: str | None = None  # one line
+    stderr: str | None = None  # the end of what a dead process wrote there; of a fault, the traceback
+    attempts: int = 1
+    seconds: float = 0.0  # wall time of the last attempt
+
+    @property
+    def ok(self) -> bool:
+        return self.status == OK
+
+
+class Dispenser:
+    """Hands out tasks to many takers, each of which keeps to one group while it lasts. Thread-safe.
+
+    A taker without a group gets one that nobody works on, or else helps where most is left.
+    """
+
+    def __init__(self, tasks: Iterable[Task]) -> None:
+        self._lock = threading.Lock()
+        self._groups: dict[str, deque[Task]] = {}
+        self._takers: Counter[str] = Counter()
+        for task in tasks:
+            self._groups.setdefault(task.group, deque()).append(task)
+
+    def take(self, last: str | None) -> Task | None:
+        """The next task of a taker whose last one was of the group `last`; None when none is left."""
+        with self._lock:
+            if last is not None and self._groups.get(last):
+                return self._groups[last].popleft()
+            if last is not None:
+                self._takers[last] -= 1
+                self._groups.pop(last, None)
+            waiting = {name: len(tasks) for name, tasks in self._groups.items() if tasks}
+            if not waiting:
+                return None
+            fewest = min(self._takers[name] for name in waiting)
+            free = [name for name in waiting if self._takers[name] == fewest]
+            group = free[0] if fewest == 0 else max(free, key=waiting.__getitem__)
+            self._takers[group] += 1
+            return self._groups[group].popleft()
+
+    def put_back(self, task: Task) -> None:
+        """The taker of this task is gone: somebody else must do it, and soon."""
+        with self._lock:
+            self._groups.setdefault(task.group, deque()).appendleft(task)
+
+    def leave(self, last: str | None) -> None:
+        """A taker whose last task was of the group `last` takes no more."""
+        with self._lock:
+            if last is not None:
+                self._takers[last] -= 1

@@ -1,0 +1,74 @@
+"""How figures are spelled for people: per cent and percentage points, units, intervals, NA."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from cosim.evaluation.figures import Measure
+from cosim.evaluation.statistics import Figure
+
+NA_TEXT = "NA"
+
+
+def number(value: float, measure: Measure, *, signed: bool = False, unit: bool = True) -> str:
+    """`12.5 %`, `+0.5 pp` (a signed share is a difference of shares), `543 m`, `NA`."""
+    if math.isnan(value):
+        return NA_TEXT
+    name = measure.unit
+    if measure.is_share:
+        value, name = 100.0 * value, "pp" if signed else "%"
+    text = _digits(value, signed)
+    return f"{text} {name}" if unit and name else text
+
+
+def change(value: float) -> str:
+    """A relative change: `-3.2 %`."""
+    return NA_TEXT if math.isnan(value) else f"{_digits(100.0 * value, True)} %"
+
+
+def interval(figure: Figure, measure: Measure, *, signed: bool = False) -> str:
+    """`12.5 % (4.4 to 26.1)`; without brackets where there is no interval."""
+    text = number(figure.value, measure, signed=signed)
+    if not figure.known or math.isnan(figure.low):
+        return text
+    low, high = (number(x, measure, signed=signed, unit=False) for x in (figure.low, figure.high))
+    return f"{text} ({low} to {high})"
+
+
+def sample(counts: Mapping[str, Any]) -> str:
+    """`3/40` of a rate, `n 40` of a mean, with the NA beside them."""
+    text = f"{counts['hits']}/{counts['n']}" if counts.get("hits") is not None else f"n {counts['n']}"
+    return f"{text}, {counts['na']} NA" if counts.get("na") else text
+
+
+def p_value(p: float) -> str:
+    """`p 0.03`, `p < 0.001`."""
+    return "p < 0.001" if p < 0.001 else f"p {p:.2g}"
+
+
+def group(identity: Mapping[str, Any], *, policy: bool = True) -> str:
+    """`merge / contested / idm / moderate / unguarded / svo 45 / lc2013`."""
+    words = [identity.get("scenario"), identity.get("demand"), identity.get("policy") if policy else None]
+    words += [identity.get("behavior"), identity.get("preset")]
+    if identity.get("svo_deg") is not None:
+        words.append(f"svo {identity['svo_deg']:g}")
+    if identity.get("penetration") is not None:
+        words.append(f"penetration {identity['penetration']:g}")
+    words.append(identity.get("driver_model"))
+    return " / ".join(str(word) for word in words if word is not None)
+
+
+def _digits(value: float, signed: bool) -> str:
+    """Three significant digits or so, never an exponent below a million."""
+    if math.isinf(value):
+        return "inf" if value > 0 else "-inf"
+    size = abs(value)
+    if size >= 1e6:
+        return f"{value:+.3g}" if signed else f"{value:.3g}"
+    places = 0 if size >= 100 else 1 if size >= 10 or size == 0 else 2 if size >= 1 else 3
+    text = f"{value:+.{places}f}" if signed else f"{value:.{places}f}"
+    if "." in text:
+        text = text.rstrip("0").rstrip(".")
+    return {"-0": "0", "+0": "0"}.get(text, text)

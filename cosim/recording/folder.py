@@ -1,0 +1,102 @@
+"""A folder of recordings: which episodes there are, which are still missing, and on which road."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from cosim.errors import BadInput
+from cosim.recording import roads
+from cosim.recording.file import FORMAT, Recording, read
+from cosim.road import RoadMap
+
+
+class Folder:
+    """`DIR/manifest.json`, `DIR/episodes/KEY.parquet`, `DIR/roads/HASH.json`.
+
+    An episode is there when its file is: files appear whole, so a killed recorder leaves no half episode,
+    and one that is resumed leaves out what is there.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._roads: dict[str, RoadMap] = {}
+
+    @property
+    def manifest_file(self) -> Path:
+        return self.path / "manifest.json"
+
+    def prepare(self) -> None:
+        """Make the folder. Raises BadInput."""
+        try:
+            for part in ("episodes", "roads"):
+                (self.path / part).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise BadInput(
+                f"cannot make this folder: {error.strerror}", field="--out", value=self.path
+            ) from None
+
+    def episode_file(self, key: str) -> Path:
+        return self.path / "episodes" / f"{key}.parquet"
+
+    def has(self, key: str) -> bool:
+        return self.episode_file(key).is_file()
+
+    def episodes(self) -> list[str]:
+        """Keys of the episodes that are there, sorted."""
+        return sorted(file.stem for file in (self.path / "episodes").glob("*.parquet"))
+
+    def manifest(self) -> dict[str, Any]:
+        """Raises BadInput when this is not a folder of recordings."""
+        try:
+            found = json.loads(self.manifest_file.read_text())
+        except OSError:
+            raise BadInput("not a folder of recordings (no manifest.json)", file=self.path) from None
+        except ValueError as error:
+            raise BadInput(f"not JSON: {error}", file=self.manifest_file) from None
+        if not isinstance(found, dict) or found.get("format") != FORMAT:
+            raise BadInput(f"not a folder of recordings of format {FORMAT}", file=self.manifest_file)
+        return found
+
+    def write_manifest(self, document: Mapping[str, Any]) -> None:
+        """Replace the manifest whole."""
+        _write_whole(self.manifest_file, json.dumps({"format": FORMAT, **document}, indent=1) + "\n")
+
+    def add_road(self, road: RoadMap) -> str:
+        """Store a road once; returns its name, which the episodes' cases carry."""
+        text = roads.text(road)
+        name = hashlib.sha256(text.encode()).hexdigest()[:16]
+        file = self.path / "roads" / f"{name}.json"
+        if not file.is_file():
+            _write_whole(file, text)
+        return name
+
+    def road(self, recording: Recording) -> RoadMap:
+        """The road a recording was driven on. Raises BadInput."""
+        name = str(recording.case["road"])
+        if name not in self._roads:
+            self._roads[name] = roads.read_road(self.path / "roads" / f"{name}.json")
+        return self._roads[name]
+
+    def recordings(self, scenarios: Sequence[str] = (), behaviors: Sequence[str] = ()) -> Iterator[Recording]:
+        """Every episode, by key; only the named scenarios and behaviours where any are named."""
+        for key in self.episodes():
+            recording = read(self.episode_file(key))
+            if scenarios and recording.case["scenario"] not in scenarios:
+                continue
+            if behaviors and recording.case["behavior"] not in behaviors:
+                continue
+            yield recording
+
+
+def _write_whole(file: Path, text: str) -> None:
+    draft = file.with_name(f".{file.name}.{os.getpid()}.part")  # two workers may store the same road
+    try:
+        draft.write_text(text)
+        draft.replace(file)
+    except OSError as error:
+        raise BadInput(f"cannot write: {error.strerror}", file=file) from None

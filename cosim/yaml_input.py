@@ -122,9 +122,14 @@ def read(path: Path, known: Iterable[str]) -> Section:
     Raises:
         BadInput: missing, not UTF-8, not YAML (with the line), or not such a mapping.
     """
+    return Section(path, document(path), known)
+
+
+def document(path: Path) -> object:
+    """What the YAML file `path` holds. Raises BadInput: missing, not UTF-8, not YAML (with the line)."""
     regular_file(path, file=path, field="file")
     try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+        return yaml.safe_load(path.read_text(encoding="utf-8"))
     except UnicodeDecodeError as error:
         raise BadInput("is not UTF-8", file=path, field="byte", value=error.start) from None
     except yaml.YAMLError as error:
@@ -132,7 +137,6 @@ def read(path: Path, known: Iterable[str]) -> Section:
         problem = f"not YAML: {getattr(error, 'problem', None) or 'malformed'}"
         line = None if mark is None else mark.line + 1
         raise BadInput(problem, file=path, field="line", value=line) from None
-    return Section(path, values, known)
 
 
 def check_pattern(pattern: str, file: object, field: str) -> None:

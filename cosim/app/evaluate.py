@@ -40,9 +40,7 @@ def evaluate(args: argparse.Namespace) -> int:
         return _dry_run(plan, engine, args)
     if args.out is None:
         raise BadInput("name the run's folder", field="--out")
-    with RunFolder(
-        args.out, resume=args.resume, episodes=plan.episodes, own_store=args.store is None
-    ) as folder:
+    with RunFolder(args.out, resume=args.resume, episodes=plan.episodes) as folder:
         store = _store(folder, plan, args)
         with store:
             return _drive(plan, engine, store, folder.path, args)

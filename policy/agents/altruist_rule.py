@@ -179,7 +179,7 @@ class AltruistRule:
 
 
 def _missions(histories: Mapping[str, History]) -> dict[str, Seen]:
-    """Every mission vehicle that any AV perceives (V2V: in a queue it is not among everybody's 15 rows)."""
+    """Every mission vehicle that any AV perceives (V2V: not everybody is near enough to)."""
     found: dict[str, Seen] = {}
     for history in histories.values():
         for r in np.flatnonzero(history.valid[-1] & (history.kinematics[-1, :, 7] > 0.5)):

@@ -46,3 +46,8 @@ def restore_adam(
     whole = optimizer.state_dict()
     whole["state"] = slots
     optimizer.load_state_dict(whole)
+
+
+def use_threads(count: int) -> None:
+    """Threads of this process for torch: a learner beside actors wants one each."""
+    torch.set_num_threads(count)

@@ -6,6 +6,6 @@ does it and returns the exit code. What a verb needs is imported inside `work`: 
 
 from __future__ import annotations
 
-from cosim.app.verbs import doctor, evaluate, replay, run, scenarios
+from cosim.app.verbs import compare, doctor, evaluate, replay, run, scenarios, train
 
-VERBS = (run, evaluate, replay, scenarios, doctor)
+VERBS = (run, evaluate, compare, replay, train, scenarios, doctor)

@@ -1,0 +1,93 @@
+"""Training of the value networks from a configuration file: the roof over trainer and rollouts."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.resources
+import math
+import shutil
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import policy
+from cosim.app import output
+from cosim.app.progress import Progress
+from cosim.app.rollouts import Rollouts
+from cosim.dataclass_input import dataclass_from
+from cosim.errors import BadInput
+from cosim.scenario import load
+from cosim.yaml_input import document
+from policy.agents.approaches import APPROACHES
+from policy.training.config import TrainingFile, agent_config
+from policy.training.log import tensorboard
+from policy.training.networks import use_threads
+from policy.training.vfn import Lesson, Trainer, VfnTraining
+from sumo_scenarios import names
+
+CONTESTED = 2.0  # contested episodes for every dense one: altruism is learned where somebody must yield
+
+
+def train(args: argparse.Namespace) -> int:
+    """`cosim train vfn|a2c`. Raises BadInput for whatever is wrong before anything is driven."""
+    path, file = configuration(args.config)
+    name = args.policy or ("conv3d-a2c" if args.what == "a2c" else "vfn-p")
+    agent = agent_config(name, file)
+    learning = APPROACHES[name].learning
+    if (learning == "a2c") != (args.what == "a2c"):
+        raise BadInput(f"is trained by {learning}", field="--policy", value=name)
+    training = _scheduled(file.training, args, name)
+    for lesson in training.lessons:
+        load(lesson.scenario, demand=[lesson.demand], behavior=lesson.behavior)
+    folder = output.prepare_folder(args.out)
+    if not args.resume and (folder / "state.json").exists():
+        raise BadInput("holds a training run already: --resume goes on", field="--out", value=args.out)
+    shutil.copyfile(path, folder / "config.yaml")
+    about = {"policy": name, "scenarios": sorted({lesson.scenario for lesson in training.lessons})}
+    explore = replace(file.explore, sample=learning == "a2c")
+    use_threads(args.threads)  # more threads than cores stall each other (docs/training.md)
+    writer = tensorboard(folder)
+    progress = Progress(f"train {name}", "iterations")
+    try:
+        with Rollouts(args.workers, name, agent, explore, file.reward) as actors:
+            trainer = Trainer(
+                training, agent.vfn, actors, folder, device=args.device, log=writer, about=about
+            )
+            if args.resume and not trainer.resume():
+                print("nothing to resume: starting anew", file=sys.stderr)
+            trainer.run(progress)
+    finally:
+        progress.done()
+        writer.close()
+    best = f", best validation reward {trainer.best:.3f}" if math.isfinite(trainer.best) else ""
+    print(f"{name}: {trainer.iteration} iterations, {trainer.learner.updates} updates{best}")
+    print(f"  {folder / 'best.safetensors'}")
+    return 0
+
+
+def configuration(name: str) -> tuple[Path, TrainingFile]:
+    """A shipped configuration by name, or a file. Raises BadInput naming file, field and value."""
+    shipped = Path(str(importlib.resources.files(policy) / "configs" / f"{name}.yaml"))
+    path = shipped if shipped.is_file() else Path(name)
+    return path, dataclass_from(TrainingFile, document(path) or {}, path)
+
+
+def _scheduled(training: VfnTraining, args: argparse.Namespace, name: str) -> VfnTraining:
+    """The file's schedule with what the command line and the approach say otherwise."""
+    worlds = names() if "all" in args.scenario else tuple(args.scenario)
+    if worlds:
+        training = replace(
+            training,
+            lessons=tuple(
+                Lesson(world, demand, weight=weight)
+                for world in worlds
+                for demand, weight in (("contested", CONTESTED), ("dense", 1.0))
+            ),
+        )
+    if name.endswith("-egoistic"):  # the twin never weighs anybody's interest but its own
+        training = replace(training, svo=(0.0,), replay=replace(training.replay, phi=(0.0, 0.0)))
+    if args.iterations is not None:
+        training = replace(training, iterations=args.iterations)
+    if args.seed is not None:
+        training = replace(training, seed=args.seed)
+    return replace(training, learning=APPROACHES[name].learning)

@@ -1,0 +1,44 @@
+"""`cosim train`: train one of the networks; killed at any moment, `--resume` goes on exactly."""
+
+from __future__ import annotations
+
+import argparse
+
+from cosim.app.verbs import arguments
+
+WHAT = ("vfn", "a2c")
+
+
+def add(verbs: arguments.Verbs) -> None:
+    """Register the verb and its flags."""
+    train = verbs.add_parser(
+        "train",
+        help="train the value network or one of the baselines",
+        description="Train a network. The folder --out then holds log.jsonl, tensorboard/, best and last "
+        "weights with their configuration, and everything that --resume needs.",
+    )
+    train.add_argument("what", choices=WHAT, help="which network")
+    train.add_argument(
+        "--config", default="compact", metavar="FILE", help="compact, paper, smoke, or a YAML file"
+    )
+    train.add_argument("--policy", metavar="NAME", help="the approach (default: vfn-p; a2c: conv3d-a2c)")
+    train.add_argument(
+        "--scenario", action="append", default=[], metavar="NAME", help="a world, or all (default: merge)"
+    )
+    train.add_argument("--iterations", type=arguments.count, metavar="N", help="instead of the file's")
+    train.add_argument(
+        "--seed", type=arguments.seed, metavar="N", help="of everything; instead of the file's"
+    )
+    train.add_argument("--resume", action="store_true", help="go on in --out")
+    train.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    train.add_argument("--workers", type=arguments.count, default=1, metavar="N", help="driving processes")
+    train.add_argument("--threads", type=arguments.count, default=1, metavar="N", help="of the learner")
+    train.add_argument("--out", required=True, metavar="DIR")
+    train.set_defaults(work=work)
+
+
+def work(args: argparse.Namespace) -> int:
+    """Train until the last iteration."""
+    from cosim.app.train_vfn import train
+
+    return train(args)

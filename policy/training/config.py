@@ -1,0 +1,37 @@
+"""One training run as one document: sizes, reward, exploration and schedule (policy/configs/*.yaml)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+from cosim.rewards import RewardConfig
+from cosim.types import ObservationConfig
+from policy.agents.approaches import AgentConfig, configure
+from policy.chain import ChainConfig
+from policy.hpn import HpnConfig
+from policy.safety import SafetyConfig
+from policy.traffic import TrafficConfig
+from policy.training.explorer import ExploreConfig
+from policy.training.vfn import VfnTraining
+from policy.vfn import VfnConfig
+
+
+@dataclass(frozen=True, slots=True)
+class TrainingFile:
+    """The sections of a configuration file; whatever it leaves out keeps the compact default."""
+
+    observation: ObservationConfig = field(default_factory=ObservationConfig)
+    chain: ChainConfig = field(default_factory=ChainConfig)
+    hpn: HpnConfig = field(default_factory=HpnConfig)
+    vfn: VfnConfig = field(default_factory=VfnConfig)
+    safety: SafetyConfig = field(default_factory=SafetyConfig)
+    traffic: TrafficConfig = field(default_factory=TrafficConfig)
+    reward: RewardConfig = field(default_factory=RewardConfig)
+    explore: ExploreConfig = field(default_factory=ExploreConfig)
+    training: VfnTraining = field(default_factory=VfnTraining)
+
+
+def agent_config(name: str, file: TrainingFile) -> AgentConfig:
+    """The approach `name` at the sizes of `file`, untrained."""
+    config = configure(name, file.observation, file.chain, file.hpn, file.vfn)
+    return replace(config, safety=file.safety, traffic=file.traffic)

@@ -1,129 +1,46 @@
-"""The hybrid predictive network (P, figure 3): N past observations in, the next map and kinematics out."""
+"""The hybrid predictive network (P, figure 3): the next seconds as maps and as kinematics, from two branches.
+
+Three ways to a map (measured, docs/results/prediction_maps.md):
+- `rendered`: the kinematic branch corrects every vehicle's forecast, and the rasteriser that draws the
+  observed maps draws the predicted ones. Vehicles stay sharp and no step of the chain blurs the next. Ships.
+- `corrected`: P's convolutional map branch sees those maps and predicts a correction, block after block.
+- `plain`: P's map branch alone, as written. Trained with the mean squared error it predicts empty maps.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
-import torch
 from torch import nn
-from torch.nn import functional
 
-from policy.tensors import KINEMATIC_INPUTS
-
-PREDICTED = 4  # x, y, speed, heading of each row: P's K
+from policy.kinematic_branch import KinematicBranch, KinematicConfig
+from policy.map_branch import MapBranch, MapBranchConfig
 
 
 @dataclass(frozen=True, slots=True)
 class HpnConfig:
-    """Layout of the network. Defaults: compact size; P gives no strides, so two readings are offered."""
+    """Which branches there are, and their layouts."""
 
-    height: int = 32
-    width: int = 128
-    channels: int = 4
-    frames: int = 10  # N, 2 s of history (P, Table I)
-    rows: int = 16
-    block: int = 5  # frames predicted per step; 1 is the paper's (contract.md, Time)
-    reading: Literal["s2fc", "pool"] = "pool"  # compute.md: stride 2 then FC, or stride 2 with pooling
-    history: bool = True  # False: the current frame only (P, figure 6)
-    correct: bool = True  # see the rendered next map and predict its correction (compute.md: what works)
-    skips: bool = True  # add encoder features to the decoder's: P has none; False with correct=False is P's
-    features: tuple[int, int, int] = (32, 64, 64)  # P, section IV-C.1
-    hidden: int = 128  # P: FC layers of the K branch
-    latent: int = 512  # P, Table I
-
-    @property
-    def seen(self) -> int:
-        """Past frames that enter the network."""
-        return self.frames if self.history else 1
-
-    @property
-    def inputs(self) -> int:
-        """Map channels that enter the network."""
-        return (self.seen + (self.block if self.correct else 0)) * self.channels
+    maps: Literal["rendered", "corrected", "plain"] = "rendered"
+    kinematic: KinematicConfig = field(default_factory=KinematicConfig)  # not in `plain`
+    map_branch: MapBranchConfig = field(default_factory=MapBranchConfig)  # not in `rendered`
 
 
 class HPN(nn.Module):
-    """Predictive autoencoder with a map branch and a kinematic branch, added elementwise.
+    """The branches that the configuration asks for; `policy.chain.predict` puts them to work.
 
-    With `correct`, the last map layer starts at zero: the untrained network returns the rendered map, and
-    training can only be kept where it beats it.
+    Untrained, `rendered` and `corrected` return the maps rendered from the forecast along the lanes.
+    Raises ValueError when the map branch is not of the kind that `maps` needs.
     """
+
+    kinematic: KinematicBranch | None
+    map_branch: MapBranch | None
 
     def __init__(self, config: HpnConfig) -> None:
         super().__init__()
-        self.config = c = config
-        size = (c.height, c.width)
-        before: list[tuple[int, int]] = []  # what each convolution sees
-        convolved: list[tuple[int, int]] = []  # what it yields, before pooling
-        pools: list[tuple[int, int]] = []
-        widths = [c.inputs, *c.features]
-        self.encoder = nn.ModuleList()
-        for k in range(3):
-            self.encoder.append(nn.Conv2d(widths[k], widths[k + 1], 3, stride=2, padding=1))
-            h, w = ((n + 1) // 2 for n in size)
-            pool = (2 if h > 1 else 1, 2 if w > 1 else 1) if c.reading == "pool" else (1, 1)
-            before.append(size)
-            convolved.append((h, w))
-            pools.append(pool)
-            size = (h // pool[0], w // pool[1])
-        self._before, self._convolved, self._pools = before, convolved, pools
-        self._core = (c.features[2], *size)  # shape of the convolution output
-        flat = self._core[0] * self._core[1] * self._core[2]
-        self.kinematics_in = nn.Sequential(
-            nn.Linear(c.seen * c.rows * KINEMATIC_INPUTS, c.hidden), nn.ReLU(), nn.Linear(c.hidden, flat)
-        )
-        direct = c.reading == "pool" and flat == c.latent  # the paper's numbers then fit without a layer
-        self.to_latent = nn.Identity() if direct else nn.Linear(flat, c.latent)
-        self.from_latent = nn.Identity() if direct else nn.Linear(c.latent, flat)
-        self.decoder = nn.ModuleList()
-        outs = [c.features[1], c.features[0], c.block * c.channels]
-        for k, source in enumerate((c.features[2], *outs[:2])):
-            self.decoder.append(nn.ConvTranspose2d(source, outs[k], 3, stride=2, padding=1))
-        self.kinematics_out = nn.Sequential(
-            nn.Linear(c.latent, c.hidden), nn.ReLU(), nn.Linear(c.hidden, c.block * c.rows * PREDICTED)
-        )
-        if c.correct:
-            last = self.decoder[2]
-            assert isinstance(last, nn.ConvTranspose2d)
-            assert last.bias is not None
-            nn.init.zeros_(last.weight)
-            nn.init.zeros_(last.bias)
-
-    def forward(
-        self, past: Sequence[torch.Tensor], kinematics: torch.Tensor, rendered: torch.Tensor | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """One prediction step.
-
-        past: maps of the `seen` frames, oldest first, as one or more groups [B,k*C,H,W] of whole frames;
-        kinematics [B,seen,R,F+1]; rendered [B,block*C,H,W]: with `correct`, of the frames to predict.
-        Returns the next maps [B,block*C,H,W] (not clamped) and kinematics [B,block,R,4] x y speed heading
-        (scaled as the input is). Fastest in channels_last.
-        """
-        c = self.config
-        if c.correct != (rendered is not None):
-            raise ValueError("a rendered map is needed exactly when the network corrects one")
-        b = kinematics.shape[0]
-        z = torch.cat([*past, rendered] if rendered is not None else list(past), 1)
-        skips: list[torch.Tensor] = []
-        for convolution, pool in zip(self.encoder, self._pools, strict=True):
-            z = functional.relu_(convolution(z))
-            skips.append(z)
-            if pool != (1, 1):
-                z = functional.max_pool2d(z, pool)
-        moved = self.kinematics_in(kinematics.flatten(1))
-        latent = functional.relu(self.to_latent(z.flatten(1) + moved))  # P: elementwise addition
-        z = functional.relu(self.from_latent(latent)).reshape(b, *self._core)
-        z = z.contiguous(memory_format=torch.channels_last)
-        for k, convolution in enumerate(self.decoder):
-            if self._pools[2 - k] != (1, 1):  # undo the pooling
-                z = functional.interpolate(z, size=self._convolved[2 - k], mode="nearest")
-            if c.skips:
-                z = z + skips[2 - k]
-            z = convolution(z, output_size=list(self._before[2 - k]))
-            if k < 2:
-                z = functional.relu_(z)
-        if rendered is not None:
-            z = z + rendered
-        return z, self.kinematics_out(latent).reshape(b, c.block, c.rows, PREDICTED)
+        self.config = config
+        self.kinematic = None if config.maps == "plain" else KinematicBranch(config.kinematic)
+        if config.maps != "rendered" and config.map_branch.correct != (config.maps == "corrected"):
+            raise ValueError("a map branch corrects rendered maps exactly when `maps` says so")
+        self.map_branch = None if config.maps == "rendered" else MapBranch(config.map_branch)

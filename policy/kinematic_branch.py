@@ -43,12 +43,20 @@ class KinematicBranch(nn.Module):
         super().__init__()
         self.config = c = config
         inputs = own_inputs(c.frames)
-        self.own = nn.Sequential(nn.Linear(inputs, c.hidden), nn.ReLU(), nn.Linear(c.hidden, c.hidden), nn.ReLU())
+        self.own = nn.Sequential(
+            nn.Linear(inputs, c.hidden), nn.ReLU(), nn.Linear(c.hidden, c.hidden), nn.ReLU()
+        )
         self.near = nn.Sequential(
-            nn.Linear(NEIGHBOUR_INPUTS, c.neighbour), nn.ReLU(), nn.Linear(c.neighbour, c.neighbour), nn.ReLU()
+            nn.Linear(NEIGHBOUR_INPUTS, c.neighbour),
+            nn.ReLU(),
+            nn.Linear(c.neighbour, c.neighbour),
+            nn.ReLU(),
         )
         self.joined = nn.Sequential(
-            nn.Linear(c.hidden + 2 * c.neighbour, c.hidden), nn.ReLU(), nn.Linear(c.hidden, c.hidden), nn.ReLU()
+            nn.Linear(c.hidden + 2 * c.neighbour, c.hidden),
+            nn.ReLU(),
+            nn.Linear(c.hidden, c.hidden),
+            nn.ReLU(),
         )
         self.out = nn.Linear(c.hidden, c.horizon * OUTPUTS)
         nn.init.zeros_(self.out.weight)

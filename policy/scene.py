@@ -90,17 +90,45 @@ def rows_ahead(scene: Scene, x: Floats, y: Floats, speed: Floats, heading: Float
     """
     known = (scene.row >= 0) & scene.valid[np.maximum(scene.row, 0), -1]  # [B,R]
     who = np.maximum(scene.row, 0)
-    b, r = who.shape
-    rows = np.zeros((b, x.shape[1], r, len(KINEMATIC_FEATURES)))
-    dx = x[who] - scene.pose[:, 0, None, None]  # [B,R,M]
-    dy = y[who] - scene.pose[:, 1, None, None]
-    c, s = np.cos(scene.pose[:, 2])[:, None, None], np.sin(scene.pose[:, 2])[:, None, None]
     # headings of one vehicle continue its own history row: the same multiple of 2 pi
     base = np.stack([h.kinematics[-1, :, 3] for h in scene.histories]) - scene.state[who, -1, 3]  # [B,R]
+    return _rows(scene, who, known, base, (x, y, speed, heading)), known
+
+
+def pictured(
+    scene: Scene, x: Floats, y: Floats, speed: Floats, heading: Floats
+) -> tuple[Floats, Bools, Ints]:
+    """The same of every vehicle an AV knows, row 0 the ego: what its predicted maps are drawn from.
+
+    Returns rows [B,M,V,8], who is known [B,V] and which vehicle of the scene each row is [B,V].
+    """
+    b, v = len(scene.agents), len(scene.vehicles)
+    who = np.tile(np.arange(v), (b, 1))
+    who[np.arange(b), scene.ego] = 0  # the ego and the first one change places
+    who[:, 0] = scene.ego
+    known = scene.valid[who, -1]
+    if not scene.shared:
+        mine = np.zeros((b, v), np.bool_)
+        for k, row in enumerate(scene.row):
+            mine[k, row[row >= 0]] = True
+        known = known & np.take_along_axis(mine, who, 1)
+    base = np.repeat(-scene.pose[:, 2:3], v, 1)
+    return _rows(scene, who, known, base, (x, y, speed, heading)), known, who
+
+
+def _rows(
+    scene: Scene, who: Ints, known: Bools, base: Floats, states: tuple[Floats, Floats, Floats, Floats]
+) -> Floats:
+    """[B,M,k,8] of the vehicles who [B,k]; base [B,k] rad is added to their headings."""
+    x, y, speed, heading = states
+    rows = np.zeros((len(who), x.shape[1], who.shape[1], len(KINEMATIC_FEATURES)))
+    dx = x[who] - scene.pose[:, 0, None, None]  # [B,k,M]
+    dy = y[who] - scene.pose[:, 1, None, None]
+    c, s = np.cos(scene.pose[:, 2])[:, None, None], np.sin(scene.pose[:, 2])[:, None, None]
     rows[..., 0] = (c * dx + s * dy).transpose(0, 2, 1)
     rows[..., 1] = (c * dy - s * dx).transpose(0, 2, 1)
     rows[..., 2] = speed[who].transpose(0, 2, 1)
     rows[..., 3] = (heading[who] + base[..., None]).transpose(0, 2, 1)
     rows[..., 4:] = scene.state[who, -1, 4:][:, None]
     rows *= known[:, None, :, None]
-    return rows, known
+    return rows

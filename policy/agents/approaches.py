@@ -13,7 +13,7 @@ from policy.checkpoint import SHIPPED
 from policy.hpn import HpnConfig
 from policy.safety import SafetyConfig
 from policy.traffic import TrafficConfig
-from policy.vfn import VfnConfig
+from policy.vfn import TABLE_1, VfnConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +67,7 @@ def compact(name: str) -> AgentConfig:
 def paper(name: str) -> AgentConfig:
     """The paper-size configuration: 64 x 512, one frame a step, M = 20, T's Table 1 read literally."""
     hpn = HpnConfig(height=64, width=512, block=1, reading="pool")
-    return configure(name, PAPER, ChainConfig(every=1), hpn, VfnConfig(strides="literal"))
+    return configure(name, PAPER, ChainConfig(every=1), hpn, TABLE_1)
 
 
 def configure(

@@ -1,0 +1,206 @@
+"""Trains the HPN's kinematic branch on recorded episodes: the right place in the picture, and how sure.
+
+The maps are drawn from the corrected kinematics, so what counts is where a vehicle lies in the picture of
+an AV that moves itself: the loss is taken between pairs (AV, vehicle), in the AV's own predicted frame, for
+all frames of the horizon at once. It saturates when a box misses altogether: half a car's length off is worse
+than nothing, ten metres off are as wrong as twenty.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import nn
+
+from cosim.types import Bools, Floats, Floats32, Ints
+from policy.kinematic_branch import KinematicBranch, KinematicConfig, correct, sureness
+
+HALF_LENGTH, HALF_WIDTH = 2.5, 1.0  # m, half a car: an error of that size loses half of the box
+WINDOW = (128.0, 16.0)  # m, what lies outside of both pictures counts for nothing
+
+
+class Moment(NamedTuple):
+    """One decision: V vehicles and the B AVs that look at them. Coordinates from one origin per moment."""
+
+    own: Floats32  # [V,.] `VehicleInputs`
+    near: Floats32  # [V,K,.]
+    lane: Floats32  # [V,M,4]
+    gp: Floats32  # [V,M,4]
+    truth: Floats32  # [V,M,4] nan where the vehicle is gone
+    known: Bools  # [V]
+    ego: Ints  # [B] places of the AVs
+
+
+@dataclass(frozen=True, slots=True)
+class KinematicTraining:
+    """How it is trained. Chosen on validation seeds."""
+
+    batch: int = 24  # moments an update: about 1,000 vehicles
+    rate: float = 2e-3  # AdamW, one cycle
+    decay: float = 1e-3
+    clip: float = 1.0  # norm of the gradient
+    far: float = 0.3  # weight of the part that does not saturate: it shows the way from far off
+    alone: float = 0.3  # weight of each vehicle's own place, beside its place in the pictures
+    speed: float = 0.1  # per 3 m/s
+    heading: float = 0.2  # per rad
+    seed: int = 0
+
+
+class Batch(NamedTuple):
+    """Moments one behind the other, and the pairs among them."""
+
+    own: torch.Tensor
+    near: torch.Tensor
+    lane: torch.Tensor
+    gp: torch.Tensor
+    truth: torch.Tensor
+    looking: torch.Tensor  # [P] the AV of each pair
+    seen: torch.Tensor  # [P] the vehicle
+
+
+def collate(moments: Sequence[Moment], device: str = "cpu") -> Batch:
+    """One batch; vehicles that are not known are left out."""
+    first = 0
+    looking, seen = [], []
+    for m in moments:
+        place = first + np.cumsum(m.known) - 1
+        egos = place[m.ego[m.known[m.ego]]]
+        all_ = place[m.known]
+        pairs = np.stack(np.meshgrid(egos, all_, indexing="ij"), -1).reshape(-1, 2)
+        pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+        looking.append(pairs[:, 0])
+        seen.append(pairs[:, 1])
+        first += int(m.known.sum())
+
+    def joined(name: str) -> torch.Tensor:
+        return torch.from_numpy(np.concatenate([getattr(m, name)[m.known] for m in moments])).to(device)
+
+    return Batch(
+        *(joined(name) for name in ("own", "near", "lane", "gp", "truth")),
+        torch.from_numpy(np.concatenate(looking)).to(device),
+        torch.from_numpy(np.concatenate(seen)).to(device),
+    )
+
+
+def losses(raw: torch.Tensor, batch: Batch, c: KinematicTraining) -> dict[str, torch.Tensor]:
+    """The loss and its parts; raw [V,M,OUTPUTS] as the branch gives it."""
+    guess = correct(raw, batch.lane, batch.gp)
+    there = torch.isfinite(batch.truth).all(-1)  # [V,M]
+    truth = torch.where(there[..., None], batch.truth, guess.detach())
+    along, across = _turned(guess[..., :2] - truth[..., :2], truth[..., 3])
+    alone = _mean(_misplaced(along, across, c.far), there)
+    speed = _mean((guess[..., 2] - truth[..., 2]).abs() / 3.0, there)
+    heading = _mean((guess[..., 3] - truth[..., 3]).abs().clamp_max(1.0), there)
+    e, v = batch.looking, batch.seen
+    mine = _seen_from(guess[v], guess[e])  # [P,M,2] ahead, left
+    real = _seen_from(truth[v], truth[e])
+    shown = _inside(mine.detach()) | _inside(real)
+    along, across = _turned(mine - real, truth[v][..., 3] - truth[e][..., 3])
+    picture = _mean(_misplaced(along, across, c.far), shown & there[v] & there[e])
+    share = (1 - along.abs() / (2 * HALF_LENGTH)).clamp_min(0) * (
+        1 - across.abs() / (2 * HALF_WIDTH)
+    ).clamp_min(0)
+    share = torch.where(there[v], share.detach(), 0.0)
+    sure = sureness(raw[v][..., 5], raw[e][..., 6])
+    doubt = _mean((sure - share) ** 2, shown & there[e])
+    total = picture + c.alone * alone + c.speed * speed + c.heading * heading + doubt
+    missed = _mean(1.0 - share, shown & there[v] & there[e])
+    return {"loss": total, "picture": picture, "alone": alone, "sureness": doubt, "missed": missed}
+
+
+def _turned(d: torch.Tensor, heading: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    c, s = torch.cos(heading), torch.sin(heading)
+    return c * d[..., 0] + s * d[..., 1], c * d[..., 1] - s * d[..., 0]
+
+
+def _seen_from(states: torch.Tensor, ego: torch.Tensor) -> torch.Tensor:
+    return torch.stack(_turned(states[..., :2] - ego[..., :2], ego[..., 3]), -1)
+
+
+def _inside(place: torch.Tensor) -> torch.Tensor:
+    return (place[..., 0].abs() < WINDOW[0]) & (place[..., 1].abs() < WINDOW[1])
+
+
+def _misplaced(along: torch.Tensor, across: torch.Tensor, far: float) -> torch.Tensor:
+    square = (along / HALF_LENGTH) ** 2 + (across / HALF_WIDTH) ** 2
+    return 1.0 - torch.exp(-0.5 * square) + far * (torch.sqrt(1.0 + square) - 1.0)
+
+
+def _mean(values: torch.Tensor, where: torch.Tensor) -> torch.Tensor:
+    return (values * where).sum() / where.sum().clamp_min(1)
+
+
+class KinematicTask:
+    """`policy.training.loop.Task` of the kinematic branch."""
+
+    def __init__(
+        self,
+        config: KinematicConfig,
+        training: KinematicTraining,
+        updates: int,
+        train: Sequence[Moment],
+        validation: Sequence[Moment],
+        device: str = "cpu",
+    ) -> None:
+        self._training, self._train, self._device = training, train, device
+        self._validation = [collate(validation[k : k + 64], device) for k in range(0, len(validation), 64)]
+        torch.manual_seed(training.seed)  # module initialisers know no generator
+        self.network = KinematicBranch(config).to(device)
+        self._optimizer = torch.optim.AdamW(
+            self.network.parameters(), lr=training.rate, weight_decay=training.decay
+        )
+        self._cycle = torch.optim.lr_scheduler.OneCycleLR(
+            self._optimizer, training.rate, total_steps=updates + 1
+        )
+
+    def update(self, number: int) -> dict[str, float]:
+        """See `Task.update`."""
+        t = self._training
+        rng = np.random.default_rng([t.seed, number])
+        chosen = rng.integers(len(self._train), size=t.batch)
+        batch = collate([self._train[k] for k in chosen], self._device)
+        found = losses(self.network(batch.own, batch.near), batch, t)
+        self._optimizer.zero_grad(set_to_none=True)
+        found["loss"].backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(self.network.parameters(), t.clip)
+        self._optimizer.step()
+        self._cycle.step()
+        return {name: float(value.detach()) for name, value in found.items()}
+
+    def validate(self) -> dict[str, float]:
+        """See `Task.validate`."""
+        sums: dict[str, float] = {}
+        with torch.no_grad():
+            for batch in self._validation:
+                for name, value in losses(self.network(batch.own, batch.near), batch, self._training).items():
+                    sums[name] = sums.get(name, 0.0) + float(value) / len(self._validation)
+        return sums
+
+    def state(self) -> dict[str, Any]:
+        """See `Task.state`."""
+        return {
+            "network": self.network.state_dict(),
+            "optimizer": self._optimizer.state_dict(),
+            "cycle": self._cycle.state_dict(),
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """See `Task.restore`."""
+        self.network.load_state_dict(state["network"])
+        self._optimizer.load_state_dict(state["optimizer"])
+        self._cycle.load_state_dict(state["cycle"])
+
+
+def moment(
+    own: Floats32, near: Floats32, lane: Floats, gp: Floats, truth: Floats, known: Bools, ego: Ints
+) -> Moment:
+    """Move everything to one origin: float32 has not the digits for world coordinates."""
+    origin = np.array([*lane[int(ego[0]), 0, :2], 0.0, 0.0])
+    truth = truth.copy()
+    truth[..., 3] -= 2 * np.pi * np.round((truth[..., 3] - lane[..., 3]) / (2 * np.pi))
+    near_by = [(a - origin).astype(np.float32) for a in (lane, gp, truth)]
+    return Moment(own, near, *near_by, known, ego)

@@ -12,8 +12,14 @@ from cosim.raster import RoadRaster, channel_indices, draw_rows
 from cosim.types import Bools, Bytes, Floats, ObservationConfig
 from policy.forecast import KinematicForecast
 from policy.hpn import HPN
-from policy.scene import Scene, rows_ahead
+from policy.kinematic_branch import Corrected, apply
+from policy.map_branch import MapBranch
+from policy.scene import Scene, pictured, rows_ahead
 from policy.tensors import Batch, kinematic_tensor, map_tensor
+from policy.traffic import Traffic
+from policy.vehicle_inputs import vehicle_inputs
+
+FLOOR, SPAN, FASTEST = 0.1, 0.9, 30.0  # pixel of a vehicle (contract.md): 0.1 + 0.9 clip((dv + 30) / 60)
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +28,7 @@ class ChainConfig:
 
     horizon: int = 20  # frames of 0.2 s: 4 s (P, Table I)
     every: int = 5  # the VFN takes every fifth frame, M = 4; paper: 1, M = 20
-    source: Literal["hpn", "gp_raster"] = "hpn"  # gp_raster: the rendered maps as they are
+    source: Literal["hpn", "gp_raster"] = "hpn"  # gp_raster: maps rendered from the forecast as it is
 
     @property
     def hypotheses(self) -> int:
@@ -34,13 +40,13 @@ class Prediction(NamedTuple):
     """The M = horizon / every hypotheses of every AV."""
 
     maps: torch.Tensor  # [B,M,C,H,W] float32 in [0,1], each in the predicted ego's frame
-    kinematics: torch.Tensor  # [B,M,R,F+1] scaled; by the GP (P, eq. 10)
+    kinematics: torch.Tensor  # [B,M,R,F+1] scaled; the Gaussian process's (P, eq. 10), corrected by the HPN
     rows: Floats  # [B,horizon,R,8] every frame in m, m/s, rad, in the ego's frame at the newest frame
     valid: Bools  # [B,R]
 
 
 def render(rows: Floats, valid: Bools, pose: Floats, config: ObservationConfig, raster: RoadRaster) -> Bytes:
-    """Maps of predicted kinematics: rows [B,M,R,8], valid [B,R], pose [B,3] -> uint8 [B,M,C,H,W]."""
+    """Maps of predicted kinematics: rows [B,M,k,8], valid [B,k], pose [B,3] -> uint8 [B,M,C,H,W]."""
     b, m, r, f = rows.shape
     out = np.empty((b * m, len(config.channels), config.height, config.width), np.uint8)
     draw_rows(
@@ -59,6 +65,20 @@ def render(rows: Floats, valid: Bools, pose: Floats, config: ObservationConfig, 
     return out.reshape(b, m, *out.shape[1:])
 
 
+def shade(rows: Floats, share: Floats) -> Floats:
+    """Rows [B,M,k,8] (row 0 the ego) whose pixels are darkened to share [B,M,k] of their value.
+
+    A vehicle whose box is expected to be right by one half is drawn with half of its pixel value: the
+    expected picture, which has the least squared error. Never darker than the floor: nobody vanishes.
+    """
+    out = rows.copy()
+    ego = rows[..., :1, 2]
+    level = FLOOR + SPAN * np.clip((rows[..., 2] - ego + FASTEST) / (2 * FASTEST), 0.0, 1.0)
+    out[..., 2] = ego + (np.maximum(level * share, FLOOR) - FLOOR) * (2 * FASTEST / SPAN) - FASTEST
+    out[..., 0, 2] = ego[..., 0]
+    return out
+
+
 def predict(
     config: ChainConfig,
     observation: ObservationConfig,
@@ -67,24 +87,59 @@ def predict(
     scene: Scene,
     batch: Batch,
     forecast: KinematicForecast,
+    traffic: Traffic | None = None,
 ) -> Prediction:
-    """Algorithm 1, batched over all AVs; the GP corrects the kinematics at every step (eq. 10).
+    """Algorithm 1, batched over all AVs.
 
-    `forecast`: the predicted states of all vehicles of `scene` in the world, at least `horizon` frames.
+    `forecast`: the predicted states of all vehicles of `scene` in the world, at least `horizon` frames;
+    `traffic`: the same speeds along the lanes, for an `hpn` with a kinematic branch (ValueError without).
     Without an `hpn` the maps rendered from the forecast are returned.
     """
-    m, device = config.horizon, str(batch.maps.device)
-    rows, valid = rows_ahead(
-        scene, forecast.x[:, :m], forecast.y[:, :m], forecast.speed[:, :m], forecast.heading[:, :m]
-    )
+    device = str(batch.maps.device)
+    corrected: Corrected | None = None
+    if hpn is not None and hpn.kinematic is not None:
+        if traffic is None:
+            raise ValueError("the kinematic branch needs the traffic along the lanes")
+        corrected = apply(hpn.kinematic, vehicle_inputs(scene, forecast, traffic), forecast)
+        forecast = corrected.forecast
+    m, every = config.horizon, config.every
+    states = (forecast.x[:, :m], forecast.y[:, :m], forecast.speed[:, :m], forecast.heading[:, :m])
+    rows, valid = rows_ahead(scene, *states)
     kinematics = kinematic_tensor(rows, np.repeat(valid[:, None], m, 1), device)
-    rendered = None
-    if hpn is None or hpn.config.correct:
-        rendered = render(rows, valid, scene.pose, observation, raster)
-        if hpn is None:
-            wanted = slice(config.every - 1, None, config.every)
-            return Prediction(map_tensor(rendered[:, wanted], device), kinematics[:, wanted], rows, valid)
-    n, block, channels = hpn.config.seen, hpn.config.block, batch.maps.shape[2]
+    branch = None if hpn is None else hpn.map_branch
+    if branch is None:
+        drawn = _rendered(scene, states, corrected, slice(every - 1, None, every), observation, raster)
+        return Prediction(map_tensor(drawn, device), kinematics[:, every - 1 :: every], rows, valid)
+    reference = None
+    if branch.config.correct:
+        reference = _rendered(scene, states, corrected, slice(None), observation, raster)
+    maps = _chain(branch, config, batch, kinematics, reference)
+    return Prediction(maps, kinematics[:, every - 1 :: every], rows, valid)
+
+
+def _rendered(
+    scene: Scene,
+    states: tuple[Floats, Floats, Floats, Floats],
+    corrected: Corrected | None,
+    wanted: slice,
+    observation: ObservationConfig,
+    raster: RoadRaster,
+) -> Bytes:
+    """Maps [B,.,C,H,W] of the wanted frames, of every vehicle that each AV knows."""
+    x, y, speed, heading = (a[:, wanted] for a in states)
+    rows, known, who = pictured(scene, x, y, speed, heading)
+    if corrected is not None:
+        share = corrected.share(scene.ego)[..., : states[0].shape[1]][..., wanted]  # [B,V,M]
+        rows = shade(rows, np.take_along_axis(share, who[..., None], 1).transpose(0, 2, 1))
+    return render(rows, known, scene.pose, observation, raster)
+
+
+def _chain(
+    branch: MapBranch, config: ChainConfig, batch: Batch, kinematics: torch.Tensor, rendered: Bytes | None
+) -> torch.Tensor:
+    """The map branch, block after block: its own maps and the forecast kinematics are its next past."""
+    m, device = config.horizon, batch.maps.device
+    n, block, channels = branch.config.seen, branch.config.block, batch.maps.shape[2]
     b, _, _, h, w = batch.maps.shape
     # channels_last from here on: every frame is a group of channels, the window a few such groups
     past = [_grouped(batch.maps[:, -n:])]
@@ -97,15 +152,14 @@ def predict(
             if ahead.shape[1] < block:  # the horizon ends within this block
                 ahead = np.concatenate([ahead, np.repeat(ahead[:, -1:], block - ahead.shape[1], 1)], 1)
             drawn = _grouped(torch.from_numpy(ahead).to(device)).to(torch.float32).mul_(1.0 / 255.0)
-        guess, _ = hpn(past, moved, drawn)  # its own K is replaced by the GP's (eq. 10)
+        guess, _ = branch(past, moved, drawn)  # its own K is replaced by the GP's (eq. 10)
         guess = guess.clamp_(0.0, 1.0)
         frames = guess.view(b, block, channels, h, w)
         guesses += [frames[:, k] for k in range(block) if (start + k + 1) % config.every == 0]
         if start + block < m:
             past = _newest([*past, guess], n * channels)
             moved = torch.cat([moved, kinematics[:, start : start + block]], 1)[:, -n:]
-    maps = torch.stack(guesses[: config.hypotheses], 1)
-    return Prediction(maps, kinematics[:, config.every - 1 :: config.every], rows, valid)
+    return torch.stack(guesses[: config.hypotheses], 1)
 
 
 def _grouped(maps: torch.Tensor) -> torch.Tensor:

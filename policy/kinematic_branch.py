@@ -16,9 +16,9 @@ import numpy as np
 import torch
 from torch import nn
 
-from cosim.types import Floats, Floats32
+from cosim.types import Floats, Floats32, Ints
 from policy.forecast import KinematicForecast
-from policy.vehicle_inputs import FRAME, NEIGHBOUR_INPUTS, VehicleInputs, own_inputs
+from policy.vehicle_inputs import NEIGHBOUR_INPUTS, VehicleInputs, own_inputs
 
 OUTPUTS = 7  # belief in the GP; ahead, left, speed, heading; sureness as the one seen, as the one who looks
 
@@ -71,8 +71,8 @@ class KinematicBranch(nn.Module):
         """own [V,.], near [V,K,.] as in `VehicleInputs` -> [V,M,OUTPUTS] m, m/s, rad; logits."""
         n = self.near(near) * near[..., :1]  # the first input says whether anybody is there
         z = torch.cat([self.own(own), n.amax(-2), n.mean(-2)], -1)
-        raw: torch.Tensor = self.out(self.joined(z))
-        return raw.unflatten(-1, (self.config.horizon, OUTPUTS)) * self.unit
+        raw: torch.Tensor = self.out(self.joined(z)).contiguous()
+        return raw.view(*raw.shape[:-1], self.config.horizon, OUTPUTS) * self.unit
 
 
 def correct(raw: torch.Tensor, lane: torch.Tensor, gp: torch.Tensor) -> torch.Tensor:
@@ -108,12 +108,12 @@ class Corrected(NamedTuple):
     seen: Floats32  # [V,M] logits of `sureness`
     looking: Floats32  # [V,M]
 
-    def share(self, ego: np.ndarray) -> Floats:
+    def share(self, ego: Ints) -> Floats:
         """[B,V,M] `sureness` of every vehicle in the picture of each AV; ego [B] are their places."""
         logit = self.seen[None] + self.looking[ego][:, None] + 4.0
-        out = 1.0 / (1.0 + np.exp(-logit.astype(np.float64)))
+        out: Floats = 1.0 / (1.0 + np.exp(-logit.astype(np.float64)))
         out[np.arange(len(ego)), ego] = 1.0  # everybody is in the middle of his own picture
-        return np.asarray(out)
+        return out
 
 
 def apply(branch: KinematicBranch, inputs: VehicleInputs, forecast: KinematicForecast) -> Corrected:
@@ -130,7 +130,10 @@ def apply(branch: KinematicBranch, inputs: VehicleInputs, forecast: KinematicFor
     surely = raw[..., 5:].cpu().numpy()
     f = forecast
     corrected = KinematicForecast(
-        *(np.ascontiguousarray(moved[..., k]) for k in range(4)),
+        moved[..., 0],
+        moved[..., 1],
+        moved[..., 2],
+        moved[..., 3],
         f.speed_std[:, :m],
         f.heading_std[:, :m],
         f.along_std[:, :m],
@@ -138,8 +141,3 @@ def apply(branch: KinematicBranch, inputs: VehicleInputs, forecast: KinematicFor
         inputs.known,
     )
     return Corrected(corrected, surely[..., 0], surely[..., 1])
-
-
-def frames_ahead(config: KinematicConfig) -> Floats:
-    """[M] s, when each predicted frame is."""
-    return FRAME * np.arange(1, config.horizon + 1)

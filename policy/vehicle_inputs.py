@@ -138,13 +138,13 @@ def _accel(past: Floats, seen: Bools) -> Floats:
 
 
 def _leaders(scene: Scene, traffic: Traffic, now: Floats, accel: Floats, known: Bools) -> Floats:
-    """[V,LEADERS*LEADER] the next on the vehicle's own path: there at all, gap, speed, closing, acceleration."""
-    paths = [(p.lanes, p.lane_start, p.scale) if p is not None else ((), (), 1.0) for p in traffic.stream]
-    start = np.zeros(len(paths) + 1, np.int64)
-    np.cumsum([len(lanes) for lanes, _, _ in paths], out=start[1:])
-    lanes = np.array([k for p in paths for k in p[0]], np.int64)
-    begins = np.array([s for p in paths for s in p[1]], np.float64)
-    scale = np.array([p[2] for p in paths])
+    """[V,LEADERS*LEADER] the next on the own path: there at all, gap, speed, closing, acceleration."""
+    start = np.zeros(len(now) + 1, np.int64)
+    np.cumsum([0 if p is None else len(p.lanes) for p in traffic.stream], out=start[1:])
+    paths = [p for p in traffic.stream if p is not None]
+    lanes = np.array([k for p in paths for k in p.lanes], np.int64)
+    begins = np.concatenate([p.lane_start for p in paths]) if paths else np.zeros(0)
+    scale = np.array([1.0 if p is None else p.scale for p in traffic.stream])
     place = np.where(known, scene.lane, -2).astype(np.int64)
     who, gap = _next_on_path(
         start,

@@ -61,13 +61,12 @@ APPROACHES = {
 def compact(name: str) -> AgentConfig:
     """The compact configuration of an approach, with the weights that are shipped for it."""
     config = configure(name, COMPACT, ChainConfig(), HpnConfig(), VfnConfig())
-    return replace(config, vfn_weights=_shipped(name), hpn_weights=_shipped("hpn"))
+    return replace(config, vfn_weights=shipped(name), hpn_weights=shipped("hpn"))
 
 
 def paper(name: str) -> AgentConfig:
     """The paper-size configuration: 64 x 512, one frame a step, M = 20, T's Table 1 read literally."""
-    hpn = HpnConfig(height=64, width=512, block=1, reading="pool")
-    return configure(name, PAPER, ChainConfig(every=1), hpn, TABLE_1)
+    return configure(name, PAPER, ChainConfig(every=1), HpnConfig(), TABLE_1)
 
 
 def configure(
@@ -98,7 +97,7 @@ def configure(
     )
 
 
-def _shipped(name: str) -> Path | None:
+def shipped(name: str) -> Path | None:
     """The weights in the package; None while there are none."""
     path = SHIPPED / f"{name}.safetensors"
     return path if path.is_file() else None

@@ -104,15 +104,17 @@ class PredictionAware:
         c, context = self.config, self._context
         scene = join(histories, context.observation.share_perception)
         forecast = self._predictor.predict(scene.state, scene.valid)
+        traffic = predict_traffic(scene, forecast, context.road, c.traffic, c.safety.frames)
         with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=c.bf16):
             batch = to_batch(scene.histories, context.svo)
             maps, kinematics = batch.maps, batch.kinematics
             if c.predicted_maps:
                 assert self._raster is not None
-                ahead = predict(c.chain, c.observation, self._raster, self.hpn, scene, batch, forecast)
+                ahead = predict(
+                    c.chain, c.observation, self._raster, self.hpn, scene, batch, forecast, traffic
+                )
                 maps = torch.cat([maps, ahead.maps], 1)
                 kinematics = torch.cat([kinematics, ahead.kinematics], 1)
-        traffic = predict_traffic(scene, forecast, context.road, c.traffic, c.safety.frames)
         self._expected = scene.vehicles, traffic, forecast
         return Inputs(scene, maps, kinematics, batch.route, batch.phi, traffic)
 

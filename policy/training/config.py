@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 from cosim.rewards import RewardConfig
 from cosim.types import ObservationConfig
-from policy.agents.approaches import AgentConfig, configure
+from policy.agents.approaches import AgentConfig, configure, shipped
 from policy.chain import ChainConfig
 from policy.hpn import HpnConfig
 from policy.safety import SafetyConfig
@@ -32,6 +32,6 @@ class TrainingFile:
 
 
 def agent_config(name: str, file: TrainingFile) -> AgentConfig:
-    """The approach `name` at the sizes of `file`, untrained."""
+    """The approach `name` at the sizes of `file`: its value network untrained, its HPN the shipped one."""
     config = configure(name, file.observation, file.chain, file.hpn, file.vfn)
-    return replace(config, safety=file.safety, traffic=file.traffic)
+    return replace(config, safety=file.safety, traffic=file.traffic, hpn_weights=shipped("hpn"))

@@ -80,7 +80,11 @@ def collate(moments: Sequence[Moment], device: str = "cpu") -> Batch:
         return torch.from_numpy(np.concatenate([getattr(m, name)[m.known] for m in moments])).to(device)
 
     return Batch(
-        *(joined(name) for name in ("own", "near", "lane", "gp", "truth")),
+        joined("own"),
+        joined("near"),
+        joined("lane"),
+        joined("gp"),
+        joined("truth"),
         torch.from_numpy(np.concatenate(looking)).to(device),
         torch.from_numpy(np.concatenate(seen)).to(device),
     )
@@ -202,5 +206,5 @@ def moment(
     origin = np.array([*lane[int(ego[0]), 0, :2], 0.0, 0.0])
     truth = truth.copy()
     truth[..., 3] -= 2 * np.pi * np.round((truth[..., 3] - lane[..., 3]) / (2 * np.pi))
-    near_by = [(a - origin).astype(np.float32) for a in (lane, gp, truth)]
-    return Moment(own, near, *near_by, known, ego)
+    moved = [np.asarray(a - origin, np.float32) for a in (lane, gp, truth)]
+    return Moment(own, near, moved[0], moved[1], moved[2], known, ego)

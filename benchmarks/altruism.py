@@ -15,16 +15,15 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
-from scipy import stats
 
-from benchmarks.intervals import share
 from cosim.app.progress import Progress
 from cosim.app.runner import Runner
+from cosim.evaluation import statistics
 from cosim.scenario import load
 from cosim.types import EpisodeResult
 from cosim.worker import Worker
 
-WORLDS = ("merge", "exit", "roundabout", "intersection")
+WORLDS = ("merge", "exit", "roundabout", "intersection", "highway")
 POLICIES = ("idm", "idm-courteous", "altruist-rule", "keep-lane")
 COMMAND = "python -m benchmarks.altruism --seeds {seeds} --out docs/results/altruism.md"
 
@@ -44,51 +43,48 @@ def episodes(
 
 def rate(hits: Sequence[bool]) -> str:
     """`k/n = p % (low to high)`, Wilson 95 %."""
-    return f"{sum(hits)}/{len(hits)} = {share(sum(hits), len(hits)).text(0, 100.0)} %"
+    return f"{sum(hits)}/{len(hits)} = {statistics.share(sum(hits), len(hits)).text(0, 100.0)} %"
 
 
-def mean(values: Sequence[float], digits: int = 0) -> str:
-    """`mean (low to high)`, bootstrap 95 %."""
-    data = np.array([v for v in values if v is not None], float)
-    if len(data) < 2 or np.ptp(data) == 0:
-        return f"{data.mean():.{digits}f}" if len(data) else "NA"
-    rng = np.random.default_rng(0)
-    low, high = stats.bootstrap((data,), np.mean, rng=rng, n_resamples=2000).confidence_interval
-    return f"{data.mean():.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
+def mean(results: Sequence[EpisodeResult], name: str, digits: int = 0) -> str:
+    """`mean (low to high)` of one figure, bootstrap 95 %."""
+    return statistics.mean(figures(results, name)).text(digits)
+
+
+def figures(results: Sequence[EpisodeResult], name: str) -> list[float]:
+    """One figure of every episode; NA is nan."""
+    values = [r.value(name) for r in results]
+    return [math.nan if value is None else float(value) for value in values]
 
 
 def table(world: str, demand: str, runs: dict[str, list[EpisodeResult]]) -> list[str]:
     """The Markdown table of one world."""
     first = next(iter(runs.values()))[0]
+    has_mission = first.value("mission_success") is not None
+    heads = ["policy", "mission success", "crashed", "AV-caused", "mission vehicle m", "AVs m", "all m"]
+    heads += ["hard brakings of AVs", "not comparable"]
     lines = [
         f"## {world}, {demand}",
         "",
-        f"Behaviour {first.behavior}, drivers {first.driver_model}, preset {first.preset}.",
+        f"Behaviour {first.behavior}, drivers {first.driver_model}, preset {first.preset}."
+        + ("" if has_mission else " Nobody has a mission here, so nothing is claimed about one."),
         "",
-        "| policy | mission success | crashed | AV-caused | mission vehicle m | AVs m | all m |"
-        " hard brakings of AVs | not comparable |",
-        "|---|---|---|---|---|---|---|---|---|",
+        f"| {' | '.join(heads)} |",
+        "|---" * len(heads) + "|",
     ]
     for policy, results in runs.items():
-        served = [bool(r.value("mission_success")) for r in results]
-        crashed = [bool(r.value("crashed")) for r in results]
-        caused = [bool(r.value("av_caused_collisions")) for r in results]
-        figures = [
-            mean([r.value(name) for r in results], digits)
-            for name, digits in (
-                ("dt_mission_m", 0),
-                ("dt_av_m", 0),
-                ("dt_mean_m", 0),
-                ("hard_brakings_av", 1),
-            )
+        cells = [
+            policy,
+            rate([bool(r.value("mission_success")) for r in results]) if has_mission else "-",
+            rate([bool(r.value("crashed")) for r in results]),
+            rate([bool(r.value("av_caused_collisions")) for r in results]),
+            *(mean(results, name) for name in ("dt_mission_m", "dt_av_m", "dt_mean_m")),
+            mean(results, "hard_brakings_av", 1),
+            str(sum(bool(r.validity) for r in results)),
         ]
-        odd = sum(bool(r.validity) for r in results)
-        cells = [policy, rate(served), rate(crashed), rate(caused), *figures, str(odd)]
         lines.append(f"| {' | '.join(cells)} |")
-    if {"idm", "altruist-rule"} <= runs.keys() and first.value("dt_mission_m") is not None:
-        before, after = (
-            np.mean([r.value("dt_mission_m") for r in runs[p]]) for p in ("idm", "altruist-rule")
-        )
+    if has_mission and {"idm", "altruist-rule"} <= runs.keys():
+        before, after = (np.nanmean(figures(runs[p], "dt_mission_m")) for p in ("idm", "altruist-rule"))
         lines += ["", f"The mission vehicle travels {after / before:.2f} times as far with `altruist-rule`."]
     return [*lines, ""]
 

@@ -21,8 +21,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import Bounds, differential_evolution
 
-from benchmarks.intervals import median_of_blocks, quantile, rate, share
 from benchmarks.lane_changes import CLASSES, Traffic, build_highway, measure
+from cosim.evaluation.statistics import median_of_blocks, quantile, rate, share
 from cosim.simulation.drivers import BEHAVIORS_FILE, LC2013, MIXED, MOBIL, Behaviors, load_behaviors
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results" / "behaviors.md"

@@ -62,7 +62,7 @@ class Episode:
         self._begin = self.snapshot.time
         self._collisions: list[Collision] = []
         self._tally: dict[str, int] = dict.fromkeys(
-            ("decisions", "vetoes", "fallbacks", "lane_changes", "lane_changes_blocked"), 0
+            ("decisions", "vetoes", "fallbacks", "lane_changes", "blocked"), 0
         )
         self._hash = hashlib.sha256()
         self._inserted_before = self.simulator.counts()["inserted"]
@@ -89,7 +89,7 @@ class Episode:
         self.steps += 1
         for command, receipt in zip(commands, self.receipts, strict=True):
             self._tally["lane_changes"] += bool(command.lane_offset and receipt.executed)
-            self._tally["lane_changes_blocked"] += not receipt.executed
+            self._tally["blocked"] += not receipt.executed  # of any command
         for frame in self.frames:
             self._metrics.add(frame)
             self._collisions += frame.events.collisions
@@ -98,6 +98,16 @@ class Episode:
             )
         self.truncated = not self.terminated and self.elapsed >= self.scenario.duration - 1e-6
         return self._observe(self.frames)
+
+    def context(self, svo: float) -> PolicyContext:
+        """What a policy is told when this episode starts; `svo` (phi) in rad."""
+        return PolicyContext(
+            road=self.simulator.road,
+            timing=self.scenario.timing,
+            observation=self.observation,
+            svo=svo,
+            rng=generator(self.seed, "policy"),
+        )
 
     @property
     def over(self) -> bool:
@@ -125,7 +135,7 @@ class Episode:
                 self._tally["fallbacks"] / decided if decided else None, "share", "lower"
             ),
             "lane_changes_commanded": Metric(self._tally["lane_changes"], "changes", ""),
-            "commands_blocked": Metric(self._tally["lane_changes_blocked"], "commands", "lower"),
+            "commands_blocked": Metric(self._tally["blocked"], "commands", "lower"),
         }
         s = self.scenario
         return EpisodeResult(
@@ -196,15 +206,7 @@ def run_episode(
     """Drive one whole episode with one policy; `svo` (phi) in rad."""
     began = time.perf_counter()
     histories = episode.start(seed)
-    policy.reset(
-        PolicyContext(
-            road=episode.simulator.road,
-            timing=episode.scenario.timing,
-            observation=episode.observation,
-            svo=svo,
-            rng=generator(seed, "policy"),
-        )
-    )
+    policy.reset(episode.context(svo))
     while not episode.over:
         before = time.perf_counter()
         decisions = policy.decide(histories)

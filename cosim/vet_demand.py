@@ -182,7 +182,8 @@ class _DemandReader:
         self.found.flows += tag == "flow"
         if "route" in attributes:
             self.found.used_routes.setdefault(attributes["route"], Use(f"{tag}.route", owner, line))
-        depart = attributes.get("begin" if tag == "flow" else "depart", "")
+        # a flow that names no begin begins with the simulation, so it is late behind anything later
+        depart = attributes.get("begin", "0") if tag == "flow" else attributes.get("depart", "")
         if self._additional or not depart[:1].isdigit():  # an additional file is loaded whole: order is free
             return
         when = time_of(depart, self._path, f"{tag}.depart")

@@ -25,6 +25,7 @@ CHUNK = 1 << 18  # bytes
 
 Start = Callable[[str, dict[str, str], int], None]  # tag, attributes, line
 End = Callable[[str], None]
+Progress = Callable[[float, float], None]  # bytes of the file read, of all
 
 _GZIP_MAGIC = b"\x1f\x8b"
 _UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
@@ -61,11 +62,19 @@ def is_there(path: Path) -> bool:
         return False
 
 
-def scan(path: Path, roots: tuple[str, ...], start: Start, end: End | None = None) -> str:
+def scan(
+    path: Path,
+    roots: tuple[str, ...],
+    start: Start,
+    end: End | None = None,
+    *,
+    unpacked: float = MAX_UNPACKED,
+    progress: Progress | None = None,
+) -> str:
     """Call `start` for every element (the root included) and `end` when it closes; return the root's tag.
 
     Plain and gzip-packed files are told apart by their first bytes, as SUMO does. `roots`: the root tags
-    that are right here; empty for any.
+    that are right here; empty for any. `unpacked`: bytes that a .gz may hold.
 
     Raises:
         BadInput: not readable, not UTF-8, truncated or malformed (with line and column), wrong root,
@@ -102,7 +111,7 @@ def scan(path: Path, roots: tuple[str, ...], start: Start, end: End | None = Non
     parser.EndElementHandler = closed
     fed = 0
     try:
-        for chunk in _chunks(path):
+        for chunk in chunks(path, unpacked, progress):
             fed += len(chunk)
             parser.Parse(chunk, False)
             if fed - max(parser.CurrentByteIndex, 0) > MAX_TOKEN:
@@ -116,10 +125,10 @@ def scan(path: Path, roots: tuple[str, ...], start: Start, end: End | None = Non
 
 def content(path: Path) -> bytes:
     """The whole of a plain or gzip file, unpacked; raises BadInput like `scan`."""
-    return b"".join(_chunks(path))
+    return b"".join(chunks(path))
 
 
-def _chunks(path: Path) -> Iterator[bytes]:
+def chunks(path: Path, unpacked: float = MAX_UNPACKED, progress: Progress | None = None) -> Iterator[bytes]:
     """The unpacked bytes of a plain or gzip file."""
     regular_file(path, file=path, field="file")
     with path.open("rb") as raw:
@@ -127,14 +136,16 @@ def _chunks(path: Path) -> Iterator[bytes]:
         raw.seek(0)
         if head in _UTF16_MARKS:
             raise BadInput("is not UTF-8", file=path, field="encoding", value="UTF-16")
-        if head != _GZIP_MAGIC:
-            while chunk := raw.read(CHUNK):
-                yield chunk
-            return
-        yield from _unpacked(raw, path)
+        size = path.stat().st_size
+        for chunk in (
+            iter(lambda: raw.read(CHUNK), b"") if head != _GZIP_MAGIC else _unpacked(raw, path, unpacked)
+        ):
+            yield chunk
+            if progress is not None:
+                progress(raw.tell(), size)
 
 
-def _unpacked(raw: IO[bytes], path: Path) -> Iterator[bytes]:
+def _unpacked(raw: IO[bytes], path: Path, most: float) -> Iterator[bytes]:
     total = 0
     with gzip.GzipFile(fileobj=raw) as unpacked:
         while True:
@@ -146,8 +157,8 @@ def _unpacked(raw: IO[bytes], path: Path) -> Iterator[bytes]:
             if not chunk:
                 return
             total += len(chunk)
-            if total > MAX_UNPACKED:
-                problem = f"unpacks to more than {MAX_UNPACKED >> 20} MiB"
+            if total > most:
+                problem = f"unpacks to more than {most / 2**20:.0f} MiB"
                 raise BadInput(problem, file=path, field="unpacked size", value=total)
             yield chunk
 
@@ -200,7 +211,7 @@ def _malformed(error: expat.ExpatError, path: Path, fed: int, stack: list[str]) 
 def _first_undecodable(path: Path) -> str | None:
     """The first byte that is not UTF-8, in hexadecimal; None when all are."""
     tail = b""
-    for chunk in _chunks(path):
+    for chunk in chunks(path):
         data = tail + chunk
         try:
             data.decode("utf-8")

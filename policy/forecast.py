@@ -18,7 +18,7 @@ class KinematicForecast(NamedTuple):
     heading: Floats  # [V,M] rad, unwrapped
     speed_std: Floats  # [V,M] m/s, zero for predictors that do not know their error
     heading_std: Floats  # [V,M] rad
-    along_std: Floats  # [V,M] m, of the position in driving direction
+    along_std: Floats  # [V,M] m, of the position in the predicted driving direction (gp-direct: now's)
     across_std: Floats  # [V,M] m
     valid: Bools  # [V] was perceived in the newest frame
 
@@ -31,3 +31,19 @@ def integrate_position(now: Floats, speed: Floats, heading: Floats, dt: float) -
     x = now[:, :1] + np.cumsum(0.5 * dt * (vx[:, 1:] + vx[:, :-1]), 1)
     y = now[:, 1:2] + np.cumsum(0.5 * dt * (vy[:, 1:] + vy[:, :-1]), 1)
     return x, y
+
+
+def motion_of(now: Floats, x: Floats, y: Floats, dt: float) -> tuple[Floats, Floats]:
+    """Speed and heading along predicted positions: now [V,>=4], x, y [V,M] m -> m/s, rad (unwrapped) [V,M].
+
+    Who hardly moves keeps its heading.
+    """
+    dx = np.diff(np.concatenate([now[:, :1], x], 1), axis=1)
+    dy = np.diff(np.concatenate([now[:, 1:2], y], 1), axis=1)
+    step = np.hypot(dx, dy)
+    turn = np.arctan2(dy, dx) - now[:, 3:4]
+    turn = (turn + np.pi) % (2 * np.pi) - np.pi
+    moving = step > 0.1 * dt
+    last = np.maximum.accumulate(np.where(moving, np.arange(1, x.shape[1] + 1), 0), axis=1)  # 0: never yet
+    held = np.take_along_axis(np.concatenate([np.zeros_like(turn[:, :1]), turn], 1), last, 1)
+    return step / dt, now[:, 3:4] + np.unwrap(held, axis=1)

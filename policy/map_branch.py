@@ -1,4 +1,4 @@
-"""The HPN's map branch, P's figure 3 read literally: past observations in, the next map and kinematics out."""
+"""The HPN's map branch, P's figure 3 as written: past observations in, the next map and kinematics out."""
 
 from __future__ import annotations
 

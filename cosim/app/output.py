@@ -65,7 +65,7 @@ def table(result: EpisodeResult) -> str:
         f"svo {result.svo_deg:g} deg, seed {result.seed}, {result.steps} decisions",
     ]
     shown = [name for name in HEADLINE if name in result.metrics]
-    lines += [f"  {name:<24} {_text(result.metrics[name])}" for name in shown]
+    lines += [f"  {name:<24} {figure(result.metrics[name])}" for name in shown]
     for c in result.collisions:
         who = f"{c.kind}, {'AV-caused' if c.av_caused else 'not AV-caused'}"
         lines.append(f"  collision at {c.time:.1f} s: {c.collider} hit {c.victim} on {c.lane} ({who})")
@@ -115,7 +115,8 @@ def _collision(fields: dict[str, Any]) -> dict[str, Any]:
     return {k: _plain(v) if isinstance(v, float) else v for k, v in fields.items()}
 
 
-def _text(metric: Metric) -> str:
+def figure(metric: Metric) -> str:
+    """One figure with its unit, as people read it; NA is said."""
     value = metric.value
     if value is None:
         return "NA"

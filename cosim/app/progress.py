@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
+import threading
 import time
 from typing import TextIO
 
 BAR = 30  # characters
 REDRAW = 0.1  # s between redraws on a terminal
 LINE_EVERY = 10.0  # s between lines in a log
+STARTING = "starting SUMO, compiling kernels (first use only: up to half a minute) ..."
 
 
 class Progress:
@@ -20,10 +23,19 @@ class Progress:
         self._terminal = self._stream.isatty()
         self._began = self._last = time.monotonic()
         self._drawn = False
+        self._note: threading.Timer | None = None
+
+    def starting(self, after: float = 3.0) -> None:
+        """Say what takes so long if nothing has been done `after` s from now."""
+        if not self._quiet:
+            self._note = threading.Timer(after, self._say, [f"{self._title}: {STARTING}\n"])
+            self._note.daemon = True
+            self._note.start()
 
     def __call__(self, done: float, total: float) -> None:
         if self._quiet:
             return
+        self._begun()
         now = time.monotonic()
         if now - self._last < (REDRAW if self._terminal else LINE_EVERY) and done < total:
             return
@@ -45,6 +57,17 @@ class Progress:
 
     def done(self) -> None:
         """Clear the bar."""
+        self._begun()
         if self._drawn:
             self._stream.write("\r\x1b[K")
             self._stream.flush()
+
+    def _say(self, line: str) -> None:
+        with contextlib.suppress(ValueError):  # the stream is closed: nobody listens any more
+            self._stream.write(line)
+            self._stream.flush()
+
+    def _begun(self) -> None:
+        if self._note is not None:
+            self._note.cancel()
+            self._note = None

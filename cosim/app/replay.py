@@ -7,15 +7,17 @@ import json
 import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from cosim.app.progress import Progress
 from cosim.app.runner import Runner
 from cosim.errors import BadInput, CosimError
+from cosim.evaluation import run_folder
 from cosim.evaluation.case import Case
 from cosim.evaluation.replay.recorder import Recording
+from cosim.evaluation.tasks import OK
 from cosim.manifest import manifest
 from cosim.scenario import Scenario
 from cosim.sumocfg import CLOCK, INPUTS, command_line, hint, keeps
@@ -25,7 +27,6 @@ from cosim.worker import Worker
 
 MANIFEST = "manifest.json"
 CASE, OPTIONS = "case", "sumo_arguments"  # what `cosim run --out` adds to the manifest
-DRIVEN = "ok"  # status of an episode that was driven to its end
 
 
 class ReplayDiffers(CosimError):
@@ -75,7 +76,7 @@ def find(folder: Path, episode: str | None) -> Recorded:
     """
     document = _json(folder / MANIFEST)
     if "cells" in document:
-        return _of_batch(folder, document, episode)
+        return _of_batch(folder, episode)
     if CASE not in document:
         raise BadInput("was not written by this version of cosim run or evaluate", file=folder / MANIFEST)
     recorded = Recorded(
@@ -110,8 +111,8 @@ def check_inputs(recorded: Recorded) -> tuple[Scenario, list[str]]:
     for name in sorted(then.get("files", {}).keys() - now["files"].keys()):
         raise BadInput("belonged to the recorded run, and to this one no more", file=name)
     for name in sorted(now.keys() - {"files", "versions", "seed", "options_not_passed_on"}):
-        if name in then and then[name] != now[name]:
-            problem = f"is {now[name]!r} now, it was {then[name]!r} when it was driven"
+        if name in then and (before := _lasting(name, then)) != (here := _lasting(name, now)):
+            problem = f"is {here!r} now, it was {before!r} when it was driven"
             raise BadInput(problem, file=recorded.folder / MANIFEST, field=name)
     versions = then.get("versions", {})
     warnings = [
@@ -169,31 +170,30 @@ def warn(lines: Sequence[str]) -> None:
         print(f"cosim: warning: {line}", file=sys.stderr)
 
 
-def _of_batch(folder: Path, document: Mapping[str, Any], episode: str | None) -> Recorded:
-    from pyarrow import parquet
-
-    table = folder / "episodes.parquet"
-    try:
-        rows = parquet.read_table(table, columns=["key", "cell", "seed", "status", "trace_hash"]).to_pylist()
-    except (OSError, ValueError, KeyError) as error:
-        raise BadInput(f"cannot be read: {str(error).splitlines()[0]}", file=table) from None
+def _of_batch(folder: Path, episode: str | None) -> Recorded:
+    run = run_folder.read(folder)
     if episode is None:
-        raise BadInput(f"holds {len(rows)} episodes: name one by its key or seed", file=folder)
-    found = [r for r in rows if r["key"] == episode] or [r for r in rows if str(r["seed"]) == episode]
+        raise BadInput(f"holds {len(run.rows)} episodes: name one by its key or seed", file=folder)
+    keys = [row["key"] for row in run.rows]
+    found = [r for r in run.rows if r["key"] == episode] or [r for r in run.rows if str(r["seed"]) == episode]
     if not found:
-        raise BadInput(
-            f"no such episode{hint(episode, [r['key'] for r in rows])}", field="EPISODE", value=episode
-        )
+        raise BadInput(f"no such episode{hint(episode, keys)}", field="EPISODE", value=episode)
     if len(found) > 1:
-        keys = ", ".join(r["key"] for r in found[:4]) + (", ..." if len(found) > 4 else "")
-        raise BadInput(f"{len(found)} episodes have this seed: {keys}", field="EPISODE", value=episode)
+        some = ", ".join(r["key"] for r in found[:4]) + (", ..." if len(found) > 4 else "")
+        raise BadInput(f"{len(found)} episodes have this seed: {some}", field="EPISODE", value=episode)
     row = found[0]
-    if row["status"] != DRIVEN:
+    if row["status"] != OK:
         problem = f"was not driven to its end (status {row['status']}): nothing to compare with"
         raise BadInput(problem, field="EPISODE", value=row["key"])
-    cell = document["cells"][row["cell"]]
+    cell = run.manifest["cells"][row["cell"]]
     case = Case.read({**cell[CASE], "seed": row["seed"]})
-    return Recorded(replace(case, seed=row["seed"]), (), cell["manifest"], row["trace_hash"], folder)
+    return Recorded(case, (), cell["manifest"], row["trace_hash"], folder)
+
+
+def _lasting(name: str, document: Mapping[str, Any]) -> Any:
+    """A setting of a manifest; of SUMO's options only those that a replay uses again."""
+    value = document[name]
+    return {k: v for k, v in value.items() if keeps(k)} if name == "sumo_options" else value
 
 
 def _json(path: Path) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -17,13 +16,11 @@ from cosim.envs.spaces import Observation
 from cosim.envs.view import View
 from cosim.errors import BadInput
 from cosim.scenario import Scenario
-from cosim.sumocfg import one_of
 from cosim.types import COMPACT, Bytes, ObservationConfig
 
 if TYPE_CHECKING:
     from cosim.envs.host import PolicyFactory
 
-TRAINING_SEEDS = 100_000  # seeds 0 to 99,999 are for training (contract.md); tests begin at 200,000
 MISSION, NEAREST = "mission", "nearest"
 
 
@@ -43,7 +40,7 @@ class SumoEnv(gymnasium.Env[Observation, np.int64]):
     from the training seeds. Each environment has a process of its own: close it. `words` are `cosim.open`'s.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 2.5}  # noqa: RUF012 - gymnasium's own form
+    metadata = {"render_modes": [*spaces.RENDER_MODES], "render_fps": 2.5}  # noqa: RUF012 - gymnasium's own form
 
     def __init__(
         self,
@@ -56,11 +53,7 @@ class SumoEnv(gymnasium.Env[Observation, np.int64]):
         render_mode: str | None = None,
         **words: Any,
     ) -> None:
-        if flatten is not None:
-            one_of(flatten, ("kinematics",), "flatten")
-            observation = replace(observation, maps=False)
-        if render_mode is not None:
-            one_of(render_mode, self.metadata["render_modes"], "render_mode")
+        observation = spaces.checked(observation, flatten, render_mode)
         self.render_mode = render_mode
         self.action_space = spaces.action_space()
         self.observation_space = spaces.observation_space(observation, flatten)
@@ -79,7 +72,7 @@ class SumoEnv(gymnasium.Env[Observation, np.int64]):
         """Begin an episode. Raises BadInput when no AV ever appears, or not the one that was named."""
         super().reset(seed=seed)
         if seed is None:
-            seed = int(self.np_random.integers(TRAINING_SEEDS))
+            seed = spaces.training_seed(self.np_random)
         views = self._session.reset(seed)
         wanted = str((options or {}).get("learner", self._wanted))
         while not (found := self._choose(views, wanted)):
@@ -132,12 +125,9 @@ class SumoEnv(gymnasium.Env[Observation, np.int64]):
         return spaces.observation(self._view, self._config, self._flatten)
 
     def _info(self, step: StepResult) -> dict[str, Any]:
-        receipt = step.receipts.get(self.learner)
         return {
             "action_mask": self.action_masks(),
-            "reward_terms": step.terms[self.learner]._asdict(),
-            "executed": receipt is not None and receipt.executed,
-            "blocked": (receipt and receipt.blocked) or "",
+            **spaces.told(step, self.learner),
             "time": step.info["elapsed"],
         }
 

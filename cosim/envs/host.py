@@ -15,7 +15,6 @@ from cosim.errors import BadInput
 from cosim.rewards import RewardConfig, RewardTerms, rewards
 from cosim.road import RoadMap
 from cosim.scenario import Scenario
-from cosim.seeding import generator
 from cosim.types import (
     Bytes,
     Decision,
@@ -25,7 +24,6 @@ from cosim.types import (
     MetaAction,
     ObservationConfig,
     Policy,
-    PolicyContext,
     Receipt,
     Simulator,
     Snapshot,
@@ -83,15 +81,7 @@ class Host:
         self._started = True
         if self._others is not None:
             make_torch_deterministic()
-            self._others.reset(
-                PolicyContext(
-                    road=self._simulator.road,
-                    timing=self._episode.scenario.timing,
-                    observation=self._episode.observation,
-                    svo=self._svo,
-                    rng=generator(seed, "policy"),
-                )
-            )
+            self._others.reset(self._episode.context(self._svo))
         return self._reply(self._packer.pack(self._histories, None), {}, {})
 
     def act(self, actions: Mapping[str, int], see: Collection[str] | None) -> Reply:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,12 +10,11 @@ from pettingzoo import ParallelEnv
 
 import cosim.envs.session as sessions
 from cosim.envs import spaces
-from cosim.envs.gym import TRAINING_SEEDS, no_av
+from cosim.envs.gym import no_av
 from cosim.envs.session import Session
 from cosim.envs.spaces import Observation
 from cosim.envs.view import View
 from cosim.scenario import Scenario
-from cosim.sumocfg import one_of
 from cosim.types import COMPACT, Bytes, ObservationConfig
 
 MAX_AGENTS = 32  # slots: about twice the AVs on the road in our worlds; SUMO drives any further ones
@@ -45,7 +43,7 @@ class SumoParallelEnv(ParallelEnv):  # type: ignore[misc]
 
     metadata = {  # noqa: RUF012 - PettingZoo's own form
         "name": "cosim_v0",
-        "render_modes": ["rgb_array"],
+        "render_modes": [*spaces.RENDER_MODES],
         "render_fps": 2.5,
         "is_parallelizable": True,
     }
@@ -60,9 +58,7 @@ class SumoParallelEnv(ParallelEnv):  # type: ignore[misc]
         render_mode: str | None = None,
         **words: Any,
     ) -> None:
-        if flatten is not None:
-            one_of(flatten, ("kinematics",), "flatten")
-            observation = replace(observation, maps=False)
+        observation = spaces.checked(observation, flatten, render_mode)
         self.render_mode = render_mode
         self.possible_agents = [f"av_{k}" for k in range(max_agents)]
         self.agents: list[str] = []
@@ -92,7 +88,7 @@ class SumoParallelEnv(ParallelEnv):  # type: ignore[misc]
     ) -> tuple[dict[str, Observation], dict[str, dict[str, Any]]]:
         """Begin the episode `seed`, or one drawn from the training seeds. `options` is not used."""
         if seed is None:
-            seed = int(self._rng.integers(TRAINING_SEEDS))
+            seed = spaces.training_seed(self._rng)
         else:
             self._rng = np.random.default_rng(seed)
         self._slots: dict[str, str] = {}  # SUMO id -> agent, whoever had one in this episode
@@ -118,12 +114,7 @@ class SumoParallelEnv(ParallelEnv):  # type: ignore[misc]
         infos = {a: self._info(a) for a in acting}
         for agent in acting:
             name = av_of[agent]
-            receipt = step.receipts.get(name)
-            infos[agent] |= {
-                "reward_terms": step.terms[name]._asdict(),
-                "executed": receipt is not None and receipt.executed,
-                "blocked": (receipt and receipt.blocked) or "",
-            }
+            infos[agent] |= spaces.told(step, name)
             if name in step.ended:
                 infos[agent]["ended"] = step.ended[name]
         self._drive_on()

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import cast
+from dataclasses import replace
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
 import numpy.typing as npt
 
+from cosim.envs.session import StepResult
 from cosim.envs.view import View
+from cosim.sumocfg import one_of
 from cosim.types import KINEMATIC_FEATURES, Floats, Floats32, MetaAction, ObservationConfig
 
 Observation = dict[str, npt.NDArray[np.generic]] | Floats32
@@ -36,7 +39,9 @@ HALF_LANE = 1.6  # m to either side of a centre line
 FAR = 400.0  # m that count as 1, and beyond: no dead end, no conflict (cosim.road.PATH_HORIZON)
 _SCALE = np.array([SCALE[name] for name in KINEMATIC_FEATURES], np.float32)  # [F]
 
-FLATTEN = (None, "kinematics")
+FLATTEN = ("kinematics",)
+RENDER_MODES = ("rgb_array",)
+TRAINING_SEEDS = 100_000  # seeds 0 to 99,999 are for training (contract.md); tests begin at 200,000
 
 
 def observation_space(config: ObservationConfig, flatten: str | None) -> Space:
@@ -53,6 +58,23 @@ def observation_space(config: ObservationConfig, flatten: str | None) -> Space:
         shape = (n, len(config.channels), config.height, config.width)
         spaces["velocity_map"] = gymnasium.spaces.Box(0, 255, shape, np.uint8)
     return cast(Space, gymnasium.spaces.Dict(spaces))
+
+
+def checked(
+    observation: ObservationConfig, flatten: str | None, render_mode: str | None
+) -> ObservationConfig:
+    """What an environment of this face has to observe. Raises BadInput for an unknown flatten or mode."""
+    if render_mode is not None:
+        one_of(render_mode, RENDER_MODES, "render_mode")
+    if flatten is None:
+        return observation
+    one_of(flatten, FLATTEN, "flatten")
+    return replace(observation, maps=False)
+
+
+def training_seed(rng: np.random.Generator) -> int:
+    """A seed for an episode nobody named one for."""
+    return int(rng.integers(TRAINING_SEEDS))
 
 
 def action_space() -> gymnasium.spaces.Discrete:
@@ -115,3 +137,13 @@ def neighbours(view: View) -> tuple[Floats, Floats]:
 def action_mask(view: View) -> npt.NDArray[np.int8]:
     """[A] 1 where the action can do something, as `Discrete.sample(mask)` wants it."""
     return view.action_mask.astype(np.int8)
+
+
+def told(step: StepResult, av: str) -> dict[str, Any]:
+    """What both faces say of one AV's decision in `info`: the reward's terms, what became of its command."""
+    receipt = step.receipts.get(av)
+    return {
+        "reward_terms": step.terms[av]._asdict(),
+        "executed": receipt is not None and receipt.executed,
+        "blocked": (receipt and receipt.blocked) or "",
+    }

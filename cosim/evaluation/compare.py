@@ -1,23 +1,17 @@
-"""A against B on equal traffic: pairs of episodes with the same seed, their differences, the verdict.
-
-A pair is one episode of A and one of B that agree in all of `PAIR` and in the seed; a group is the pairs
-that agree in `PAIR`. Nothing is pooled over groups.
-"""
+"""A against B on equal traffic: their figures, the differences of pairs, and the verdict on thresholds."""
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 from cosim.errors import BadInput
-from cosim.evaluation import run_folder, wording
+from cosim.evaluation import wording
 from cosim.evaluation.figures import Measure, Row
-from cosim.evaluation.run_folder import Run
+from cosim.evaluation.pairing import Group, Side, pair, title
 from cosim.evaluation.statistics import (
     NA,
     Figure,
@@ -29,13 +23,8 @@ from cosim.evaluation.statistics import (
     paired_share,
     share,
 )
-from cosim.evaluation.summary import GROUP, not_comparable
-from cosim.evaluation.tasks import BAD_INPUT, OK
 from cosim.evaluation.thresholds import CHANGE, DIFFERENCE, Threshold, parse
-from cosim.sumocfg import hint
 
-PAIR = tuple(name for name in GROUP if name != "policy")
-ACROSS = ("behavior", "penetration", "preset", "svo_deg", "driver_model")  # what A and B may differ in
 PASSED, FAILED, SKIPPED = "passed", "failed", "skipped"
 
 
@@ -74,9 +63,10 @@ class Check:
     """One threshold in one group."""
 
     threshold: Threshold
-    group: str
+    group: Group
     status: str  # PASSED, FAILED or SKIPPED
-    message: str  # with the figures
+    finding: str  # what the threshold was held against
+    figures: str = ""  # A, B and the difference, for who sees no table beside it
 
 
 @dataclass(frozen=True)
@@ -94,8 +84,7 @@ class Compared:
 
     def check(self, threshold: Threshold) -> Check:
         """Hold one threshold against the group."""
-        status, message = _judge(threshold, self)
-        return Check(threshold, self.group.name, status, message)
+        return Check(threshold, self.group, *_judge(threshold, self))
 
 
 @dataclass(frozen=True)
@@ -104,24 +93,24 @@ class Comparison:
 
     a: str
     b: str
-    groups: list[Group]
+    groups: list[Compared]
     checks: list[Check]
     alone: tuple[list[str], list[str]]  # cells that only A, only B has
 
     @property
     def exit_code(self) -> int:
         """0 passed, 1 a threshold failed, 2 input refused, 3 simulations failed among the compared."""
-        if any(group.refused for group in self.groups):
+        if any(g.group.refused for g in self.groups):
             return 2
-        if any(group.failed for group in self.groups):
+        if any(g.group.failed for g in self.groups):
             return 3
         return int(any(check.status == FAILED for check in self.checks))
 
     @property
     def verdict(self) -> str:
         """The same in words."""
-        refused = sum(len(group.refused) for group in self.groups)
-        failed = sum(len(group.failed) for group in self.groups)
+        refused = sum(len(g.group.refused) for g in self.groups)
+        failed = sum(len(g.group.failed) for g in self.groups)
         if refused:
             return f"no verdict: {refused} compared episodes had bad input"
         if failed:
@@ -141,27 +130,22 @@ def compare(
 ) -> Comparison:
     """Pair the episodes and hold every threshold against every group.
 
-    `across`: names of `PAIR` in which A and B may differ, e.g. ("svo_deg",). `seed` fixes the bootstrap.
+    `across`: what A and B may differ in, e.g. ("svo_deg",). `seed` fixes the bootstrap.
 
     Raises:
-        BadInput: nothing to pair, no seed in common, a side's policy is not clear, a threshold that cannot
-            be read or that applies to no group.
+        BadInput: see `pair`; a threshold that cannot be read, or that applies to no group.
     """
-    for name in across:
-        if name not in ACROSS:
-            raise BadInput(
-                f"not one of {', '.join(ACROSS)}{hint(name, ACROSS)}", field="--across", value=name
-            )
     known = {**b.run.measures, **a.run.measures}
     thresholds = [parse(text, known) for text in fail_on]
-    groups, alone = _pair(a, b, tuple(across), known, seed)
+    found, alone = pair(a, b, across)
+    groups = [Compared(group, known, seed) for group in found]
     checks = [group.check(threshold) for group in groups for threshold in thresholds]
     for threshold in thresholds:
         mine = [check for check in checks if check.threshold is threshold]
         if all(check.status == SKIPPED for check in mine):
             problem = f"{threshold.measure.name} is NA in every compared episode"
             raise BadInput(problem, field="--fail-on", value=threshold.text)
-    return Comparison(_title(a), _title(b), groups, checks, alone)
+    return Comparison(title(a), title(b), groups, checks, alone)
 
 
 def paired(measure: Measure, pairs: Sequence[tuple[Row, Row]], seed: int = 0) -> PairedFigure:
@@ -183,41 +167,44 @@ def paired(measure: Measure, pairs: Sequence[tuple[Row, Row]], seed: int = 0) ->
 
 # ---- inside ----
 
-def _judge(threshold: Threshold, group: Group) -> tuple[str, str]:
-    """Status and message of one threshold in one group."""
-    measure = threshold.measure
-    found = group.figures[measure.name]
-    if not group.pairs:
-        return FAILED, "no pair of episodes finished on both sides"
-    if found.na_on_both == len(group.pairs):
-        return SKIPPED, f"{measure.name} is NA in all {len(group.pairs)} pairs"
+
+def _judge(threshold: Threshold, compared: Compared) -> tuple[str, str, str]:
+    """Status, finding and figures of one threshold in one group."""
+    measure, pairs = threshold.measure, compared.group.pairs
+    found = compared.figures[measure.name]
+    if not pairs:
+        return FAILED, "no pair of episodes finished on both sides", ""
+    if found.na_on_both == len(pairs):
+        return SKIPPED, f"{measure.name} is NA in all {len(pairs)} pairs", ""
+    x, y = (measure.values([both[k] for both in pairs]) for k in (0, 1))
+    count = f"{found.n} pairs" + (f", NA in {found.na} more" if found.na else "")
     if threshold.kind == CHANGE:
-        x, y = (measure.values([pair[k] for pair in group.pairs]) for k in (0, 1))
-        figure = paired_change(x, y, group.seed)
-        value, shown = threshold.of(figure), wording.change(threshold.of(figure))
-    else:
-        signed = threshold.kind == DIFFERENCE
-        value = threshold.of(found.difference if signed else found.b)
-        shown = wording.number(value, measure, signed=signed)
-    what = measure.name if threshold.bound == "value" else f"{threshold.bound} bound of {measure.name}"
-    if math.isnan(value) and found.n and threshold.bound != "value":
-        shown = f"NA (no interval from {found.n} pair{'s' * (found.n > 1)})"
-    message = f"{what} {'' if threshold.kind == 'absolute' else 'B - A '}is {shown}: {_figures(found)}"
-    return (FAILED if threshold.fails(value) else PASSED), message
+        figure, what = paired_change(x, y, compared.seed), "B / A - 1"
+        shown = [wording.change(v) for v in (threshold.of(figure), figure.value, figure.low, figure.high)]
+        whole = f"{shown[1]} ({shown[2]} to {shown[3]})"
+    elif threshold.kind == DIFFERENCE:
+        figure, what = found.difference, "B - A"
+        shown = [wording.number(threshold.of(figure), measure, signed=True)]
+        whole = wording.interval(figure, measure, signed=True)
+    else:  # of B alone: pairs in which only A is NA count too
+        y = [value for value in y if not math.isnan(value)]
+        figure = share(int(sum(y)), len(y)) if measure.is_rate else mean(y, compared.seed)
+        what, count = "B", f"{int(sum(y))} of {len(y)} episodes" if measure.is_rate else f"{len(y)} episodes"
+        shown = [wording.number(threshold.of(figure), measure)]
+        whole = wording.interval(figure, measure)
+    finding = f"{what} is {whole}, {count}"
+    if threshold.bound != "value":
+        finding = f"{threshold.bound} bound is {shown[0]}: {finding}"
+    return FAILED if threshold.fails(threshold.of(figure)) else PASSED, finding, _figures(found)
 
 
 def _figures(found: PairedFigure) -> str:
-    """`A 2.5 % (0.4 to 12.9), B ..., B - A ..., 40 pairs`, everything that a reader needs to judge."""
+    """`A 2.5 % (0.4 to 12.9) = 1/40, B ..., B - A ..., p 1`"""
     m = found.measure
-    count_a, count_b = (f" = {h}/{found.n}" for h in found.hits) if found.hits else ("", "")
+    counts = [f" = {hits}/{found.n}" for hits in found.hits] if found.hits else ["", ""]
     parts = [
-        f"A {wording.interval(found.a, m)}{count_a}",
-        f"B {wording.interval(found.b, m)}{count_b}",
+        f"A {wording.interval(found.a, m)}{counts[0]}",
+        f"B {wording.interval(found.b, m)}{counts[1]}",
         f"B - A {wording.interval(found.difference, m, signed=True)}",
-        f"{found.n} pairs" + (f", {found.na} more are NA" if found.na else ""),
     ]
-    if found.p is not None:
-        parts.append(wording.p_value(found.p))
-    return ", ".join(parts)
-
-
+    return ", ".join(parts if found.p is None else [*parts, wording.p_value(found.p)])

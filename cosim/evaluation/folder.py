@@ -20,10 +20,10 @@ class RunFolder:
 
     Raises:
         BadInput: the path cannot be made or written, has not room for `episodes`, is in use by another
-            process, holds results already (without `resume`), or holds none (with it).
+            process, or holds results already (without `resume`).
     """
 
-    def __init__(self, path: str, *, resume: bool, episodes: int, own_store: bool = True) -> None:
+    def __init__(self, path: str, *, resume: bool, episodes: int) -> None:
         self.path = Path(path).absolute()
         self._shown = path
         self._lock: int | None = None
@@ -33,8 +33,6 @@ class RunFolder:
             held = [name for name in RESULTS if (self.path / name).exists()]
             if held and not resume:
                 raise self._wrong(f"holds {held[0]} already: go on with --resume, or name another folder")
-            if resume and own_store and FILE not in held:
-                raise self._wrong("holds no run to resume")
             self._check_room(max(episodes * ROOM, ROOM_AT_LEAST))
         except BaseException:
             self._remove_made()

@@ -6,8 +6,9 @@ agree in `PAIR`. Nothing is pooled over groups.
 
 from __future__ import annotations
 
+import itertools
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -36,19 +37,18 @@ class Side:
 class Group:
     """The pairs of one cell."""
 
-    identity: dict[str, Any]  # PAIR, and "a" and "b": who drove
-    name: str
+    identity: dict[str, Any]  # by the names of `PAIR`
+    a: dict[str, Any]  # who drove: policy, policy_label, and whatever A and B differ in
+    b: dict[str, Any]
     pairs: list[tuple[Row, Row]]  # both ok, by seed
     failed: list[Row]  # sim_crash and timeout among the pairs
     refused: list[Row]  # bad_input among the pairs
     unpaired: tuple[int, int]  # episodes of A and of B without a partner
-    known: dict[str, Measure]
-    seed: int  # of the bootstrap
 
-    @cached_property
-    def figures(self) -> dict[str, PairedFigure]:
-        """Every measure by name."""
-        return {name: paired(measure, self.pairs, self.seed) for name, measure in self.known.items()}
+    @property
+    def name(self) -> str:
+        """`merge / contested / ... / lc2013: idm -> altruist-rule`"""
+        return f"{wording.group(self.identity)}: {who(self.a)} -> {who(self.b)}"
 
     @property
     def not_comparable(self) -> int:
@@ -59,11 +59,6 @@ class Group:
     def identical(self) -> int:
         """Pairs in which both drove exactly alike."""
         return sum(a.get("trace_hash") == b.get("trace_hash") for a, b in self.pairs)
-
-    def check(self, threshold: Threshold) -> Check:
-        """Hold one threshold against the group."""
-        status, message = _judge(threshold, self)
-        return Check(threshold, self.name, status, message)
 
 
 def side(text: str) -> Side:
@@ -86,14 +81,32 @@ def chosen(run: Run, policy: str) -> Side:
     return Side(run, policy)
 
 
-def _title(one: Side) -> str:
+def title(one: Side) -> str:
+    """`DIR` or `DIR:POLICY`."""
     return str(one.run.path) if one.policy is None else f"{one.run.path}:{one.policy}"
 
 
-def _pair(
-    a: Side, b: Side, across: tuple[str, ...], known: dict[str, Measure], seed: int
-) -> tuple[list[Group], tuple[list[str], list[str]]]:
-    """Groups of pairs in A's order, and the names of the cells that only one side has."""
+def who(one: Mapping[str, Any]) -> str:
+    """`vfn-p (untrained) svo_deg=45.0`"""
+    label = f" ({one['policy_label']})" if one["policy_label"] else ""
+    others = [f" {k}={v}" for k, v in one.items() if k not in ("policy", "policy_label")]
+    return str(one["policy"]) + label + "".join(others)
+
+
+def pair(a: Side, b: Side, across: Sequence[str] = ()) -> tuple[list[Group], tuple[list[str], list[str]]]:
+    """Groups of pairs in A's order, and the names of the cells that only one side has.
+
+    `across`: names of `ACROSS` in which A and B may differ.
+
+    Raises:
+        BadInput: nothing to pair, no seed in common, a side's policy is not clear, two cells that would be
+            the same partner.
+    """
+    for name in across:
+        if name not in ACROSS:
+            raise BadInput(
+                f"not one of {', '.join(ACROSS)}{hint(name, ACROSS)}", field="--across", value=name
+            )
     by_policy = _clear_policies(a, b)
     if by_policy:
         common = set(a.run.policies) & set(b.run.policies)
@@ -102,21 +115,31 @@ def _pair(
             raise BadInput(problem + "; choose with DIR:POLICY")
     fields = tuple(name for name in PAIR if name not in across) + (("policy",) if by_policy else ())
     same_folder = a.run.path.resolve() == b.run.path.resolve()
-    cells_a, cells_b = (_cells(one, fields, across, same_folder) for one in (a, b))
+    all_a, all_b = (_cells(one, fields, across, same_folder) for one in (a, b))
     groups = []
-    for key, rows_a in cells_a.items():
-        rows_b = cells_b.get(key, {})
-        seeds = sorted(rows_a.keys() & rows_b.keys())
-        if seeds:
-            pairs = [(rows_a[s], rows_b[s]) for s in seeds]
-            groups.append(_group(pairs, fields, (len(rows_a), len(rows_b)), known, seed))
+    for key, cells_a in all_a.items():
+        for rows_a, rows_b in itertools.product(cells_a.values(), all_b.get(key, {}).values()):
+            seeds = sorted(rows_a.keys() & rows_b.keys())
+            if seeds:
+                pairs = [(rows_a[s], rows_b[s]) for s in seeds]
+                groups.append(_group(pairs, fields, (len(rows_a), len(rows_b))))
     if not groups:
-        raise BadInput(_why_none(cells_a, cells_b, fields))
-    alone = tuple(
-        [_name(next(iter(rows.values())), fields) for key, rows in mine.items() if key not in others]
-        for mine, others in ((cells_a, cells_b), (cells_b, cells_a))
+        raise BadInput(_why_none(all_a, all_b, fields))
+    only_a, only_b = (
+        [
+            _name(next(iter(rows.values())))
+            for key, cells in mine.items()
+            for rows in cells.values()
+            if key not in others
+        ]
+        for mine, others in ((all_a, all_b), (all_b, all_a))
     )
-    return groups, (alone[0], alone[1])
+    return groups, (only_a, only_b)
+
+
+# ---- inside ----
+
+_Key = tuple[Any, ...]
 
 
 def _clear_policies(a: Side, b: Side) -> bool:
@@ -131,11 +154,15 @@ def _clear_policies(a: Side, b: Side) -> bool:
     raise BadInput(problem, value=str(one.run.path))
 
 
-def _cells(
-    one: Side, fields: tuple[str, ...], across: tuple[str, ...], same_folder: bool
-) -> dict[_Key, dict[int, Row]]:
-    """Rows by pairing key and seed. Raises BadInput when two rows would be the same partner."""
-    found: dict[_Key, dict[int, Row]] = {}
+_Cells = dict[_Key, dict[_Key, dict[int, Row]]]
+
+
+def _cells(one: Side, fields: tuple[str, ...], across: Sequence[str], same_folder: bool) -> _Cells:
+    """Rows by pairing key, then by the values of `across`, then by seed.
+
+    Raises BadInput when two rows would be one.
+    """
+    found: _Cells = {}
     for row in one.run.rows:
         if one.policy is not None and row["policy"] != one.policy:
             continue
@@ -143,61 +170,48 @@ def _cells(
         if same_folder:  # then files can be told apart even where their names are equal
             case = {k: v for k, v in one.run.case(row).items() if k not in (*across, "outputs")}
             key += (json.dumps(case, sort_keys=True),)
-        rows = found.setdefault(key, {})
-        twin = rows.get(row["seed"])
-        if twin is not None:
-            problem = (
-                f"two cells would be one, {twin['cell']} and {row['cell']}: both are {_name(row, fields)}"
-                f" with seed {row['seed']}"
-            )
-            raise BadInput(problem, file=one.run.path)
-        rows[row["seed"]] = row
+        rows = found.setdefault(key, {}).setdefault(tuple(row.get(name) for name in across), {})
+        twin = rows.setdefault(row["seed"], row)
+        if twin is not row:
+            problem = f"two cells would be one, {twin['cell']} and {row['cell']}: both are {_name(row)}"
+            raise BadInput(f"{problem} with seed {row['seed']}", file=one.run.path)
     return found
 
 
-def _group(
-    pairs: list[tuple[Row, Row]],
-    fields: tuple[str, ...],
-    episodes: tuple[int, int],
-    known: dict[str, Measure],
-    seed: int,
-) -> Group:
+def _group(pairs: list[tuple[Row, Row]], fields: tuple[str, ...], episodes: tuple[int, int]) -> Group:
     first_a, first_b = pairs[0]
-    identity = {name: first_a.get(name) for name in fields if name != "policy"}
     differing = [n for n in PAIR if n not in fields and first_a.get(n) != first_b.get(n)]
-    for letter, row in (("a", first_a), ("b", first_b)):
-        identity[letter] = {"policy": row["policy"], "policy_label": row.get("policy_label") or ""}
-        identity[letter] |= {n: row.get(n) for n in differing}
-    name = f"{wording.group(identity)}: {_who(identity['a'])} -> {_who(identity['b'])}"
+    drivers = [
+        {
+            "policy": row["policy"],
+            "policy_label": next((p[k]["policy_label"] for p in pairs if p[k].get("policy_label")), ""),
+            **{name: row.get(name) for name in differing},
+        }
+        for k, row in enumerate((first_a, first_b))
+    ]
     wrong = [row for pair in pairs for row in pair if row["status"] != OK]
     return Group(
-        identity=identity,
-        name=name,
+        identity={n: first_a.get(n) for n in PAIR if n not in differing},
+        a=drivers[0],
+        b=drivers[1],
         pairs=[(x, y) for x, y in pairs if x["status"] == OK and y["status"] == OK],
         failed=[row for row in wrong if row["status"] != BAD_INPUT],
         refused=[row for row in wrong if row["status"] == BAD_INPUT],
         unpaired=(episodes[0] - len(pairs), episodes[1] - len(pairs)),
-        known=known,
-        seed=seed,
     )
 
 
-def _who(one: dict[str, Any]) -> str:
-    """`vfn-p (untrained) svo_deg=45.0`"""
-    label = f" ({one['policy_label']})" if one["policy_label"] else ""
-    others = [f" {k}={v}" for k, v in one.items() if k not in ("policy", "policy_label")]
-    return one["policy"] + label + "".join(others)
+def _name(row: Row) -> str:
+    return wording.group({name: row.get(name) for name in GROUP})
 
 
-def _name(row: Row, fields: tuple[str, ...]) -> str:
-    return wording.group({name: row.get(name) for name in (*fields, "policy")})
-
-
-def _why_none(a: dict[_Key, dict[int, Row]], b: dict[_Key, dict[int, Row]], fields: tuple[str, ...]) -> str:
+def _why_none(a: _Cells, b: _Cells, fields: tuple[str, ...]) -> str:
     """Why nothing could be paired, in one sentence."""
-    if a.keys() & b.keys():
-        seeds = [sorted(seed for rows in cells.values() for seed in rows) for cells in (a, b)]
-        spans = [f"{s[0]} to {s[-1]}" for s in seeds]
+    if common := a.keys() & b.keys():
+        spans = []
+        for cells in (a, b):
+            seeds = [seed for key in common for rows in cells[key].values() for seed in rows]
+            spans.append(f"{min(seeds)} to {max(seeds)}")
         return f"A and B have no seed in common: A has {spans[0]}, B has {spans[1]}"
     for k, name in enumerate(fields):
         has = [{key[k] for key in cells} for cells in (a, b)]
@@ -210,4 +224,4 @@ def _why_none(a: dict[_Key, dict[int, Row]], b: dict[_Key, dict[int, Row]], fiel
 
 
 def _words(values: Iterable[Any]) -> str:
-    return ", ".join("none" if v is None else str(v) for v in values) or "none"
+    return ", ".join(sorted("none" if v is None else str(v) for v in values)) or "none"

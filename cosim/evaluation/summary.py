@@ -11,7 +11,9 @@ from typing import Any
 
 from cosim.evaluation.figures import TIMINGS, Measure, Row, measures
 from cosim.evaluation.statistics import CONFIDENCE, mean, rule_of_three, share
-from cosim.evaluation.tasks import OK, STATUSES
+from cosim.evaluation.tasks import BAD_INPUT, OK, SIM_CRASH, TIMEOUT
+
+STATUSES = (OK, SIM_CRASH, TIMEOUT, BAD_INPUT)
 
 # What must be equal for episodes to be counted together; rows of different cells never are.
 GROUP = (

@@ -12,29 +12,38 @@ from cosim.evaluation.statistics import Figure
 NA_TEXT = "NA"
 
 
-def number(value: float, measure: Measure, *, signed: bool = False, unit: bool = True) -> str:
-    """`12.5 %`, `+0.5 pp` (a signed share is a difference of shares), `543 m`, `NA`."""
+def number(
+    value: float, measure: Measure, *, signed: bool = False, unit: bool = True, places: int | None = None
+) -> str:
+    """`12.5 %`, `+0.5 pp` (a signed share is a difference of shares), `543 m`, `NA`.
+
+    `places`: decimals; by default three significant digits or so.
+    """
     if math.isnan(value):
         return NA_TEXT
     name = measure.unit
     if measure.is_share:
         value, name = 100.0 * value, "pp" if signed else "%"
-    text = _digits(value, signed)
+    text = _digits(value, signed, places)
     return f"{text} {name}" if unit and name else text
 
 
 def change(value: float) -> str:
     """A relative change: `-3.2 %`."""
-    return NA_TEXT if math.isnan(value) else f"{_digits(100.0 * value, True)} %"
+    return NA_TEXT if math.isnan(value) else f"{_digits(100.0 * value, True, 1)} %"
 
 
 def interval(figure: Figure, measure: Measure, *, signed: bool = False) -> str:
-    """`12.5 % (4.4 to 26.1)`; without brackets where there is no interval."""
-    text = number(figure.value, measure, signed=signed)
-    if not figure.known or math.isnan(figure.low):
-        return text
-    low, high = (number(x, measure, signed=signed, unit=False) for x in (figure.low, figure.high))
-    return f"{text} ({low} to {high})"
+    """`12.5 % (4.4 to 26.1)`, to two digits of the interval's width; bare where there is no interval."""
+    width = (figure.high - figure.low) * (100.0 if measure.is_share else 1.0)
+    if not figure.known or not 0.0 < width < math.inf:
+        return number(figure.value, measure, signed=signed)
+    places = min(max(1 - math.floor(math.log10(width)), 1 if measure.is_share else 0), 4)
+    value, low, high = (
+        number(x, measure, signed=signed, unit=unit, places=places)
+        for x, unit in ((figure.value, True), (figure.low, False), (figure.high, False))
+    )
+    return f"{value} ({low} to {high})"
 
 
 def sample(counts: Mapping[str, Any]) -> str:
@@ -60,15 +69,16 @@ def group(identity: Mapping[str, Any], *, policy: bool = True) -> str:
     return " / ".join(str(word) for word in words if word is not None)
 
 
-def _digits(value: float, signed: bool) -> str:
-    """Three significant digits or so, never an exponent below a million."""
-    if math.isinf(value):
-        return "inf" if value > 0 else "-inf"
+def _digits(value: float, signed: bool, places: int | None = None) -> str:
+    """Never an exponent below a million, never a minus before a zero."""
+    sign = "+" if signed else ""
     size = abs(value)
-    if size >= 1e6:
-        return f"{value:+.3g}" if signed else f"{value:.3g}"
-    places = 0 if size >= 100 else 1 if size >= 10 or size == 0 else 2 if size >= 1 else 3
-    text = f"{value:+.{places}f}" if signed else f"{value:.{places}f}"
-    if "." in text:
-        text = text.rstrip("0").rstrip(".")
-    return {"-0": "0", "+0": "0"}.get(text, text)
+    if math.isinf(value) or size >= 1e6:
+        return f"{value:{sign}.3g}"
+    if places is None:
+        places = 0 if size >= 100 else 1 if size >= 10 or size == 0 else 2 if size >= 1 else 3
+        text = f"{value:{sign}.{places}f}"
+        text = text.rstrip("0").rstrip(".") if places else text
+    else:
+        text = f"{value:{sign}.{places}f}"
+    return text.lstrip("+-") if not text.strip("+-0.") else text

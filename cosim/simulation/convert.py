@@ -11,6 +11,7 @@ import numpy as np
 from cosim.errors import BadInput
 from cosim.road import ConflictZone, Lane, RoadMap
 from cosim.scenario import Zone
+from cosim.simulation.conventions import centres
 from cosim.types import Events, Kind, Snapshot
 
 # The compiled getters: libsumo's Python wrappers around them double the cost of a read. The version
@@ -64,15 +65,14 @@ class SnapshotReader:
         position, angle, speed, accel, lane_id, lane_position = GETTERS
         index = self._lane_index
         front = np.array([position(i) for i in ids], np.float64).reshape(-1, 2)  # [n,2] m
-        heading = np.radians(90.0 - np.array([angle(i) for i in ids], np.float64))  # [n] rad
-        heading = (heading + np.pi) % (2 * np.pi) - np.pi
+        x, y, heading = centres(front[:, 0], front[:, 1], np.array([angle(i) for i in ids]), self._front)
         return Snapshot(
             time=libsumo.simulation.getTime(),
             ids=ids,
             kind=kind,
             mission=mission,
-            x=front[:, 0] - self._front * np.cos(heading),
-            y=front[:, 1] - self._front * np.sin(heading),
+            x=x,
+            y=y,
             heading=heading,
             speed=np.array([speed(i) for i in ids], np.float64),
             accel=np.array([accel(i) for i in ids], np.float64),

@@ -20,6 +20,7 @@ from cosim.simulation.convert import Body, SnapshotReader, read_road, struggling
 from cosim.simulation.drivers import Drivers
 from cosim.simulation.fleet import Fleet
 from cosim.simulation.stderr import SumoStderr
+from cosim.simulation.xerces import keep_awake
 from cosim.sumo_outputs import sumo_options
 from cosim.types import Bools, Collision, Command, Events, Kind, Receipt, Snapshot
 
@@ -187,6 +188,7 @@ class SumoSimulator:
                 else:
                     libsumo.start(["sumo", *arguments])
                     self._started = True
+                    keep_awake()
         except SUMO_ERRORS as error:
             self._started = libsumo.isLoaded()
             raise self._explain(error, starting=True) from None

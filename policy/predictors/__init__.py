@@ -7,12 +7,13 @@ from collections.abc import Callable
 from cosim.errors import BadInput
 from policy.forecast import KinematicForecast
 from policy.predictors.constant import ConstantAcceleration, ConstantSpeed
-from policy.predictors.gp import GaussianProcessIndirect
+from policy.predictors.gp import GaussianProcessDirect, GaussianProcessIndirect
 from policy.predictors.protocol import Predictor
 
 PREDICTORS: dict[str, Callable[[int, float], Predictor]] = {
     "cs": ConstantSpeed,
     "ca": ConstantAcceleration,
+    "gp-direct": GaussianProcessDirect,
     "gp-indirect": GaussianProcessIndirect,
 }
 

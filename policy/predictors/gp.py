@@ -1,28 +1,121 @@
-"""The indirect Gaussian-process predictor (P, section IV-C) on the predictors' protocol."""
+"""Gaussian-process predictors (P, section IV-C): "indirect" by speed and heading, "direct" by positions."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import numpy as np
+
 from cosim.types import Bools, Floats
-from policy.forecast import KinematicForecast
-from policy.gaussian_process import BankConfig, GaussianProcessBank
+from policy.checkpoint import SHIPPED, load
+from policy.forecast import KinematicForecast, integrate_position, motion_of
+from policy.gaussian_process import ACROSS, ALONG, HEADING, SPEED, BankConfig, GaussianProcessBank
+from policy.kernel_prior import KernelPrior, PriorConfig, PriorNetwork, describe, trailing_run
 
 
-class GaussianProcessIndirect:
-    """Speed and heading by the kernel bank, position by integration, with intervals."""
+class _GaussianProcess:
+    """What both share: banks, their learned prior, one batch per length of history.
 
-    name = "gp-indirect"
+    `weights`: the fitted prior and calibration; None: the uniform prior, intervals as the kernels say.
+    """
 
-    def __init__(
-        self,
-        horizon: int = 20,
-        dt: float = 0.2,
-        frames: int = 10,
-        config: BankConfig | None = None,
-        log_prior: Floats | None = None,
-    ) -> None:
+    name: str
+    configs: tuple[BankConfig, BankConfig]
+    spreads: int  # quantities with an interval
+
+    def __init__(self, horizon: int = 20, dt: float = 0.2, weights: Path | None | str = "shipped") -> None:
         self.horizon, self.dt = horizon, dt
-        self.bank = GaussianProcessBank(config, frames, horizon, dt, log_prior)
+        self.banks = tuple(GaussianProcessBank(c, horizon, dt) for c in self.configs)
+        self.prior: KernelPrior | None = None
+        if weights == "shipped":
+            weights = SHIPPED / f"{self.name}.safetensors"
+            weights = weights if weights.is_file() else None
+        if weights is not None:
+            config = self.prior_config()
+            network = PriorNetwork(config)
+            load(Path(weights), {"prior": network}, {"prior": config})
+            self.prior = KernelPrior.of(network)
+            self._calibration = self.prior.calibrated(horizon, dt)
+
+    @classmethod
+    def prior_config(cls) -> PriorConfig:
+        """The layout of this predictor's prior."""
+        return PriorConfig(tuple(len(c.kernels()) for c in cls.configs), cls.spreads)
 
     def predict(self, kinematics: Floats, valid: Bools) -> KinematicForecast:
-        """See `Predictor.predict`."""
-        return self.bank.predict(kinematics, valid)
+        """See `Predictor.predict`. Only the unbroken run of valid, finite frames up to now counts; a vehicle
+        that is not valid now gets no forecast (`valid` False, zeros)."""
+        state = np.asarray(kinematics[:, :, :4], dtype=np.float64)
+        run = trailing_run(state, valid)
+        known = run > 0
+        now = np.where(known[:, None], np.nan_to_num(state[:, -1]), 0.0)  # [V,4]
+        logs: list[Floats | None] = [None] * len(self.banks)
+        spread = np.ones((len(state), self.spreads))
+        if self.prior is not None:
+            weights, spread = self.prior.apply(describe(state, run, self.dt))
+            logs = list(weights)
+        moments = np.zeros((len(self.banks), 4, len(state), self.horizon))
+        for count in np.unique(run[known]):
+            rows = slice(None) if (run == count).all() else np.flatnonzero(run == count)
+            series = self.series(state[rows, -count:])
+            for b, bank in enumerate(self.banks):
+                log, heat = logs[b], 1.0 if self.prior is None else float(self.prior.temperature[b])
+                f = bank.forecast(series[b], None if log is None else log[rows], heat)
+                moments[b][:, rows] = f
+        scale = spread.T[:, :, None]  # [spreads,V,1]
+        if self.prior is not None:
+            scale = scale * self._calibration[:, None]
+        return self._forecast(now, moments, scale, known)
+
+    def series(self, state: Floats) -> tuple[Floats, Floats]:
+        """Two series [S,n] of states [S,n,4]."""
+        raise NotImplementedError
+
+    def _forecast(self, now: Floats, moments: Floats, scale: Floats, known: Bools) -> KinematicForecast:
+        """Put together; moments [2,4,V,M] mean, variance, integral, its variance; scale [spreads,V,M]."""
+        raise NotImplementedError
+
+
+class GaussianProcessIndirect(_GaussianProcess):
+    """Speed and heading by the kernel bank, position by integration (eq. 9), with intervals."""
+
+    name = "gp-indirect"
+    configs = (SPEED, HEADING)
+    spreads = 4
+
+    def series(self, state: Floats) -> tuple[Floats, Floats]:
+        return state[:, :, 2], state[:, :, 3]
+
+    def _forecast(self, now: Floats, moments: Floats, scale: Floats, known: Bools) -> KinematicForecast:
+        (v, v_var, _, along_var), (h, h_var, _, turned_var) = moments
+        v = np.maximum(v, 0.0)  # nobody reverses
+        x, y = integrate_position(now, v, h, self.dt)
+        # eq. (9) linearised: along by the integral of speed, across by the turned angle at mean speed
+        elapsed = self.dt * np.arange(1, self.horizon + 1)
+        mean_speed = np.sqrt((x - now[:, :1]) ** 2 + (y - now[:, 1:2]) ** 2) / elapsed
+        across = mean_speed * np.sqrt(turned_var)
+        deviations = scale * np.stack([np.sqrt(v_var), np.sqrt(h_var), np.sqrt(along_var), across])
+        deviations *= known[:, None]
+        return KinematicForecast(x, y, v, h, *deviations, known)
+
+
+class GaussianProcessDirect(_GaussianProcess):
+    """Positions themselves by the kernel bank, in the vehicle's own frame; speed and heading follow."""
+
+    name = "gp-direct"
+    configs = (ALONG, ACROSS)
+    spreads = 2
+
+    def series(self, state: Floats) -> tuple[Floats, Floats]:
+        dx, dy = state[:, :, 0] - state[:, -1:, 0], state[:, :, 1] - state[:, -1:, 1]
+        c, s = np.cos(state[:, -1:, 3]), np.sin(state[:, -1:, 3])
+        return c * dx + s * dy, c * dy - s * dx
+
+    def _forecast(self, now: Floats, moments: Floats, scale: Floats, known: Bools) -> KinematicForecast:
+        (u, u_var), (w, w_var) = moments[:, :2]
+        c, s = np.cos(now[:, 3:4]), np.sin(now[:, 3:4])
+        x, y = now[:, :1] + c * u - s * w, now[:, 1:2] + s * u + c * w
+        speed, heading = motion_of(now, x, y, self.dt)
+        along, across = scale * np.sqrt(np.stack([u_var, w_var])) * known[:, None]
+        zero = np.zeros_like(x)
+        return KinematicForecast(x, y, speed, heading, zero, zero, along, across, known)

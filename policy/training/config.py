@@ -12,6 +12,7 @@ from policy.hpn import HpnConfig
 from policy.safety import SafetyConfig
 from policy.traffic import TrafficConfig
 from policy.training.explorer import ExploreConfig
+from policy.training.hpn import HpnTraining
 from policy.training.vfn import VfnTraining
 from policy.vfn import VfnConfig
 
@@ -29,6 +30,7 @@ class TrainingFile:
     reward: RewardConfig = field(default_factory=RewardConfig)
     explore: ExploreConfig = field(default_factory=ExploreConfig)
     training: VfnTraining = field(default_factory=VfnTraining)
+    prediction: HpnTraining = field(default_factory=HpnTraining)  # cosim train hpn
 
 
 def agent_config(name: str, file: TrainingFile) -> AgentConfig:

@@ -10,29 +10,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import nn
 
-from cosim.types import Bools, Floats, Floats32, Ints
+from cosim.seeding import generator, subseed
 from policy.kinematic_branch import KinematicBranch, KinematicConfig, correct, sureness
+from policy.training.loop import one_cycle
+from policy.training.moments import Moment
+from policy.training.networks import adam_tensors, restore_adam, seeded
 
 HALF_LENGTH, HALF_WIDTH = 2.5, 1.0  # m, half a car: an error of that size loses half of the box
 WINDOW = (128.0, 16.0)  # m, what lies outside of both pictures counts for nothing
-
-
-class Moment(NamedTuple):
-    """One decision: V vehicles and the B AVs that look at them. Coordinates from one origin per moment."""
-
-    own: Floats32  # [V,.] `VehicleInputs`
-    near: Floats32  # [V,K,.]
-    lane: Floats32  # [V,M,4]
-    gp: Floats32  # [V,M,4]
-    truth: Floats32  # [V,M,4] nan where the vehicle is gone
-    known: Bools  # [V]
-    ego: Ints  # [B] places of the AVs
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,27 +143,26 @@ class KinematicTask:
     ) -> None:
         self._training, self._train, self._device = training, train, device
         self._validation = [collate(validation[k : k + 64], device) for k in range(0, len(validation), 64)]
-        torch.manual_seed(training.seed)  # module initialisers know no generator
-        self.network = KinematicBranch(config).to(device)
+        self.updates = updates
+        seed = subseed(training.seed, "network") % 2**31
+        self.network = seeded(lambda: KinematicBranch(config), seed).to(device)
         self._optimizer = torch.optim.AdamW(
             self.network.parameters(), lr=training.rate, weight_decay=training.decay
-        )
-        self._cycle = torch.optim.lr_scheduler.OneCycleLR(
-            self._optimizer, training.rate, total_steps=updates + 1
         )
 
     def update(self, number: int) -> dict[str, float]:
         """See `Task.update`."""
         t = self._training
-        rng = np.random.default_rng([t.seed, number])
+        rng = generator(t.seed, "batch", str(number))
         chosen = rng.integers(len(self._train), size=t.batch)
         batch = collate([self._train[k] for k in chosen], self._device)
         found = losses(self.network(batch.own, batch.near), batch, t)
         self._optimizer.zero_grad(set_to_none=True)
         found["loss"].backward()  # type: ignore[no-untyped-call]
+        for group in self._optimizer.param_groups:
+            group["lr"] = one_cycle(number, self.updates, t.rate)
         nn.utils.clip_grad_norm_(self.network.parameters(), t.clip)
         self._optimizer.step()
-        self._cycle.step()
         return {name: float(value.detach()) for name, value in found.items()}
 
     def validate(self) -> dict[str, float]:
@@ -184,27 +174,10 @@ class KinematicTask:
                     sums[name] = sums.get(name, 0.0) + float(value) / len(self._validation)
         return sums
 
-    def state(self) -> dict[str, Any]:
-        """See `Task.state`."""
-        return {
-            "network": self.network.state_dict(),
-            "optimizer": self._optimizer.state_dict(),
-            "cycle": self._cycle.state_dict(),
-        }
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """See `Task.tensors`."""
+        return adam_tensors({"network": self.network}, self._optimizer)
 
-    def restore(self, state: Mapping[str, Any]) -> None:
+    def restore(self, tensors: Mapping[str, torch.Tensor]) -> None:
         """See `Task.restore`."""
-        self.network.load_state_dict(state["network"])
-        self._optimizer.load_state_dict(state["optimizer"])
-        self._cycle.load_state_dict(state["cycle"])
-
-
-def moment(
-    own: Floats32, near: Floats32, lane: Floats, gp: Floats, truth: Floats, known: Bools, ego: Ints
-) -> Moment:
-    """Move everything to one origin: float32 has not the digits for world coordinates."""
-    origin = np.array([*lane[int(ego[0]), 0, :2], 0.0, 0.0])
-    truth = truth.copy()
-    truth[..., 3] -= 2 * np.pi * np.round((truth[..., 3] - lane[..., 3]) / (2 * np.pi))
-    moved = [np.asarray(a - origin, np.float32) for a in (lane, gp, truth)]
-    return Moment(own, near, moved[0], moved[1], moved[2], known, ego)
+        restore_adam(tensors, {"network": self.network}, self._optimizer)

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 
-def tensorboard(folder: Path) -> Any:
-    """A writer of scalars into `folder`/tensorboard."""
+def tensorboard(folder: Path, begin: int | None = None) -> Any:
+    """A writer of scalars into `folder`/tensorboard; what it holds from step `begin` on is superseded."""
     from torch.utils.tensorboard import SummaryWriter
 
-    return SummaryWriter(str(folder / "tensorboard"))
+    return SummaryWriter(str(folder / "tensorboard"), purge_step=begin)

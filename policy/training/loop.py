@@ -79,7 +79,9 @@ def train(
         if about["layout"] != said:
             names = said.keys() | about["layout"].keys()
             differs = sorted(k for k in names if said.get(k) != about["layout"].get(k))
-            raise BadInput(f"the run in this folder is another one ({', '.join(differs)} differ)", file=folder)
+            raise BadInput(
+                f"the run in this folder is another one ({', '.join(differs)} differ)", file=folder
+            )
         task.restore(tensors)
         done, log, sums = about["done"], about["log"], about["sums"]
     folder.mkdir(parents=True, exist_ok=True)

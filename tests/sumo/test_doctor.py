@@ -67,10 +67,10 @@ def test_another_sumo_on_the_path_and_a_wrong_sumo_home_are_warnings(tmp_path: P
     assert not list(doctor.sumo_copies({"PATH": str(tmp_path / "empty")}, "1.28.0"))
 
 
-def test_a_numba_cache_that_cannot_be_written_is_a_failure(tmp_path: Path) -> None:
+def test_a_numba_cache_that_cannot_be_written_is_a_warning(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.write_text("")
     assert doctor.numba_cache({"NUMBA_CACHE_DIR": str(tmp_path)}).state == OK
     broken = doctor.numba_cache({"NUMBA_CACHE_DIR": str(file / "cache")})
-    assert broken.state == FAIL
+    assert broken.state == WARN
     assert "NUMBA_CACHE_DIR" in broken.mend

@@ -102,7 +102,7 @@ def test_weights_that_went_wrong_do_not_drive() -> None:
 
 def test_smoke_size_runs_the_same_path() -> None:
     config = AgentConfig(
-        observation=SMOKE, hpn=HpnConfig(height=16), vfn=VfnConfig(height=16), chain=compact("vfn-p").chain
+        observation=SMOKE, hpn=HpnConfig(), vfn=VfnConfig(height=16), chain=compact("vfn-p").chain
     )
     decisions = decide(PredictionAware("vfn-p", config))
     assert decisions["a"].action == MetaAction.DECELERATE
@@ -112,7 +112,7 @@ def test_the_paper_configuration_is_the_papers() -> None:
     config = paper("vfn-p")
     assert (config.observation.height, config.observation.width) == (64, 512)
     assert config.chain.hypotheses == 20
-    assert config.hpn.block == 1
+    assert config.hpn.maps == "rendered", "whatever the size: the pictures are drawn, not decoded"
     assert config.vfn.frames == 30
     assert config.vfn.strides == "literal"
     assert compact("vfn-p").observation == COMPACT

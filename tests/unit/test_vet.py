@@ -294,6 +294,16 @@ def test_unsorted_departures_are_a_warning_because_sumo_drops_them(case: Case) -
     assert case(additional=loaded_whole).warnings == ()
 
 
+@pytest.mark.parametrize("begin", ['begin="5"', ""])
+def test_a_flow_that_begins_before_the_element_above_it_is_a_warning_too(case: Case, begin: str) -> None:
+    """SUMO 1.28 drops it without a word; a flow that names no begin begins at 0."""
+    late = (
+        f'<vehicle id="late" route="r" depart="50"/><flow id="lost" route="r" {begin} end="90" number="2"/>'
+    )
+    (warning,) = case(routes=ROUTES.replace("</routes>", f"{late}</routes>")).warnings
+    assert "drops 1 of them (lost)" in warning
+
+
 def test_a_route_without_a_connection_is_a_warning(case: Case) -> None:
     (warning,) = case(routes=ROUTES.replace('edges="ab bc"', 'edges="bc ab"', 1)).warnings
     assert "no connection from 'bc' to 'ab'" in warning

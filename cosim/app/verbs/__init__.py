@@ -6,6 +6,17 @@ does it and returns the exit code. What a verb needs is imported inside `work`: 
 
 from __future__ import annotations
 
-from cosim.app.verbs import compare, doctor, evaluate, replay, run, scenarios, train
+from cosim.app.verbs import (
+    compare,
+    doctor,
+    evaluate,
+    metrics,
+    record,
+    replay,
+    report,
+    run,
+    scenarios,
+    train,
+)
 
-VERBS = (run, evaluate, compare, replay, train, scenarios, doctor)
+VERBS = (run, evaluate, compare, replay, report, record, metrics, train, scenarios, doctor)

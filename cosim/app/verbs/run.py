@@ -78,14 +78,12 @@ def work(args: argparse.Namespace) -> int:
     folder = output.prepare_folder(args.out) if args.out else None
     files = folder / "outputs" if folder is not None and case.outputs else None
     progress = Progress(f"{scenario.name} {args.policy}", "s")
-    recording = None
+    progress.starting()
     try:
         with Worker(Runner, scenario, case.policy, math.radians(case.svo_deg), name="cosim-run") as worker:
-            how = {"progress": progress, "outputs": case.outputs, "folder": files}
-            if args.replay:
-                result, recording = worker.call("record", case.seed, **how)
-            else:
-                result = worker.call("run", case.seed, **how)
+            verb = "record" if args.replay else "run"
+            answer = worker.call(verb, case.seed, progress=progress, outputs=case.outputs, folder=files)
+            result, recording = answer if args.replay else (answer, None)
     finally:
         if files is not None:  # what a simulation that died leaves behind
             shutil.rmtree(files / sumo_outputs.DRAFT, ignore_errors=True)

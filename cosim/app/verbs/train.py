@@ -6,14 +6,15 @@ import argparse
 
 from cosim.app.verbs import arguments
 
-WHAT = ("vfn", "a2c")
+WHAT = ("vfn", "a2c", "hpn")
+VARIANTS = ("hpn", "hpn-no-history", "hpn-plain")
 
 
 def add(verbs: arguments.Verbs) -> None:
     """Register the verb and its flags."""
     train = verbs.add_parser(
         "train",
-        help="train the value network or one of the baselines",
+        help="train the value network, one of the baselines, or the predictor",
         description="Train a network. The folder --out then holds log.jsonl, tensorboard/, best and last "
         "weights with their configuration, and everything that --resume needs.",
     )
@@ -33,12 +34,21 @@ def add(verbs: arguments.Verbs) -> None:
     train.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     train.add_argument("--workers", type=arguments.count, default=1, metavar="N", help="driving processes")
     train.add_argument("--threads", type=arguments.count, default=1, metavar="N", help="of the learner")
+    recorded = train.add_argument_group("hpn", "learns from recordings (cosim record)")
+    recorded.add_argument("--recordings", action="append", default=[], metavar="DIR", help="training seeds")
+    recorded.add_argument("--validation", action="append", default=[], metavar="DIR", help="tuning seeds")
+    recorded.add_argument("--variant", choices=VARIANTS, default="hpn", help="hpn is the one that ships")
     train.add_argument("--out", required=True, metavar="DIR")
     train.set_defaults(work=work)
 
 
 def work(args: argparse.Namespace) -> int:
     """Train until the last iteration."""
+    if args.what == "hpn":
+        from cosim.app import train_hpn
+
+        train_hpn.check(args)
+        return train_hpn.train(args)
     from cosim.app.train_vfn import train
 
     return train(args)

@@ -129,7 +129,8 @@ class Recorder:
 
     def recording(self, facts: Mapping[str, Any]) -> Recording:
         """Everything seen since the last reset; `facts` go beside it."""
-        classes = getattr(self.inner_simulator, "driver_classes", dict)()  # only SUMO's simulator knows them
+        # only SUMO's simulator knows them
+        classes: dict[str, str] = getattr(self.inner_simulator, "driver_classes", dict)()
         times = np.array([f.time for f in self.frames])
         return Recording(
             facts=facts,

@@ -34,7 +34,7 @@ function drawRoad(ctx, data, view, c) {
     for (const k of seen) {
       const lane = data.lanes[k];
       if (lane.internal !== internal) continue;
-      ctx.strokeStyle = data.goal.has(k) && data.goal.size < data.lanes.length / 2 ? c.goal : data.zones.has(k) ? c.zone : c.road;
+      ctx.strokeStyle = data.goal.has(k) ? c.goal : data.zones.has(k) ? c.zone : c.road;
       ctx.lineWidth = Math.max(lane.width - (internal ? 0 : line), 1 / view.scale);
       trace(ctx, lane); ctx.stroke();
     }
@@ -60,7 +60,8 @@ function drawForecast(ctx, state, view, c, t) {
     const every = Math.max(Math.round(1 / data.forecastInterval), 1);
     for (let i = every - 1; i < path.x.length; i += every) { // one ellipse a second: the interval
       const j = i ? i - 1 : 0;
-      const heading = i ? Math.atan2(path.y[i] - path.y[j], path.x[i] - path.x[j]) : now.heading;
+      const dx = path.x[i] - path.x[j], dy = path.y[i] - path.y[j];
+      const heading = Math.hypot(dx, dy) > 0.5 ? Math.atan2(dy, dx) : now.heading; // standing: no direction of its own
       ctx.globalAlpha = 0.13;
       ctx.beginPath();
       ctx.ellipse(path.x[i], path.y[i], Math.max(SIGMAS * path.along[i], 0.3), Math.max(SIGMAS * path.across[i], 0.3), heading, 0, 7);

@@ -60,14 +60,14 @@ function fillChoice(state, box, choice) {
   const table = element("table"), head = element("tr");
   for (const name of ["action", "Q", "score s", "TTC s", ""]) head.append(element("th", name));
   table.append(head);
-  const best = choice.q ? choice.q.indexOf(Math.max(...choice.q)) : -1;
+  const tops = best(choice);
   ACTIONS.forEach((name, a) => {
     const row = element("tr");
     const unsafe = choice.unsafe && choice.unsafe[a];
     row.className = `${a === choice.action ? "chosen" : ""} ${unsafe ? "unsafe" : ""}`;
     row.append(element("td", name), element("td", choice.q ? number(choice.q[a], 3) : ""),
       element("td", choice.score ? number(choice.score[a], 2) : ""), element("td", choice.ttc ? number(choice.ttc[a], 1) : ""),
-      element("td", [unsafe ? "unsafe" : "", a === best ? "best Q" : ""].filter(Boolean).join(", ")));
+      element("td", [unsafe ? "unsafe" : "", tops.includes(a) && tops.length < ACTIONS.length ? "best Q" : ""].filter(Boolean).join(", ")));
     table.append(row);
   });
   box.append(table);
@@ -149,7 +149,7 @@ function fillLegend(state) {
   });
   const patch = (colour) => (ctx) => { ctx.fillStyle = colour; ctx.fillRect(2, 4, 26, 8); };
   if (data.zones.size) entry("conflict zone", patch(c.zone));
-  if (data.goal.size && data.goal.size < data.lanes.length / 2) entry("lanes where the mission is fulfilled", patch(c.goal));
+  if (data.goal.size) entry("lanes where the mission is fulfilled", patch(c.goal));
 }
 
 function fillEvents(state) {

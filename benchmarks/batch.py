@@ -1,0 +1,94 @@
+"""What the engine of `cosim evaluate` costs, and what a second worker gains.
+
+  python -m benchmarks.batch [--scenario merge] [--demand free] [--duration 10] [--episodes 200] [--rounds N]
+
+Each round drives the same episodes with one worker and with two, the order swapped from round to round, with
+everything `cosim evaluate` does: processes, rows, store. Overhead is all the time with one worker that is not
+`total_s` (which the episode itself measures inside its process), less the first start. `busy` is the share of
+time in which the workers had an episode: it says what two workers gain on two cores that nobody else uses.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from cosim.app.case_runner import CaseRunner
+from cosim.app.progress import Progress
+from cosim.evaluation import batch, matrix
+from cosim.evaluation.engines import LocalEngine
+from cosim.evaluation.spec import Spec
+from cosim.evaluation.store import Store
+from policy.agents import check_name
+
+GAIN = 0.6  # of the time of one worker, at most, that two may take
+OVERHEAD = 0.05  # of the serial time, at most
+
+
+@dataclass(frozen=True)
+class Run:
+    """One batch: wall time, time inside the episodes, all in s."""
+
+    wall: float
+    episodes: tuple[float, ...]  # total_s of each
+    start: float  # until the first episode was in, less that episode
+    busy: float  # share of the workers' time
+
+
+def measured(plan: matrix.Plan, workers: int, progress: Progress) -> Run:
+    """Drive the plan into a fresh store."""
+    arrivals: list[float] = []
+
+    def arrived(done: float, total: float) -> None:
+        arrivals.append(time.perf_counter())
+        progress(done, total)
+
+    with tempfile.TemporaryDirectory() as folder, Store.in_folder(Path(folder)) as store:
+        batch.begin(plan, store, {})
+        began = time.perf_counter()
+        batch.drive(plan, store, LocalEngine(CaseRunner, workers=workers), Path(folder), arrived)
+        wall = time.perf_counter() - began
+        rows = store.rows()
+    if any(row["status"] != "ok" for row in rows):
+        raise SystemExit(f"not all episodes came through: {rows[0]['error']}")
+    episodes = tuple(row["total_s"] for row in rows)
+    start = arrivals[0] - began - episodes[0]
+    return Run(wall, episodes, start, sum(episodes) / (workers * (wall - start)))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--scenario", default="merge")
+    parser.add_argument("--demand", default="free")
+    parser.add_argument("--duration", type=float, default=10.0)
+    parser.add_argument("--episodes", type=int, default=200)
+    parser.add_argument("--rounds", type=int, default=1)
+    args = parser.parse_args()
+    seeds = (200_000, 200_000 + args.episodes)
+    spec = Spec((args.scenario,), seeds, demand=((args.demand,),), duration=args.duration)
+    plan = matrix.plan(matrix.cells(spec), range(*seeds), check_name)
+    runs: dict[int, list[Run]] = {1: [], 2: []}
+    for k in range(args.rounds):
+        for workers in (1, 2) if k % 2 == 0 else (2, 1):
+            progress = Progress(f"round {k + 1}, {workers} workers", "episodes")
+            runs[workers].append(measured(plan, workers, progress))
+            progress.done()
+            last = runs[workers][-1]
+            print(
+                f"round {k + 1}: {workers} workers, {args.episodes} episodes of "
+                f"{statistics.median(last.episodes):.2f} s (median) in {last.wall:.1f} s, "
+                f"start {last.start:.1f} s, busy {last.busy:.1%}",
+                flush=True,
+            )
+    gain = statistics.median(b.wall / a.wall for a, b in zip(runs[1], runs[2], strict=True))
+    overhead = statistics.median((r.wall - r.start) / sum(r.episodes) - 1.0 for r in runs[1])
+    print(f"two workers take {gain:.2f} of the time of one (at most {GAIN})")
+    print(f"the engine costs {overhead:.2%} of the serial time (at most {OVERHEAD:.0%})")
+
+
+if __name__ == "__main__":
+    main()

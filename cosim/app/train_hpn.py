@@ -1,0 +1,184 @@
+"""Training of the hybrid predictive network from recordings: `cosim train hpn`."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import queue
+import sys
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cosim.app import output
+from cosim.app.prediction_data import MAPLESS, episodes, followed
+from cosim.app.progress import Progress
+from cosim.app.train_vfn import configuration
+from cosim.errors import BadInput, CosimError
+from cosim.recording import Folder, read
+from cosim.types import COMPACT
+from cosim.worker import Worker
+from policy.predictors import make_predictor
+from policy.traffic import TrafficConfig
+from policy.training import hpn
+from policy.training.kinematics import KinematicTask
+from policy.training.loop import train as run_loop
+from policy.training.map_branch import MapTask
+from policy.training.moments import MapSample, Moment, map_sample, moment
+from policy.training.networks import use_threads
+
+TRAINING, VALIDATION = range(0, 100_000), range(100_000, 200_000)  # seeds (contract.md)
+
+
+def train(args: argparse.Namespace) -> int:
+    """`cosim train hpn`. Raises BadInput for whatever is wrong before anything is computed."""
+    _, file = configuration(args.config)
+    name, training = args.variant, file.prediction
+    if args.seed is not None:
+        training = hpn.seeded(training, args.seed)
+    if not args.recordings or not args.validation:
+        raise BadInput(
+            "recordings to train and to validate on are needed", field="--recordings, --validation"
+        )
+    found = {
+        "train": _checked(args.recordings, TRAINING, "--recordings"),
+        "validation": _checked(args.validation, VALIDATION, "--validation"),
+    }
+    folder = output.prepare_folder(args.out)
+    use_threads(args.threads)
+    data = {part: _manifest(keys) for part, keys in found.items()}
+    examples = {part: _gather(keys, name, training, args, part) for part, keys in found.items()}
+    task: KinematicTask | MapTask
+    variant = hpn.VARIANTS[name]
+    loop, device = training.loop, args.device
+    if variant.maps == "plain":
+        samples = {part: [s for s in found if isinstance(s, MapSample)] for part, found in examples.items()}
+        task = MapTask(
+            variant.map_branch, training.maps, loop.updates, samples["train"], samples["validation"], device
+        )
+    else:
+        moments = {part: [m for m in found if isinstance(m, Moment)] for part, found in examples.items()}
+        task = KinematicTask(
+            variant.kinematic,
+            training.kinematics,
+            loop.updates,
+            moments["train"],
+            moments["validation"],
+            device,
+        )
+    progress = Progress(f"train {name}", "updates")
+    layout = hpn.layout(name, training, data)
+    log = run_loop(task, loop, folder, layout=layout, resume=args.resume, progress=progress)
+    progress.done()
+    file_name = folder / f"{name}.safetensors"
+    hpn.save(file_name, name, hpn.assemble(name, task), log[-1], data)
+    print(f"{name}: {loop.updates} updates, validation loss {log[-1]['validation_loss']:.4f}")
+    print(f"  {file_name}")
+    return 0
+
+
+class Gatherer:
+    """Lives in a worker: turns recorded episodes into what is learned from."""
+
+    def __init__(self, variant: str, training: hpn.HpnTraining) -> None:
+        self._variant, self._training = hpn.VARIANTS[variant], training
+        self._predictor = make_predictor("gp-indirect", 20, 0.2)
+        self._folders: dict[str, Folder] = {}
+
+    def gather(self, path: str, key: str) -> list[Moment] | list[MapSample]:
+        """Everything that one episode gives."""
+        folder = self._folders.setdefault(path, Folder(Path(path)))
+        recording = read(folder.episode_file(key))
+        road, seed, t = folder.road(recording), int(recording.case["seed"]), self._training
+        if self._variant.maps == "plain":
+            return [
+                map_sample(at.histories[name], at.maps[name], at.future)
+                for at in followed(recording, road, COMPACT, t.map_stride, seed)
+                for name in sorted(at.maps)[seed % 2 :: 4]  # every fourth AV: allies see the same cars
+            ]
+        seen = self._variant.kinematic.history
+        return [
+            moment(at.histories, at.future, road, self._predictor, TrafficConfig(), seen)
+            for at in followed(recording, road, MAPLESS, t.stride, seed)
+        ]
+
+
+def _gather(
+    keys: Sequence[tuple[Path, str]], variant: str, training: hpn.HpnTraining, args: Any, part: str
+) -> list[Moment] | list[MapSample]:
+    """Examples of every episode, in the order of the keys whichever worker was faster."""
+    waiting: queue.SimpleQueue[int] = queue.SimpleQueue()
+    for k in range(len(keys)):
+        waiting.put(k)
+    done: list[Any] = [None] * len(keys)
+    failed: list[CosimError] = []
+    count = [0]
+    progress = Progress(f"read {part}", "episodes")
+
+    def work() -> None:
+        try:
+            with Worker(Gatherer, variant, training, name="cosim-gather") as worker:
+                while not failed:
+                    try:
+                        k = waiting.get_nowait()
+                    except queue.Empty:
+                        return
+                    done[k] = worker.call("gather", str(keys[k][0]), keys[k][1])
+                    count[0] += 1
+        except CosimError as error:
+            failed.append(error)
+
+    threads = [threading.Thread(target=work, daemon=True) for _ in range(min(args.workers, len(keys)))]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        while thread.is_alive():
+            thread.join(0.5)
+            progress(count[0], len(keys))
+    progress.done()
+    if failed:
+        raise failed[0]
+    flat = [example for found in done for example in found]
+    if not flat:
+        raise BadInput("no episode is long enough to learn from", field="--recordings")
+    return flat
+
+
+def _checked(paths: Sequence[str], seeds: range, field: str) -> list[tuple[Path, str]]:
+    found = episodes([Path(p) for p in paths])
+    if not found:
+        raise BadInput("holds no episodes", field=field, value=", ".join(paths))
+    wrong = sorted({s for _, key in found if (s := int(key.rsplit("-", 1)[1])) not in seeds})
+    if wrong:
+        raise BadInput(
+            f"seeds {seeds.start} to {seeds.stop - 1} are for this (contract), not {wrong[0]}",
+            field=field,
+            value=", ".join(paths),
+        )
+    return found
+
+
+def _manifest(keys: Sequence[tuple[Path, str]]) -> dict[str, Any]:
+    """What data it was, short enough for a card: how many episodes of which worlds and seeds, and a hash."""
+    names = sorted(key for _, key in keys)
+    seeds = np.array([int(name.rsplit("-", 1)[1]) for name in names])
+    worlds = sorted({name.split("-", 1)[0] for name in names})
+    return {
+        "episodes": len(names),
+        "scenarios": worlds,
+        "seeds": [int(seeds.min()), int(seeds.max())],
+        "keys_sha256": hashlib.sha256(json.dumps(names).encode()).hexdigest(),
+    }
+
+
+def check(args: argparse.Namespace) -> None:
+    """Refuse flags that say nothing to an HPN. Raises BadInput."""
+    for flag in ("policy", "iterations"):
+        if getattr(args, flag) is not None:
+            raise BadInput("is not for hpn", field=f"--{flag}", value=getattr(args, flag))
+    if args.scenario:
+        print("cosim: --scenario is not for hpn: the recordings say which worlds", file=sys.stderr)

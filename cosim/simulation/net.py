@@ -1,0 +1,38 @@
+"""A net alone, read by SUMO into a RoadMap: for files of traffic that was driven elsewhere."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import libsumo
+
+from cosim.errors import BadInput
+from cosim.road import RoadMap
+from cosim.simulation.convert import read_road
+from cosim.simulation.stderr import SumoStderr
+
+
+class NetReader:
+    """Lives in a `cosim.worker.Worker`, since a bad net can kill the process. Vet the net before."""
+
+    def __init__(self, net: Path) -> None:
+        stderr = SumoStderr()
+        try:
+            with stderr:
+                libsumo.start(
+                    ["sumo", "--net-file", str(net), "--no-step-log", "true", "--no-warnings", "true"]
+                )
+        except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
+            words = " ".join((stderr.take() or str(error)).split())
+            raise BadInput(f"SUMO refuses it: {words}", file=net) from None
+        finally:
+            stderr.close()
+        self._net = net
+
+    def road(self) -> RoadMap:
+        """Every lane that a motor vehicle may use."""
+        return read_road((), self._net)
+
+    def close(self) -> None:
+        """End SUMO."""
+        libsumo.close()

@@ -1,0 +1,64 @@
+#!/usr/bin/env bash
+# Builds the image, with a Docker engine or without: `docker/build.sh [runtime|test]`.
+#
+# Without one, buildah builds on a Debian that debootstrap makes (once; it stays in the local store), and the
+# build sees the pip settings of this machine, folders of wheels included. Variables, beside those of engine.sh:
+#
+#   BASE             the image to start from (default: debian:bookworm-slim, or made by debootstrap)
+#   EXTRAS           extras of pyproject.toml to put in, with commas between: ray,postgresql
+#   PIP_CONF         a pip.conf for the build (default: this machine's own settings)
+#   MOUNTS           folders that PIP_CONF names, mounted at the same place (split at spaces)
+#   CA_BUNDLE        a file of certificates that PIP_CONF names, mounted at the same place
+#   PIP_INDEX_URL, PIP_EXTRA_INDEX_URL   with Docker, which mounts nothing: where pip finds packages
+set -euo pipefail
+cd "$(dirname "$0")/.."
+. docker/engine.sh
+choose_engine
+target=${1:-runtime}
+tag=$IMAGE
+[ "$target" = runtime ] || tag=$IMAGE-$target
+local_base=localhost/debian-base:bookworm
+args=(--file docker/Dockerfile --target "$target" --tag "$tag"
+    --build-arg "EXTRAS=${EXTRAS:-}"
+    --build-arg "REVISION=$(git rev-parse HEAD 2>/dev/null || echo unknown)")
+
+make_base() {
+    local root
+    root=$(mktemp -d)
+    echo "== $local_base: debootstrap"
+    debootstrap --variant=minbase --include=ca-certificates bookworm "$root" >"$root.log" 2>&1 ||
+        { tail -n 20 "$root.log" >&2; exit 4; }
+    rm -rf "$root"/var/cache/apt/archives/*.deb "$root"/var/cache/apt/*.bin "$root"/var/lib/apt/lists/* \
+        "$root"/var/log/* "$root"/etc/resolv.conf "$root"/etc/hostname "$root.log"
+    tar -C "$root" --one-file-system -c . | podman import --quiet - "$local_base" >/dev/null
+    rm -rf "$root"
+}
+
+began=$SECONDS
+if [ "$ENGINE" = docker ]; then
+    [ -z "${BASE:-}" ] || args+=(--build-arg "BASE=$BASE")
+    for name in PIP_INDEX_URL PIP_EXTRA_INDEX_URL; do
+        [ -z "${!name:-}" ] || args+=(--build-arg "$name=${!name}")
+    done
+    docker build "${args[@]}" "${build_args[@]}" .
+else
+    if [ -z "${BASE:-}" ] && [ "$(id -u)" = 0 ] && command -v debootstrap >/dev/null; then
+        podman image exists "$local_base" || make_base
+        BASE=$local_base
+    fi
+    [ -z "${BASE:-}" ] || args+=(--build-arg "BASE=$BASE")
+    lent=$(mktemp -d)
+    trap 'rm -rf "$lent"' EXIT
+    if [ -n "${PIP_CONF:-}" ]; then
+        cp "$PIP_CONF" "$lent/pip.conf"
+        for place in ${MOUNTS:-} ${CA_BUNDLE:-}; do args+=(--volume "$place:$place:ro"); done
+    else
+        python3 docker/host_pip.py "$lent" >"$lent/mounts"
+        while read -r source inside; do args+=(--volume "$source:$inside:ro"); done <"$lent/mounts"
+    fi
+    args+=(--volume "$lent:/run/host-pip:ro" --build-arg PIP_CONFIG_FILE=/run/host-pip/pip.conf)
+    # chroot: no runtime, no namespaces of its own, so that it builds inside a container or a small machine too.
+    buildah bud --isolation chroot --network host --layers "${args[@]}" "${build_args[@]}" .
+fi
+size=$("${engine[@]}" image inspect --format '{{.Size}}' "$tag")
+echo "== $tag: $((size / 1000000)) MB, built in $((SECONDS - began)) s"

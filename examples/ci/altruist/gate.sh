@@ -1,0 +1,15 @@
+#!/bin/sh
+# Evaluates the candidate beside the baseline on equal seeds and says by its exit code whether it may be merged:
+# 0 yes, 1 a threshold failed, 2 bad input, 3 a simulation failed.   gate.sh [FOLDER FOR RESULTS]
+set -eu
+here=$(cd "$(dirname "$0")" && pwd)
+out=${1:-runs/ci-altruist}
+again=
+if [ -e "$out/store.sqlite" ]; then again=--resume; fi # a job that was cut off goes on where it was
+cosim evaluate "$here/SPEC.yaml" --out "$out" $again
+cosim report "$out"
+cosim compare "$out" --baseline idm --candidate altruist-rule \
+    --fail-on 'collision_rate > +0pp' \
+    --fail-on 'mission_success_rate < +30pp' \
+    --fail-on 'dt_av_m < -20%' \
+    --junit "$out/junit.xml" --markdown "$out/compare.md"

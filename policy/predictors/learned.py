@@ -1,0 +1,151 @@
+"""P's learned baselines: LSTM and autoencoder, each direct (positions) and indirect (speed and heading)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import nn
+
+from cosim.errors import BadInput
+from cosim.types import Bools, Floats
+from policy.checkpoint import SHIPPED, load
+from policy.forecast import KinematicForecast, motion_of
+from policy.kernel_prior import trailing_run
+
+INPUTS = 6  # per frame, see `features`
+# Scales that bring inputs and outputs to order one: m behind, m aside, m/s, rad, m/s of change.
+BEHIND, ASIDE, SPEED, TURN, GAIN = 30.0, 5.0, 15.0, 0.3, 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class NetConfig:
+    """Layout of one network; small, as P's baselines are."""
+
+    kind: Literal["lstm", "ae"]
+    target: Literal["direct", "indirect"]
+    frames: int = 10  # N
+    horizon: int = 20  # M
+    dt: float = 0.2  # s
+    hidden: int = 64
+    latent: int = 16  # of the autoencoder
+
+
+class KinematicNet(nn.Module):
+    """Features of the past -> the next M frames in the vehicle's own frame (x ahead, y left, heading 0 now).
+
+    `lstm`: one layer, its last state decoded by two dense layers. `ae`: dense encoder of the whole past to
+    `latent` numbers, mirrored decoder to the future.
+    """
+
+    def __init__(self, config: NetConfig) -> None:
+        super().__init__()
+        self.config = c = config
+        outputs = 2 * c.horizon
+        if c.kind == "lstm":
+            self.lstm = nn.LSTM(INPUTS, c.hidden, batch_first=True)
+            self.head = nn.Sequential(nn.Linear(c.hidden, c.hidden), nn.ReLU(), nn.Linear(c.hidden, outputs))
+        else:
+            self.head = nn.Sequential(
+                nn.Flatten(),
+                nn.Linear(INPUTS * c.frames, c.hidden),
+                nn.ReLU(),
+                nn.Linear(c.hidden, c.latent),
+                nn.ReLU(),
+                nn.Linear(c.latent, c.hidden),
+                nn.ReLU(),
+                nn.Linear(c.hidden, outputs),
+            )
+
+    def forward(self, past: torch.Tensor, speed: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """past [V,N,INPUTS], speed [V] m/s now -> x, y [V,M] m; indirect also speed m/s, heading rad."""
+        c = self.config
+        if c.kind == "lstm":
+            past = self.lstm(past)[0][:, -1]
+        raw = self.head(past).view(-1, 2, c.horizon)
+        elapsed = c.dt * torch.arange(1, c.horizon + 1, dtype=raw.dtype)
+        if c.target == "direct":
+            return speed[:, None] * elapsed + ASIDE * raw[:, 0], GAIN * raw[:, 1]
+        v = (speed[:, None] + GAIN * raw[:, 0]).clamp(min=0.0)
+        h = TURN * raw[:, 1]
+        return *integrate(speed, v, h, c.dt), v, h
+
+
+def integrate(
+    now: torch.Tensor, speed: torch.Tensor, heading: torch.Tensor, dt: float
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """P, eq. (9), trapezoid rule in the vehicle's own frame: now [V] m/s, speed, heading [V,M] -> x, y."""
+    v = torch.cat([now[:, None], speed], 1)
+    h = torch.cat([torch.zeros_like(heading[:, :1]), heading], 1)
+    vx, vy = v * torch.cos(h), v * torch.sin(h)
+    return (
+        torch.cumsum(0.5 * dt * (vx[:, 1:] + vx[:, :-1]), 1),
+        torch.cumsum(0.5 * dt * (vy[:, 1:] + vy[:, :-1]), 1),
+    )
+
+
+def features(state: Floats, run: Floats) -> torch.Tensor:
+    """[V,N,INPUTS] of states [V,N,>=4]: place, speed, heading, change of speed against now; known or not."""
+    now = np.nan_to_num(state[:, -1:])
+    dx, dy = state[:, :, 0] - now[:, :, 0], state[:, :, 1] - now[:, :, 1]
+    c, s = np.cos(now[:, :, 3]), np.sin(now[:, :, 3])
+    frames = state.shape[1]
+    known = np.arange(frames)[None] >= frames - run[:, None]  # [V,N]
+    columns = (
+        (c * dx + s * dy) / BEHIND,
+        (c * dy - s * dx) / ASIDE,
+        state[:, :, 2] / SPEED,
+        (state[:, :, 3] - now[:, :, 3]) / TURN,
+        (state[:, :, 2] - now[:, :, 2]) / GAIN,
+        np.ones_like(dx),
+    )
+    return torch.from_numpy(np.where(known[..., None], np.stack(columns, -1), 0.0).astype(np.float32))
+
+
+class Learned:
+    """One of the four on the predictors' protocol. Raises BadInput for a horizon or dt it was not made for."""
+
+    def __init__(
+        self,
+        config: NetConfig,
+        horizon: int = 20,
+        dt: float = 0.2,
+        weights: Path | None | Literal["shipped"] = "shipped",
+    ) -> None:
+        self.name = f"{config.kind}-{config.target}"
+        self.horizon, self.dt = horizon, dt
+        if horizon > config.horizon or abs(dt - config.dt) > 1e-9:
+            raise BadInput(
+                f"predicts {config.horizon} frames of {config.dt:g} s, not {horizon} of {dt:g} s",
+                field="predictor",
+                value=self.name,
+            )
+        self.network = KinematicNet(config).eval()
+        if weights is not None:
+            file = SHIPPED / f"{self.name}.safetensors" if weights == "shipped" else weights
+            load(file, {"network": self.network}, {"network": config})
+
+    def predict(self, kinematics: Floats, valid: Bools) -> KinematicForecast:
+        """See `Predictor.predict`; no intervals. Histories are cut or filled to the N frames it knows."""
+        state = np.asarray(kinematics[:, :, :4], dtype=np.float64)
+        run = trailing_run(state, valid)
+        known = run > 0
+        now = np.where(known[:, None], np.nan_to_num(state[:, -1]), 0.0)
+        n, m = self.network.config.frames, self.horizon
+        state = state[:, -n:]
+        if state.shape[1] < n:
+            lead = np.repeat(state[:, :1], n - state.shape[1], 1)
+            state = np.concatenate([lead, state], 1)
+        seen = features(state, np.minimum(run, n))
+        with torch.inference_mode():
+            speed_now = torch.from_numpy(now[:, 2].astype(np.float32))
+            u, w, *rest = (t[:, :m].to(torch.float64).numpy() for t in self.network(seen, speed_now))
+        c, s = np.cos(now[:, 3:4]), np.sin(now[:, 3:4])
+        x, y = now[:, :1] + c * u - s * w, now[:, 1:2] + s * u + c * w
+        speed, heading = (rest[0], now[:, 3:4] + rest[1]) if rest else motion_of(now, x, y, self.dt)
+        x, y, speed, heading = (np.where(known[:, None], a, 0.0) for a in (x, y, speed, heading))
+        zero = np.zeros_like(x)
+        return KinematicForecast(x, y, speed, heading, zero, zero, zero, zero, known)

@@ -1,0 +1,74 @@
+"""The three HPNs that are trained and compared, and how: the shipped one, and two ablations of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from cosim.errors import BadInput
+from policy import checkpoint
+from policy.hpn import HPN, HpnConfig
+from policy.kinematic_branch import KinematicConfig
+from policy.training.kinematics import KinematicTask, KinematicTraining
+from policy.training.loop import Line, LoopConfig
+from policy.training.map_branch import MapTask, MapTraining
+
+Variant = Literal["hpn", "hpn-no-history", "hpn-plain"]
+VARIANTS: dict[str, HpnConfig] = {
+    "hpn": HpnConfig(),
+    "hpn-no-history": HpnConfig(kinematic=KinematicConfig(history=False)),  # P, figure 6
+    "hpn-plain": HpnConfig(maps="plain"),  # P's figure 3 as written
+}
+
+
+@dataclass(frozen=True, slots=True)
+class HpnTraining:
+    """One training run. Defaults: what trains on a CPU core in an hour."""
+
+    stride: int = 4  # decisions between two moments of an episode: neighbours are nearly the same
+    map_stride: int = 20  # the same for `hpn-plain`, whose samples are whole maps
+    loop: LoopConfig = field(default_factory=LoopConfig)
+    kinematics: KinematicTraining = field(default_factory=KinematicTraining)
+    maps: MapTraining = field(default_factory=MapTraining)
+
+
+def seeded(training: HpnTraining, seed: int) -> HpnTraining:
+    """The same run with other draws."""
+    return replace(
+        training,
+        kinematics=replace(training.kinematics, seed=seed),
+        maps=replace(training.maps, seed=seed),
+    )
+
+
+def layout(name: str, training: HpnTraining, data: Mapping[str, Any]) -> dict[str, Any]:
+    """What a run is: a folder's run is only gone on with when nothing of it has changed."""
+    return {"hpn": asdict(VARIANTS[name]), "training": asdict(training), "data": dict(data)}
+
+
+def assemble(name: str, task: KinematicTask | MapTask) -> HPN:
+    """The whole HPN around what was trained."""
+    network = HPN(VARIANTS[name])
+    branch = network.kinematic if isinstance(task, KinematicTask) else network.map_branch
+    assert branch is not None
+    branch.load_state_dict(task.network.state_dict())
+    return network.eval()
+
+
+def save(path: Path, name: str, network: HPN, last: Line, data: Mapping[str, Any]) -> None:
+    """Weights and card; the card names the variant, its training data and the last validation losses."""
+    measured = {k: round(v, 6) for k, v in last.items() if k.startswith("validation_")}
+    checkpoint.save(path, {"hpn": network}, {"hpn": network.config}, {"variant": name, **measured}, data)
+
+
+def load(path: Path) -> tuple[str, HPN]:
+    """A trained HPN and which variant it is. Raises BadInput, WeightsMismatch."""
+    card = checkpoint.read_card(path)
+    name = str(card["measured"].get("variant"))
+    if name not in VARIANTS:
+        raise BadInput("these weights are no HPN's", file=path, field="variant", value=name)
+    network = HPN(VARIANTS[name])
+    checkpoint.load(path, {"hpn": network}, {"hpn": network.config})
+    return name, network.eval()

@@ -1,0 +1,116 @@
+"""What a supervised learner learns from: one decision of a recorded episode, and what came of it."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from cosim.road import RoadMap
+from cosim.types import Bools, Bytes, Floats, Floats32, History, Ints, Snapshot
+from policy.forecast import KinematicForecast
+from policy.predictors import Predictor
+from policy.scene import Scene, join
+from policy.traffic import Traffic, TrafficConfig, predict_traffic
+from policy.vehicle_inputs import vehicle_inputs
+
+TURN = 2 * np.pi
+
+
+class Moment(NamedTuple):
+    """V vehicles and the B AVs that look at them. Coordinates from one origin per moment (float32)."""
+
+    own: Floats32  # [V,.] `VehicleInputs`
+    near: Floats32  # [V,K,.]
+    lane: Floats32  # [V,M,4] x m, y m, speed m/s, heading rad
+    gp: Floats32  # [V,M,4]
+    truth: Floats32  # [V,M,4] nan where the vehicle is gone
+    known: Bools  # [V]
+    ego: Ints  # [B] places of the AVs
+
+
+class MapSample(NamedTuple):
+    """One AV at one decision: its maps before and after, packed (they are nearly empty)."""
+
+    maps: bytes  # zlib of uint8 [N+M,C,H,W]
+    shape: tuple[int, ...]
+    kinematics: Floats32  # [N,R,8] as in `History`
+    valid: Bools  # [N,R]
+    next_kinematics: Floats32  # [M,R,8] the same rows later; only the first four columns mean anything
+    next_valid: Bools  # [M,R]
+
+    def unpacked(self) -> Bytes:
+        """uint8 [N+M,C,H,W]"""
+        return np.frombuffer(zlib.decompress(self.maps), np.uint8).reshape(self.shape)
+
+
+def foresee(
+    scene: Scene, predictor: Predictor, road: RoadMap, config: TrafficConfig
+) -> tuple[KinematicForecast, Traffic]:
+    """The two forecasts that the kinematic branch corrects."""
+    forecast = predictor.predict(scene.state, scene.valid)
+    return forecast, predict_traffic(scene, forecast, road, config, predictor.horizon)
+
+
+def without_history(scene: Scene) -> Scene:
+    """The same scene as known from the newest frame alone (P, figure 6: without history)."""
+    valid = scene.valid.copy()
+    valid[:, :-1] = False
+    return scene._replace(valid=valid)
+
+
+def moment(
+    histories: Mapping[str, History],
+    future: Sequence[Snapshot],
+    road: RoadMap,
+    predictor: Predictor,
+    config: TrafficConfig,
+    history: bool = True,
+) -> Moment:
+    """One decision as the kinematic branch learns from it; `future`: the next M frames."""
+    scene = join(histories)
+    if not history:
+        scene = without_history(scene)
+    inputs = vehicle_inputs(scene, *foresee(scene, predictor, road, config))
+    truth = states_of(scene.vehicles, future)  # [V,M,4]
+    truth[..., 3] -= TURN * np.round((truth[..., 3] - inputs.lane[..., 3]) / TURN)
+    origin = np.array([*scene.pose[0, :2], 0.0, 0.0])
+    moved = [np.asarray(a - origin, np.float32) for a in (inputs.lane, inputs.gp, truth)]
+    return Moment(inputs.own, inputs.near, moved[0], moved[1], moved[2], inputs.known, scene.ego)
+
+
+def states_of(vehicles: Sequence[str], frames: Sequence[Snapshot]) -> Floats:
+    """[V,M,4] x y speed heading of the vehicles in every frame; nan where one is not on the road."""
+    out = np.full((len(vehicles), len(frames), 4), np.nan)
+    for k, frame in enumerate(frames):
+        at = np.array([frame.row.get(name, -1) for name in vehicles], np.int64)
+        here = at >= 0
+        rows = at[here]
+        out[here, k] = np.stack([frame.x[rows], frame.y[rows], frame.speed[rows], frame.heading[rows]], 1)
+    return out
+
+
+def map_sample(history: History, maps: Bytes, future: Sequence[Snapshot]) -> MapSample:
+    """One AV at one decision; maps [M,C,H,W] are its own of the next M frames."""
+    states = states_of(history.ids, future)  # [R,M,4]
+    there = np.isfinite(states[..., 0]) & history.valid[-1][:, None]
+    x, y, heading = history.pose
+    c, s = np.cos(heading), np.sin(heading)
+    dx, dy = states[..., 0] - x, states[..., 1] - y
+    after = np.zeros((len(future), *history.kinematics.shape[1:]), np.float32)
+    turned = states[..., 3] - heading
+    turned -= TURN * np.round((turned - history.kinematics[-1, :, None, 3]) / TURN)
+    for k, value in enumerate((c * dx + s * dy, c * dy - s * dx, states[..., 2], turned)):
+        after[..., k] = np.where(there, value, 0.0).T
+    after[..., 4:] = history.kinematics[-1, :, 4:]
+    whole = np.concatenate([history.velocity_map, maps])
+    return MapSample(
+        zlib.compress(whole.tobytes(), 1),
+        whole.shape,
+        history.kinematics.copy(),
+        history.valid.copy(),
+        after,
+        np.ascontiguousarray(there.T),
+    )

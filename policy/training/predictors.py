@@ -1,0 +1,189 @@
+"""Fits what the kinematic predictors learn: the prior over kernels, its calibration, and P's baselines.
+
+All of them see the same windows of recorded episodes and minimise the same figure, the mean position error
+over the horizon (PE), so that their table compares methods and not objectives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import nn
+
+from cosim.types import Bools, Floats
+from policy.gaussian_process import GaussianProcessBank, Operators
+from policy.kernel_prior import PriorNetwork, describe, trailing_run
+from policy.predictors.gp import GaussianProcessDirect, GaussianProcessIndirect
+from policy.predictors.learned import KinematicNet, features, integrate
+
+COVERED = 0.9  # what an interval shall cover
+NORMAL = 1.645  # half its width in standard deviations, if errors were normal
+SPREAD_WEIGHT = 0.05  # of the intervals' loss: it shall not move the mean forecast
+SMALLEST = {"speed": 0.01, "heading": 1e-3, "along": 0.01, "across": 0.01}  # m/s, rad, m: below is noise
+
+GaussianProcess = type[GaussianProcessIndirect] | type[GaussianProcessDirect]
+
+
+class Windows(NamedTuple):
+    """S moments of single vehicles with their whole past known, each in its own frame at that moment."""
+
+    past: Floats  # [S,N,4] x m ahead, y m left, speed m/s, heading rad
+    future: Floats  # [S,M,4] nan once it has left
+    weight: Floats  # [S] mean 1
+
+
+def in_own_frame(past: Floats, future: Floats, weight: Floats) -> Windows:
+    """Windows [S,N,4], [S,M,4] in the world; those with an unknown past or no future at all are left out."""
+    whole = np.isfinite(past).all((1, 2)) & np.isfinite(future[:, 0]).all(1)
+    past, future, weight = past[whole], future[whole], weight[whole]
+    now = past[:, -1:]
+    c, s = np.cos(now[:, :, 3]), np.sin(now[:, :, 3])
+
+    def turned(world: Floats) -> Floats:
+        dx, dy = world[:, :, 0] - now[:, :, 0], world[:, :, 1] - now[:, :, 1]
+        return np.stack([c * dx + s * dy, c * dy - s * dx, world[:, :, 2], world[:, :, 3] - now[:, :, 3]], -1)
+
+    return Windows(turned(past), turned(future), weight / weight.mean())
+
+
+def examples_for_net(windows: Windows) -> dict[str, torch.Tensor]:
+    """What `net_loss` needs of each window."""
+    run = trailing_run(windows.past, np.isfinite(windows.past[:, :, 0]))
+    return {
+        "past": features(windows.past, run),
+        "speed": _tensor(windows.past[:, -1, 2]),
+        **_truth(windows),
+    }
+
+
+def net_loss(network: KinematicNet, batch: Mapping[str, torch.Tensor]) -> torch.Tensor:
+    """Mean position error of an LSTM's or autoencoder's forecast, m."""
+    x, y = network(batch["past"], batch["speed"])[:2]
+    return position_error(x, y, batch)
+
+
+def position_error(x: torch.Tensor, y: torch.Tensor, batch: Mapping[str, torch.Tensor]) -> torch.Tensor:
+    """PE: distance between forecast and truth, mean over the frames that have one, then over vehicles."""
+    here = batch["here"]
+    squared = (x - batch["future"][:, :, 0]) ** 2 + (y - batch["future"][:, :, 1]) ** 2
+    error = torch.sqrt(squared + 1e-6) * here  # differentiable at 0
+    return (error.sum(1) / here.sum(1) * batch["weight"]).mean()
+
+
+class BankMath(nn.Module):
+    """`GaussianProcessBank.forecast` in torch, so that gradients reach the prior over kernels."""
+
+    predict: torch.Tensor
+    drift: torch.Tensor
+    variance: torch.Tensor
+
+    def __init__(self, bank: GaussianProcessBank, frames: int) -> None:
+        super().__init__()
+        op: Operators = bank.operators(frames)
+        self.unit, self.kernels, self.steps = bank.config.unit, len(bank.kernels), bank.horizon
+        for name in ("predict", "drift", "variance"):
+            self.register_buffer(name, _tensor(getattr(op, name)), persistent=False)
+
+    def forward(
+        self, past: torch.Tensor, evidence: torch.Tensor, log_prior: torch.Tensor, heat: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """past [S,n] relative to now in the unit, evidence, log_prior [S,K] -> mean, deviation [S,2M]."""
+        weight = torch.softmax(evidence / heat + log_prior, 1)
+        means = (past @ self.predict + self.drift).view(-1, self.kernels, 2 * self.steps)
+        mean = torch.bmm(weight[:, None], means)[:, 0]
+        second = torch.bmm(weight[:, None], means.square())[:, 0] + weight @ self.variance
+        deviation = torch.sqrt((second - mean**2).clamp(min=0.0) + 1e-8)
+        return self.unit * mean, self.unit * deviation
+
+
+class PriorFit:
+    """The examples and the loss of one Gaussian-process predictor's prior."""
+
+    def __init__(self, kind: GaussianProcess, windows: Windows) -> None:
+        self.predictor = kind(weights=None)
+        self.network = PriorNetwork(kind.prior_config())
+        frames = windows.past.shape[1]
+        self._math = [BankMath(bank, frames) for bank in self.predictor.banks]
+        run = np.full(len(windows.past), frames)
+        self.examples = {
+            "motion": _tensor(describe(windows.past, run, self.predictor.dt)),
+            "speed": _tensor(windows.past[:, -1, 2]),
+            **_truth(windows),
+        }
+        for b, (bank, series) in enumerate(
+            zip(self.predictor.banks, self.predictor.series(windows.past), strict=True)
+        ):
+            past = (series - series[:, -1:]) / bank.config.unit
+            parts = [bank.evidence(part) for part in np.array_split(past, max(len(past) // 20_000, 1))]
+            evidence = np.concatenate(parts)
+            self.examples[f"past{b}"] = _tensor(past)
+            self.examples[f"evidence{b}"] = _tensor(evidence - evidence.max(1, keepdims=True))
+
+    def loss(self, batch: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        """Position error, and a little of how badly the intervals fit (pinball loss of their edge)."""
+        raw = self.network(batch["motion"])
+        kernels = self.network.config.kernels
+        *priors, spread = torch.split(raw, [*kernels, self.network.config.spreads], 1)
+        heat = self.network.log_temperature.exp()
+        m = self.predictor.horizon
+        first, second = (
+            math(batch[f"past{b}"], batch[f"evidence{b}"], priors[b], heat[b])
+            for b, math in enumerate(self._math)
+        )
+        future, here = batch["future"], batch["here"]
+        if isinstance(self.predictor, GaussianProcessDirect):
+            x, y = first[0][:, :m], second[0][:, :m]
+            errors = [x - future[:, :, 0], y - future[:, :, 1]]
+            deviations = [first[1][:, :m], second[1][:, :m]]
+        else:
+            v = (batch["speed"][:, None] + first[0][:, :m]).clamp(min=0.0)
+            h = second[0][:, :m]
+            x, y = integrate(batch["speed"], v, h, self.predictor.dt)
+            elapsed = self.predictor.dt * torch.arange(1, m + 1)
+            dx, dy = future[:, :, 0] - x, future[:, :, 1] - y
+            c, s = torch.cos(h), torch.sin(h)
+            errors = [v - future[:, :, 2], h - future[:, :, 3], c * dx + s * dy, c * dy - s * dx]
+            across = torch.sqrt(x**2 + y**2 + 1e-6) / elapsed * second[1][:, m:]
+            deviations = [first[1][:, :m], second[1][:, :m], first[1][:, m:], across]
+        total = position_error(x, y, batch)
+        for k, (error, deviation) in enumerate(zip(errors, deviations, strict=True)):
+            unit = (1.0, 0.05, 1.0, 0.5)[k] if len(errors) == 4 else (1.0, 0.5)[k]
+            edge = NORMAL * deviation.detach() * torch.exp(spread[:, k : k + 1])
+            beyond = (error.detach().abs() - edge) / unit
+            pinball = torch.maximum(COVERED * beyond, (COVERED - 1.0) * beyond) * here
+            total = total + SPREAD_WEIGHT * (pinball.sum(1) / here.sum(1) * batch["weight"]).mean()
+        return total
+
+
+def interval_errors(forecast_std: tuple[Floats, ...], errors: tuple[Floats, ...], weight: Floats) -> Floats:
+    """[quantities,M] the factor on each standard deviation with which an interval of NORMAL deviations covers
+    COVERED of the errors [S,M] (nan where there is no truth)."""
+    factors = np.ones((len(errors), errors[0].shape[1]))
+    for q, (error, std) in enumerate(zip(errors, forecast_std, strict=True)):
+        for step in range(error.shape[1]):
+            ratio = np.abs(error[:, step]) / np.maximum(NORMAL * std[:, step], 1e-9)
+            there = np.isfinite(ratio)
+            factors[q, step] = _quantile(ratio[there], weight[there], COVERED)
+    return factors
+
+
+def _quantile(values: Floats, weight: Floats, share: float) -> float:
+    order = np.argsort(values)
+    total = np.cumsum(weight[order])
+    return float(values[order[np.searchsorted(total, share * total[-1])]])
+
+
+def _truth(windows: Windows) -> dict[str, torch.Tensor]:
+    here = np.isfinite(windows.future).all(2)
+    return {
+        "future": _tensor(np.nan_to_num(windows.future)),
+        "here": _tensor(here),
+        "weight": _tensor(windows.weight),
+    }
+
+
+def _tensor(values: Floats | Bools) -> torch.Tensor:
+    return torch.from_numpy(np.ascontiguousarray(values, np.float32))

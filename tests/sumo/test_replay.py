@@ -1,0 +1,141 @@
+"""`cosim replay`: the same episode again, from a run's and from a batch's folder, or a clear refusal."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from cosim.app.cli import main
+from cosim.app.replay import find
+from cosim.errors import BadInput
+
+SEED = "200041"
+
+
+@pytest.fixture(scope="module")
+def driven(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run folder, with an option for SUMO and outputs."""
+    out = tmp_path_factory.mktemp("run")
+    arguments = ["run", "merge", "--demand", "contested", "--policy", "altruist-rule", "--seed", SEED]
+    arguments += ["--duration", "4", "--output", "tripinfo", "--out", str(out)]
+    assert main([*arguments, "--", "--scale", "0.8", "--no-warnings", "true"]) == 0
+    return out
+
+
+@pytest.fixture
+def run(driven: Path, tmp_path: Path) -> Path:
+    """A copy of it to spoil."""
+    return Path(shutil.copytree(driven, tmp_path / "run"))
+
+
+def changed(run: Path, **fields: object) -> None:
+    """Rewrite the manifest with other values."""
+    file = run / "manifest.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | fields))
+
+
+def test_a_replay_is_the_same_episode_drawn(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = (run / "outputs" / "tripinfo.xml").stat().st_mtime_ns
+    assert main(["replay", str(run), SEED]) == 0
+    trace = json.loads((run / "result.json").read_text())["trace_hash"]
+    assert f"the same episode: trace hash {trace}" in capsys.readouterr().out
+    assert (run / "replay.html").stat().st_size > 30_000
+    assert (run / "replay.mp4").stat().st_size > 10_000
+    assert (run / "outputs" / "tripinfo.xml").stat().st_mtime_ns == before
+
+
+def test_the_folder_says_what_was_driven(driven: Path) -> None:
+    recorded = find(driven, None)
+    assert recorded.case.policy == "altruist-rule"
+    assert recorded.case.outputs == ("tripinfo",)
+    assert recorded.options == ("--scale=0.8",)
+    scenario = recorded.case.scenario(recorded.options)
+    assert dict(scenario.options)["scale"] == "0.8"
+    assert scenario.duration == 4.0
+
+
+def test_another_episode_is_refused_with_exit_code_1(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    result = json.loads((run / "result.json").read_text())
+    (run / "result.json").write_text(json.dumps(result | {"trace_hash": "0" * 64}))
+    page = run / "page.html"
+    assert main(["replay", str(run), "--html", str(page)]) == 1
+    assert "the replay is not the recorded episode: trace hash" in capsys.readouterr().err
+    assert not page.exists()
+    assert main(["replay", str(run), "--html", str(page), "--no-check"]) == 0
+    assert "ANOTHER episode" in capsys.readouterr().out
+    assert page.exists()
+
+
+def test_a_file_that_has_changed_is_named(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = json.loads((run / "manifest.json").read_text())["files"]
+    changed(run, files={**files, "net.net.xml": "0" * 64})
+    assert main(["replay", str(run)]) == 2
+    error = capsys.readouterr().err
+    assert "merge/net.net.xml: has changed since it was driven (SHA-256 000000000000..." in error
+
+
+def test_a_setting_that_has_changed_is_named(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    changed(run, preset="guarded")
+    assert main(["replay", str(run)]) == 2
+    assert "preset: is 'unguarded' now, it was 'guarded' when it was driven" in capsys.readouterr().err
+
+
+def test_other_versions_are_only_warned_of(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    versions = json.loads((run / "manifest.json").read_text())["versions"]
+    changed(run, versions=versions | {"numpy": "1.0"})
+    assert main(["replay", str(run), "--html", str(run / "page.html")]) == 0
+    assert "warning: driven with numpy 1.0, here is" in capsys.readouterr().err
+
+
+def test_whom_the_film_shall_follow_must_be_there(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    film = run / "film.mp4"
+    assert main(["replay", str(run), "--mp4", str(film), "--follow", "mission.9"]) == 2
+    assert "--follow='mission.9': no such vehicle, did you mean 'mission.0'?" in capsys.readouterr().err
+    assert not film.exists()
+
+
+def test_a_folder_that_is_none_is_one_clear_sentence(tmp_path: Path, run: Path) -> None:
+    with pytest.raises(
+        BadInput, match="no such file: a folder of cosim run --out or cosim evaluate is needed"
+    ):
+        find(tmp_path / "nowhere", None)
+    (tmp_path / "manifest.json").write_text("{}")
+    with pytest.raises(BadInput, match="was not written by this version"):
+        find(tmp_path, None)
+    with pytest.raises(BadInput, match=f"EPISODE='7': this folder holds one episode, with seed {SEED}"):
+        find(run, "7")
+
+
+def test_an_episode_of_a_batch_is_found_by_key_and_by_seed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    batch = tmp_path / "batch"
+    arguments = ["--scenario", "merge", "--policy", "keep-lane", "--policy", "idm", "--duration", "1"]
+    assert (
+        main(["evaluate", *arguments, "--seeds", "200051:200053", "--workers", "1", "--out", str(batch)]) == 0
+    )
+    manifest = json.loads((batch / "manifest.json").read_text())
+    cell = next(c for c, v in manifest["cells"].items() if v["case"]["policy"] == "keep-lane")
+    key = f"{cell}-200052"
+    with pytest.raises(BadInput, match="2 episodes have this seed: "):
+        find(batch, "200052")
+    with pytest.raises(BadInput, match="did you mean"):
+        find(batch, key[:-1])
+    with pytest.raises(BadInput, match="holds 4 episodes: name one by its key or seed"):
+        find(batch, None)
+    capsys.readouterr()
+    page = tmp_path / "page.html"
+    assert main(["replay", str(batch), key, "--html", str(page)]) == 0
+    assert "the same episode" in capsys.readouterr().out
+    assert page.stat().st_size > 30_000
+
+
+def test_a_run_can_draw_its_replay_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "run"
+    assert main(["run", "merge", "--duration", "1", "--replay", "--out", str(out)]) == 0
+    assert {p.name for p in out.iterdir()} >= {"replay.html", "replay.mp4", "result.json"}
+    assert main(["run", "merge", "--replay"]) == 2
+    assert "--replay: needs a run folder to write into: --out DIR" in capsys.readouterr().err

@@ -1,0 +1,212 @@
+"""`cosim metrics`: floating-car data become the same snapshots, and bad files one clear sentence."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cosim.app.cli import main
+from cosim.errors import BadInput
+from cosim.evaluation.fcd import Analysis, Roles, analyse
+from cosim.evaluation.vehicle_types import Size, read_sizes, size_of
+from cosim.simulation.fake import straight_road
+
+HEAD = '<fcd-export xmlns:xsi="http://www.w3.org/2001/XMLSchema-instance">\n'
+
+
+def car(name: str, x: float, speed: float, *, y: float = 1.6, angle: float = 90.0, more: str = "") -> str:
+    """A vehicle heading east whose front bumper is at x."""
+    return (
+        f'<vehicle id="{name}" x="{x:.3f}" y="{y:.3f}" angle="{angle:.2f}" type="car" speed="{speed:.3f}" '
+        f'pos="{x:.3f}" lane="road_0" slope="0.00" {more}/>'
+    )
+
+
+def step(time: float, *vehicles: str) -> str:
+    return f'<timestep time="{time:.2f}">{"".join(vehicles)}</timestep>\n'
+
+
+def following(count: int = 11, interval: float = 0.2) -> str:
+    """A car at 20 m/s closes in on one at 10 m/s, bumpers 50 m apart at first."""
+    return "".join(
+        step(t, car("fast", 100 + 20 * t, 20.0), car("slow", 155 + 10 * t, 10.0))
+        for t in (interval * k for k in range(count))
+    )
+
+
+@pytest.fixture
+def fcd(tmp_path: Path) -> Any:
+    """Writes a file of these steps."""
+
+    def write(body: str, name: str = "fcd.xml") -> Path:
+        path = tmp_path / name
+        text = HEAD + body + "</fcd-export>\n"
+        path.write_bytes(gzip.compress(text.encode()) if name.endswith(".gz") else text.encode())
+        return path
+
+    return write
+
+
+def value(found: Analysis, name: str) -> Any:
+    return found.figures[name].value
+
+
+def test_front_bumpers_and_degrees_become_the_gap_between_two_cars(fcd: Any) -> None:
+    found = analyse(fcd(following()))
+    assert value(found, "min_ttc_s") == pytest.approx((50 - 20) / 10)  # 2 s later the gap is 30 m
+    assert value(found, "max_drac_mps2") == pytest.approx(10**2 / (2 * 30), rel=1e-3)
+    assert value(found, "min_headway_s") == pytest.approx(30 / 20, rel=1e-3)
+    assert (found.frames, found.vehicles, found.watched, found.interval) == (11, 2, 2, 0.2)
+
+
+def test_heading_north_is_no_other_thing_than_heading_east(fcd: Any) -> None:
+    turned = re.sub(r'x="([\d.]+)" y="([\d.]+)" angle="90.00"', r'x="\2" y="\1" angle="0.00"', following())
+    assert value(analyse(fcd(turned)), "min_ttc_s") == pytest.approx(3.0)
+
+
+def test_the_types_file_gives_sizes_and_the_rest_is_said(fcd: Any) -> None:
+    found = analyse(fcd(following()), sizes={"car": Size(15.0, 2.0)})
+    assert value(found, "min_ttc_s") == pytest.approx(2.0)  # 10 m less between them
+    assert not any("taken as" in note for note in found.notes)
+    assert any("every vehicle is taken as 5 x 1.8 m" in note for note in analyse(fcd(following())).notes)
+    other = analyse(fcd(following()), sizes={"bus": Size(12.0, 2.5)})
+    assert any("taken as 5 x 1.8 m: car" in note for note in other.notes)
+
+
+def test_a_type_of_one_vehicle_has_the_size_of_its_origin() -> None:
+    sizes = {"hv": Size(4.0, 1.7), "odd@name": Size(9.0, 2.0)}
+    assert size_of("hv@veh.7", sizes) == size_of("hv/moderate", sizes) == size_of("hv", sizes) == sizes["hv"]
+    assert size_of("odd@name", sizes) == sizes["odd@name"]
+    assert size_of("lorry", sizes) is None
+
+
+def test_sizes_are_read_with_sumo_s_defaults_of_the_class(tmp_path: Path) -> None:
+    path = tmp_path / "types.add.xml"
+    path.write_text(
+        '<additional><vType id="a" length="4"/><vType id="b" vClass="bus" width="3"/></additional>'
+    )
+    assert read_sizes([path]) == {"a": Size(4.0, 1.8), "b": Size(12.0, 3.0)}
+    path.write_text('<routes><vType id="a" length="-4"/></routes>')
+    with pytest.raises(
+        BadInput, match=r"length='-4': must be a positive number of metres \(vType 'a', line 1\)"
+    ):
+        read_sizes([path])
+
+
+def test_only_the_chosen_vehicles_are_watched(fcd: Any) -> None:
+    path = fcd(following().replace('id="fast" ', 'id="fast" ').replace("car", "av", 1))
+    nobody = analyse(path, roles=Roles(av_type="lorry"))
+    assert nobody.watched == 0
+    assert value(nobody, "min_headway_s") is None
+    assert any("nothing to count" in note for note in nobody.notes)
+    one = analyse(path, roles=Roles(av_ids=re.compile("fast")))
+    assert one.watched == 1
+    assert value(one, "min_headway_s") == pytest.approx(1.5, rel=1e-3)
+    slow = analyse(path, roles=Roles(mission=re.compile("slow")))
+    assert value(slow, "min_headway_s") is None  # headways are those of AVs
+    assert value(slow, "min_ttc_s") == pytest.approx(3.0)
+
+
+def test_fine_steps_are_thinned_to_the_frames_of_an_episode(fcd: Any) -> None:
+    fine = analyse(fcd(following(21, 0.1)))
+    assert (fine.frames, fine.interval) == (11, 0.2)
+    assert any("thinned" in note for note in fine.notes)
+    assert analyse(fcd(following(21, 0.1)), frame=0.1).frames == 21
+    assert analyse(fcd(following(5, 0.5))).interval == 0.5
+    with pytest.raises(
+        BadInput, match=r"--frame='0.25': must be a whole number of the file's steps of 0.1 s"
+    ):
+        analyse(fcd(following(21, 0.1)), frame=0.25)
+
+
+def test_steps_without_vehicles_may_be_left_out(fcd: Any) -> None:
+    hard = [step(0, car("a", 100, 20)), step(0.2, car("a", 104, 20)), step(5.0, car("a", 200, 1))]
+    found = analyse(fcd("".join(hard)))
+    assert found.frames == 26
+    assert value(found, "hard_brakings") == 0  # nobody saw how it came to 1 m/s
+
+
+def test_a_window_of_time_is_all_that_counts(fcd: Any) -> None:
+    found = analyse(fcd(following()), begin=0.4, end=1.0)
+    assert (found.begin, found.end, found.frames) == (0.4, 1.0, 4)
+    assert value(found, "min_ttc_s") == pytest.approx(4.0)
+
+
+def test_packed_files_and_whole_tracks_of_streaming_give_the_same(fcd: Any) -> None:
+    plain, packed = analyse(fcd(following())), analyse(fcd(following(), "fcd.xml.gz"))
+    assert plain.figures == packed.figures
+
+
+def test_with_a_net_a_headway_needs_its_lanes(fcd: Any) -> None:
+    path = fcd(following())
+    assert value(analyse(path, road=straight_road(2, 2000.0, 25.0)), "min_headway_s") == pytest.approx(
+        1.5, rel=1e-3
+    )
+    assert not any("--net" in note for note in analyse(path, road=straight_road(1, 2000.0, 25.0)).notes)
+
+
+BAD = {
+    "truncated": (following()[:-40], r"not well-formed|truncated"),
+    "no angle": (
+        following().replace('angle="90.00" ', "", 1),
+        r"vehicle.angle: vehicle 'fast' has none \(line 2\)",
+    ),
+    "NaN": (
+        following().replace('speed="20.000"', 'speed="nan"', 1),
+        r"vehicle.speed='nan': not a finite number",
+    ),
+    "no id": (following().replace('id="fast" ', "", 1), r"vehicle.id \(line 2\): is missing"),
+    "twice": (step(0, car("a", 1, 1), car("a", 9, 1)), r"vehicle.id='a': is twice in the step at 0 s"),
+    "back in time": (step(1, car("a", 1, 1)) + step(0, car("a", 1, 1)), r"times must increase"),
+    "uneven": (
+        step(0, car("a", 1, 1)) + step(0.2, car("a", 1, 1)) + step(0.5, car("a", 1, 1)),
+        r"steps are not evenly spaced: 0.2 s at first, then 0.3 s",
+    ),
+    "no time": (step(0, car("a", 1, 1)).replace('time="0.00"', ""), r"is not a time"),
+    "nobody": (step(0) + step(0.2), r"holds no vehicle"),
+    "outside": (car("a", 1, 1), r"a vehicle outside of a timestep"),
+    "degrees": (
+        "".join(step(0.2 * k, car("a", 8.68 + 1e-5 * k, 20, y=50.1)) for k in range(80)),
+        r"positions do not move with the speeds: degrees",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_a_bad_file_is_one_clear_sentence(fcd: Any, kind: str) -> None:
+    body, words = BAD[kind]
+    path = fcd(body)
+    with pytest.raises(BadInput, match=words) as caught:
+        analyse(path)
+    assert str(caught.value).startswith(str(path))
+    assert "\n" not in str(caught.value)
+
+
+def test_another_file_of_sumo_is_not_fcd(tmp_path: Path) -> None:
+    path = tmp_path / "tripinfo.xml"
+    path.write_text("<tripinfos></tripinfos>")
+    with pytest.raises(BadInput, match="<fcd-export> is needed"):
+        analyse(path)
+
+
+def test_the_command_line_prints_units_or_one_document(
+    fcd: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = fcd(following())
+    assert main(["metrics", str(path)]) == 0
+    shown = capsys.readouterr().out
+    assert re.search(r"min_ttc_s +3 s\n", shown)
+    assert "note: every vehicle is watched" in shown
+    assert main(["metrics", str(path), "--json", "--begin", "1"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["min_ttc_s"] == pytest.approx(3.0)
+    assert document["units"]["max_drac_mps2"] == "m/s2"
+    assert document["begin_s"] == 1.0
+    assert main(["metrics", str(tmp_path / "none.xml")]) == 2
+    assert main(["metrics", str(path), "--av-ids", "("]) == 2
+    assert "--av-ids='(': not a regular expression" in capsys.readouterr().err

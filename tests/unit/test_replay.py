@@ -1,0 +1,262 @@
+"""Replays without SUMO: watching changes nothing, the page holds everything, the film is a film."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import json
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+
+from cosim.app.output import document as facts
+from cosim.episode import Episode, run_episode
+from cosim.evaluation.replay import packing, recorder
+from cosim.evaluation.replay.page import page
+from cosim.evaluation.replay.recorder import Recorder, Recording
+from cosim.evaluation.replay.strip import Strip, poses_at
+from cosim.evaluation.replay.video import HEIGHT, WIDTH, film
+from cosim.types import Decision, Forecast, History, MetaAction, ObservationConfig, PolicyContext
+from policy.agents.keep_lane import KeepLane
+from tests.contracts.fake_worlds import platoon, scenario, wall
+
+COLUMNS = (
+    "kind",
+    "mission",
+    "x",
+    "y",
+    "heading",
+    "speed",
+    "accel",
+    "length",
+    "width",
+    "lane",
+    "lane_position",
+)
+
+
+class Explains:
+    """Tries the lane to its left for ever, says why it brakes, and what it predicts."""
+
+    name = "explains"
+    label = "made up"
+    observation = ObservationConfig(maps=False)
+    av_parameters: Mapping[str, str] = {}
+    last_forecast: Forecast | None = None
+
+    def reset(self, context: PolicyContext) -> None:
+        self.last_forecast = None
+
+    def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
+        ahead = 5.0 * np.arange(1.0, 11.0)[None] + np.array([h.pose[0] for h in histories.values()])[:, None]
+        level = np.ones_like(ahead)
+        self.last_forecast = Forecast(
+            tuple(histories), ahead, 1.6 * level, 0.0 * level, 0.3 * level * np.arange(10), 0.1 * level, 0.2
+        )
+        why = Decision(
+            MetaAction.LANE_LEFT,
+            q=np.array([0.5, 0.25, 0.0, -1.0, 0.125], np.float32),
+            safety_score=np.array([1.0, 2.0, 3.0, 4.0, 5.0], np.float32),
+            unsafe=np.array([True, False, False, True, False]),
+            ttc=np.array([0.5, 10.0, 10.0, 1.5, np.inf], np.float32),
+            blamed="human",
+            vetoed=True,
+        )
+        return dict.fromkeys(histories, why)
+
+
+def watched(world: Any = platoon, seconds: float = 4.0, policy: Any = None) -> tuple[Recording, str]:
+    """An episode on the fake simulator, and its trace hash."""
+    watch = Recorder(world(), policy or Explains())
+    episode = Episode(scenario(seconds), watch.simulator, watch.policy.observation)
+    result = run_episode(episode, watch.policy, 200_000, svo=0.5)
+    return watch.recording(facts(result)), result.trace_hash
+
+
+@pytest.fixture(scope="module")
+def recording() -> Recording:
+    return watched()[0]
+
+
+def unpacked(text: str) -> dict[str, Any]:
+    """The document inside a page."""
+    match = re.search(r'<script id="data"[^>]*>(.*?)</script>', text, re.DOTALL)
+    assert match is not None
+    found: dict[str, Any] = json.loads(gzip.decompress(base64.b64decode(match[1])))
+    return found
+
+
+def restored(steps: list[int], unit: float, order: int = 1) -> np.ndarray:
+    """As assets/data.js does."""
+    values = np.array(steps, np.int64)
+    for _ in range(order):
+        values = np.cumsum(values)
+    return values * unit
+
+
+def test_an_episode_that_is_watched_is_the_same_episode() -> None:
+    policy, world = Explains(), platoon()
+    episode = Episode(scenario(), world, policy.observation)
+    alone = run_episode(episode, policy, 200_000, svo=0.5)
+    assert watched()[1] == alone.trace_hash
+
+
+def test_every_vehicle_is_followed_through_every_frame(recording: Recording) -> None:
+    assert recording.times == pytest.approx(0.2 * np.arange(21))
+    assert sorted(t.id for t in recording.tracks) == ["a", "b", "c", "human"]
+    for track in recording.tracks:
+        assert (track.first, len(track.x)) == (0, 21)
+        driven = np.diff(track.x)
+        assert driven == pytest.approx(0.2 * (track.speed[1:] + track.speed[:-1]) / 2, abs=0.25)
+
+
+def test_what_was_decided_predicted_and_refused_is_kept(recording: Recording) -> None:
+    assert recording.decided == pytest.approx(0.4 * np.arange(10))
+    assert set(recording.choices[0]) == {"a", "b", "c"}
+    blocked = [choices["a"].blocked for choices in recording.choices]
+    assert blocked[0] is None  # the first change begins ...
+    assert blocked[1] == "a lane change is under way"
+    assert blocked[-1] == "no lane on that side"  # ... and there are two lanes only
+    forecast = recording.forecasts[3]
+    assert forecast is not None
+    assert forecast.ids == ("a", "b", "c")
+
+
+def test_the_page_holds_the_positions_to_half_a_centimetre(recording: Recording) -> None:
+    data = unpacked(page(recording))
+    names = [v[0] for v in data["vehicles"]]
+    for packed in data["tracks"]:
+        track = next(t for t in recording.tracks if t.id == names[packed[0]])
+        assert packed[1] == track.first
+        assert restored(packed[2], 0.01, 2) == pytest.approx(track.x, abs=0.006)
+        assert restored(packed[3], 0.01, 2) == pytest.approx(track.y, abs=0.006)
+        assert restored(packed[5], 0.01) == pytest.approx(track.speed, abs=0.006)
+    path = next(p for p in data["forecasts"][0] if names[p[0]] == "a")
+    assert recording.forecasts[0] is not None
+    assert restored(path[1], 0.1) == pytest.approx(recording.forecasts[0].x[0, 1::2], abs=0.051)
+    assert restored(path[3], 0.1) == pytest.approx(0.3 * np.arange(1, 10, 2), abs=0.051)
+
+
+def test_the_page_holds_values_vetoes_blame_and_refusals(recording: Recording) -> None:
+    data = unpacked(page(recording))
+    names, words = [v[0] for v in data["vehicles"]], data["words"]
+    vehicle, action, _, flags, blamed, blocked, q, score, ttc, unsafe = data["choices"][-1][0]
+    assert names[vehicle] == "a"
+    assert MetaAction(action) == MetaAction.LANE_LEFT
+    assert flags == 1  # vetoed, no fallback
+    assert words[blamed] == "human"
+    assert words[blocked] == "no lane on that side"
+    assert q == [0.5, 0.25, 0.0, -1.0, 0.125]
+    assert score == [1, 2, 3, 4, 5]
+    assert ttc == [0.5, 10, 10, 1.5, None]  # JSON knows no infinity
+    assert unsafe == [1, 0, 0, 1, 0]
+
+
+def test_the_page_needs_no_network_and_names_no_other_file(recording: Recording) -> None:
+    text = page(recording)
+    assert "default-src 'none'" in text
+    assert not re.search(r"https?://|\bsrc=|<link|@import|\bimport\(|fetch\(", text)
+    assert len(text) < 100_000
+
+
+def test_names_from_outside_cannot_break_the_page() -> None:
+    found, _ = watched()
+    evil = "</script><img onerror=alert(1)>"
+    found = replace(found, facts={**found.facts, "scenario": evil})
+    text = page(found)
+    assert evil not in text
+    assert unpacked(text)["facts"]["scenario"] == evil
+
+
+def test_a_collision_is_marked_where_it_happened() -> None:
+    found, _ = watched(wall, 6.0, KeepLane())
+    data = unpacked(page(found))
+    assert [(c["collider"], c["victim"]) for c in data["collisions"]] == [("a", "standing")]
+    crash = data["collisions"][0]
+    assert found.collisions[0].time * 1000 == pytest.approx(crash["t"])
+    assert 100 < crash["x"] < 140
+
+
+def test_a_long_recording_keeps_every_other_frame_and_stays_small(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recorder, "MOST", 40)  # vehicle frames, of 84
+    found, _ = watched()
+    assert sum(len(t.x) for t in found.tracks) <= 40 + 4
+    assert found.interval == pytest.approx(0.8)
+    assert len(found.choices) == 10  # decisions are all kept
+    kept = [time for time, f in zip(found.decided, found.forecasts, strict=True) if f is not None]
+    assert kept
+    assert all(np.isclose(found.times, time).any() for time in kept[:-1])
+
+
+def test_a_vehicle_that_was_away_has_two_tracks() -> None:
+    watch = Recorder(platoon(), Explains())
+    (first,) = watch.simulator.reset(0)
+    gone = replace(
+        first,
+        ids=first.ids[1:],
+        **{name: getattr(first, name)[1:] for name in COLUMNS},
+    )
+    watch.see(replace(gone, time=0.2))
+    watch.see(replace(first, time=0.4))
+    tracks = [t for t in watch.recording({}).tracks if t.id == first.ids[0]]
+    assert [(t.first, len(t.x)) for t in tracks] == [(0, 1), (2, 1)]
+    assert first.ids[0] not in {p.track.id for p in poses_at(watch.recording({}), 0.2)}
+
+
+def test_between_two_frames_a_vehicle_is_between_two_places(recording: Recording) -> None:
+    a, b = (next(p for p in poses_at(recording, t) if p.track.id == "human") for t in (1.0, 1.2))
+    middle = next(p for p in poses_at(recording, 1.1) if p.track.id == "human")
+    assert middle.x == pytest.approx((a.x + b.x) / 2)
+    assert a.x < middle.x < b.x
+
+
+def test_a_vehicle_is_drawn_where_it_is(recording: Recording) -> None:
+    pose = next(p for p in poses_at(recording, 0.0) if p.track.id == "human")
+    strip = Strip(pose.x, pose.y, 640, 200)
+    empty = np.asarray(strip.finished()).copy()
+    strip.vehicle(pose)
+    changed = np.argwhere((np.asarray(strip.finished()) != empty).any(axis=2))
+    rows, columns = changed[:, 0], changed[:, 1]
+    assert (rows.min() + rows.max()) / 2 == pytest.approx(100, abs=1.5)
+    assert (columns.min() + columns.max()) / 2 == pytest.approx(320, abs=1.5)
+    assert columns.max() - columns.min() == pytest.approx(5.0 * 640 / 200, abs=3)  # 5 m at 200 m a picture
+
+
+def test_the_film_has_ten_pictures_a_second_that_move(recording: Recording, tmp_path: Path) -> None:
+    path = tmp_path / "film.mp4"
+    film(recording, path, follow="human")
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        assert stream.codec_context.name == "h264"
+        pictures = [frame.to_ndarray(format="rgb24") for frame in container.decode(stream)]
+    assert len(pictures) == 41
+    assert pictures[0].shape == (HEIGHT, WIDTH, 3)
+    assert np.abs(pictures[0].astype(int) - pictures[-1]).max() > 50
+    assert [p.name for p in tmp_path.iterdir()] == ["film.mp4"]
+
+
+def test_a_film_that_fails_leaves_nothing_behind(recording: Recording, tmp_path: Path) -> None:
+    def stop(*_: float) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        film(recording, tmp_path / "film.mp4", progress=stop)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_empty_world_can_be_drawn() -> None:
+    watch = Recorder(platoon(), Explains())
+    (first,) = watch.simulator.reset(0)
+    nobody = {name: getattr(first, name)[:0] for name in COLUMNS}
+    empty = replace(first, ids=(), **nobody)
+    watch.start(empty)
+    data = packing.document(watch.recording({}))
+    assert data["tracks"] == []
+    assert math.isclose(data["begin"], 0.0)

@@ -51,6 +51,7 @@ class Worker:
         handle, path = tempfile.mkstemp(prefix="cosim-worker-", suffix=".stderr")
         os.close(handle)
         self._stderr = Path(path)
+        self._heard = 0  # bytes of it that belong to earlier calls
         self._pipe, theirs = _CONTEXT.Pipe()
         self._process = _CONTEXT.Process(
             target=_serve, args=(theirs, factory, arguments, path), name=name, daemon=True
@@ -76,6 +77,7 @@ class Worker:
         """Run one method in the worker. `progress` receives what the method passes to its own `progress`."""
         if self._closed:
             raise SimulationCrashed("the simulation's process has ended already")
+        self._heard = self._stderr.stat().st_size
         try:
             self._pipe.send((method, arguments, options, progress is not None))
         except (BrokenPipeError, OSError):
@@ -150,7 +152,8 @@ class Worker:
         return SimulationCrashed(problem, exitcode=code, stderr=stderr)
 
     def _last_words(self) -> str:
-        return self._stderr.read_text("utf-8", "replace").strip()[-STDERR_KEPT:]
+        """What the process wrote during this call."""
+        return self._stderr.read_bytes()[self._heard :].decode("utf-8", "replace").strip()[-STDERR_KEPT:]
 
 
 @contextlib.contextmanager
@@ -176,8 +179,9 @@ def _script_left_out(*needed: object) -> Iterator[None]:
 def _serve(pipe: Connection, factory: Callable[..., Any], arguments: tuple[Any, ...], stderr: str) -> None:
     """The worker's whole life. Ends when the pipe breaks, so it never outlives its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
-    with open(stderr, "wb", buffering=0) as file:
-        os.dup2(file.fileno(), 2)
+    file = os.open(stderr, os.O_RDWR | os.O_APPEND)  # as `cosim.simulation.stderr` wants it, to read back
+    os.dup2(file, 2)
+    os.close(file)
     target = None
 
     def attempt(work: Callable[[], Any]) -> bool:

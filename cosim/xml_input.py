@@ -68,13 +68,13 @@ def scan(
     start: Start,
     end: End | None = None,
     *,
-    unpacked: float = MAX_UNPACKED,
+    unpacked: float | None = None,
     progress: Progress | None = None,
 ) -> str:
     """Call `start` for every element (the root included) and `end` when it closes; return the root's tag.
 
     Plain and gzip-packed files are told apart by their first bytes, as SUMO does. `roots`: the root tags
-    that are right here; empty for any. `unpacked`: bytes that a .gz may hold.
+    that are right here; empty for any. `unpacked`: bytes that a .gz may hold (MAX_UNPACKED).
 
     Raises:
         BadInput: not readable, not UTF-8, truncated or malformed (with line and column), wrong root,
@@ -128,9 +128,10 @@ def content(path: Path) -> bytes:
     return b"".join(chunks(path))
 
 
-def chunks(path: Path, unpacked: float = MAX_UNPACKED, progress: Progress | None = None) -> Iterator[bytes]:
+def chunks(path: Path, unpacked: float | None = None, progress: Progress | None = None) -> Iterator[bytes]:
     """The unpacked bytes of a plain or gzip file."""
     regular_file(path, file=path, field="file")
+    most = MAX_UNPACKED if unpacked is None else unpacked
     with path.open("rb") as raw:
         head = raw.read(2)
         raw.seek(0)
@@ -138,7 +139,7 @@ def chunks(path: Path, unpacked: float = MAX_UNPACKED, progress: Progress | None
             raise BadInput("is not UTF-8", file=path, field="encoding", value="UTF-16")
         size = path.stat().st_size
         for chunk in (
-            iter(lambda: raw.read(CHUNK), b"") if head != _GZIP_MAGIC else _unpacked(raw, path, unpacked)
+            iter(lambda: raw.read(CHUNK), b"") if head != _GZIP_MAGIC else _unpacked(raw, path, most)
         ):
             yield chunk
             if progress is not None:

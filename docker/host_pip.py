@@ -1,9 +1,9 @@
 """Lends this machine's pip settings to an image's build: `host_pip.py FOLDER`.
 
 Wherever pip finds packages for the person who builds (a folder of wheels, an index of the house, a
-certificate bundle), the build shall find them too. FOLDER gets a pip.conf and the bundle; the folders that the
-settings name are printed, a line `SOURCE TARGET` each, to be mounted for the build. The pip.conf knows only the
-mounted places, so that no path of this machine and no address ends in the image.
+certificate bundle), the build shall find them too. FOLDER gets a pip.conf and the bundle; the folders that
+the settings name are printed, a line `SOURCE TARGET` each, to be mounted for the build. The pip.conf knows
+only the mounted places, so that no path of this machine ends in the image.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ class KinematicForecast(NamedTuple):
     heading: Floats  # [V,M] rad, unwrapped
     speed_std: Floats  # [V,M] m/s, zero for predictors that do not know their error
     heading_std: Floats  # [V,M] rad
-    along_std: Floats  # [V,M] m, of the position in the predicted driving direction (gp-direct: now's)
+    along_std: Floats  # [V,M] m, of the position in the predicted driving direction
     across_std: Floats  # [V,M] m
     valid: Bools  # [V] was perceived in the newest frame
 

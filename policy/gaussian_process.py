@@ -38,8 +38,8 @@ class BankConfig:
 
 # m/s. Slopes and drifts as m/s2: cruising, ordinary and hard braking; who brakes is not who accelerates.
 SPEED = BankConfig(1.0, (0.2, 1.0), (0.5, 2.0), (1.0, 2.5), (0.02, 0.2), (-2.5, 0.0, 1.5))
-# 0.05 rad: 1 m/s sideways at 20 m/s, a usual lane change. Drifts of +-0.3 rad/s: round a ring, or a corner.
-HEADING = BankConfig(0.05, (0.2, 2.0), (0.5, 3.0), (1.0, 2.5), (0.02, 0.2), (-6.0, 0.0, 6.0))
+# 0.05 rad: 1 m/s sideways at 20 m/s, a usual lane change. Drifts of 0.15 and 0.4 rad/s: round rings, corners.
+HEADING = BankConfig(0.05, (0.2,), (0.5, 3.0), (0.7, 2.0), (0.02, 0.2), (-8.0, -3.0, 0.0, 3.0, 8.0))
 # m, of "direct" positions from now on, along the heading and across it. Slopes are speeds.
 ALONG = BankConfig(1.0, (5.0, 20.0), (0.5, 2.0, 8.0), (1.0, 2.5, 5.0), (0.02, 0.2), (0.0,), 1.0)
 ACROSS = BankConfig(0.5, (0.5, 5.0), (0.5, 2.0, 8.0), (1.0, 2.5, 5.0), (0.02, 0.2), (0.0,), 1.0)
@@ -118,7 +118,8 @@ class GaussianProcessBank:
         white = past @ op.whiten
         white -= op.drift_white
         white = white.reshape(-1, past.shape[1])
-        return op.log_norm - 0.5 * np.einsum("ij,ij->i", white, white).reshape(len(past), -1)
+        distance = np.einsum("ij,ij->i", white, white).reshape(len(past), -1)
+        return np.asarray(op.log_norm - 0.5 * distance)
 
     def operators(self, count: int) -> Operators:
         """For histories of `count` frames; computed once."""

@@ -120,6 +120,11 @@ def _drive(plan: matrix.Plan, engine: Engine, store: Store, folder: Path, args: 
     manifest = _manifest(plan, store)
     summary = summarize(rows, manifest["units"], manifest["better"])
     export(folder, rows, manifest, summary)
+    if not args.no_report:
+        from cosim.evaluation import report  # matplotlib: a second that a run without a report need not pay
+        from cosim.evaluation.run_folder import read
+
+        report.write(read(folder), None, shown=args.out)
     _warn(rows)
     for fault in faults:
         print(f"cosim: {fault.key}: no row, --resume tries it again: {fault.stderr}", file=sys.stderr)

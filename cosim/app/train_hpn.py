@@ -12,8 +12,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from cosim.app import output
 from cosim.app.prediction_data import MAPLESS, episodes, followed
 from cosim.app.progress import Progress
@@ -135,10 +133,13 @@ def _gather(
     threads = [threading.Thread(target=work, daemon=True) for _ in range(min(args.workers, len(keys)))]
     for thread in threads:
         thread.start()
+    told = 0
     for thread in threads:
         while thread.is_alive():
             thread.join(0.5)
-            progress(count[0], len(keys))
+            if count[0] > told:
+                told = count[0]
+                progress(told, len(keys))
     progress.done()
     if failed:
         raise failed[0]
@@ -163,15 +164,15 @@ def _checked(paths: Sequence[str], seeds: range, field: str) -> list[tuple[Path,
 
 
 def _manifest(keys: Sequence[tuple[Path, str]]) -> dict[str, Any]:
-    """What data it was, short enough for a card: how many episodes of which worlds and seeds, and a hash."""
+    """What data it was, short enough for a card: how it was recorded, how much of it, and a hash."""
     names = sorted(key for _, key in keys)
-    seeds = np.array([int(name.rsplit("-", 1)[1]) for name in names])
-    worlds = sorted({name.split("-", 1)[0] for name in names})
+    seeds = [int(name.rsplit("-", 1)[1]) for name in names]
+    folders = [Folder(path).manifest() for path in sorted({path for path, _ in keys})]
     return {
         "episodes": len(names),
-        "scenarios": worlds,
-        "seeds": [int(seeds.min()), int(seeds.max())],
+        "seeds": [min(seeds), max(seeds)],
         "keys_sha256": hashlib.sha256(json.dumps(names).encode()).hexdigest(),
+        "cells": sum(len(found.get("cells", {})) for found in folders),
     }
 
 

@@ -97,9 +97,9 @@ def quantile(values: Sequence[float] | Array, q: float) -> Figure:
         return NA
     tail = (1.0 - CONFIDENCE) / 2.0
     low, high = (int(stats.binom.ppf(p, len(ordered), q)) for p in (tail, 1.0 - tail))
-    last = len(ordered) - 1
+    last = len(ordered) - 1  # of n values the low-th and the (high + 1)-th smallest, counted from 1
     return Figure(
-        float(np.quantile(ordered, q)), float(ordered[min(low, last)]), float(ordered[min(high, last)])
+        float(np.quantile(ordered, q)), float(ordered[max(low - 1, 0)]), float(ordered[min(high, last)])
     )
 
 

@@ -68,11 +68,11 @@ def markdown(comparison: Comparison) -> str:
         lines.append("")
     for compared in comparison.groups:
         lines += ["<details>", f"<summary>{_html(compared.group.name)}</summary>", ""]
-        lines += [f"{note}  " for note in _notes(compared)]
+        lines += [f"{_html(note)}  " for note in _notes(compared)]
         lines += ["", "| | A | B | B - A |", "|---|---|---|---|"]
         lines += [_row([_html(cell) for cell in _cells(figure)]) for figure in _shown(comparison, compared)]
         lines += ["", "</details>", ""]
-    lines += [f"{line}  " for line in _lonely(comparison)]
+    lines += [f"{_html(line)}  " for line in _lonely(comparison)]
     return "\n".join(lines).rstrip() + "\n"
 
 

@@ -8,7 +8,9 @@ from pathlib import Path
 
 def refusals() -> dict[str, bool]:
     """What must not be possible -> whether it is refused."""
-    status = dict(line.split(":\t", 1) for line in Path("/proc/self/status").read_text().splitlines() if ":\t" in line)
+    status = dict(
+        line.split(":\t", 1) for line in Path("/proc/self/status").read_text().splitlines() if ":\t" in line
+    )
     return {
         "root": os.getuid() != 0,
         "capabilities": int(status["CapEff"], 16) == 0 and int(status["CapBnd"], 16) == 0,

@@ -16,26 +16,30 @@ from policy.kernel_prior import KernelPrior, PriorConfig, PriorNetwork, describe
 class _GaussianProcess:
     """What both share: banks, their learned prior, one batch per length of history.
 
-    `weights`: the fitted prior and calibration; None: the uniform prior, intervals as the kernels say.
+    `weights`: the fitted prior and calibration, as it is or from a file; None: the shipped one.
     """
 
     name: str
     configs: tuple[BankConfig, BankConfig]
     spreads: int  # quantities with an interval
 
-    def __init__(self, horizon: int = 20, dt: float = 0.2, weights: Path | None | str = "shipped") -> None:
+    def __init__(
+        self,
+        horizon: int = 20,
+        dt: float = 0.2,
+        weights: Path | PriorNetwork | None = None,
+    ) -> None:
         self.horizon, self.dt = horizon, dt
         self.banks = tuple(GaussianProcessBank(c, horizon, dt) for c in self.configs)
-        self.prior: KernelPrior | None = None
-        if weights == "shipped":
-            weights = SHIPPED / f"{self.name}.safetensors"
-            weights = weights if weights.is_file() else None
-        if weights is not None:
-            config = self.prior_config()
-            network = PriorNetwork(config)
-            load(Path(weights), {"prior": network}, {"prior": config})
-            self.prior = KernelPrior.of(network)
-            self._calibration = self.prior.calibrated(horizon, dt)
+        if isinstance(weights, PriorNetwork):
+            network = weights
+        else:
+            network = PriorNetwork(self.prior_config())
+            file = weights or SHIPPED / f"{self.name}.safetensors"
+            if file.is_file():
+                load(file, {"prior": network}, {"prior": network.config})
+        self.prior = KernelPrior.of(network)
+        self._calibration = self.prior.calibrated(horizon, dt)
 
     @classmethod
     def prior_config(cls) -> PriorConfig:
@@ -49,22 +53,15 @@ class _GaussianProcess:
         run = trailing_run(state, valid)
         known = run > 0
         now = np.where(known[:, None], np.nan_to_num(state[:, -1]), 0.0)  # [V,4]
-        logs: list[Floats | None] = [None] * len(self.banks)
-        spread = np.ones((len(state), self.spreads))
-        if self.prior is not None:
-            weights, spread = self.prior.apply(describe(state, run, self.dt))
-            logs = list(weights)
+        logs, spread = self.prior.apply(describe(state, run, self.dt))
         moments = np.zeros((len(self.banks), 4, len(state), self.horizon))
         for count in np.unique(run[known]):
             rows = slice(None) if (run == count).all() else np.flatnonzero(run == count)
             series = self.series(state[rows, -count:])
             for b, bank in enumerate(self.banks):
-                log, heat = logs[b], 1.0 if self.prior is None else float(self.prior.temperature[b])
-                f = bank.forecast(series[b], None if log is None else log[rows], heat)
+                f = bank.forecast(series[b], logs[b][rows], float(self.prior.temperature[b]))
                 moments[b][:, rows] = f
-        scale = spread.T[:, :, None]  # [spreads,V,1]
-        if self.prior is not None:
-            scale = scale * self._calibration[:, None]
+        scale = spread.T[:, :, None] * self._calibration[:, None]  # [spreads,V,M]
         return self._forecast(now, moments, scale, known)
 
     def series(self, state: Floats) -> tuple[Floats, Floats]:
@@ -94,9 +91,8 @@ class GaussianProcessIndirect(_GaussianProcess):
         elapsed = self.dt * np.arange(1, self.horizon + 1)
         mean_speed = np.sqrt((x - now[:, :1]) ** 2 + (y - now[:, 1:2]) ** 2) / elapsed
         across = mean_speed * np.sqrt(turned_var)
-        deviations = scale * np.stack([np.sqrt(v_var), np.sqrt(h_var), np.sqrt(along_var), across])
-        deviations *= known[:, None]
-        return KinematicForecast(x, y, v, h, *deviations, known)
+        std = scale * np.stack([np.sqrt(v_var), np.sqrt(h_var), np.sqrt(along_var), across]) * known[:, None]
+        return KinematicForecast(x, y, v, h, std[0], std[1], std[2], std[3], known)
 
 
 class GaussianProcessDirect(_GaussianProcess):
@@ -116,6 +112,8 @@ class GaussianProcessDirect(_GaussianProcess):
         c, s = np.cos(now[:, 3:4]), np.sin(now[:, 3:4])
         x, y = now[:, :1] + c * u - s * w, now[:, 1:2] + s * u + c * w
         speed, heading = motion_of(now, x, y, self.dt)
-        along, across = scale * np.sqrt(np.stack([u_var, w_var])) * known[:, None]
+        u_var, w_var = scale**2 * np.stack([u_var, w_var]) * known[:, None]
+        c, s = np.cos(heading - now[:, 3:4]), np.sin(heading - now[:, 3:4])
+        along, across = np.sqrt(c**2 * u_var + s**2 * w_var), np.sqrt(s**2 * u_var + c**2 * w_var)
         zero = np.zeros_like(x)
         return KinematicForecast(x, y, speed, heading, zero, zero, along, across, known)

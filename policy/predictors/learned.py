@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from cosim.errors import BadInput
-from cosim.types import Bools, Floats
+from cosim.types import Bools, Floats, Ints
 from policy.checkpoint import SHIPPED, load
 from policy.forecast import KinematicForecast, motion_of
 from policy.kernel_prior import trailing_run
@@ -87,7 +87,7 @@ def integrate(
     )
 
 
-def features(state: Floats, run: Floats) -> torch.Tensor:
+def features(state: Floats, run: Ints) -> torch.Tensor:
     """[V,N,INPUTS] of states [V,N,>=4]: place, speed, heading, change of speed against now; known or not."""
     now = np.nan_to_num(state[:, -1:])
     dx, dy = state[:, :, 0] - now[:, :, 0], state[:, :, 1] - now[:, :, 1]
@@ -106,14 +106,17 @@ def features(state: Floats, run: Floats) -> torch.Tensor:
 
 
 class Learned:
-    """One of the four on the predictors' protocol. Raises BadInput for a horizon or dt it was not made for."""
+    """One of the four on the predictors' protocol. `weights`: None for the shipped ones.
+
+    Raises BadInput for a horizon or dt it was not made for, WeightsMismatch for weights of another layout.
+    """
 
     def __init__(
         self,
         config: NetConfig,
         horizon: int = 20,
         dt: float = 0.2,
-        weights: Path | None | Literal["shipped"] = "shipped",
+        weights: Path | KinematicNet | None = None,
     ) -> None:
         self.name = f"{config.kind}-{config.target}"
         self.horizon, self.dt = horizon, dt
@@ -123,9 +126,11 @@ class Learned:
                 field="predictor",
                 value=self.name,
             )
-        self.network = KinematicNet(config).eval()
-        if weights is not None:
-            file = SHIPPED / f"{self.name}.safetensors" if weights == "shipped" else weights
+        if isinstance(weights, KinematicNet):
+            self.network = weights.eval()
+        else:
+            self.network = KinematicNet(config).eval()
+            file = weights or SHIPPED / f"{self.name}.safetensors"
             load(file, {"network": self.network}, {"network": config})
 
     def predict(self, kinematics: Floats, valid: Bools) -> KinematicForecast:

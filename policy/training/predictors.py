@@ -22,7 +22,6 @@ from policy.predictors.learned import KinematicNet, features, integrate
 COVERED = 0.9  # what an interval shall cover
 NORMAL = 1.645  # half its width in standard deviations, if errors were normal
 SPREAD_WEIGHT = 0.05  # of the intervals' loss: it shall not move the mean forecast
-SMALLEST = {"speed": 0.01, "heading": 1e-3, "along": 0.01, "across": 0.01}  # m/s, rad, m: below is noise
 
 GaussianProcess = type[GaussianProcessIndirect] | type[GaussianProcessDirect]
 
@@ -103,8 +102,8 @@ class PriorFit:
     """The examples and the loss of one Gaussian-process predictor's prior."""
 
     def __init__(self, kind: GaussianProcess, windows: Windows) -> None:
-        self.predictor = kind(weights=None)
         self.network = PriorNetwork(kind.prior_config())
+        self.predictor = kind(weights=self.network)
         frames = windows.past.shape[1]
         self._math = [BankMath(bank, frames) for bank in self.predictor.banks]
         run = np.full(len(windows.past), frames)
@@ -121,6 +120,10 @@ class PriorFit:
             evidence = np.concatenate(parts)
             self.examples[f"past{b}"] = _tensor(past)
             self.examples[f"evidence{b}"] = _tensor(evidence - evidence.max(1, keepdims=True))
+
+    def fitted(self) -> GaussianProcessIndirect | GaussianProcessDirect:
+        """The predictor with the prior as it is now."""
+        return type(self.predictor)(weights=self.network)
 
     def loss(self, batch: Mapping[str, torch.Tensor]) -> torch.Tensor:
         """Position error, and a little of how badly the intervals fit (pinball loss of their edge)."""
@@ -158,7 +161,7 @@ class PriorFit:
         return total
 
 
-def interval_errors(forecast_std: tuple[Floats, ...], errors: tuple[Floats, ...], weight: Floats) -> Floats:
+def factors_for(forecast_std: tuple[Floats, ...], errors: tuple[Floats, ...], weight: Floats) -> Floats:
     """[quantities,M] the factor on each standard deviation with which an interval of NORMAL deviations covers
     COVERED of the errors [S,M] (nan where there is no truth)."""
     factors = np.ones((len(errors), errors[0].shape[1]))
@@ -177,7 +180,7 @@ def _quantile(values: Floats, weight: Floats, share: float) -> float:
 
 
 def _truth(windows: Windows) -> dict[str, torch.Tensor]:
-    here = np.isfinite(windows.future).all(2)
+    here: Bools = np.isfinite(windows.future[:, :, 0])
     return {
         "future": _tensor(np.nan_to_num(windows.future)),
         "here": _tensor(here),

@@ -60,6 +60,7 @@ def test_the_run_folder_holds_every_episode_in_every_form(undisturbed: Path) -> 
         assert "merge.sumocfg" in cell["manifest"]["files"]
     summary = json.loads((undisturbed / "summary.json").read_text())
     assert (summary["episodes"], summary["status"]["ok"]) == (6, 6)
+    assert "keep-lane" in (undisturbed / "report.html").read_text()
 
 
 def test_an_episode_is_the_one_that_cosim_run_drives(
@@ -78,7 +79,7 @@ def test_an_episode_is_the_one_that_cosim_run_drives(
 
 
 def test_json_is_exactly_one_document(undisturbed: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    evaluate("--resume --json", "--out", undisturbed)
+    evaluate("--resume --json --no-report", "--out", undisturbed)
     assert json.loads(capsys.readouterr().out) == json.loads((undisturbed / "summary.json").read_text())
 
 
@@ -88,7 +89,7 @@ def test_two_workers_and_a_file_give_the_same_rows_as_one_and_flags(
     (tmp_path / "SPEC.yaml").write_text(
         "scenario: merge\ndemand: free\npolicy: [idm, keep-lane]\nduration: 4\nseeds: '200000:200003'\n"
     )
-    evaluate("--workers 2", tmp_path / "SPEC.yaml", "--out", tmp_path / "run")
+    evaluate("--workers 2 --no-report", tmp_path / "SPEC.yaml", "--out", tmp_path / "run")
     assert rows(tmp_path / "run") == rows(undisturbed)
 
 
@@ -109,7 +110,7 @@ def test_workers_and_parent_killed_and_resumed_every_episode_once_and_the_same(
     while any(Path(f"/proc/{pid}").exists() for pid in workers):
         assert time.monotonic() < end, "workers outlived their parent"
         time.sleep(0.05)
-    evaluate("--resume --workers 2", "--out", out)
+    evaluate("--resume --workers 2 --no-report", "--out", out)
     assert rows(out) == rows(undisturbed)
 
 
@@ -161,7 +162,7 @@ def test_a_net_that_kills_sumo_costs_its_own_rows_only(
     (tmp_path / "bad.net.xml").write_text("<net></net>")
     config = tmp_path / "bad.sumocfg"
     config.write_text('<configuration><net-file value="bad.net.xml"/><end value="9"/></configuration>')
-    flags = "--duration 2 --seeds 200000:200002 --workers 1"
+    flags = "--duration 2 --seeds 200000:200002 --workers 1 --no-report"
     evaluate(flags, "--scenario", config, "--scenario", "merge", "--out", tmp_path / "run")
     assert "2 of 4 episodes have no figures" in capsys.readouterr().err
     found = rows(tmp_path / "run")
@@ -176,7 +177,7 @@ def test_what_sumo_refuses_in_mid_run_costs_its_own_rows_and_the_next_cell_is_fi
     for name, vehicles in (("good", good), ("bad", good + bad)):
         text = f'<routes><vType id="av"/>{vehicles}</routes>'
         (tmp_path / f"{name}.rou.xml").write_text(text)
-    flags = "--scenario merge --duration 4 --seeds 200000:200001 --workers 1"
+    flags = "--scenario merge --duration 4 --seeds 200000:200001 --workers 1 --no-report"
     evaluate(flags, "--demand", tmp_path / "*.rou.xml", "--out", tmp_path / "run")
     found = {r["demand"]: r for r in rows(tmp_path / "run")}
     assert found["good"]["status"] == "ok"
@@ -193,14 +194,14 @@ def test_demand_from_sumo_s_own_tools_runs_as_it_comes(tmp_path: Path) -> None:
         tool = [sys.executable, str(home / "tools" / "randomTrips.py")]
         net = str(game / "A10KW" / "osm.net.xml")
         subprocess.run(
-            [*tool, "-n", net, "-e", "20", "-p", "1", *flags],
+            [*tool, "-n", net, "-e", "8", "-p", "0.5", *flags],
             cwd=tmp_path,
             env={**os.environ, "SUMO_HOME": str(home)},
             check=True,
             capture_output=True,
         )
-    demands = ["--demand", tmp_path / "*.trips.xml", "--demand", tmp_path / "*.rou.xml"]
-    flags = "--penetration 0.5 --duration 20 --seeds 200000:200001 --workers 1"
+    demands = ["--demand", tmp_path / "*.trips.xml", "--demand", tmp_path / "b*"]
+    flags = "--penetration 0.5 --duration 8 --seeds 200000:200001 --workers 1 --no-report"
     evaluate(flags, "--scenario", game / "A10KW.sumocfg", *demands, "--out", tmp_path / "run")
     found = {r["demand"]: r for r in rows(tmp_path / "run")}
     assert sorted(found) == ["a.trips", "b"]

@@ -50,6 +50,7 @@ def add(verbs: arguments.Verbs) -> None:
     running.add_argument("--store", metavar="URL", help="a database instead of DIR/store.sqlite")
     running.add_argument("--step-timeout", type=arguments.positive, metavar="S", help="end a hung decision")
     running.add_argument("--reset-timeout", type=arguments.positive, metavar="S", help="end a hung start")
+    running.add_argument("--no-report", action="store_true", help="leave report.html out")
     running.add_argument("--dry-run", action="store_true", help="print the matrix and an estimated time")
     running.add_argument("--json", action="store_true", help="print exactly one JSON document on stdout")
     evaluate.set_defaults(work=work)

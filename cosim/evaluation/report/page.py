@@ -14,7 +14,7 @@ from cosim.errors import BadInput
 from cosim.evaluation import wording
 from cosim.evaluation.figures import Row
 from cosim.evaluation.report import tables
-from cosim.evaluation.report.blocks import Block, blocks
+from cosim.evaluation.report.blocks import Block, Difference, blocks
 from cosim.evaluation.report.plots import plots
 from cosim.evaluation.report.worst import last_line, worst
 from cosim.evaluation.run_folder import Run
@@ -36,7 +36,13 @@ COMPARED = (  # of each block against its baseline
     "min_ttc_s",
     "hard_brakings_av",
 )
-TOLD = ("collision_rate", "av_caused_collision_rate", "mission_success_rate", "dt_mission_m", "dt_av_m")
+TOLD = {  # of these in the verdict, in words
+    "collision_rate": "collisions",
+    "av_caused_collision_rate": "AV-caused collisions",
+    "mission_success_rate": "mission success",
+    "dt_mission_m": "the mission vehicle's distance",
+    "dt_av_m": "the AVs' distance",
+}
 
 
 def write(run: Run, path: Path | None = None, shown: str | None = None) -> Path:
@@ -68,15 +74,16 @@ def html(run: Run, shown: str | None = None) -> str:
         lstrip_blocks=True,
     )
     found = blocks(run)
+    differences = [block.differences(COMPARED) for block in found]
     folder = str(run.path) if shown is None else shown
     wrong = [row for row in run.rows if row["status"] != OK]
     return environment.get_template("page.html").render(
         name=run.path.resolve().name,
         verdict=_verdict(run, found),
-        findings=_findings(found),
+        findings=_findings(found, differences),
         shown=FINDINGS,
         figures=tables.figures(found, run.measures) if found else None,
-        sections=[_section(block, k < PLOTTED) for k, block in enumerate(found)],
+        sections=[_section(block, differences[k], k < PLOTTED) for k, block in enumerate(found)],
         plotted=PLOTTED,
         worst=[
             {"why": w.why, "row": w.row, "group": wording.group(w.row), "command": _replay(folder, w.row)}
@@ -120,21 +127,21 @@ def _verdict(run: Run, found: Sequence[Block]) -> dict[str, Any]:
     }
 
 
-def _findings(found: Sequence[Block]) -> list[dict[str, Any]]:
+def _findings(found: Sequence[Block], differences: Sequence[list[Difference]]) -> list[dict[str, Any]]:
     """Per block and series: what differs from the baseline beyond chance, and what does not."""
     lines = []
-    for block in found:
-        for difference in block.differences(TOLD):
+    for block, mine in zip(found, differences, strict=True):
+        for difference in mine:
             told, untold = [], []
             for name, figure in difference.figures.items():
-                if not figure.n:
+                if name not in TOLD or not figure.n:
                     continue
                 tone = tables.tone(figure)
                 if tone:
                     value = wording.interval(figure.difference, figure.measure, signed=True)
-                    told.append({"name": _plain_name(name), "value": value, "tone": tone})
+                    told.append({"name": TOLD[name], "value": value, "tone": tone})
                 else:
-                    untold.append(_plain_name(name))
+                    untold.append(TOLD[name])
             lines.append(
                 {
                     "block": wording.group(block.identity),
@@ -148,13 +155,13 @@ def _findings(found: Sequence[Block]) -> list[dict[str, Any]]:
     return lines
 
 
-def _section(block: Block, draw: bool) -> dict[str, Any]:
+def _section(block: Block, differences: list[Difference], draw: bool) -> dict[str, Any]:
     return {
         "title": wording.group(block.identity),
         "plots": plots(block) if draw else [],
         "drawn": draw,
         "ok": sum(len(s.ok) for s in block.series),
-        "differences": tables.differences(block, COMPARED),
+        "differences": tables.differences(differences),
         "everything": tables.everything(block),
     }
 
@@ -178,13 +185,3 @@ def _manifest(run: Run) -> dict[str, Any]:
 
 def _count(number: int, noun: str) -> str:
     return f"{number:,} {noun}{'s' * (number != 1)}".replace(",", " ")
-
-
-def _plain_name(name: str) -> str:
-    return {
-        "collision_rate": "collisions",
-        "av_caused_collision_rate": "AV-caused collisions",
-        "mission_success_rate": "mission success",
-        "dt_mission_m": "the mission vehicle's distance",
-        "dt_av_m": "the AVs' distance",
-    }[name]

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from cosim.evaluation import wording
 from cosim.evaluation.compare import PairedFigure
 from cosim.evaluation.figures import HEADLINE, Measure
-from cosim.evaluation.report.blocks import Block, Series
+from cosim.evaluation.report.blocks import Block, Difference, Series
 from cosim.evaluation.statistics import CONFIDENCE, Figure
 from cosim.evaluation.summary import GROUP
 
@@ -71,13 +71,13 @@ def figures(blocks: Sequence[Block], known: dict[str, Measure]) -> Table:
     return Table(heads, rows, common)
 
 
-def differences(block: Block, names: Iterable[str]) -> Table | None:
+def differences(found: Sequence[Difference]) -> Table | None:
     """Every series of a block against its baseline, pair by pair; None where there is no pair."""
-    found = block.differences(names)
-    shown = [n for n in names if any(d.figures[n].n for d in found if n in d.figures)]
     if not found:
         return None
-    measures = {n: d.figures[n].measure for d in found for n in shown if n in d.figures}
+    names = dict.fromkeys(n for d in found for n in d.figures)
+    shown = [n for n in names if any(d.figures[n].n for d in found)]
+    measures = found[0].figures
     rows = [
         [
             Cell(d.series.label, d.series.label, (f"against {d.baseline.label}",)),
@@ -86,7 +86,7 @@ def differences(block: Block, names: Iterable[str]) -> Table | None:
         ]
         for d in found
     ]
-    return Table(["policy", "pairs", *(head(measures[n]) for n in shown)], rows, [])
+    return Table(["policy", "pairs", *(head(measures[n].measure) for n in shown)], rows, [])
 
 
 def everything(block: Block) -> Table:

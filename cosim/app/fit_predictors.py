@@ -1,0 +1,165 @@
+"""Fits everything the kinematic predictors learn from recordings, and writes it with its card."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from cosim.app.progress import Progress
+from cosim.errors import BadInput
+from cosim.evaluation.prediction import Predicted, Scores, interval_errors
+from cosim.recording import Folder, windows
+from cosim.types import Floats
+from policy.checkpoint import save
+from policy.forecast import KinematicForecast
+from policy.predictors import Predictor
+from policy.predictors.gp import GaussianProcessDirect, GaussianProcessIndirect
+from policy.predictors.learned import KinematicNet, Learned, NetConfig
+from policy.training.fitting import FitConfig, fit
+from policy.training.predictors import (
+    GaussianProcess,
+    PriorFit,
+    Windows,
+    examples_for_net,
+    factors_for,
+    in_own_frame,
+    net_loss,
+)
+
+EVERY = 5  # frames between two moments of an episode: 1 s, nearer ones are almost the same
+SCORED_EVERY = 10  # frames, on validation episodes
+TRAINING_SEEDS, TUNING_SEEDS = range(100_000), range(100_000, 200_000)
+NETS = {
+    "lstm-direct": NetConfig("lstm", "direct"),
+    "lstm-indirect": NetConfig("lstm", "indirect"),
+    "ae-direct": NetConfig("ae", "direct"),
+    "ae-indirect": NetConfig("ae", "indirect"),
+}
+PRIORS: dict[str, GaussianProcess] = {
+    "gp-direct": GaussianProcessDirect,
+    "gp-indirect": GaussianProcessIndirect,
+}
+FITTED = (*NETS, *PRIORS)
+STEPS = 1500  # of 1024 windows each, for every predictor alike
+LEARNING_RATE = {"net": 2e-3, "prior": 1e-2}
+
+
+def fit_predictors(
+    training: Path,
+    validation: Path,
+    out: Path,
+    names: Sequence[str] = FITTED,
+    steps: int = STEPS,
+    state: Path | None = None,
+) -> dict[str, dict[str, float]]:
+    """Fit `names` on the training seeds, calibrate and measure on the tuning seeds, write into `out`.
+
+    `state`: a folder in which a killed fit finds what it needs to go on. Returns what was measured.
+    Raises BadInput for recordings of other seeds: nothing is ever fitted on test seeds.
+    """
+    torch.set_num_threads(1)
+    data = {
+        "training": _about(Folder(training), TRAINING_SEEDS),
+        "validation": _about(Folder(validation), TUNING_SEEDS),
+    }
+    learned = _windows(Folder(training))
+    checked = _windows(Folder(validation))
+    out.mkdir(parents=True, exist_ok=True)
+    if state is not None:
+        state.mkdir(parents=True, exist_ok=True)
+    measured = {}
+    for name in names:
+        progress = Progress(f"fit {name}", "steps")
+        kept = None if state is None else state / f"{name}.safetensors"
+        file = out / f"{name}.safetensors"
+        rate = LEARNING_RATE["net" if name in NETS else "prior"]
+        config = FitConfig(steps=steps, learning_rate=rate)
+        if name in NETS:
+            torch.manual_seed(config.seed)
+            network = KinematicNet(NETS[name])
+            examples = examples_for_net(learned)
+            fit(network, examples, lambda b, n=network: net_loss(n, b), config, state=kept, progress=progress)  # type: ignore[misc]
+            predictor: Predictor = Learned(NETS[name], weights=network)
+            parts: tuple[dict[str, Any], dict[str, Any]] = ({"network": network}, {"network": NETS[name]})
+        else:
+            torch.manual_seed(config.seed)
+            prior = PriorFit(PRIORS[name], learned)
+            fit(prior.network, prior.examples, prior.loss, config, state=kept, progress=progress)
+            _calibrate(prior, checked)
+            predictor = prior.fitted()
+            parts = ({"prior": prior.network}, {"prior": prior.network.config})
+        progress.done()
+        measured[name] = score(predictor, Folder(validation))
+        save(file, *parts, measured=measured[name], data={**data, "fit": asdict(config)})
+    return measured
+
+
+def score(predictor: Predictor, folder: Folder) -> dict[str, float]:
+    """Position error in m on a folder of recordings, every scenario counting the same."""
+    scores = Scores(predictor.horizon, predictor.dt)
+    for recording in folder.recordings():
+        w = windows(recording, every=SCORED_EVERY)
+        scores.add(recording.case, w.future, {predictor.name: forecast(predictor, w.past)})
+    rows = [r for r in scores.position_table() if r["scenario"] == "all" and r["behavior"] == "all"]
+    return {f"position_error_{r['horizon_s']}": round(r["mean_m"], 4) for r in rows}
+
+
+def forecast(predictor: Predictor, past: Floats) -> Predicted:
+    """Forecasts of windows [S,N,4], in portions that fit into memory."""
+    parts = []
+    for at in range(0, max(len(past), 1), 4096):
+        part = past[at : at + 4096]
+        parts.append(predictor.predict(part, np.isfinite(part[:, :, 0])))
+    f = KinematicForecast(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    return Predicted(f.x, f.y, f.speed, f.heading, (f.speed_std, f.heading_std, f.along_std, f.across_std))
+
+
+def _calibrate(prior: PriorFit, checked: Windows) -> None:
+    """Set the prior's calibration: factors with which its intervals cover 90 % of the tuning episodes."""
+    predicted = forecast(prior.fitted(), checked.past)
+    errors = interval_errors(predicted, checked.future)
+    used = [q for q, std in enumerate(predicted.std) if std.any()]
+    factors = factors_for(
+        tuple(predicted.std[q] for q in used), tuple(errors[q] for q in used), checked.weight
+    )
+    prior.network.calibration.copy_(torch.from_numpy(factors))
+
+
+def _windows(folder: Folder) -> Windows:
+    """Every recording's moments; every scenario has the same total weight."""
+    parts = [(r.case["scenario"], windows(r, every=EVERY)) for r in folder.recordings()]
+    scenario = np.concatenate([np.full(len(w.lane), name) for name, w in parts])
+    _, group, count = np.unique(scenario, return_inverse=True, return_counts=True)
+    return in_own_frame(
+        np.concatenate([w.past for _, w in parts]),
+        np.concatenate([w.future for _, w in parts]),
+        1.0 / count[group],
+    )
+
+
+def _about(folder: Folder, allowed: range) -> dict[str, Any]:
+    """What the data were, for the card. Raises BadInput when a seed is not one of `allowed`."""
+    found = folder.manifest()
+    seeds = found["seeds"]
+    if not all(seed in allowed for seed in seeds):
+        raise BadInput(
+            f"seeds must lie in {allowed.start}..{allowed.stop - 1}",
+            file=folder.manifest_file,
+            field="seeds",
+            value=seeds,
+        )
+    episodes = found.get("episodes", {})
+    digest = hashlib.sha256(json.dumps(episodes, sort_keys=True).encode()).hexdigest()
+    return {
+        "seeds": [min(seeds), max(seeds)],
+        "episodes": len(episodes),
+        "sha256": digest,
+        "commands": found["commands"],
+    }

@@ -1,0 +1,99 @@
+"""How far predicted maps are from what followed: PRE and occupancy IoU (contract.md, Observation)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from cosim.raster import RoadRaster, rasterize_road
+from cosim.road import RoadMap
+from cosim.types import Bytes, Floats, Floats32, History, ObservationConfig
+from policy.chain import ChainConfig, predict
+from policy.hpn import HPN
+from policy.predictors import Predictor
+from policy.scene import join
+from policy.tensors import to_batch, to_numpy
+from policy.traffic import TrafficConfig
+from policy.training.moments import foresee, without_history
+
+OCCUPIED = 0.05  # a pixel above this is occupied (contract.md: IoU)
+HORIZONS = (0.2, 0.4, 1.0, 2.0, 3.0, 4.0)  # s (contract.md, Time)
+
+
+def frame_of(horizon: float, dt: float = 0.2) -> int:
+    """Place of a horizon (s) among the predicted frames."""
+    return round(horizon / dt) - 1
+
+
+def vehicle_channels(config: ObservationConfig) -> npt.NDArray[np.int64]:
+    """Channels that show vehicles: all but the road."""
+    return np.array([k for k, name in enumerate(config.channels) if name != "road"], np.int64)
+
+
+def picture_error(
+    predicted: Floats32 | Bytes, true: Bytes, channels: npt.NDArray[np.int64]
+) -> tuple[Floats, Floats]:
+    """PRE (mean squared error per vehicle pixel) and IoU of maps [...,C,H,W]; uint8 counts as 255 = 1.
+
+    Two empty maps agree: their IoU is 1.
+    """
+    axes = (-3, -2, -1)
+    p, t = (_unit(a[..., channels, :, :]) for a in (predicted, true))
+    pre = ((p - t) ** 2).mean(axes, dtype=np.float64)
+    a, b = p > OCCUPIED, t > OCCUPIED
+    union = (a | b).sum(axes)
+    return pre, np.where(union > 0, (a & b).sum(axes) / np.maximum(union, 1), 1.0)
+
+
+def _unit(maps: Floats32 | Bytes) -> Floats32:
+    scale = 255.0 if maps.dtype == np.uint8 else 1.0
+    return np.asarray(maps, np.float32) / np.float32(scale)
+
+
+class Guess(NamedTuple):
+    """Predicted maps of B AVs, in the order of `agents`."""
+
+    agents: tuple[str, ...]
+    maps: dict[str, Floats32]  # predictor -> [B,M,C,H,W], every frame of the horizon
+
+
+class MapPredictors:
+    """The predictors of the table: repeating the last frame, the rendered forecast, and trained HPNs.
+
+    `predictor` forecasts for all of them; an HPN without history gets the forecast of the newest frame alone.
+    """
+
+    def __init__(
+        self, hpns: Mapping[str, HPN], predictor: Predictor, observation: ObservationConfig, road: RoadMap
+    ) -> None:
+        self._hpns, self._predictor, self._observation, self._road = hpns, predictor, observation, road
+        self._raster: RoadRaster = rasterize_road(road)
+        self._traffic = TrafficConfig()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Every predictor, the two references first."""
+        return ("last-frame", "gp-raster", *self._hpns)
+
+    def predict(self, histories: Mapping[str, History]) -> Guess:
+        """Maps of the whole horizon, frame by frame."""
+        config = ChainConfig(horizon=self._predictor.horizon, every=1)
+        scene = join(histories, self._observation.share_perception)
+        last = np.stack([h.velocity_map[-1] for h in scene.histories])
+        maps = {"last-frame": np.repeat(_unit(last)[:, None], config.horizon, 1)}
+        with torch.inference_mode():
+            batch = to_batch(scene.histories, 0.0)
+            for name in self.names[1:]:
+                hpn = self._hpns.get(name)
+                history = hpn is None or hpn.kinematic is None or hpn.kinematic.config.history
+                known = scene if history else without_history(scene)
+                forecast, traffic = foresee(known, self._predictor, self._road, self._traffic)
+                guess = predict(
+                    config, self._observation, self._raster, hpn, known, batch, forecast, traffic
+                )
+                maps[name] = to_numpy(guess.maps)
+        return Guess(scene.agents, maps)

@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 RUN ?= runs/demo
 
-.PHONY: demo test check nets clean
+.PHONY: demo test check nets image smoke clean
 
 demo: $(VENV)/.installed
 	$(BIN)/cosim run merge --demand contested --policy altruist-rule --out $(RUN)
@@ -31,6 +31,14 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 $(VENV)/.installed-dev: $(VENV)/.installed
 	$(BIN)/pip install --quiet -c constraints.txt -e '.[dev]'
 	touch $@
+
+# The container: docker/build.sh says what it needs, with a Docker engine or without (docs/container.md).
+image:
+	docker/build.sh
+
+# From build to gate verdict; leaves rows, JUnit and reports in runs/smoke.
+smoke: image
+	docker/smoke.sh runs/smoke
 
 clean:
 	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache

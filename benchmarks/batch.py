@@ -1,7 +1,8 @@
 """What the engine of `cosim evaluate` costs, and what a second worker gains.
 
-    python -m benchmarks.batch [--scenario merge] [--demand dense] [--duration 10] [--episodes 50]
-        [--rounds 4]
+    python -m benchmarks.batch [--policy vfn-p] [--duration 10] [--episodes 50] [--rounds 4]
+
+with the defaults 200 episodes of about one second of processor time each, on merge / dense.
 
 Each round drives the same episodes with one worker and with two, the order swapped from round to round, so
 that whatever else the machine does falls on both; with all of `cosim evaluate`: processes, rows, store.
@@ -64,14 +65,13 @@ def measured(plan: matrix.Plan, workers: int, progress: Progress) -> Run:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--scenario", default="merge")
-    parser.add_argument("--demand", default="dense")
+    parser.add_argument("--policy", default="vfn-p")
     parser.add_argument("--duration", type=float, default=10.0)
     parser.add_argument("--episodes", type=int, default=50)
     parser.add_argument("--rounds", type=int, default=4)
     args = parser.parse_args()
     seeds = (200_000, 200_000 + args.episodes)
-    spec = Spec((args.scenario,), seeds, demand=((args.demand,),), duration=args.duration)
+    spec = Spec(("merge",), seeds, demand=(("dense",),), policy=(args.policy,), duration=args.duration)
     plan = matrix.plan(matrix.cells(spec), range(*seeds), check_name)
     runs: dict[int, list[Run]] = {1: [], 2: []}
     for k in range(args.rounds):

@@ -2,14 +2,13 @@
 # Builds the image, with a Docker engine or without: `docker/build.sh [runtime|test]`.
 #
 # Without one, buildah builds on a Debian that debootstrap makes (once; it stays in the local store), and the
-# build sees the pip settings of this machine, folders of wheels included. Variables, beside those of engine.sh:
+# build finds packages wherever pip finds them here: pip's own files and variables (PIP_CONFIG_FILE,
+# PIP_FIND_LINKS, PIP_CERT, ...) count, and the folders that they name are mounted. Variables, beside those of
+# engine.sh:
 #
-#   BASE             the image to start from (default: debian:bookworm-slim, or made by debootstrap)
-#   EXTRAS           extras of pyproject.toml to put in, with commas between: ray,postgresql
-#   PIP_CONF         a pip.conf for the build (default: this machine's own settings)
-#   MOUNTS           folders that PIP_CONF names, mounted at the same place (split at spaces)
-#   CA_BUNDLE        a file of certificates that PIP_CONF names, mounted at the same place
-#   PIP_INDEX_URL, PIP_EXTRA_INDEX_URL   with Docker, which mounts nothing: where pip finds packages
+#   BASE     the image to start from (default: debian:bookworm-slim, or made by debootstrap)
+#   EXTRAS   extras of pyproject.toml to put in, with commas between: ray,postgresql
+#   PIP_INDEX_URL, PIP_EXTRA_INDEX_URL   all that a Docker engine is told of pip, for it mounts nothing
 set -euo pipefail
 cd "$(dirname "$0")/.."
 . docker/engine.sh
@@ -49,13 +48,8 @@ else
     [ -z "${BASE:-}" ] || args+=(--build-arg "BASE=$BASE")
     lent=$(mktemp -d)
     trap 'rm -rf "$lent"' EXIT
-    if [ -n "${PIP_CONF:-}" ]; then
-        cp "$PIP_CONF" "$lent/pip.conf"
-        for place in ${MOUNTS:-} ${CA_BUNDLE:-}; do args+=(--volume "$place:$place:ro"); done
-    else
-        python3 docker/host_pip.py "$lent" >"$lent/mounts"
-        while read -r source inside; do args+=(--volume "$source:$inside:ro"); done <"$lent/mounts"
-    fi
+    python3 docker/host_pip.py "$lent" >"$lent/mounts"
+    while read -r source inside; do args+=(--volume "$source:$inside:ro"); done <"$lent/mounts"
     args+=(--volume "$lent:/run/host-pip:ro" --build-arg PIP_CONFIG_FILE=/run/host-pip/pip.conf)
     # chroot: no runtime, no namespaces of its own, so that it builds inside a container or a small machine too.
     buildah bud --isolation chroot --network host --layers "${args[@]}" "${build_args[@]}" .

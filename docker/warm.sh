@@ -6,10 +6,15 @@ NUMBA_CACHE_DIR=$1/numba
 MPLCONFIGDIR=$1/matplotlib
 export NUMBA_CACHE_DIR MPLCONFIGDIR
 mkdir -p "$NUMBA_CACHE_DIR" "$MPLCONFIGDIR"
-# The drive includes every kernel of metrics, geometry, observation and the agent; the worlds differ in shape.
-for world in $(cd / && python -c 'import sumo_scenarios; print(*sumo_scenarios.names())'); do
-    (cd / && cosim run "$world" --policy vfn-p --behavior mixed --duration 8 --json >/dev/null)
-    (cd / && cosim run "$world" --policy altruist-rule --penetration 0.3 --duration 8 --json >/dev/null)
+cd /  # away from the sources: the kernels of the installed package are meant
+
+quietly() { "$@" >/tmp/warm.log 2>&1 || { cat /tmp/warm.log >&2; exit 1; }; }
+
+# The agent with prediction calls every kernel there is; the worlds differ in what they make it do.
+for world in $(python -c 'import sumo_scenarios; print(*sumo_scenarios.names())'); do
+    quietly cosim run "$world" --policy vfn-p --behavior mixed --duration 4
+    quietly cosim run "$world" --policy altruist-rule --penetration 0.3 --duration 4
 done
-(cd / && python -c 'import matplotlib.font_manager')
+quietly python -c 'import matplotlib.font_manager'
+rm -rf /tmp/warm.log
 chmod -R a+rX "$1"

@@ -67,11 +67,15 @@ class KinematicBranch(nn.Module):
         scale = [2 * one, 4 * t**1.5 + 0.05, t + 0.05, 4 * t + 0.1, 0.3 * t + 0.01, one, one]
         self.register_buffer("unit", torch.stack(scale, -1), persistent=False)
 
+    def features(self, own: torch.Tensor, near: torch.Tensor) -> torch.Tensor:
+        """The last hidden layer [V,hidden]; arguments as in `forward`."""
+        n = self.near(near) * near[..., :1]  # the first input says whether anybody is there
+        joined: torch.Tensor = self.joined(torch.cat([self.own(own), n.amax(-2), n.mean(-2)], -1))
+        return joined
+
     def forward(self, own: torch.Tensor, near: torch.Tensor) -> torch.Tensor:
         """own [V,.], near [V,K,.] as in `VehicleInputs` -> [V,M,OUTPUTS] m, m/s, rad; logits."""
-        n = self.near(near) * near[..., :1]  # the first input says whether anybody is there
-        z = torch.cat([self.own(own), n.amax(-2), n.mean(-2)], -1)
-        raw: torch.Tensor = self.out(self.joined(z)).contiguous()
+        raw: torch.Tensor = self.out(self.features(own, near)).contiguous()
         return raw.view(*raw.shape[:-1], self.config.horizon, OUTPUTS) * self.unit
 
 

@@ -92,8 +92,6 @@ class MapPredictors:
                 history = hpn is None or hpn.kinematic is None or hpn.kinematic.config.history
                 known = scene if history else without_history(scene)
                 forecast, traffic = foresee(known, self._predictor, self._road, self._traffic)
-                guess = predict(
-                    config, self._observation, self._raster, hpn, known, batch, forecast, traffic
-                )
+                guess = predict(config, self._observation, self._raster, hpn, known, batch, forecast, traffic)
                 maps[name] = to_numpy(guess.maps)
         return Guess(scene.agents, maps)

@@ -43,7 +43,7 @@ class VehicleInputs(NamedTuple):
 def own_inputs(frames: int) -> int:
     """Length of a vehicle's own inputs when `frames` past frames are seen."""
     marks = len(MARKS)
-    return FIXED + 5 * frames - 4 + 2 * AHEAD * marks + 2 * marks + LEADER * LEADERS
+    return FIXED + 5 * frames - 4 + 2 * AHEAD * marks + LEADER * LEADERS
 
 
 def vehicle_inputs(scene: Scene, forecast: KinematicForecast, traffic: Traffic) -> VehicleInputs:
@@ -59,14 +59,12 @@ def vehicle_inputs(scene: Scene, forecast: KinematicForecast, traffic: Traffic) 
     past = np.nan_to_num(scene.state)
     seen = scene.valid & np.isfinite(scene.state).all(2)  # [V,N]
     accel = _accel(past, seen)
-    std = np.stack([forecast.along_std, forecast.across_std], -1)[:, MARKS]
     own = np.concatenate(
         [
             _fixed(traffic, now),
             _past(past, seen, now),
             _ahead(gp, now),
             _ahead(lane, now),
-            std.reshape(len(now), -1) / 10.0,
             _leaders(scene, traffic, now, accel, known),
         ],
         1,

@@ -12,13 +12,12 @@ from typing import Any
 import numpy as np
 import torch
 
+from cosim.app.bench_predict import forecast
 from cosim.app.progress import Progress
 from cosim.errors import BadInput
-from cosim.evaluation.prediction import Predicted, Scores, interval_errors
+from cosim.evaluation.prediction import Scores, interval_errors
 from cosim.recording import Folder, windows
-from cosim.types import Floats
 from policy.checkpoint import save
-from policy.forecast import KinematicForecast
 from policy.predictors import Predictor
 from policy.predictors.gp import GaussianProcessDirect, GaussianProcessIndirect
 from policy.predictors.learned import KinematicNet, Learned, NetConfig
@@ -109,16 +108,6 @@ def score(predictor: Predictor, folder: Folder) -> dict[str, float]:
         scores.add(recording.case, w.future, {predictor.name: forecast(predictor, w.past)})
     rows = [r for r in scores.position_table() if r["scenario"] == "all" and r["behavior"] == "all"]
     return {f"position_error_{r['horizon_s']}": round(r["mean_m"], 4) for r in rows}
-
-
-def forecast(predictor: Predictor, past: Floats) -> Predicted:
-    """Forecasts of windows [S,N,4], in portions that fit into memory."""
-    parts = []
-    for at in range(0, max(len(past), 1), 4096):
-        part = past[at : at + 4096]
-        parts.append(predictor.predict(part, np.isfinite(part[:, :, 0])))
-    f = KinematicForecast(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
-    return Predicted(f.x, f.y, f.speed, f.heading, (f.speed_std, f.heading_std, f.along_std, f.across_std))
 
 
 def _calibrate(prior: PriorFit, checked: Windows) -> None:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from cosim.app.progress import Progress
+from cosim.errors import CosimError
+from cosim.evaluation.engines import Engine
+from cosim.evaluation.tasks import Task
 from cosim.recording import Folder, Recording, histories
 from cosim.road import RoadMap
 from cosim.types import COMPACT, Bytes, History, ObservationConfig, Snapshot
@@ -72,3 +76,17 @@ MAPLESS = ObservationConfig(
     perception_range=COMPACT.perception_range,
     maps=False,
 )
+
+
+def spread(engine: Engine, tasks: Sequence[Task], title: str) -> list[Any]:
+    """What each task returned, in the order of the tasks. Raises CosimError for the first that failed."""
+    found: dict[str, Any] = {}
+    progress = Progress(title, "episodes")
+    for outcome in engine.run(tasks):
+        if not outcome.ok:
+            progress.done()
+            raise CosimError(f"{outcome.key}: {outcome.error}")
+        found[outcome.key] = outcome.value
+        progress(len(found), len(tasks))
+    progress.done()
+    return [found[task.key] for task in tasks]

@@ -10,7 +10,6 @@ from cosim.determinism import make_torch_deterministic
 from cosim.episode import Episode, run_episode
 from cosim.evaluation.replay.recorder import Recorder, Recording
 from cosim.scenario import Scenario
-from cosim.simulation.sumo import SumoSimulator
 from cosim.sumo_outputs import drafts
 from cosim.types import EpisodeResult, ObservationConfig, Policy
 from policy.agents import make
@@ -25,6 +24,8 @@ class Runner:
     def __init__(
         self, scenario: Scenario, policy: str, svo: float, observation: ObservationConfig | None = None
     ) -> None:
+        from cosim.simulation.sumo import SumoSimulator  # libsumo: only here, in the worker's process
+
         self._policy = make(policy)
         self._svo = svo
         wanted = observation or self._policy.observation

@@ -5,26 +5,26 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
-import queue
 import sys
-import threading
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from cosim.app import output
-from cosim.app.prediction_data import MAPLESS, episodes, followed
+from cosim.app.prediction_data import MAPLESS, episodes, followed, spread
 from cosim.app.progress import Progress
 from cosim.app.train_vfn import configuration
-from cosim.errors import BadInput, CosimError
+from cosim.errors import BadInput
+from cosim.evaluation.engines import LocalEngine
+from cosim.evaluation.tasks import Task
 from cosim.recording import Folder, read
 from cosim.types import COMPACT
-from cosim.worker import Worker
 from policy.predictors import make_predictor
 from policy.traffic import TrafficConfig
 from policy.training import hpn
 from policy.training.kinematics import KinematicTask
 from policy.training.loop import train as run_loop
+from policy.training.loop import write_log
 from policy.training.map_branch import MapTask
 from policy.training.moments import MapSample, Moment, map_sample, moment
 from policy.training.networks import use_threads
@@ -49,11 +49,12 @@ def train(args: argparse.Namespace) -> int:
     folder = output.prepare_folder(args.out)
     use_threads(args.threads)
     data = {part: _manifest(keys) for part, keys in found.items()}
-    examples = {part: _gather(keys, name, training, args, part) for part, keys in found.items()}
+    examples = {part: _gather(keys, name, training, args.workers, part) for part, keys in found.items()}
     task: KinematicTask | MapTask
     variant = hpn.VARIANTS[name]
     loop, device = training.loop, args.device
     if variant.maps == "plain":
+        loop = training.map_loop
         samples = {part: [s for s in found if isinstance(s, MapSample)] for part, found in examples.items()}
         task = MapTask(
             variant.map_branch, training.maps, loop.updates, samples["train"], samples["validation"], device
@@ -73,6 +74,7 @@ def train(args: argparse.Namespace) -> int:
     log = run_loop(task, loop, folder, layout=layout, resume=args.resume, progress=progress)
     progress.done()
     file_name = folder / f"{name}.safetensors"
+    write_log(file_name.with_suffix(".csv"), log)
     hpn.save(file_name, name, hpn.assemble(name, task), log[-1], data)
     print(f"{name}: {loop.updates} updates, validation loss {log[-1]['validation_loss']:.4f}")
     print(f"  {file_name}")
@@ -87,7 +89,7 @@ class Gatherer:
         self._predictor = make_predictor("gp-indirect", 20, 0.2)
         self._folders: dict[str, Folder] = {}
 
-    def gather(self, path: str, key: str) -> list[Moment] | list[MapSample]:
+    def run(self, path: str, key: str, progress: object = None) -> list[Moment] | list[MapSample]:
         """Everything that one episode gives."""
         folder = self._folders.setdefault(path, Folder(Path(path)))
         recording = read(folder.episode_file(key))
@@ -104,46 +106,17 @@ class Gatherer:
             for at in followed(recording, road, MAPLESS, t.stride, seed)
         ]
 
+    def close(self) -> None:
+        """Nothing to end."""
+
 
 def _gather(
-    keys: Sequence[tuple[Path, str]], variant: str, training: hpn.HpnTraining, args: Any, part: str
+    keys: Sequence[tuple[Path, str]], variant: str, training: hpn.HpnTraining, workers: int, part: str
 ) -> list[Moment] | list[MapSample]:
     """Examples of every episode, in the order of the keys whichever worker was faster."""
-    waiting: queue.SimpleQueue[int] = queue.SimpleQueue()
-    for k in range(len(keys)):
-        waiting.put(k)
-    done: list[Any] = [None] * len(keys)
-    failed: list[CosimError] = []
-    count = [0]
-    progress = Progress(f"read {part}", "episodes")
-
-    def work() -> None:
-        try:
-            with Worker(Gatherer, variant, training, name="cosim-gather") as worker:
-                while not failed:
-                    try:
-                        k = waiting.get_nowait()
-                    except queue.Empty:
-                        return
-                    done[k] = worker.call("gather", str(keys[k][0]), keys[k][1])
-                    count[0] += 1
-        except CosimError as error:
-            failed.append(error)
-
-    threads = [threading.Thread(target=work, daemon=True) for _ in range(min(args.workers, len(keys)))]
-    for thread in threads:
-        thread.start()
-    told = 0
-    for thread in threads:
-        while thread.is_alive():
-            thread.join(0.5)
-            if count[0] > told:
-                told = count[0]
-                progress(told, len(keys))
-    progress.done()
-    if failed:
-        raise failed[0]
-    flat = [example for found in done for example in found]
+    tasks = [Task(f"{path} {key}", str(path), (str(path), key)) for path, key in keys]
+    found = spread(LocalEngine(Gatherer, (variant, training), workers=workers), tasks, f"read {part}")
+    flat = [example for examples in found for example in examples]
     if not flat:
         raise BadInput("no episode is long enough to learn from", field="--recordings")
     return flat

@@ -35,7 +35,7 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[int, str, 
     }
     found = {}
     for name, process in running.items():
-        said, _ = process.communicate(timeout=300)
+        said, _ = process.communicate(timeout=600)
         found[name] = (process.returncode, said, out[name])
     return found
 

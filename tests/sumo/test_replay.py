@@ -114,12 +114,12 @@ def test_an_episode_of_a_batch_is_found_by_key_and_by_seed(
 ) -> None:
     batch = tmp_path / "batch"
     arguments = ["--scenario", "merge", "--policy", "keep-lane", "--policy", "idm", "--duration", "1"]
-    assert (
-        main(["evaluate", *arguments, "--seeds", "200052:200053", "--workers", "1", "--out", str(batch)]) == 0
-    )
+    arguments += ["--output", "tripinfo", "--seeds", "200052:200053", "--workers", "1", "--out", str(batch)]
+    assert main(["evaluate", *arguments]) == 0
     manifest = json.loads((batch / "manifest.json").read_text())
     cell = next(c for c, v in manifest["cells"].items() if v["case"]["policy"] == "keep-lane")
     key = f"{cell}-200052"
+    assert (batch / "outputs" / key / "tripinfo.xml").read_text().rstrip().endswith("</tripinfos>")
     with pytest.raises(BadInput, match="2 episodes have this seed: "):
         find(batch, "200052")
     with pytest.raises(BadInput, match="did you mean"):

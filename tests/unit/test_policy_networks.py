@@ -1,4 +1,4 @@
-"""HPN and VFN: shapes at every size, what an untrained network says, what is masked stays unread."""
+"""The HPN's branches and the VFN: shapes at every size, what an untrained network says, what stays unread."""
 
 from __future__ import annotations
 
@@ -9,14 +9,17 @@ from policy_scenes import Car, histories, straight_road
 
 from cosim.types import KINEMATIC_FEATURES
 from policy.hpn import HPN, HpnConfig
+from policy.kinematic_branch import KinematicBranch, KinematicConfig, correct, sureness
+from policy.map_branch import MapBranch, MapBranchConfig
 from policy.tensors import KINEMATIC_INPUTS, ROUTE_INPUTS, kinematic_tensor, to_batch
+from policy.vehicle_inputs import NEIGHBOUR_INPUTS, NEIGHBOURS, own_inputs
 from policy.vfn import VFN, VfnConfig
 
 
-def step(config: HpnConfig, batch: int = 2) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def step(config: MapBranchConfig, batch: int = 2) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Random input, the predicted maps and kinematics, and the rendered maps shown to the network."""
     torch.manual_seed(0)
-    network = HPN(config).eval()
+    network = MapBranch(config).eval()
     past = torch.rand(batch, config.seen * config.channels, config.height, config.width)
     rendered = torch.rand(batch, config.block * config.channels, config.height, config.width)
     kinematics = torch.rand(batch, config.seen, config.rows, KINEMATIC_INPUTS)
@@ -28,41 +31,41 @@ def step(config: HpnConfig, batch: int = 2) -> tuple[torch.Tensor, torch.Tensor,
 @pytest.mark.parametrize("reading", ["pool", "s2fc"])
 @pytest.mark.parametrize(("height", "width", "block"), [(16, 128, 5), (32, 128, 5), (64, 512, 1)])
 @pytest.mark.parametrize("correct", [True, False])
-def test_the_hpn_predicts_the_next_maps_and_kinematics_at_every_size(
+def test_the_map_branch_predicts_the_next_maps_and_kinematics_at_every_size(
     reading: str, height: int, width: int, block: int, correct: bool
 ) -> None:
-    config = HpnConfig(height, width, block=block, reading=reading, correct=correct, skips=correct)  # type: ignore[arg-type]
+    config = MapBranchConfig(height, width, block=block, reading=reading, correct=correct, skips=correct)  # type: ignore[arg-type]
     maps, moved, _ = step(config, batch=1)
     assert maps.shape == (1, block * 4, height, width)
     assert moved.shape == (1, block, 16, 4)
 
 
 def test_at_paper_size_the_pooled_reading_needs_no_layer_to_reach_the_latent_dimension() -> None:
-    network = HPN(HpnConfig(64, 512, block=1, correct=False, skips=False))
+    network = MapBranch(MapBranchConfig(64, 512, block=1))
     parameters = sum(p.numel() for p in network.parameters())
     assert 0.40e6 < parameters < 0.46e6, "compute.md: 0.44 M"
 
 
 def test_an_untrained_correction_changes_nothing() -> None:
-    maps, _, rendered = step(HpnConfig())
+    maps, _, rendered = step(MapBranchConfig(correct=True, skips=True))
     torch.testing.assert_close(maps, rendered, rtol=0.0, atol=0.0)
 
 
-def test_the_hpn_without_history_sees_the_current_frame_only() -> None:
-    config = HpnConfig(history=False)
+def test_the_map_branch_without_history_sees_the_current_frame_only() -> None:
+    config = MapBranchConfig(history=False)
     assert config.seen == 1
     assert step(config)[0].shape == (2, 20, 32, 128)
 
 
 def test_a_network_that_corrects_asks_for_the_rendered_map() -> None:
-    network = HPN(HpnConfig())
+    network = MapBranch(MapBranchConfig(correct=True))
     with pytest.raises(ValueError, match="rendered"):
         network([torch.zeros(1, 40, 32, 128)], torch.zeros(1, 10, 16, KINEMATIC_INPUTS))
 
 
 def test_window_groups_are_as_good_as_one_stack() -> None:
     torch.manual_seed(0)
-    network = HPN(HpnConfig(correct=False)).eval()
+    network = MapBranch(MapBranchConfig()).eval()
     past = torch.rand(1, 40, 32, 128)
     kinematics = torch.rand(1, 10, 16, KINEMATIC_INPUTS)
     with torch.inference_mode():
@@ -113,7 +116,7 @@ def test_the_vfn_hears_the_social_value_orientation_and_sees_the_maps() -> None:
 
 def test_gradients_reach_every_layer_of_both_networks() -> None:
     torch.manual_seed(0)
-    hpn, vfn = HPN(HpnConfig(16, 128)), VFN(VfnConfig(16, 128))
+    hpn, vfn = MapBranch(MapBranchConfig(16, 128, correct=True, skips=True)), VFN(VfnConfig(16, 128))
     torch.nn.init.normal_(vfn.value.weight)
     torch.nn.init.normal_(hpn.decoder[2].weight)  # type: ignore[arg-type]
     maps, moved = hpn(
@@ -130,6 +133,63 @@ def test_gradients_reach_every_layer_of_both_networks() -> None:
         for name, parameter in network.named_parameters():
             assert parameter.grad is not None, name
             assert parameter.grad.abs().sum() > 0, name
+
+
+def kinematic_input(vehicles: int = 3) -> tuple[torch.Tensor, torch.Tensor]:
+    torch.manual_seed(5)
+    near = torch.randn(vehicles, NEIGHBOURS, NEIGHBOUR_INPUTS)
+    near[..., 0] = 1.0
+    return torch.randn(vehicles, own_inputs(10)), near
+
+
+def test_an_untrained_kinematic_branch_leaves_the_forecast_along_the_lane_as_it_is() -> None:
+    own, near = kinematic_input()
+    raw = KinematicBranch(KinematicConfig())(own, near)
+    assert raw.shape == (3, 20, 7)
+    assert (raw == 0.0).all()
+    lane = torch.randn(3, 20, 4).abs()
+    torch.testing.assert_close(correct(raw, lane, lane), lane)
+    aside = correct(raw, lane, lane + 1.0) - lane
+    assert ((aside > 0.1) & (aside < 0.15)).all(), "an eighth of the way to the other forecast"
+    assert (sureness(raw[..., 5], raw[..., 6]) > 0.97).all()
+
+
+def test_a_correction_is_ahead_and_aside_of_where_the_vehicle_is_heading() -> None:
+    raw = torch.zeros(1, 1, 7)
+    raw[..., 1], raw[..., 2], raw[..., 3] = 2.0, 0.5, -50.0
+    north = torch.tensor([[[10.0, 20.0, 15.0, np.pi / 2]]])
+    x, y, speed, heading = correct(raw, north, north)[0, 0].tolist()
+    assert (x, y) == (pytest.approx(9.5), pytest.approx(22.0))
+    assert speed == 0.0, "nobody reverses"
+    assert heading == pytest.approx(np.pi / 2)
+
+
+def test_vehicles_share_the_weights_and_neighbours_have_no_order() -> None:
+    torch.manual_seed(0)
+    branch = KinematicBranch(KinematicConfig())
+    torch.nn.init.normal_(branch.out.weight)
+    own, near = kinematic_input()
+    with torch.inference_mode():
+        together = branch(own, near)
+        alone = torch.cat([branch(own[k : k + 1], near[k : k + 1]) for k in range(3)])
+        shuffled = branch(own, near.flip(1))
+        near[:, 4:] = 0.0
+        fewer = branch(own, near)
+        near[:, 4:, 1:] = 7.0  # an empty place says nothing, whatever stands in it
+        torch.testing.assert_close(branch(own, near), fewer)
+    torch.testing.assert_close(together, alone)
+    torch.testing.assert_close(together, shuffled)
+
+
+def test_the_hpn_has_the_branches_that_its_maps_need() -> None:
+    rendered = HPN(HpnConfig())
+    assert rendered.kinematic is not None
+    assert rendered.map_branch is None
+    plain = HPN(HpnConfig(maps="plain"))
+    assert plain.kinematic is None
+    assert plain.map_branch is not None
+    with pytest.raises(ValueError, match="corrects rendered maps"):
+        HPN(HpnConfig(maps="corrected"))
 
 
 def test_masked_and_nan_rows_reach_no_network() -> None:

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from cosim.errors import BadInput, CosimError, SimulationCrashed, SimulationError
+from cosim.errors import BadInput, CosimError, SimulationCrashed, SimulationError, SimulationTimeout
+from cosim.simulation.stderr import SumoStderr
 from cosim.worker import Worker
 
 
@@ -48,6 +49,13 @@ class Servant:
     def murmur_and_die(self) -> None:
         os.write(2, b"Error: the net is broken\n")
         os.kill(os.getpid(), signal.SIGSEGV)
+
+    def let_sumo_speak_and_die(self) -> None:
+        with SumoStderr() as stderr:
+            os.write(2, b"Error: first\n")
+            assert stderr.take() == "first"
+            os.write(2, b"Error: SUMO is at its wits' end\n")
+            os.kill(os.getpid(), signal.SIGSEGV)
 
     def leave(self) -> None:
         os._exit(3)
@@ -109,6 +117,22 @@ def test_a_killed_process_is_named_with_its_signal_and_last_words(worker: Worker
         worker.call("murmur_and_die")
     with pytest.raises(SimulationCrashed, match="ended already"):
         worker.call("add", 1)
+
+
+def test_sumo_s_own_last_words_are_heard_too(worker: Worker) -> None:
+    worker.call("shout")  # words of an earlier call are not those of this one
+    with pytest.raises(SimulationCrashed, match=r"last words: Error: SUMO is at its wits' end") as caught:
+        worker.call("let_sumo_speak_and_die")
+    assert caught.value.exitcode == -signal.SIGSEGV
+    assert caught.value.stderr.splitlines() == ["Error: first", "Error: SUMO is at its wits' end"]
+
+
+def test_silence_before_the_first_sign_of_life_has_a_limit_of_its_own() -> None:
+    with Worker(Servant, timeout=0.1, start_timeout=30.0) as worker:
+        assert worker.call("add", 1) == 1, "the start took longer than 0.1 s"
+        worker._start_timeout = 0.2
+        with pytest.raises(SimulationTimeout, match=r"0\.2 s during 'sleep'"):
+            worker.call("sleep")
 
 
 def test_a_process_that_was_killed_between_calls_is_noticed(worker: Worker) -> None:

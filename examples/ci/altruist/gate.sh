@@ -7,7 +7,6 @@ out=${1:-runs/ci-altruist}
 again=
 if [ -e "$out/store.sqlite" ]; then again=--resume; fi # a job that was cut off goes on where it was
 cosim evaluate "$here/SPEC.yaml" --out "$out" $again
-cosim report "$out"
 cosim compare "$out" --baseline idm --candidate altruist-rule \
     --fail-on 'collision_rate > +0pp' \
     --fail-on 'mission_success_rate < +30pp' \

@@ -7,7 +7,6 @@ out=${1:-runs/ci-reckless}
 again=
 if [ -e "$out/store.sqlite" ]; then again=--resume; fi # a job that was cut off goes on where it was
 cosim evaluate "$here/SPEC.yaml" --out "$out" $again
-cosim report "$out"
 cosim compare "$out" --baseline idm --candidate keep-lane \
     --fail-on 'collision_rate > +5pp' \
     --fail-on 'av_caused_collision_rate > 10%' \

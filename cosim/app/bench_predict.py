@@ -1,0 +1,204 @@
+"""`cosim bench predict`: how far off the kinematic predictors are, and what their intervals are worth."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cosim.app.progress import Progress
+from cosim.errors import BadInput
+from cosim.evaluation import statistics
+from cosim.evaluation.prediction import Predicted, Scores
+from cosim.recording import Folder, Recording, read, windows
+from cosim.types import Floats
+from policy.forecast import KinematicForecast
+from policy.predictors import Predictor, make_predictor
+
+EIGHT = ("cs", "ca", "lstm-direct", "lstm-indirect", "ae-direct", "ae-indirect", "gp-direct", "gp-indirect")
+EVERY = 5  # frames between two moments: 1 s
+HORIZON, DT = 20, 0.2  # frames, s
+PORTION = 2048  # windows forecast at once
+
+
+def bench_predict(
+    folder: Folder,
+    out: Path,
+    *,
+    scenarios: Sequence[str] = (),
+    behaviors: Sequence[str] = (),
+    seeds: range | None = None,
+    predictors: Sequence[str] = EIGHT,
+    command: str = "",
+) -> Scores:
+    """Measure on recorded episodes; writes position_error.csv, interval_coverage.csv, position_error.png and
+    prediction.md into `out`. Raises BadInput when no recording fits."""
+    made = [make_predictor(name, HORIZON, DT) for name in predictors]
+    keys = [key for key in folder.episodes() if seeds is None or int(key.rsplit("-", 1)[1]) in seeds]
+    scores, progress = Scores(HORIZON, DT), Progress("bench predict", "episodes")
+    for done, key in enumerate(keys, 1):
+        recording = read(folder.episode_file(key))
+        if _wanted(recording, scenarios, behaviors):
+            measure(scores, recording, made)
+        progress(done, len(keys))
+    progress.done()
+    if not scores.cases:
+        raise BadInput("holds no recording of these scenarios, behaviours and seeds", file=folder.path)
+    positions, coverage = scores.position_table(), scores.coverage_table()
+    write_csv(out / "position_error.csv", positions)
+    if coverage:
+        write_csv(out / "interval_coverage.csv", coverage)
+    plot(out / "position_error.png", scores)
+    (out / "prediction.md").write_text(markdown(scores, positions, coverage, command))
+    (out / "prediction.json").write_text(json.dumps(paired(scores), indent=1) + "\n")
+    return scores
+
+
+def measure(scores: Scores, recording: Recording, predictors: Iterable[Predictor]) -> None:
+    """Add one episode to the scores: every vehicle an AV perceives, once a second."""
+    w = windows(recording, every=EVERY, horizon=scores.steps)
+    scores.add(recording.case, w.future, {p.name: forecast(p, w.past) for p in predictors})
+
+
+def forecast(predictor: Predictor, past: Floats) -> Predicted:
+    """Forecasts of windows [S,N,4] (nan where unknown), in portions that fit into a processor's cache."""
+    parts = []
+    for at in range(0, max(len(past), 1), PORTION):
+        part = past[at : at + PORTION]
+        parts.append(predictor.predict(part, np.isfinite(part[:, :, 0])))
+    f = KinematicForecast(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    return Predicted(f.x, f.y, f.speed, f.heading, (f.speed_std, f.heading_std, f.along_std, f.across_std))
+
+
+def paired(scores: Scores) -> dict[str, Any]:
+    """Each predictor against `gp-indirect` on the same episodes: difference of the mean error over the
+    horizon (m), per scenario; positive where it is worse."""
+    reference = scores.errors.get("gp-indirect")
+    found: dict[str, Any] = {}
+    if reference is None:
+        return found
+    for name, errors in scores.errors.items():
+        if name == "gp-indirect":
+            continue
+        found[name] = {}
+        for scenario, behavior, members in scores.groups():
+            if behavior == "all" and scenario != "all":
+                ours = [float(np.nanmean(reference[i])) for i in members]
+                theirs = [float(np.nanmean(errors[i])) for i in members]
+                found[name][scenario] = statistics.paired_mean(ours, theirs).document()
+    return found
+
+
+def write_csv(file: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Rows with a header; the file appears whole. NA is an empty field."""
+    draft = file.with_name(f".{file.name}.part")
+    with draft.open("w", newline="") as stream:
+        writer = csv.DictWriter(stream, list(rows[0]))
+        writer.writeheader()
+        for row in rows:
+            writer.writerow({k: _plain(v) for k, v in row.items()})
+    draft.replace(file)
+
+
+def markdown(
+    scores: Scores,
+    positions: Sequence[Mapping[str, Any]],
+    coverage: Sequence[Mapping[str, Any]],
+    command: str,
+) -> str:
+    """The tables as a document."""
+    named = sorted({str(c["scenario"]) for c in scores.cases})
+    at = {(r["predictor"], r["scenario"], r["behavior"], r["horizon_s"]): r for r in positions}
+    lines = ["# Kinematic prediction", ""]
+    if command:
+        lines += [f"`{command}`", ""]
+    lines += [
+        f"{len(scores.cases)} episodes; every vehicle an AV perceives, once a second. Position error in m "
+        "with 95 % interval (bootstrap over episodes); every scenario counts the same.",
+        "",
+        "## Mean over the 4 s horizon",
+        "",
+        _row(["predictor", *named, "all"]),
+        _row(["---"] + ["---:"] * (len(named) + 1)),
+    ]
+    for name in scores.errors:
+        cells = [_figure(at[name, s, "all", "mean"]) for s in [*named, "all"]]
+        lines.append(_row([name, *cells]))
+    horizons = list(scores.horizons())
+    lines += ["", "## Against the horizon, all scenarios", ""]
+    lines += [_row(["predictor", *(f"{h:g} s" for h in horizons)])]
+    lines += [_row(["---"] + ["---:"] * len(horizons))]
+    for name in scores.errors:
+        lines.append(_row([name, *(_figure(at[name, "all", "all", h]) for h in horizons)]))
+    if coverage:
+        lines += ["", "## Share of the truth inside the 90 % interval", ""]
+        lines += [_row(["predictor", "quantity", "scenario", *(f"{h:g} s" for h in horizons)])]
+        lines += [_row(["---"] * 3 + ["---:"] * len(horizons))]
+        inside = {
+            (r["predictor"], r["quantity"], r["scenario"], r["horizon_s"]): r
+            for r in coverage
+            if r["behavior"] == "all"
+        }
+        for name, quantity, scenario in dict.fromkeys(key[:3] for key in inside):
+            cells = [f"{100 * inside[name, quantity, scenario, h]['coverage']:.1f} %" for h in horizons]
+            lines.append(_row([name, quantity, scenario, *cells]))
+    return "\n".join(lines) + "\n"
+
+
+def plot(file: Path, scores: Scores) -> None:
+    """P's figure 5: position error against the horizon, a panel per scenario and one for all."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    panels = [(s, b, m) for s, b, m in scores.groups() if b == "all"]
+    figure, axes = plt.subplots(2, math.ceil(len(panels) / 2), figsize=(12, 7), squeeze=False)
+    time = scores.dt * np.arange(1, scores.steps + 1)
+    for axis, (scenario, _, members) in zip(axes.flat, panels, strict=False):
+        for k, (name, errors) in enumerate(scores.errors.items()):
+            each = np.stack(errors)[members]
+            weight = np.ones(len(members))
+            if scenario == "all":
+                names = [scores.cases[i]["scenario"] for i in members]
+                weight = np.array([1.0 / names.count(n) for n in names])
+            there = np.isfinite(each)
+            mean = (np.where(there, each, 0.0) * weight[:, None]).sum(0) / (there * weight[:, None]).sum(0)
+            wide = 2.2 if name == "gp-indirect" else 1.2
+            axis.plot(time, mean, label=name, color=f"C{k}", linewidth=wide)
+        axis.set_title(scenario)
+        axis.set_xlabel("horizon (s)")
+        axis.set_ylabel("position error (m)")
+        axis.grid(alpha=0.3)
+    axes.flat[0].legend(fontsize=8)
+    for axis in list(axes.flat)[len(panels) :]:
+        axis.axis("off")
+    figure.tight_layout()
+    figure.savefig(file, dpi=110)
+    plt.close(figure)
+
+
+def _wanted(recording: Recording, scenarios: Sequence[str], behaviors: Sequence[str]) -> bool:
+    case = recording.case
+    return (not scenarios or case["scenario"] in scenarios) and (
+        not behaviors or case["behavior"] in behaviors
+    )
+
+
+def _figure(row: Mapping[str, Any]) -> str:
+    return statistics.Figure(row["mean_m"], row["ci_low"], row["ci_high"]).text(3)
+
+
+def _row(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, float):
+        return f"{value:.6g}" if math.isfinite(value) else ""
+    return value

@@ -1,0 +1,75 @@
+"""`cosim bench`: measurements a reader can repeat. `predict`: the predictors against recorded episodes."""
+
+from __future__ import annotations
+
+import argparse
+
+from cosim.app.verbs import arguments
+from cosim.app.verbs.record import seeds
+from cosim.scenario import BEHAVIORS
+
+DEMANDS = ("dense", "contested")
+POLICIES = ("idm", "altruist-rule", "vfn")
+
+
+def add(verbs: arguments.Verbs) -> None:
+    """Register the verb and its flags."""
+    kinds = verbs.add_parser("bench", help="measure and write tables").add_subparsers(
+        required=True, metavar="WHAT"
+    )
+    predict = kinds.add_parser(
+        "predict",
+        help="position error, interval coverage and map error of the predictors",
+        description="Measure every predictor on recorded episodes; records what it needs itself unless "
+        "--recordings names a folder of `cosim record`.",
+    )
+    predict.add_argument("--scenario", action="append", default=[], metavar="S", help="repeatable (all five)")
+    predict.add_argument("--behavior", action="append", default=[], choices=BEHAVIORS, help="repeatable")
+    predict.add_argument("--demand", action="append", default=[], metavar="NAME", help="repeatable")
+    predict.add_argument("--policy", action="append", default=[], metavar="NAME", help="repeatable")
+    predict.add_argument("--seeds", type=seeds, required=True, metavar="A:B", help="test seeds, B left out")
+    predict.add_argument("--recordings", metavar="DIR", help="use these (seeds outside A:B are left out)")
+    predict.add_argument("--workers", type=arguments.count, default=1, metavar="N", help="for recording (1)")
+    predict.add_argument("--out", required=True, metavar="DIR")
+    predict.set_defaults(work=work)
+
+
+def work(args: argparse.Namespace) -> int:
+    """Record where needed, measure, print the tables."""
+    import shlex
+    import sys
+    from pathlib import Path
+
+    import sumo_scenarios
+    from cosim.app import output
+    from cosim.app.bench_predict import bench_predict
+    from cosim.app.record import cases, record
+    from cosim.errors import BadInput
+    from cosim.recording import Folder
+
+    out = output.prepare_folder(args.out)
+    where = Path(args.recordings) if args.recordings else out / "recordings"
+    if not args.recordings:
+        wanted = cases(
+            args.scenario or sumo_scenarios.names(),
+            args.demand or DEMANDS,
+            args.behavior or [b for b in BEHAVIORS if b != "as-is"],
+            args.policy or POLICIES,
+            args.seeds,
+        )
+        if failed := record(where, wanted, workers=args.workers, resume=True):
+            print(f"cosim: {len(failed)} episodes were not recorded: {failed[0]}", file=sys.stderr)
+    elif args.demand or args.policy:
+        raise BadInput("recordings are there already", field="--demand, --policy")
+    folder = Folder(where)
+    folder.manifest()
+    bench_predict(
+        folder,
+        out,
+        scenarios=args.scenario,
+        behaviors=args.behavior,
+        seeds=args.seeds,
+        command="cosim " + shlex.join(sys.argv[1:]),
+    )
+    print((out / "prediction.md").read_text())
+    return 0

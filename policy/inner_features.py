@@ -1,0 +1,99 @@
+"""What goes on inside a trained HPN, as pictures (P, figure 7)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch.nn import functional
+
+from cosim.raster import rasterize_road
+from cosim.road import RoadMap
+from cosim.types import Floats, Floats32, History, ObservationConfig
+from policy.chain import render
+from policy.hpn import HPN
+from policy.map_branch import MapBranch
+from policy.predictors import Predictor
+from policy.scene import Scene, join, pictured
+from policy.tensors import Batch, to_batch, to_numpy
+from policy.traffic import TrafficConfig
+from policy.training.moments import foresee, without_history
+from policy.vehicle_inputs import vehicle_inputs
+
+PAINTED = 8  # features shown of each layer: those that differ most
+
+
+def painted(
+    hpns: Mapping[str, HPN],
+    histories: Mapping[str, History],
+    av: str,
+    observation: ObservationConfig,
+    road: RoadMap,
+    predictor: Predictor,
+) -> dict[str, Floats32]:
+    """Layer -> pictures [k,h,w] in [0,1] as the AV `av` sees them.
+
+    Features of the map branch are pictures already. Those of the kinematic branch belong to vehicles: each
+    vehicle is drawn where it is now, as bright as its feature.
+    """
+    scene = join(histories, observation.share_perception)
+    b = scene.agents.index(av)
+    out: dict[str, Floats32] = {}
+    with torch.inference_mode():
+        for name, hpn in hpns.items():
+            if hpn.kinematic is not None:
+                known = scene if hpn.kinematic.config.history else without_history(scene)
+                inputs = vehicle_inputs(known, *foresee(known, predictor, road, TrafficConfig()))
+                features = hpn.kinematic.features(torch.from_numpy(inputs.own), torch.from_numpy(inputs.near))
+                values = to_numpy(features) * inputs.known[:, None]
+                out[f"{name}, vehicles"] = _on_the_road(values, scene, b, observation, road)
+            if hpn.map_branch is not None and not hpn.map_branch.config.correct:
+                batch = to_batch(scene.histories, 0.0)
+                for layer, maps in enumerate(_encoded(hpn.map_branch, batch, b)):
+                    out[f"{name}, layer {layer + 1}"] = _scaled(_liveliest(maps))
+    return out
+
+
+def _encoded(branch: MapBranch, batch: Batch, b: int) -> list[Floats32]:
+    """[k,h,w] of every encoder layer."""
+    z = batch.maps[b : b + 1, -branch.config.seen :].flatten(1, 2)
+    out = []
+    for convolution, pool in zip(branch.encoder, branch._pools, strict=True):
+        z = functional.relu(convolution(z))
+        out.append(to_numpy(z[0]))
+        if pool != (1, 1):
+            z = functional.max_pool2d(z, pool)
+    return out
+
+
+def _on_the_road(
+    values: Floats32, scene: Scene, b: int, observation: ObservationConfig, road: RoadMap
+) -> Floats32:
+    """[k,H,W]: the liveliest features [V,.], each vehicle drawn with its own."""
+    chosen = np.argsort(-values.std(0))[:PAINTED]
+    now = scene.state[:, -1]
+    x, y, heading = (now[:, k : k + 1] for k in (0, 1, 3))
+    raster = rasterize_road(road)
+    out = []
+    for feature in chosen:
+        level = values[:, feature] / max(float(values[:, feature].max()), 1e-9)
+        speed: Floats = 60.0 * level[:, None].astype(np.float64) - 30.0  # the rasteriser's brightness
+        rows, known, _ = pictured(scene, x, y, speed, heading)
+        ego = rows[b : b + 1].copy()
+        ego[..., 0, 2] = 0.0  # brightness is the speed against the ego's
+        maps = render(ego, known[b : b + 1], scene.pose[b : b + 1], observation, raster)[0, 0]
+        road_channel = observation.channels.index("road")
+        vehicles = np.delete(maps, road_channel, 0).max(0).astype(np.float32) / 255.0
+        out.append(np.maximum(vehicles, 0.08 * (maps[road_channel] > 0)))
+    return np.stack(out).astype(np.float32)
+
+
+def _liveliest(maps: Floats32) -> Floats32:
+    """The PAINTED features [k,h,w] that vary most over the picture."""
+    return maps[np.argsort(-maps.std((1, 2)))[:PAINTED]]
+
+
+def _scaled(maps: Floats32) -> Floats32:
+    low, high = maps.min((1, 2), keepdims=True), maps.max((1, 2), keepdims=True)
+    return np.asarray((maps - low) / np.maximum(high - low, 1e-9), np.float32)

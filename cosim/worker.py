@@ -35,7 +35,8 @@ class Worker:
     (progress counts as a sign of life); `start_timeout` is the longest one before the first sign of life, of
     the factory and of each call (default: the same). Raises whatever CosimError the method raised,
     SimulationCrashed when the process died, SimulationTimeout when it stayed silent. A worker whose process
-    is gone stays gone: make a new one.
+    is gone stays gone: make a new one. Without `wait` the first call waits for the start, and raises what the
+    factory raised.
     """
 
     def __init__(
@@ -45,6 +46,7 @@ class Worker:
         timeout: float = 300.0,
         start_timeout: float | None = None,
         name: str = "cosim",
+        wait: bool = True,
     ) -> None:
         self._timeout = timeout
         self._start_timeout = start_timeout
@@ -60,11 +62,9 @@ class Worker:
             self._process.start()
         theirs.close()
         self._closed = False
-        try:
-            self._answer("start", None)
-        except BaseException:
-            self.close()
-            raise
+        self._started = False
+        if wait:
+            self._wait()
 
     @property
     def pid(self) -> int | None:
@@ -77,6 +77,7 @@ class Worker:
         """Run one method in the worker. `progress` receives what the method passes to its own `progress`."""
         if self._closed:
             raise SimulationCrashed("the simulation's process has ended already")
+        self._wait()
         self._heard = self._stderr.stat().st_size
         try:
             self._pipe.send((method, arguments, options, progress is not None))
@@ -113,6 +114,17 @@ class Worker:
     def __del__(self) -> None:
         with contextlib.suppress(Exception):
             self.close()
+
+    def _wait(self) -> None:
+        """Until the factory has built its object."""
+        if self._started:
+            return
+        try:
+            self._answer("start", None)
+        except BaseException:
+            self.close()
+            raise
+        self._started = True
 
     def _answer(self, method: str, progress: Callable[..., None] | None) -> Any:
         patience = self._timeout if self._start_timeout is None else self._start_timeout

@@ -98,18 +98,27 @@ def plan(cases: Iterable[Case], seeds: range, check_policy: CheckPolicy) -> Plan
             that is malformed or whose edges are not in the net, a vehicle type that is not there.
     """
     found = []
+    worlds: dict[Case, tuple[Scenario, Mapping[str, Any], str | None]] = {}
     for case in cases:
         check_policy(case.policy)
-        scenario = case.scenario()
-        sumo_outputs.check(case.outputs, scenario.options)
-        refused = None
-        try:
-            scenario = vetted(scenario)
-        except BadInput as error:
-            if error.file != str(scenario.net):
-                raise
-            refused = str(error)
-        document = manifest(scenario, seeds[0])
-        del document["seed"]
-        found.append(Cell(replace(case, seed=seeds[0]), scenario, document, refused))
+        world = replace(case, policy="", svo_deg=0.0, seed=seeds[0])  # who drives changes nothing of it
+        if world not in worlds:
+            worlds[world] = _read(world)
+        found.append(Cell(replace(case, seed=seeds[0]), *worlds[world]))
     return Plan(tuple(found), seeds)
+
+
+def _read(case: Case) -> tuple[Scenario, Mapping[str, Any], str | None]:
+    """The scenario, vetted unless its net is refused; its manifest without the seed; why it is refused."""
+    scenario = case.scenario()
+    sumo_outputs.check(case.outputs, scenario.options)
+    refused = None
+    try:
+        scenario = vetted(scenario)
+    except BadInput as error:
+        if error.file != str(scenario.net):
+            raise
+        refused = str(error)
+    document = manifest(scenario, case.seed)
+    del document["seed"]
+    return scenario, document, refused

@@ -125,7 +125,8 @@ class Supervisor:
         return "done", value, None, None
 
     def _ready(self) -> Worker:
-        if self._worker is not None and self._tasks >= self._limits.recycle:
+        worker = self._worker
+        if worker is not None and (self._tasks >= self._limits.recycle or worker.pid is None):
             self._drop()
         if self._worker is None:
             self._tasks = 0
@@ -137,6 +138,7 @@ class Supervisor:
                 timeout=self._limits.step + SIGN_OF_LIFE,
                 start_timeout=self._limits.start,
                 name="cosim-evaluation",
+                wait=False,  # `kill` must reach a process that is still starting
             )
         return self._worker
 

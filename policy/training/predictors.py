@@ -78,6 +78,7 @@ class BankMath(nn.Module):
     predict: torch.Tensor
     drift: torch.Tensor
     variance: torch.Tensor
+    integral: torch.Tensor
 
     def __init__(self, bank: GaussianProcessBank, frames: int) -> None:
         super().__init__()
@@ -85,13 +86,17 @@ class BankMath(nn.Module):
         self.unit, self.kernels, self.steps = bank.config.unit, len(bank.kernels), bank.horizon
         for name in ("predict", "drift", "variance"):
             self.register_buffer(name, _tensor(getattr(op, name)), persistent=False)
+        trapezoid = np.tril(np.full((bank.horizon, bank.horizon), bank.dt))
+        trapezoid[np.diag_indices(bank.horizon)] = 0.5 * bank.dt
+        self.register_buffer("integral", _tensor(trapezoid.T), persistent=False)
 
     def forward(
         self, past: torch.Tensor, evidence: torch.Tensor, log_prior: torch.Tensor, heat: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """past [S,n] relative to now in the unit, evidence, log_prior [S,K] -> mean, deviation [S,2M]."""
         weight = torch.softmax(evidence / heat + log_prior, 1)
-        means = (past @ self.predict + self.drift).view(-1, self.kernels, 2 * self.steps)
+        means = (past @ self.predict + self.drift).view(-1, self.kernels, self.steps)
+        means = torch.cat([means, means @ self.integral], 2)
         mean = torch.bmm(weight[:, None], means)[:, 0]
         second = torch.bmm(weight[:, None], means.square())[:, 0] + weight @ self.variance
         deviation = torch.sqrt((second - mean**2).clamp(min=0.0) + 1e-8)

@@ -158,14 +158,11 @@ def test_a_killed_run_goes_on_as_if_nothing_had_happened(kind: str, tmp_path: Pa
     config = LoopConfig(updates=updates, log_every=4, validate_every=6, save_every=0.0)
     whole = train(task(), config, tmp_path / "whole", layout={})
 
-    class Killed(Exception):
-        pass
-
-    def kill(done: float, total: float) -> None:
+    def kill(done: float, _: float) -> None:
         if done == 3:
-            raise Killed
+            raise KeyboardInterrupt
 
-    with pytest.raises(Killed):
+    with pytest.raises(KeyboardInterrupt):
         train(task(), config, tmp_path / "two", layout={}, progress=kill)
     again = train(task(), config, tmp_path / "two", layout={}, resume=True)
     assert again == whole, "losses are equal to the last digit"

@@ -1,0 +1,205 @@
+"""What predicting the next four seconds costs: forecast, HPN, chain and rendering, for 8 AVs at a time.
+
+    python -m benchmarks.prediction_maps [--decisions 40] [--threads 1 2] [--json]
+
+Real histories (highway, dense, tuning seed 100,000, the share of AVs chosen so that about 8 decide) are
+gathered first; then every part is timed on them, medians over decisions. The map branch at paper size (one
+frame a step, 20 steps) is timed eager, compiled, in bfloat16 and, where it is installed, by ONNX Runtime.
+"Real time" is the
+decision period, 0.4 s. Compare ratios, not seconds: other work on the machine moves everything.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import io
+import json
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from cosim.raster import rasterize_road
+from cosim.scenario import Fleet, Scenario, load
+from cosim.types import COMPACT, PAPER, ObservationConfig
+from cosim.worker import Worker
+from policy.chain import ChainConfig, predict
+from policy.hpn import HPN, HpnConfig
+from policy.map_branch import MapBranch, MapBranchConfig
+from policy.predictors import make_predictor
+from policy.scene import join
+from policy.tensors import to_batch
+from policy.traffic import TrafficConfig, predict_traffic
+
+DECISION = 0.4  # s
+TARGET = 25.0  # ms, compact size, 8 AVs
+AGENTS, PENETRATION = 8, 0.19
+
+
+class Gatherer:
+    """Lives in a worker: drives an episode and keeps what 8 AVs saw."""
+
+    def __init__(self, scenario: Scenario, observation: ObservationConfig) -> None:
+        from cosim.episode import Episode
+        from cosim.simulation.sumo import SumoSimulator
+
+        self._simulator = SumoSimulator(scenario, history=observation.frames)
+        self._episode = Episode(scenario, self._simulator, observation)
+
+    def gather(self, seed: int, decisions: int) -> tuple[Any, list[Any]]:
+        """The road, and histories of the first AGENTS AVs (copies)."""
+        kept = []
+        histories = self._episode.start(seed)
+        while not self._episode.over and len(kept) < decisions:
+            chosen = sorted(histories)[:AGENTS]
+            if len(chosen) == AGENTS:
+                kept.append(
+                    {a: histories[a]._replace(velocity_map=histories[a].velocity_map.copy()) for a in chosen}
+                )
+            histories = self._episode.advance({})
+        return self._simulator.road, kept
+
+    def close(self) -> None:
+        """End SUMO."""
+        self._simulator.close()
+
+
+def median_ms(work: Callable[[], object], rounds: int) -> float:
+    """Median wall time in ms; the first two rounds (compilation, caches) are not counted."""
+    times = []
+    for _ in range(rounds + 2):
+        began = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - began)
+    return 1e3 * statistics.median(times[2:])
+
+
+def parts(road: Any, kept: list[Any], size: ObservationConfig, chain: ChainConfig) -> dict[str, float]:
+    """ms of every part of one joint prediction with the shipped kind of HPN."""
+    predictor, raster, hpn = (
+        make_predictor("gp-indirect", 20, 0.2),
+        rasterize_road(road),
+        HPN(HpnConfig()).eval(),
+    )
+    names = ("join", "forecast", "along the lanes", "to tensors", "HPN and rendering", "rendering alone")
+    spent: dict[str, list[float]] = {name: [] for name in names}
+    with torch.inference_mode():
+        for number, histories in enumerate([*kept[:2], *kept]):
+            clock = [time.perf_counter()]
+            scene = join(histories)
+            clock.append(time.perf_counter())
+            forecast = predictor.predict(scene.state, scene.valid)
+            clock.append(time.perf_counter())
+            traffic = predict_traffic(scene, forecast, road, TrafficConfig(), 28)
+            clock.append(time.perf_counter())
+            batch = to_batch(scene.histories, 0.0)
+            clock.append(time.perf_counter())
+            predict(chain, size, raster, hpn, scene, batch, forecast, traffic)
+            clock.append(time.perf_counter())
+            predict(chain, size, raster, None, scene, batch, forecast)
+            clock.append(time.perf_counter())
+            if number >= 2:
+                for name, seconds in zip(names, np.diff(clock), strict=True):
+                    spent[name].append(1e3 * seconds)
+    out = {name: statistics.median(v) for name, v in spent.items()}
+    out["whole prediction"] = statistics.median(np.sum([spent[n] for n in names[:-1]], 0).tolist())
+    return out
+
+
+def map_branch(config: MapBranchConfig, horizon: int, rounds: int) -> dict[str, float | str]:
+    """ms of the map branch's whole chain for 8 AVs, by the way it is computed."""
+    torch.manual_seed(0)
+    branch = MapBranch(config).eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    seen = config.seen * config.channels
+    past = torch.rand(AGENTS, seen, config.height, config.width).contiguous(memory_format=torch.channels_last)
+    rows = torch.rand(AGENTS, config.seen, config.rows, 9)
+    steps = horizon // config.block
+    out: dict[str, float | str] = {}
+
+    def chain(step: Callable[..., Any]) -> None:
+        window = past
+        with torch.inference_mode():
+            for _ in range(steps):
+                guess = step([window], rows)[0]
+                window = torch.cat([window, guess.to(window.dtype)], 1)[:, -seen:]
+
+    out["eager"] = median_ms(lambda: chain(branch), rounds)
+
+    def reduced() -> None:
+        with torch.autocast("cpu", torch.bfloat16):
+            chain(branch)
+
+    out["bfloat16"] = median_ms(reduced, rounds)
+    try:
+        compiled = torch.compile(branch)
+        out["compiled"] = median_ms(lambda: chain(compiled), rounds)
+    except Exception as error:  # needs a C++ compiler on the machine
+        out["compiled"] = f"not possible here: {type(error).__name__}"
+    out["ONNX Runtime"] = onnx(branch, past, rows, steps, rounds)
+    return out
+
+
+def onnx(branch: MapBranch, past: torch.Tensor, rows: torch.Tensor, steps: int, rounds: int) -> float | str:
+    """ms by ONNX Runtime, or why not."""
+    if importlib.util.find_spec("onnxruntime") is None or importlib.util.find_spec("onnx") is None:
+        return "not installed"
+    import onnxruntime
+
+    file = io.BytesIO()
+    torch.onnx.export(branch, ([past], rows), file, dynamo=False)
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = torch.get_num_threads()
+    session = onnxruntime.InferenceSession(file.getvalue(), options)
+    names = [i.name for i in session.get_inputs()]
+    seen, first, moved = past.shape[1], past.contiguous().numpy(), rows.numpy()
+
+    def chain() -> None:
+        window = first
+        for _ in range(steps):
+            guess = session.run(None, dict(zip(names, (window, moved), strict=True)))[0]
+            window = np.concatenate([window, guess], 1)[:, -seen:]
+
+    return median_ms(chain, rounds)
+
+
+def main() -> None:
+    """Print one table; with --json one document."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("--decisions", type=int, default=40)
+    parser.add_argument("--rounds", type=int, default=5, help="of the map branch's chain")
+    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--json", action="store_true")
+    args = parser.parse_args()
+    scenario = load("highway", demand=["dense"], fleet=Fleet(penetration=PENETRATION))
+    plans = {
+        "compact": (COMPACT, ChainConfig(), MapBranchConfig()),
+        "paper": (PAPER, ChainConfig(every=1), MapBranchConfig(height=64, width=512, block=1)),
+    }
+    result: dict[str, Any] = {"agents": AGENTS, "target_ms": TARGET}
+    for name, (size, chain, branch) in plans.items():
+        with Worker(Gatherer, scenario, replace(size)) as worker:
+            road, kept = worker.call("gather", 100_000, args.decisions)
+        for threads in args.threads:
+            torch.set_num_threads(threads)
+            spent = parts(road, kept, size, chain)
+            found: dict[str, Any] = {part: round(ms, 2) for part, ms in spent.items()}
+            found["times real time"] = round(1e3 * DECISION / spent["whole prediction"], 1)
+            found["vehicles"] = round(float(np.mean([len(join(h).vehicles) for h in kept])), 1)
+            ways = map_branch(branch, chain.horizon, args.rounds)
+            found["map branch, whole chain"] = {
+                way: f"{ms:.1f} ms, {1e3 * DECISION / ms:.1f} times real time"
+                if isinstance(ms, float)
+                else ms
+                for way, ms in ways.items()
+            }
+            result[f"{name}, {threads} threads"] = found
+    print(json.dumps(result, indent=None if args.json else 2))
+
+
+if __name__ == "__main__":
+    main()

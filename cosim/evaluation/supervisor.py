@@ -125,6 +125,8 @@ class Supervisor:
         return "done", value, None, None
 
     def _ready(self) -> Worker:
+        if self._ended:
+            raise SimulationCrashed("no more tasks: it was told to end")
         worker = self._worker
         if worker is not None and (self._tasks >= self._limits.recycle or worker.pid is None):
             self._drop()

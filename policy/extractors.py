@@ -58,7 +58,7 @@ class Conv3dMaps(nn.Module):
         kernel = first.weight[:, :, 0].contiguous(memory_format=torch.channels_last)
         z = functional.conv2d(frames, kernel, first.bias, first.stride[1:], first.padding[1:])
         # [B*T,h,w,32] in memory is [B,T,h,w,32]: channels_last_3d without a copy
-        z = functional.relu_(z).unflatten(0, (b, t)).transpose(1, 2)  # [B,32,T,h,w]
+        z = functional.relu_(z).view(b, t, *z.shape[1:]).transpose(1, 2)  # [B,32,T,h,w]
         z = z.contiguous(memory_format=torch.channels_last_3d)
         z = functional.relu_(self.second(z))
         z = functional.relu_(self.third(z))

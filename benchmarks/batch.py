@@ -6,8 +6,8 @@ with the defaults 200 episodes of about one second of processor time each, on me
 
 Each round drives the same episodes with one worker and with two, the order swapped from round to round, so
 that whatever else the machine does falls on both; with all of `cosim evaluate`: processes, rows, store.
-Overhead is all the time with one worker that is not `total_s`, which an episode measures inside its process,
-less the first start. `busy` is the share of time in which the workers had an episode: what is missing there
+Overhead is all the time with one worker, from the first row to the last, that is not `total_s`, which an
+episode measures inside its process. `busy` is the share of time in which the workers had an episode: what is missing there
 is the engine's fault, the rest is the machine's.
 """
 
@@ -40,6 +40,7 @@ class Run:
     episodes: tuple[float, ...]  # total_s of each
     start: float  # until the first episode was in, less that episode
     busy: float  # share of the workers' time
+    between: float  # from the first arrival to the last
 
 
 def measured(plan: matrix.Plan, workers: int, progress: Progress) -> Run:
@@ -60,7 +61,8 @@ def measured(plan: matrix.Plan, workers: int, progress: Progress) -> Run:
         raise SystemExit(f"not all episodes came through: {rows[0]['error']}")
     episodes = tuple(row["total_s"] for row in rows)
     start = arrivals[0] - began - episodes[0]
-    return Run(wall, episodes, start, sum(episodes) / (workers * (wall - start)))
+    busy = sum(episodes) / (workers * (wall - start))
+    return Run(wall, episodes, start, busy, arrivals[-1] - arrivals[0])
 
 
 def main() -> None:
@@ -88,8 +90,7 @@ def main() -> None:
             )
     one, two = (sum(r.wall for r in runs[n]) for n in (1, 2))
     gain = two / one
-    driven = sum(r.wall - r.start for r in runs[1])
-    overhead = driven / sum(sum(r.episodes) for r in runs[1]) - 1.0
+    overhead = sum(r.between for r in runs[1]) / sum(sum(r.episodes[1:]) for r in runs[1]) - 1.0
     print(f"{args.rounds * args.episodes} episodes: {one:.0f} s with one worker, {two:.0f} s with two")
     print(f"two workers take {gain:.2f} of the time of one (at most {GAIN})")
     print(f"the engine costs {overhead:.2%} of the serial time (at most {OVERHEAD:.0%})")

@@ -38,7 +38,7 @@ class Contact:
 
     def numbers(self, lane: npt.NDArray[np.integer]) -> Ints:
         """[n] lanes -> [n] rows of `table` (which may grow: read it afterwards)."""
-        found = self._number[self._edge[lane]]
+        found: Ints = self._number[self._edge[lane]]
         if len(found) and found.min() < 0:
             for k in np.flatnonzero(found < 0):
                 self._meet(int(lane[k]))

@@ -158,8 +158,8 @@ class RoadMap:
     @cached_property
     def straight_on(self) -> LaneGraph:
         """The straightest successor of every lane (another vehicle's route is unknown)."""
-        paths = map(self.path, range(len(self.lanes)))
-        following = [path.lanes[1] if len(path.lanes) > 1 else -1 for path in paths]
+        steps = [self._successor(k, None, 0) for k in range(len(self.lanes))]
+        following = [-1 if step is None else step[0] for step in steps]
         lengths = [lane.length for lane in self.lanes]
         return LaneGraph(np.array(following, np.int64), np.array(lengths, np.float64))
 
@@ -173,17 +173,28 @@ class RoadMap:
         conflict = max(keep.conflict - arc - 0.5 * length, 0.0)
         return RouteAhead((left, keep, right), arc, conflict, here.speed_limit)
 
+    @cached_property
+    def _lengths(self) -> list[float]:
+        """Every lane's length along its centre line, m (`Lane.length` is SUMO's)."""
+        return [float(np.sqrt((np.diff(lane.shape, axis=0) ** 2).sum(1)).sum()) for lane in self.lanes]
+
+    @cached_property
+    def _exits(self) -> list[float]:
+        """Every lane's heading at its end, rad."""
+        last = [lane.shape[-1] - lane.shape[-2] for lane in self.lanes]
+        return [float(np.arctan2(d[1], d[0])) for d in last]
+
     def _follow(self, first: int, route: tuple[str, ...] | None) -> LanePath:
         lanes = [first]
-        total = _polyline_length(self.lanes[first].shape)
+        total = self._lengths[first]
         place = 0  # where on the route we are
         dead_end = leaves = False
-        while total < PATH_HORIZON + _polyline_length(self.lanes[first].shape):
+        while total < PATH_HORIZON + self._lengths[first]:
             lane = self.lanes[lanes[-1]]
             if route is not None and place >= len(route) - 1 and not lane.internal:
                 leaves = True
                 break
-            step = self._successor(lane, route, place)
+            step = self._successor(lanes[-1], route, place)
             if step is None:
                 dead_end = True
                 if route is None and not lane.successors:
@@ -195,16 +206,15 @@ class RoadMap:
             if following in lanes:  # a ring: once round is far enough
                 break
             lanes.append(following)
-            total += _polyline_length(self.lanes[following].shape)
+            total += self._lengths[following]
         return self._join(tuple(lanes), dead_end, leaves)
 
-    def _successor(self, lane: Lane, route: tuple[str, ...] | None, place: int) -> tuple[int, int] | None:
+    def _successor(self, index: int, route: tuple[str, ...] | None, place: int) -> tuple[int, int] | None:
+        lane = self.lanes[index]
         if not lane.successors:
             return None
         if route is None:
-            ahead = _heading(lane.shape, -1)
-            turns = [abs(_wrap(self._exit_heading(s) - ahead)) for s in lane.successors]
-            return lane.successors[int(np.argmin(turns))], place
+            return min(lane.successors, key=lambda s: abs(_wrap(self._exits[s] - self._exits[index]))), place
         fitting = self._fitting(lane, route, place)
         if not fitting:
             return None
@@ -224,7 +234,7 @@ class RoadMap:
     def _reach(self, lane: int, route: tuple[str, ...], place: int, left: float) -> float:
         """How many of the next `left` m of the route can be driven from the start of `lane` on, in m."""
         here = self.lanes[lane]
-        own = _polyline_length(here.shape)
+        own = self._lengths[lane]
         if own >= left or (place >= len(route) - 1 and not here.internal):
             return left
         further = (
@@ -241,9 +251,6 @@ class RoadMap:
             seen += 1
         return self.lanes[lane].edge == edge
 
-    def _exit_heading(self, lane: int) -> float:
-        return _heading(self.lanes[lane].shape, -1)
-
     def _join(self, indices: tuple[int, ...], dead_end: bool, leaves: bool) -> LanePath:
         pieces: list[Floats] = []
         starts = []  # m
@@ -252,7 +259,7 @@ class RoadMap:
             shape = self.lanes[i].shape
             starts.append(total)
             pieces.append(shape if not pieces else shape[1:])
-            total += _polyline_length(shape)
+            total += self._lengths[i]
         points = np.concatenate(pieces)
         step = np.sqrt((np.diff(points, axis=0) ** 2).sum(1))
         keep = np.concatenate([[True], step > 1e-6])
@@ -271,18 +278,9 @@ class RoadMap:
             np.array(starts),
             dead_end,
             leaves,
-            scale=_polyline_length(first.shape) / max(first.length, 1e-6),
+            scale=self._lengths[indices[0]] / max(first.length, 1e-6),
             conflict=min(conflict, default=np.inf),
         )
-
-
-def _polyline_length(shape: Floats) -> float:
-    return float(np.sqrt((np.diff(shape, axis=0) ** 2).sum(1)).sum())
-
-
-def _heading(shape: Floats, at: int) -> float:
-    d = shape[-1] - shape[-2] if at == -1 else shape[1] - shape[0]
-    return float(np.arctan2(d[1], d[0]))
 
 
 def _wrap(angle: float) -> float:

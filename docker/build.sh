@@ -19,7 +19,7 @@ tag=$IMAGE
 local_base=localhost/debian-base:bookworm
 args=(--file docker/Dockerfile --target "$target" --tag "$tag"
     --build-arg "EXTRAS=${EXTRAS:-}"
-    --build-arg "REVISION=$(git rev-parse HEAD 2>/dev/null || echo unknown)")
+    --build-arg "REVISION=$(git describe --always --dirty --abbrev=40 --exclude '*' 2>/dev/null || echo unknown)")
 
 make_base() {
     local root

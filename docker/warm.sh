@@ -10,11 +10,9 @@ cd /  # away from the sources: the kernels of the installed package are meant
 
 quietly() { "$@" >/tmp/warm.log 2>&1 || { cat /tmp/warm.log >&2; exit 1; }; }
 
-# The agent with prediction calls every kernel there is; the worlds differ in what they make it do.
-for world in $(python -c 'import sumo_scenarios; print(*sumo_scenarios.names())'); do
-    quietly cosim run "$world" --policy vfn-p --behavior mixed --duration 4
-    quietly cosim run "$world" --policy altruist-rule --penetration 0.3 --duration 4
-done
+# The agent with prediction calls every kernel there is; a second world for its other shapes.
+quietly cosim run merge --policy vfn-p --behavior mixed --duration 4
+quietly cosim run intersection --policy vfn-p --demand dense --duration 4
 quietly python -c 'import matplotlib.font_manager'
 rm -rf /tmp/warm.log
 chmod -R a+rX "$1"

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cosim.compiled import compiled
 from cosim.types import Bools, Floats
 
 
@@ -25,12 +26,22 @@ class KinematicForecast(NamedTuple):
 
 def integrate_position(now: Floats, speed: Floats, heading: Floats, dt: float) -> tuple[Floats, Floats]:
     """P, eq. (9), trapezoid rule: now [V,>=4] x y speed heading; speed, heading [V,M] -> x, y [V,M] m."""
-    v = np.concatenate([now[:, 2:3], speed], 1)
-    h = np.concatenate([now[:, 3:4], heading], 1)
-    vx, vy = v * np.cos(h), v * np.sin(h)
-    x = now[:, :1] + np.cumsum(0.5 * dt * (vx[:, 1:] + vx[:, :-1]), 1)
-    y = now[:, 1:2] + np.cumsum(0.5 * dt * (vy[:, 1:] + vy[:, :-1]), 1)
+    x, y = np.empty(speed.shape), np.empty(speed.shape)
+    _integrate(now, speed, heading, dt, x, y)
     return x, y
+
+
+@compiled
+def _integrate(now: Floats, speed: Floats, heading: Floats, dt: float, x: Floats, y: Floats) -> None:
+    for v in range(speed.shape[0]):
+        px, py = now[v, 0], now[v, 1]
+        vx, vy = now[v, 2] * np.cos(now[v, 3]), now[v, 2] * np.sin(now[v, 3])
+        for k in range(speed.shape[1]):
+            wx, wy = speed[v, k] * np.cos(heading[v, k]), speed[v, k] * np.sin(heading[v, k])
+            px += 0.5 * dt * (vx + wx)
+            py += 0.5 * dt * (vy + wy)
+            x[v, k], y[v, k] = px, py
+            vx, vy = wx, wy
 
 
 def motion_of(now: Floats, x: Floats, y: Floats, dt: float) -> tuple[Floats, Floats]:

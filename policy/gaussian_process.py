@@ -43,9 +43,9 @@ class BankConfig:
 SPEED = BankConfig(1.0, (0.2, 1.0), (0.5, 2.0), (1.0, 2.5), (0.02, 0.2), (-2.5, 0.0, 1.5))
 # 0.05 rad: 1 m/s sideways at 20 m/s, a usual lane change. Drifts of 0.15 and 0.4 rad/s: round rings, corners.
 HEADING = BankConfig(0.05, (0.2,), (0.5, 3.0), (0.7, 2.0), (0.02, 0.2), (-8.0, -3.0, 0.0, 3.0, 8.0))
-# m, of "direct" positions from now on, along the heading and across it. Slopes are speeds.
-ALONG = BankConfig(1.0, (5.0, 20.0), (0.5, 2.0, 8.0), (1.0, 2.5, 5.0), (0.02, 0.2), (0.0,), 1.0)
-ACROSS = BankConfig(0.5, (0.5, 5.0), (0.5, 2.0, 8.0), (1.0, 2.5, 5.0), (0.02, 0.2), (0.0,), 1.0)
+# m, of "direct" positions: ahead of and aside of where constant speed leads.
+ALONG = BankConfig(1.0, (0.2, 2.0), (0.5, 2.0, 8.0), (1.0, 2.5, 5.0), (0.02, 0.2))
+ACROSS = BankConfig(0.5, (0.2, 2.0), (0.5, 2.0, 8.0), (1.0, 2.5, 5.0), (0.02, 0.2))
 
 
 class SeriesForecast(NamedTuple):

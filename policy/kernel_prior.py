@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from cosim.compiled import compiled
 from cosim.types import Bools, Floats, Ints
 
 FEATURES = 11
@@ -92,36 +93,54 @@ class KernelPrior(NamedTuple):
 
 def trailing_run(state: Floats, valid: Bools) -> Ints:
     """[V] how many unbroken valid, finite frames lead up to now; state [V,N,>=4], valid [V,N]."""
-    good = valid & np.isfinite(state[:, :, :4]).all(2)
-    return np.asarray(np.cumprod(good[:, ::-1], axis=1).sum(1))
+    run = np.empty(len(state), np.int64)
+    _trailing_run(state, valid, run)
+    return run
 
 
 def describe(state: Floats, run: Ints, dt: float) -> Floats:
     """The present motion as [V,FEATURES], each of order one; state [V,N,>=4], `run` from `trailing_run`.
 
-    Speed, standing, acceleration and turning rate now, and how both changed over the known past.
+    Speed, standing, acceleration and turning rate now, and how both changed over the known past; zeros for
+    a vehicle that is not known now.
     """
-    v = len(state)
-    now = np.nan_to_num(state[:, -1])
-    last = np.nan_to_num(state[np.arange(v), -np.minimum(np.maximum(run, 1), 2)])
-    first = np.nan_to_num(state[np.arange(v), -np.maximum(run, 1)])
-    speed = now[:, 2]
-    accel = np.tanh((speed - last[:, 2]) / dt / 2.0)
-    turning = np.tanh((now[:, 3] - last[:, 3]) / dt / 0.2)
-    gained = np.tanh((speed - first[:, 2]) / 4.0)
-    turned = np.tanh((now[:, 3] - first[:, 3]) / 0.3)
-    quick = speed / 15.0 - 1.0
-    columns = (
-        quick,
-        quick**2,
-        speed < STANDING,
-        np.exp(-speed / 2.0),
-        accel,
-        np.abs(accel),
-        turning,
-        np.abs(turning),
-        gained,
-        turned,
-        np.abs(turned),
-    )
-    return np.stack([np.asarray(c, np.float64) for c in columns], 1)
+    out = np.zeros((len(state), FEATURES))
+    _describe(state, run, dt, out)
+    return out
+
+
+@compiled
+def _trailing_run(state: Floats, valid: Bools, run: Ints) -> None:
+    for v in range(state.shape[0]):
+        run[v] = 0
+        for k in range(state.shape[1] - 1, -1, -1):
+            whole = valid[v, k]
+            for f in range(4):
+                whole = whole and np.isfinite(state[v, k, f])
+            if not whole:
+                break
+            run[v] += 1
+
+
+@compiled
+def _describe(state: Floats, run: Ints, dt: float, out: Floats) -> None:
+    now = state.shape[1] - 1
+    for v in range(state.shape[0]):
+        if run[v] == 0:
+            continue
+        last, first = now + 1 - min(run[v], 2), now + 1 - run[v]
+        speed, heading = state[v, now, 2], state[v, now, 3]
+        accel = np.tanh((speed - state[v, last, 2]) / dt / 2.0)
+        turning = np.tanh((heading - state[v, last, 3]) / dt / 0.2)
+        turned = np.tanh((heading - state[v, first, 3]) / 0.3)
+        out[v, 0] = speed / 15.0 - 1.0
+        out[v, 1] = out[v, 0] ** 2
+        out[v, 2] = speed < STANDING
+        out[v, 3] = np.exp(-speed / 2.0)
+        out[v, 4] = accel
+        out[v, 5] = abs(accel)
+        out[v, 6] = turning
+        out[v, 7] = abs(turning)
+        out[v, 8] = np.tanh((speed - state[v, first, 2]) / 4.0)
+        out[v, 9] = turned
+        out[v, 10] = abs(turned)

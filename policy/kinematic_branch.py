@@ -64,7 +64,7 @@ class KinematicBranch(nn.Module):
         t = torch.linspace(0.0, 1.0, c.horizon + 1)[1:]  # of the horizon
         one = torch.ones_like(t)
         # how large an error is at each frame, so that every output is of order one
-        scale = [2 * one, 4 * t**1.5 + 0.05, t + 0.05, 4 * t + 0.1, 0.3 * t + 0.01, one, one]
+        scale = [2 * one, 4 * t**2 + 0.005, t**1.5 + 0.002, 4 * t + 0.02, 0.3 * t**1.5 + 0.001, one, one]
         self.register_buffer("unit", torch.stack(scale, -1), persistent=False)
 
     def features(self, own: torch.Tensor, near: torch.Tensor) -> torch.Tensor:

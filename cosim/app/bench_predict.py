@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from cosim.app import map_bench, map_figures
 from cosim.app.progress import Progress
 from cosim.errors import BadInput
 from cosim.evaluation import statistics
@@ -57,6 +58,34 @@ def bench_predict(
     (out / "prediction.md").write_text(markdown(scores, positions, coverage, command))
     (out / "prediction.json").write_text(json.dumps(paired(scores), indent=1) + "\n")
     return scores
+
+
+def bench_maps(
+    folder: Folder,
+    out: Path,
+    *,
+    scenarios: Sequence[str] = (),
+    behaviors: Sequence[str] = (),
+    workers: int = 1,
+) -> None:
+    """The maps on the same recordings: map_error.csv, map_error.md, and P's figures 6, 7, 8 and 10.
+
+    Raises BadInput when no recorded episode is long enough.
+    """
+    weights = map_bench.hpn_weights()
+    episodes = map_bench.measure(
+        folder.path, weights=weights, scenarios=scenarios, behaviors=behaviors, workers=workers
+    )
+    table = map_bench.rows(episodes)
+    map_bench.write_table(out / "map_error.csv", table)
+    (out / "map_error.md").write_text(map_bench.markdown(table))
+    map_figures.errors(table, out / "map_error.png")
+    logs = {name: path.with_suffix(".csv") for name, path in weights.items()}
+    if present := {name: log for name, log in logs.items() if log.is_file()}:
+        map_figures.training(present, out / "hpn_training.png")
+    worlds = sorted({episode.scenario for episode in episodes})
+    if weights:
+        map_figures.pictures(folder.path, out, weights, worlds)
 
 
 def measure(scores: Scores, recording: Recording, predictors: Iterable[Predictor]) -> None:

@@ -85,7 +85,7 @@ def rows_in_both(before: Snapshot, after: Snapshot) -> tuple[Ints, Ints]:
 
 
 class Slots:
-    """Gives every vehicle of an episode a lasting number, in order of appearance."""
+    """Gives every vehicle of an episode a lasting number, in order of appearance (until `keep`)."""
 
     def __init__(self) -> None:
         self.of: dict[str, int] = {}
@@ -102,6 +102,12 @@ class Slots:
             self._rows = np.array([self.of.setdefault(name, len(self.of)) for name in names], dtype=np.int64)
             self._ids = names
         return self._rows
+
+    def keep(self, numbers: Ints) -> None:
+        """Forget all but these numbers, which become 0, 1, 2, ... in this order."""
+        new = {int(old): k for k, old in enumerate(numbers)}
+        self.of = {name: new[old] for name, old in self.of.items() if old in new}
+        self._ids, self._rows = (), np.zeros(0, dtype=np.int64)
 
 
 def grown(table: Table, needed: int, fill: float, axis: int = 0) -> Table:

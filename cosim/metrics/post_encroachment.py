@@ -29,6 +29,8 @@ class PostEncroachment:
 
     def add(self, snapshot: Snapshot) -> None:
         s = snapshot
+        if len(self._slots) > 2 * s.n + 64:
+            self._forget_those_who_left()
         slot = self._slots.rows(s.ids)  # [n]
         self._sizes = grown(self._sizes, len(self._slots), 0.0)
         self._watched = grown(self._watched, len(self._slots), False)
@@ -50,6 +52,14 @@ class PostEncroachment:
             self._contact.table,
         )
         self._smallest = min(self._smallest, found)
+
+    def _forget_those_who_left(self) -> None:
+        """In an hour of traffic thousands come and go, and a frame's cost grows with all that are known."""
+        kept = np.flatnonzero(~np.isnan(self._trail[:, : len(self._slots), 0]).all(0))
+        self._slots.keep(kept)
+        self._trail = self._trail[:, kept]
+        self._sizes, self._watched = self._sizes[kept], self._watched[kept]
+        self._known = None
 
     def result(self) -> dict[str, Metric]:
         value = float(self._smallest) if self._smallest <= LONGEST else None

@@ -55,8 +55,8 @@ class _GaussianProcess:
         now = np.where(known[:, None], np.nan_to_num(state[:, -1]), 0.0)  # [V,4]
         logs, spread = self.prior.apply(describe(state, run, self.dt))
         moments = np.zeros((len(self.banks), 4, len(state), self.horizon))
-        for count in np.unique(run[known]):
-            rows = slice(None) if (run == count).all() else np.flatnonzero(run == count)
+        for count in np.unique(run[known]).tolist():
+            rows = slice(None) if count == run.min() == run.max() else np.flatnonzero(run == count)
             series = self.series(state[rows, -count:])
             for b, bank in enumerate(self.banks):
                 f = bank.forecast(series[b], logs[b][rows], float(self.prior.temperature[b]))
@@ -96,7 +96,10 @@ class GaussianProcessIndirect(_GaussianProcess):
 
 
 class GaussianProcessDirect(_GaussianProcess):
-    """Positions themselves by the kernel bank, in the vehicle's own frame; speed and heading follow."""
+    """Positions themselves by the kernel bank, in the vehicle's own frame; speed and heading follow.
+
+    The mean function is straight on at the present speed: one frame alone then gives constant speed.
+    """
 
     name = "gp-direct"
     configs = (ALONG, ACROSS)
@@ -105,10 +108,12 @@ class GaussianProcessDirect(_GaussianProcess):
     def series(self, state: Floats) -> tuple[Floats, Floats]:
         dx, dy = state[:, :, 0] - state[:, -1:, 0], state[:, :, 1] - state[:, -1:, 1]
         c, s = np.cos(state[:, -1:, 3]), np.sin(state[:, -1:, 3])
-        return c * dx + s * dy, c * dy - s * dx
+        past = self.dt * np.arange(1 - state.shape[1], 1)
+        return c * dx + s * dy - state[:, -1:, 2] * past, c * dy - s * dx
 
     def _forecast(self, now: Floats, moments: Floats, scale: Floats, known: Bools) -> KinematicForecast:
         (u, u_var), (w, w_var) = moments[:, :2]
+        u = u + now[:, 2:3] * (self.dt * np.arange(1, self.horizon + 1))
         c, s = np.cos(now[:, 3:4]), np.sin(now[:, 3:4])
         x, y = now[:, :1] + c * u - s * w, now[:, 1:2] + s * u + c * w
         speed, heading = motion_of(now, x, y, self.dt)

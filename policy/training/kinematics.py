@@ -38,6 +38,7 @@ class KinematicTraining:
     alone: float = 0.3  # weight of each vehicle's own place, beside its place in the pictures
     speed: float = 0.1  # per 3 m/s
     heading: float = 0.2  # per rad
+    early: float = 0.15  # of the horizon: frames weigh 1 / (early + t), or the first ones would not count
     seed: int = 0
 
 
@@ -84,26 +85,29 @@ def collate(moments: Sequence[Moment], device: str = "cpu") -> Batch:
 def losses(raw: torch.Tensor, batch: Batch, c: KinematicTraining) -> dict[str, torch.Tensor]:
     """The loss and its parts; raw [V,M,OUTPUTS] as the branch gives it."""
     guess = correct(raw, batch.lane, batch.gp)
+    t = torch.linspace(0.0, 1.0, raw.shape[1] + 1, device=raw.device)[1:]
+    frames = 1.0 / (c.early + t)  # [M]
     there = torch.isfinite(batch.truth).all(-1)  # [V,M]
     truth = torch.where(there[..., None], batch.truth, guess.detach())
     along, across = _turned(guess[..., :2] - truth[..., :2], truth[..., 3])
-    alone = _mean(_misplaced(along, across, c.far), there)
-    speed = _mean((guess[..., 2] - truth[..., 2]).abs() / 3.0, there)
-    heading = _mean((guess[..., 3] - truth[..., 3]).abs().clamp_max(1.0), there)
+    alone = _mean(_misplaced(along, across, c.far), there * frames)
+    speed = _mean((guess[..., 2] - truth[..., 2]).abs() / 3.0, there * frames)
+    heading = _mean((guess[..., 3] - truth[..., 3]).abs().clamp_max(1.0), there * frames)
     e, v = batch.looking, batch.seen
     mine = _seen_from(guess[v], guess[e])  # [P,M,2] ahead, left
     real = _seen_from(truth[v], truth[e])
     shown = _inside(mine.detach()) | _inside(real)
     along, across = _turned(mine - real, truth[v][..., 3] - truth[e][..., 3])
-    picture = _mean(_misplaced(along, across, c.far), shown & there[v] & there[e])
+    both = (shown & there[v] & there[e]) * frames
+    picture = _mean(_misplaced(along, across, c.far), both)
     share = (1 - along.abs() / (2 * HALF_LENGTH)).clamp_min(0) * (
         1 - across.abs() / (2 * HALF_WIDTH)
     ).clamp_min(0)
     share = torch.where(there[v], share.detach(), 0.0)
     sure = sureness(raw[v][..., 5], raw[e][..., 6])
-    doubt = _mean((sure - share) ** 2, shown & there[e])
+    doubt = _mean((sure - share) ** 2, (shown & there[e]) * frames)
     total = picture + c.alone * alone + c.speed * speed + c.heading * heading + doubt
-    missed = _mean(1.0 - share, shown & there[v] & there[e])
+    missed = _mean(1.0 - share, both)
     return {"loss": total, "picture": picture, "alone": alone, "sureness": doubt, "missed": missed}
 
 
@@ -125,8 +129,8 @@ def _misplaced(along: torch.Tensor, across: torch.Tensor, far: float) -> torch.T
     return 1.0 - torch.exp(-0.5 * square) + far * (torch.sqrt(1.0 + square) - 1.0)
 
 
-def _mean(values: torch.Tensor, where: torch.Tensor) -> torch.Tensor:
-    return (values * where).sum() / where.sum().clamp_min(1)
+def _mean(values: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+    return (values * weight).sum() / weight.sum().clamp_min(1e-9)
 
 
 class KinematicTask:

@@ -143,7 +143,8 @@ class PriorFit:
         )
         future, here = batch["future"], batch["here"]
         if isinstance(self.predictor, GaussianProcessDirect):
-            x, y = first[0][:, :m], second[0][:, :m]
+            ahead = self.predictor.dt * torch.arange(1, m + 1)
+            x, y = batch["speed"][:, None] * ahead + first[0][:, :m], second[0][:, :m]
             errors = [x - future[:, :, 0], y - future[:, :, 1]]
             deviations = [first[1][:, :m], second[1][:, :m]]
         else:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from cosim.metrics import METRICS, MetricContext, Metrics
+from cosim.metrics.post_encroachment import PostEncroachment
 from cosim.road import Lane, RoadMap
 from cosim.types import Collision, Events, Kind, Metric, Snapshot, Timing
 
@@ -126,6 +127,30 @@ def test_a_crossing_leaves_its_known_post_encroachment_time() -> None:
     seen = drive({"av": steady(-50.0, 20.0, kind=Kind.AV), "north": north})
     assert seen["min_pet_s"] == pytest.approx(0.65)
     assert seen["min_ttc_s"] is None  # at constant speed they never touch
+
+
+def test_those_who_left_are_forgotten_but_not_the_smallest_post_encroachment_time() -> None:
+    """120 cars, one every half second; one of them crosses close behind the AV, the others elsewhere."""
+
+    def passer(k: int) -> Car:
+        start = 0.5 * k  # s
+        return Car(
+            lambda _: 0.0 if k == 20 else 400.0,
+            y=lambda t: -70.0 + 20.0 * (t - start),
+            heading_deg=90.0,
+            lane=lambda _: -1,
+            present=lambda t: start <= t < start + 8.0,
+        )
+
+    av = Car(lambda t: -50.0 + 20.0 * (t - 10.0), kind=Kind.AV, present=lambda t: 10.0 <= t < 20.0)
+    cars = {"av": av} | {f"c{k:03}": passer(k) for k in range(120)}
+    metric = PostEncroachment()
+    metric.reset(frame(cars, 0.0), MetricContext(straight_road(), Timing(), "none", frozenset(), 80.0))
+    for k in range(1, 400):
+        metric.add(frame(cars, FRAME * k))
+    assert metric.result()["min_pet_s"].value == pytest.approx(0.65)
+    assert len(metric._slots) < 90
+    assert metric._trail.shape[1] < 220
 
 
 def test_a_car_on_a_bridge_is_in_no_conflict_with_one_below_it() -> None:

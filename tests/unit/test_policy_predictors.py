@@ -2,43 +2,301 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+import torch
 
-from cosim.errors import BadInput
+from cosim.errors import BadInput, WeightsMismatch
+from policy.checkpoint import SHIPPED, save
+from policy.forecast import integrate_position, motion_of
+from policy.kernel_prior import PriorNetwork, describe, trailing_run
 from policy.predictors import PREDICTORS, make_predictor
+from policy.predictors.gp import GaussianProcessIndirect
+from policy.predictors.learned import KinematicNet, Learned, NetConfig
+from policy.training.fitting import FitConfig, fit
+from policy.training.predictors import (
+    PriorFit,
+    examples_for_net,
+    factors_for,
+    in_own_frame,
+    net_loss,
+)
 
-PAST = 0.2 * np.arange(-9, 1)
+TIME = 0.2 * np.arange(-9, 1)
+EIGHT = ("cs", "ca", "lstm-direct", "lstm-indirect", "ae-direct", "ae-indirect", "gp-direct", "gp-indirect")
+
+
+def cars(speed: np.ndarray, heading: np.ndarray | None = None) -> np.ndarray:
+    """[V,N,8] that are at (100, 50) now and came there with speeds and headings [V,N]."""
+    state = np.zeros((*speed.shape, 8))
+    state[:, :, 2] = speed
+    state[:, :, 3] = 0.0 if heading is None else heading
+    way = np.exp(1j * 0.5 * (state[:, 1:, 3] + state[:, :-1, 3])) * 0.5 * (speed[:, 1:] + speed[:, :-1])
+    place = np.concatenate([np.zeros((len(speed), 1)), 0.2 * np.cumsum(way, 1)], 1)
+    place += 100.0 + 50.0j - place[:, -1:]
+    state[:, :, 0], state[:, :, 1] = place.real, place.imag
+    state[:, :, 4:6] = (5.0, 2.0)
+    return state
+
+
+def everywhere(state: np.ndarray) -> np.ndarray:
+    return np.ones(state.shape[:2], bool)
+
+
+def test_the_eight_of_the_paper_are_there() -> None:
+    assert set(EIGHT) <= set(PREDICTORS)
 
 
 @pytest.mark.parametrize("name", PREDICTORS)
-def test_every_predictor_keeps_the_protocol(name: str) -> None:
+def test_a_steady_car_goes_on_whatever_else_is_not_known(name: str) -> None:
     predictor = make_predictor(name, 20, 0.2)
-    state = np.zeros((3, 10, 8))
-    state[:, :, 2] = 12.0
-    valid = np.ones((3, 10), bool)
-    valid[1, :-1] = False
-    valid[2, -1] = False
-    state[2, -1] = np.nan
+    state = cars(np.full((4, 10), 12.0))
+    valid = everywhere(state)
+    valid[1, :-1] = False  # entered the view just now
+    state[1, :-1] = 1e6  # what is not valid must not be read
+    valid[2, -1] = False  # left the view
+    state[3, -1, 1] = np.nan
     forecast = predictor.predict(state, valid)
     assert predictor.name == name
-    assert forecast.valid.tolist() == [True, True, False]
+    assert forecast.valid.tolist() == [True, True, False, False]
     for values in forecast[:-1]:
-        assert values.shape == (3, 20)
+        assert values.shape == (4, 20)
         assert np.isfinite(values).all()
-    np.testing.assert_allclose(forecast.x[:2, -1], 48.0, atol=0.5)
+        assert (values[2:] == 0.0).all(), "no forecast of who is not known now"
+    assert (forecast.speed >= 0.0).all()
+    np.testing.assert_allclose(forecast.x[:2, 4], 112.0, atol=1.5)
+    np.testing.assert_allclose(forecast.x[:2, -1], 148.0, atol=8.0)
+    np.testing.assert_allclose(forecast.y[:2], 50.0, atol=1.0)
+
+
+@pytest.mark.parametrize("name", PREDICTORS)
+def test_a_standing_car_hardly_moves(name: str) -> None:
+    state = cars(np.zeros((1, 10)), np.full((1, 10), 2.0))
+    forecast = make_predictor(name, 20, 0.2).predict(state, everywhere(state))
+    moved = np.hypot(forecast.x - 100.0, forecast.y - 50.0)
+    assert moved[0, 4] < 0.5
+    assert moved[0, -1] < 5.0, "it may start within four seconds"
+    np.testing.assert_allclose(forecast.heading[0, 4], 2.0, atol=0.3)
+
+
+@pytest.mark.parametrize("name", ["lstm-indirect", "gp-direct", "gp-indirect"])
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_turning_car_is_predicted_inside_the_turn(name: str, sign: float) -> None:
+    state = cars(np.full((1, 10), 8.0), sign * 0.35 * TIME[None])
+    forecast = make_predictor(name, 20, 0.2).predict(state, everywhere(state))
+    aside = sign * (forecast.y[0, 4] - 50.0)
+    assert 0.4 < aside < 3.0, "an arc is 1.4 m aside after 1 s"
+
+
+@pytest.mark.parametrize("name", PREDICTORS)
+def test_a_lane_change_under_way_breaks_nothing(name: str) -> None:
+    drift = 0.08 * np.sin(np.pi * np.clip(TIME + 1.0, 0.0, 2.0) / 2.0)
+    state = cars(np.full((1, 10), 20.0), drift[None])
+    forecast = make_predictor(name, 20, 0.2).predict(state, everywhere(state))
+    assert 50.2 < forecast.y[0, 4] < 54.0
+    assert 116.0 < forecast.x[0, 4] < 122.0
+
+
+@pytest.mark.parametrize("name", PREDICTORS)
+def test_a_gap_in_the_past_hides_what_lies_before_it(name: str) -> None:
+    state = cars(np.stack([np.full(10, 12.0)] * 2))
+    state[1, :5] = 0.0  # would be a fierce acceleration
+    state[1, 4] = np.nan
+    short = everywhere(state)
+    short[0, :5] = False
+    forecast = make_predictor(name, 20, 0.2).predict(state, short)
+    for values in forecast[:-1]:
+        np.testing.assert_allclose(values[0], values[1], atol=1e-9)
+
+
+@pytest.mark.parametrize("name", PREDICTORS)
+def test_a_forecast_does_not_depend_on_place_direction_or_company(name: str) -> None:
+    rng = np.random.default_rng(0)
+    speed = np.maximum(10.0 + rng.normal(0.0, 0.4, (5, 10)).cumsum(1), 0.0)
+    state = cars(speed, rng.normal(0.0, 0.02, (5, 10)).cumsum(1))
+    turned = state.copy()
+    c, s = np.cos(2.0), np.sin(2.0)
+    turned[:, :, 0], turned[:, :, 1] = (
+        c * state[:, :, 0] - s * state[:, :, 1],
+        s * state[:, :, 0] + c * state[:, :, 1],
+    )
+    turned[:, :, 3] += 2.0
+    predictor = make_predictor(name, 20, 0.2)
+    a, b = predictor.predict(state, everywhere(state)), predictor.predict(turned, everywhere(state))
+    np.testing.assert_allclose(b.x, c * a.x - s * a.y, atol=1e-3)
+    np.testing.assert_allclose(b.y, s * a.x + c * a.y, atol=1e-3)
+    np.testing.assert_allclose(a.along_std, b.along_std, atol=1e-3)
+    alone = predictor.predict(state[2:3], everywhere(state[2:3]))
+    np.testing.assert_allclose(alone.x[0], a.x[2], atol=1e-4)
+    nobody = predictor.predict(state[:0], everywhere(state[:0]))
+    assert nobody.x.shape == (0, 20)
 
 
 def test_constant_acceleration_goes_on_accelerating_and_stops_at_standstill() -> None:
-    state = np.zeros((2, 10, 8))
-    state[0, :, 2] = 10.0 + 2.0 * PAST
-    state[1, :, 2] = 2.0 - 2.0 * PAST
-    forecast = make_predictor("ca", 20, 0.2).predict(state, np.ones((2, 10), bool))
+    state = cars(np.stack([10.0 + 2.0 * TIME, 2.0 - 2.0 * TIME]))
+    forecast = make_predictor("ca", 20, 0.2).predict(state, everywhere(state))
     assert forecast.speed[0, 4] == pytest.approx(12.0, abs=1e-6)
-    assert forecast.x[0, 4] == pytest.approx(11.0, abs=0.05)
+    assert forecast.x[0, 4] == pytest.approx(111.0, abs=0.05)
     assert forecast.speed[1, -1] == 0.0
+
+
+def test_the_gaussian_process_is_less_sure_of_a_braking_car_than_of_a_steady_one() -> None:
+    state = cars(np.stack([np.full(10, 20.0), 14.0 - 3.0 * TIME]))
+    forecast = make_predictor("gp-indirect", 20, 0.2).predict(state, everywhere(state))
+    assert (forecast.along_std[1] > forecast.along_std[0]).all()
+    assert (np.diff(forecast.along_std, axis=1) > 0.0).mean() > 0.9
+    assert forecast.speed[1, 4] < 13.0, "braking goes on for a while"
+    assert (np.diff(forecast.x[1]) >= -1e-9).all(), "nobody reverses"
+
+
+def test_speed_and_heading_follow_from_positions() -> None:
+    now = np.array([[0.0, 0.0, 5.0, 3.0]])
+    speed = np.full((1, 20), 5.0)
+    heading = 3.0 + 0.1 * np.arange(1, 21)[None]  # past pi
+    x, y = integrate_position(now, speed, heading, 0.2)
+    found_speed, found_heading = motion_of(now, x, y, 0.2)
+    np.testing.assert_allclose(found_speed, 5.0, atol=0.02)
+    np.testing.assert_allclose(found_heading, heading - 0.05, atol=1e-6)
+    stopped = np.repeat(x[:, :1], 20, 1), np.repeat(y[:, :1], 20, 1)
+    assert motion_of(now, *stopped, 0.2)[1][0, -1] == pytest.approx(3.05)
+
+
+def test_what_is_described_is_the_present_motion() -> None:
+    state = cars(np.stack([np.zeros(10), 15.0 + 2.0 * TIME]))
+    valid = everywhere(state)
+    valid[1, :7] = False
+    run = trailing_run(state, valid)
+    assert run.tolist() == [10, 3]
+    motion = describe(state, run, 0.2)
+    assert motion[0, 2] == 1.0, "standing"
+    assert motion[1, 4] == pytest.approx(np.tanh(1.0))
+    assert motion[1, 8] == pytest.approx(np.tanh(0.8 / 4.0)), "only the frames that are known"
+
+
+# ---- fitting ----
+
+
+def episodes(seed: int, count: int = 600) -> tuple[np.ndarray, np.ndarray]:
+    """Pasts and futures of cars whose braking or accelerating ends within the next second."""
+    rng = np.random.default_rng(seed)
+    time = 0.2 * np.arange(-9, 21)
+    accel = rng.normal(0.0, 1.5, (count, 1))
+    speed = np.maximum(15.0 + accel * np.minimum(time, rng.uniform(0.0, 1.0, (count, 1))), 0.0)
+    state = cars(speed, rng.normal(0.0, 0.05, (count, 1)) * time)[:, :, :4]
+    return state[:, :10], state[:, 10:]
+
+
+def test_fitting_the_prior_lowers_the_error_and_calibration_gives_the_coverage_promised() -> None:
+    past, future = episodes(0)
+    windows = in_own_frame(past, future, np.ones(len(past)))
+    prior = PriorFit(GaussianProcessIndirect, windows)
+
+    def error(predictor: GaussianProcessIndirect) -> float:
+        f = predictor.predict(past, np.ones(past.shape[:2], bool))
+        return float(np.hypot(f.x - future[:, :, 0], f.y - future[:, :, 1]).mean())
+
+    before = error(prior.fitted())
+    fit(prior.network, prior.examples, prior.loss, FitConfig(steps=60, batch=256))
+    assert error(prior.fitted()) < 0.6 * before
+    fresh_past, fresh_future = episodes(1, 2000)
+    f = prior.fitted().predict(fresh_past, np.ones(fresh_past.shape[:2], bool))
+    miss = fresh_future[:, :, 2] - f.speed
+    factor = factors_for((f.speed_std[:1000],), (miss[:1000],), np.ones(1000))
+    assert (np.abs(miss[1000:]) <= 1.645 * factor * f.speed_std[1000:]).mean() == pytest.approx(0.9, abs=0.03)
+
+
+@pytest.mark.parametrize("kind", ["lstm", "ae"])
+def test_a_killed_fit_goes_on_to_the_same_weights(kind: str, tmp_path: Path) -> None:
+    past, future = episodes(2, 200)
+    examples = examples_for_net(in_own_frame(past, future, np.ones(len(past))))
+    config = FitConfig(steps=30, batch=32, learning_rate=2e-3)
+
+    def fresh() -> KinematicNet:
+        torch.manual_seed(0)
+        return KinematicNet(NetConfig(kind, "indirect"))  # type: ignore[arg-type]
+
+    whole, broken = fresh(), fresh()
+    last = fit(whole, examples, lambda b: net_loss(whole, b), config)
+    assert last < float(net_loss(fresh(), examples).detach())
+    monkey = pytest.MonkeyPatch()
+    monkey.setattr("policy.training.fitting.SAVE_EVERY", 10)
+
+    def killed(done: float, _: float) -> None:
+        if done == 15:
+            raise KeyboardInterrupt
+
+    state = tmp_path / "state.safetensors"
+    with pytest.raises(KeyboardInterrupt):
+        fit(broken, examples, lambda b: net_loss(broken, b), config, state=state, progress=killed)
+    again = fresh()
+    steps: list[float] = []
+    fit(
+        again,
+        examples,
+        lambda b: net_loss(again, b),
+        config,
+        state=state,
+        progress=lambda d, _: steps.append(d),
+    )
+    monkey.undo()
+    assert steps[0] == 11
+    for name, value in whole.state_dict().items():
+        torch.testing.assert_close(again.state_dict()[name], value, rtol=0.0, atol=0.0)
+
+
+def test_windows_are_seen_from_the_vehicle_and_unknown_pasts_are_left_out() -> None:
+    past, future = episodes(3, 5)
+    c, s = np.cos(1.0), np.sin(1.0)
+    for part in (past, future):
+        x, y = part[:, :, 0].copy(), part[:, :, 1].copy()
+        part[:, :, 0], part[:, :, 1] = c * x - s * y, s * x + c * y
+        part[:, :, 3] += 1.0
+    past[4, 0] = np.nan
+    found = in_own_frame(past, future, np.array([1.0, 1.0, 2.0, 2.0, 9.0]))
+    assert len(found.past) == 4
+    np.testing.assert_allclose(found.past[:, -1, [0, 1, 3]], 0.0, atol=1e-12)
+    assert (found.future[:, -1, 0] > 20.0).all()
+    assert found.weight.mean() == pytest.approx(1.0)
+
+
+# ---- names and weights ----
 
 
 def test_an_unknown_predictor_is_bad_input() -> None:
     with pytest.raises(BadInput, match="predictor='psychic'"):
         make_predictor("psychic", 20, 0.2)
+
+
+def test_a_horizon_that_a_network_was_not_made_for_is_bad_input() -> None:
+    with pytest.raises(BadInput, match="20 frames of"):
+        make_predictor("lstm-direct", 30, 0.2)
+    assert make_predictor("ae-indirect", 5, 0.2).predict(
+        cars(np.full((1, 10), 5.0)), np.ones((1, 10), bool)
+    ).x.shape == (1, 5)
+
+
+def test_weights_of_another_layout_are_refused(tmp_path: Path) -> None:
+    other = NetConfig("ae", "direct", hidden=32)
+    save(tmp_path / "x.safetensors", {"network": KinematicNet(other)}, {"network": other})
+    with pytest.raises(WeightsMismatch, match="hidden"):
+        Learned(NetConfig("ae", "direct"), weights=tmp_path / "x.safetensors")
+    config = GaussianProcessIndirect.prior_config()
+    save(tmp_path / "y.safetensors", {"prior": PriorNetwork(config)}, {"prior": config})
+    assert GaussianProcessIndirect(weights=tmp_path / "y.safetensors").horizon == 20
+
+
+@pytest.mark.parametrize("name", [n for n in EIGHT if n not in ("cs", "ca")])
+def test_shipped_weights_say_what_they_are(name: str) -> None:
+    from policy.checkpoint import read_card
+
+    card = read_card(SHIPPED / f"{name}.safetensors")
+    assert 0.1 < card["measured"]["position_error_mean"] < 3.0
+    assert max(card["data"]["training"]["seeds"]) < 100_000
+    assert (
+        100_000
+        <= min(card["data"]["validation"]["seeds"])
+        <= max(card["data"]["validation"]["seeds"])
+        < 200_000
+    )

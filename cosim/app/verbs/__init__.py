@@ -7,9 +7,11 @@ does it and returns the exit code. What a verb needs is imported inside `work`: 
 from __future__ import annotations
 
 from cosim.app.verbs import (
+    bench,
     compare,
     doctor,
     evaluate,
+    fit_predictors,
     metrics,
     record,
     replay,
@@ -19,4 +21,17 @@ from cosim.app.verbs import (
     train,
 )
 
-VERBS = (run, evaluate, compare, replay, report, record, metrics, train, scenarios, doctor)
+VERBS = (
+    run,
+    evaluate,
+    compare,
+    replay,
+    report,
+    record,
+    metrics,
+    train,
+    fit_predictors,
+    bench,
+    scenarios,
+    doctor,
+)

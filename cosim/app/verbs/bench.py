@@ -29,7 +29,8 @@ def add(verbs: arguments.Verbs) -> None:
     predict.add_argument("--policy", action="append", default=[], metavar="NAME", help="repeatable")
     predict.add_argument("--seeds", type=seeds, required=True, metavar="A:B", help="test seeds, B left out")
     predict.add_argument("--recordings", metavar="DIR", help="use these (seeds outside A:B are left out)")
-    predict.add_argument("--workers", type=arguments.count, default=1, metavar="N", help="for recording (1)")
+    predict.add_argument("--no-maps", action="store_true", help="kinematics only (the maps take longer)")
+    predict.add_argument("--workers", type=arguments.count, default=1, metavar="N", help="processes (1)")
     predict.add_argument("--out", required=True, metavar="DIR")
     predict.set_defaults(work=work)
 
@@ -42,7 +43,7 @@ def work(args: argparse.Namespace) -> int:
 
     import sumo_scenarios
     from cosim.app import output
-    from cosim.app.bench_predict import bench_predict
+    from cosim.app.bench_predict import bench_maps, bench_predict
     from cosim.app.record import cases, record
     from cosim.errors import BadInput
     from cosim.recording import Folder
@@ -72,4 +73,7 @@ def work(args: argparse.Namespace) -> int:
         command="cosim " + shlex.join(sys.argv[1:]),
     )
     print((out / "prediction.md").read_text())
+    if not args.no_maps:
+        bench_maps(folder, out, scenarios=args.scenario, behaviors=args.behavior, workers=args.workers)
+        print((out / "map_error.md").read_text())
     return 0

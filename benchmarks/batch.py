@@ -7,8 +7,8 @@ with the defaults 200 episodes of about one second of processor time each, on me
 Each round drives the same episodes with one worker and with two, the order swapped from round to round, so
 that whatever else the machine does falls on both; with all of `cosim evaluate`: processes, rows, store.
 Overhead is all the time with one worker, from the first row to the last, that is not `total_s`, which an
-episode measures inside its process. `busy` is the share of time in which the workers had an episode: what is missing there
-is the engine's fault, the rest is the machine's.
+episode measures inside its process. `busy` is the share of time in which the workers had an episode: what is
+missing there is the engine's fault (start and end included), the rest is the machine's.
 """
 
 from __future__ import annotations

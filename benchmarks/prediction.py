@@ -15,6 +15,7 @@ import json
 import time
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -101,7 +102,7 @@ def errors(past: Floats, future: Floats, episode: Floats) -> dict[str, dict[str,
     units = ((past[:, :, 2], SPEED.unit), (past[:, :, 3], HEADING.unit))
     v, h = (np.array([fit_series(s, unit).mean for s in values]) for values, unit in units)
     keep("maximum likelihood, per series", v, h)
-    banks = [GaussianProcessBank(BankConfig(unit, *_kernels(PLAIN))) for _, unit in units]
+    banks = [GaussianProcessBank(replace(PLAIN, unit=unit)) for _, unit in units]
     for name, cold in (("bank, the most likely kernel", 1e-6), ("bank, averaged", 1.0)):
         v, h = (bank.forecast(s, None, cold).mean for bank, (s, _) in zip(banks, units, strict=True))
         keep(name, v, h)
@@ -115,10 +116,6 @@ def errors(past: Floats, future: Floats, episode: Floats) -> dict[str, dict[str,
         }
         rows[name]["mean"] = statistics.mean(np.nanmean(each, 1)).text(3)
     return rows
-
-
-def _kernels(config: BankConfig) -> tuple[tuple[float, ...], ...]:
-    return config.slope, config.amplitude, config.length, config.noise
 
 
 def sample(folder: Folder, moments: int) -> tuple[Floats, Floats, Floats]:

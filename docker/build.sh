@@ -12,8 +12,12 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 . docker/engine.sh
-choose_engine
 target=${1:-runtime}
+case $target in
+    runtime | test) ;;
+    *) sed -n '2,/^set/{s/^# \{0,1\}//p}' "$0"; exit 2 ;;
+esac
+choose_engine
 tag=$IMAGE
 [ "$target" = runtime ] || tag=$IMAGE-$target
 local_base=localhost/debian-base:bookworm

@@ -36,8 +36,7 @@ class _GaussianProcess:
         else:
             network = PriorNetwork(self.prior_config())
             file = weights or SHIPPED / f"{self.name}.safetensors"
-            if file.is_file():
-                load(file, {"prior": network}, {"prior": network.config})
+            load(file, {"prior": network}, {"prior": network.config})
         self.prior = KernelPrior.of(network)
         self._calibration = self.prior.calibrated(horizon, dt)
 

@@ -91,3 +91,20 @@ def test_what_is_wrong_is_said_before_anything_is_driven(
     assert main(["record", "--scenario", "exit", *flags.split(), "--out", str(tmp_path / "out")]) == 2
     assert word in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_bench_predict_records_what_it_needs_and_writes_its_tables(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flags = "--scenario merge --demand free --behavior mixed --policy idm --seeds 200000:200002 --no-maps"
+    out = tmp_path / "bench"
+    assert main(["bench", "predict", *flags.split(), "--out", str(out)]) == 0
+    assert "gp-indirect" in capsys.readouterr().out
+    rows = (out / "position_error.csv").read_text().splitlines()
+    assert len(rows) == 1 + 8 * 3 * 7, "predictors x (behaviour, scenario, all) x horizons and their mean"
+    assert (out / "interval_coverage.csv").is_file()
+    assert (out / "position_error.png").is_file()
+    assert len(Folder(out / "recordings").episodes()) == 2
+    again = ["bench", "predict", "--recordings", str(out / "recordings"), "--seeds", "7:9", "--out", str(out)]
+    assert main([*again, "--no-maps"]) == 2
+    assert "holds no recording of these" in capsys.readouterr().err

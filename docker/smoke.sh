@@ -90,7 +90,7 @@ expect 0 "rows, JUnit and reports are readable" --entrypoint python -- /scenario
 fits="yes"
 "${engine[@]}" run "${locked[@]}" "${run_args[@]}" --entrypoint with-caches "$IMAGE" sh -c \
     'cosim run merge --demand contested --policy vfn-p --duration 4 --json >/dev/null 2>&1
-     diff -rq /opt/cosim-caches/numba /tmp/cosim-caches/numba' >>"$log" 2>&1 ||
+     diff -rq /opt/cosim/caches/numba /tmp/cosim-caches/numba' >>"$log" 2>&1 ||
     fits="no: compiled anew in every container (another processor, or a kernel that warm.sh does not call)"
 echo "     the image's compiled kernels fit this processor: $fits" | tee -a "$log"
 

@@ -5,9 +5,9 @@
 # compiled for another processor is passed over there and compiled anew, once in a container's life.
 set -eu
 caches=/tmp/cosim-caches
-if [ -d /opt/cosim-caches ] && [ ! -d "$caches" ]; then
+if [ -d /opt/cosim/caches ] && [ ! -d "$caches" ]; then
     # Under another name first: a second process that starts meanwhile never sees half of it.
-    if ! cp -R /opt/cosim-caches "$caches.$$" 2>/dev/null; then
+    if ! cp -R /opt/cosim/caches "$caches.$$" 2>/dev/null; then
         echo "cosim: cannot write /tmp: run the container with --tmpfs /tmp" >&2
         exit 2
     fi

@@ -61,7 +61,7 @@ def _covariance(kernel: Floats, a: Floats, b: Floats) -> Floats:
 
 
 def _gram(kernel: Floats, past: Floats) -> Floats:
-    return _covariance(kernel, past, past) + (kernel[3] ** 2 + 1e-9) * np.eye(len(past))
+    return np.asarray(_covariance(kernel, past, past) + (kernel[3] ** 2 + 1e-9) * np.eye(len(past)))
 
 
 def _loss(log_kernel: Floats, past: Floats, y: Floats) -> tuple[float, Floats]:

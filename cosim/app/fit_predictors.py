@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from cosim.app.bench_predict import forecast
 from cosim.app.progress import Progress
@@ -20,14 +19,16 @@ from cosim.recording import Folder, windows
 from policy.checkpoint import save
 from policy.predictors import Predictor
 from policy.predictors.gp import GaussianProcessDirect, GaussianProcessIndirect
-from policy.predictors.learned import KinematicNet, Learned, NetConfig
+from policy.predictors.learned import Learned, NetConfig
 from policy.training.fitting import FitConfig, fit
+from policy.training.networks import use_threads
 from policy.training.predictors import (
     GaussianProcess,
     PriorFit,
     Windows,
     examples_for_net,
     factors_for,
+    fresh_net,
     in_own_frame,
     net_loss,
 )
@@ -63,7 +64,7 @@ def fit_predictors(
     `state`: a folder in which a killed fit finds what it needs to go on. Returns what was measured.
     Raises BadInput for recordings of other seeds: nothing is ever fitted on test seeds.
     """
-    torch.set_num_threads(1)
+    use_threads(1)
     data = {
         "training": _about(Folder(training), TRAINING_SEEDS),
         "validation": _about(Folder(validation), TUNING_SEEDS),
@@ -81,15 +82,13 @@ def fit_predictors(
         rate = LEARNING_RATE["net" if name in NETS else "prior"]
         config = FitConfig(steps=steps, learning_rate=rate)
         if name in NETS:
-            torch.manual_seed(config.seed)
-            network = KinematicNet(NETS[name])
+            network = fresh_net(NETS[name], config.seed)
             examples = examples_for_net(learned)
             fit(network, examples, lambda b, n=network: net_loss(n, b), config, state=kept, progress=progress)  # type: ignore[misc]
             predictor: Predictor = Learned(NETS[name], weights=network)
             parts: tuple[dict[str, Any], dict[str, Any]] = ({"network": network}, {"network": NETS[name]})
         else:
-            torch.manual_seed(config.seed)
-            prior = PriorFit(PRIORS[name], learned)
+            prior = PriorFit(PRIORS[name], learned, config.seed)
             fit(prior.network, prior.examples, prior.loss, config, state=kept, progress=progress)
             _calibrate(prior, checked)
             predictor = prior.fitted()
@@ -118,7 +117,7 @@ def _calibrate(prior: PriorFit, checked: Windows) -> None:
     factors = factors_for(
         tuple(predicted.std[q] for q in used), tuple(errors[q] for q in used), checked.weight
     )
-    prior.network.calibration.copy_(torch.from_numpy(factors))
+    prior.calibrate(factors)
 
 
 def _windows(folder: Folder) -> Windows:

@@ -15,6 +15,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import nn
 
+from policy.training.networks import adam_tensors, restore_adam
+
 SAVE_EVERY = 200  # steps: at most so many are lost when it is killed
 
 Batch = Mapping[str, torch.Tensor]
@@ -77,10 +79,7 @@ def _fingerprint(network: nn.Module, count: int, config: FitConfig) -> str:
 def _save(
     file: Path, network: nn.Module, optimizer: torch.optim.Optimizer, fingerprint: str, step: int
 ) -> None:
-    tensors = {f"network.{name}": value.contiguous() for name, value in network.state_dict().items()}
-    for name, parameter in network.named_parameters():
-        for part in ("exp_avg", "exp_avg_sq"):
-            tensors[f"adam.{part}.{name}"] = optimizer.state[parameter][part]
+    tensors = adam_tensors({"network": network}, optimizer)
     draft = file.with_suffix(".part")
     save_file(tensors, draft, metadata={"fingerprint": fingerprint, "step": str(step)})
     draft.replace(file)
@@ -98,12 +97,5 @@ def _resume(file: Path, network: nn.Module, optimizer: torch.optim.Optimizer, fi
             tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118
     except SafetensorError:
         return 0
-    step = int(about["step"])
-    network.load_state_dict({name: tensors[f"network.{name}"] for name in network.state_dict()})
-    for name, parameter in network.named_parameters():
-        optimizer.state[parameter] = {
-            "step": torch.tensor(float(step)),
-            "exp_avg": tensors[f"adam.exp_avg.{name}"],
-            "exp_avg_sq": tensors[f"adam.exp_avg_sq.{name}"],
-        }
-    return step
+    restore_adam(tensors, {"network": network}, optimizer)
+    return int(about["step"])

@@ -17,7 +17,8 @@ from cosim.types import Bools, Floats
 from policy.gaussian_process import GaussianProcessBank, Operators
 from policy.kernel_prior import PriorNetwork, describe, trailing_run
 from policy.predictors.gp import GaussianProcessDirect, GaussianProcessIndirect
-from policy.predictors.learned import KinematicNet, features, integrate
+from policy.predictors.learned import KinematicNet, NetConfig, features, integrate
+from policy.training.networks import seeded
 
 COVERED = 0.9  # what an interval shall cover
 NORMAL = 1.645  # half its width in standard deviations, if errors were normal
@@ -56,6 +57,11 @@ def examples_for_net(windows: Windows) -> dict[str, torch.Tensor]:
         "speed": _tensor(windows.past[:, -1, 2]),
         **_truth(windows),
     }
+
+
+def fresh_net(config: NetConfig, seed: int) -> KinematicNet:
+    """An untrained network, the same for equal seeds."""
+    return seeded(lambda: KinematicNet(config), seed)
 
 
 def net_loss(network: KinematicNet, batch: Mapping[str, torch.Tensor]) -> torch.Tensor:
@@ -106,8 +112,8 @@ class BankMath(nn.Module):
 class PriorFit:
     """The examples and the loss of one Gaussian-process predictor's prior."""
 
-    def __init__(self, kind: GaussianProcess, windows: Windows) -> None:
-        self.network = PriorNetwork(kind.prior_config())
+    def __init__(self, kind: GaussianProcess, windows: Windows, seed: int = 0) -> None:
+        self.network = seeded(lambda: PriorNetwork(kind.prior_config()), seed)
         self.predictor = kind(weights=self.network)
         frames = windows.past.shape[1]
         self._math = [BankMath(bank, frames) for bank in self.predictor.banks]
@@ -129,6 +135,10 @@ class PriorFit:
     def fitted(self) -> GaussianProcessIndirect | GaussianProcessDirect:
         """The predictor with the prior as it is now."""
         return type(self.predictor)(weights=self.network)
+
+    def calibrate(self, factors: Floats) -> None:
+        """Set the factors [spreads,M] on the standard deviations."""
+        self.network.calibration.copy_(torch.from_numpy(factors))
 
     def loss(self, batch: Mapping[str, torch.Tensor]) -> torch.Tensor:
         """Position error, and a little of how badly the intervals fit (pinball loss of their edge)."""

@@ -67,7 +67,7 @@ def compact(name: str) -> AgentConfig:
 def paper(name: str) -> AgentConfig:
     """The paper-size configuration: 64 x 512, one frame a step, M = 20, T's Table 1 read literally."""
     config = configure(name, PAPER, ChainConfig(every=1), HpnConfig(), TABLE_1)
-    return replace(config, hpn_weights=_shipped("hpn"))  # it knows vehicles, not pixels: one for all sizes
+    return replace(config, hpn_weights=shipped("hpn"))  # it knows vehicles, not pixels: one for all sizes
 
 
 def configure(

@@ -71,6 +71,11 @@ class VFN(nn.Module):
                 nn.init.zeros_(head.weight)
                 nn.init.zeros_(head.bias)
 
+    @property
+    def layout(self) -> torch.memory_format:
+        """The memory format in which its convolutions are fastest."""
+        return torch.channels_last if self.config.extractor == "conv2d" else torch.channels_last_3d
+
     def features(
         self, maps: torch.Tensor, kinematics: torch.Tensor, route: torch.Tensor, phi: torch.Tensor
     ) -> torch.Tensor:

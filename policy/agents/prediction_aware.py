@@ -72,7 +72,7 @@ class PredictionAware:
             if c.hpn_weights is not None:
                 load(c.hpn_weights, {"hpn": self.hpn}, {"hpn": c.hpn})
         self.label = c.note or _label(parts)
-        self.vfn.to(memory_format=torch.channels_last_3d)  # type: ignore[call-overload]
+        self.vfn.to(memory_format=self.vfn.layout)  # type: ignore[call-overload]
         if self.hpn is not None:
             self.hpn.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._road: RoadMap | None = None

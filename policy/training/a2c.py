@@ -44,7 +44,7 @@ class A2cLearner:
     def __init__(self, vfn: VfnConfig, config: A2cConfig, seed: int, device: str = "cpu") -> None:
         self.config, self.device = config, device
         self.online: VFN = seeded(lambda: VFN(vfn), seed)
-        self.online.to(device=device, memory_format=torch.channels_last_3d)  # type: ignore[call-overload]
+        self.online.to(device=device, memory_format=self.online.layout)  # type: ignore[call-overload]
         self.optimizer = torch.optim.Adam(self.online.parameters(), lr=config.learning_rate)
         self.updates = 0
 

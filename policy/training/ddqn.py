@@ -43,7 +43,7 @@ class Learner:
         self.target = VFN(vfn)
         self.target.load_state_dict(self.online.state_dict())
         for network in (self.online, self.target):
-            network.to(device=device, memory_format=torch.channels_last_3d)  # type: ignore[call-overload]
+            network.to(device=device, memory_format=network.layout)  # type: ignore[call-overload]
         self.optimizer = torch.optim.Adam(self.online.parameters(), lr=config.learning_rate)
         self.updates = 0
 

@@ -1,101 +1,93 @@
-"""Gradient descent on examples that fit into memory: seeded step by step, and resumable to the bit."""
+"""Fits a small network to examples that lie in memory, on the loop of every supervised training."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
+import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import nn
 
+from policy.training.loop import Line, LoopConfig, Progress, train
 from policy.training.networks import adam_tensors, restore_adam
 
-SAVE_EVERY = 200  # steps: at most so many are lost when it is killed
-
-Batch = Mapping[str, torch.Tensor]
+Batch = Mapping[str, torch.Tensor]  # name -> [S,...], S the same for all
 Loss = Callable[[Batch], torch.Tensor]
-Progress = Callable[[float, float], None]
+CHECKED = 8192  # validation examples a loss is taken on, about
 
 
 @dataclass(frozen=True, slots=True)
 class FitConfig:
     """One fit with Adam and a learning rate that falls along a cosine to 0."""
 
-    steps: int = 2000
+    steps: int = 6000
     batch: int = 1024
     learning_rate: float = 1e-2
     seed: int = 0
 
 
+class FitTask:
+    """`policy.training.loop.Task` of one network and one loss."""
+
+    def __init__(
+        self, network: nn.Module, loss: Loss, config: FitConfig, examples: Batch, validation: Batch
+    ) -> None:
+        self._network, self._loss, self._config = network, loss, config
+        self._examples = examples
+        stride = max(len(next(iter(validation.values()))) // CHECKED, 1)
+        self._validation = {name: tensor[::stride] for name, tensor in validation.items()}
+        self._count = len(next(iter(examples.values())))
+        self._optimizer = torch.optim.Adam(network.parameters(), config.learning_rate)
+
+    def update(self, number: int) -> Line:
+        """See `Task.update`."""
+        c = self._config
+        rng = np.random.default_rng((c.seed, number))  # of this step alone: going on changes nothing
+        rows = torch.from_numpy(rng.integers(0, self._count, c.batch))
+        value = self._loss({name: tensor[rows] for name, tensor in self._examples.items()})
+        self._optimizer.zero_grad(set_to_none=True)
+        value.backward()  # type: ignore[no-untyped-call]
+        for group in self._optimizer.param_groups:
+            group["lr"] = 0.5 * c.learning_rate * (1.0 + math.cos(math.pi * number / c.steps))
+        self._optimizer.step()
+        return {"loss": float(value.detach())}
+
+    def validate(self) -> Line:
+        """See `Task.validate`."""
+        with torch.no_grad():
+            return {"loss": float(self._loss(self._validation))}
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """See `Task.tensors`."""
+        return adam_tensors({"network": self._network}, self._optimizer)
+
+    def restore(self, tensors: Mapping[str, torch.Tensor]) -> None:
+        """See `Task.restore`."""
+        restore_adam(tensors, {"network": self._network}, self._optimizer)
+
+
 def fit(
     network: nn.Module,
-    examples: Batch,
     loss: Loss,
     config: FitConfig,
+    examples: Batch,
+    validation: Batch,
     *,
-    state: Path | None = None,
+    folder: Path | None = None,
     progress: Progress | None = None,
-) -> float:
-    """Fit `network` in place; `loss` takes a batch of `examples` (tensors with a common first length).
+) -> list[Line]:
+    """Fit `network` in place; returns the log of losses. A fit that left a state in `folder` goes on.
 
-    `state`: where to keep what a later call with the same configuration, network and data needs to go on.
-    Returns the mean loss of the last 100 steps.
+    Raises BadInput when `folder` holds another fit.
     """
-    count = len(next(iter(examples.values())))
-    optimizer = torch.optim.Adam(network.parameters(), config.learning_rate)
-    fingerprint = _fingerprint(network, count, config)
-    first = 0 if state is None else _resume(state, network, optimizer, fingerprint)
-    recent = [math.nan]
-    for step in range(first, config.steps):
-        rate = 0.5 * config.learning_rate * (1.0 + math.cos(math.pi * step / config.steps))
-        for group in optimizer.param_groups:
-            group["lr"] = rate
-        rng = np.random.default_rng((config.seed, step))  # of this step alone: resuming changes nothing
-        rows = torch.from_numpy(rng.integers(0, count, config.batch))
-        value = loss({name: tensor[rows] for name, tensor in examples.items()})
-        optimizer.zero_grad()
-        value.backward()  # type: ignore[no-untyped-call]
-        optimizer.step()
-        recent = [*recent[-99:], float(value.detach())]
-        if progress is not None:
-            progress(step + 1, config.steps)
-        if state is not None and ((step + 1) % SAVE_EVERY == 0 or step + 1 == config.steps):
-            _save(state, network, optimizer, fingerprint, step + 1)
-    return float(np.nanmean(recent)) if len(recent) > 1 else math.nan
-
-
-def _fingerprint(network: nn.Module, count: int, config: FitConfig) -> str:
+    task = FitTask(network, loss, config, examples, validation)
     shapes = {name: list(value.shape) for name, value in network.state_dict().items()}
-    return hashlib.sha256(json.dumps([asdict(config), count, shapes]).encode()).hexdigest()
-
-
-def _save(
-    file: Path, network: nn.Module, optimizer: torch.optim.Optimizer, fingerprint: str, step: int
-) -> None:
-    tensors = adam_tensors({"network": network}, optimizer)
-    draft = file.with_suffix(".part")
-    save_file(tensors, draft, metadata={"fingerprint": fingerprint, "step": str(step)})
-    draft.replace(file)
-
-
-def _resume(file: Path, network: nn.Module, optimizer: torch.optim.Optimizer, fingerprint: str) -> int:
-    """Steps already done; 0 when there is nothing that fits."""
-    if not file.is_file():
-        return 0
-    try:
-        with safe_open(file, framework="pt", device="cpu") as stored:
-            about = stored.metadata() or {}
-            if about.get("fingerprint") != fingerprint:
-                return 0
-            tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118
-    except SafetensorError:
-        return 0
-    restore_adam(tensors, {"network": network}, optimizer)
-    return int(about["step"])
+    layout = {"config": asdict(config), "shapes": shapes, "examples": len(next(iter(examples.values())))}
+    times = LoopConfig(updates=config.steps)
+    with tempfile.TemporaryDirectory(prefix="cosim-fit-") as scratch:
+        where = folder or Path(scratch)
+        return train(task, times, where, layout=layout, resume=True, progress=progress)

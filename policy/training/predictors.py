@@ -110,27 +110,29 @@ class BankMath(nn.Module):
 
 
 class PriorFit:
-    """The examples and the loss of one Gaussian-process predictor's prior."""
+    """One Gaussian-process predictor's prior: its examples, its loss, its calibration."""
 
-    def __init__(self, kind: GaussianProcess, windows: Windows, seed: int = 0) -> None:
+    def __init__(self, kind: GaussianProcess, seed: int = 0, frames: int = 10) -> None:
         self.network = seeded(lambda: PriorNetwork(kind.prior_config()), seed)
         self.predictor = kind(weights=self.network)
-        frames = windows.past.shape[1]
         self._math = [BankMath(bank, frames) for bank in self.predictor.banks]
-        run = np.full(len(windows.past), frames)
-        self.examples = {
+
+    def examples(self, windows: Windows) -> dict[str, torch.Tensor]:
+        """What `loss` needs of each window."""
+        run = np.full(len(windows.past), windows.past.shape[1])
+        found = {
             "motion": _tensor(describe(windows.past, run, self.predictor.dt)),
             "speed": _tensor(windows.past[:, -1, 2]),
             **_truth(windows),
         }
-        for b, (bank, series) in enumerate(
-            zip(self.predictor.banks, self.predictor.series(windows.past), strict=True)
-        ):
+        both = self.predictor.series(windows.past)
+        for b, (bank, series) in enumerate(zip(self.predictor.banks, both, strict=True)):
             past = (series - series[:, -1:]) / bank.config.unit
             parts = [bank.evidence(part) for part in np.array_split(past, max(len(past) // 20_000, 1))]
             evidence = np.concatenate(parts)
-            self.examples[f"past{b}"] = _tensor(past)
-            self.examples[f"evidence{b}"] = _tensor(evidence - evidence.max(1, keepdims=True))
+            found[f"past{b}"] = _tensor(past)
+            found[f"evidence{b}"] = _tensor(evidence - evidence.max(1, keepdims=True))
+        return found
 
     def fitted(self) -> GaussianProcessIndirect | GaussianProcessDirect:
         """The predictor with the prior as it is now."""

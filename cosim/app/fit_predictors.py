@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -47,8 +48,9 @@ PRIORS: dict[str, GaussianProcess] = {
     "gp-indirect": GaussianProcessIndirect,
 }
 FITTED = (*NETS, *PRIORS)
-STEPS = 1500  # of 1024 windows each, for every predictor alike
-LEARNING_RATE = {"net": 2e-3, "prior": 1e-2}
+STEPS = 6000  # of 1024 windows each, for every predictor alike
+# the predictor, its networks and their configurations by name, how it was fitted
+Fitted = tuple[Predictor, tuple[dict[str, Any], dict[str, Any]], FitConfig]
 
 
 def fit_predictors(
@@ -61,7 +63,7 @@ def fit_predictors(
 ) -> dict[str, dict[str, float]]:
     """Fit `names` on the training seeds, calibrate and measure on the tuning seeds, write into `out`.
 
-    `state`: a folder in which a killed fit finds what it needs to go on. Returns what was measured.
+    `state`: where every fit keeps its log and what it needs to go on after a kill. Returns what was measured.
     Raises BadInput for recordings of other seeds: nothing is ever fitted on test seeds.
     """
     use_threads(1)
@@ -72,31 +74,40 @@ def fit_predictors(
     learned = _windows(Folder(training))
     checked = _windows(Folder(validation))
     out.mkdir(parents=True, exist_ok=True)
-    if state is not None:
-        state.mkdir(parents=True, exist_ok=True)
     measured = {}
     for name in names:
-        progress = Progress(f"fit {name}", "steps")
-        kept = None if state is None else state / f"{name}.safetensors"
-        file = out / f"{name}.safetensors"
-        rate = LEARNING_RATE["net" if name in NETS else "prior"]
-        config = FitConfig(steps=steps, learning_rate=rate)
-        if name in NETS:
-            network = fresh_net(NETS[name], config.seed)
-            examples = examples_for_net(learned)
-            fit(network, examples, lambda b, n=network: net_loss(n, b), config, state=kept, progress=progress)  # type: ignore[misc]
-            predictor: Predictor = Learned(NETS[name], weights=network)
-            parts: tuple[dict[str, Any], dict[str, Any]] = ({"network": network}, {"network": NETS[name]})
-        else:
-            prior = PriorFit(PRIORS[name], learned, config.seed)
-            fit(prior.network, prior.examples, prior.loss, config, state=kept, progress=progress)
-            _calibrate(prior, checked)
-            predictor = prior.fitted()
-            parts = ({"prior": prior.network}, {"prior": prior.network.config})
-        progress.done()
+        kept = None if state is None else state / name
+        predictor, parts, config = (_fit_net if name in NETS else _fit_prior)(
+            name, learned, checked, steps, kept, Progress(f"fit {name}", "steps")
+        )
         measured[name] = score(predictor, Folder(validation))
-        save(file, *parts, measured=measured[name], data={**data, "fit": asdict(config)})
+        about = {**data, "fit": asdict(config)}
+        save(out / f"{name}.safetensors", *parts, measured=measured[name], data=about)
     return measured
+
+
+def _fit_net(
+    name: str, learned: Windows, checked: Windows, steps: int, kept: Path | None, progress: Progress
+) -> Fitted:
+    config = FitConfig(steps=steps, learning_rate=2e-3)
+    network = fresh_net(NETS[name], config.seed)
+    examples, checks = examples_for_net(learned), examples_for_net(checked)
+    fit(network, partial(net_loss, network), config, examples, checks, folder=kept, progress=progress)
+    progress.done()
+    predictor = Learned(NETS[name], weights=network)
+    return predictor, ({"network": network}, {"network": NETS[name]}), config
+
+
+def _fit_prior(
+    name: str, learned: Windows, checked: Windows, steps: int, kept: Path | None, progress: Progress
+) -> Fitted:
+    config = FitConfig(steps=steps, learning_rate=1e-2)
+    prior = PriorFit(PRIORS[name], config.seed)
+    examples, checks = prior.examples(learned), prior.examples(checked)
+    fit(prior.network, prior.loss, config, examples, checks, folder=kept, progress=progress)
+    progress.done()
+    _calibrate(prior, checked)
+    return prior.fitted(), ({"prior": prior.network}, {"prior": prior.network.config}), config
 
 
 def score(predictor: Predictor, folder: Folder) -> dict[str, float]:

@@ -122,7 +122,7 @@ def write(path: Path, tape: Tape, case: Mapping[str, Any]) -> None:
             hidden = values < 0
         elif field.name == "target_speed":
             hidden = np.isnan(values)
-        arrays.append(pa.array(values.astype(field.type.to_pandas_dtype()), field.type, mask=hidden))
+        arrays.append(pa.array(values.astype(str(field.type)), field.type, mask=hidden))
     events = {str(k): asdict(s.events) for k, s in enumerate(tape.frames) if any(asdict(s.events).values())}
     about = {
         "format": FORMAT,

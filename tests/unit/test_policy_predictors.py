@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +18,12 @@ from policy.predictors import PREDICTORS, make_predictor
 from policy.predictors.gp import GaussianProcessIndirect
 from policy.predictors.learned import KinematicNet, Learned, NetConfig
 from policy.training.fitting import FitConfig, fit
+from policy.training.loop import LoopConfig
 from policy.training.predictors import (
     PriorFit,
     examples_for_net,
     factors_for,
+    fresh_net,
     in_own_frame,
     net_loss,
 )
@@ -191,14 +195,16 @@ def episodes(seed: int, count: int = 600) -> tuple[np.ndarray, np.ndarray]:
 def test_fitting_the_prior_lowers_the_error_and_calibration_gives_the_coverage_promised() -> None:
     past, future = episodes(0)
     windows = in_own_frame(past, future, np.ones(len(past)))
-    prior = PriorFit(GaussianProcessIndirect, windows)
+    prior = PriorFit(GaussianProcessIndirect)
+    examples = prior.examples(windows)
 
     def error(predictor: GaussianProcessIndirect) -> float:
         f = predictor.predict(past, np.ones(past.shape[:2], bool))
         return float(np.hypot(f.x - future[:, :, 0], f.y - future[:, :, 1]).mean())
 
     before = error(prior.fitted())
-    fit(prior.network, prior.examples, prior.loss, FitConfig(steps=60, batch=256))
+    log = fit(prior.network, prior.loss, FitConfig(steps=60, batch=256), examples, examples)
+    assert log[-1]["validation_loss"] < before
     assert error(prior.fitted()) < 0.6 * before
     fresh_past, fresh_future = episodes(1, 2000)
     f = prior.fitted().predict(fresh_past, np.ones(fresh_past.shape[:2], bool))
@@ -208,40 +214,32 @@ def test_fitting_the_prior_lowers_the_error_and_calibration_gives_the_coverage_p
 
 
 @pytest.mark.parametrize("kind", ["lstm", "ae"])
-def test_a_killed_fit_goes_on_to_the_same_weights(kind: str, tmp_path: Path) -> None:
+def test_a_killed_fit_goes_on_to_the_same_weights(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     past, future = episodes(2, 200)
     examples = examples_for_net(in_own_frame(past, future, np.ones(len(past))))
     config = FitConfig(steps=30, batch=32, learning_rate=2e-3)
 
-    def fresh() -> KinematicNet:
-        torch.manual_seed(0)
-        return KinematicNet(NetConfig(kind, "indirect"))  # type: ignore[arg-type]
+    def fresh() -> tuple[KinematicNet, Callable[..., list[dict[str, float]]]]:
+        network = fresh_net(NetConfig(kind, "indirect"), 0)  # type: ignore[arg-type]
+        return network, partial(fit, network, partial(net_loss, network), config, examples, examples)
 
-    whole, broken = fresh(), fresh()
-    last = fit(whole, examples, lambda b: net_loss(whole, b), config)
-    assert last < float(net_loss(fresh(), examples).detach())
-    monkey = pytest.MonkeyPatch()
-    monkey.setattr("policy.training.fitting.SAVE_EVERY", 10)
+    whole, fit_whole = fresh()
+    untrained = float(net_loss(whole, examples).detach())
+    assert fit_whole()[-1]["validation_loss"] < untrained
+    monkeypatch.setattr("policy.training.fitting.LoopConfig", partial(LoopConfig, save_every=0.0))
 
     def killed(done: float, _: float) -> None:
         if done == 15:
             raise KeyboardInterrupt
 
-    state = tmp_path / "state.safetensors"
     with pytest.raises(KeyboardInterrupt):
-        fit(broken, examples, lambda b: net_loss(broken, b), config, state=state, progress=killed)
-    again = fresh()
+        fresh()[1](folder=tmp_path, progress=killed)
+    again, fit_again = fresh()
     steps: list[float] = []
-    fit(
-        again,
-        examples,
-        lambda b: net_loss(again, b),
-        config,
-        state=state,
-        progress=lambda d, _: steps.append(d),
-    )
-    monkey.undo()
-    assert steps[0] == 11
+    fit_again(folder=tmp_path, progress=lambda done, _: steps.append(done))
+    assert steps[0] == 16
     for name, value in whole.state_dict().items():
         torch.testing.assert_close(again.state_dict()[name], value, rtol=0.0, atol=0.0)
 

@@ -18,9 +18,9 @@ def add(verbs: arguments.Verbs) -> None:
     verb.add_argument("--training", required=True, metavar="DIR", help="recordings, seeds below 100000")
     verb.add_argument("--validation", required=True, metavar="DIR", help="recordings, seeds 100000..199999")
     verb.add_argument("--only", action="append", default=[], metavar="NAME", help="repeatable (default all)")
-    verb.add_argument("--steps", type=arguments.count, metavar="N", help="gradient steps (1500)")
+    verb.add_argument("--steps", type=arguments.count, metavar="N", help="gradient steps (6000)")
     verb.add_argument("--out", required=True, metavar="DIR", help="for the weights and their cards")
-    verb.add_argument("--state", metavar="DIR", help="keep here what a killed fit needs to go on")
+    verb.add_argument("--state", metavar="DIR", help="logs, and what a killed fit needs to go on")
     verb.set_defaults(work=work)
 
 

@@ -1,23 +1,25 @@
 """One decision without the agent against bare libsumo, and against HighwayEnv, side by side in one run.
 
-    python -m benchmarks.loop [--scenario merge] [--demand dense] [--decisions 200] [--rounds 5] [--profile]
+    python -m benchmarks.loop [--scenario merge] [--demand dense] [--decisions 75] [--rounds 5] [--profile]
 
-Each round runs the same episode (same seed, same traffic: AVs driven by SUMO's IDM) twice, in fresh
-processes one after the other: bare, four `libsumo.simulationStep()` per decision and nothing else but giving
-newcomers their driver; and ours, the same steps plus two frames of VelocityMap and kinematics for every AV,
-with full history. Figures are medians over decisions; only the ratios mean anything elsewhere.
+Each round drives the same episode (same seed, same traffic: AVs driven by SUMO's IDM) in three processes that
+take turns, five decisions each, so that whatever else the machine does meets all of them alike: bare, four
+`libsumo.simulationStep()` per decision and nothing else but giving newcomers their driver; and ours, the same
+steps plus two frames of VelocityMap and kinematics for every AV with full history, at compact and at paper
+size. Figures are medians over decisions; only the ratios mean anything elsewhere.
 """
 
 from __future__ import annotations
 
 import argparse
+import cProfile
+import io
 import json
+import pstats
 import statistics
 import time
 from dataclasses import replace
 from typing import Any
-
-import numpy as np
 
 from cosim.scenario import Fleet, Scenario, load
 from cosim.types import COMPACT, PAPER, ObservationConfig
@@ -26,6 +28,7 @@ from cosim.worker import Worker
 TARGET = {"compact": 3.0, "paper": 6.0}  # times bare libsumo
 HIGHWAY_TARGET = 20.0  # times HighwayEnv's simulated seconds per second
 VEHICLES, AVS = 50, 8
+TURN = 5  # decisions before the next process has its turn
 
 
 class Bare:
@@ -40,9 +43,13 @@ class Bare:
         self._simulator = SumoSimulator(scenario)
         self._steps = round(scenario.timing.decision / scenario.timing.step)
 
-    def run(self, seed: int, decisions: int) -> list[float]:
-        """Seconds per decision."""
+    def start(self, seed: int) -> None:
+        """Begin an episode."""
+        self._seed = seed
         self._simulator.reset(seed)
+
+    def go(self, decisions: int) -> dict[str, list[float]]:
+        """Drive on; seconds per decision."""
         step, departed = self._sumo.simulationStep, self._sumo.simulation.getDepartedIDList
         times = []
         for _ in range(decisions):
@@ -50,9 +57,9 @@ class Bare:
             for _ in range(self._steps):
                 step()
                 for name in departed():
-                    self._simulator._bodies[name] = self._simulator._fleet.welcome(name, seed)
+                    self._simulator._bodies[name] = self._simulator._fleet.welcome(name, self._seed)
             times.append(time.perf_counter() - began)
-        return times
+        return {"total": times}
 
     def close(self) -> None:
         """End SUMO."""
@@ -69,22 +76,19 @@ class Ours:
         self._simulator = SumoSimulator(scenario)
         self._observer = Observer(self._simulator.road, observation)
 
-    def run(self, seed: int, decisions: int, profile: bool = False) -> dict[str, Any]:
-        """Seconds per decision, and how many vehicles and AVs there were."""
+    def start(self, seed: int) -> None:
+        """Begin an episode; everything is compiled before the clock starts."""
         simulator, observer = self._simulator, self._observer
-        observer.reset()
-        for frame in simulator.reset(seed):
-            observer.add(frame)
-        observer.histories(simulator.route, simulator.commanded)  # compiled before the clock starts
-        simulator.reset(seed)
-        observer.reset()
-        total, observing, vehicles, avs = [], [], [], []
-        profiler = None
-        if profile:
-            import cProfile
+        for _ in range(2):
+            observer.reset()
+            for frame in simulator.reset(seed):
+                observer.add(frame)
+            observer.histories(simulator.route, simulator.commanded)
 
-            profiler = cProfile.Profile()
-            profiler.enable()
+    def go(self, decisions: int) -> dict[str, list[float]]:
+        """Drive on; seconds per decision and the part spent observing; vehicles and AVs there were."""
+        simulator, observer = self._simulator, self._observer
+        seen: dict[str, list[float]] = {"total": [], "observing": [], "vehicles": [], "avs": []}
         for _ in range(decisions):
             began = time.perf_counter()
             _, frames = simulator.advance(())
@@ -93,20 +97,20 @@ class Ours:
                 observer.add(frame)
             histories = observer.histories(simulator.route, simulator.commanded)
             end = time.perf_counter()
-            total.append(end - began)
-            observing.append(end - middle)
-            vehicles.append(frames[-1].n)
-            avs.append(len(histories))
-        text = ""
-        if profiler is not None:
-            import io
-            import pstats
+            seen["total"].append(end - began)
+            seen["observing"].append(end - middle)
+            seen["vehicles"].append(frames[-1].n)
+            seen["avs"].append(len(histories))
+        return seen
 
-            profiler.disable()
-            stream = io.StringIO()
-            pstats.Stats(profiler, stream=stream).sort_stats("tottime").print_stats(18)
-            text = stream.getvalue()
-        return {"total": total, "observing": observing, "n": vehicles, "avs": avs, "profile": text}
+    def profile(self, seed: int, decisions: int) -> str:
+        """The same under cProfile, as its table."""
+        self.start(seed)
+        stream = io.StringIO()
+        with cProfile.Profile() as profiler:
+            self.go(decisions)
+        pstats.Stats(profiler, stream=stream).sort_stats("tottime").print_stats(18)
+        return stream.getvalue()
 
     def reset_times(self, seeds: range) -> list[float]:
         """Seconds of `libsumo.load` + the first snapshot (no warm-up: that is simulated time)."""
@@ -116,6 +120,17 @@ class Ours:
             frames = self._simulator.reset(seed)
             self._observer.reset()
             self._observer.add(frames[-1])
+            times.append(time.perf_counter() - began)
+        return times
+
+    def load_times(self, n: int) -> list[float]:
+        """Seconds of bare `libsumo.load` with the same options: what no reset can undercut."""
+        import libsumo
+
+        arguments, times = self._simulator._arguments(100_000), []
+        for _ in range(n):
+            began = time.perf_counter()
+            libsumo.load(arguments)
             times.append(time.perf_counter() - began)
         return times
 
@@ -184,32 +199,41 @@ def main() -> None:
 
     scenario = load(args.scenario, demand=[args.demand], fleet=Fleet(penetration=args.penetration))
     result: dict[str, Any] = {"scenario": args.scenario, "demand": args.demand, "rounds": args.rounds}
-    bare, ours = [], {"compact": [], "paper": []}
-    share, counts = {"compact": [], "paper": []}, []
-    for k in range(args.rounds):
-        seed = 100_000 + k
-        with Worker(Bare, scenario) as worker:
-            worker.call("run", seed, args.decisions)
-            bare.append(statistics.median(worker.call("run", seed, args.decisions)))
-        for name, config in (("compact", COMPACT), ("paper", PAPER)):
-            with Worker(Ours, scenario, config) as worker:
-                run = worker.call("run", seed, args.decisions)
-                ours[name].append(statistics.median(run["total"]))
-                share[name].append(statistics.median(run["observing"]))
-                counts.append((float(np.mean(run["n"])), float(np.mean(run["avs"]))))
-                if args.profile and k == 0:
-                    print(worker.call("run", seed, args.decisions, profile=True)["profile"])
-    vehicles, avs = np.mean(counts, axis=0)
-    result |= {"vehicles": round(float(vehicles), 1), "avs": round(float(avs), 1)}
-    result["bare_us"] = round(1e6 * statistics.median(bare), 1)
-    for name in ours:
-        ratios = [o / b for o, b in zip(ours[name], bare, strict=True)]
-        result[name] = {
-            "decision_us": round(1e6 * statistics.median(ours[name]), 1),
-            "observation_us": round(1e6 * statistics.median(share[name]), 1),
+    rounds: list[dict[str, dict[str, float]]] = []  # [round][who][figure], medians over decisions
+    with (
+        Worker(Bare, scenario) as plain,
+        Worker(Ours, scenario, COMPACT) as compact,
+        Worker(Ours, scenario, PAPER) as paper,
+    ):
+        workers = {"bare": plain, "compact": compact, "paper": paper}
+        for k in range(args.rounds + 1):
+            seen: dict[str, dict[str, list[float]]] = {who: {} for who in workers}
+            for worker in workers.values():
+                worker.call("start", 100_000 + k)
+            for _ in range(0, args.decisions, TURN):
+                for who, worker in workers.items():
+                    for figure, values in worker.call("go", TURN).items():
+                        seen[who].setdefault(figure, []).extend(values)
+            if k:  # the first round warms up
+                rounds.append({w: {f: statistics.median(v) for f, v in s.items()} for w, s in seen.items()})
+        if args.profile:
+            for who in TARGET:
+                print(workers[who].call("profile", 100_000, args.decisions))
+
+    def typical(who: str, figure: str) -> float:
+        return statistics.median(r[who][figure] for r in rounds)
+
+    result["vehicles"] = typical("compact", "vehicles")
+    result["avs"] = typical("compact", "avs")
+    result["bare_us"] = round(1e6 * typical("bare", "total"), 1)
+    for who in TARGET:
+        ratios = [r[who]["total"] / r["bare"]["total"] for r in rounds]
+        result[who] = {
+            "decision_us": round(1e6 * typical(who, "total"), 1),
+            "observation_us": round(1e6 * typical(who, "observing"), 1),
             "ratio": round(statistics.median(ratios), 2),
             "ratio_range": [round(min(ratios), 2), round(max(ratios), 2)],
-            "target": TARGET[name],
+            "target": TARGET[who],
         }
     short = replace(scenario, warmup=0.0)
     with Worker(Ours, short, COMPACT) as worker:
@@ -219,6 +243,7 @@ def main() -> None:
         result["reset_ms"] = round(1e3 * statistics.median(times), 2)
         result["memory_growth_mib"] = round(worker.call("memory") - before, 1)
         result["resets"] = args.resets
+        result["bare_load_ms"] = round(1e3 * statistics.median(worker.call("load_times", args.resets)), 2)
     with Worker(Highway) as worker:
         simulated, seconds = worker.call("run", 60)
     theirs = simulated / seconds

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from cosim.errors import CosimError, SimulationCrashed, SimulationTimeout
+from cosim.memory import keep_freed_memory
 
 STDERR_KEPT = 4000  # characters of a dead process's stderr that its error carries
 
@@ -191,6 +192,7 @@ def _script_left_out(*needed: object) -> Iterator[None]:
 def _serve(pipe: Connection, factory: Callable[..., Any], arguments: tuple[Any, ...], stderr: str) -> None:
     """The worker's whole life. Ends when the pipe breaks, so it never outlives its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
+    keep_freed_memory()
     file = os.open(stderr, os.O_RDWR | os.O_APPEND)  # as `cosim.simulation.stderr` wants it, to read back
     os.dup2(file, 2)
     os.close(file)

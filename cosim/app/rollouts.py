@@ -89,7 +89,7 @@ def drive_episode(episode: Episode, agent: Explorer, drive: Drive, reward: Rewar
         )
     )
     label = f"{drive.lesson.scenario}/{drive.lesson.demand}/{drive.seed}"
-    agent.episode(label, drive.epsilon, generator(drive.seed, "explore"))
+    agent.episode(label, drive.epsilon, generator(drive.seed, "explore"), drive.guided)
     earned: list[float] = []
     while True:
         decisions = agent.decide(histories)  # the last state is decided upon too: its mask is needed

@@ -16,6 +16,7 @@ from cosim.app.progress import Progress
 from cosim.app.rollouts import Rollouts
 from cosim.dataclass_input import dataclass_from
 from cosim.errors import BadInput
+from cosim.memory import keep_freed_memory
 from cosim.scenario import load
 from cosim.yaml_input import document
 from policy.agents.approaches import APPROACHES
@@ -45,6 +46,7 @@ def train(args: argparse.Namespace) -> int:
     shutil.copyfile(path, folder / "config.yaml")
     about = {"policy": name, "scenarios": sorted({lesson.scenario for lesson in training.lessons})}
     explore = replace(file.explore, sample=learning == "a2c")
+    keep_freed_memory()
     use_threads(args.threads)  # more threads than cores stall each other (docs/training.md)
     writer = tensorboard(folder)
     progress = Progress(f"train {name}", "iterations")

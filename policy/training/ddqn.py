@@ -24,6 +24,8 @@ class DdqnConfig:
     r_unsafe: float = -5.0  # value of an action that the prioritizer refused: a crash's (Alg. 4, line 13)
     scale: float = 0.1  # of all rewards: action values of the order of 1
     clip: float = 10.0  # largest gradient norm
+    imitation: float = 0.5  # weight of the mentor's lessons: his action is worth more than any other,
+    margin: float = 0.05  # by this much (large-margin loss of deep Q-learning from demonstrations)
 
 
 class Losses(NamedTuple):
@@ -31,6 +33,7 @@ class Losses(NamedTuple):
 
     td: float  # Huber loss of the n-step error
     unsafe: float  # of the refused actions
+    imitation: float  # of the mentor's actions
     q: float  # mean value of the actions carried out
 
 
@@ -67,14 +70,19 @@ class Learner:
             value = q[refused].gather(1, vetoed[refused][:, None])[:, 0]
             worth = torch.full_like(value, c.r_unsafe * c.scale)
             unsafe = functional.smooth_l1_loss(value, worth, reduction="sum") / len(q)
+        imitation = torch.zeros((), device=device)
+        guided = torch.from_numpy(batch.guided).to(device)
+        if c.imitation > 0.0 and bool(guided.any()):
+            lead = torch.full_like(q, c.margin).scatter(1, action[:, None], 0.0)
+            imitation = ((q + lead).amax(1) - chosen)[guided].sum() * (c.imitation / len(q))
         self.optimizer.zero_grad(set_to_none=True)
-        (td + unsafe).backward()  # type: ignore[no-untyped-call]
+        (td + unsafe + imitation).backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(self.online.parameters(), c.clip)
         self.optimizer.step()
         self.updates += 1
         if self.updates % c.target_every == 0:
             self.target.load_state_dict(self.online.state_dict())
-        return Losses(float(td.detach()), float(unsafe.detach()), float(chosen.detach().mean()))
+        return Losses(*(float(x.detach()) for x in (td, unsafe, imitation, chosen.mean())))
 
     # ---- to go on exactly ----
 

@@ -38,6 +38,7 @@ class Trajectory:
     terms: Floats32  # [D,3] reward terms: ego, AVs, HVs (equation 6)
     interacting: Bools  # [D] near a mission vehicle, or vetoed: what a rebalanced replay wants more of
     phi: float  # rad, the SVO it acted with
+    guided: bool  # driven by the mentor
     ending: Ending
 
     def __len__(self) -> int:

@@ -14,6 +14,7 @@ from policy.agents.approaches import AgentConfig
 from policy.agents.prediction_aware import Inputs, PredictionAware
 from policy.tensors import to_numpy
 from policy.training.experience import Ending, Trajectory
+from policy.training.mentor import Mentor
 from policy.vfn import VFN
 
 IS_MISSION = 7  # column of the kinematic matrix
@@ -56,10 +57,12 @@ class Explorer(PredictionAware):
         self.explore = explore
         self.frozen = VFN(config.vfn).eval()
         self.frozen.load_state_dict(self.vfn.state_dict())
+        self._mentor = Mentor()
 
-    def episode(self, label: str, epsilon: float, rng: np.random.Generator) -> None:
-        """A new episode, with this much exploration (0 to 1)."""
-        self._label, self._epsilon, self._rng = label, epsilon, rng
+    def episode(self, label: str, epsilon: float, rng: np.random.Generator, guided: bool = False) -> None:
+        """A new episode, with this much exploration (0 to 1), or `guided`: the mentor drives every AV."""
+        self._label, self._epsilon, self._rng, self._guided = label, epsilon, rng, guided
+        self._mentor.reset(self._context)
         self.learning: dict[str, _Tape] = {}
         self._chosen = False
         self._whim: dict[str, int] = {}  # random action an AV is keeping up
@@ -72,7 +75,11 @@ class Explorer(PredictionAware):
         inputs = self.perceive(histories)
         if not self._chosen:
             self._choose_learners(inputs)
-        decisions = self.choose(self._explored(self.values(inputs), inputs), inputs)
+        if self._guided:
+            q = self._mentor.preferences(dict(zip(inputs.scene.agents, inputs.scene.histories, strict=True)))
+        else:
+            q = self._explored(self.values(inputs), inputs)
+        decisions = self.choose(q, inputs)
         for b, av in enumerate(inputs.scene.agents):
             if av in self.learning:
                 self._record(self.learning[av], b, inputs, decisions[av])
@@ -194,6 +201,7 @@ class Explorer(PredictionAware):
                 terms=np.array(tape.terms, np.float32),
                 interacting=np.array(tape.interacting[:count], np.bool_),
                 phi=self._context.svo,
+                guided=self._guided,
                 ending=ending,
             )
         )

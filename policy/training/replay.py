@@ -35,7 +35,7 @@ class Batch(NamedTuple):
     discount: Floats32  # [B] gamma^k of the state `later`; 0 when the AV crashed before it
     allowed: Bools  # [B,A] actions that were safe in `later` (all, where none was)
     vetoed: Ints  # [B] the action the prioritizer refused in `now`, or -1
-    cos_sin: Floats32  # [B,2]
+    guided: Bools  # [B] the mentor's action, for the SVO that he drove with
 
 
 class Replay:
@@ -68,10 +68,11 @@ class Replay:
         picks = np.concatenate([_draw(near, wanted, rng), _draw(far, c.batch - wanted, rng)])
         phi = np.array([self.trajectories[k].phi for k, _ in picks], np.float32)
         fresh = np.radians(rng.uniform(*c.phi, len(picks))).astype(np.float32)
-        phi = np.where(rng.random(len(picks)) < c.relabel, fresh, phi)
-        return self._batch(picks, phi, device)
+        relabelled = rng.random(len(picks)) < c.relabel
+        guided = np.array([self.trajectories[k].guided for k, _ in picks]) & ~relabelled
+        return self._batch(picks, np.where(relabelled, fresh, phi), guided, device)
 
-    def _batch(self, picks: Ints, phi: Floats32, device: str) -> Batch:
+    def _batch(self, picks: Ints, phi: Floats32, guided: Bools, device: str) -> Batch:
         c = self.config
         weights = np.stack([np.cos(phi), np.sin(phi), np.sin(phi)], 1)  # [B,3] of the reward's terms
         reward = np.zeros(len(picks), np.float32)
@@ -97,7 +98,7 @@ class Replay:
             discount,
             np.stack(allowed),
             np.array([tr.vetoed[t] for tr, t in now], np.int64),
-            np.stack([np.cos(phi), np.sin(phi)], 1),
+            guided,
         )
 
     def _places(self) -> tuple[Ints, Ints]:

@@ -54,6 +54,7 @@ class VfnTraining:
     prefill: int = 2_000  # decisions recorded before the first update (Alg. 4), with epsilon 1
     epsilon: tuple[float, float] = (1.0, 0.05)  # P, Table I: linear
     epsilon_iterations: int = 200
+    guided: tuple[float, float] = (0.5, 0.1)  # share of the episodes that the mentor drives, linear likewise
     disseminate: int = 5  # iterations between copies of the learner's weights to the frozen AVs
     svo: tuple[float, ...] = (45.0, 60.0)  # deg, drawn per episode; (0,) trains the egoistic twin
     seed: int = 0  # of everything
@@ -76,6 +77,7 @@ class Drive(NamedTuple):
     weights: str  # file of the learning AVs' network, "" for untrained
     frozen: str  # file of the others'
     record: bool  # False: validation, greedy, nothing is recorded
+    guided: bool = False  # by the mentor
 
 
 class Drove(NamedTuple):
@@ -192,6 +194,7 @@ class Trainer:
                     weights,
                     frozen,
                     True,
+                    self._guided(k, j),
                 )
             )
         return drives
@@ -209,8 +212,16 @@ class Trainer:
         c = self.config
         if c.learning == "ddqn" and self.replay.size < c.prefill:
             return 1.0
-        first, last = c.epsilon
-        return first + (last - first) * min(k / c.epsilon_iterations, 1.0)
+        return self._faded(c.epsilon, k)
+
+    def _guided(self, k: int, j: int) -> bool:
+        c = self.config
+        luck = uniform(c.seed, "guided", str(k), str(j))
+        return c.learning == "ddqn" and luck < self._faded(c.guided, k)
+
+    def _faded(self, ends: tuple[float, float], k: int) -> float:
+        first, last = ends
+        return first + (last - first) * min(k / self.config.epsilon_iterations, 1.0)
 
     def _keep(self, k: int, drove: Sequence[Drove]) -> None:
         for j, one in enumerate(drove):

@@ -67,6 +67,7 @@ def trajectory(
         terms=np.array(terms, np.float32),
         interacting=np.full(d, near),
         phi=0.0,
+        guided=False,
         ending=ending,  # type: ignore[arg-type]
     )
 

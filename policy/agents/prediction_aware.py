@@ -119,9 +119,13 @@ class PredictionAware:
         return Inputs(scene, maps, kinematics, batch.route, batch.phi, traffic)
 
     def values(self, inputs: Inputs) -> Floats32:
-        """The action values [B,A]. Raises FloatingPointError when one is not finite."""
+        """The action values [B,A]."""
+        return self.valued(self.vfn, inputs.maps, inputs.kinematics, inputs.route, inputs.phi)
+
+    def valued(self, network: VFN, *seen: torch.Tensor) -> Floats32:
+        """What `network` gives for its inputs [B,.]: [B,A]. Raises FloatingPointError when not finite."""
         with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=self.config.bf16):
-            q = to_numpy(self.vfn(inputs.maps, inputs.kinematics, inputs.route, inputs.phi))
+            q = to_numpy(network(*seen))
         if not np.isfinite(q).all():
             raise FloatingPointError("the value network returned values that are not finite")
         return q

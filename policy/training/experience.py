@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -78,8 +79,10 @@ def states(chosen: list[tuple[Trajectory, int]], phi: Floats32, device: str = "c
         row[:past], row[past:] = trajectory.maps(t)
     kinematics = np.stack([trajectory.kinematics[t] for trajectory, t in chosen]).astype(np.float32)
     route = np.stack([trajectory.route[t] for trajectory, t in chosen])
+    # turned to channels last, as the first convolution wants them, while they are still bytes
+    turned = torch.from_numpy(maps).to(device).permute(0, 1, 3, 4, 2).contiguous()
     return States(
-        torch.from_numpy(maps).to(device).to(torch.float32).mul_(1.0 / 255.0),
+        turned.to(torch.float32).mul_(1.0 / 255.0).permute(0, 1, 4, 2, 3),
         torch.from_numpy(kinematics).to(device),
         torch.from_numpy(route).to(device),
         torch.from_numpy(np.stack([np.cos(phi), np.sin(phi)], 1).astype(np.float32)).to(device),
@@ -93,8 +96,12 @@ def save(path: Path, trajectories: list[Trajectory]) -> None:
         for name, value in vars(trajectory).items():
             arrays[f"{k}.{name}"] = np.asarray(value)
     draft = path.with_suffix(".part")
-    with draft.open("wb") as file:
-        np.savez_compressed(file, **arrays)
+    with zipfile.ZipFile(
+        draft, "w", zipfile.ZIP_DEFLATED, compresslevel=1
+    ) as file:  # mostly zeros: 1 will do
+        for name, value in arrays.items():
+            with file.open(f"{name}.npy", "w", force_zip64=True) as part:
+                np.lib.format.write_array(part, np.asarray(value), allow_pickle=False)
     draft.replace(path)
 
 

@@ -87,15 +87,13 @@ class Explorer(PredictionAware):
 
     def values(self, inputs: Inputs) -> Floats32:
         """The learner's values for learning AVs, the frozen ones for the others."""
-        q = super().values(inputs)
-        others = [b for b, av in enumerate(inputs.scene.agents) if av not in self.learning]
-        if others and self._epsilon < 1.0:
-            with torch.inference_mode():
-                q[others] = to_numpy(
-                    self.frozen(
-                        *(t[others] for t in (inputs.maps, inputs.kinematics, inputs.route, inputs.phi))
-                    )
-                )
+        mine = np.array([av in self.learning for av in inputs.scene.agents])
+        q = np.zeros((len(mine), len(MetaAction)), np.float32)
+        seen = (inputs.maps, inputs.kinematics, inputs.route, inputs.phi)
+        for rows, network in ((mine, self.vfn), (~mine, self.frozen)):
+            if rows.any():
+                part = torch.from_numpy(np.flatnonzero(rows))
+                q[rows] = self.valued(network, *(t[part] for t in seen))
         return q
 
     def pay(self, terms: Mapping[str, RewardTerms], crashed: frozenset[str], present: frozenset[str]) -> None:

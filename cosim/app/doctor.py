@@ -30,7 +30,7 @@ NEEDED = (
 )
 # One version for all of them: libsumo and sumolib are pinned together, eclipse-sumo rebuilds the nets.
 SUMO_PACKAGES = ("libsumo", "sumolib", "traci", "eclipse-sumo", "sumo-data")
-PROBE_LIMIT = 20.0  # s for `sumo --version` and `import libsumo`
+PROBE_LIMIT = 120.0  # s for `sumo --version` and `import libsumo`: 300 MB of libraries from a cold, busy disk
 SIMULATION_LIMIT = 180.0  # s: numba compiles on the first run
 
 _SIMULATE = """

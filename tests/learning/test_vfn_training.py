@@ -181,6 +181,29 @@ def test_a_refused_action_is_worth_a_crash() -> None:
     assert q[1].item() > -0.1
 
 
+def test_the_mentors_action_leads_by_the_margin_where_nothing_else_speaks_for_it() -> None:
+    """Every action pays the same; the mentor braked, somebody else idled elsewhere."""
+    mentor = replace(trajectory([4], [(1.0, 0.0, 0.0)], ending="crashed"), guided=True)
+    other = trajectory([1], [(1.0, 0.0, 0.0)], route=[5, 6], ending="crashed")
+    replay = Replay(ReplayConfig(batch=16, n_step=1, relabel=0.0))
+    replay.add([mentor, other])
+    learner = Learner(TINY, DdqnConfig(learning_rate=1e-2, imitation=0.5, margin=0.1), seed=1)
+    rng = np.random.default_rng(0)
+    for _ in range(150):
+        learner.update(replay.sample(rng))
+    with torch.no_grad():
+        q = learner.online(*experience.states([(mentor, 0)], np.zeros(1, np.float32)))[0]
+    others = q[[0, 1, 2, 3]].max().item()
+    assert q[4].item() == pytest.approx(0.1, abs=0.04), "what it pays, x 0.1"
+    assert q[4].item() - others > 0.08
+
+
+def test_a_relabelled_sample_is_no_lesson_of_the_mentors() -> None:
+    mentor = replace(trajectory([4], [(1.0, 0.0, 0.0)]), guided=True)
+    assert only(ReplayConfig(batch=20, relabel=0.0), mentor)[1].guided.all()
+    assert not only(ReplayConfig(batch=20, relabel=1.0), mentor)[1].guided.any()
+
+
 def test_saved_and_loaded_a_learner_goes_on_exactly(tmp_path: Path) -> None:
     one = trajectory([1, 3, 4, 0], [(1, 2, 3)] * 4)
     replay, _ = only(ReplayConfig(batch=8), one)
@@ -261,6 +284,16 @@ def test_a_crashed_av_ends_its_drive_and_the_others_are_cut() -> None:
     assert ends["a"].ending == "crashed"
     assert ends["b"].ending == "cut"
     assert ends["a"].terms[-1, 0] < -3.0  # crash: -5, and what speed it had
+
+
+def test_the_mentor_cruises_up_to_the_limit_and_its_drive_is_marked_as_guided() -> None:
+    episode = fake_episode(FakeVehicle("a", 100.0, 0, 15.0, is_av=True))
+    drive = Drive(Lesson("fake"), 5, 0.7, 1.0, "", "", True, guided=True)
+    (drove,) = drive_episode(episode, agent(), drive, RewardConfig()).trajectories
+    assert drove.guided
+    assert set(drove.action.tolist()) == {MetaAction.ACCELERATE, MetaAction.IDLE}, "no random action"
+    limit = episode.simulator.road.lanes[0].speed_limit
+    assert episode.snapshot.speed[0] == pytest.approx(limit, abs=2.5)
 
 
 class Pretend:

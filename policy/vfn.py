@@ -35,10 +35,11 @@ class VfnConfig:
     joined: int = 256  # T, Table 1
     kinematic: int = 128  # as the HPN's K branch; 0: maps and phi are all the network sees
     extractor: Literal["conv3d", "conv2d"] = "conv3d"
+    dueling: bool = True  # q = state value + advantage: how good the moment is drowns what an action changes
     critic: bool = False  # True: action preferences and a state value (A2C), not action values
 
 
-TABLE_1 = VfnConfig(features=(32, 64, 64), hidden=512, strides="literal")
+TABLE_1 = VfnConfig(features=(32, 64, 64), hidden=512, strides="literal", dueling=False)
 
 
 class VFN(nn.Module):
@@ -65,7 +66,7 @@ class VFN(nn.Module):
             )
         self.joined = nn.Linear(c.hidden + c.kinematic + 2, c.joined)
         self.value = nn.Linear(c.joined, len(MetaAction))
-        self.state = nn.Linear(c.joined, 1) if c.critic else None
+        self.state = nn.Linear(c.joined, 1) if c.critic or c.dueling else None
         for head in (self.value, self.state):
             if head is not None:
                 nn.init.zeros_(head.weight)
@@ -89,14 +90,17 @@ class VFN(nn.Module):
         self, maps: torch.Tensor, kinematics: torch.Tensor, route: torch.Tensor, phi: torch.Tensor
     ) -> torch.Tensor:
         """maps [B,T,C,H,W] in [0,1], kinematics [B,T,R,F+1], route [B,.], phi [B,2] -> q [B,5]."""
-        q: torch.Tensor = self.value(self.features(maps, kinematics, route, phi))
+        z = self.features(maps, kinematics, route, phi)
+        q: torch.Tensor = self.value(z)
+        if self.config.dueling and self.state is not None:
+            q = q - q.mean(1, keepdim=True) + self.state(z)
         return q
 
     def actor_critic(
         self, maps: torch.Tensor, kinematics: torch.Tensor, route: torch.Tensor, phi: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Log-preferences [B,5] (not normalised) and state values [B]. Needs `critic`."""
-        if self.state is None:
+        if self.state is None or not self.config.critic:
             raise ValueError("this network has no critic")
         z = self.features(maps, kinematics, route, phi)
         return self.value(z), self.state(z)[:, 0]

@@ -93,6 +93,7 @@ def configure(
             rows=observation.rows,
             extractor=approach.extractor,
             kinematic=vfn.kinematic if approach.kinematics else 0,
+            dueling=vfn.dueling and approach.learning != "a2c",
             critic=approach.learning == "a2c",
         ),
     )

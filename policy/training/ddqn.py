@@ -24,8 +24,8 @@ class DdqnConfig:
     r_unsafe: float = -5.0  # value of an action that the prioritizer refused: a crash's (Alg. 4, line 13)
     scale: float = 0.1  # of all rewards: action values of the order of 1
     clip: float = 10.0  # largest gradient norm
-    imitation: float = 0.5  # weight of the mentor's lessons: his action is worth more than any other,
-    margin: float = 0.05  # by this much (large-margin loss of deep Q-learning from demonstrations)
+    imitation: float = 1.0  # weight of the mentor's advice: his action is worth more than any other,
+    margin: float = 0.3  # by this much (large-margin loss of deep Q-learning from demonstrations)
 
 
 class Losses(NamedTuple):
@@ -71,10 +71,12 @@ class Learner:
             worth = torch.full_like(value, c.r_unsafe * c.scale)
             unsafe = functional.smooth_l1_loss(value, worth, reduction="sum") / len(q)
         imitation = torch.zeros((), device=device)
-        guided = torch.from_numpy(batch.guided).to(device)
-        if c.imitation > 0.0 and bool(guided.any()):
-            lead = torch.full_like(q, c.margin).scatter(1, action[:, None], 0.0)
-            imitation = ((q + lead).amax(1) - chosen)[guided].sum() * (c.imitation / len(q))
+        advice = torch.from_numpy(batch.advice).to(device)
+        advised = advice >= 0
+        if c.imitation > 0.0 and bool(advised.any()):
+            heard, his = q[advised], advice[advised][:, None]
+            lead = torch.full_like(heard, c.margin).scatter(1, his, 0.0)
+            imitation = ((heard + lead).amax(1) - heard.gather(1, his)[:, 0]).sum() * (c.imitation / len(q))
         self.optimizer.zero_grad(set_to_none=True)
         (td + unsafe + imitation).backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(self.online.parameters(), c.clip)

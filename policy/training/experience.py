@@ -36,10 +36,10 @@ class Trajectory:
     unsafe: Bools  # [D+1, A] what the prioritizer masked
     action: npt.NDArray[np.int8]  # [D] carried out
     vetoed: npt.NDArray[np.int8]  # [D] the preferred action that was masked, or -1
+    advice: npt.NDArray[np.int8]  # [D] what the mentor would have done, among what was safe; -1: nothing was
     terms: Floats32  # [D,3] reward terms: ego, AVs, HVs (equation 6)
     interacting: Bools  # [D] near a mission vehicle, or vetoed: what a rebalanced replay wants more of
     phi: float  # rad, the SVO it acted with
-    guided: bool  # driven by the mentor
     ending: Ending
 
     def __len__(self) -> int:

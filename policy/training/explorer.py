@@ -41,6 +41,7 @@ class _Tape:
     unsafe: list[np.ndarray] = field(default_factory=list)
     action: list[int] = field(default_factory=list)
     vetoed: list[int] = field(default_factory=list)
+    advice: list[int] = field(default_factory=list)
     terms: list[tuple[float, float, float]] = field(default_factory=list)
     interacting: list[bool] = field(default_factory=list)
 
@@ -75,14 +76,13 @@ class Explorer(PredictionAware):
         inputs = self.perceive(histories)
         if not self._chosen:
             self._choose_learners(inputs)
-        if self._guided:
-            q = self._mentor.preferences(dict(zip(inputs.scene.agents, inputs.scene.histories, strict=True)))
-        else:
-            q = self._explored(self.values(inputs), inputs)
+        scene = inputs.scene
+        advice = self._mentor.preferences(dict(zip(scene.agents, scene.histories, strict=True)))
+        q = advice if self._guided else self._explored(self.values(inputs), inputs)
         decisions = self.choose(q, inputs)
-        for b, av in enumerate(inputs.scene.agents):
+        for b, av in enumerate(scene.agents):
             if av in self.learning:
-                self._record(self.learning[av], b, inputs, decisions[av])
+                self._record(self.learning[av], b, inputs, decisions[av], advice[b])
         return decisions
 
     def values(self, inputs: Inputs) -> Floats32:
@@ -147,7 +147,7 @@ class Explorer(PredictionAware):
                 q[b, self._whim[av]] = 2.0
         return q
 
-    def _record(self, tape: _Tape, b: int, inputs: Inputs, decision: Decision) -> None:
+    def _record(self, tape: _Tape, b: int, inputs: Inputs, decision: Decision, advice: Floats32) -> None:
         history, n = inputs.scene.histories[b], self.observation.frames
         if tape.frames:
             stride = self._stride
@@ -165,6 +165,8 @@ class Explorer(PredictionAware):
         tape.action.append(int(decision.action))
         preferred = int(np.argmax(decision.q))
         tape.vetoed.append(preferred if unsafe[preferred] else -1)
+        # in a hopeless moment the mentor knows no better either
+        tape.advice.append(-1 if unsafe.all() else int(np.where(unsafe, -np.inf, advice).argmax()))
         newest = history.kinematics[-1]
         mission = history.valid[-1] & (newest[:, IS_MISSION] > 0.5)
         close = mission & (np.hypot(newest[:, 0], newest[:, 1]) < self.explore.near)
@@ -196,10 +198,10 @@ class Explorer(PredictionAware):
                 unsafe=np.stack(tape.unsafe[: count + 1]),
                 action=np.array(tape.action[:count], np.int8),
                 vetoed=np.array(tape.vetoed[:count], np.int8),
+                advice=np.array(tape.advice[:count], np.int8),
                 terms=np.array(tape.terms, np.float32),
                 interacting=np.array(tape.interacting[:count], np.bool_),
                 phi=self._context.svo,
-                guided=self._guided,
                 ending=ending,
             )
         )

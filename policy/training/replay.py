@@ -35,7 +35,7 @@ class Batch(NamedTuple):
     discount: Floats32  # [B] gamma^k of the state `later`; 0 when the AV crashed before it
     allowed: Bools  # [B,A] actions that were safe in `later` (all, where none was)
     vetoed: Ints  # [B] the action the prioritizer refused in `now`, or -1
-    guided: Bools  # [B] the mentor's action, for the SVO that he drove with
+    advice: Ints  # [B] the mentor's action in `now`, -1: none (he speaks for the SVO of the drive alone)
 
 
 class Replay:
@@ -69,10 +69,11 @@ class Replay:
         phi = np.array([self.trajectories[k].phi for k, _ in picks], np.float32)
         fresh = np.radians(rng.uniform(*c.phi, len(picks))).astype(np.float32)
         relabelled = rng.random(len(picks)) < c.relabel
-        guided = np.array([self.trajectories[k].guided for k, _ in picks]) & ~relabelled
-        return self._batch(picks, np.where(relabelled, fresh, phi), guided, device)
+        advice = np.array([self.trajectories[k].advice[t] for k, t in picks], np.int64)
+        advice[relabelled] = -1
+        return self._batch(picks, np.where(relabelled, fresh, phi), advice, device)
 
-    def _batch(self, picks: Ints, phi: Floats32, guided: Bools, device: str) -> Batch:
+    def _batch(self, picks: Ints, phi: Floats32, advice: Ints, device: str) -> Batch:
         c = self.config
         weights = np.stack([np.cos(phi), np.sin(phi), np.sin(phi)], 1)  # [B,3] of the reward's terms
         reward = np.zeros(len(picks), np.float32)
@@ -98,7 +99,7 @@ class Replay:
             discount,
             np.stack(allowed),
             np.array([tr.vetoed[t] for tr, t in now], np.int64),
-            guided,
+            advice,
         )
 
     def _places(self) -> tuple[Ints, Ints]:

@@ -67,7 +67,7 @@ def trajectory(
         terms=np.array(terms, np.float32),
         interacting=np.full(d, near),
         phi=0.0,
-        guided=False,
+        advice=np.full(d, -1, np.int8),
         ending=ending,  # type: ignore[arg-type]
     )
 
@@ -159,7 +159,7 @@ def test_what_the_prioritizer_masks_is_not_hoped_for() -> None:
     unsafe = np.zeros((2, 5), np.bool_)
     unsafe[1, 3] = True
     one = trajectory([1], [(0.0, 0.0, 0.0)], unsafe=unsafe)
-    learner = Learner(TINY, DdqnConfig(), seed=1)
+    learner = Learner(replace(TINY, dueling=False), DdqnConfig(), seed=1)
     for network in (learner.online, learner.target):
         with torch.no_grad():
             network.value.weight.zero_()
@@ -181,27 +181,25 @@ def test_a_refused_action_is_worth_a_crash() -> None:
     assert q[1].item() > -0.1
 
 
-def test_the_mentors_action_leads_by_the_margin_where_nothing_else_speaks_for_it() -> None:
-    """Every action pays the same; the mentor braked, somebody else idled elsewhere."""
-    mentor = replace(trajectory([4], [(1.0, 0.0, 0.0)], ending="crashed"), guided=True)
-    other = trajectory([1], [(1.0, 0.0, 0.0)], route=[5, 6], ending="crashed")
-    replay = Replay(ReplayConfig(batch=16, n_step=1, relabel=0.0))
-    replay.add([mentor, other])
+def test_the_mentors_advice_leads_by_the_margin_where_nothing_else_speaks_for_it() -> None:
+    """Somebody idled and was paid; the mentor would have braked."""
+    one = trajectory([1], [(1.0, 0.0, 0.0)], ending="crashed")
+    one = replace(one, advice=np.array([4], np.int8))
     learner = Learner(TINY, DdqnConfig(learning_rate=1e-2, imitation=0.5, margin=0.1), seed=1)
+    replay, _ = only(ReplayConfig(batch=16, n_step=1, relabel=0.0), one)
     rng = np.random.default_rng(0)
     for _ in range(150):
         learner.update(replay.sample(rng))
     with torch.no_grad():
-        q = learner.online(*experience.states([(mentor, 0)], np.zeros(1, np.float32)))[0]
-    others = q[[0, 1, 2, 3]].max().item()
-    assert q[4].item() == pytest.approx(0.1, abs=0.04), "what it pays, x 0.1"
-    assert q[4].item() - others > 0.08
+        q = learner.online(*experience.states([(one, 0)], np.zeros(1, np.float32)))[0]
+    assert q.argmax() == 4
+    assert q[4].item() - q[[0, 1, 2, 3]].max().item() > 0.08
 
 
-def test_a_relabelled_sample_is_no_lesson_of_the_mentors() -> None:
-    mentor = replace(trajectory([4], [(1.0, 0.0, 0.0)]), guided=True)
-    assert only(ReplayConfig(batch=20, relabel=0.0), mentor)[1].guided.all()
-    assert not only(ReplayConfig(batch=20, relabel=1.0), mentor)[1].guided.any()
+def test_advice_holds_for_the_orientation_of_the_drive_alone() -> None:
+    one = replace(trajectory([4], [(1.0, 0.0, 0.0)]), advice=np.array([4], np.int8))
+    assert (only(ReplayConfig(batch=20, relabel=0.0), one)[1].advice == 4).all()
+    assert (only(ReplayConfig(batch=20, relabel=1.0), one)[1].advice == -1).all()
 
 
 def test_saved_and_loaded_a_learner_goes_on_exactly(tmp_path: Path) -> None:
@@ -286,11 +284,11 @@ def test_a_crashed_av_ends_its_drive_and_the_others_are_cut() -> None:
     assert ends["a"].terms[-1, 0] < -3.0  # crash: -5, and what speed it had
 
 
-def test_the_mentor_cruises_up_to_the_limit_and_its_drive_is_marked_as_guided() -> None:
+def test_the_mentor_cruises_up_to_the_limit_and_his_advice_is_what_he_does() -> None:
     episode = fake_episode(FakeVehicle("a", 100.0, 0, 15.0, is_av=True))
     drive = Drive(Lesson("fake"), 5, 0.7, 1.0, "", "", True, guided=True)
     (drove,) = drive_episode(episode, agent(), drive, RewardConfig()).trajectories
-    assert drove.guided
+    assert np.array_equal(drove.advice, drove.action)
     assert set(drove.action.tolist()) == {MetaAction.ACCELERATE, MetaAction.IDLE}, "no random action"
     limit = episode.simulator.road.lanes[0].speed_limit
     assert episode.snapshot.speed[0] == pytest.approx(limit, abs=2.5)

@@ -16,6 +16,7 @@ from cosim.app.bench_predict import forecast
 from cosim.app.progress import Progress
 from cosim.errors import BadInput
 from cosim.evaluation.prediction import Scores, interval_errors
+from cosim.memory import keep_freed_memory
 from cosim.recording import Folder, windows
 from policy.checkpoint import save
 from policy.predictors import Predictor
@@ -66,6 +67,7 @@ def fit_predictors(
     `state`: where every fit keeps its log and what it needs to go on after a kill. Returns what was measured.
     Raises BadInput for recordings of other seeds: nothing is ever fitted on test seeds.
     """
+    keep_freed_memory()
     use_threads(1)
     data = {
         "training": _about(Folder(training), TRAINING_SEEDS),

@@ -16,17 +16,21 @@ from policy.agents import make
 
 
 class Runner:
-    """One scenario, one policy, any number of episodes; lives in a `cosim.worker.Worker`.
+    """One scenario, one policy (by name, or as it is), any number of episodes; lives in a `cosim.worker.Worker`.
 
     Raises BadInput for an unknown policy and for input that SUMO refuses.
     """
 
     def __init__(
-        self, scenario: Scenario, policy: str, svo: float, observation: ObservationConfig | None = None
+        self,
+        scenario: Scenario,
+        policy: str | Policy,
+        svo: float,
+        observation: ObservationConfig | None = None,
     ) -> None:
         from cosim.simulation.sumo import SumoSimulator  # libsumo: only here, in the worker's process
 
-        self._policy = make(policy)
+        self._policy = make(policy) if isinstance(policy, str) else policy
         self._svo = svo
         wanted = observation or self._policy.observation
         make_torch_deterministic()

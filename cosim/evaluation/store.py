@@ -87,6 +87,15 @@ class Store:
             if rows:
                 connection.execute(_cells.insert(), rows)
 
+    def extend(self, cells: Sequence[Mapping[str, Any]]) -> None:
+        """Write down further cells, as in `begin`, behind those that are there; known ones stay as they are."""
+        known = self.cells()
+        new = [cell for cell in cells if cell["cell"] not in known]
+        rows = [{"run": self._run, "place": len(known) + i, **cell} for i, cell in enumerate(new)]
+        if rows:
+            with self._writing() as connection:
+                connection.execute(_cells.insert(), rows)
+
     def spec_hash(self) -> str | None:
         """The hash of what this run was begun with; None when it was not begun."""
         with self._engine.connect() as connection:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from cosim.actions import SPEED_STEP
 from cosim.types import KINEMATIC_FEATURES, Bools, Bytes, Floats, Floats32, History
 
 # Scales that bring every kinematic feature to about [-1, 1]: row range, map half width, motorway speed,
@@ -15,7 +16,7 @@ from cosim.types import KINEMATIC_FEATURES, Bools, Bytes, Floats, Floats32, Hist
 KINEMATIC_SCALE = np.array([125.0, 16.0, 30.0, np.pi, 10.0, 3.0, 1.0, 1.0], np.float32)
 KINEMATIC_INPUTS = len(KINEMATIC_FEATURES) + 1  # the features and the mask
 LOOK_AHEAD = np.array([20.0, 50.0, 100.0])  # m, where the candidate centre lines are sampled
-ROUTE_INPUTS = 5 + 3 * (3 + 2 * len(LOOK_AHEAD))
+ROUTE_INPUTS = 7 + 3 * (3 + 2 * len(LOOK_AHEAD))
 FAR = 200.0  # m: lane ends and conflict zones further away are all alike
 
 
@@ -60,7 +61,8 @@ def kinematic_tensor(kinematics: Floats32 | Floats, valid: Bools, device: str = 
 def route_features(history: History) -> Floats32:
     """The ego's own route knowledge and command [ROUTE_INPUTS], scaled to about [-1, 1].
 
-    Target speed, speed limit, distance to the conflict zone, lane change under way, own speed; then for
+    Target speed, speed limit, distance to the conflict zone, lane change under way, own speed, how many
+    grid levels the target may still rise, how far the speed is from it; then for
     the left, present and right lane: does it exist, does it dead-end, how far off, and where its centre
     line lies LOOK_AHEAD m ahead (offset and direction in the ego frame).
     """
@@ -71,6 +73,8 @@ def route_features(history: History) -> Floats32:
         min(route.conflict_distance, FAR) / FAR,
         float(history.lane_changing),
         history.ego_speed / 30.0,
+        np.clip((route.speed_limit - history.target_speed) / SPEED_STEP, -1.0, 2.0),
+        np.clip((history.ego_speed - history.target_speed) / SPEED_STEP, -1.0, 1.0),
     ]
     c, s = np.cos(pose[2]), np.sin(pose[2])
     for side, path in enumerate(route.paths):

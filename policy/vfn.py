@@ -1,7 +1,7 @@
 """The value function network: action values from past and predicted maps, kinematics, route and phi.
 
 A 3D CNN after T's Table 1 (Conv3D 32@(1,8,8), 64@(3,4,4), 64@(3,3,3), FC 512, FC 256, FC 5); kinematics
-and the ego's own route knowledge join after FC 512 through an MLP. The baselines of Table III are the same
+and the ego's own route knowledge join after FC 512 through MLPs. The baselines of Table III are the same
 network with parts left out.
 """
 
@@ -14,9 +14,11 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from cosim.types import MetaAction
+from cosim.types import KINEMATIC_FEATURES, MetaAction
 from policy.extractors import Conv2dMaps, Conv3dMaps, Strides
 from policy.tensors import KINEMATIC_INPUTS, ROUTE_INPUTS
+
+IS_MISSION = KINEMATIC_FEATURES.index("is_mission")
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,13 +35,34 @@ class VfnConfig:
     features: tuple[int, int, int] = (16, 32, 32)  # T, Table 1: 32, 64, 64
     hidden: int = 256  # T, Table 1: 512
     joined: int = 256  # T, Table 1
-    kinematic: int = 128  # as the HPN's K branch; 0: maps and phi are all the network sees
+    kinematic: int = 64  # features of a vehicle; 0: maps and phi are all the network sees
+    route: int = 64  # width of the branch of the ego's own route knowledge; goes with `kinematic`
     extractor: Literal["conv3d", "conv2d"] = "conv3d"
     dueling: bool = True  # q = state value + advantage: how good the moment is drowns what an action changes
     critic: bool = False  # True: action preferences and a state value (A2C), not action values
 
 
 TABLE_1 = VfnConfig(features=(32, 64, 64), hidden=512, strides="literal", dueling=False)
+
+
+class Vehicles(nn.Module):
+    """Kinematics [B,T,R,F+1] -> [B,3*width]: the ego, the others' strongest features, mission vehicles.
+
+    Every vehicle goes through the same two layers, so what was learned about one row holds for all, and who
+    stands in which row makes no difference.
+    """
+
+    def __init__(self, frames: int, width: int) -> None:
+        super().__init__()
+        self.one = nn.Sequential(
+            nn.Linear(frames * KINEMATIC_INPUTS, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU()
+        )
+
+    def forward(self, kinematics: torch.Tensor) -> torch.Tensor:
+        """Rows without a vehicle are zeros and say nothing."""
+        mission, seen = kinematics[..., IS_MISSION].amax(1), kinematics[..., -1].amax(1)  # [B,R]
+        each = self.one(kinematics.transpose(1, 2).flatten(2)) * seen[..., None]  # [B,R,width]
+        return torch.cat([each[:, 0], each[:, 1:].amax(1), (each * mission[..., None]).sum(1)], 1)
 
 
 class VFN(nn.Module):
@@ -58,13 +81,13 @@ class VFN(nn.Module):
         self.hidden = nn.Linear(int(self.maps.flat), c.hidden)
         self.kinematics = None
         if c.kinematic:
-            self.kinematics = nn.Sequential(
-                nn.Linear(c.frames * c.rows * KINEMATIC_INPUTS + ROUTE_INPUTS, c.kinematic),
-                nn.ReLU(),
-                nn.Linear(c.kinematic, c.kinematic),
-                nn.ReLU(),
+            self.kinematics = Vehicles(c.frames, c.kinematic)
+            # a branch of its own: what few numbers say about the ego's way and command must not drown
+            self.route = nn.Sequential(
+                nn.Linear(ROUTE_INPUTS, c.route), nn.ReLU(), nn.Linear(c.route, c.route), nn.ReLU()
             )
-        self.joined = nn.Linear(c.hidden + c.kinematic + 2, c.joined)
+        own = c.route if c.kinematic else 0
+        self.joined = nn.Linear(c.hidden + 3 * c.kinematic + own + 2, c.joined)
         self.value = nn.Linear(c.joined, len(MetaAction))
         self.state = nn.Linear(c.joined, 1) if c.critic or c.dueling else None
         for head in (self.value, self.state):
@@ -83,7 +106,7 @@ class VFN(nn.Module):
         """The joined representation [B,joined]; arguments as in `forward`."""
         parts = [functional.relu(self.hidden(self.maps(maps)))]
         if self.kinematics is not None:
-            parts.append(self.kinematics(torch.cat([kinematics.flatten(1), route], 1)))
+            parts += [self.kinematics(kinematics), self.route(route)]
         return functional.relu(self.joined(torch.cat([*parts, phi], 1)))
 
     def forward(

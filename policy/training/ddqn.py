@@ -23,6 +23,7 @@ class DdqnConfig:
     target_every: int = 300  # updates between copies of the online network
     r_unsafe: float = -5.0  # value of an action that the prioritizer refused: a crash's (Alg. 4, line 13)
     scale: float = 0.1  # of all rewards: action values of the order of 1
+    refused: float = 1.0  # weight of the refused actions' loss
     clip: float = 10.0  # largest gradient norm
     imitation: float = 1.0  # weight of the mentor's advice: his action is worth more than any other,
     margin: float = 0.3  # by this much (large-margin loss of deep Q-learning from demonstrations)
@@ -69,12 +70,14 @@ class Learner:
         if bool(refused.any()):  # stored as terminal with reward r_unsafe (Alg. 4)
             value = q[refused].gather(1, vetoed[refused][:, None])[:, 0]
             worth = torch.full_like(value, c.r_unsafe * c.scale)
-            unsafe = functional.smooth_l1_loss(value, worth, reduction="sum") / len(q)
+            unsafe = functional.smooth_l1_loss(value, worth, reduction="sum") * (c.refused / len(q))
         imitation = torch.zeros((), device=device)
         advice = torch.from_numpy(batch.advice).to(device)
         advised = advice >= 0
         if c.imitation > 0.0 and bool(advised.any()):
-            heard, his = q[advised], advice[advised][:, None]
+            # among what was safe: what the prioritizer masks need not be learned a second time
+            possible = torch.from_numpy(batch.possible).to(device)
+            heard, his = q.masked_fill(~possible, -torch.inf)[advised], advice[advised][:, None]
             lead = torch.full_like(heard, c.margin).scatter(1, his, 0.0)
             imitation = ((heard + lead).amax(1) - heard.gather(1, his)[:, 0]).sum() * (c.imitation / len(q))
         self.optimizer.zero_grad(set_to_none=True)

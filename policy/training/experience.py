@@ -39,6 +39,7 @@ class Trajectory:
     advice: npt.NDArray[np.int8]  # [D] what the mentor would have done, among what was safe; -1: nothing was
     terms: Floats32  # [D,3] reward terms: ego, AVs, HVs (equation 6)
     interacting: Bools  # [D] near a mission vehicle, or vetoed: what a rebalanced replay wants more of
+    yielding: Bools  # [D] the mentor would have yielded to a mission vehicle here
     phi: float  # rad, the SVO it acted with
     ending: Ending
 

@@ -14,7 +14,7 @@ from policy.agents.approaches import AgentConfig
 from policy.agents.prediction_aware import Inputs, PredictionAware
 from policy.tensors import to_numpy
 from policy.training.experience import Ending, Trajectory
-from policy.training.mentor import Mentor
+from policy.training.mentor import YIELD, Mentor
 from policy.vfn import VFN
 
 IS_MISSION = 7  # column of the kinematic matrix
@@ -44,6 +44,7 @@ class _Tape:
     advice: list[int] = field(default_factory=list)
     terms: list[tuple[float, float, float]] = field(default_factory=list)
     interacting: list[bool] = field(default_factory=list)
+    yielding: list[bool] = field(default_factory=list)
 
 
 class Explorer(PredictionAware):
@@ -167,6 +168,7 @@ class Explorer(PredictionAware):
         tape.vetoed.append(preferred if unsafe[preferred] else -1)
         # in a hopeless moment the mentor knows no better either
         tape.advice.append(-1 if unsafe.all() else int(np.where(unsafe, -np.inf, advice).argmax()))
+        tape.yielding.append(bool(advice.max() == YIELD))
         newest = history.kinematics[-1]
         mission = history.valid[-1] & (newest[:, IS_MISSION] > 0.5)
         close = mission & (np.hypot(newest[:, 0], newest[:, 1]) < self.explore.near)
@@ -201,6 +203,7 @@ class Explorer(PredictionAware):
                 advice=np.array(tape.advice[:count], np.int8),
                 terms=np.array(tape.terms, np.float32),
                 interacting=np.array(tape.interacting[:count], np.bool_),
+                yielding=np.array(tape.yielding[:count], np.bool_),
                 phi=self._context.svo,
                 ending=ending,
             )

@@ -29,7 +29,7 @@ class HpnTraining:
 
     stride: int = 4  # decisions between two moments of an episode: neighbours are nearly the same
     map_stride: int = 20  # the same for `hpn-plain`, whose samples are whole maps
-    loop: LoopConfig = field(default_factory=LoopConfig)
+    loop: LoopConfig = field(default_factory=lambda: LoopConfig(updates=6000))
     map_loop: LoopConfig = field(  # an update costs four times as much, and the loss is flat long before
         default_factory=lambda: LoopConfig(updates=2000, log_every=25, validate_every=100)
     )

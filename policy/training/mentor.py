@@ -9,6 +9,7 @@ import numpy as np
 from cosim.types import Floats32, History, MetaAction, PolicyContext
 from policy.agents.altruist_rule import AltruistRule
 
+YIELD = 2.0  # his preference for what the scripted altruist commands: above all others
 BEHIND = 3.0  # m/s that the speed may lag behind its target before the target is raised further
 CRUISE = {
     MetaAction.IDLE: 0.8,
@@ -44,5 +45,5 @@ class Mentor:
             if slower and history.ego_speed > history.target_speed - BEHIND:
                 row[MetaAction.ACCELERATE] = 1.0
             if av in yielding:
-                row[yielding[av].action] = 2.0
+                row[yielding[av].action] = YIELD
         return q

@@ -1,4 +1,4 @@
-"""Replay of whole trajectories: n-step samples, drawn in equal parts from interaction and from cruising."""
+"""Replay of whole trajectories: n-step samples, in fixed parts from yielding, interaction and cruising."""
 
 from __future__ import annotations
 
@@ -20,7 +20,9 @@ class ReplayConfig:
     batch: int = 64  # P, Table I
     n_step: int = 8  # compute.md: one step did not learn altruism; 1 is the papers'
     gamma: float = 0.97  # a decision of 0.4 s; P: 0.95
-    interaction: float = 0.5  # share of a batch near a mission vehicle or vetoed (P, Alg. 4: rebalanced)
+    # shares of a batch, however rare such moments are (P, Alg. 4: rebalanced):
+    yielding: float = 0.25  # where the mentor would have yielded; one AV in ten does, for some seconds
+    interaction: float = 0.25  # near a mission vehicle, or vetoed
     relabel: float = 0.5  # share of a batch that is learned for another SVO than it was driven with
     phi: tuple[float, float] = (0.0, 90.0)  # deg, what relabelling draws from; equal bounds: one SVO only
 
@@ -33,6 +35,7 @@ class Batch(NamedTuple):
     action: Ints  # [B]
     reward: Floats32  # [B]
     discount: Floats32  # [B] gamma^k of the state `later`; 0 when the AV crashed before it
+    possible: Bools  # [B,A] actions that were safe in `now`
     allowed: Bools  # [B,A] actions that were safe in `later` (all, where none was)
     vetoed: Ints  # [B] the action the prioritizer refused in `now`, or -1
     advice: Ints  # [B] the mentor's action in `now`, -1: none (he speaks for the SVO of the drive alone)
@@ -45,7 +48,7 @@ class Replay:
         self.config = config
         self.trajectories: deque[Trajectory] = deque()
         self.size = 0
-        self._index: tuple[Ints, Ints] | None = None  # [*,2] (trajectory, t): interacting, cruising
+        self._index: list[Ints] | None = None  # [*,2] (trajectory, t): yielding, interacting, cruising
 
     def add(self, trajectories: list[Trajectory]) -> int:
         """Store them; returns how many of the oldest were dropped."""
@@ -63,9 +66,12 @@ class Replay:
         if not self.size:
             raise ValueError("the replay is empty")
         c = self.config
-        near, far = self._places()
-        wanted = round(c.batch * c.interaction) if len(near) and len(far) else c.batch * (len(near) > 0)
-        picks = np.concatenate([_draw(near, wanted, rng), _draw(far, c.batch - wanted, rng)])
+        shares = (c.yielding, c.interaction, 1.0 - c.yielding - c.interaction)
+        groups = [(p, share) for p, share in zip(self._places(), shares, strict=True) if len(p)]
+        edges = np.cumsum([0.0] + [share for _, share in groups])
+        counts = np.diff(np.round(c.batch * edges / edges[-1]).astype(int)) if edges[-1] else [c.batch]
+        drawn = [_draw(places, int(k), rng) for (places, _), k in zip(groups, counts, strict=False)]
+        picks = np.concatenate(drawn)
         phi = np.array([self.trajectories[k].phi for k, _ in picks], np.float32)
         fresh = np.radians(rng.uniform(*c.phi, len(picks))).astype(np.float32)
         relabelled = rng.random(len(picks)) < c.relabel
@@ -79,7 +85,7 @@ class Replay:
         reward = np.zeros(len(picks), np.float32)
         discount = np.zeros(len(picks), np.float32)
         now, later = [], []
-        allowed = []
+        possible, allowed = [], []
         for b, (k, t) in enumerate(picks):
             trajectory = self.trajectories[k]
             end = min(t + c.n_step, len(trajectory))
@@ -89,6 +95,7 @@ class Replay:
                 discount[b] = c.gamma ** (end - t)
             now.append((trajectory, int(t)))
             later.append((trajectory, int(end)))
+            possible.append(~trajectory.unsafe[t])
             safe = ~trajectory.unsafe[end]
             allowed.append(safe if safe.any() else np.ones_like(safe))
         return Batch(
@@ -97,19 +104,21 @@ class Replay:
             np.array([tr.action[t] for tr, t in now], np.int64),
             reward,
             discount,
+            np.stack(possible),
             np.stack(allowed),
             np.array([tr.vetoed[t] for tr, t in now], np.int64),
             advice,
         )
 
-    def _places(self) -> tuple[Ints, Ints]:
+    def _places(self) -> list[Ints]:
         if self._index is None:
             rows = [
                 np.stack([np.full(len(t), k), np.arange(len(t))], 1) for k, t in enumerate(self.trajectories)
             ]
             every = np.concatenate(rows)
+            yields = np.concatenate([t.yielding for t in self.trajectories])
             near = np.concatenate([t.interacting for t in self.trajectories])
-            self._index = every[near], every[~near]
+            self._index = [every[yields], every[near & ~yields], every[~near & ~yields]]
         return self._index
 
 

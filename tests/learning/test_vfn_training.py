@@ -66,6 +66,7 @@ def trajectory(
         vetoed=np.array(vetoed or [-1] * d, np.int8),
         terms=np.array(terms, np.float32),
         interacting=np.full(d, near),
+        yielding=np.zeros(d, np.bool_),
         phi=0.0,
         advice=np.full(d, -1, np.int8),
         ending=ending,  # type: ignore[arg-type]
@@ -101,10 +102,16 @@ def test_relabelling_learns_for_another_orientation_than_was_driven() -> None:
     assert batch.now.phi[:, 1].numpy() == pytest.approx(np.ones(300))
 
 
-def test_half_of_a_batch_comes_from_interaction_however_rare_it_is() -> None:
-    replay = Replay(ReplayConfig(batch=100))
-    replay.add([trajectory([1] * 30, [(0, 0, 0)] * 30, near=False), trajectory([4], [(0, 0, 0)])])
-    assert (replay.sample(np.random.default_rng(0)).action == 4).sum() == 50
+def test_rare_moments_have_their_share_of_a_batch() -> None:
+    far, near = trajectory([1] * 30, [(0, 0, 0)] * 30, near=False), trajectory([4], [(0, 0, 0)])
+    config = ReplayConfig(batch=100, yielding=0.25, interaction=0.5)
+    replay = Replay(config)
+    replay.add([far, near])
+    actions = replay.sample(np.random.default_rng(0)).action
+    assert (actions == 4).sum() == 67, "nobody yields: the others share the batch 2 to 1"
+    replay.add([replace(trajectory([3], [(0, 0, 0)]), yielding=np.ones(1, np.bool_))])
+    actions = replay.sample(np.random.default_rng(0)).action
+    assert [(actions == a).sum() for a in (3, 4, 1)] == [25, 50, 25]
 
 
 def test_the_oldest_drives_are_forgotten_first() -> None:

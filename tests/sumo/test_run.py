@@ -11,6 +11,8 @@ from typing import Any
 
 import pytest
 
+from policy.agents import make
+
 REQUIRED = """
     scenario demand policy preset driver_model seed steps crashed collisions av_caused_collisions teleports
     mission_success mission_time_s dt_mean_m dt_mission_m min_ttc_s vehicles_inserted
@@ -67,9 +69,9 @@ def test_the_same_seed_in_fresh_processes_is_the_same_run_and_another_seed_is_no
     assert timeless[0] == timeless[1]
 
 
-def test_the_whole_agent_commands_every_av_and_says_that_it_is_untrained() -> None:
+def test_the_whole_agent_commands_every_av_and_says_what_is_untrained() -> None:
     found = document("merge", "--policy", "vfn-p", "--duration", "4", "--seed", "200001")
-    assert found["policy_label"] == "untrained"
+    assert found["policy_label"] == make("vfn-p").label
     assert found["veto_rate"] is not None
     assert found["timings"]["decision_s"] > 0
 
@@ -98,7 +100,7 @@ def test_somebody_else_s_scenario_with_table_ii_drivers(a10kw: str) -> None:
 
 def test_the_whole_agent_drives_on_somebody_else_s_scenario(a10kw: str) -> None:
     found = document(a10kw, "--penetration", "0.2", "--policy", "vfn-p", "--duration", "12")
-    assert found["policy_label"] == "untrained"
+    assert found["policy_label"] == make("vfn-p").label
     assert found["steps"] > 1
 
 

@@ -38,7 +38,7 @@ def decide(agent: PredictionAware) -> dict[str, Decision]:
 
 @pytest.mark.parametrize("name", ["vfn-p", "vfn"])
 def test_every_av_gets_an_explained_decision(name: str) -> None:
-    agent = PredictionAware(name)
+    agent = PredictionAware(name, dataclasses.replace(compact(name), vfn_weights=None, hpn_weights=None))
     assert agent.label == "untrained"
     decisions = decide(agent)
     assert list(decisions) == ["a", "b"]

@@ -117,7 +117,8 @@ def test_the_vfn_hears_the_social_value_orientation_and_sees_the_maps() -> None:
 def test_gradients_reach_every_layer_of_both_networks() -> None:
     torch.manual_seed(0)
     hpn, vfn = MapBranch(MapBranchConfig(16, 128, correct=True, skips=True)), VFN(VfnConfig(16, 128))
-    torch.nn.init.normal_(vfn.value.weight)
+    for head in (vfn.value, vfn.state):
+        torch.nn.init.normal_(head.weight)  # type: ignore[union-attr]
     torch.nn.init.normal_(hpn.decoder[2].weight)  # type: ignore[arg-type]
     maps, moved = hpn(
         [torch.rand(2, 40, 16, 128)], torch.rand(2, 10, 16, KINEMATIC_INPUTS), torch.rand(2, 20, 16, 128)
@@ -210,8 +211,8 @@ def test_the_ego_is_told_where_its_lanes_end() -> None:
     batch = to_batch([on_it, beside], np.pi / 4)
     assert batch.maps.shape == (2, 10, 4, 32, 128)
     assert batch.route.shape == (2, ROUTE_INPUTS)
-    per_lane = (ROUTE_INPUTS - 5) // 3
-    left, keep, right = (batch.route[:, 5 + k * per_lane : 8 + k * per_lane] for k in range(3))
+    per_lane = (ROUTE_INPUTS - 7) // 3
+    left, keep, right = (batch.route[:, 7 + k * per_lane : 10 + k * per_lane] for k in range(3))
     assert keep[:, 1].tolist() == [1.0, 0.0], "only the right lane dead-ends"
     assert keep[0, 2] == pytest.approx(0.5), "100 m ahead, of 200"
     assert right[:, 0].tolist() == [0.0, 1.0]

@@ -3,8 +3,10 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 RUN ?= runs/demo
+SCALE ?= 1
+WORKERS ?= 2
 
-.PHONY: demo test check nets image smoke clean
+.PHONY: demo test check nets results results-small image smoke clean
 
 demo: $(VENV)/.installed
 	$(BIN)/cosim run merge --demand contested --policy altruist-rule --out $(RUN)
@@ -17,6 +19,17 @@ check: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# Every table and figure of docs/results/ that is driven; killed? the same goes on. SCALE=0.1: a tenth of the
+# episodes. What lacks trained weights is left out and named; `python -m benchmarks.papers --dry-run` tells
+# what is still to be driven, and its CPU hours.
+results: $(VENV)/.installed-dev
+	$(BIN)/python -m benchmarks.papers --scale $(SCALE) --workers $(WORKERS)
+
+# The same in small: one world, two episodes each, two seconds long, untrained networks. Shows that all works.
+results-small: $(VENV)/.installed-dev
+	$(BIN)/python -m benchmarks.papers --scale 0.001 --scenario merge --duration 2 --untrained \
+	    --workers $(WORKERS) --runs runs/results-small --out runs/results-small/pages
 
 # Rebuild every world's net from its plain XML sources.
 nets: $(VENV)/.installed-dev

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from cosim.evaluation import statistics
+from cosim.memory import keep_freed_memory
 from cosim.recording import Folder, windows
 from cosim.types import Floats
 from policy.forecast import integrate_position
@@ -140,6 +141,7 @@ def main() -> None:
     parser.add_argument("--vehicles", type=int, default=50, help="for the speed")
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
+    keep_freed_memory()
     past, future, episode = sample(Folder(Path(args.recordings)), args.moments)
     few = np.random.default_rng(1).permutation(len(past))[: args.vehicles]
     result = {

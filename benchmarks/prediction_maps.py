@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from cosim.memory import keep_freed_memory
 from cosim.raster import rasterize_road
 from cosim.scenario import Fleet, Scenario, load
 from cosim.types import COMPACT, PAPER, ObservationConfig
@@ -175,6 +176,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
+    keep_freed_memory()
     scenario = load("highway", demand=["dense"], fleet=Fleet(penetration=PENETRATION))
     plans = {
         "compact": (COMPACT, ChainConfig(), MapBranchConfig()),

@@ -120,7 +120,7 @@ class GaussianProcessBank:
         white = past @ op.whiten
         white -= op.drift_white
         white = white.reshape(-1, past.shape[1])
-        distance = np.einsum("ij,ij->i", white, white).reshape(len(past), -1)
+        distance = np.einsum("ij,ij->i", white, white).reshape(len(past), len(self.kernels))
         return np.asarray(op.log_norm - 0.5 * distance)
 
     def operators(self, count: int) -> Operators:

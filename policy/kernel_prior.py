@@ -17,7 +17,8 @@ from torch import nn
 from cosim.compiled import compiled
 from cosim.types import Bools, Floats, Ints
 
-FEATURES = 11
+LAGS = np.array([1, 2, 4, 9])  # frames back over which speed and heading are compared with now
+FEATURES = 4 + 2 * len(LAGS) + 3
 STANDING = 0.1  # m/s, SUMO's own threshold of a halt
 
 
@@ -28,9 +29,10 @@ class PriorConfig:
     kernels: tuple[int, ...]  # of each bank
     spreads: int  # quantities whose standard deviation is scaled
     horizon: int = 20
+    frames: int = 10  # N, a whole past
     dt: float = 0.2  # s
     features: int = FEATURES
-    hidden: int = 32
+    hidden: int = 64
 
 
 class PriorNetwork(nn.Module):
@@ -46,8 +48,9 @@ class PriorNetwork(nn.Module):
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
         self.log_temperature = nn.Parameter(torch.full((len(config.kernels),), 2.5))
-        # factors that make a 90 % interval cover 90 % at each step, found on episodes not trained on
-        self.register_buffer("calibration", torch.ones(config.spreads, config.horizon))
+        # factors that make a 90 % interval cover 90 % at each step, found on episodes not trained on; a row
+        # for each number of frames that are known, 1 to N: a completed past (policy.past) is less sure
+        self.register_buffer("calibration", torch.ones(config.frames, config.spreads, config.horizon))
 
     def forward(self, features: torch.Tensor) -> torch.Tensor:
         """[V,F] -> [V,sum(kernels)+spreads]: log weights of every bank's kernels, log factors."""
@@ -61,7 +64,7 @@ class KernelPrior(NamedTuple):
     out: tuple[Floats, Floats]  # [H,K], [K]
     cuts: tuple[int, ...]  # where one bank's weights end
     temperature: Floats  # [banks]
-    calibration: Floats  # [spreads,M]
+    calibration: Floats  # [N,spreads,M]
     dt: float  # s between the calibration's steps
 
     @staticmethod
@@ -85,62 +88,41 @@ class KernelPrior(NamedTuple):
         return parts[:-1], np.exp(parts[-1])
 
     def calibrated(self, horizon: int, dt: float) -> Floats:
-        """[spreads,M] factors at the steps asked for; beyond the last one calibrated, that one's."""
-        known = self.dt * np.arange(1, self.calibration.shape[1] + 1)
+        """[N,spreads,M] factors at the steps asked for; beyond the last one calibrated, that one's."""
+        found = self.calibration
+        known = self.dt * np.arange(1, found.shape[2] + 1)
         wanted = dt * np.arange(1, horizon + 1)
-        return np.stack([np.interp(wanted, known, row) for row in self.calibration])
+        rows = [np.interp(wanted, known, row) for row in found.reshape(-1, found.shape[2])]
+        return np.stack(rows).reshape(*found.shape[:2], horizon)
 
 
-def trailing_run(state: Floats, valid: Bools) -> Ints:
-    """[V] how many unbroken valid, finite frames lead up to now; state [V,N,>=4], valid [V,N]."""
-    run = np.empty(len(state), np.int64)
-    _trailing_run(state, valid, run)
-    return run
+def describe(past: Floats, known: Bools, dt: float) -> Floats:
+    """The present motion as [V,FEATURES], each of order one; past [V,N,>=4] whole, known [V].
 
-
-def describe(state: Floats, run: Ints, dt: float) -> Floats:
-    """The present motion as [V,FEATURES], each of order one; state [V,N,>=4], `run` from `trailing_run`.
-
-    Speed, standing, acceleration and turning rate now, and how both changed over the known past; zeros for
-    a vehicle that is not known now.
+    Speed, standing, mean acceleration and turning rate since LAGS; zeros for a vehicle that is not known now.
     """
-    out = np.zeros((len(state), FEATURES))
-    _describe(state, run, dt, out)
+    out = np.zeros((len(past), FEATURES))
+    _describe(past, known, dt, np.minimum(LAGS, past.shape[1] - 1), out)
     return out
 
 
 @compiled
-def _trailing_run(state: Floats, valid: Bools, run: Ints) -> None:
-    for v in range(state.shape[0]):
-        run[v] = 0
-        for k in range(state.shape[1] - 1, -1, -1):
-            whole = valid[v, k]
-            for f in range(4):
-                whole = whole and np.isfinite(state[v, k, f])
-            if not whole:
-                break
-            run[v] += 1
-
-
-@compiled
-def _describe(state: Floats, run: Ints, dt: float, out: Floats) -> None:
-    now = state.shape[1] - 1
-    for v in range(state.shape[0]):
-        if run[v] == 0:
+def _describe(past: Floats, known: Bools, dt: float, lags: Ints, out: Floats) -> None:
+    now = past.shape[1] - 1
+    for v in range(past.shape[0]):
+        if not known[v]:
             continue
-        last, first = now + 1 - min(run[v], 2), now + 1 - run[v]
-        speed, heading = state[v, now, 2], state[v, now, 3]
-        accel = np.tanh((speed - state[v, last, 2]) / dt / 2.0)
-        turning = np.tanh((heading - state[v, last, 3]) / dt / 0.2)
-        turned = np.tanh((heading - state[v, first, 3]) / 0.3)
+        speed, heading = past[v, now, 2], past[v, now, 3]
         out[v, 0] = speed / 15.0 - 1.0
         out[v, 1] = out[v, 0] ** 2
         out[v, 2] = speed < STANDING
         out[v, 3] = np.exp(-speed / 2.0)
-        out[v, 4] = accel
-        out[v, 5] = abs(accel)
-        out[v, 6] = turning
-        out[v, 7] = abs(turning)
-        out[v, 8] = np.tanh((speed - state[v, first, 2]) / 4.0)
-        out[v, 9] = turned
-        out[v, 10] = abs(turned)
+        at = 4
+        for lag in lags:
+            elapsed = dt * max(lag, 1)
+            out[v, at] = np.tanh((speed - past[v, now - lag, 2]) / elapsed / 2.0)
+            out[v, at + 1] = np.tanh((heading - past[v, now - lag, 3]) / elapsed / 0.2)
+            at += 2
+        out[v, at] = abs(out[v, 4])
+        out[v, at + 1] = abs(out[v, 5])
+        out[v, at + 2] = abs(out[v, at - 1])

@@ -13,6 +13,8 @@ import numpy as np
 from cosim.compiled import compiled
 from cosim.types import Bools, Floats, Ints
 
+ORDINARY = 3.0  # m/s2: who brakes harder than this now has hardly done so for two seconds
+
 
 def trailing_run(state: Floats, valid: Bools) -> Ints:
     """[V] how many unbroken valid, finite frames lead up to now; state [V,N,>=4], valid [V,N]."""
@@ -24,8 +26,9 @@ def trailing_run(state: Floats, valid: Bools) -> Ints:
 def whole_past(state: Floats, run: Ints, frames: int, dt: float) -> Floats:
     """[V,frames,4] x y speed heading, known or completed; `run` from `trailing_run` of state [V,N,>=4].
 
-    Speed and heading go back as the two oldest known frames show, nobody reverses, and the places follow
-    from both (P, eq. 9 backwards). A longer past is cut; zeros for a vehicle that is not known now.
+    Speed (its slope within ORDINARY) and heading go back as the two oldest known frames show, nobody
+    reverses, and the places follow from both (P, eq. 9 backwards). A longer past is cut; zeros for a vehicle
+    that is not known now.
     """
     out = np.zeros((len(state), frames, 4))
     _whole_past(state, run, dt, out)
@@ -59,6 +62,7 @@ def _whole_past(state: Floats, run: Ints, dt: float, out: Floats) -> None:
         gain = turn = 0.0
         if known > 1:
             gain = out[v, oldest + 1, 2] - out[v, oldest, 2]
+            gain = min(max(gain, -ORDINARY * dt), ORDINARY * dt)
             turn = out[v, oldest + 1, 3] - out[v, oldest, 3]
         for k in range(oldest - 1, -1, -1):
             x, y, speed, heading = out[v, k + 1]

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from cosim.app.bench_predict import forecast
+from cosim.app.prediction_data import recorded_by
 from cosim.app.progress import Progress
 from cosim.errors import BadInput
 from cosim.evaluation.prediction import Scores, interval_errors
@@ -123,14 +124,20 @@ def score(predictor: Predictor, folder: Folder) -> dict[str, float]:
 
 
 def _calibrate(prior: PriorFit, checked: Windows) -> None:
-    """Set the prior's calibration: factors with which its intervals cover 90 % of the tuning episodes."""
-    predicted = forecast(prior.fitted(), checked.past)
-    errors = interval_errors(predicted, checked.future)
-    used = [q for q, std in enumerate(predicted.std) if std.any()]
-    factors = factors_for(
-        tuple(predicted.std[q] for q in used), tuple(errors[q] for q in used), checked.weight
-    )
-    prior.calibrate(factors)
+    """Set the prior's calibration: factors with which its intervals cover 90 % of the tuning episodes.
+
+    Once for each number of known frames: the same moments, with what lies before them hidden.
+    """
+    predictor, factors = prior.fitted(), []
+    for known in range(1, checked.past.shape[1] + 1):
+        past = checked.past.copy()
+        past[:, :-known] = np.nan
+        predicted = forecast(predictor, past)
+        errors = interval_errors(predicted, checked.future)
+        used = [q for q, std in enumerate(predicted.std) if std.any()]
+        stds = tuple(predicted.std[q] for q in used)
+        factors.append(factors_for(stds, tuple(errors[q] for q in used), checked.weight))
+    prior.calibrate(np.stack(factors))
 
 
 def _windows(folder: Folder) -> Windows:
@@ -162,5 +169,5 @@ def _about(folder: Folder, allowed: range) -> dict[str, Any]:
         "seeds": [min(seeds), max(seeds)],
         "episodes": len(episodes),
         "sha256": digest,
-        "commands": found["commands"],
+        "commands": recorded_by(found),
     }

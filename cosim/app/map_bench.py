@@ -102,13 +102,17 @@ def measure(
     weights: Mapping[str, Path] | None = None,
     scenarios: Sequence[str] = (),
     behaviors: Sequence[str] = (),
+    seeds: range | None = None,
     stride: int = STRIDE,
     workers: int = 1,
 ) -> list[EpisodeErrors]:
     """Every episode of a folder of recordings. Raises BadInput when nothing is left to measure."""
     source = Folder(folder)
     keys = [
-        key for key in source.episodes() if _wanted(read(source.episode_file(key)).case, scenarios, behaviors)
+        key
+        for key in source.episodes()
+        if (seeds is None or int(key.rsplit("-", 1)[1]) in seeds)
+        and _wanted(read(source.episode_file(key)).case, scenarios, behaviors)
     ]
     chosen = hpn_weights() if weights is None else weights
     engine = LocalEngine(MapMeter, ({k: str(p) for k, p in chosen.items()}, stride), workers=workers)
@@ -165,17 +169,65 @@ def write_table(path: Path, table: Sequence[Mapping[str, Any]]) -> None:
     draft.replace(path)
 
 
-def markdown(table: Sequence[Mapping[str, Any]]) -> str:
-    """The table for people: PRE in 1e-5 per pixel and IoU, a line per world and predictor."""
-    head = " | ".join(f"{h:g} s" for h in HORIZONS)
-    lines = [
-        f"| world | predictor | PRE (1e-5) {head} | IoU {head} |",
-        "|" + "---|" * (2 + 2 * len(HORIZONS)),
+def against(episodes: Sequence[EpisodeErrors], ours: str = "hpn") -> list[dict[str, Any]]:
+    """How `ours` differs from every other predictor, relative to it, on the same episodes and over HORIZONS.
+
+    PRE below 0 and IoU above 0 say that ours is better; `everywhere`: at every horizon in the mean.
+    """
+    out: list[dict[str, Any]] = []
+    worlds = sorted({e.scenario for e in episodes})
+    for world in (*worlds, "all"):
+        here = [e for e in episodes if world in ("all", e.scenario)]
+        for other in (name for name in here[0].pre if name != ours and ours in here[0].pre):
+            row: dict[str, Any] = {"scenario": world, "against": other, "everywhere": True}
+            for name, sign in (("pre", -1.0), ("iou", 1.0)):
+                mine, theirs = (
+                    np.stack([getattr(e, name)[predictor] for e in here]) for predictor in (ours, other)
+                )  # [E,H]
+                figure = statistics.paired_change(theirs.mean(1), mine.mean(1))
+                row |= {
+                    f"{name}_change": figure.value,
+                    f"{name}_low": figure.low,
+                    f"{name}_high": figure.high,
+                }
+                row["everywhere"] &= bool((sign * (mine - theirs).mean(0) > 0.0).all())
+            out.append(row)
+    return out
+
+
+def markdown(
+    table: Sequence[Mapping[str, Any]], compared: Sequence[Mapping[str, Any]] = (), command: str = ""
+) -> str:
+    """The tables for people: PRE and IoU with their intervals, and what the HPN gains on the others."""
+    lines = ["# Predicted maps", ""]
+    if command:
+        lines += [f"`{command}`", ""]
+    total = [r for r in table if r["scenario"] == "all"]
+    lines += [
+        f"{total[0]['episodes']} episodes, {total[0]['n']} samples (an AV at a decision, one in {STRIDE}). "
+        "With 95 % intervals over episodes; PRE is the mean squared error per pixel of the vehicle channels, "
+        "IoU the overlap of occupied pixels.",
     ]
+    if compared:
+        lines += ["", "## What the HPN gains, mean over the horizons", ""]
+        lines += ["| world | against | PRE | IoU | better at every horizon |", "|---|---|---|---|---|"]
+        for r in compared:
+            pre, iou = (
+                statistics.Figure(r[f"{n}_change"], r[f"{n}_low"], r[f"{n}_high"]).text(1, 100.0)
+                for n in ("pre", "iou")
+            )
+            said = "yes" if r["everywhere"] else "no"
+            lines.append(f"| {r['scenario']} | {r['against']} | {pre} % | {iou} % | {said} |")
     keys = list(dict.fromkeys((row["scenario"], row["predictor"]) for row in table))
-    for world, predictor in keys:
-        mine = [r for r in table if (r["scenario"], r["predictor"]) == (world, predictor)]
-        pre = " | ".join(f"{1e5 * r['pre']:.1f}" for r in mine)
-        iou = " | ".join(f"{r['iou']:.3f}" for r in mine)
-        lines.append(f"| {world} | {predictor} | {pre} | {iou} |")
+    head = " | ".join(f"{h:g} s" for h in HORIZONS)
+    for name, title, scale, digits in (("pre", "PRE, 1e-5 per pixel", 1e5, 1), ("iou", "IoU", 1.0, 3)):
+        lines += ["", f"## {title}", "", f"| world | predictor | {head} |"]
+        lines += ["|" + "---|" * (2 + len(HORIZONS))]
+        for world, predictor in keys:
+            mine = [r for r in table if (r["scenario"], r["predictor"]) == (world, predictor)]
+            cells = [
+                statistics.Figure(r[name], r[f"{name}_low"], r[f"{name}_high"]).text(digits, scale)
+                for r in mine
+            ]
+            lines.append(f"| {world} | {predictor} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"

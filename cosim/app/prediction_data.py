@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -62,6 +63,15 @@ def followed(
 def episodes(folders: list[Path]) -> list[tuple[Path, str]]:
     """(folder, key) of every recorded episode. Raises BadInput for a folder that holds none."""
     return [(path, key) for path in folders for key in _keys(Folder(path))]
+
+
+def recorded_by(manifest: Mapping[str, Any]) -> list[str]:
+    """The commands that drove a folder's episodes, without where they wrote: that is no part of the data."""
+    told = set()
+    for command in manifest["commands"]:
+        words = [w for k, w in enumerate(command) if "--out" not in (w, *command[max(k - 1, 0) : k])]
+        told.add("cosim record " + shlex.join(w for w in words if w != "--resume"))
+    return sorted(told)
 
 
 def _keys(folder: Folder) -> list[str]:

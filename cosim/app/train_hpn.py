@@ -6,17 +6,18 @@ import argparse
 import hashlib
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from cosim.app import output
-from cosim.app.prediction_data import MAPLESS, episodes, followed, spread
+from cosim.app.prediction_data import MAPLESS, episodes, followed, recorded_by, spread
 from cosim.app.progress import Progress
 from cosim.app.train_vfn import configuration
 from cosim.errors import BadInput
 from cosim.evaluation.engines import LocalEngine
 from cosim.evaluation.tasks import Task
+from cosim.memory import keep_freed_memory
 from cosim.recording import Folder, read
 from cosim.types import COMPACT
 from policy.predictors import make_predictor
@@ -47,6 +48,7 @@ def train(args: argparse.Namespace) -> int:
         "validation": _checked(args.validation, VALIDATION, "--validation"),
     }
     folder = output.prepare_folder(args.out)
+    keep_freed_memory()
     use_threads(args.threads)
     data = {part: _manifest(keys) for part, keys in found.items()}
     examples = {part: _gather(keys, name, training, args.workers, part) for part, keys in found.items()}
@@ -75,10 +77,27 @@ def train(args: argparse.Namespace) -> int:
     progress.done()
     file_name = folder / f"{name}.safetensors"
     write_log(file_name.with_suffix(".csv"), log)
-    hpn.save(file_name, name, hpn.assemble(name, task), log[-1], data)
+    hpn.save(file_name, name, hpn.assemble(name, task), log[-1], {**data, "commands": _commands(args, found)})
     print(f"{name}: {loop.updates} updates, validation loss {log[-1]['validation_loss']:.4f}")
     print(f"  {file_name}")
     return 0
+
+
+def _commands(args: argparse.Namespace, found: Mapping[str, Sequence[tuple[Path, str]]]) -> dict[str, Any]:
+    """How to train the same again, for the card: the training's command, and those of its recordings."""
+    seed = "" if args.seed is None else f" --seed {args.seed}"
+    recorders = {
+        f"{part} recordings": [
+            told
+            for path in sorted({path for path, _ in keys})
+            for told in recorded_by(Folder(path).manifest())
+        ]
+        for part, keys in found.items()
+    }
+    return {
+        "train": f"cosim train hpn --variant {args.variant} --config {Path(args.config).name}{seed}",
+        **recorders,
+    }
 
 
 class Gatherer:

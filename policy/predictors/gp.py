@@ -10,11 +10,12 @@ from cosim.types import Bools, Floats
 from policy.checkpoint import SHIPPED, load
 from policy.forecast import KinematicForecast, integrate_position, motion_of
 from policy.gaussian_process import ACROSS, ALONG, HEADING, SPEED, BankConfig, GaussianProcessBank
-from policy.kernel_prior import KernelPrior, PriorConfig, PriorNetwork, describe, trailing_run
+from policy.kernel_prior import KernelPrior, PriorConfig, PriorNetwork, describe
+from policy.past import trailing_run, whole_past
 
 
 class _GaussianProcess:
-    """What both share: banks, their learned prior, one batch per length of history.
+    """What both share: banks, their learned prior, whole histories.
 
     `weights`: the fitted prior and calibration, as it is or from a file; None: the shipped one.
     """
@@ -46,22 +47,21 @@ class _GaussianProcess:
         return PriorConfig(tuple(len(c.kernels()) for c in cls.configs), cls.spreads)
 
     def predict(self, kinematics: Floats, valid: Bools) -> KinematicForecast:
-        """See `Predictor.predict`. Only the unbroken run of valid, finite frames up to now counts; a vehicle
-        that is not valid now gets no forecast (`valid` False, zeros)."""
+        """See `Predictor.predict`. Only the unbroken run of valid, finite frames up to now counts, and what
+        lies before it is completed (`policy.past`); a vehicle that is not valid now gets no forecast (`valid`
+        False, zeros)."""
         state = np.asarray(kinematics[:, :, :4], dtype=np.float64)
         run = trailing_run(state, valid)
         known = run > 0
-        now = np.where(known[:, None], np.nan_to_num(state[:, -1]), 0.0)  # [V,4]
-        logs, spread = self.prior.apply(describe(state, run, self.dt))
-        moments = np.zeros((len(self.banks), 4, len(state), self.horizon))
-        for count in np.unique(run[known]).tolist():
-            rows = slice(None) if count == run.min() == run.max() else np.flatnonzero(run == count)
-            series = self.series(state[rows, -count:])
-            for b, bank in enumerate(self.banks):
-                f = bank.forecast(series[b], logs[b][rows], float(self.prior.temperature[b]))
-                moments[b][:, rows] = f
-        scale = spread.T[:, :, None] * self._calibration[:, None]  # [spreads,V,M]
-        return self._forecast(now, moments, scale, known)
+        frames = len(self._calibration)
+        past = whole_past(state, run, frames, self.dt)  # [V,N,4]
+        logs, spread = self.prior.apply(describe(past, known, self.dt))
+        moments = np.empty((len(self.banks), 4, len(state), self.horizon))
+        for b, (bank, series) in enumerate(zip(self.banks, self.series(past), strict=True)):
+            moments[b] = bank.forecast(series, logs[b], float(self.prior.temperature[b]))
+        moments[:, :, ~known] = 0.0
+        factor = self._calibration[np.clip(run, 1, frames) - 1]  # [V,spreads,M]
+        return self._forecast(past[:, -1], moments, (spread[:, :, None] * factor).swapaxes(0, 1), known)
 
     def series(self, state: Floats) -> tuple[Floats, Floats]:
         """Two series [S,n] of states [S,n,4]."""

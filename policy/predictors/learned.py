@@ -11,10 +11,10 @@ import torch
 from torch import nn
 
 from cosim.errors import BadInput
-from cosim.types import Bools, Floats, Ints
+from cosim.types import Bools, Floats
 from policy.checkpoint import SHIPPED, load
 from policy.forecast import KinematicForecast, motion_of
-from policy.kernel_prior import trailing_run
+from policy.past import trailing_run, whole_past
 
 INPUTS = 6  # per frame, see `features`
 # Scales that bring inputs and outputs to order one: m behind, m aside, m/s, rad, m/s of change.
@@ -87,22 +87,20 @@ def integrate(
     )
 
 
-def features(state: Floats, run: Ints) -> torch.Tensor:
-    """[V,N,INPUTS] of states [V,N,>=4]: place, speed, heading, change of speed against now; known or not."""
-    now = np.nan_to_num(state[:, -1:])
-    dx, dy = state[:, :, 0] - now[:, :, 0], state[:, :, 1] - now[:, :, 1]
+def features(past: Floats, known: Bools) -> torch.Tensor:
+    """[V,N,INPUTS] of whole pasts [V,N,>=4], known [V]: place, speed, heading, gain in speed since."""
+    now = past[:, -1:]
+    dx, dy = past[:, :, 0] - now[:, :, 0], past[:, :, 1] - now[:, :, 1]
     c, s = np.cos(now[:, :, 3]), np.sin(now[:, :, 3])
-    frames = state.shape[1]
-    known = np.arange(frames)[None] >= frames - run[:, None]  # [V,N]
     columns = (
         (c * dx + s * dy) / BEHIND,
         (c * dy - s * dx) / ASIDE,
-        state[:, :, 2] / SPEED,
-        (state[:, :, 3] - now[:, :, 3]) / TURN,
-        (state[:, :, 2] - now[:, :, 2]) / GAIN,
+        past[:, :, 2] / SPEED,
+        (past[:, :, 3] - now[:, :, 3]) / TURN,
+        (past[:, :, 2] - now[:, :, 2]) / GAIN,
         np.ones_like(dx),
     )
-    return torch.from_numpy(np.where(known[..., None], np.stack(columns, -1), 0.0).astype(np.float32))
+    return torch.from_numpy(np.where(known[:, None, None], np.stack(columns, -1), 0.0).astype(np.float32))
 
 
 class Learned:
@@ -134,17 +132,13 @@ class Learned:
             load(file, {"network": self.network}, {"network": config})
 
     def predict(self, kinematics: Floats, valid: Bools) -> KinematicForecast:
-        """See `Predictor.predict`; no intervals. Histories are cut or filled to the N frames it knows."""
+        """See `Predictor.predict`; no intervals. Short histories are completed (`policy.past`)."""
         state = np.asarray(kinematics[:, :, :4], dtype=np.float64)
         run = trailing_run(state, valid)
         known = run > 0
-        now = np.where(known[:, None], np.nan_to_num(state[:, -1]), 0.0)
-        n, m = self.network.config.frames, self.horizon
-        state = state[:, -n:]
-        if state.shape[1] < n:
-            lead = np.repeat(state[:, :1], n - state.shape[1], 1)
-            state = np.concatenate([lead, state], 1)
-        seen = features(state, np.minimum(run, n))
+        past = whole_past(state, run, self.network.config.frames, self.dt)
+        now, m = past[:, -1], self.horizon
+        seen = features(past, known)
         with torch.inference_mode():
             speed_now = torch.from_numpy(now[:, 2].astype(np.float32))
             u, w, *rest = (t[:, :m].to(torch.float64).numpy() for t in self.network(seen, speed_now))

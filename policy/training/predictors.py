@@ -15,7 +15,7 @@ from torch import nn
 
 from cosim.types import Bools, Floats
 from policy.gaussian_process import GaussianProcessBank, Operators
-from policy.kernel_prior import PriorNetwork, describe, trailing_run
+from policy.kernel_prior import PriorNetwork, describe
 from policy.predictors.gp import GaussianProcessDirect, GaussianProcessIndirect
 from policy.predictors.learned import KinematicNet, NetConfig, features, integrate
 from policy.training.networks import seeded
@@ -23,6 +23,7 @@ from policy.training.networks import seeded
 COVERED = 0.9  # what an interval shall cover
 NORMAL = 1.645  # half its width in standard deviations, if errors were normal
 SPREAD_WEIGHT = 0.05  # of the intervals' loss: it shall not move the mean forecast
+SPREAD = slice(None, None, 4)  # of a batch: intervals cost more than the mean and need less
 
 GaussianProcess = type[GaussianProcessIndirect] | type[GaussianProcessDirect]
 
@@ -51,9 +52,8 @@ def in_own_frame(past: Floats, future: Floats, weight: Floats) -> Windows:
 
 def examples_for_net(windows: Windows) -> dict[str, torch.Tensor]:
     """What `net_loss` needs of each window."""
-    run = trailing_run(windows.past, np.isfinite(windows.past[:, :, 0]))
     return {
-        "past": features(windows.past, run),
+        "past": features(windows.past, np.ones(len(windows.past), np.bool_)),
         "speed": _tensor(windows.past[:, -1, 2]),
         **_truth(windows),
     }
@@ -81,8 +81,8 @@ def position_error(x: torch.Tensor, y: torch.Tensor, batch: Mapping[str, torch.T
 class BankMath(nn.Module):
     """`GaussianProcessBank.forecast` in torch, so that gradients reach the prior over kernels."""
 
-    predict: torch.Tensor
-    drift: torch.Tensor
+    table: torch.Tensor  # [K*(n+1),M] past and 1 -> the series ahead, by kernel
+    both: torch.Tensor  # [n+1,K*2M] the same, and its integral
     variance: torch.Tensor
     integral: torch.Tensor
 
@@ -90,38 +90,46 @@ class BankMath(nn.Module):
         super().__init__()
         op: Operators = bank.operators(frames)
         self.unit, self.kernels, self.steps = bank.config.unit, len(bank.kernels), bank.horizon
-        for name in ("predict", "drift", "variance"):
-            self.register_buffer(name, _tensor(getattr(op, name)), persistent=False)
+        each = np.concatenate([op.predict, op.drift[None]]).reshape(frames + 1, self.kernels, self.steps)
+        self.register_buffer("table", _tensor(each.swapaxes(0, 1).reshape(-1, self.steps)), persistent=False)
         trapezoid = np.tril(np.full((bank.horizon, bank.horizon), bank.dt))
         trapezoid[np.diag_indices(bank.horizon)] = 0.5 * bank.dt
-        self.register_buffer("integral", _tensor(trapezoid.T), persistent=False)
+        both = np.concatenate([each, each @ trapezoid.T], 2).reshape(frames + 1, -1)
+        for name, values in (("both", both), ("variance", op.variance), ("integral", trapezoid.T)):
+            self.register_buffer(name, _tensor(values), persistent=False)
 
     def forward(
         self, past: torch.Tensor, evidence: torch.Tensor, log_prior: torch.Tensor, heat: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """past [S,n] relative to now in the unit, evidence, log_prior [S,K] -> mean, deviation [S,2M]."""
+        """past [S,n] relative to now in the unit, evidence, log_prior [S,K] -> mean [S,2M], deviation [.,2M].
+
+        The deviation is that of the examples SPREAD, and no gradient flows through it.
+        """
         weight = torch.softmax(evidence / heat + log_prior, 1)
-        means = (past @ self.predict + self.drift).view(-1, self.kernels, self.steps)
-        means = torch.cat([means, means @ self.integral], 2)
-        mean = torch.bmm(weight[:, None], means)[:, 0]
-        second = torch.bmm(weight[:, None], means.square())[:, 0] + weight @ self.variance
-        deviation = torch.sqrt((second - mean**2).clamp(min=0.0) + 1e-8)
+        seen = torch.cat([past, torch.ones_like(past[:, :1])], 1)  # [S,n+1]
+        mean = (weight[:, :, None] * seen[:, None]).flatten(1) @ self.table
+        mean = torch.cat([mean, mean @ self.integral], 1)
+        with torch.no_grad():
+            few = weight[SPREAD]
+            means = (seen[SPREAD] @ self.both).view(-1, self.kernels, 2 * self.steps)
+            second = torch.bmm(few[:, None], means.square_())[:, 0] + few @ self.variance
+            deviation = torch.sqrt((second - mean[SPREAD] ** 2).clamp(min=0.0) + 1e-8)
         return self.unit * mean, self.unit * deviation
 
 
 class PriorFit:
     """One Gaussian-process predictor's prior: its examples, its loss, its calibration."""
 
-    def __init__(self, kind: GaussianProcess, seed: int = 0, frames: int = 10) -> None:
+    def __init__(self, kind: GaussianProcess, seed: int = 0) -> None:
         self.network = seeded(lambda: PriorNetwork(kind.prior_config()), seed)
         self.predictor = kind(weights=self.network)
-        self._math = [BankMath(bank, frames) for bank in self.predictor.banks]
+        self._math = [BankMath(bank, self.network.config.frames) for bank in self.predictor.banks]
 
     def examples(self, windows: Windows) -> dict[str, torch.Tensor]:
         """What `loss` needs of each window."""
-        run = np.full(len(windows.past), windows.past.shape[1])
+        known = np.ones(len(windows.past), np.bool_)
         found = {
-            "motion": _tensor(describe(windows.past, run, self.predictor.dt)),
+            "motion": _tensor(describe(windows.past, known, self.predictor.dt)),
             "speed": _tensor(windows.past[:, -1, 2]),
             **_truth(windows),
         }
@@ -139,7 +147,7 @@ class PriorFit:
         return type(self.predictor)(weights=self.network)
 
     def calibrate(self, factors: Floats) -> None:
-        """Set the factors [spreads,M] on the standard deviations."""
+        """Set the factors [N,spreads,M] on the standard deviations, by how many frames are known."""
         self.network.calibration.copy_(torch.from_numpy(factors))
 
     def loss(self, batch: Mapping[str, torch.Tensor]) -> torch.Tensor:
@@ -167,15 +175,16 @@ class PriorFit:
             dx, dy = future[:, :, 0] - x, future[:, :, 1] - y
             c, s = torch.cos(h), torch.sin(h)
             errors = [v - future[:, :, 2], h - future[:, :, 3], c * dx + s * dy, c * dy - s * dx]
-            across = torch.sqrt(x**2 + y**2 + 1e-6) / elapsed * second[1][:, m:]
+            across = (torch.sqrt(x**2 + y**2 + 1e-6) / elapsed)[SPREAD].detach() * second[1][:, m:]
             deviations = [first[1][:, :m], second[1][:, :m], first[1][:, m:], across]
         total = position_error(x, y, batch)
+        here, weight, spread = here[SPREAD], batch["weight"][SPREAD], spread[SPREAD]
         for k, (error, deviation) in enumerate(zip(errors, deviations, strict=True)):
             unit = (1.0, 0.05, 1.0, 0.5)[k] if len(errors) == 4 else (1.0, 0.5)[k]
-            edge = NORMAL * deviation.detach() * torch.exp(spread[:, k : k + 1])
-            beyond = (error.detach().abs() - edge) / unit
+            edge = NORMAL * deviation * torch.exp(spread[:, k : k + 1])
+            beyond = (error[SPREAD].detach().abs() - edge) / unit
             pinball = torch.maximum(COVERED * beyond, (COVERED - 1.0) * beyond) * here
-            total = total + SPREAD_WEIGHT * (pinball.sum(1) / here.sum(1) * batch["weight"]).mean()
+            total = total + SPREAD_WEIGHT * (pinball.sum(1) / here.sum(1) * weight).mean()
         return total
 
 

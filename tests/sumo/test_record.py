@@ -101,7 +101,7 @@ def test_bench_predict_records_what_it_needs_and_writes_its_tables(
     assert main(["bench", "predict", *flags.split(), "--out", str(out)]) == 0
     assert "gp-indirect" in capsys.readouterr().out
     rows = (out / "position_error.csv").read_text().splitlines()
-    assert len(rows) == 1 + 8 * 3 * 7, "predictors x (behaviour, scenario, all) x horizons and their mean"
+    assert len(rows) == 1 + 9 * 3 * 7, "predictors x (behaviour, scenario, all) x horizons and their mean"
     assert (out / "interval_coverage.csv").is_file()
     assert (out / "position_error.png").is_file()
     assert len(Folder(out / "recordings").episodes()) == 2

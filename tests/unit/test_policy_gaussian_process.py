@@ -142,7 +142,7 @@ def test_the_prior_in_numpy_is_the_one_that_was_fitted() -> None:
     for parameter in network.parameters():
         torch.nn.init.normal_(parameter, std=0.3)
     state = cars(np.abs(np.random.default_rng(0).normal(10.0, 5.0, (6, 10))))
-    motion = describe(state, np.full(6, 10), 0.2)
+    motion = describe(state, np.ones(6, bool), 0.2)
     prior = KernelPrior.of(network)
     (speed, heading), spread = prior.apply(motion)
     raw = network(torch.from_numpy(motion.astype(np.float32))).detach().numpy()
@@ -154,11 +154,11 @@ def test_the_prior_in_numpy_is_the_one_that_was_fitted() -> None:
 
 def test_calibration_goes_with_time_not_with_frames() -> None:
     network = PriorNetwork(GaussianProcessIndirect.prior_config())
-    network.calibration.copy_(torch.linspace(1.0, 2.0, 20).expand(4, 20))
+    network.calibration.copy_(torch.linspace(1.0, 2.0, 20).expand(10, 4, 20))
     prior = KernelPrior.of(network)
-    np.testing.assert_allclose(prior.calibrated(20, 0.2)[0], np.linspace(1.0, 2.0, 20))
-    np.testing.assert_allclose(prior.calibrated(10, 0.4)[0], np.linspace(1.0, 2.0, 20)[1::2])
-    assert prior.calibrated(30, 0.2)[0, 29] == 2.0
+    np.testing.assert_allclose(prior.calibrated(20, 0.2)[9, 0], np.linspace(1.0, 2.0, 20))
+    np.testing.assert_allclose(prior.calibrated(10, 0.4)[0, 3], np.linspace(1.0, 2.0, 20)[1::2])
+    assert prior.calibrated(30, 0.2)[0, 0, 29] == 2.0
 
 
 def test_fifty_vehicles_are_quick() -> None:

@@ -11,11 +11,14 @@ import pytest
 import torch
 
 from cosim.errors import BadInput, WeightsMismatch
+from cosim.road import Lane, RoadMap
 from policy.checkpoint import SHIPPED, save
 from policy.forecast import integrate_position, motion_of
-from policy.kernel_prior import PriorNetwork, describe, trailing_run
+from policy.kernel_prior import PriorNetwork, describe
+from policy.past import ORDINARY, trailing_run, whole_past
 from policy.predictors import PREDICTORS, make_predictor
 from policy.predictors.gp import GaussianProcessIndirect
+from policy.predictors.lane import along_lanes
 from policy.predictors.learned import KinematicNet, Learned, NetConfig
 from policy.training.fitting import FitConfig, fit
 from policy.training.loop import LoopConfig
@@ -167,16 +170,62 @@ def test_speed_and_heading_follow_from_positions() -> None:
     assert motion_of(now, *stopped, 0.2)[1][0, -1] == pytest.approx(3.05)
 
 
-def test_what_is_described_is_the_present_motion() -> None:
-    state = cars(np.stack([np.zeros(10), 15.0 + 2.0 * TIME]))
+def test_an_unknown_past_went_as_the_oldest_known_frames_show() -> None:
+    state = cars(np.stack([15.0 + 2.0 * TIME, np.full(10, 12.0), 14.0 - 8.0 * TIME, np.full(10, 9.0)]))
+    state[1, :, 3] = 0.3 * TIME
+    state[1] = cars(state[1:2, :, 2], state[1:2, :, 3])[0]
     valid = everywhere(state)
-    valid[1, :7] = False
+    valid[0, :7] = False
+    state[1, :5] = np.nan
+    valid[2, :6] = False
+    valid[3, :-1] = False
     run = trailing_run(state, valid)
-    assert run.tolist() == [10, 3]
-    motion = describe(state, run, 0.2)
+    assert run.tolist() == [3, 5, 4, 1]
+    past = whole_past(state, run, 10, 0.2)
+    np.testing.assert_allclose(past[0, :, 2], 15.0 + 2.0 * TIME)
+    np.testing.assert_allclose(past[1, :, 3], 0.3 * TIME, atol=1e-9)
+    whole = cars(np.full((1, 10), 12.0), 0.3 * TIME[None])[0]
+    np.testing.assert_allclose(past[1, :, :2], whole[:, :2], atol=0.02)
+    np.testing.assert_allclose(np.diff(past[2, :7, 2]), -ORDINARY * 0.2, err_msg="no emergency for 2 s")
+    np.testing.assert_allclose(past[3, :, 0], 100.0 + 9.0 * TIME)
+    gone = whole_past(state[:1], np.zeros(1, np.int64), 10, 0.2)
+    assert (gone == 0.0).all()
+    longer = np.concatenate([state[:1], state[:1]], 1)
+    np.testing.assert_allclose(whole_past(longer, np.full(1, 20), 10, 0.2), state[:1, :, :4])
+
+
+@pytest.mark.parametrize("known", [1, 2, 4])
+def test_an_interval_is_wider_the_less_is_known(known: int) -> None:
+    state = cars(np.full((2, 10), 12.0))
+    valid = everywhere(state)
+    valid[1, :-known] = False
+    forecast = make_predictor("gp-indirect", 20, 0.2).predict(state, valid)
+    assert forecast.along_std[1].sum() > forecast.along_std[0].sum()
+
+
+def test_what_is_described_is_the_present_motion() -> None:
+    state = cars(np.stack([np.zeros(10), 15.0 + 2.0 * TIME, np.full(10, 9.0)]))
+    motion = describe(state, np.array([True, True, False]), 0.2)
     assert motion[0, 2] == 1.0, "standing"
-    assert motion[1, 4] == pytest.approx(np.tanh(1.0))
-    assert motion[1, 8] == pytest.approx(np.tanh(0.8 / 4.0)), "only the frames that are known"
+    np.testing.assert_allclose(motion[1, 4:12:2], np.tanh(1.0), err_msg="2 m/s2 over every lag")
+    assert (motion[2] == 0.0).all(), "not known now"
+
+
+def test_led_along_its_lane_a_car_takes_the_bend_that_its_past_does_not_show() -> None:
+    bend = np.array([[0.0, 50.0], [110.0, 50.0], [110.0, 150.0]])
+    road = RoadMap((Lane("e_0", "e", 0, bend, 210.0, 3.2, 13.9),))
+    state = cars(np.full((3, 10), 10.0))[:, :, :4]
+    state[2, :3] = np.nan  # a short history
+    valid = np.isfinite(state[:, :, 0])
+    plain = make_predictor("gp-indirect", 20, 0.2).predict(state, valid)
+    lane = np.array([0, -1, 0])
+    led = along_lanes(plain, state, valid, lane, np.full(3, 102.5), np.full(3, 5.0), road)
+    assert plain.x[0, -1] == pytest.approx(140.0, abs=6.0)
+    for car in (0, 2):
+        assert led.x[car, -1] == pytest.approx(110.0, abs=2.0)
+        assert led.y[car, -1] == pytest.approx(80.0, abs=6.0)
+    np.testing.assert_allclose(led.x[1], plain.x[1], err_msg="off every lane: as forecast", atol=1e-6)
+    np.testing.assert_allclose(led.speed, plain.speed, atol=0.5)
 
 
 # ---- fitting ----

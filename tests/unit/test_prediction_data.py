@@ -98,7 +98,16 @@ def test_map_errors_are_measured_against_what_followed(folder: Path, tmp_path: P
     map_bench.write_table(tmp_path / "map_error.csv", table)
     head = (tmp_path / "map_error.csv").read_text().splitlines()[0]
     assert head.startswith("predictor,scenario,horizon_s,pre,")
-    assert "| merge | hpn |" in map_bench.markdown(table)
+    compared = map_bench.against([episode, episode])
+    (still,) = [r for r in compared if (r["scenario"], r["against"]) == ("merge", "last-frame")]
+    assert still["pre_change"] < 0.0 < still["iou_change"]
+    assert still["everywhere"] is bool(
+        (episode.pre["hpn"] < episode.pre["last-frame"]).all()
+        and (episode.iou["hpn"] > episode.iou["last-frame"]).all()
+    )
+    said = map_bench.markdown(table, compared, "cosim bench predict")
+    assert "| merge | hpn |" in said
+    assert "| merge | last-frame |" in said
 
 
 def arguments(folder: Path, **changes: object) -> argparse.Namespace:

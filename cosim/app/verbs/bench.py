@@ -64,16 +64,25 @@ def work(args: argparse.Namespace) -> int:
         raise BadInput("recordings are there already", field="--demand, --policy")
     folder = Folder(where)
     folder.manifest()
+    command = "cosim " + shlex.join(sys.argv[1:])
     bench_predict(
         folder,
         out,
         scenarios=args.scenario,
         behaviors=args.behavior,
         seeds=args.seeds,
-        command="cosim " + shlex.join(sys.argv[1:]),
+        command=command,
     )
     print((out / "prediction.md").read_text())
     if not args.no_maps:
-        bench_maps(folder, out, scenarios=args.scenario, behaviors=args.behavior, workers=args.workers)
+        bench_maps(
+            folder,
+            out,
+            scenarios=args.scenario,
+            behaviors=args.behavior,
+            seeds=args.seeds,
+            workers=args.workers,
+            command=command,
+        )
         print((out / "map_error.md").read_text())
     return 0

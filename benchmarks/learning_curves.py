@@ -1,0 +1,212 @@
+"""How learning went: crashes, missions and distance over training, several seeds of one agent together.
+
+    python -m benchmarks.learning_curves vfn-p=runs/vfn-p-0 vfn-p=runs/vfn-p-1 twin=runs/twin-0 \\
+        [--out docs/results/learning.md]
+
+RUN is a folder of `cosim train vfn|a2c`; runs of one LABEL are one agent trained from several seeds (without
+a label it is the folder's name). With --out a page, CSV and picture are written, else the page is printed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure as Picture
+
+from benchmarks.tables import DPI, markdown_row, write_page
+from cosim.errors import BadInput, CosimError
+from cosim.types import Floats
+
+COURSES = {"crashed": "crashed, %", "mission_success": "missions fulfilled, %", "dt_mean_m": "distance, m"}
+PERCENT = ("crashed", "mission_success")
+PARTS = {"train": "training drives", "valid": "validation, greedy"}
+WINDOW = 20  # iterations a point of the training drives is the mean of
+
+
+@dataclass(frozen=True)
+class Course:
+    """One figure over one run; [k] each."""
+
+    iteration: Floats
+    value: Floats  # in the figure's own unit, shares as fractions
+
+
+@dataclass(frozen=True)
+class Training:
+    """One run: (part, figure) -> its course."""
+
+    label: str
+    name: str
+    courses: Mapping[tuple[str, str], Course]
+    iterations: int
+    seed: int | None  # None: the folder does not say
+
+
+def read(text: str) -> Training:
+    """`[LABEL=]RUN`. Raises BadInput when there is no log of a training in it."""
+    label, _, folder = text.rpartition("=")
+    path = Path(folder)
+    log = path / "log.jsonl"
+    if not log.is_file():
+        raise BadInput("holds no log.jsonl: is it a run of `cosim train vfn|a2c`?", file=path)
+    try:
+        records: list[dict[str, Any]] = [json.loads(line) for line in log.read_text().splitlines()]
+        at = [float(record["iteration"]) for record in records]
+    except (ValueError, KeyError, TypeError) as error:
+        raise BadInput(f"is no log of a training: {error!r}", file=log) from None
+    courses = {}
+    for part in PARTS:
+        for name in COURSES:
+            found = [
+                (k, float(r[f"{part}/{name}"]))
+                for k, r in zip(at, records, strict=True)
+                if f"{part}/{name}" in r
+            ]
+            if found:
+                x, y = np.array(found).T
+                courses[part, name] = smoothed(x, y) if part == "train" else Course(x, y)
+    if not courses:
+        raise BadInput("holds none of the figures that are drawn", file=log)
+    return Training(label or path.name, path.name, courses, len(records), _seed(path))
+
+
+def smoothed(x: Floats, y: Floats, window: int = WINDOW) -> Course:
+    """Means over `window` neighbours, each at the last of them; over all there are when these are fewer."""
+    width = min(window, len(y))
+    return Course(x[width - 1 :], np.convolve(y, np.full(width, 1.0 / width), "valid"))
+
+
+def together(courses: Sequence[Course]) -> tuple[Floats, Floats, Floats, Floats]:
+    """Iterations that all courses reach, and there the mean, the lowest and the highest of them: [k] each."""
+    first, last = max(c.iteration[0] for c in courses), min(c.iteration[-1] for c in courses)
+    x = courses[0].iteration
+    x = x[(x >= first) & (x <= last)]
+    values = np.array([np.interp(x, c.iteration, c.value) for c in courses])
+    return x, values.mean(0), values.min(0), values.max(0)
+
+
+def page(runs: Sequence[Training], command: str, drawn: str = "") -> list[str]:
+    """The Markdown page."""
+    lines = ["# How learning went", "", f"Made by `{command}`.", ""]
+    lines += [
+        f"Training drives: means over {WINDOW} iterations; they explore, and a falling share of them is",
+        "driven by the mentor (docs/training.md). Validation: greedy, on tuning seeds. Thin: a training seed",
+        "each; thick: their mean. In the table the mean over seeds, in brackets the lowest and the highest.",
+        "",
+        *([f"![crashes, missions, distance over training]({drawn})", ""] if drawn else []),
+        markdown_row(["agent", "seeds", "iterations", "drives", "figure", "first", "last"]),
+        "|---" * 7 + "|",
+    ]
+    for label, mine in _by_label(runs).items():
+        seeds = ", ".join("?" if run.seed is None else str(run.seed) for run in mine)
+        count = ", ".join(dict.fromkeys(str(run.iterations) for run in mine))
+        for (part, name), courses in _shared(mine).items():
+            _, mean, low, high = together(courses)
+            if not len(mean):
+                continue
+            ends = [_text(name, mean[k], low[k], high[k]) for k in (0, -1)]
+            lines.append(markdown_row([label, seeds, count, PARTS[part], COURSES[name], *ends]))
+    return lines
+
+
+def write_csv(path: Path, runs: Iterable[Training]) -> None:
+    """Every point of every run."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(("agent", "run", "drives", "figure", "iteration", "value"))
+        for run in runs:
+            for (part, name), course in run.courses.items():
+                for x, y in zip(course.iteration, course.value, strict=True):
+                    writer.writerow((run.label, run.name, part, name, f"{x:g}", f"{y:.6g}"))
+
+
+def draw(path: Path, runs: Sequence[Training]) -> None:
+    """A row per part, a column per figure."""
+    parts = [part for part in PARTS if any(p == part for run in runs for p, _ in run.courses)]
+    picture = Picture(figsize=(4.2 * len(COURSES), 3.2 * len(parts)), layout="constrained")
+    axes = picture.subplots(len(parts), len(COURSES), squeeze=False)
+    for row, part in enumerate(parts):
+        for column, (name, title) in enumerate(COURSES.items()):
+            _draw(axes[row, column], runs, (part, name))
+            axes[row, column].set(title=f"{title} ({PARTS[part]})", xlabel="iterations")
+    axes[0, 0].legend(fontsize="small")
+    picture.savefig(path, dpi=DPI)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Read, then write or print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("runs", nargs="+", metavar="[LABEL=]RUN")
+    parser.add_argument("--out", type=Path, metavar="FILE.md")
+    args = parser.parse_args(arguments)
+    try:
+        runs = [read(text) for text in args.runs]
+    except CosimError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return error.exit_code
+    words = sys.argv[1:] if arguments is None else arguments
+    command = " ".join(["python -m benchmarks.learning_curves", *words])
+    if args.out is None:
+        print("\n".join(page(runs, command)))
+        return 0
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    picture = args.out.with_suffix(".png")
+    draw(picture, runs)
+    write_csv(args.out.with_suffix(".csv"), runs)
+    write_page(args.out, page(runs, command, picture.name))
+    return 0
+
+
+# ---- inside ----
+
+
+def _seed(folder: Path) -> int | None:
+    """The training seed, as the checkpoint has it."""
+    try:
+        return int(json.loads((folder / "state.json").read_text())["config"]["seed"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _by_label(runs: Iterable[Training]) -> dict[str, list[Training]]:
+    found: dict[str, list[Training]] = {}
+    for run in runs:
+        found.setdefault(run.label, []).append(run)
+    return found
+
+
+def _shared(runs: Sequence[Training]) -> dict[tuple[str, str], list[Course]]:
+    """What all of these runs have."""
+    keys = [key for key in runs[0].courses if all(key in run.courses for run in runs)]
+    return {key: [run.courses[key] for run in runs] for key in keys}
+
+
+def _text(name: str, *values: float) -> str:
+    scale, digits = (100.0, 1) if name in PERCENT else (1.0, 0)
+    mean, low, high = (f"{scale * v:.{digits}f}" for v in values)
+    return mean if low == high else f"{mean} ({low} to {high})"
+
+
+def _draw(axes: Axes, runs: Sequence[Training], key: tuple[str, str]) -> None:
+    scale = 100.0 if key[1] in PERCENT else 1.0
+    for k, (label, mine) in enumerate(_by_label(runs).items()):
+        courses = [run.courses[key] for run in mine if key in run.courses]
+        for course in courses:
+            axes.plot(course.iteration, scale * course.value, color=f"C{k}", alpha=0.35, linewidth=0.8)
+        if courses:
+            x, mean, _, _ = together(courses)
+            axes.plot(x, scale * mean, color=f"C{k}", linewidth=1.8, label=label)
+    axes.grid(alpha=0.3)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,198 @@
+"""What the learned decisions are worth: vfn-p against its egoistic twin, the scripted altruist and IDM.
+
+    python -m benchmarks.papers.decisions [--scale 1] [--scenario merge] [--dry-run]
+
+300 episodes a world of `dense` with mixed drivers, 100 of `contested`, on test seeds, `unguarded`; each
+target of `benchmarks/targets.py` beside its figure. What Table III has driven already is not driven again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+from benchmarks import targets
+from benchmarks.arms import differences, of_world
+from benchmarks.papers.agents import Agent
+from benchmarks.papers.driving import WORLDS, Order, Results, Settings
+from benchmarks.papers.pages import Job, heading, save
+from benchmarks.tables import (
+    COLUMNS,
+    Line,
+    difference_lines,
+    difference_table,
+    found,
+    lines_of,
+    markdown_row,
+    picture,
+    table,
+)
+from benchmarks.targets import Arms, Finding
+from cosim.evaluation.run_folder import Run
+from cosim.evaluation.statistics import Figure
+
+DENSE, CONTESTED = 300, 100  # episodes a world
+TWIN = "vfn-p-egoistic"
+AGENTS = ("vfn-p", "vfn", TWIN, "altruist-rule", "idm", "keep-lane")
+BEHAVIOR = {"dense": "mixed", "contested": "moderate"}  # contract.md, Demand and behaviour
+DIFFERENCES = (
+    "mission_success_rate",
+    "collision_rate",
+    "dt_mission_m",
+    "dt_av_m",
+    "dt_mean_m",
+    "hard_brakings_av",
+)
+PANELS = (  # demand, figure, title
+    ("dense", "collision_rate", "C%, dense"),
+    ("contested", "mission_success_rate", "served, contested"),
+    ("contested", "dt_mission_m", "DT of the mission vehicle, contested"),
+    ("contested", "dt_av_m", "DT of the AVs, contested"),
+)
+PERCENT = tuple(title for _, name, title in PANELS if name.endswith("_rate"))
+
+Runs = Mapping[str, Mapping[str, Run]]  # demand -> arm -> its episodes
+
+
+def orders() -> list[Order]:
+    """Everybody in every world; in `contested` nobody needs to see how hard the traffic is."""
+    return [
+        Order(Agent(name), world, demand, behavior, episodes, svo=svo(name))
+        for demand, behavior, episodes in (
+            ("dense", BEHAVIOR["dense"], DENSE),
+            ("contested", BEHAVIOR["contested"], CONTESTED),
+        )
+        for world in WORLDS
+        for name in AGENTS
+        if demand == "dense" or name != "keep-lane"
+    ]
+
+
+def svo(name: str) -> float:
+    """phi in degrees: the twin was trained for itself alone, and drives so."""
+    return 0.0 if name == TWIN else 45.0
+
+
+def write(results: Results, settings: Settings) -> None:
+    """decisions.md, decisions.png, data/decisions.csv."""
+    runs = {demand: results.runs(demand=demand) for demand in BEHAVIOR}
+    names = {one.order.name: one.name for one in results.driven if one.rows}
+    driven = {row["scenario"] for arms in runs.values() for run in arms.values() for row in run.rows}
+    worlds = [world for world in WORLDS if world in driven]
+    about = (
+        f"phi 45 degrees, `{TWIN}` 0. DT: mean distance in m over the fixed duration; nobody drives on",
+        "after a crash. The unguarded `keep-lane` fleet shows how hard the traffic is.",
+    )
+    page = heading(JOB, results, settings, *about)
+    findings = list(found_targets(runs, worlds, names))
+    page += told(findings)
+    if worlds:
+        settings.out.mkdir(parents=True, exist_ok=True)
+        picture(settings.out / "decisions.png", panels(runs, worlds), PERCENT)
+        page += ["![crashes, missions, distances](decisions.png)", ""]
+    page += headline(runs, worlds, names)
+    page += figures(runs, worlds, names)
+    save(JOB, settings, page, csv_lines(runs, worlds, names))
+
+
+def found_targets(runs: Runs, worlds: Sequence[str], names: Mapping[str, str]) -> Iterator[Finding]:
+    """Every target whose arms were driven; `names`: arm -> as the tables show it."""
+    parts = Arms(*(names.get(a, "") for a in ("vfn-p", TWIN, "idm", "altruist-rule")))
+    if {parts.agent, parts.idm} <= runs["dense"].keys():
+        yield from targets.dense(runs["dense"], worlds, parts)
+    if set(parts) <= runs["contested"].keys():
+        yield from targets.contested(runs["contested"], worlds, parts)
+
+
+def told(findings: Sequence[Finding]) -> list[str]:
+    """The targets: first which are missed, then all of them with their figures."""
+    if not findings:
+        return ["The targets need `vfn-p`, its twin, `altruist-rule` and `idm`: not driven yet.", ""]
+    missed = [f"- {f.world}, {f.demand}: {f.target} ({f.found})" for f in findings if not f.met]
+    first = f"{len(findings) - len(missed)} of {len(findings)} are met by their value"
+    return [
+        "## Targets",
+        "",
+        *([f"{first}; missed:", "", *missed] if missed else [f"{first}."]),
+        "",
+        *_findings(findings, "target", "verdict"),
+    ]
+
+
+def headline(runs: Runs, worlds: Sequence[str], names: Mapping[str, str]) -> list[str]:
+    """T's claim, tested in both demands."""
+    agent, twin = names.get("vfn-p", ""), names.get(TWIN, "")
+    tested = [
+        finding
+        for demand, arms in runs.items()
+        if {agent, twin} <= arms.keys()
+        for finding in targets.altruists_against_twin(demand, arms[twin], arms[agent], worlds)
+    ]
+    if not tested:
+        return []
+    return [
+        "## Altruists against egoists",
+        "",
+        f"T's headline: altruists crash less and everybody gets further. `{agent}` - `{twin}`, equal seeds.",
+        "",
+        *_findings(tested, "claim", "tested"),
+    ]
+
+
+def figures(runs: Runs, worlds: Sequence[str], names: Mapping[str, str]) -> list[str]:
+    """The tables of every world: the arms, and the agent's differences to them."""
+    page = []
+    for demand, arms in runs.items():
+        for world in worlds:
+            if not any(of_world(run, world) for run in arms.values()):
+                continue
+            page += [f"## {world}, {demand}", "", f"Drivers {BEHAVIOR[demand]}.", "", *table(world, arms)]
+            agent = names.get("vfn-p", "")
+            compared = {
+                f"{agent} - {other}": differences(arms[other], arms[agent])[world]
+                for other in _others(names)
+                if {agent, other} <= arms.keys()
+            }
+            if compared:
+                page += difference_table(compared, DIFFERENCES)
+    return page
+
+
+def csv_lines(runs: Runs, worlds: Sequence[str], names: Mapping[str, str]) -> list[Line]:
+    """Every figure and every paired difference of the page."""
+    lines: list[Line] = []
+    agent = names.get("vfn-p", "")
+    for demand, arms in runs.items():
+        lines += lines_of(demand, worlds, arms, COLUMNS)
+        for other in _others(names):
+            if {agent, other} <= arms.keys():
+                compared = differences(arms[other], arms[agent])
+                lines += difference_lines(demand, agent, other, compared, DIFFERENCES)
+    return lines
+
+
+def panels(runs: Runs, worlds: Sequence[str]) -> dict[str, dict[str, dict[str, Figure]]]:
+    """Title -> arm -> world -> figure."""
+    out: dict[str, dict[str, dict[str, Figure]]] = {}
+    for demand, name, title in PANELS:
+        for arm, run in runs[demand].items():
+            known = {w: found(of_world(run, w), run.measures[name])[0] for w in worlds}
+            out.setdefault(title, {})[arm] = {w: f for w, f in known.items() if f.known}
+    return out
+
+
+# ---- inside ----
+
+
+def _others(names: Mapping[str, str]) -> list[str]:
+    return [names[name] for name in ("idm", TWIN, "altruist-rule", "vfn") if name in names]
+
+
+def _findings(findings: Sequence[Finding], what: str, verdict: str) -> list[str]:
+    head = [markdown_row(["demand", "world", what, "found", verdict]), "|---|---|---|---|---|"]
+    return [*head, *(markdown_row(list(finding)) for finding in findings), ""]
+
+
+JOB = Job("decisions", "What the learned decisions are worth", orders, write)
+
+if __name__ == "__main__":
+    JOB.main()

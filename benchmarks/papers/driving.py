@@ -1,0 +1,346 @@
+"""Drives what the tables need, each episode once: one store for all of them, resumable, shared and growing.
+
+An episode counts only for the very agent (configuration, weights by hash), input files and versions it was
+driven with: newly trained weights are driven anew, all else stays. More episodes drive only what is missing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from statistics import fmean
+
+from benchmarks.papers.agents import Agent, build, fingerprint, missing, short
+from cosim.app.case_runner import CaseRunner
+from cosim.app.progress import Progress
+from cosim.app.runner import Runner
+from cosim.evaluation import batch, estimate, matrix
+from cosim.evaluation.case import Case
+from cosim.evaluation.engines import LocalEngine
+from cosim.evaluation.figures import Row
+from cosim.evaluation.folder import RunFolder
+from cosim.evaluation.run_folder import Run
+from cosim.evaluation.store import Store
+
+TEST_SEEDS = 200_000  # contract.md: tests from here on
+WORLDS = ("exit", "merge", "roundabout", "intersection", "highway")  # P's order
+SVO = 45.0  # deg, weighs oneself and the others alike
+PROBES = 2  # worlds in which an agent's cost is measured
+LEAST = 2  # episodes, however small the scale
+MARK = "#"  # between an agent's name and its fingerprint
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """So many episodes of an agent in one kind of traffic, on the test seeds from the first one."""
+
+    agent: Agent
+    scenario: str
+    demand: str
+    behavior: str  # of the HVs
+    episodes: int  # at scale 1
+    svo: float = SVO  # deg
+    arm: str = ""  # its name in tables; "": the agent's
+
+    @property
+    def name(self) -> str:
+        return self.arm or self.agent.name
+
+    @property
+    def case(self) -> Case:
+        """Of the first seed; the policy is the agent's name."""
+        return Case(
+            what=self.scenario,
+            demand=(self.demand,),
+            policy=self.agent.name,
+            behavior=self.behavior,
+            driver_model="lc2013",
+            penetration=None,
+            av_type=None,
+            av_ids=None,
+            svo_deg=self.svo,
+            preset="unguarded",
+            duration=None,
+            seed=TEST_SEEDS,
+        )
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How much is driven, and where everything lies."""
+
+    runs: Path = Path("runs/results")  # the store of all episodes
+    out: Path = Path("docs/results")  # pages, pictures, CSV
+    scale: float = 1.0  # of the numbers of episodes
+    scenarios: tuple[str, ...] = ()  # (): all that a table has
+    workers: int = 2
+    untrained: bool = False  # value networks as they are born: nothing needs to have been trained
+    duration: float | None = None  # s; None: the scenario's own
+    first: int = TEST_SEEDS  # seed; what is compared to tune something belongs on tuning seeds
+    trainings: Mapping[str, tuple[Path, ...]] = field(default_factory=dict)  # policy -> runs of cosim train
+
+    def episodes(self, full: int) -> int:
+        """How many of `full` episodes are wanted."""
+        return max(math.ceil(full * self.scale), LEAST)
+
+    def trained(self, policy: str) -> tuple[Path, ...]:
+        """The runs of `cosim train` it is known of: as told, else runs/POLICY and runs/POLICY-0, -1, ..."""
+        places = [Path("runs") / policy, *sorted(Path("runs").glob(f"{policy}-[0-9]*"))]
+        return self.trainings.get(policy, tuple(p for p in places if (p / "log.jsonl").is_file()))
+
+    @property
+    def flags(self) -> str:
+        """As they were typed, for the page's command."""
+        words = [] if self.scale == 1.0 else [f"--scale {self.scale:g}"]
+        words += [f"--scenario {name}" for name in self.scenarios]
+        words += [f"--duration {self.duration:g}"] if self.duration is not None else []
+        return " ".join(["", *words, *(["--untrained"] if self.untrained else [])])
+
+
+@dataclass(frozen=True)
+class Driven:
+    """What there is of one order."""
+
+    order: Order
+    rows: list[Row]  # by seed, of any status; [] when nothing could be driven
+    why: str = ""  # why not
+
+    @property
+    def label(self) -> str:
+        """`untrained`, or what else is to be warned of; "" when nothing is."""
+        return next((str(row["policy_label"]) for row in self.rows if row.get("policy_label")), "")
+
+    @property
+    def name(self) -> str:
+        """In tables: the arm, and what is to be warned of."""
+        return f"{self.order.name} ({self.label})" if self.label else self.order.name
+
+
+@dataclass(frozen=True)
+class Results:
+    """Every order with its rows, and what the store knows of all figures."""
+
+    driven: tuple[Driven, ...]
+    notes: Mapping[str, Mapping[str, str]]  # `units` and `better` of the figures
+
+    def runs(self, *, demand: str = "", behavior: str = "") -> dict[str, Run]:
+        """Arm -> its episodes of all worlds, of one demand or behaviour where that is given; never none."""
+        found: dict[str, list[Row]] = {}
+        for one in self.driven:
+            mine = demand in ("", one.order.demand) and behavior in ("", one.order.behavior)
+            if mine and one.rows:
+                found.setdefault(one.name, []).extend(one.rows)
+        return {name: Run(Path(name), rows, self.notes) for name, rows in found.items()}
+
+    @property
+    def absent(self) -> list[str]:
+        """What was not driven and why, a line per reason."""
+        return reasons({one.order.agent: one.why for one in self.driven if one.why})
+
+
+def drive(orders: Sequence[Order], settings: Settings, title: str) -> Results:
+    """Drive what the store does not hold yet; what lacks weights is left out and named on stderr.
+
+    Raises BadInput (nothing is driven then) and CosimError as `cosim evaluate` does.
+    """
+    orders = [o for o in dict.fromkeys(orders) if not settings.scenarios or o.scenario in settings.scenarios]
+    absent = without_weights(orders, settings, title)
+    work = planned([o for o in orders if o.agent not in absent], settings)
+    settings.runs.mkdir(parents=True, exist_ok=True)
+    with (
+        RunFolder(str(settings.runs), resume=True, episodes=work.episodes) as folder,
+        _store(folder.path) as store,
+    ):
+        _drive(work, store, settings, title)
+        rows: dict[str, list[Row]] = {}
+        for row in store.rows():
+            rows.setdefault(row["cell"], []).append(row)
+        notes = {name: dict(store.document()[name]) for name in ("units", "better")}
+    driven = []
+    for order in orders:
+        cell = work.cell_of.get(order)
+        last = settings.first + settings.episodes(order.episodes)
+        mine: list[Row] = [
+            {**row, "policy": order.agent.name}  # rows that failed bear the fingerprint
+            for row in rows.get(cell or "", [])
+            if settings.first <= row["seed"] < last
+        ]
+        driven.append(Driven(order, mine, absent.get(order.agent, "")))
+    return Results(tuple(driven), notes)
+
+
+def without_weights(orders: Sequence[Order], settings: Settings, title: str) -> dict[Agent, str]:
+    """The agents that cannot drive, and why; said on stderr, a line per reason."""
+    absent = {o.agent: why for o in orders if not settings.untrained and (why := missing(o.agent))}
+    for line in reasons(absent):
+        print(f"{title}: not driven: {line}", file=sys.stderr)
+    return absent
+
+
+def reasons(absent: Mapping[Agent, str]) -> list[str]:
+    """`vfn-p and 9 more: no weights ...`: one line per reason."""
+    names: dict[str, list[str]] = {}
+    for agent, why in absent.items():
+        names.setdefault(why, []).append(agent.name)
+    more = {why: f" and {len(mine) - 1} more" if len(mine) > 1 else "" for why, mine in names.items()}
+    return [f"{mine[0]}{more[why]}: {why}" for why, mine in names.items()]
+
+
+def cost(orders: Sequence[Order], settings: Settings) -> list[tuple[str, int, float]]:
+    """What is still to be driven: agent, episodes, CPU hours, reckoned from short episodes just now.
+
+    Agents without weights are counted with untrained networks, which cost the same.
+    """
+    orders = [o for o in orders if not settings.scenarios or o.scenario in settings.scenarios]
+    able = planned([o for o in orders if settings.untrained or not missing(o.agent)], settings)
+    done = _stored(settings)
+    probed = planned(orders, replace(settings, untrained=True))
+    cells = {cell.name: cell for cell in probed.cells}
+    left: dict[str, dict[str, int]] = {}  # agent -> cell -> episodes
+    for order in orders:
+        of_agent = left.setdefault(order.agent.name, {})
+        todo = settings.episodes(order.episodes) - done.get(able.cell_of.get(order, ""), 0)
+        cell = probed.cell_of[order]
+        of_agent[cell] = max(of_agent.get(cell, 0), todo)
+    engine = LocalEngine(AgentRunner, (probed.agents, True), workers=1)
+    found = []
+    for name, of_agent in left.items():
+        worlds = {cells[cell].case.what: cells[cell] for cell, todo in of_agent.items() if todo}
+        costs = list(estimate.probe([*worlds.values()][:PROBES], engine).values())
+        if costs:
+            reset, second = fmean(c.reset for c in costs), fmean(c.second for c in costs)
+            spent = sum(n * (reset + second * cells[c].scenario.duration) for c, n in of_agent.items())
+            found.append((name, sum(of_agent.values()), spent / 3600.0))
+    return found
+
+
+@dataclass(frozen=True)
+class Planned(matrix.Plan):
+    """A plan whose cells have numbers of episodes of their own."""
+
+    counts: tuple[int, ...]
+    cell_of: Mapping[Order, str]
+    agents: Mapping[str, Agent]
+
+    @property
+    def episodes(self) -> int:
+        return sum(self.counts)
+
+    def cases(self) -> Iterator[tuple[matrix.Cell, Case]]:
+        for cell, count in zip(self.cells, self.counts, strict=True):
+            for seed in self.seeds[:count]:
+                yield cell, cell.case.with_seed(seed)
+
+
+def planned(orders: Sequence[Order], settings: Settings) -> Planned:
+    """Every cell that is ordered, once; its policy bears the fingerprint of agent, files and versions.
+
+    Raises BadInput when a world or demand is wrong.
+    """
+    agents = {o.agent.name: o.agent for o in orders}
+    clash = [o.agent.name for o in orders if agents[o.agent.name] != o.agent]
+    assert not clash, f"two agents of one name: {clash}"
+    prints = {name: fingerprint(agent, settings.untrained) for name, agent in agents.items()}
+    cases = [replace(o.case, duration=settings.duration) for o in orders]
+    most = max((settings.episodes(o.episodes) for o in orders), default=1)
+    plan = matrix.plan(cases, range(settings.first, settings.first + most), lambda _: None)
+    cells: dict[str, matrix.Cell] = {}
+    counts: dict[str, int] = {}
+    cell_of = {}
+    for order, cell in zip(orders, plan.cells, strict=True):
+        mark = short([prints[order.agent.name], cell.manifest])
+        cell = replace(cell, case=replace(cell.case, policy=f"{order.agent.name}{MARK}{mark}"))
+        cells.setdefault(cell.name, cell)
+        counts[cell.name] = max(counts.get(cell.name, 0), settings.episodes(order.episodes))
+        cell_of[order] = cell.name
+    return Planned(tuple(cells.values()), plan.seeds, tuple(counts.values()), cell_of, agents)
+
+
+class AgentRunner(CaseRunner):
+    """Hosted by the engine: like `cosim evaluate`, for agents that `--policy` does not know."""
+
+    def __init__(self, agents: Mapping[str, Agent], untrained: bool) -> None:
+        super().__init__()
+        self._agents, self._untrained = agents, untrained
+
+    def _open(self, case: Case, warnings: tuple[str, ...]) -> Runner:
+        if self._runner is None or case.cell != self._cell:
+            self.close()  # one simulation per process: the old one must go first
+            policy = build(self._agents[case.policy.split(MARK)[0]], self._untrained)
+            scenario = replace(case.scenario(), warnings=warnings)
+            self._runner = Runner(scenario, policy, math.radians(case.svo_deg))
+            self._cell = case.cell
+        return self._runner
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The flags that all papers' tables share."""
+    default = Settings()
+    add = parser.add_argument
+    add("--scale", type=float, default=1.0, metavar="X", help="of the numbers of episodes")
+    add("--scenario", action="append", default=[], choices=WORLDS, help="default: all that a table has")
+    add("--duration", type=float, metavar="S", help="of an episode; default: the scenario's own")
+    add("--workers", type=int, default=default.workers, metavar="N")
+    add("--untrained", action="store_true", help="value networks as they are born, labelled so")
+    add("--runs", type=Path, default=default.runs, help="where the episodes are kept")
+    add("--out", type=Path, default=default.out, help="folder of pages, pictures and data/*.csv")
+    add("--training", action="append", default=[], metavar="POLICY=RUN", help="a run of cosim train")
+    add("--dry-run", action="store_true", help="what is still to be driven, and its CPU hours")
+
+
+def settings_of(args: argparse.Namespace) -> Settings:
+    """The settings as typed."""
+    trainings: dict[str, tuple[Path, ...]] = {}
+    for text in args.training:
+        policy, _, run = text.partition("=")
+        trainings[policy] = (*trainings.get(policy, ()), Path(run))
+    return Settings(
+        runs=args.runs,
+        out=args.out,
+        scale=args.scale,
+        scenarios=tuple(args.scenario),
+        workers=args.workers,
+        untrained=args.untrained,
+        duration=args.duration,
+        trainings=trainings,
+    )
+
+
+# ---- inside ----
+
+
+def _store(folder: Path) -> Store:
+    store = Store.in_folder(folder)
+    if store.spec_hash() is None:
+        store.begin("papers", {"units": {}, "better": {}}, [])
+    return store
+
+
+def _drive(work: Planned, store: Store, settings: Settings, title: str) -> None:
+    store.extend(
+        [{"cell": c.name, "case": c.case.document(), "manifest": dict(c.manifest)} for c in work.cells]
+    )
+    engine = LocalEngine(AgentRunner, (work.agents, settings.untrained), workers=settings.workers)
+    progress = Progress(title, "episodes")
+    try:
+        faults = batch.drive(work, store, engine, settings.runs / "outputs", progress)
+    finally:
+        progress.done()
+    for fault in faults:
+        print(f"{title}: {fault.key}: our own code failed, no row: {fault.stderr}", file=sys.stderr)
+
+
+def _stored(settings: Settings) -> dict[str, int]:
+    """How many episodes of each cell the store holds."""
+    if not settings.runs.is_dir():
+        return {}
+    with _store(settings.runs) as store:
+        found: dict[str, int] = {}
+        for key in sorted(store.keys()):
+            cell = key.rpartition("-")[0]
+            found[cell] = found.get(cell, 0) + 1
+        return found

@@ -1,0 +1,177 @@
+"""What the guide AV does: who it is, and how it makes room for the merging vehicle (T, figure 8)."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from benchmarks.papers.driving import AgentRunner
+from cosim.evaluation.case import Case
+from cosim.evaluation.replay.recorder import Recording, Track
+from cosim.evaluation.replay.strip import Strip, poses_at
+from cosim.evaluation.tasks import Progress
+from cosim.road import Lane
+from cosim.types import Floats, Kind
+
+SLOWS, YIELDS, OVERTAKES, OTHER, NONE = KINDS = (
+    "slows down in its lane",
+    "yields to the left",
+    "yields, then overtakes",
+    "neither",
+    "no AV at the merging point",
+)
+BEFORE = 15.0  # s before the merge in which room is made
+NEAR = (
+    -125.0,
+    20.0,
+)  # m along the road from the merging vehicle: who perceives it, and who is just beside it
+SLOWER = 2.0  # m/s that it lost: it made room
+LANE = 3.2  # m, a lane's width; half of it to either side is in a lane
+WIDTH, HEIGHT = 760, 120  # pixels of a snapshot
+SHOWN = (-5.0, 0.0, 5.0)  # s from the merge
+
+
+@dataclass(frozen=True, slots=True)
+class Guided:
+    """One episode: times in s from the merge, speeds in m/s."""
+
+    kind: str
+    merged: float | None  # s from the episode's start; None: it never merged
+    guide: str = ""
+    mission: str = ""
+    times: tuple[float, ...] = ()
+    guide_speed: tuple[float | None, ...] = ()  # None: not on the road then
+    mission_speed: tuple[float | None, ...] = ()
+
+
+class GuideWatcher(AgentRunner):
+    """Hosted by the engine: drives an episode, looks at its guide AV and takes three pictures."""
+
+    def run(
+        self, case: Case, warnings: tuple[str, ...], outputs: str | None, progress: Progress
+    ) -> dict[str, Any]:
+        """`seed`, `trace_hash`, `crashed`; `guided`: the fields of `Guided`; `pictures`: PNG files."""
+        result, recording = self._open(case, warnings).record(case.seed, progress)
+        found = guided(recording)
+        facts = {"seed": case.seed, "trace_hash": result.trace_hash, "crashed": result.value("crashed")}
+        return {**facts, "guided": asdict(found), "pictures": _pictures(recording, found)}
+
+
+def guided(r: Recording) -> Guided:
+    """Who made room, and how."""
+    mission = next((t for t in r.tracks if t.mission), None)
+    at = None if mission is None else _merge(r, mission)
+    if mission is None or at is None:
+        return Guided(OTHER, None)
+    k = at - mission.first
+    frame = _Frame(mission, k, r.road.lanes[int(mission.lane[k])])
+    avs = [t for t in r.tracks if t.kind == Kind.AV]
+    candidates = [(gap, t) for t in avs if (gap := frame.meets(t, at, r.interval)) is not None]
+    merged = float(r.times[at] - r.begin)
+    if not candidates:
+        return Guided(NONE, merged, mission=mission.id)
+    guide = min(candidates, key=lambda one: one[0])[1]
+    times = r.times - r.times[at]
+    return Guided(
+        frame.kind(guide, at, r.interval),
+        merged,
+        guide.id,
+        mission.id,
+        tuple(np.round(times, 3).tolist()),
+        _speeds(guide, len(times)),
+        _speeds(mission, len(times)),
+    )
+
+
+def _merge(r: Recording, mission: Track) -> int | None:
+    """The frame in which the merging vehicle is first on a lane that it changed to; None if it never is."""
+    lanes = r.road.lanes
+    for k in range(1, len(mission.lane)):
+        a, b = int(mission.lane[k - 1]), int(mission.lane[k])
+        if (
+            a >= 0
+            and b >= 0
+            and a != b
+            and lanes[a].edge == lanes[b].edge
+            and lanes[b].index > lanes[a].index
+        ):
+            return mission.first + k
+    return None
+
+
+class _Frame:
+    """The road along the (straight) lane that was merged into, and to the left of it, in m."""
+
+    def __init__(self, mission: Track, k: int, lane: Lane) -> None:
+        self._mission, self._k = mission, k
+        ahead = lane.shape[-1] - lane.shape[0]
+        self._ahead = ahead / np.hypot(*ahead)
+        self._left = np.array([-self._ahead[1], self._ahead[0]])
+        self._middle = float(lane.shape[0] @ self._left)
+
+    def along(self, t: Track) -> Floats:
+        """[k] m"""
+        return np.asarray(np.stack([t.x, t.y], 1) @ self._ahead)
+
+    def across(self, t: Track) -> Floats:
+        """[k] m to the left of the middle of the lane that was merged into."""
+        return np.asarray(np.stack([t.x, t.y], 1) @ self._left) - self._middle
+
+    def meets(self, t: Track, at: int, interval: float) -> float | None:
+        """How near (m) it is to the merge, if it drove in that lane shortly before; else None."""
+        now = at - t.first
+        first = max(now - round(BEFORE / interval), 0)
+        if not 0 <= now < len(t.x) or not (np.abs(self.across(t)[first : now + 1]) < LANE / 2).any():
+            return None
+        gap = float(self.along(t)[now] - self.along(self._mission)[self._k])
+        return abs(gap) if NEAR[0] <= gap <= NEAR[1] else None
+
+    def kind(self, t: Track, at: int, interval: float) -> str:
+        """One of KINDS."""
+        now = at - t.first
+        first = max(now - round(BEFORE / interval), 0)
+        across = self.across(t)
+        if across[now] - across[first] > LANE / 2:
+            return YIELDS
+        speeds = t.speed[first : now + 1]
+        slowed = float((np.maximum.accumulate(speeds) - speeds).max()) >= SLOWER
+        end = min(t.first + len(t.x), self._mission.first + len(self._mission.x)) - 1
+        ahead = self.along(t)[end - t.first] - self.along(self._mission)[end - self._mission.first]
+        if slowed and (across[now:] - across[now]).max() > LANE / 2 and ahead > 0.0:
+            return OVERTAKES
+        return SLOWS if slowed else OTHER
+
+
+def _speeds(t: Track, frames: int) -> tuple[float | None, ...]:
+    """Its speed in every frame of the recording."""
+    found: list[float | None] = [None] * frames
+    for k, speed in enumerate(t.speed.tolist()):
+        found[t.first + k] = round(speed, 3)
+    return tuple(found)
+
+
+def _pictures(r: Recording, found: Guided) -> list[bytes]:
+    """The road around the merging vehicle at SHOWN; [] where there is no guide."""
+    if not found.guide or found.merged is None:
+        return []
+    pictures = []
+    for shift in SHOWN:
+        time = float(np.clip(r.begin + found.merged + shift, r.times[0], r.times[-1]))
+        poses = poses_at(r, time)
+        middle = next((p for p in poses if p.track.id == found.mission), None)
+        if middle is None:
+            continue
+        strip = Strip(middle.x, middle.y, WIDTH, HEIGHT)
+        strip.road(r)
+        for pose in poses:
+            strip.vehicle(pose)
+        for pose in poses:
+            if pose.track.id in (found.mission, found.guide):
+                strip.name(pose)
+        raw = io.BytesIO()
+        strip.finished().save(raw, "PNG", optimize=True)
+        pictures.append(raw.getvalue())
+    return pictures

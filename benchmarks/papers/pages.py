@@ -1,0 +1,141 @@
+"""What all pages have in common: the job's command line, its heading, its CSV and its pictures."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from matplotlib import rc_context
+from matplotlib.figure import Figure as Picture
+
+from benchmarks.papers.agents import config
+from benchmarks.papers.driving import (
+    TEST_SEEDS,
+    Order,
+    Results,
+    Settings,
+    add_arguments,
+    cost,
+    drive,
+    settings_of,
+)
+from benchmarks.tables import Line, write_csv, write_page
+from cosim.errors import CosimError
+from cosim.evaluation.tasks import OK
+from policy.checkpoint import read_card
+
+STYLE: Any = {"svg.fonttype": "none", "svg.hashsalt": "cosim", "font.size": 9.0}  # equal figures, equal file
+
+
+@dataclass(frozen=True)
+class Job:
+    """One table or figure: what it needs to be driven, and the page made of it."""
+
+    name: str  # of the module, the page and the CSV
+    title: str
+    orders: Callable[[], list[Order]]
+    write: Callable[[Results, Settings], None]
+    package: str = "benchmarks.papers"  # where its module lies
+    first: int = TEST_SEEDS  # seed
+
+    @property
+    def command(self) -> str:
+        return f"python -m {self.package}.{self.name}"
+
+    def make(self, settings: Settings) -> None:
+        """Drive what is missing, then write the page with all there is."""
+        settings = replace(settings, first=self.first)
+        self.write(drive(self.orders(), settings, self.name), settings)
+        print(settings.out / f"{self.name}.md")
+
+    def main(self) -> None:
+        """The command line."""
+        parser = argparse.ArgumentParser(prog=self.command, description=self.title)
+        add_arguments(parser)
+        args = parser.parse_args()
+        run_jobs([self], settings_of(args), args.dry_run)
+
+
+def run_jobs(jobs: Sequence[Job], settings: Settings, dry_run: bool = False) -> None:
+    """One after the other; what a user did wrong ends it with one sentence and exit code 2."""
+    try:
+        for job in jobs:
+            if not dry_run:
+                job.make(settings)
+                continue
+            table = cost(job.orders(), replace(settings, first=job.first))
+            for agent, episodes, hours in table:
+                print(f"{job.name}: {agent}: {episodes} episodes, {hours:.2f} CPU hours")
+            episodes, hours = sum(n for _, n, _ in table), sum(h for *_, h in table)
+            print(f"{job.name}: {episodes} episodes, {hours:.1f} CPU hours", flush=True)
+    except CosimError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(error.exit_code) from None
+    except KeyboardInterrupt:
+        print("interrupted: the same command goes on", file=sys.stderr)
+        raise SystemExit(130) from None
+
+
+def heading(job: Job, results: Results, settings: Settings, *more: str) -> list[str]:
+    """Title, command, what it rests on, and what is not there."""
+    rows = [row for one in results.driven for row in one.rows]
+    wrong = sum(row["status"] != OK for row in rows)
+    command = f"Made by `{job.command}{settings.flags}`, resumable"
+    lines = [f"# {job.title}", "", f"{command}; figures in `data/{job.name}.csv`."]
+    lines += [
+        f"Preset `unguarded`, drivers `lc2013`, equal seeds from {settings.first:,} on. Rates with Wilson,",
+        "means with bootstrap, differences of pairs with Tango's and bootstrap 95 % intervals; p: McNemar.",
+        *more,
+    ]
+    if weights := networks(results, settings):
+        lines += ["", *weights]
+    if settings.untrained:
+        lines += ["", "**Untrained networks: this page shows that the machinery works, and nothing else.**"]
+    if settings.duration is not None:
+        lines += ["", f"**Episodes cut to {settings.duration:g} s: not comparable with any other page.**"]
+    if wrong:
+        lines += ["", f"{wrong} of {len(rows)} episodes failed and are left out."]
+    lines += [""]
+    if results.absent:
+        lines += ["Not run yet:", "", *(f"- {why}" for why in results.absent), ""]
+    return lines
+
+
+def networks(results: Results, settings: Settings) -> list[str]:
+    """The weights that were driven: a line each."""
+    lines: dict[str, None] = {}
+    for one in results.driven:
+        agent = one.order.agent
+        file = config(agent, settings.untrained).vfn_weights if one.rows and agent.learned else None
+        if file is not None and not agent.preference:
+            card = read_card(file)
+            after = card["measured"].get("iteration")
+            told = "" if after is None else f", iteration {after}"
+            name = agent.name if agent.weights else agent.base
+            lines[f"- weights of `{name}`: SHA-256 {card['sha256'][:12]}{told}"] = None
+    return list(lines)
+
+
+def save(job: Job, settings: Settings, page: Sequence[str], lines: Sequence[Line]) -> None:
+    """The page and the CSV."""
+    data = settings.out / "data"
+    data.mkdir(parents=True, exist_ok=True)
+    write_csv(data / f"{job.name}.csv", lines)
+    write_page(settings.out / f"{job.name}.md", page)
+
+
+def drawing(width: float, height: float) -> Picture:
+    """An empty picture; sizes in inches."""
+    return Picture(figsize=(width, height), layout="constrained")
+
+
+def save_picture(picture: Picture, path: Path) -> str:
+    """Write it as SVG; the Markdown that shows it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with rc_context(STYLE):
+        picture.savefig(path, metadata={"Date": None, "Creator": None})
+    return f"![{path.stem}]({path.name})"

@@ -1,0 +1,176 @@
+"""T's figure 8: three sample episodes of the guide AV, with speed profiles and pictures, found among many.
+
+    python -m benchmarks.papers.t_figure8 [--scale 1] [--dry-run]
+
+Every episode is watched and sorted by what its guide AV did (`benchmarks.papers.guide`); the first of each
+kind is shown, and how many there were of each is said, so that a picture cannot pass for the rule. Watching
+takes as long as driving did.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from benchmarks.papers.agents import Agent
+from benchmarks.papers.driving import (
+    SVO,
+    Driven,
+    Order,
+    Results,
+    Settings,
+    planned,
+)
+from benchmarks.papers.guide import (
+    BEFORE,
+    KINDS,
+    OTHER,
+    OVERTAKES,
+    SHOWN,
+    SLOWER,
+    SLOWS,
+    YIELDS,
+    GuideWatcher,
+)
+from benchmarks.papers.pages import Job, drawing, heading, save, save_picture
+from benchmarks.tables import Line, markdown_row
+from cosim.app.progress import Progress
+from cosim.errors import CosimError
+from cosim.evaluation.engines import LocalEngine
+from cosim.evaluation.folder import RunFolder
+from cosim.evaluation.statistics import share
+from cosim.evaluation.tasks import OK, Task
+
+EPISODES = 100
+FOLDER = "guide"  # in settings.runs
+AGENTS = ("vfn-p", "altruist-rule")  # the learned altruist, and what a scripted one does
+WANTED = (SLOWS, YIELDS, OVERTAKES)  # T's three samples, from left to right
+Watched = Mapping[str, Any]  # `GuideWatcher.run`, and the seed
+
+
+def orders() -> list[Order]:
+    """The contested merge."""
+    return [Order(Agent(name), "merge", "contested", "moderate", EPISODES, SVO) for name in AGENTS]
+
+
+def write(results: Results, settings: Settings) -> None:
+    """t_figure8.md, pictures of every sample, data/t_figure8.csv; watches what was not watched yet."""
+    traffic = "World `merge`, demand `contested`, HVs moderate, phi 45 degrees."
+    page = [
+        *heading(JOB, results, settings, traffic),
+        "The guide AV is the one nearest to the merging vehicle when it merges, of those that perceive it",
+        f"and drove in the lane it merges into within the {BEFORE:g} s before. It made room if it lost",
+        f"{SLOWER:g} m/s or more in that time, or moved to the left. Every picture is 200 m wide.",
+        "",
+    ]
+    lines: list[Line] = []
+    found = watch([one for one in results.driven if one.rows], settings)
+    if found:
+        page += _counted(found, lines)
+    for name, episodes in found.items():
+        for kind in WANTED:
+            mine = [e for e in episodes if e["guided"]["kind"] == kind]
+            page += [f"## {name}: {kind}", ""]
+            page += _sample(name, kind, mine[0], settings) if mine else [f"None of {len(episodes)} episodes."]
+            page += [""]
+    save(JOB, settings, page, lines)
+
+
+def watch(driven: Sequence[Driven], settings: Settings) -> dict[str, list[Watched]]:
+    """Every episode that came through once more, watched: a small file each, in settings.runs/guide.
+
+    Raises CosimError when one is not the same again.
+    """
+    work = planned([one.order for one in driven], settings)
+    hashes = {row["key"]: row["trace_hash"] for one in driven for row in one.rows if row["status"] == OK}
+    folder = settings.runs / FOLDER
+    with RunFolder(str(folder), resume=True, episodes=0):
+        todo = [
+            Task(case.key, cell.name, (case, cell.scenario.warnings, None))
+            for cell, case in work.cases()
+            if case.key in hashes and not (folder / f"{case.key}.json").exists()
+        ]
+        engine = LocalEngine(GuideWatcher, (work.agents, settings.untrained), workers=settings.workers)
+        _drive(todo, folder, engine, hashes)
+        return {one.name: _kept(folder, one) for one in driven}
+
+
+def _kept(folder: Path, one: Driven) -> list[Watched]:
+    """What was watched of one arm, by seed."""
+    files = [folder / f"{row['key']}.json" for row in one.rows]
+    return [json.loads(file.read_text()) for file in files if file.exists()]
+
+
+def _counted(found: Mapping[str, list[Watched]], lines: list[Line]) -> list[str]:
+    """How many episodes of each kind; rates with their intervals into `lines`."""
+    heads = ["", *KINDS, "did not merge", "episodes"]
+    page = [markdown_row(heads), "|---" * len(heads) + "|"]
+    for name, episodes in found.items():
+        cells = []
+        merged = [e for e in episodes if e["guided"]["merged"] is not None]
+        groups = {kind: sum(e["guided"]["kind"] == kind for e in merged) for kind in KINDS}
+        groups["did not merge"] = len(episodes) - len(merged)
+        for kind, hits in groups.items():
+            figure = share(hits, len(episodes))
+            cells.append(f"{hits} = {figure.text(0, 100.0)} %" if figure.known else "-")
+            values = (figure.value, figure.low, figure.high, len(episodes), 0, None)
+            lines.append(Line("contested, moderate", "merge", name, "", kind, "share", *values))
+        page.append(markdown_row([name, *cells, str(len(episodes))]))
+    return [*page, "", f'"{OTHER}": it merged, and nobody had to make room.', ""]
+
+
+def _sample(name: str, kind: str, episode: Watched, settings: Settings) -> list[str]:
+    """Speed profiles of the guide AV and of the merging vehicle, and the road at three moments."""
+    g = episode["guided"]
+    stem = f"t_figure8-{name.split(' (')[0]}-{WANTED.index(kind) + 1}"
+    picture = drawing(7.6, 2.6)
+    axes = picture.subplots()
+    for vehicle, values, colour in (
+        (f"guide AV {g['guide']}", g["guide_speed"], "tab:orange"),
+        (f"merging vehicle {g['mission']}", g["mission_speed"], "tab:purple"),
+    ):
+        points = [(t, v) for t, v in zip(g["times"], values, strict=True) if v is not None]
+        axes.plot(*zip(*points, strict=True), color=colour, label=vehicle)
+    axes.axvline(0.0, color="0.5", linewidth=0.8)
+    axes.set(xlabel="s from the merge", ylabel="speed, m/s")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize="small")
+    page = [f"Seed {episode['seed']}, trace hash `{episode['trace_hash'][:16]}`; merged {g['merged']:.1f} s"]
+    page[0] += " after the episode began."
+    page += ["", save_picture(picture, settings.out / f"{stem}.svg"), ""]
+    for k, (png, shift) in enumerate(zip(episode["pictures"], SHOWN, strict=False)):
+        file = settings.out / f"{stem}-{k + 1}.png"
+        file.write_bytes(base64.b64decode(png))
+        page += [f"{shift:+g} s:", "", f"![{shift:+g} s]({file.name})", ""]
+    return page
+
+
+def _drive(todo: Sequence[Task], folder: Path, engine: LocalEngine, hashes: Mapping[str, str]) -> None:
+    """Each episode into a file of its own, whole or not at all; what fails is tried again next time."""
+    progress = Progress("t_figure8, watched", "episodes")
+    try:
+        with closing(engine.run(todo)) as outcomes:
+            for k, outcome in enumerate(outcomes):
+                progress(k + 1, len(todo))
+                if not outcome.ok:
+                    print(f"t_figure8: {outcome.key}: {outcome.error or outcome.stderr}", file=sys.stderr)
+                    continue
+                if outcome.value["trace_hash"] != hashes[outcome.key]:
+                    raise CosimError(f"{outcome.key}: watched, it is not the episode that was driven before")
+                pictures = [base64.b64encode(png).decode() for png in outcome.value["pictures"]]
+                draft = folder / f".{outcome.key}.part"
+                draft.write_text(json.dumps({**outcome.value, "pictures": pictures}))
+                draft.replace(folder / f"{outcome.key}.json")
+    finally:
+        progress.done()
+
+
+JOB = Job("t_figure8", "Figure 8 of T: what the guide AV does", orders, write)
+
+if __name__ == "__main__":
+    JOB.main()

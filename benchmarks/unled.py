@@ -1,0 +1,53 @@
+"""The prioritizer alone: an agent without a network, to which every action is worth the same, or random."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from cosim.types import Floats32, History, MetaAction, PolicyContext
+from policy.agents.approaches import AgentConfig
+from policy.agents.prediction_aware import Inputs, PredictionAware
+from policy.scene import join
+from policy.traffic import predict_traffic
+
+
+class Unled(PredictionAware):
+    """Where all actions are worth the same, it keeps lane and speed while that is safe and picks up speed
+    when it has become slow (the prioritizer's order of equal values); without a mask it is then `keep-lane`.
+    With `random` values the prioritizer has to refuse more. No network is asked, no map drawn."""
+
+    def __init__(
+        self, name: str, config: AgentConfig, share_intentions: bool = True, *, random: bool = False
+    ) -> None:
+        super().__init__(name, replace(config, predicted_maps=False, vfn_weights=None))
+        self.observation = replace(config.observation, maps=False)
+        self.label = ""
+        self._share_intentions, self._random = share_intentions, random
+
+    def reset(self, context: PolicyContext) -> None:
+        """As the agent's."""
+        super().reset(replace(context, share_intentions=context.share_intentions and self._share_intentions))
+
+    def perceive(self, histories: Mapping[str, History]) -> Inputs:
+        """What the prioritizer needs."""
+        c, context = self.config, self._context
+        scene = join(histories, context.observation.share_perception)
+        forecast = self._predictor.predict(scene.state, scene.valid)
+        traffic = predict_traffic(scene, forecast, context.road, c.traffic, c.safety.frames)
+        self._expected = scene.vehicles, traffic, forecast
+        none = torch.empty(0)
+        return Inputs(scene, none, none, none, none, traffic)
+
+    def values(self, inputs: Inputs) -> Floats32:
+        """All alike, or drawn anew."""
+        if self._random:
+            shape = len(inputs.scene.agents), len(MetaAction)
+            return self._context.rng.random(shape, np.float32)
+        q = np.zeros((len(inputs.scene.agents), len(MetaAction)), np.float32)
+        if not self.config.mask:
+            q[:, MetaAction.IDLE] = 1.0
+        return q

@@ -33,6 +33,7 @@ class RewardConfig:
     nearest: float = 5.0  # m, distances below it count as this: a vehicle's length, so that none dominates
     mission: float = 20.0  # a mission vehicle's utility counts as this many bystanders': altruism was
     # learned with 20 and not with 1, where its gain drowns among those who merely drive by
+    social: float = 1.0  # of every other's utility against the own: with eta = 0 twenty add up undiminished
     perception_range: float = 125.0  # m, only neighbours an AV perceives count (ObservationConfig)
 
     def __post_init__(self) -> None:
@@ -41,7 +42,7 @@ class RewardConfig:
         for name in ("reference_speed", "nearest", "perception_range"):
             if not 0.0 < getattr(self, name) < np.inf:
                 raise BadInput("must be a positive number", field=name, value=getattr(self, name))
-        for name in ("crash", "speed", "distance", "lane_change", "acceleration", "eta", "mission"):
+        for name in ("crash", "speed", "distance", "lane_change", "acceleration", "eta", "mission", "social"):
             if not np.isfinite(getattr(self, name)):
                 raise BadInput("must be a finite number", field=name, value=getattr(self, name))
 
@@ -83,7 +84,8 @@ def rewards(
     coupling[np.arange(len(rows)), rows] = 0.0
     if config.variant == "p":
         coupling *= np.maximum(distance, config.nearest) ** -config.eta
-    social = coupling * (utility * np.where(after.mission, config.mission, 1.0))  # [a,n] r(i, c)
+    weight = config.social * np.where(after.mission, config.mission, 1.0)  # [n]
+    social = coupling * (utility * weight)  # [a,n] r(i, c)
     is_av = after.kind == Kind.AV
     av_social, hv_social = social[:, is_av].sum(axis=1), social[:, ~is_av].sum(axis=1)  # [a]
 

@@ -27,6 +27,7 @@ EIGHT = ("cs", "ca", "lstm-direct", "lstm-indirect", "ae-direct", "ae-indirect",
 EVERY = 5  # frames between two moments: 1 s
 LED = "gp-lane"  # knows the road, so it is not one of the eight
 HORIZON, DT = 20, 0.2  # frames, s
+PAGE, MAPS_PAGE = "prediction.md", "prediction_maps.md"
 TOLERATED = 0.03  # a 90 % interval shall cover 90 +- 3 %
 PORTION = 2048  # windows forecast at once
 
@@ -42,7 +43,7 @@ def bench_predict(
     command: str = "",
 ) -> Scores:
     """Measure on recorded episodes; writes position_error.csv, interval_coverage.csv, position_error.png and
-    prediction.md into `out`. Raises BadInput when no recording fits."""
+    PAGE into `out`. Raises BadInput when no recording fits."""
     made = [make_predictor(name, HORIZON, DT) for name in predictors]
     keys = [key for key in folder.episodes() if seeds is None or int(key.rsplit("-", 1)[1]) in seeds]
     scores, progress = Scores(HORIZON, DT), Progress("bench predict", "episodes")
@@ -59,7 +60,7 @@ def bench_predict(
     if coverage:
         write_csv(out / "interval_coverage.csv", coverage)
     plot(out / "position_error.png", scores)
-    (out / "prediction.md").write_text(markdown(scores, positions, coverage, command))
+    (out / PAGE).write_text(markdown(scores, positions, coverage, command))
     (out / "prediction.json").write_text(json.dumps(paired(scores), indent=1) + "\n")
     return scores
 
@@ -74,7 +75,7 @@ def bench_maps(
     workers: int = 1,
     command: str = "",
 ) -> None:
-    """The maps on the same recordings: map_error.csv, map_gain.csv, map_error.md, P's figures 6, 7, 8, 10.
+    """The maps on the same recordings: map_error.csv, map_gain.csv, MAPS_PAGE, P's figures 6, 7, 8, 10.
 
     Raises BadInput when no recorded episode is long enough.
     """
@@ -87,14 +88,20 @@ def bench_maps(
     compared = map_bench.against(episodes)
     if compared:
         map_bench.write_table(out / "map_gain.csv", compared)
-    (out / "map_error.md").write_text(map_bench.markdown(table, compared, command))
     map_figures.errors(table, out / "map_error.png")
     logs = {name: path.with_suffix(".csv") for name, path in weights.items()}
     if present := {name: log for name, log in logs.items() if log.is_file()}:
         map_figures.training(present, out / "hpn_training.png")
     worlds = sorted({episode.scenario for episode in episodes})
-    if weights:
-        map_figures.pictures(folder.path, out, weights, worlds)
+    shown = map_figures.pictures(folder.path, out, weights, worlds) if weights else []
+    page = [map_bench.markdown(table, compared, command), "## Pictures", ""]
+    if present:
+        page += ["Losses with and without history (P, figure 6):", "", "![losses](hpn_training.png)", ""]
+    page += ["Errors against the horizon (P, figure 8):", "", "![errors](map_error.png)", ""]
+    if shown:
+        page += ["What was predicted, what followed, and inner features (P, figures 8, 10 and 7):", ""]
+        page += [f"![{picture.stem}]({picture.name})" for picture in shown]
+    (out / MAPS_PAGE).write_text("\n".join(page) + "\n")
 
 
 def measure(
@@ -179,7 +186,7 @@ def markdown(
     at = {(r["predictor"], r["scenario"], r["behavior"], r["horizon_s"]): r for r in positions}
     lines = ["# Kinematic prediction", ""]
     if command:
-        lines += [f"`{command}`", ""]
+        lines += ["```", command, "```", ""]
     lines += [
         f"{len(scores.cases)} episodes; every vehicle an AV perceives, once a second. Position error in m "
         "with 95 % interval (bootstrap over episodes); every scenario counts the same. The eight know a "
@@ -199,6 +206,7 @@ def markdown(
     lines += [_row(["---"] + ["---:"] * len(horizons))]
     for name in scores.errors:
         lines.append(_row([name, *(_figure(at[name, "all", "all", h]) for h in horizons)]))
+    lines += ["", "![position error against the horizon](position_error.png)"]
     if coverage:
         lines += ["", "## Share of the truth inside the 90 % interval", ""]
         lines += [f"Bold: more than {100 * TOLERATED:g} points off.", ""]

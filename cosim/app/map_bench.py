@@ -201,7 +201,7 @@ def markdown(
     """The tables for people: PRE and IoU with their intervals, and what the HPN gains on the others."""
     lines = ["# Predicted maps", ""]
     if command:
-        lines += [f"`{command}`", ""]
+        lines += ["```", command, "```", ""]
     total = [r for r in table if r["scenario"] == "all"]
     lines += [
         f"{total[0]['episodes']} episodes, {total[0]['n']} samples (an AV at a decision, one in {STRIDE}). "

@@ -16,7 +16,7 @@ from policy.agents import make
 
 
 class Runner:
-    """One scenario, one policy (by name, or as it is), any number of episodes; lives in a `cosim.worker.Worker`.
+    """One scenario, one policy (a name or an object), any number of episodes; lives in a `Worker`.
 
     Raises BadInput for an unknown policy and for input that SUMO refuses.
     """

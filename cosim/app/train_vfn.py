@@ -7,7 +7,7 @@ import importlib.resources
 import math
 import shutil
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import policy
@@ -44,7 +44,11 @@ def train(args: argparse.Namespace) -> int:
     if not args.resume and (folder / "state.json").exists():
         raise BadInput("holds a training run already: --resume goes on", field="--out", value=args.out)
     shutil.copyfile(path, folder / "config.yaml")
-    about = {"policy": name, "scenarios": sorted({lesson.scenario for lesson in training.lessons})}
+    about = {
+        "policy": name,
+        "scenarios": sorted({lesson.scenario for lesson in training.lessons}),
+        **{part: asdict(getattr(file, part)) for part in ("reward", "explore", "chain", "safety", "traffic")},
+    }
     explore = replace(file.explore, sample=learning == "a2c")
     keep_freed_memory()
     use_threads(args.threads)  # more threads than cores stall each other (docs/training.md)

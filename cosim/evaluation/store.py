@@ -88,7 +88,7 @@ class Store:
                 connection.execute(_cells.insert(), rows)
 
     def extend(self, cells: Sequence[Mapping[str, Any]]) -> None:
-        """Write down further cells, as in `begin`, behind those that are there; known ones stay as they are."""
+        """Write down further cells, as in `begin`, behind those that are there; known ones stay."""
         known = self.cells()
         new = [cell for cell in cells if cell["cell"] not in known]
         rows = [{"run": self._run, "place": len(known) + i, **cell} for i, cell in enumerate(new)]

@@ -43,7 +43,8 @@ def work(args: argparse.Namespace) -> int:
 
     import sumo_scenarios
     from cosim.app import output
-    from cosim.app.bench_predict import bench_maps, bench_predict
+    from cosim.app.bench_predict import MAPS_PAGE, PAGE, bench_maps, bench_predict
+    from cosim.app.prediction_data import recorded_by
     from cosim.app.record import cases, record
     from cosim.errors import BadInput
     from cosim.recording import Folder
@@ -64,7 +65,7 @@ def work(args: argparse.Namespace) -> int:
         raise BadInput("recordings are there already", field="--demand, --policy")
     folder = Folder(where)
     folder.manifest()
-    command = "cosim " + shlex.join(sys.argv[1:])
+    command = "\n".join([*recorded_by(folder.manifest()), "cosim " + shlex.join(sys.argv[1:])])
     bench_predict(
         folder,
         out,
@@ -73,7 +74,7 @@ def work(args: argparse.Namespace) -> int:
         seeds=args.seeds,
         command=command,
     )
-    print((out / "prediction.md").read_text())
+    print((out / PAGE).read_text())
     if not args.no_maps:
         bench_maps(
             folder,
@@ -84,5 +85,5 @@ def work(args: argparse.Namespace) -> int:
             workers=args.workers,
             command=command,
         )
-        print((out / "map_error.md").read_text())
+        print((out / MAPS_PAGE).read_text())
     return 0

@@ -5,7 +5,8 @@
 Speed: 50 vehicles, one forecast of speed and heading; the fastest of many, so that other work on the machine
 counts least. Error: position error of the indirect Gaussian process on the same moments of recorded episodes,
 with every way to choose the kernel: per series by maximum likelihood, the bank's most likely one, the bank
-averaged, the bank averaged with the fitted prior.
+averaged, the bank averaged with the fitted prior. Short histories: the same moments, with the earlier frames
+hidden.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from cosim.evaluation import statistics
+from cosim.evaluation.prediction import NORMAL
 from cosim.memory import keep_freed_memory
 from cosim.recording import Folder, windows
 from cosim.types import Floats
@@ -32,6 +34,7 @@ from policy.predictors.gp import GaussianProcessIndirect
 
 PLAIN = BankConfig(1.0, (0.2, 1.0, 3.0), (0.5, 2.0), (1.0, 2.5), (0.02, 0.2))  # no drifts, no prior
 TARGET_MS, TARGET_RATIO = 1.0, 500.0
+SHORT = (1, 2, 3, 5, 8, 10)  # frames known
 
 
 def scikit_learn(series: Floats) -> Floats:
@@ -119,6 +122,25 @@ def errors(past: Floats, future: Floats, episode: Floats) -> dict[str, dict[str,
     return rows
 
 
+def short_histories(past: Floats, future: Floats, episode: Floats) -> dict[str, dict[str, float]]:
+    """gp-indirect with the last n frames alone: mean position error [m], and the share of the truth inside
+    the 90 % interval along the road."""
+    predictor, found = GaussianProcessIndirect(), {}
+    for known in SHORT:
+        valid = np.zeros(past.shape[:2], np.bool_)
+        valid[:, -known:] = True
+        f = predictor.predict(past, valid)
+        dx, dy = future[:, :, 0] - f.x, future[:, :, 1] - f.y
+        along = np.abs(np.cos(f.heading) * dx + np.sin(f.heading) * dy)
+        inside = np.where(np.isfinite(along), along <= NORMAL * f.along_std, np.nan)
+        means = [
+            np.mean([np.nanmean(values[episode == e]) for e in np.unique(episode)])
+            for values in (np.hypot(dx, dy), inside)
+        ]
+        found[f"{known} frames"] = {"mean": round(float(means[0]), 3), "inside": round(float(means[1]), 3)}
+    return found
+
+
 def sample(folder: Folder, moments: int) -> tuple[Floats, Floats, Floats]:
     """Moments with a whole past drawn evenly from every recording: past, future, episode."""
     keys = folder.episodes()
@@ -148,6 +170,7 @@ def main() -> None:
         "moments": len(past),
         "speed": speed(past[few]),
         "position_error_m": errors(past, future, episode),
+        "short_histories": short_histories(past, future, episode),
     }
     print(json.dumps(result, indent=None if args.json else 2))
 

@@ -94,7 +94,7 @@ SETTINGS = (
     Setting("critical_th 0.75 s", replace(DEFAULT, critical_th=0.75)),
     Setting("critical_th 2.5 s", replace(DEFAULT, critical_th=2.5)),
     Setting("horizon 2 s", replace(DEFAULT, horizon=2.0)),
-    Setting("horizon 2 s, critical_th 0 s", replace(DEFAULT, horizon=2.0, critical_th=0.0)),
+    Setting("contacts within 1.5 s", replace(DEFAULT, horizon=1.0, critical_th=0.5, safe_th=0.5)),
     Setting("lambda 2 /s", replace(DEFAULT, decay=2.0)),
     Setting("no margins", margins(0.0, 0.0)),
     Setting("margins doubled", margins(2 * DEFAULT.margin_length, 2 * DEFAULT.margin_width)),

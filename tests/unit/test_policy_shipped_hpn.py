@@ -1,4 +1,4 @@
-"""The HPN that ships, on small scenes: it goes on from what it sees, whoever stands, enters, leaves or turns."""
+"""The HPN that ships, on small scenes: it goes on from what it sees, whoever stands, enters or turns."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_weights_of_another_layout_are_refused(tmp_path: Path) -> None:
     card = json.loads((tmp_path / "hpn.json").read_text())
     card["configs"]["hpn"]["kinematic"]["hidden"] = 64
     (tmp_path / "hpn.json").write_text(json.dumps(card))
-    with pytest.raises(WeightsMismatch, match="hidden"):
+    with pytest.raises(WeightsMismatch, match="kinematic"):
         trained.load(tmp_path / "hpn.safetensors")
     card["measured"]["variant"] = "other"
     (tmp_path / "hpn.json").write_text(json.dumps(card))

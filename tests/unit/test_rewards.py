@@ -151,3 +151,15 @@ def test_distance_counts_what_was_driven_and_speed_what_is_driven_now() -> None:
 def test_a_wrong_weight_is_refused_by_name(field: str, value: object) -> None:
     with pytest.raises(BadInput, match=field):
         RewardConfig(**{field: value})  # type: ignore[arg-type]
+
+
+def test_what_others_gain_can_count_undiminished_and_less() -> None:
+    flat = replace(P, eta=0.0, social=0.02, mission=150.0, perception_range=250.0)
+    far, near = (decide(config=flat, hv_at=at, mission=True) for at in (200.0, 30.0))
+    bystander = decide(config=flat, hv_at=30.0)
+    assert far.hv_social == pytest.approx(near.hv_social), "distance makes no difference"
+    assert bystander.hv_social == pytest.approx(0.02 * bystander.ego), (
+        "an HV at the ego's speed, times social"
+    )
+    assert near.hv_social == pytest.approx(150.0 * bystander.hv_social)
+    assert near.ego == bystander.ego

@@ -20,6 +20,7 @@ from cosim.memory import keep_freed_memory
 from cosim.scenario import load
 from cosim.yaml_input import document
 from policy.agents.approaches import APPROACHES
+from policy.checkpoint import sha256
 from policy.training.config import TrainingFile, agent_config
 from policy.training.log import tensorboard
 from policy.training.networks import use_threads
@@ -49,6 +50,8 @@ def train(args: argparse.Namespace) -> int:
         "scenarios": sorted({lesson.scenario for lesson in training.lessons}),
         **{part: asdict(getattr(file, part)) for part in ("reward", "explore", "chain", "safety", "traffic")},
     }
+    if agent.predicted_maps and agent.chain.source == "hpn" and agent.hpn_weights is not None:
+        about["hpn_sha256"] = sha256(agent.hpn_weights)
     explore = replace(file.explore, sample=learning == "a2c")
     keep_freed_memory()
     use_threads(args.threads)  # more threads than cores stall each other (docs/training.md)

@@ -9,7 +9,7 @@ WORKERS ?= 2
 .PHONY: demo test check nets results results-small image smoke clean
 
 demo: $(VENV)/.installed
-	$(BIN)/cosim run merge --demand contested --policy altruist-rule --out $(RUN)
+	$(BIN)/cosim run merge --demand contested --policy vfn-p --out $(RUN)
 
 test: $(VENV)/.installed-dev check
 	$(BIN)/python -m pytest

@@ -123,8 +123,10 @@ def test_who_changes_lanes_arrives_in_the_next_one() -> None:
 
 
 def test_a_bend_is_driven_along_its_lane() -> None:
-    bend = np.array([[0.0, 0.0], [340.0, 0.0], [340.0, 300.0]])
-    road = RoadMap((Lane("a_0", "a", 0, bend, 640.0, LANE_WIDTH, 25.0),))
-    scene, guess = ahead([Car("ego", 290.0, 0, 10.0, is_av=True), Car("turns", 320.0, 0, 10.0)], road)
+    turn = 30.0 * np.exp(1j * np.linspace(-np.pi / 2, 0.0, 20)) + 325.0 + 30.0j  # radius 30 m
+    bend = np.array([[0.0, 0.0], *np.stack([turn.real, turn.imag], 1), [355.0, 300.0]])
+    length = float(np.hypot(*np.diff(bend, axis=0).T).sum())
+    road = RoadMap((Lane("a_0", "a", 0, bend, length, LANE_WIDTH, 13.9),))
+    scene, guess = ahead([Car("ego", 280.0, 0, 10.0, is_av=True), Car("turns", 318.0, 0, 10.0)], road)
     turns = row(scene, guess, "turns")
     assert turns[-1, 1] > 5.0, "straight on there is no road"

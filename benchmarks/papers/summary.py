@@ -275,7 +275,7 @@ CLAIMS = (
     Claim(
         "P, figure 5", "the indirect GP has the lowest position error of eight", "prediction.md", predictors
     ),
-    Claim("P, figure 6", "history lowers the map error by about 20 %", "map_error.md", history),
+    Claim("P, figure 6", "history lowers the map error by about 20 %", "prediction_maps.md", history),
     Claim(
         "T, figure 5",
         f"merging vehicle {MERGING_EGOISTIC:g} m among egoists, {MERGING_ALTRUISTIC:g} m among altruists",

@@ -30,6 +30,7 @@ FIGURES = (
     "dt_av_m",
     "dt_mission_m",
     "veto_rate",
+    "hard_brakings_av",
     "av_caused_collisions",
 )
 

@@ -156,7 +156,7 @@ class AltruistRule:
         left = history.route.paths[0]
         if left is None or history.route.to_end(0) < 100.0 or history.lane_changing:
             return False
-        for ahead, other in _along(history, left, side=LANE):
+        for ahead, other in along(history, left, side=LANE):
             if ahead < 0.0 and other - speed > c.max_closing:
                 return False  # a guide that has slowed down already stays in its lane
             behind = c.clear + other * c.clear_time + max(other - speed, 0.0) * c.closing_time
@@ -170,7 +170,7 @@ class AltruistRule:
         own, speed = history.route.paths[1], history.ego_speed
         if own is None:
             return False
-        for ahead, other in _along(history, own):
+        for ahead, other in along(history, own):
             if ahead > 0.0:
                 wish = 2.0 + 0.8 * speed + speed * max(speed - other, 0.0) / (2.0 * 21.0**0.5)
                 if ahead - 5.0 < 1.1 * wish:
@@ -188,7 +188,7 @@ def _missions(histories: Mapping[str, History]) -> dict[str, Seen]:
     return found
 
 
-def _along(history: History, path: LanePath, side: float = 0.0) -> list[tuple[float, float]]:
+def along(history: History, path: LanePath, side: float = 0.0) -> list[tuple[float, float]]:
     """Vehicles on the path's next lanes, or behind on its course: m ahead of the ego (centres), m/s.
 
     Upstream a lane has other names, so behind it is the place that counts: `side` m to the left.

@@ -7,10 +7,15 @@ from collections.abc import Mapping
 import numpy as np
 
 from cosim.types import Floats32, History, MetaAction, PolicyContext
-from policy.agents.altruist_rule import AltruistRule
+from policy.agents.altruist_rule import AltruistRule, along
 
 YIELD = 2.0  # his preference for what the scripted altruist commands: above all others
-BEHIND = 3.0  # m/s that the speed may lag behind its target before the target is raised further
+# He follows by IDM, as AVs that SUMO drives do (contract.md, Vehicles), in steps that the 5 m/s grid allows:
+TIME_GAP, STANDSTILL, ACCEL, COMFORT = 0.8, 2.0, 3.0, 7.0  # s, m, m/s2, m/s2
+CAR = 5.0  # m, between the centres of two cars that touch
+AHEAD = 1.0  # s, over which he asks IDM where the speed is going
+EAGER = 5.0  # m/s by which he wishes to drive faster than he may: IDM alone creeps up to its desired speed
+UP, DOWN = 2.2, 2.6  # m/s between that speed and the target before he goes a level up or down
 CRUISE = {
     MetaAction.IDLE: 0.8,
     MetaAction.DECELERATE: 0.6,
@@ -20,7 +25,7 @@ CRUISE = {
 
 
 class Mentor:
-    """What `AltruistRule` commands where it commands, else up to the speed limit as fast as the mask allows.
+    """What `AltruistRule` commands where it commands; else the speed limit, or IDM behind a leader.
 
     An egoist (phi = 0) has a mentor too, who only cruises.
     """
@@ -39,11 +44,23 @@ class Mentor:
         q = np.zeros((len(histories), len(MetaAction)), np.float32)
         for row, (av, history) in zip(q, histories.items(), strict=True):
             row[list(CRUISE)] = list(CRUISE.values())
-            lane = int(history.lane[0])
-            limit = self._road.lanes[lane].speed_limit if lane >= 0 else 0.0
-            slower = history.target_speed < limit - 0.1
-            if slower and history.ego_speed > history.target_speed - BEHIND:
-                row[MetaAction.ACCELERATE] = 1.0
+            row[self._cruise(history)] = 1.0
             if av in yielding:
                 row[yielding[av].action] = YIELD
         return q
+
+    def _cruise(self, history: History) -> MetaAction:
+        """The grid step towards the speed that IDM would have soon."""
+        lane, speed, target = int(history.lane[0]), history.ego_speed, history.target_speed
+        limit = max(self._road.lanes[lane].speed_limit, 1.0) if lane >= 0 else max(speed, 1.0)
+        own, press = history.route.paths[1], 0.0  # IDM's interaction term
+        leaders = [] if own is None else [(x, v) for x, v in along(history, own) if x > 0.0]
+        if leaders:
+            ahead, other = min(leaders)
+            closing = speed * (speed - other) / (2.0 * (ACCEL * COMFORT) ** 0.5)
+            wish = STANDSTILL + max(speed * TIME_GAP + closing, 0.0)
+            press = (wish / max(ahead - CAR, 0.5)) ** 2
+        soon = min(max(speed + AHEAD * ACCEL * (1.0 - (speed / (limit + EAGER)) ** 4 - press), 0.0), limit)
+        if soon > target + UP:
+            return MetaAction.ACCELERATE
+        return MetaAction.DECELERATE if soon < target - DOWN else MetaAction.IDLE

@@ -31,6 +31,11 @@ def context(agent: PredictionAware, svo: float = 0.0) -> PolicyContext:
     return PolicyContext(ROAD, Timing(), agent.observation, svo, np.random.default_rng(0))
 
 
+def untrained(name: str) -> PredictionAware:
+    """The approach as it is born, whatever is shipped for it."""
+    return PredictionAware(name, dataclasses.replace(compact(name), vfn_weights=None, hpn_weights=None))
+
+
 def decide(agent: PredictionAware) -> dict[str, Decision]:
     agent.reset(context(agent))
     return agent.decide(histories(ROAD, CARS, agent.observation))
@@ -38,7 +43,7 @@ def decide(agent: PredictionAware) -> dict[str, Decision]:
 
 @pytest.mark.parametrize("name", ["vfn-p", "vfn"])
 def test_every_av_gets_an_explained_decision(name: str) -> None:
-    agent = PredictionAware(name, dataclasses.replace(compact(name), vfn_weights=None, hpn_weights=None))
+    agent = untrained(name)
     assert agent.label == "untrained"
     decisions = decide(agent)
     assert list(decisions) == ["a", "b"]
@@ -73,7 +78,7 @@ def test_the_network_decides_where_the_mask_allows_it() -> None:
 
 
 def test_a_lane_change_that_did_not_begin_is_not_tried_again_at_once() -> None:
-    agent = PredictionAware("vfn-p")
+    agent = untrained("vfn-p")
     with torch.no_grad():
         agent.vfn.value.bias[MetaAction.LANE_LEFT] = 1.0
     agent.reset(context(agent))

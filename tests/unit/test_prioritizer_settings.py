@@ -107,7 +107,7 @@ def test_the_parts_of_a_decision_add_up() -> None:
     )
     context = PolicyContext(ROAD, Timing(), PLAIN.observation, 0.0, np.random.default_rng(0))
     spent = agent_costs.decision(
-        replace(PLAIN, predicted_maps=False, vfn=compact("vfn").vfn), ROAD, [seen], context
+        replace(PLAIN, predicted_maps=False, vfn=compact("vfn").vfn, vfn_weights=None), ROAD, [seen], context
     )
     assert list(spent) == ["prediction", "values", "prioritizer", "decision", "processor time"]
     assert min(spent.values()) > 0.0

@@ -13,7 +13,7 @@ def keep_freed_memory() -> None:
     """Ask glibc never to hand freed memory back; elsewhere nothing happens.
 
     Batches of maps are tens of megabytes: by default each is mapped, faulted in page by page and unmapped
-    again, which took a fifth of a training update (docs/training.md).
+    again.
     """
     try:
         mallopt = ctypes.CDLL(None).mallopt

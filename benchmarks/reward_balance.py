@@ -35,9 +35,7 @@ TRIED = {
     "1/d, mission 60": RewardConfig(mission=60.0),
     "1/d from 30 m on, mission 600": RewardConfig(mission=600.0, nearest=30.0),
     "no decay, 250 m, mission 20": RewardConfig(eta=0.0, mission=20.0, perception_range=250.0),
-    "shipped: no decay, 250 m, social 0.02, mission 150": RewardConfig(
-        eta=0.0, mission=150.0, perception_range=250.0, social=0.02
-    ),
+    "compact.yaml: no decay, 250 m, social 0.02, mission 150": configuration("compact")[1].reward,
 }
 
 

@@ -132,6 +132,7 @@ class Observation(NamedTuple):
 # Columns of the kinematic matrix, in the ego's frame at the newest frame of the history
 # (x ahead, y to the left), so that one history lives in one fixed frame and series are smooth.
 KINEMATIC_FEATURES = ("x", "y", "speed", "heading", "length", "width", "is_av", "is_mission")
+IS_MISSION = KINEMATIC_FEATURES.index("is_mission")
 
 
 class History(NamedTuple):

@@ -14,11 +14,9 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from cosim.types import KINEMATIC_FEATURES, MetaAction
+from cosim.types import IS_MISSION, MetaAction
 from policy.extractors import Conv2dMaps, Conv3dMaps, Strides
 from policy.tensors import KINEMATIC_INPUTS, ROUTE_INPUTS
-
-IS_MISSION = KINEMATIC_FEATURES.index("is_mission")
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cosim.road import LanePath, RoadMap
-from cosim.types import Decision, History, MetaAction, PolicyContext
+from cosim.types import IS_MISSION, Decision, History, MetaAction, PolicyContext
 from policy.agents.idm import NO_MAPS
 
 LANE = 3.2  # m, SUMO's lane width
@@ -182,7 +182,7 @@ def _missions(histories: Mapping[str, History]) -> dict[str, Seen]:
     """Every mission vehicle that any AV perceives (V2V: not everybody is near enough to)."""
     found: dict[str, Seen] = {}
     for history in histories.values():
-        for r in np.flatnonzero(history.valid[-1] & (history.kinematics[-1, :, 7] > 0.5)):
+        for r in np.flatnonzero(history.valid[-1] & (history.kinematics[-1, :, IS_MISSION] > 0.5)):
             speed = float(history.kinematics[-1, r, 2])
             found[history.ids[r]] = Seen(int(history.lane[r]), float(history.lane_position[r]), speed)
     return found

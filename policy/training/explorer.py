@@ -9,15 +9,13 @@ import numpy as np
 import torch
 
 from cosim.rewards import RewardTerms
-from cosim.types import Decision, Floats32, History, MetaAction
+from cosim.types import IS_MISSION, Decision, Floats32, History, MetaAction
 from policy.agents.approaches import AgentConfig
 from policy.agents.prediction_aware import Inputs, PredictionAware
 from policy.tensors import to_numpy
 from policy.training.experience import Ending, Trajectory
 from policy.training.mentor import YIELD, Mentor
 from policy.vfn import VFN
-
-IS_MISSION = 7  # column of the kinematic matrix
 
 
 @dataclass(frozen=True, slots=True)

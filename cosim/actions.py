@@ -12,6 +12,7 @@ from cosim.types import LANE_OFFSET, Command, Decision, Floats, History, MetaAct
 
 SPEED_STEP = 5.0  # m/s between grid levels: "Decelerate" must be able to brake (compute.md)
 SPEED_MARGIN = 2.0  # m/s above the speed limit: the highest level
+LEAST_STEP = 1.0  # m/s: what a step changes at least
 TIME_CONSTANT = 0.6  # s, with which the target speed is tracked
 MAX_DECEL = 8.0  # m/s2
 MAX_ACCEL = 3.0  # m/s2
@@ -22,31 +23,22 @@ STEP = 0.1  # s, with which a rollout tracks the target speed (SUMO's step, cont
 def next_target(target: float, speed: float, action: int, speed_limit: float) -> float:
     """The target speed after `action`, all in m/s; `speed` is the AV's present one.
 
-    The levels are 0, 5, 10, ... up to the limit, and the limit + 2 on top. Decelerate goes one level below
-    the lower of target and speed, Accelerate one above the higher: so Decelerate brakes at once, however far
-    the target had run ahead of the speed, and Accelerate ends a braking at once (each first rounds to the
-    nearest level, as HighwayEnv's meta-actions round the present speed). All others keep the target, on the
-    grid or not, and no target exceeds the top.
+    The levels are 0, 5, 10, ... up to the limit, and the limit + 2 on top. Decelerate goes to the highest
+    level at least `LEAST_STEP` below the lower of target and speed, Accelerate to the lowest one as much
+    above the higher: so Decelerate brakes at once, however far the target had run ahead of the speed, and
+    Accelerate ends a braking at once. All others keep the target, on the grid or not, and no target exceeds
+    the top.
     """
+    top = speed_limit + SPEED_MARGIN
+    whole = math.floor(speed_limit / SPEED_STEP + 1e-6)  # the highest multiple of the step in the limit
     if action == MetaAction.ACCELERATE:
-        return _level_speed(_level(max(target, speed), speed_limit) + 1, speed_limit)
+        level = math.ceil((max(target, speed) + LEAST_STEP) / SPEED_STEP - 1e-6)
+        return level * SPEED_STEP if level <= whole else top
     if action == MetaAction.DECELERATE:
-        return _level_speed(_level(min(target, speed), speed_limit) - 1, speed_limit)
-    return min(target, speed_limit + SPEED_MARGIN)
-
-
-def _level(speed: float, speed_limit: float) -> int:
-    """The number of the level nearest to a speed; a level halfway between two counts up."""
-    below_top = math.floor(speed_limit / SPEED_STEP + 1e-6)  # the highest multiple of the step in the limit
-    if speed >= 0.5 * (below_top * SPEED_STEP + speed_limit + SPEED_MARGIN):
-        return below_top + 1
-    return min(math.floor(speed / SPEED_STEP + 0.5), below_top)
-
-
-def _level_speed(level: int, speed_limit: float) -> float:
-    """The speed of a level; beyond the ends the lowest and the highest."""
-    below_top = math.floor(speed_limit / SPEED_STEP + 1e-6)
-    return max(level, 0) * SPEED_STEP if level <= below_top else speed_limit + SPEED_MARGIN
+        below = min(target, speed) - LEAST_STEP
+        level = min(math.floor(below / SPEED_STEP + 1e-6), whole)
+        return top if below >= top else max(level, 0) * SPEED_STEP
+    return min(target, top)
 
 
 @compiled

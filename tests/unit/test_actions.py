@@ -33,9 +33,11 @@ def test_braking_from_the_top_goes_back_to_the_grid_and_ends_at_standstill() -> 
 def test_decelerate_brakes_and_accelerate_accelerates_whatever_was_commanded_before(
     speed: float, target: float
 ) -> None:
-    """At least half a level away from the speed, not only from a target that is far from it."""
+    """By the least step at least and a level more at most, from the speed, not from a target far from it."""
     assert next_target(target, speed, DOWN, 25.0) <= max(min(target, speed) - 1.0, 0.0)
+    assert next_target(target, speed, DOWN, 25.0) > max(min(target, speed) - 6.01, -0.01)
     assert next_target(target, speed, UP, 25.0) >= min(max(target, speed) + 1.0, 27.0)
+    assert next_target(target, speed, UP, 25.0) < max(target, speed) + 6.01
 
 
 def test_braking_goes_on_level_by_level_while_the_speed_lags_behind() -> None:
@@ -65,3 +67,9 @@ def test_a_step_of_five_down_takes_about_two_seconds() -> None:
     while speed > 20.2:
         speed, steps = tracked_speed(speed, 20.0, 0.1), steps + 1
     assert 15 <= steps <= 25
+
+
+def test_a_speed_just_above_a_level_is_braked_gently() -> None:
+    """The rounding that was here before braked from 22.4 m/s straight to 15."""
+    assert next_target(25.0, 22.4, DOWN, 25.0) == 20.0
+    assert next_target(20.0, 21.5, DOWN, 25.0) == 15.0, "below the target, not only below the speed"

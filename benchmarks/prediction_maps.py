@@ -1,12 +1,12 @@
 """What predicting the next four seconds costs: forecast, HPN, chain and rendering, for 8 AVs at a time.
 
-    python -m benchmarks.prediction_maps [--decisions 40] [--threads 1 2] [--json]
+    python -m benchmarks.prediction_maps [--size compact paper] [--threads 1 2] [--out FILE.md | --json]
 
 Real histories (highway, dense, tuning seed 100,000, the share of AVs chosen so that about 8 decide) are
 gathered first; then every part is timed on them, medians over decisions. The map branch at paper size (one
 frame a step, 20 steps) is timed eager, compiled, in bfloat16 and, where it is installed, by ONNX Runtime.
-"Real time" is the
-decision period, 0.4 s. Compare ratios, not seconds: other work on the machine moves everything.
+"Real time" is
+the decision period, 0.4 s. Compare ratios, not seconds: other work on the machine moves everything.
 """
 
 from __future__ import annotations
@@ -16,14 +16,17 @@ import importlib.util
 import io
 import json
 import statistics
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+from benchmarks.tables import markdown_row, write_page
 from cosim.memory import keep_freed_memory
 from cosim.raster import rasterize_road
 from cosim.scenario import Fleet, Scenario, load
@@ -71,13 +74,13 @@ class Gatherer:
 
 
 def median_ms(work: Callable[[], object], rounds: int) -> float:
-    """Median wall time in ms; the first two rounds (compilation, caches) are not counted."""
+    """Median wall time in ms; the first round (compilation, caches) is not counted."""
     times = []
-    for _ in range(rounds + 2):
+    for _ in range(rounds + 1):
         began = time.perf_counter()
         work()
         times.append(time.perf_counter() - began)
-    return 1e3 * statistics.median(times[2:])
+    return 1e3 * statistics.median(times[1:])
 
 
 def parts(road: Any, kept: list[Any], size: ObservationConfig, chain: ChainConfig) -> dict[str, float]:
@@ -122,6 +125,10 @@ def map_branch(config: MapBranchConfig, horizon: int, rounds: int) -> dict[str, 
     steps = horizon // config.block
     out: dict[str, float | str] = {}
 
+    def note(way: str, result: float | str) -> None:
+        out[way] = result
+        say(f"  map branch, {way}: {_ratio(result)}")
+
     def chain(step: Callable[..., Any]) -> None:
         window = past
         with torch.inference_mode():
@@ -129,20 +136,61 @@ def map_branch(config: MapBranchConfig, horizon: int, rounds: int) -> dict[str, 
                 guess = step([window], rows)[0]
                 window = torch.cat([window, guess.to(window.dtype)], 1)[:, -seen:]
 
-    out["eager"] = median_ms(lambda: chain(branch), rounds)
+    note("eager", median_ms(lambda: chain(branch), rounds))
 
     def reduced() -> None:
         with torch.autocast("cpu", torch.bfloat16):
             chain(branch)
 
-    out["bfloat16"] = median_ms(reduced, rounds)
+    note("ONNX Runtime", onnx(branch, past, rows, steps, rounds))
     try:
         compiled = torch.compile(branch)
-        out["compiled"] = median_ms(lambda: chain(compiled), rounds)
+        note("compiled", median_ms(lambda: chain(compiled), rounds))
     except Exception as error:  # needs a C++ compiler on the machine
-        out["compiled"] = f"not possible here: {type(error).__name__}"
-    out["ONNX Runtime"] = onnx(branch, past, rows, steps, rounds)
+        note("compiled", f"not possible here: {type(error).__name__}")
+    note("bfloat16", median_ms(reduced, rounds))
     return out
+
+
+def say(line: str) -> None:
+    """Progress: paper size takes minutes."""
+    print(line, file=sys.stderr, flush=True)
+
+
+def _ratio(ms: float | str) -> str:
+    return ms if isinstance(ms, str) else f"{ms:.1f} ms, {1e3 * DECISION / ms:.2g} x real time"
+
+
+def page(result: Mapping[str, Mapping[str, Any]], command: str) -> list[str]:
+    """Markdown: the whole prediction by its parts, then the map branch by the way it is computed."""
+    lines = [
+        "# What a prediction costs",
+        "",
+        f"Made by `{command}`; tuning seeds, {AGENTS} AVs, four seconds ahead, medians. Real time is the",
+        f"decision period, {1e3 * DECISION:.0f} ms: 10 x real time means that a tenth of it is used.",
+        "",
+        "## The HPN that ships, by its parts, ms",
+        "",
+    ]
+    parts_of = list(next(iter(result.values()))["parts"])
+    lines += [markdown_row(["size", *parts_of, "real time"]), "|---" * (len(parts_of) + 2) + "|"]
+    for name, found in result.items():
+        spent = found["parts"]
+        whole = _ratio(spent["whole prediction"]).split(", ")[1]
+        lines.append(markdown_row([name, *(f"{ms:.2f}" for ms in spent.values()), whole]))
+    lines += [
+        "",
+        f"Target at compact size: at most {TARGET:.0f} ms on two cores.",
+        "",
+        "## P's own network (`hpn-plain`: figure 3, algorithm 1), the whole chain",
+        "",
+    ]
+    ways = list(next(iter(result.values()))["map branch"])
+    lines += [markdown_row(["size", *ways]), "|---" * (len(ways) + 1) + "|"]
+    lines += [
+        markdown_row([name, *map(_ratio, found["map branch"].values())]) for name, found in result.items()
+    ]
+    return lines
 
 
 def onnx(branch: MapBranch, past: torch.Tensor, rows: torch.Tensor, steps: int, rounds: int) -> float | str:
@@ -169,12 +217,14 @@ def onnx(branch: MapBranch, past: torch.Tensor, rows: torch.Tensor, steps: int, 
 
 
 def main() -> None:
-    """Print one table; with --json one document."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    """Measure, then print or write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--size", nargs="+", choices=("compact", "paper"), default=["compact", "paper"])
     parser.add_argument("--decisions", type=int, default=40)
     parser.add_argument("--rounds", type=int, default=5, help="of the map branch's chain")
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--json", action="store_true")
+    parser.add_argument("--out", type=Path, metavar="FILE.md")
     args = parser.parse_args()
     keep_freed_memory()
     scenario = load("highway", demand=["dense"], fleet=Fleet(penetration=PENETRATION))
@@ -182,25 +232,28 @@ def main() -> None:
         "compact": (COMPACT, ChainConfig(), MapBranchConfig()),
         "paper": (PAPER, ChainConfig(every=1), MapBranchConfig(height=64, width=512, block=1)),
     }
-    result: dict[str, Any] = {"agents": AGENTS, "target_ms": TARGET}
-    for name, (size, chain, branch) in plans.items():
+    result: dict[str, Any] = {}
+    for name in args.size:
+        size, chain, branch = plans[name]
         with Worker(Gatherer, scenario, replace(size)) as worker:
             road, kept = worker.call("gather", 100_000, args.decisions)
         for threads in args.threads:
             torch.set_num_threads(threads)
+            label = f"{name}, {threads} thread{'s' * (threads > 1)}"
+            say(label)
             spent = parts(road, kept, size, chain)
-            found: dict[str, Any] = {part: round(ms, 2) for part, ms in spent.items()}
-            found["times real time"] = round(1e3 * DECISION / spent["whole prediction"], 1)
-            found["vehicles"] = round(float(np.mean([len(join(h).vehicles) for h in kept])), 1)
+            say(f"  whole prediction: {_ratio(spent['whole prediction'])}")
+            vehicles = round(float(np.mean([len(join(h).vehicles) for h in kept])), 1)
             ways = map_branch(branch, chain.horizon, args.rounds)
-            found["map branch, whole chain"] = {
-                way: f"{ms:.1f} ms, {1e3 * DECISION / ms:.1f} times real time"
-                if isinstance(ms, float)
-                else ms
-                for way, ms in ways.items()
-            }
-            result[f"{name}, {threads} threads"] = found
-    print(json.dumps(result, indent=None if args.json else 2))
+            result[label] = {"parts": spent, "map branch": ways, "vehicles": vehicles}
+    if args.json:
+        print(json.dumps(result))
+        return
+    lines = page(result, " ".join(["python -m benchmarks.prediction_maps", *sys.argv[1:]]))
+    if args.out is None:
+        print("\n".join(lines))
+    else:
+        write_page(args.out, lines)
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
+from policy.training.experience import Advised
 from policy.training.networks import adam_tensors, restore_adam, seeded
 from policy.training.replay import Batch
 from policy.vfn import VFN, VfnConfig
@@ -71,23 +72,44 @@ class Learner:
             value = q[refused].gather(1, vetoed[refused][:, None])[:, 0]
             worth = torch.full_like(value, c.r_unsafe * c.scale)
             unsafe = functional.smooth_l1_loss(value, worth, reduction="sum") * (c.refused / len(q))
-        imitation = torch.zeros((), device=device)
-        advice = torch.from_numpy(batch.advice).to(device)
-        advised = advice >= 0
-        if c.imitation > 0.0 and bool(advised.any()):
-            # among what was safe: what the prioritizer masks need not be learned a second time
-            possible = torch.from_numpy(batch.possible).to(device)
-            heard, his = q.masked_fill(~possible, -torch.inf)[advised], advice[advised][:, None]
-            lead = torch.full_like(heard, c.margin).scatter(1, his, 0.0)
-            imitation = ((heard + lead).amax(1) - heard.gather(1, his)[:, 0]).sum() * (c.imitation / len(q))
-        self.optimizer.zero_grad(set_to_none=True)
-        (td + unsafe + imitation).backward()  # type: ignore[no-untyped-call]
-        nn.utils.clip_grad_norm_(self.online.parameters(), c.clip)
-        self.optimizer.step()
+        possible, wrong = (torch.from_numpy(x).to(device) for x in (batch.possible, batch.wrong))
+        imitation = c.imitation * self._margin(q, possible, wrong)
+        self._step(td + unsafe + imitation)
         self.updates += 1
         if self.updates % c.target_every == 0:
-            self.target.load_state_dict(self.online.state_dict())
+            self.follow()
         return Losses(*(float(x.detach()) for x in (td, unsafe, imitation, chosen.mean())))
+
+    def imitate(self, batch: Advised) -> float:
+        """One step towards the mentor alone, without maps; returns how often the choice is one of his."""
+        q = self.online(None, batch.kinematics, batch.route, batch.phi)
+        self._step(self.config.imitation * self._margin(q, batch.possible, batch.wrong))
+        choice = q.masked_fill(~batch.possible, -torch.inf).argmax(1, keepdim=True)
+        return 1.0 - float(batch.wrong.gather(1, choice).float().mean())
+
+    def follow(self) -> None:
+        """The target network becomes the online one."""
+        self.target.load_state_dict(self.online.state_dict())
+
+    def _margin(self, q: torch.Tensor, possible: torch.Tensor, wrong: torch.Tensor) -> torch.Tensor:
+        """Large-margin loss: among what was safe, the mentor's best is to lead what he thinks wrong.
+
+        What the prioritizer masks need not be learned a second time.
+        """
+        advised = wrong.any(1)
+        if not bool(advised.any()):
+            return q.new_zeros(())
+        heard, bad = q.masked_fill(~possible, -torch.inf)[advised], wrong[advised]
+        lead = (heard + self.config.margin * bad).amax(1) - heard.masked_fill(bad, -torch.inf).amax(1)
+        return lead.sum() / len(q)
+
+    def _step(self, loss: torch.Tensor) -> None:
+        if not loss.requires_grad:
+            return  # nobody was advised
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(self.online.parameters(), self.config.clip)
+        self.optimizer.step()
 
     # ---- to go on exactly ----
 

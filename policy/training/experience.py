@@ -36,7 +36,7 @@ class Trajectory:
     unsafe: Bools  # [D+1, A] what the prioritizer masked
     action: npt.NDArray[np.int8]  # [D] carried out
     vetoed: npt.NDArray[np.int8]  # [D] the preferred action that was masked, or -1
-    advice: npt.NDArray[np.int8]  # [D] what the mentor would have done, among what was safe; -1: nothing was
+    wrong: Bools  # [D,A] what the mentor would not have done, though it was safe; none: he had no opinion
     terms: Floats32  # [D,3] reward terms: ego, AVs, HVs (equation 6)
     interacting: Bools  # [D] near a mission vehicle, or vetoed: what a rebalanced replay wants more of
     yielding: Bools  # [D] the mentor would have yielded to a mission vehicle here
@@ -71,6 +71,34 @@ class States(NamedTuple):
     phi: torch.Tensor  # [B,2]
 
 
+class Advised(NamedTuple):
+    """A batch for learning from the mentor alone, without maps."""
+
+    kinematics: torch.Tensor  # [B,T,R,F+1]
+    route: torch.Tensor  # [B,.]
+    phi: torch.Tensor  # [B,2]
+    possible: torch.Tensor  # [B,A] bool, actions that were safe
+    wrong: torch.Tensor  # [B,A] bool, those of them that the mentor would not have taken
+
+
+def advised(chosen: list[tuple[Trajectory, int]], device: str = "cpu") -> Advised:
+    """Stack what the mentor said, for the SVO of the drives."""
+    phi = np.array([trajectory.phi for trajectory, _ in chosen], np.float32)
+    arrays = (
+        np.stack([trajectory.kinematics[t] for trajectory, t in chosen]).astype(np.float32),
+        np.stack([trajectory.route[t] for trajectory, t in chosen]),
+        _direction(phi),
+        np.stack([~trajectory.unsafe[t] for trajectory, t in chosen]),
+        np.stack([trajectory.wrong[t] for trajectory, t in chosen]),
+    )
+    return Advised(*(torch.from_numpy(array).to(device) for array in arrays))
+
+
+def _direction(phi: Floats32) -> Floats32:
+    """[B,2] of phi [B] rad, as the network takes it."""
+    return np.stack([np.cos(phi), np.sin(phi)], 1).astype(np.float32)
+
+
 def states(chosen: list[tuple[Trajectory, int]], phi: Floats32, device: str = "cpu") -> States:
     """Stack states (trajectory, t) for the network; phi [B] rad."""
     first = chosen[0][0]
@@ -86,7 +114,7 @@ def states(chosen: list[tuple[Trajectory, int]], phi: Floats32, device: str = "c
         turned.to(torch.float32).mul_(1.0 / 255.0).permute(0, 1, 4, 2, 3),
         torch.from_numpy(kinematics).to(device),
         torch.from_numpy(route).to(device),
-        torch.from_numpy(np.stack([np.cos(phi), np.sin(phi)], 1).astype(np.float32)).to(device),
+        torch.from_numpy(_direction(phi)).to(device),
     )
 
 

@@ -9,12 +9,12 @@ import numpy as np
 import torch
 
 from cosim.rewards import RewardTerms
-from cosim.types import IS_MISSION, Decision, Floats32, History, MetaAction
+from cosim.types import IS_MISSION, Bools, Decision, Floats32, History, MetaAction
 from policy.agents.approaches import AgentConfig
 from policy.agents.prediction_aware import Inputs, PredictionAware
 from policy.tensors import to_numpy
 from policy.training.experience import Ending, Trajectory
-from policy.training.mentor import YIELD, Mentor
+from policy.training.mentor import AS_GOOD, YIELD, Mentor
 from policy.vfn import VFN
 
 
@@ -39,7 +39,7 @@ class _Tape:
     unsafe: list[np.ndarray] = field(default_factory=list)
     action: list[int] = field(default_factory=list)
     vetoed: list[int] = field(default_factory=list)
-    advice: list[int] = field(default_factory=list)
+    wrong: list[Bools] = field(default_factory=list)
     terms: list[tuple[float, float, float]] = field(default_factory=list)
     interacting: list[bool] = field(default_factory=list)
     yielding: list[bool] = field(default_factory=list)
@@ -165,7 +165,8 @@ class Explorer(PredictionAware):
         preferred = int(np.argmax(decision.q))
         tape.vetoed.append(preferred if unsafe[preferred] else -1)
         # in a hopeless moment the mentor knows no better either
-        tape.advice.append(-1 if unsafe.all() else int(np.where(unsafe, -np.inf, advice).argmax()))
+        best = -np.inf if unsafe.all() else advice[~unsafe].max()
+        tape.wrong.append(~unsafe & (advice < best - AS_GOOD))
         tape.yielding.append(bool(advice.max() == YIELD))
         newest = history.kinematics[-1]
         mission = history.valid[-1] & (newest[:, IS_MISSION] > 0.5)
@@ -198,7 +199,7 @@ class Explorer(PredictionAware):
                 unsafe=np.stack(tape.unsafe[: count + 1]),
                 action=np.array(tape.action[:count], np.int8),
                 vetoed=np.array(tape.vetoed[:count], np.int8),
-                advice=np.array(tape.advice[:count], np.int8),
+                wrong=np.stack(tape.wrong[:count]),
                 terms=np.array(tape.terms, np.float32),
                 interacting=np.array(tape.interacting[:count], np.bool_),
                 yielding=np.array(tape.yielding[:count], np.bool_),

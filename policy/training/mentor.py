@@ -18,6 +18,7 @@ EAGER = 5.0  # m/s by which he wishes to drive faster than he may: IDM alone cre
 AHEAD = 0.4  # s, over which an action's acceleration is compared with IDM's
 HARD = 3.0  # m/s2: a braking that begins harder than this, and than IDM wishes, costs
 HARSH = 3.0  # m/s2 of misfit
+AS_GOOD = 1.0  # m/s2 of misfit more than the best action's, with which another is no worse advice
 NEVER = -20.0  # m/s2: he changes lanes only to yield
 LONGITUDINAL = (MetaAction.IDLE, MetaAction.ACCELERATE, MetaAction.DECELERATE)
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cosim.types import Bools, Floats32, Ints
-from policy.training.experience import States, Trajectory, states
+from policy.training.experience import Advised, States, Trajectory, advised, states
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,6 +18,7 @@ class ReplayConfig:
 
     capacity: int = 30_000  # decisions; P's 8,000 (Table I) are 20 episodes of 4 learners. 0.1 MB each
     batch: int = 64  # P, Table I
+    advised: int = 64  # states on which the mentor alone speaks, without maps (a tenth of the time)
     n_step: int = 8  # compute.md: one step did not learn altruism; 1 is the papers'
     gamma: float = 0.97  # a decision of 0.4 s; P: 0.95
     # shares of a batch, however rare such moments are (P, Alg. 4: rebalanced):
@@ -38,7 +39,7 @@ class Batch(NamedTuple):
     possible: Bools  # [B,A] actions that were safe in `now`
     allowed: Bools  # [B,A] actions that were safe in `later` (all, where none was)
     vetoed: Ints  # [B] the action the prioritizer refused in `now`, or -1
-    advice: Ints  # [B] the mentor's action in `now`, -1: none (he speaks for the SVO of the drive alone)
+    wrong: Bools  # [B,A] what the mentor would not have done in `now` (he speaks for the drive's SVO alone)
 
 
 class Replay:
@@ -66,20 +67,31 @@ class Replay:
         if not self.size:
             raise ValueError("the replay is empty")
         c = self.config
-        shares = (c.yielding, c.interaction, 1.0 - c.yielding - c.interaction)
-        groups = [(p, share) for p, share in zip(self._places(), shares, strict=True) if len(p)]
-        edges = np.cumsum([0.0] + [share for _, share in groups])
-        counts = np.diff(np.round(c.batch * edges / edges[-1]).astype(int)) if edges[-1] else [c.batch]
-        drawn = [_draw(places, int(k), rng) for (places, _), k in zip(groups, counts, strict=False)]
-        picks = np.concatenate(drawn)
+        picks = self._picks(rng, c.batch)
         phi = np.array([self.trajectories[k].phi for k, _ in picks], np.float32)
         fresh = np.radians(rng.uniform(*c.phi, len(picks))).astype(np.float32)
         relabelled = rng.random(len(picks)) < c.relabel
-        advice = np.array([self.trajectories[k].advice[t] for k, t in picks], np.int64)
-        advice[relabelled] = -1
-        return self._batch(picks, np.where(relabelled, fresh, phi), advice, device)
+        wrong = np.stack([self.trajectories[k].wrong[t] for k, t in picks]) & ~relabelled[:, None]
+        return self._batch(picks, np.where(relabelled, fresh, phi), wrong, device)
 
-    def _batch(self, picks: Ints, phi: Floats32, advice: Ints, device: str) -> Batch:
+    def advised(self, rng: np.random.Generator, device: str = "cpu") -> Advised:
+        """`advised` states for the mentor alone to speak on. Raises ValueError while nothing is stored."""
+        if not self.size:
+            raise ValueError("the replay is empty")
+        picks = self._picks(rng, self.config.advised)
+        return advised([(self.trajectories[k], int(t)) for k, t in picks], device)
+
+    def _picks(self, rng: np.random.Generator, count: int) -> Ints:
+        """[count,2] places, in the configured parts."""
+        c = self.config
+        shares = (c.yielding, c.interaction, 1.0 - c.yielding - c.interaction)
+        groups = [(p, share) for p, share in zip(self._places(), shares, strict=True) if len(p)]
+        edges = np.cumsum([0.0] + [share for _, share in groups])
+        counts = np.diff(np.round(count * edges / edges[-1]).astype(int)) if edges[-1] else [count]
+        drawn = [_draw(places, int(k), rng) for (places, _), k in zip(groups, counts, strict=False)]
+        return np.concatenate(drawn)
+
+    def _batch(self, picks: Ints, phi: Floats32, wrong: Bools, device: str) -> Batch:
         c = self.config
         weights = np.stack([np.cos(phi), np.sin(phi), np.sin(phi)], 1)  # [B,3] of the reward's terms
         reward = np.zeros(len(picks), np.float32)
@@ -107,7 +119,7 @@ class Replay:
             np.stack(possible),
             np.stack(allowed),
             np.array([tr.vetoed[t] for tr, t in now], np.int64),
-            advice,
+            wrong,
         )
 
     def _places(self) -> list[Ints]:

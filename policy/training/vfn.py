@@ -52,6 +52,7 @@ class VfnTraining:
     episodes: int = 2  # an iteration
     updates: int = 40  # an iteration: one every five joint decisions (compute.md: 4 to 8)
     prefill: int = 2_000  # decisions recorded before the first update (Alg. 4), with epsilon 1
+    warm_up: int = 0  # steps towards the mentor alone before the first update
     epsilon: tuple[float, float] = (1.0, 0.05)  # P, Table I: linear
     epsilon_iterations: int = 200
     guided: tuple[float, float] = (0.5, 0.1)  # share of the episodes that the mentor drives, linear likewise
@@ -175,10 +176,18 @@ class Trainer:
         if isinstance(self.learner, A2cLearner) or self.replay.size < c.prefill:
             return {}
         rng = generator(c.seed, "replay", str(k))
-        losses = np.array(
-            [self.learner.update(self.replay.sample(rng, self.device)) for _ in range(c.updates)]
-        )
-        return _named(Losses._fields, losses.mean(0))
+        learner, listens = self.learner, c.ddqn.imitation > 0.0 and bool(self.vfn.kinematic)
+        if listens and not learner.updates:
+            for _ in range(c.warm_up):
+                learner.imitate(self.replay.advised(rng, self.device))
+            learner.follow()
+        losses, agrees = [], []
+        for _ in range(c.updates):
+            losses.append(learner.update(self.replay.sample(rng, self.device)))
+            if listens:
+                agrees.append(learner.imitate(self.replay.advised(rng, self.device)))
+        means = _named(Losses._fields, np.array(losses).mean(0))
+        return means | ({"agrees": float(np.mean(agrees))} if agrees else {})
 
     def _drives(self, k: int, weights: str, frozen: str) -> list[Drive]:
         c = self.config

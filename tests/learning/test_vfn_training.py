@@ -68,9 +68,12 @@ def trajectory(
         interacting=np.full(d, near),
         yielding=np.zeros(d, np.bool_),
         phi=0.0,
-        advice=np.full(d, -1, np.int8),
+        wrong=np.zeros((d, 5), np.bool_),
         ending=ending,  # type: ignore[arg-type]
     )
+
+
+BUT_BRAKE = np.array([[True, True, True, True, False]])  # what the mentor thinks wrong
 
 
 def only(config: ReplayConfig, one: Trajectory, seed: int = 0) -> tuple[Replay, object]:
@@ -191,7 +194,7 @@ def test_a_refused_action_is_worth_a_crash() -> None:
 def test_the_mentors_advice_leads_by_the_margin_where_nothing_else_speaks_for_it() -> None:
     """Somebody idled and was paid; the mentor would have braked."""
     one = trajectory([1], [(1.0, 0.0, 0.0)], ending="crashed")
-    one = replace(one, advice=np.array([4], np.int8))
+    one = replace(one, wrong=BUT_BRAKE)
     learner = Learner(TINY, DdqnConfig(learning_rate=1e-2, imitation=0.5, margin=0.1), seed=1)
     replay, _ = only(ReplayConfig(batch=16, n_step=1, relabel=0.0), one)
     rng = np.random.default_rng(0)
@@ -203,10 +206,26 @@ def test_the_mentors_advice_leads_by_the_margin_where_nothing_else_speaks_for_it
     assert q[4].item() - q[[0, 1, 2, 3]].max().item() > 0.08
 
 
+def test_the_mentor_is_heard_without_maps_too_and_two_good_actions_are_not_told_apart() -> None:
+    one = trajectory([1], [(0.0, 0.0, 0.0)])
+    one = replace(one, wrong=np.array([[True, False, True, True, False]]))
+    config = DdqnConfig(learning_rate=1e-2, margin=0.1)
+    learner = Learner(replace(TINY, kinematic=8), config, seed=1)
+    replay, _ = only(ReplayConfig(advised=16, relabel=1.0), one)
+    rng = np.random.default_rng(0)
+    agrees = [learner.imitate(replay.advised(rng)) for _ in range(100)]
+    assert agrees[-1] == 1.0
+    seen = replay.advised(rng)
+    with torch.no_grad():
+        q = learner.online(None, seen.kinematics, seen.route, seen.phi)[0]
+    assert q[[1, 4]].max() > q[[0, 2, 3]].max() + 0.08
+    assert learner.updates == 0, "what is learned from rewards alone is counted"
+
+
 def test_advice_holds_for_the_orientation_of_the_drive_alone() -> None:
-    one = replace(trajectory([4], [(1.0, 0.0, 0.0)]), advice=np.array([4], np.int8))
-    assert (only(ReplayConfig(batch=20, relabel=0.0), one)[1].advice == 4).all()
-    assert (only(ReplayConfig(batch=20, relabel=1.0), one)[1].advice == -1).all()
+    one = replace(trajectory([4], [(1.0, 0.0, 0.0)]), wrong=BUT_BRAKE)
+    assert (only(ReplayConfig(batch=20, relabel=0.0), one)[1].wrong == BUT_BRAKE).all()
+    assert not only(ReplayConfig(batch=20, relabel=1.0), one)[1].wrong.any()
 
 
 def test_saved_and_loaded_a_learner_goes_on_exactly(tmp_path: Path) -> None:
@@ -295,7 +314,8 @@ def test_the_mentor_cruises_up_to_the_limit_and_his_advice_is_what_he_does() -> 
     episode = fake_episode(FakeVehicle("a", 100.0, 0, 15.0, is_av=True))
     drive = Drive(Lesson("fake"), 5, 0.7, 1.0, "", "", True, guided=True)
     (drove,) = drive_episode(episode, agent(), drive, RewardConfig()).trajectories
-    assert np.array_equal(drove.advice, drove.action)
+    assert not drove.wrong[np.arange(len(drove)), drove.action].any()
+    assert drove.wrong.any()
     assert set(drove.action.tolist()) == {MetaAction.ACCELERATE, MetaAction.IDLE}, "no random action"
     limit = episode.simulator.road.lanes[0].speed_limit
     assert episode.snapshot.speed[0] == pytest.approx(limit, abs=2.5)

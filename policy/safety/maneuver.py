@@ -66,6 +66,7 @@ class Futures(NamedTuple):
 
     under: Rollout  # [A,T+1] what each action is judged by
     intention: Rollout  # [A,T+1] what the allies are told
+    braked: Rollout  # [A,T+1] the action for `brake_after` s, then braking
 
 
 def roll_ego(history: History, paths: list[LanePath], now: Floats, c: SafetyConfig) -> Futures:
@@ -77,11 +78,20 @@ def roll_ego(history: History, paths: list[LanePath], now: Floats, c: SafetyConf
     speed, limit = float(now[2]), history.route.speed_limit
     targets = np.array([next_target(history.target_speed, speed, a, limit) for a in ACTIONS], np.float64)
     slower = ACTIONS.index(MetaAction.DECELERATE)
-    rows = [*range(len(ACTIONS)), slower]  # the last one: Decelerate once
+    count = len(ACTIONS)
+    rows = [*range(count), slower, *range(count)]  # held, Decelerate once, held and then braked
     packed = pack([paths[k] for k in rows])
-    count = len(rows)
     speeds = tracked_speeds(speed, targets[rows], c.frames, c.dt)
     speeds[slower] = braking_speeds(speed, targets[slower], c.frames, c.dt, c.reaction)
+    held = round(c.brake_after / c.dt)
+    for a in range(count):
+        if a == slower:
+            speeds[count + 1 + a] = speeds[slower]
+            continue
+        then = float(speeds[a, held])
+        lowered = next_target(targets[a], then, MetaAction.DECELERATE, limit)
+        speeds[count + 1 + a, held:] = braking_speeds(then, lowered, c.frames - held, c.dt, c.reaction)
+    count = len(rows)
     x, y = fronts(np.repeat(now[None], count, 0))
     arc, offset = project_many(*packed, x, y, np.full(count, history.route.arc))
     wide = np.abs(offset) > 0.3  # a lane change, new or under way
@@ -98,9 +108,12 @@ def roll_ego(history: History, paths: list[LanePath], now: Floats, c: SafetyConf
         MAX_DECEL,
         c.dt,
     )
-    told = [*rows[:slower], len(ACTIONS), *rows[slower + 1 : -1]]
+    every = len(ACTIONS)
+    told = [*range(slower), every, *range(slower + 1, every)]
     return Futures(
-        Rollout(*(array[: len(ACTIONS)] for array in out)), Rollout(*(array[told] for array in out))
+        Rollout(*(array[:every] for array in out)),
+        Rollout(*(array[told] for array in out)),
+        Rollout(*(array[every + 1 :] for array in out)),
     )
 
 

@@ -139,6 +139,7 @@ def evaluate(
     blamed: list[str | None] = [None] * len(ACTIONS)
     if len(others):
         touch = first_contact(ego, traffic, me, others, c)  # [A,O] s
+        late = first_contact(futures.braked, traffic, me, others, c)
         seen: dict[int, Neighbours] = {}
         for a, way in enumerate(ways):
             near = seen.get(id(way.path))
@@ -147,6 +148,8 @@ def evaluate(
                 near = Neighbours.of(way.path, arc, length, others, traffic, scene.state[me, -1], c)
                 seen[id(way.path)] = near
             times = np.where(near.behind, np.inf, touch[a])  # followers brake: checked below for changes
+            if not way.changes:  # who drives ahead in the own lane can be followed: brake later
+                times = np.where(near.ahead, np.maximum(times, late[a]), times)
             first = int(np.argmin(times))
             contact[a] = times[first]
             if np.isfinite(times[first]):

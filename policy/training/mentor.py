@@ -11,13 +11,13 @@ from cosim.types import Floats32, History, MetaAction, PolicyContext
 from policy.agents.altruist_rule import AltruistRule, along
 
 YIELD = 2.0  # his preference for what the scripted altruist commands: all others are below 0
-# He follows by IDM (contract.md, Vehicles), with as much more time gap as spares him most of the vetoes:
-TIME_GAP, STANDSTILL, ACCEL, COMFORT = 1.2, 2.0, 3.0, 7.0  # s, m, m/s2, m/s2
+# He follows by IDM (contract.md, Vehicles), with a little more time gap, which spares him harsh steps:
+TIME_GAP, STANDSTILL, ACCEL, COMFORT = 1.0, 2.0, 3.0, 7.0  # s, m, m/s2, m/s2
 CAR = 5.0  # m, between the centres of two cars that touch
 EAGER = 5.0  # m/s by which he wishes to drive faster than he may: IDM alone creeps up to its desired speed
 AHEAD = 0.4  # s, over which an action's acceleration is compared with IDM's
 HARD = 3.0  # m/s2: a braking that begins harder than this, and than IDM wishes, costs
-HARSH = 3.0  # m/s2 of misfit
+HARSH = 10.0  # m/s2 of misfit
 AS_GOOD = 1.0  # m/s2 of misfit more than the best action's, with which another is no worse advice
 NEVER = -20.0  # m/s2: he changes lanes only to yield
 LONGITUDINAL = (MetaAction.IDLE, MetaAction.ACCELERATE, MetaAction.DECELERATE)

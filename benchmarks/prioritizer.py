@@ -95,6 +95,8 @@ SETTINGS = (
     Setting("critical_th 2.5 s", replace(DEFAULT, critical_th=2.5)),
     Setting("horizon 2 s", replace(DEFAULT, horizon=2.0)),
     Setting("contacts within 1.5 s", replace(DEFAULT, horizon=1.0, critical_th=0.5, safe_th=0.5)),
+    Setting("held to the end (P)", replace(DEFAULT, brake_after=60.0)),
+    Setting("brake after 1.6 s", replace(DEFAULT, brake_after=1.6)),
     Setting("lambda 2 /s", replace(DEFAULT, decay=2.0)),
     Setting("no margins", margins(0.0, 0.0)),
     Setting("margins doubled", margins(2 * DEFAULT.margin_length, 2 * DEFAULT.margin_width)),
@@ -127,7 +129,8 @@ def write(results: Results, settings: Settings) -> None:
         "Demand `dense`, HVs `mixed`. Default: safe_th "
         f"{default.safe_th:g} s, critical_th {default.critical_th:g} s, lambda {default.decay:g} /s, margins",
         f"{default.margin_length:g} m along and {default.margin_width:g} m across, leaders brake with up to "
-        f"{default.leader_brake:g} m/s2, followers need not with more than {default.follower_brake:g}.",
+        f"{default.leader_brake:g} m/s2, followers need not with more than {default.follower_brake:g};",
+        f"a car ahead in the own lane counts if braking after {default.brake_after:g} s would touch it.",
         "`cruise`: every action is worth the same, so the agent keeps lane and speed while the prioritizer",
         "lets it; without a mask that is the unguarded `keep-lane`. `random`: drawn anew at every decision.",
         "",

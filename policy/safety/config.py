@@ -23,7 +23,9 @@ class SafetyConfig:
     margin_width: float = 0.6  # m, and across: half of the room between cars in neighbouring lanes
     reach: float = 125.0  # m, as the kinematic rows
     reaction: float = 0.4  # s until the next decision can brake
-    brake_after: float = 0.8  # s that an action is held before braking, where somebody ahead is concerned
+    # s that an action is held before braking, as far as cars ahead in the own lane are concerned; longer than
+    # the horizon: to its end, as P's algorithm 2 has it
+    brake_after: float = 0.8
     leader_brake: float = 8.0  # m/s2, a leader's hardest expected braking
     standstill_gap: float = 1.0  # m left between standing cars
     follower_reaction: float = 0.5  # s of a new follower

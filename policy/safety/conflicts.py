@@ -131,7 +131,7 @@ def gap_margin(
     """The score (s) that the gaps around the ego leave, and which of the others limits it.
 
     Leader: if it brakes with `leader_brake` from now on, and the ego with full force after one more decision,
-    they must not touch; one that shares its intentions tells when it brakes, in time to brake with it.
+    they must not touch; one that shares its intentions, and will not brake yet, tells in time to brake with it.
     A lane change further needs the place beside the ego, and a new follower that need not brake harder than
     `follower_brake`. At the limit the score is safe_th, below it falls with the gap. Decelerating never makes
     a gap smaller.
@@ -140,7 +140,8 @@ def gap_margin(
     speed = traffic.rollout.speed[others, 0]
     ratio = np.full(len(others), np.inf)  # of the gap there is to the gap needed
     if action != MetaAction.DECELERATE:
-        told = intended[others]
+        soon = traffic.rollout.speed[others, min(round(c.reaction / c.dt), ego.speed.shape[1] - 1)]
+        told = intended[others] & (soon > speed - 0.5)
         stopping = np.where(told, _stopping(ego, action, 0.0, c), _stopping(ego, action, c.reaction, c))
         need = np.maximum(stopping - speed**2 / (2 * c.leader_brake), 0.0) + c.standstill_gap
         ratio = np.where(near.ahead, near.gap / need, ratio)

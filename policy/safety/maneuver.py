@@ -13,6 +13,7 @@ from policy.motion import Rollout, fronts, pack, project, project_many, roll_out
 from policy.safety.config import SafetyConfig
 
 ACTIONS = tuple(MetaAction)
+KEEPING = [ACTIONS.index(a) for a in (MetaAction.IDLE, MetaAction.ACCELERATE)]  # that brake later, if ever
 SIDE = {MetaAction.LANE_LEFT: 0, MetaAction.LANE_RIGHT: 2}  # index into RouteAhead.paths
 LANE_END = "(lane end)"
 ROAD_EDGE = "(no lane)"
@@ -66,7 +67,6 @@ class Futures(NamedTuple):
 
     under: Rollout  # [A,T+1] what each action is judged by
     intention: Rollout  # [A,T+1] what the allies are told
-    braked: Rollout  # [A,T+1] the action for `brake_after` s, then braking
 
 
 def roll_ego(history: History, paths: list[LanePath], now: Floats, c: SafetyConfig) -> Futures:
@@ -78,24 +78,38 @@ def roll_ego(history: History, paths: list[LanePath], now: Floats, c: SafetyConf
     speed, limit = float(now[2]), history.route.speed_limit
     targets = np.array([next_target(history.target_speed, speed, a, limit) for a in ACTIONS], np.float64)
     slower = ACTIONS.index(MetaAction.DECELERATE)
-    count = len(ACTIONS)
-    rows = [*range(count), slower, *range(count)]  # held, Decelerate once, held and then braked
-    packed = pack([paths[k] for k in rows])
+    rows = [*range(len(ACTIONS)), slower]  # the last one: Decelerate once
     speeds = tracked_speeds(speed, targets[rows], c.frames, c.dt)
     speeds[slower] = braking_speeds(speed, targets[slower], c.frames, c.dt, c.reaction)
-    held = round(c.brake_after / c.dt)
-    for a in range(count):
-        if a == slower:
-            speeds[count + 1 + a] = speeds[slower]
-            continue
-        then = float(speeds[a, held])
-        lowered = next_target(targets[a], then, MetaAction.DECELERATE, limit)
-        speeds[count + 1 + a, held:] = braking_speeds(then, lowered, c.frames - held, c.dt, c.reaction)
-    count = len(rows)
+    out = _roll(history, [paths[k] for k in rows], now, speeds, c)
+    told = [*rows[:slower], len(ACTIONS), *rows[slower + 1 : -1]]
+    return Futures(
+        Rollout(*(array[: len(ACTIONS)] for array in out)), Rollout(*(array[told] for array in out))
+    )
+
+
+def roll_braked(
+    history: History, path: LanePath, now: Floats, under: Rollout, actions: list[int], c: SafetyConfig
+) -> Rollout:
+    """[k,T+1] the ego on `path` under `actions` for `brake_after` s, as in `under` [A,T+1], then braking."""
+    held = min(round(c.brake_after / c.dt), c.frames)
+    speeds = under.speed[actions].copy()
+    for row, a in zip(speeds, actions, strict=True):
+        then = float(row[held])
+        target = next_target(history.target_speed, float(now[2]), ACTIONS[a], history.route.speed_limit)
+        lowered = next_target(target, then, MetaAction.DECELERATE, history.route.speed_limit)
+        row[held:] = braking_speeds(then, lowered, c.frames - held, c.dt, c.reaction)
+    return _roll(history, [path] * len(actions), now, speeds, c)
+
+
+def _roll(history: History, paths: list[LanePath], now: Floats, speeds: Floats, c: SafetyConfig) -> Rollout:
+    """[k,T+1] the ego on each of the k paths with the speeds of its row."""
+    count = len(paths)
+    packed = pack(paths)
     x, y = fronts(np.repeat(now[None], count, 0))
     arc, offset = project_many(*packed, x, y, np.full(count, history.route.arc))
     wide = np.abs(offset) > 0.3  # a lane change, new or under way
-    out = roll_out(
+    return roll_out(
         packed,
         arc,
         offset,
@@ -107,13 +121,6 @@ def roll_ego(history: History, paths: list[LanePath], now: Floats, c: SafetyConf
         np.full(count, np.inf),
         MAX_DECEL,
         c.dt,
-    )
-    every = len(ACTIONS)
-    told = [*range(slower), every, *range(slower + 1, every)]
-    return Futures(
-        Rollout(*(array[:every] for array in out)),
-        Rollout(*(array[told] for array in out)),
-        Rollout(*(array[every + 1 :] for array in out)),
     )
 
 

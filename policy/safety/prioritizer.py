@@ -2,9 +2,10 @@
 
 Algorithm 2 rolls the ego out under each meta-action along its real lane centre lines, the others by their
 predicted speeds along theirs, and finds when their (swept, oriented) boxes first touch. With first contact
-at T, the time to collision at step h of the horizon is T - h, capped. Two further limits look at what a
-time to collision cannot see, because it is infinite at equal speeds: a leader that brakes hard, and the new
-follower that a lane change asks to brake. Algorithm 3 takes the best action that is left.
+at T, the time to collision at step h of the horizon is T - h, capped. A car ahead in the own lane counts only
+if braking a little later would touch it as well: who can follow need not fall back. Two further limits look
+at what a time to collision cannot see, because it is infinite at equal speeds: a leader that brakes hard, and
+the new follower that a lane change asks to brake. Algorithm 3 takes the best action that is left.
 
 AVs decide front to back, each knowing the rollouts chosen before it (V2V intentions, switchable).
 """
@@ -24,10 +25,12 @@ from policy.safety.config import SafetyConfig
 from policy.safety.conflicts import Neighbours, first_contact, gap_margin, others_near
 from policy.safety.maneuver import (
     ACTIONS,
+    KEEPING,
     LANE_END,
     REFUSED,
     STRADDLING,
     TOO_SLOW,
+    roll_braked,
     roll_ego,
     straddles,
     ways_of,
@@ -139,8 +142,8 @@ def evaluate(
     blamed: list[str | None] = [None] * len(ACTIONS)
     if len(others):
         touch = first_contact(ego, traffic, me, others, c)  # [A,O] s
-        late = first_contact(futures.braked, traffic, me, others, c)
         seen: dict[int, Neighbours] = {}
+        late: Floats | None = None  # [K,O] s first contact when braking follows
         for a, way in enumerate(ways):
             near = seen.get(id(way.path))
             if near is None:
@@ -148,8 +151,12 @@ def evaluate(
                 near = Neighbours.of(way.path, arc, length, others, traffic, scene.state[me, -1], c)
                 seen[id(way.path)] = near
             times = np.where(near.behind, np.inf, touch[a])  # followers brake: checked below for changes
-            if not way.changes:  # who drives ahead in the own lane can be followed: brake later
-                times = np.where(near.ahead, np.maximum(times, late[a]), times)
+            if a in KEEPING and np.isfinite(times[near.ahead]).any() and c.brake_after < c.frames * c.dt:
+                if late is None:
+                    braked = roll_braked(history, way.path, scene.state[me, -1], ego, KEEPING, c)
+                    late = first_contact(braked, traffic, me, others, c)
+                leader = np.maximum(times, late[KEEPING.index(a)])
+                times = np.where(near.ahead, leader, times)
             first = int(np.argmin(times))
             contact[a] = times[first]
             if np.isfinite(times[first]):

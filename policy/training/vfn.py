@@ -59,7 +59,7 @@ class VfnTraining:
     disseminate: int = 5  # iterations between copies of the learner's weights to the frozen AVs
     svo: tuple[float, ...] = (45.0, 60.0)  # deg, drawn per episode; (0,) trains the egoistic twin
     seed: int = 0  # of everything
-    validate_every: int = 20  # iterations
+    validate_every: int = 20  # iterations; the last one is validated too
     validation: int = 4  # episodes of every lesson, greedy, on tuning seeds
     save_every: int = 5  # iterations
     learning: Literal["ddqn", "a2c"] = "ddqn"
@@ -143,7 +143,7 @@ class Trainer:
             weights, frozen = self._weights(k), self._weights(k - k % c.disseminate)
             driving = [self._actors.submit(d) for d in self._drives(k, weights, frozen)]
             judged = []
-            if k % c.validate_every == 0 and k > 0:
+            if (k % c.validate_every == 0 and k > 0) or k + 1 == c.iterations:
                 judged = [self._actors.submit(d) for d in self._validation(weights)]
             losses = self._learn(k)
             drove = [f.result() for f in driving]

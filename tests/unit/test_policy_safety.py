@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from policy.traffic import Traffic, TrafficConfig, predict_traffic
 
 LEFT, IDLE, RIGHT, FASTER, SLOWER = MetaAction
 NOTHING = np.zeros(5, np.float32)
+HELD = SafetyConfig(brake_after=60.0)  # P's algorithm 2 as written: every action to the end of the horizon
 
 
 def prefer(action: MetaAction) -> np.ndarray:
@@ -63,18 +65,49 @@ def test_on_a_free_road_everything_is_safe_and_the_ego_keeps_going() -> None:
 
 def test_closing_on_a_standing_car_leaves_only_braking() -> None:
     road = straight_road(1)
-    cars = [Car("ego", 100.0, 0, 15.0, is_av=True), Car("stopped", 165.0, 0, 0.0)]
-    decision = decide(cars, road, prefer(FASTER))["ego"]
-    assert {LEFT, RIGHT, IDLE, FASTER} <= masked(decision)
-    assert decision.action == SLOWER
-    assert decision.vetoed
-    assert decision.blamed == "stopped"
+    near = [Car("ego", 100.0, 0, 15.0, is_av=True), Car("stopped", 125.0, 0, 0.0)]
+    far = [near[0], Car("stopped", 165.0, 0, 0.0)]
+    for cars, config in ((near, None), (far, HELD)):
+        decision = decide(cars, road, prefer(FASTER), config=config)["ego"]
+        assert {LEFT, RIGHT, IDLE, FASTER} <= masked(decision)
+        assert decision.action == SLOWER
+        assert decision.vetoed
+        assert decision.blamed == "stopped"
+
+
+def test_who_can_still_brake_for_the_car_ahead_may_go_on() -> None:
+    """60 m are two seconds too many to fall back for; they are enough to stop in from 15 m/s."""
+    road = straight_road(1)
+    cars = [Car("ego", 100.0, 0, 15.0, is_av=True, target=15.0), Car("stopped", 165.0, 0, 0.0)]
+    decision = decide(cars, road)["ego"]
+    assert {IDLE, FASTER}.isdisjoint(masked(decision))
+    assert not decision.vetoed
+    assert decision.ttc is not None
+    assert decision.ttc[IDLE] == 10.0, "braking in time never touches it"
+
+
+@pytest.mark.parametrize("speed", [5.0, 10.0, 15.0, 20.0, 25.0])
+@pytest.mark.parametrize("slower_by", [0.0, 5.0, 15.0])
+def test_going_on_is_refused_in_time(speed: float, slower_by: float) -> None:
+    """Whatever the approach: an agent that always wants to accelerate never touches the car ahead."""
+    road = straight_road(1)
+    limit, other = 25.0, max(speed - slower_by, 0.0)
+    front, target, v = 100.0, speed, speed
+    ahead = front + 90.0
+    for _ in range(30):
+        cars = [Car("ego", front, 0, v, is_av=True, target=target), Car("leader", ahead, 0, other)]
+        action = decide(cars, road, prefer(FASTER))["ego"].action
+        target = next_target(target, v, action, limit)
+        for _ in range(4):
+            v = tracked_speed(v, target, 0.1)
+            front, ahead = front + 0.1 * v, ahead + 0.1 * other
+        assert ahead - front > 5.0, "bumpers"
 
 
 def test_first_contact_is_when_the_boxes_meet() -> None:
     road = straight_road(1)
     cars = [Car("ego", 100.0, 0, 20.0, is_av=True, target=20.0), Car("slow", 150.0, 0, 10.0)]
-    decision = decide(cars, road)["ego"]
+    decision = decide(cars, road, config=HELD)["ego"]
     assert decision.ttc is not None
     gap = 50.0 - 5.0 - 0.5  # bumpers, and half of the box's added length
     assert decision.ttc[IDLE] == pytest.approx(gap / 10.0, abs=0.1)
@@ -84,7 +117,7 @@ def test_first_contact_is_when_the_boxes_meet() -> None:
 def test_the_safety_score_is_the_weighted_time_to_collision() -> None:
     road = straight_road(1)
     cars = [Car("ego", 100.0, 0, 20.0, is_av=True, target=20.0), Car("slow", 150.0, 0, 10.0)]
-    decision = decide(cars, road)["ego"]
+    decision = decide(cars, road, config=HELD)["ego"]
     assert decision.ttc is not None
     assert decision.safety_score is not None
     steps = 0.2 * np.arange(1, 21)
@@ -224,9 +257,10 @@ def test_a_follower_knows_that_its_leader_is_about_to_brake() -> None:
     road = straight_road(1)
     cars = [
         Car("rear", 100.0, 0, 20.0, is_av=True),
-        Car("front", 116.0, 0, 20.0, is_av=True),
-        Car("wall", 180.0, 0, 0.0),
+        Car("front", 112.0, 0, 20.0, is_av=True),
+        Car("wall", 150.0, 0, 0.0),
     ]
+    assert decide(cars[:2], road)["rear"].action == IDLE, "close, but it would be told"
     shared = decide(cars, road)
     assert shared["front"].action == SLOWER
     assert shared["rear"].action == SLOWER
@@ -255,8 +289,8 @@ def test_an_av_that_gave_way_does_not_stand_for_ever() -> None:
 def test_a_larger_threshold_masks_more(field: str) -> None:
     road = straight_road(1)
     cars = [Car("ego", 100.0, 0, 20.0, is_av=True, target=20.0), Car("slow", 175.0, 0, 10.0)]
-    strict = SafetyConfig(**{field: 8.0})  # type: ignore[arg-type]
-    assert IDLE not in masked(decide(cars, road)["ego"])
+    strict = replace(HELD, **{field: 8.0})  # type: ignore[arg-type]
+    assert IDLE not in masked(decide(cars, road, config=HELD)["ego"])
     assert IDLE in masked(decide(cars, road, config=strict)["ego"])
 
 
@@ -286,7 +320,7 @@ def test_the_mask_brakes_as_decelerating_at_every_decision_does() -> None:
 def test_a_target_far_above_the_speed_does_not_delay_braking() -> None:
     """Wind-up: accelerating from 12 m/s towards 27, one Decelerate brakes, so a leader's stop is survived."""
     road = straight_road(1)
-    cars = [Car("ego", 100.0, 0, 12.0, is_av=True, target=27.0), Car("wall", 160.0, 0, 0.0)]
+    cars = [Car("ego", 100.0, 0, 12.0, is_av=True, target=27.0), Car("wall", 125.0, 0, 0.0)]
     decision = decide(cars, road)["ego"]
     assert SLOWER not in masked(decision)
     assert decision.action == SLOWER

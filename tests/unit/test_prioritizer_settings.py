@@ -80,7 +80,8 @@ def test_the_score_threshold_binds_only_beyond_the_bound_that_the_page_names() -
     """A slow car at every distance: what is refused is the same up to that bound, and more above it."""
 
     def refused(safe_th: float) -> list[list[bool]]:
-        agent = Unled("cruise", replace(PLAIN, safety=replace(SafetyConfig(), safe_th=safe_th)))
+        held = replace(SafetyConfig(), safe_th=safe_th, brake_after=60.0)  # nobody is merely followed
+        agent = Unled("cruise", replace(PLAIN, safety=held))
         found = []
         for ahead in range(10, 125, 15):
             cars = Car("a", 300.0, 0, 20.0, is_av=True), Car("slow", 300.0 + ahead, 0, 5.0)

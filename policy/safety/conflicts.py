@@ -132,9 +132,9 @@ def gap_margin(
 
     Leader: if it brakes with `leader_brake` from now on, and the ego with full force after one more decision,
     they must not touch; one that shares its intentions, and will not brake yet, tells in time to brake with
-    it. A lane change further needs the place beside the ego, and a new follower that need not brake harder than
-    `follower_brake`. At the limit the score is safe_th, below it falls with the gap. Decelerating never makes
-    a gap smaller.
+    it. A lane change further needs the place beside the ego, and a new follower that need not brake harder
+    than `follower_brake`. At the limit the score is safe_th, below it falls with the gap. Decelerating never
+    makes a gap smaller.
     """
     ego = futures.under
     speed = traffic.rollout.speed[others, 0]

@@ -52,7 +52,8 @@ class VfnTraining:
     episodes: int = 2  # an iteration
     updates: int = 40  # an iteration: one every five joint decisions (compute.md: 4 to 8)
     prefill: int = 2_000  # decisions recorded before the first update (Alg. 4), with epsilon 1
-    warm_up: int = 0  # steps towards the mentor alone before the first update
+    warm_up: int = 0  # steps towards the mentor alone before the first update,
+    warm_up_after: int = 0  # from as many decisions at least, if the network sees kinematics
     epsilon: tuple[float, float] = (1.0, 0.05)  # P, Table I: linear
     epsilon_iterations: int = 200
     guided: tuple[float, float] = (0.5, 0.1)  # share of the episodes that the mentor drives, linear likewise
@@ -173,10 +174,10 @@ class Trainer:
 
     def _learn(self, k: int) -> dict[str, float]:
         c = self.config
-        if isinstance(self.learner, A2cLearner) or self.replay.size < c.prefill:
+        learner, listens = self.learner, self._listens()
+        if isinstance(learner, A2cLearner) or self._fills():
             return {}
         rng = generator(c.seed, "replay", str(k))
-        learner, listens = self.learner, c.ddqn.imitation > 0.0 and bool(self.vfn.kinematic)
         if listens and not learner.updates:
             for _ in range(c.warm_up):
                 learner.imitate(self.replay.advised(rng, self.device))
@@ -219,9 +220,16 @@ class Trainer:
 
     def _epsilon(self, k: int) -> float:
         c = self.config
-        if c.learning == "ddqn" and self.replay.size < c.prefill:
-            return 1.0
-        return self._faded(c.epsilon, k)
+        return 1.0 if c.learning == "ddqn" and self._fills() else self._faded(c.epsilon, k)
+
+    def _listens(self) -> bool:
+        """Whether the mentor is heard without maps."""
+        return self.config.ddqn.imitation > 0.0 and bool(self.vfn.kinematic)
+
+    def _fills(self) -> bool:
+        """Whether the replay is still being filled."""
+        c = self.config
+        return self.replay.size < (max(c.prefill, c.warm_up_after) if self._listens() else c.prefill)
 
     def _guided(self, k: int, j: int) -> bool:
         c = self.config

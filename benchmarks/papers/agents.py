@@ -5,16 +5,20 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import asdict, dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
 from benchmarks.unled import Unled
+from cosim.errors import BadInput
 from cosim.types import Policy, PolicyContext
+from policy import checkpoint
 from policy.agents import LEARNING, make
 from policy.agents.approaches import APPROACHES, AgentConfig, compact, shipped
 from policy.agents.prediction_aware import PredictionAware
 from policy.checkpoint import sha256
 from policy.safety import SafetyConfig
+from policy.vfn import VFN, VfnConfig
 
 PERCEPTION = 125.0  # m, what an AV's own sensors reach (contract.md)
 
@@ -74,7 +78,7 @@ def config(agent: Agent, untrained: bool = False) -> AgentConfig:
 
 
 def missing(agent: Agent) -> str | None:
-    """Which weights are not there and what makes them; None when it can drive."""
+    """Which weights are not there and what makes them, or do not fit; None when it can drive."""
     if not agent.learned or agent.preference:
         return None
     c = config(agent)
@@ -83,6 +87,16 @@ def missing(agent: Agent) -> str | None:
         return f"no weights {file}, made by `{agent.command}`"
     if c.predicted_maps and c.chain.source == "hpn" and c.hpn_weights is None:
         return "no weights policy/weights/hpn.safetensors, made by `cosim train hpn`"
+    return _misfit(c.vfn_weights, c.vfn)
+
+
+@cache
+def _misfit(weights: Path, vfn: VfnConfig) -> str | None:
+    """Why the value network's weights do not load; None when they do."""
+    try:
+        checkpoint.load(weights, {"vfn": VFN(vfn)}, {"vfn": vfn})
+    except BadInput as error:
+        return str(error)
     return None
 
 

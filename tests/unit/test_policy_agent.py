@@ -22,7 +22,7 @@ ROAD = straight_road(3)
 CARS = [
     Car("a", 300.0, 1, 20.0, is_av=True),
     Car("b", 250.0, 0, 20.0, is_av=True),
-    Car("slow", 340.0, 1, 8.0),
+    Car("slow", 328.0, 1, 8.0),
     Car("new", 270.0, 2, 20.0, frames=1),
 ]
 
@@ -69,7 +69,7 @@ def test_two_agents_built_alike_have_the_same_weights_and_leave_torchs_generator
 
 
 def test_the_network_decides_where_the_mask_allows_it() -> None:
-    agent = PredictionAware("vfn-p")
+    agent = untrained("vfn-p")
     with torch.no_grad():
         agent.vfn.value.bias[MetaAction.ACCELERATE] = 1.0
     decisions = decide(agent)

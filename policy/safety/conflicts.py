@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from cosim.actions import MAX_DECEL
 from cosim.geometry import Boxes, time_to_collision
 from cosim.road import LanePath, RoadMap
 from cosim.types import Bools, Floats, MetaAction
@@ -130,20 +129,21 @@ def gap_margin(
 ) -> tuple[float, int]:
     """The score (s) that the gaps around the ego leave, and which of the others limits it.
 
-    Leader: if it brakes with `leader_brake` from now on, and the ego with full force after one more decision,
-    they must not touch; one that shares its intentions, and will not brake yet, tells in time to brake with
-    it. A lane change further needs the place beside the ego, and a new follower that need not brake harder
-    than `follower_brake`. At the limit the score is safe_th, below it falls with the gap. Decelerating never
-    makes a gap smaller.
+    Leader: if it brakes with `leader_brake` from now on, and the ego as hard as it can from its next decision
+    on, they must not touch; one that shares its intentions brakes no earlier than they say. A lane change
+    further needs the place beside the ego, and a new follower that need not brake harder than
+    `follower_brake`. At the limit the score is safe_th, below it falls with the gap. Decelerating never makes
+    a gap smaller.
     """
-    ego = futures.under
-    speed = traffic.rollout.speed[others, 0]
+    ego, r = futures.under, traffic.rollout
+    speed = r.speed[others, 0]
     ratio = np.full(len(others), np.inf)  # of the gap there is to the gap needed
     if action != MetaAction.DECELERATE:
-        soon = traffic.rollout.speed[others, min(round(c.reaction / c.dt), ego.speed.shape[1] - 1)]
-        told = intended[others] & (soon > speed - 0.5)
-        stopping = np.where(told, _stopping(ego, action, 0.0, c), _stopping(ego, action, c.reaction, c))
-        need = np.maximum(stopping - speed**2 / (2 * c.leader_brake), 0.0) + c.standstill_gap
+        soon = r.speed[others, min(round(c.reaction / c.dt), r.speed.shape[1] - 1)]
+        braking = np.where(intended[others], soon, speed)  # m/s when it begins to brake hard
+        theirs = braking**2 / (2 * c.leader_brake)
+        theirs = theirs + np.where(intended[others], 0.5 * (speed + soon) * c.reaction, 0.0)
+        need = np.maximum(futures.stopping[action] - theirs, 0.0) + c.standstill_gap
         ratio = np.where(near.ahead, near.gap / need, ratio)
     if changes:
         closing = np.maximum(speed - ego.speed[action, 0], 0.0)
@@ -154,10 +154,3 @@ def gap_margin(
     if ratio[who] >= 1.0:
         return np.inf, who
     return 0.999 * c.safe_th * max(float(ratio[who]), 0.0), who
-
-
-def _stopping(ego: Rollout, action: int, delay: float, c: SafetyConfig) -> float:
-    """m until standstill when the ego goes on under the action for `delay` s and then brakes."""
-    frame = min(round(delay / c.dt), ego.speed.shape[1] - 1)
-    travelled = float(ego.arc[action, frame] - ego.arc[action, 0])
-    return travelled + float(ego.speed[action, frame]) ** 2 / (2 * MAX_DECEL)

@@ -15,6 +15,7 @@ from policy.safety.config import SafetyConfig
 ACTIONS = tuple(MetaAction)
 KEEPING = [ACTIONS.index(a) for a in (MetaAction.IDLE, MetaAction.ACCELERATE)]  # that brake later, if ever
 SIDE = {MetaAction.LANE_LEFT: 0, MetaAction.LANE_RIGHT: 2}  # index into RouteAhead.paths
+STOPPING = 40  # frames: 8 s, in which every AV stands
 LANE_END = "(lane end)"
 ROAD_EDGE = "(no lane)"
 REFUSED = "(lane change was refused)"
@@ -67,6 +68,7 @@ class Futures(NamedTuple):
 
     under: Rollout  # [A,T+1] what each action is judged by
     intention: Rollout  # [A,T+1] what the allies are told
+    stopping: Floats  # [A] m until standstill, when Decelerate follows from the next decision on
 
 
 def roll_ego(history: History, paths: list[LanePath], now: Floats, c: SafetyConfig) -> Futures:
@@ -83,9 +85,26 @@ def roll_ego(history: History, paths: list[LanePath], now: Floats, c: SafetyConf
     speeds[slower] = braking_speeds(speed, targets[slower], c.frames, c.dt, c.reaction)
     out = _roll(history, [paths[k] for k in rows], now, speeds, c)
     told = [*rows[:slower], len(ACTIONS), *rows[slower + 1 : -1]]
-    return Futures(
-        Rollout(*(array[: len(ACTIONS)] for array in out)), Rollout(*(array[told] for array in out))
+    held = round(c.reaction / c.dt)
+    stopping = np.array(
+        [
+            c.dt * float(np.trapezoid(_braked(speeds[a], targets[a], held, STOPPING, limit, c)))
+            for a in range(len(ACTIONS))
+        ]
     )
+    return Futures(
+        Rollout(*(array[: len(ACTIONS)] for array in out)),
+        Rollout(*(array[told] for array in out)),
+        stopping,
+    )
+
+
+def _braked(speeds: Floats, target: float, held: int, frames: int, limit: float, c: SafetyConfig) -> Floats:
+    """[frames+1] m/s: the first `held` frames of `speeds`, at `target`, then Decelerate at every decision."""
+    then = float(speeds[held])
+    lowered = next_target(target, then, MetaAction.DECELERATE, limit)
+    after = braking_speeds(then, lowered, frames - held, c.dt, c.reaction)
+    return np.concatenate([speeds[:held], after])
 
 
 def roll_braked(
@@ -94,11 +113,10 @@ def roll_braked(
     """[k,T+1] the ego on `path` under `actions` for `brake_after` s, as in `under` [A,T+1], then braking."""
     held = min(round(c.brake_after / c.dt), c.frames)
     speeds = under.speed[actions].copy()
+    limit = history.route.speed_limit
     for row, a in zip(speeds, actions, strict=True):
-        then = float(row[held])
-        target = next_target(history.target_speed, float(now[2]), ACTIONS[a], history.route.speed_limit)
-        lowered = next_target(target, then, MetaAction.DECELERATE, history.route.speed_limit)
-        row[held:] = braking_speeds(then, lowered, c.frames - held, c.dt, c.reaction)
+        target = next_target(history.target_speed, float(now[2]), ACTIONS[a], limit)
+        row[:] = _braked(row, target, held, c.frames, limit, c)
     return _roll(history, [path] * len(actions), now, speeds, c)
 
 

@@ -267,6 +267,17 @@ def test_a_follower_knows_that_its_leader_is_about_to_brake() -> None:
     assert shared["rear"].blamed == "front"
 
 
+def test_a_leader_that_says_it_goes_on_may_still_brake_at_its_next_decision() -> None:
+    """As it happened: accelerating for 0.4 s more left too little room when the leader then had to brake."""
+    road = straight_road(1)
+    cars = [
+        Car("rear", 100.0, 0, 21.3, is_av=True, target=20.0),
+        Car("front", 118.9, 0, 17.4, is_av=True, target=17.4),
+    ]
+    decisions = decide(cars, road, prefer(FASTER))
+    assert FASTER in masked(decisions["rear"])
+
+
 def test_deciding_does_not_change_the_prediction_it_was_given() -> None:
     road = straight_road(3)
     scene, traffic = predict(

@@ -111,7 +111,7 @@ def test_missing_and_broken_cards_are_bad_input(saved: Path) -> None:
 def test_an_agent_with_weights_is_no_longer_called_untrained(tmp_path: Path) -> None:
     import dataclasses
 
-    config = compact("vfn")
+    config = dataclasses.replace(compact("vfn"), vfn_weights=None)
     untrained = PredictionAware("vfn", config)
     assert untrained.label == "untrained"
     path = tmp_path / "agent.safetensors"

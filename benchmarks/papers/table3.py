@@ -33,6 +33,11 @@ ABLATION = (
     Agent("vfn"),
     Agent("no maps, mask gp", "vfn", mask="gp-indirect"),
 )
+SCHOOL = (
+    "",
+    "P trained for thousands of episodes, we for two an iteration: after so few, approaches that no",
+    "prioritizer guards have hardly learned to keep clear of others.",
+)
 ABLATED = (
     "Ablation: predicted maps yes or no, mask none, constant speed or Gaussian process. The networks are",
     "those of `vfn-p` (maps) and `vfn` (no maps), each trained with its own mask; with maps, the mask's",
@@ -56,7 +61,9 @@ def write(results: Results, settings: Settings) -> None:
     six = {names[a]: runs[names[a]] for a in (*APPROACHES, *REFERENCES) if a in names}
     ablated = {names[a.name]: runs[names[a.name]] for a in ABLATION if a.name in names}
     worlds = [w for w in WORLDS if any(of_world(run, w) for run in runs.values())]
-    page = heading(JOB, results, settings, "Demand `dense`, HVs `mixed` in equal parts, phi 45 degrees.")
+    page = heading(
+        *(JOB, results, settings), "Demand `dense`, HVs `mixed` in equal parts, phi 45 degrees.", *SCHOOL
+    )
     lines = lines_of("dense", worlds, runs, FIGURES)
     if worlds:
         page += [_picture(six, names, worlds, settings), ""]

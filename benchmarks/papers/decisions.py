@@ -58,8 +58,8 @@ def orders() -> list[Order]:
     return [
         Order(Agent(name), world, demand, behavior, episodes, svo=svo(name))
         for demand, behavior, episodes in (
-            ("dense", BEHAVIOR["dense"], DENSE),
             ("contested", BEHAVIOR["contested"], CONTESTED),
+            ("dense", BEHAVIOR["dense"], DENSE),
         )
         for world in WORLDS
         for name in AGENTS

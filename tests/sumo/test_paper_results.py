@@ -33,6 +33,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Settings of a tiny run whose episodes have all been driven, in one worker process."""
     folder = tmp_path_factory.mktemp("papers")
     with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)  # away from whatever was trained in this checkout's runs/
         patch.setattr(driving, "LEAST", 1)
         patch.setattr(figure9, "BEHAVIORS", ("mixed",))
         patch.setattr(phi, "PHIS", (0.0, 45.0))

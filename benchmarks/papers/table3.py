@@ -35,7 +35,7 @@ ABLATION = (
 )
 SCHOOL = (
     "",
-    "P trained for thousands of episodes, we for two an iteration: after so few, approaches that no",
+    "Our networks saw two drives an iteration, P's thousands of episodes: after so few, approaches that no",
     "prioritizer guards have hardly learned to keep clear of others.",
 )
 ABLATED = (

@@ -117,7 +117,7 @@ class VFN(nn.Module):
     ) -> torch.Tensor:
         """maps [B,T,C,H,W] in [0,1], kinematics [B,T,R,F+1], route [B,.], phi [B,2] -> q [B,5].
 
-        Without maps that branch says nothing: what the others learn costs a tenth of the time so.
+        Without maps that branch says nothing, and learning costs no convolutions.
         """
         z = self.features(maps, kinematics, route, phi)
         q: torch.Tensor = self.value(z)

@@ -18,7 +18,7 @@ class ReplayConfig:
 
     capacity: int = 30_000  # decisions; P's 8,000 (Table I) are 20 episodes of 4 learners. 0.1 MB each
     batch: int = 64  # P, Table I
-    advised: int = 64  # states on which the mentor alone speaks, without maps (a tenth of the time)
+    advised: int = 64  # states on which the mentor alone speaks, without maps (cheap)
     n_step: int = 8  # compute.md: one step did not learn altruism; 1 is the papers'
     gamma: float = 0.97  # a decision of 0.4 s; P: 0.95
     # shares of a batch, however rare such moments are (P, Alg. 4: rebalanced):

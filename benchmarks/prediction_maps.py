@@ -101,7 +101,7 @@ def parts(road: Any, kept: list[Any], size: ObservationConfig, chain: ChainConfi
             clock.append(time.perf_counter())
             traffic = predict_traffic(scene, forecast, road, TrafficConfig(), 28)
             clock.append(time.perf_counter())
-            batch = to_batch(scene.histories, 0.0)
+            batch = to_batch(scene.histories)
             clock.append(time.perf_counter())
             predict(chain, size, raster, hpn, scene, batch, forecast, traffic)
             clock.append(time.perf_counter())

@@ -49,7 +49,7 @@ def painted(
                 values = to_numpy(features) * inputs.known[:, None]
                 out[f"{name}, vehicles"] = _on_the_road(values, scene, b, observation, road)
             if hpn.map_branch is not None and not hpn.map_branch.config.correct:
-                batch = to_batch(scene.histories, 0.0)
+                batch = to_batch(scene.histories)
                 for layer, maps in enumerate(_encoded(hpn.map_branch, batch, b)):
                     out[f"{name}, layer {layer + 1}"] = _scaled(_liveliest(maps))
     return out

@@ -86,7 +86,7 @@ class MapPredictors:
         last = np.stack([h.velocity_map[-1] for h in scene.histories])
         maps = {"last-frame": np.repeat(_unit(last)[:, None], config.horizon, 1)}
         with torch.inference_mode():
-            batch = to_batch(scene.histories, 0.0)
+            batch = to_batch(scene.histories)
             for name in self.names[1:]:
                 hpn = self._hpns.get(name)
                 history = hpn is None or hpn.kinematic is None or hpn.kinematic.config.history

@@ -1,7 +1,7 @@
-"""The value function network: action values from past and predicted maps, kinematics, route and phi.
+"""The value function network: action values from past and predicted maps, kinematics, situation and phi.
 
 A 3D CNN after T's Table 1 (Conv3D 32@(1,8,8), 64@(3,4,4), 64@(3,3,3), FC 512, FC 256, FC 5); kinematics
-and the ego's own route knowledge join after FC 512 through MLPs. The baselines of Table III are the same
+and what the ego knows besides join after FC 512 through MLPs. The baselines of Table III are the same
 network with parts left out.
 """
 
@@ -16,7 +16,8 @@ from torch.nn import functional
 
 from cosim.types import IS_MISSION, MetaAction
 from policy.extractors import Conv2dMaps, Conv3dMaps, Strides
-from policy.tensors import KINEMATIC_INPUTS, ROUTE_INPUTS
+from policy.situation import SITUATION_INPUTS
+from policy.tensors import KINEMATIC_INPUTS
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +35,7 @@ class VfnConfig:
     hidden: int = 256  # T, Table 1: 512
     joined: int = 256  # T, Table 1
     kinematic: int = 64  # features of a vehicle; 0: maps and phi are all the network sees
-    route: int = 64  # width of the branch of the ego's own route knowledge; goes with `kinematic`
+    situation: int = 64  # width of the branch of what the ego knows besides; goes with `kinematic`
     extractor: Literal["conv3d", "conv2d"] = "conv3d"
     dueling: bool = True  # q = state value + advantage: how good the moment is drowns what an action changes
     critic: bool = False  # True: action preferences and a state value (A2C), not action values
@@ -83,10 +84,13 @@ class VFN(nn.Module):
         if c.kinematic:
             self.kinematics = Vehicles(c.frames, c.kinematic)
             # a branch of its own: what few numbers say about the ego's way and command must not drown
-            self.route = nn.Sequential(
-                nn.Linear(ROUTE_INPUTS, c.route), nn.ReLU(), nn.Linear(c.route, c.route), nn.ReLU()
+            self.situation = nn.Sequential(
+                nn.Linear(SITUATION_INPUTS, c.situation),
+                nn.ReLU(),
+                nn.Linear(c.situation, c.situation),
+                nn.ReLU(),
             )
-        own = c.route if c.kinematic else 0
+        own = c.situation if c.kinematic else 0
         self.joined = nn.Linear(c.hidden + 3 * c.kinematic + own + 2, c.joined)
         self.value = nn.Linear(c.joined, len(MetaAction))
         self.state = nn.Linear(c.joined, 1) if c.critic or c.dueling else None
@@ -101,7 +105,7 @@ class VFN(nn.Module):
         return torch.channels_last if self.config.extractor == "conv2d" else torch.channels_last_3d
 
     def features(
-        self, maps: torch.Tensor | None, kinematics: torch.Tensor, route: torch.Tensor, phi: torch.Tensor
+        self, maps: torch.Tensor | None, kinematics: torch.Tensor, situation: torch.Tensor, phi: torch.Tensor
     ) -> torch.Tensor:
         """The joined representation [B,joined]; arguments as in `forward`."""
         if maps is None:
@@ -109,27 +113,27 @@ class VFN(nn.Module):
         else:
             parts = [functional.relu(self.hidden(self.maps(maps)))]
         if self.kinematics is not None:
-            parts += [self.kinematics(kinematics), self.route(route)]
+            parts += [self.kinematics(kinematics), self.situation(situation)]
         return functional.relu(self.joined(torch.cat([*parts, phi], 1)))
 
     def forward(
-        self, maps: torch.Tensor | None, kinematics: torch.Tensor, route: torch.Tensor, phi: torch.Tensor
+        self, maps: torch.Tensor | None, kinematics: torch.Tensor, situation: torch.Tensor, phi: torch.Tensor
     ) -> torch.Tensor:
-        """maps [B,T,C,H,W] in [0,1], kinematics [B,T,R,F+1], route [B,.], phi [B,2] -> q [B,5].
+        """maps [B,T,C,H,W] in [0,1], kinematics [B,T,R,F+1], situation [B,.], phi [B,2] -> q [B,5].
 
         Without maps that branch says nothing, and learning costs no convolutions.
         """
-        z = self.features(maps, kinematics, route, phi)
+        z = self.features(maps, kinematics, situation, phi)
         q: torch.Tensor = self.value(z)
         if self.config.dueling and self.state is not None:
             q = q - q.mean(1, keepdim=True) + self.state(z)
         return q
 
     def actor_critic(
-        self, maps: torch.Tensor, kinematics: torch.Tensor, route: torch.Tensor, phi: torch.Tensor
+        self, maps: torch.Tensor, kinematics: torch.Tensor, situation: torch.Tensor, phi: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Log-preferences [B,5] (not normalised) and state values [B]. Needs `critic`."""
         if self.state is None or not self.config.critic:
             raise ValueError("this network has no critic")
-        z = self.features(maps, kinematics, route, phi)
+        z = self.features(maps, kinematics, situation, phi)
         return self.value(z), self.state(z)[:, 0]

@@ -28,7 +28,7 @@ from policy.hpn import HPN
 from policy.predictors import make_predictor
 from policy.safety import prioritize
 from policy.scene import Scene, join
-from policy.tensors import to_batch, to_numpy
+from policy.tensors import situation_tensor, svo_tensor, to_batch, to_numpy
 from policy.traffic import Traffic, predict_traffic
 from policy.vfn import VFN
 
@@ -42,7 +42,7 @@ class Inputs(NamedTuple):
     scene: Scene
     maps: torch.Tensor  # [B,T,C,H,W] in [0,1]
     kinematics: torch.Tensor  # [B,T,R,F+1] scaled
-    route: torch.Tensor  # [B,.]
+    situation: torch.Tensor  # [B,SITUATION_INPUTS]
     phi: torch.Tensor  # [B,2]
     traffic: Traffic
 
@@ -106,7 +106,7 @@ class PredictionAware:
         forecast = self._predictor.predict(scene.state, scene.valid)
         traffic = predict_traffic(scene, forecast, context.road, c.traffic, c.safety.frames)
         with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=c.bf16):
-            batch = to_batch(scene.histories, context.svo)
+            batch = to_batch(scene.histories)
             maps, kinematics = batch.maps, batch.kinematics
             if c.predicted_maps:
                 assert self._raster is not None
@@ -116,11 +116,12 @@ class PredictionAware:
                 maps = torch.cat([maps, ahead.maps], 1)
                 kinematics = torch.cat([kinematics, ahead.kinematics], 1)
         self._expected = scene.vehicles, traffic, forecast
-        return Inputs(scene, maps, kinematics, batch.route, batch.phi, traffic)
+        known = situation_tensor(scene.histories, context.road, scene.shared)
+        return Inputs(scene, maps, kinematics, known, svo_tensor(context.svo, len(known)), traffic)
 
     def values(self, inputs: Inputs) -> Floats32:
         """The action values [B,A]."""
-        return self.valued(self.vfn, inputs.maps, inputs.kinematics, inputs.route, inputs.phi)
+        return self.valued(self.vfn, inputs.maps, inputs.kinematics, inputs.situation, inputs.phi)
 
     def valued(self, network: VFN, *seen: torch.Tensor) -> Floats32:
         """What `network` gives for its inputs [B,.]: [B,A]. Raises FloatingPointError when not finite."""

@@ -82,7 +82,7 @@ class Learner:
 
     def imitate(self, batch: Advised) -> float:
         """One step towards the mentor alone, without maps; returns how often the choice is one of his."""
-        q = self.online(None, batch.kinematics, batch.route, batch.phi)
+        q = self.online(None, batch.kinematics, batch.situation, batch.phi)
         self._step(self.config.imitation * self._margin(q, batch.possible, batch.wrong))
         choice = q.masked_fill(~batch.possible, -torch.inf).argmax(1, keepdim=True)
         return 1.0 - float(batch.wrong.gather(1, choice).float().mean())

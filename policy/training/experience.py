@@ -32,7 +32,7 @@ class Trajectory:
     frames: Bytes  # [N + D * stride, C,H,W] pixel * 255
     ahead: Bytes  # [D+1, M,C,H,W] predicted maps, pixel * 255
     kinematics: Halves  # [D+1, T,R,F+1] scaled (policy.tensors)
-    route: Floats32  # [D+1, .]
+    situation: Floats32  # [D+1, .]
     unsafe: Bools  # [D+1, A] what the prioritizer masked
     action: npt.NDArray[np.int8]  # [D] carried out
     vetoed: npt.NDArray[np.int8]  # [D] the preferred action that was masked, or -1
@@ -67,7 +67,7 @@ class States(NamedTuple):
 
     maps: torch.Tensor  # [B,T,C,H,W]
     kinematics: torch.Tensor  # [B,T,R,F+1]
-    route: torch.Tensor  # [B,.]
+    situation: torch.Tensor  # [B,.]
     phi: torch.Tensor  # [B,2]
 
 
@@ -75,7 +75,7 @@ class Advised(NamedTuple):
     """A batch for learning from the mentor alone, without maps."""
 
     kinematics: torch.Tensor  # [B,T,R,F+1]
-    route: torch.Tensor  # [B,.]
+    situation: torch.Tensor  # [B,.]
     phi: torch.Tensor  # [B,2]
     possible: torch.Tensor  # [B,A] bool, actions that were safe
     wrong: torch.Tensor  # [B,A] bool, those of them that the mentor would not have taken
@@ -86,7 +86,7 @@ def advised(chosen: list[tuple[Trajectory, int]], device: str = "cpu") -> Advise
     phi = np.array([trajectory.phi for trajectory, _ in chosen], np.float32)
     arrays = (
         np.stack([trajectory.kinematics[t] for trajectory, t in chosen]).astype(np.float32),
-        np.stack([trajectory.route[t] for trajectory, t in chosen]),
+        np.stack([trajectory.situation[t] for trajectory, t in chosen]),
         _direction(phi),
         np.stack([~trajectory.unsafe[t] for trajectory, t in chosen]),
         np.stack([trajectory.wrong[t] for trajectory, t in chosen]),
@@ -107,13 +107,13 @@ def states(chosen: list[tuple[Trajectory, int]], phi: Floats32, device: str = "c
     for row, (trajectory, t) in zip(maps, chosen, strict=True):
         row[:past], row[past:] = trajectory.maps(t)
     kinematics = np.stack([trajectory.kinematics[t] for trajectory, t in chosen]).astype(np.float32)
-    route = np.stack([trajectory.route[t] for trajectory, t in chosen])
+    situation = np.stack([trajectory.situation[t] for trajectory, t in chosen])
     # turned to channels last, as the first convolution wants them, while they are still bytes
     turned = torch.from_numpy(maps).to(device).permute(0, 1, 3, 4, 2).contiguous()
     return States(
         turned.to(torch.float32).mul_(1.0 / 255.0).permute(0, 1, 4, 2, 3),
         torch.from_numpy(kinematics).to(device),
-        torch.from_numpy(route).to(device),
+        torch.from_numpy(situation).to(device),
         torch.from_numpy(_direction(phi)).to(device),
     )
 

@@ -35,7 +35,7 @@ class _Tape:
     frames: list[np.ndarray] = field(default_factory=list)
     ahead: list[np.ndarray] = field(default_factory=list)
     kinematics: list[np.ndarray] = field(default_factory=list)
-    route: list[np.ndarray] = field(default_factory=list)
+    situation: list[np.ndarray] = field(default_factory=list)
     unsafe: list[np.ndarray] = field(default_factory=list)
     action: list[int] = field(default_factory=list)
     vetoed: list[int] = field(default_factory=list)
@@ -88,7 +88,7 @@ class Explorer(PredictionAware):
         """The learner's values for learning AVs, the frozen ones for the others."""
         mine = np.array([av in self.learning for av in inputs.scene.agents])
         q = np.zeros((len(mine), len(MetaAction)), np.float32)
-        seen = (inputs.maps, inputs.kinematics, inputs.route, inputs.phi)
+        seen = (inputs.maps, inputs.kinematics, inputs.situation, inputs.phi)
         for rows, network in ((mine, self.vfn), (~mine, self.frozen)):
             if rows.any():
                 part = torch.from_numpy(np.flatnonzero(rows))
@@ -156,7 +156,7 @@ class Explorer(PredictionAware):
         ahead = inputs.maps[b, n:]
         tape.ahead.append((to_numpy(ahead) * 255.0 + 0.5).astype(np.uint8))
         tape.kinematics.append(to_numpy(inputs.kinematics[b]).astype(np.float16))
-        tape.route.append(to_numpy(inputs.route[b]))
+        tape.situation.append(to_numpy(inputs.situation[b]))
         assert decision.q is not None
         free = np.zeros(len(MetaAction), np.bool_)  # without a prioritizer nothing is masked
         unsafe = free if decision.unsafe is None else decision.unsafe
@@ -185,7 +185,7 @@ class Explorer(PredictionAware):
             return
         if again:
             tape.frames.append(tape.frames[-1][-self._stride :])
-            for states in (tape.ahead, tape.kinematics, tape.route, tape.unsafe):
+            for states in (tape.ahead, tape.kinematics, tape.situation, tape.unsafe):
                 states.append(states[-1])
         self.done.append(
             Trajectory(
@@ -195,7 +195,7 @@ class Explorer(PredictionAware):
                 frames=np.concatenate(tape.frames)[: self.observation.frames + count * self._stride],
                 ahead=np.stack(tape.ahead[: count + 1]),
                 kinematics=np.stack(tape.kinematics[: count + 1]),
-                route=np.stack(tape.route[: count + 1]),
+                situation=np.stack(tape.situation[: count + 1]),
                 unsafe=np.stack(tape.unsafe[: count + 1]),
                 action=np.array(tape.action[:count], np.int8),
                 vetoed=np.array(tape.vetoed[:count], np.int8),

@@ -8,7 +8,8 @@ import numpy as np
 
 from cosim.actions import MAX_DECEL, TIME_CONSTANT, next_target, tracked_speeds
 from cosim.types import Floats32, History, MetaAction, PolicyContext
-from policy.agents.altruist_rule import AltruistRule, along
+from policy.agents.altruist_rule import AltruistRule
+from policy.meeting import along
 
 YIELD = 2.0  # his preference for what the scripted altruist commands: all others are below 0
 # He follows by IDM (contract.md, Vehicles), with a little more time gap, which spares him harsh steps:

@@ -23,7 +23,8 @@ from cosim.types import SMOKE, MetaAction
 from policy.agents.approaches import AgentConfig
 from policy.chain import ChainConfig
 from policy.safety import SafetyConfig
-from policy.tensors import KINEMATIC_INPUTS, ROUTE_INPUTS
+from policy.situation import SITUATION_INPUTS
+from policy.tensors import KINEMATIC_INPUTS
 from policy.training import experience
 from policy.training.a2c import A2cConfig, A2cLearner
 from policy.training.ddqn import DdqnConfig, Learner
@@ -42,16 +43,16 @@ def trajectory(
     actions: list[int],
     terms: list[tuple[float, float, float]],
     *,
-    route: list[int] | None = None,
+    situation: list[int] | None = None,
     unsafe: np.ndarray | None = None,
     ending: str = "cut",
     vetoed: list[int] | None = None,
     near: bool = True,
 ) -> Trajectory:
-    """A drive whose states are told apart by one number of the route: `route` [D+1]."""
+    """A drive whose states are told apart by one number of the situation: `situation` [D+1]."""
     d = len(actions)
-    states = np.zeros((d + 1, ROUTE_INPUTS), np.float32)
-    for t, place in enumerate(route or range(d + 1)):
+    states = np.zeros((d + 1, SITUATION_INPUTS), np.float32)
+    for t, place in enumerate(situation or range(d + 1)):
         states[t, place] = 1.0
     return Trajectory(
         episode="hand",
@@ -60,7 +61,7 @@ def trajectory(
         frames=np.arange(3 + d, dtype=np.uint8)[:, None, None, None] * np.ones((1, 4, 8, 16), np.uint8),
         ahead=np.zeros((d + 1, 0, 4, 8, 16), np.uint8),
         kinematics=np.zeros((d + 1, 3, 2, KINEMATIC_INPUTS), np.float16),
-        route=states,
+        situation=states,
         unsafe=np.zeros((d + 1, 5), np.bool_) if unsafe is None else unsafe,
         action=np.array(actions, np.int8),
         vetoed=np.array(vetoed or [-1] * d, np.int8),
@@ -87,7 +88,7 @@ def test_an_n_step_return_is_the_discounted_sum_and_stops_at_a_crash() -> None:
     config = ReplayConfig(batch=200, n_step=3, gamma=0.5, relabel=0.0)
     for ending, bootstrap in (("crashed", 0.0), ("cut", 0.125), ("left", 0.125)):
         _, batch = only(config, trajectory([1, 1, 1, 1], terms, ending=ending))
-        start = batch.now.route.argmax(1).numpy()
+        start = batch.now.situation.argmax(1).numpy()
         expected = {0: 1 + 1 + 1, 1: 2 + 2 + 2, 2: 4 + 4, 3: 8}  # phi = 0: the ego's terms alone
         assert set(start) == {0, 1, 2, 3}
         for b, t in enumerate(start):
@@ -135,22 +136,22 @@ def test_a_corridor_is_walked_to_its_end() -> None:
     """Five places; accelerating leads on, anything else back; only the end pays. One-step returns."""
     rng, drives = np.random.default_rng(3), []
     for _ in range(60):
-        place, route, actions, terms = 0, [0], [], []
+        place, situation, actions, terms = 0, [0], [], []
         while place < 4 and len(actions) < 20:
             action = int(MetaAction.ACCELERATE if rng.random() < 0.5 else rng.integers(5))
             place = place + 1 if action == MetaAction.ACCELERATE else max(place - 1, 0)
             actions.append(action)
-            route.append(place)
+            situation.append(place)
             terms.append((10.0 if place == 4 else 0.0, 0.0, 0.0))
         ending = "crashed" if place == 4 else "cut"  # the end is terminal
-        drives.append(trajectory(actions, terms, route=route, ending=ending))
+        drives.append(trajectory(actions, terms, situation=situation, ending=ending))
     replay = Replay(ReplayConfig(batch=64, n_step=1, gamma=0.9, relabel=0.0))
     replay.add(drives)
     learner = Learner(TINY, DdqnConfig(learning_rate=3e-3, target_every=20), seed=0)
     draws = np.random.default_rng(0)
     for _ in range(250):
         losses = learner.update(replay.sample(draws))
-    eye = torch.zeros(4, ROUTE_INPUTS)
+    eye = torch.zeros(4, SITUATION_INPUTS)
     eye[range(4), range(4)] = 1.0
     with torch.no_grad():
         q = learner.online(
@@ -217,7 +218,7 @@ def test_the_mentor_is_heard_without_maps_too_and_two_good_actions_are_not_told_
     assert agrees[-1] == 1.0
     seen = replay.advised(rng)
     with torch.no_grad():
-        q = learner.online(None, seen.kinematics, seen.route, seen.phi)[0]
+        q = learner.online(None, seen.kinematics, seen.situation, seen.phi)[0]
     assert q[[1, 4]].max() > q[[0, 2, 3]].max() + 0.08
     assert learner.updates == 0, "what is learned from rewards alone is counted"
 

@@ -41,7 +41,7 @@ def forecasts(scene: Scene, horizon: int = 20) -> tuple[KinematicForecast, Traff
 def chain(hpn: HPN | None, config: ChainConfig, cars: list[Car] = CARS) -> tuple[Scene, Prediction]:
     scene = join(histories(ROAD, cars))
     forecast, traffic = forecasts(scene)
-    batch = to_batch(scene.histories, 0.0)
+    batch = to_batch(scene.histories)
     with torch.inference_mode():
         return scene, predict(config, COMPACT, rasterize_road(ROAD), hpn, scene, batch, forecast, traffic)
 
@@ -108,7 +108,7 @@ def test_a_vehicle_out_of_sight_now_is_in_no_predicted_map() -> None:
         lost[name] = history._replace(valid=valid)
     scene = join(lost)
     forecast, traffic = forecasts(scene)
-    batch = to_batch(scene.histories, 0.0)
+    batch = to_batch(scene.histories)
     row, column = pixel(30.0, 0.0)
     ego = scene.agents.index("ego")
     for hpn in (None, HPN(HpnConfig()).eval()):
@@ -157,7 +157,7 @@ def test_every_vehicle_that_an_ally_sees_is_in_the_predicted_map_but_alone_only_
     for share in (True, False):
         scene = join(given, share)
         forecast, traffic = forecasts(scene)
-        batch = to_batch(scene.histories, 0.0)
+        batch = to_batch(scene.histories)
         one = ChainConfig(horizon=1, every=1)
         maps = predict(one, COMPACT, rasterize_road(ROAD), None, scene, batch, forecast, traffic).maps
         drawn[share] = int((maps[scene.agents.index("ego"), 0, 1] > 0).sum())
@@ -215,7 +215,7 @@ def test_nan_and_short_histories_and_vehicles_off_every_lane_break_no_prediction
     hpn = HPN(HpnConfig()).eval()
     assert hpn.kinematic is not None
     torch.nn.init.normal_(hpn.kinematic.out.weight, std=0.1)
-    batch = to_batch(scene.histories, 0.0)
+    batch = to_batch(scene.histories)
     with torch.inference_mode():
         ahead = predict(ChainConfig(), COMPACT, rasterize_road(ROAD), hpn, scene, batch, *forecasts(scene))
     assert torch.isfinite(ahead.maps).all()
@@ -233,6 +233,6 @@ def test_the_kinematic_branch_asks_for_the_traffic() -> None:
             rasterize_road(ROAD),
             HPN(HpnConfig()).eval(),
             scene,
-            to_batch(scene.histories, 0.0),
+            to_batch(scene.histories),
             forecast,
         )

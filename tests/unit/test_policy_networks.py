@@ -11,7 +11,8 @@ from cosim.types import KINEMATIC_FEATURES
 from policy.hpn import HPN, HpnConfig
 from policy.kinematic_branch import KinematicBranch, KinematicConfig, correct, sureness
 from policy.map_branch import MapBranch, MapBranchConfig
-from policy.tensors import KINEMATIC_INPUTS, ROUTE_INPUTS, kinematic_tensor, to_batch
+from policy.situation import PER_LANE, SITUATION_INPUTS, situation
+from policy.tensors import KINEMATIC_INPUTS, kinematic_tensor, svo_tensor, to_batch
 from policy.vehicle_inputs import NEIGHBOUR_INPUTS, NEIGHBOURS, own_inputs
 from policy.vfn import VFN, VfnConfig
 
@@ -89,7 +90,7 @@ def values(network: VFN, height: int, width: int, frames: int, phi: float = 0.0)
     torch.manual_seed(1)
     maps = torch.rand(2, frames, 4, height, width)
     kinematics = torch.rand(2, frames, 16, KINEMATIC_INPUTS)
-    route = torch.rand(2, ROUTE_INPUTS)
+    route = torch.rand(2, SITUATION_INPUTS)
     direction = torch.tensor([[np.cos(phi), np.sin(phi)]], dtype=torch.float32).expand(2, 2)
     with torch.inference_mode():
         q: torch.Tensor = network(maps, kinematics, route, direction)
@@ -106,7 +107,7 @@ def test_the_vfn_hears_the_social_value_orientation_and_sees_the_maps() -> None:
         features = network.features(
             torch.zeros(2, 14, 4, 32, 128),
             torch.zeros(2, 14, 16, KINEMATIC_INPUTS),
-            torch.zeros(2, ROUTE_INPUTS),
+            torch.zeros(2, SITUATION_INPUTS),
             torch.zeros(2, 2),
         )
         blind = network.value(features)
@@ -126,7 +127,7 @@ def test_gradients_reach_every_layer_of_both_networks() -> None:
     q = vfn(
         torch.rand(2, 14, 4, 16, 128),
         torch.rand(2, 14, 16, KINEMATIC_INPUTS),
-        torch.rand(2, ROUTE_INPUTS),
+        torch.rand(2, SITUATION_INPUTS),
         torch.rand(2, 2),
     )
     (maps.square().mean() + moved.square().mean() + q.square().mean()).backward()
@@ -208,13 +209,27 @@ def test_masked_and_nan_rows_reach_no_network() -> None:
 def test_the_ego_is_told_where_its_lanes_end() -> None:
     road = straight_road(3, dead_end=0, at=400.0)
     on_it, beside = (histories(road, [Car("e", 300.0, lane, 20.0, is_av=True)])["e"] for lane in (0, 1))
-    batch = to_batch([on_it, beside], np.pi / 4)
-    assert batch.maps.shape == (2, 10, 4, 32, 128)
-    assert batch.route.shape == (2, ROUTE_INPUTS)
-    per_lane = (ROUTE_INPUTS - 7) // 3
-    left, keep, right = (batch.route[:, 7 + k * per_lane : 10 + k * per_lane] for k in range(3))
+    assert to_batch([on_it, beside]).maps.shape == (2, 10, 4, 32, 128)
+    known = situation([on_it, beside], road, shared=True)
+    assert known.shape == (2, SITUATION_INPUTS)
+    left, keep, right = (known[:, 7 + k * PER_LANE : 10 + k * PER_LANE] for k in range(3))
     assert keep[:, 1].tolist() == [1.0, 0.0], "only the right lane dead-ends"
     assert keep[0, 2] == pytest.approx(0.5), "100 m ahead, of 200"
     assert right[:, 0].tolist() == [0.0, 1.0]
     assert left[:, 0].tolist() == [1.0, 1.0]
-    torch.testing.assert_close(batch.phi[0], torch.full((2,), float(np.sqrt(0.5))))
+    torch.testing.assert_close(svo_tensor(np.pi / 4, 2), torch.full((2, 2), float(np.sqrt(0.5))))
+
+
+def test_the_ego_is_told_who_drives_around_it() -> None:
+    road = straight_road(2)
+    cars = [
+        Car("e", 300.0, 0, 20.0, is_av=True),
+        Car("leader", 340.0, 0, 17.0),
+        Car("follower", 275.0, 0, 23.0),
+        Car("beside", 310.0, 1, 20.0),
+    ]
+    known = situation([histories(road, cars)["e"]], road, shared=True)[0]
+    left, keep, right = (known[7 + (k + 1) * PER_LANE - 4 : 7 + (k + 1) * PER_LANE] for k in range(3))
+    assert keep == pytest.approx([0.4, -0.1, 0.25, 0.1], abs=0.02)
+    assert left == pytest.approx([0.1, 0.0, 1.0, 0.0], abs=0.02)
+    assert not right.any(), "there is no lane"

@@ -42,7 +42,7 @@ def ahead(cars: list[Car], road: RoadMap = ROAD, name: str = "hpn") -> tuple[Sce
     if name == "hpn-no-history":
         scene = without_history(scene)
     forecast = foresee(scene, make_predictor("gp-indirect", 20, 0.2), road, TrafficConfig())
-    batch = to_batch(scene.histories, 0.0)
+    batch = to_batch(scene.histories)
     with torch.inference_mode():
         guess = predict(
             ChainConfig(every=1), COMPACT, rasterize_road(road), shipped(name), scene, batch, *forecast

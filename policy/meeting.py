@@ -1,0 +1,98 @@
+"""Who drives along an AV's lanes, and how its way meets a mission vehicle's: geometry on the road map."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from cosim.road import LanePath, RoadMap
+from cosim.types import IS_MISSION, History
+
+LANE = 3.2  # m, SUMO's lane width
+
+
+class Seen(NamedTuple):
+    """The mission vehicle as one AV perceives it and tells the others."""
+
+    lane: int  # index into RoadMap.lanes
+    lane_position: float  # m, front bumper
+    speed: float  # m/s
+
+
+@dataclass(frozen=True, slots=True)
+class Meeting:
+    """How an AV stands to a mission vehicle whose way meets its own."""
+
+    behind: float  # m, how far behind the mission vehicle it will arrive where their ways meet
+    crossing: bool  # their ways cross at a junction (else their lanes lie side by side)
+    from_right: bool  # the mission vehicle's lane lies to the right
+    speed: float  # m/s, of the mission vehicle
+
+
+def missions(histories: Iterable[History]) -> dict[str, Seen]:
+    """Every mission vehicle that any of these AVs perceives (V2V: not everybody is near enough to)."""
+    found: dict[str, Seen] = {}
+    for history in histories:
+        for r in np.flatnonzero(history.valid[-1] & (history.kinematics[-1, :, IS_MISSION] > 0.5)):
+            speed = float(history.kinematics[-1, r, 2])
+            found[history.ids[r]] = Seen(int(history.lane[r]), float(history.lane_position[r]), speed)
+    return found
+
+
+def meet(road: RoadMap, history: History, seen: Seen) -> Meeting | None:
+    """Where this AV's way meets the mission vehicle's; None when it does not."""
+    own = history.route.paths[1]
+    if own is None or seen.lane < 0:
+        return None
+    theirs = road.path(seen.lane)
+    place = seen.lane_position * theirs.scale  # m, their front bumper
+    beside = _beside(road, own, theirs)
+    if beside is not None:
+        mine, other, right = beside
+        return Meeting((mine - history.route.arc) - (other - place), False, right, seen.speed)
+    if not (np.isfinite(own.conflict) and _crosses_junction(road, theirs)):
+        return None  # not our affair: we drive beside the lane they want
+    if _same_approach(road, own, theirs):
+        return None
+    behind = history.route.conflict_distance - max(theirs.conflict - place, 0.0)
+    return Meeting(behind, True, False, seen.speed)
+
+
+def along(history: History, path: LanePath, side: float = 0.0) -> list[tuple[float, float]]:
+    """Vehicles on the path's next lanes, or behind on its course: m ahead of the ego (centres), m/s.
+
+    Upstream a lane has other names, so behind it is the place that counts: `side` m to the left.
+    """
+    newest = history.kinematics[-1]
+    return [
+        (float(newest[r, 0]), float(newest[r, 2]))
+        for r in np.flatnonzero(history.valid[-1])[1:]
+        if int(history.lane[r]) in path.lanes[:3]
+        or (newest[r, 0] < 0.0 and abs(newest[r, 1] - side) < LANE / 2.0)
+    ]
+
+
+def _crosses_junction(road: RoadMap, path: LanePath) -> bool:
+    """Whether the conflict zone that the path meets lies inside a junction."""
+    return any(road.lanes[i].internal and any(i in zone.lanes for zone in road.zones) for i in path.lanes)
+
+
+def _same_approach(road: RoadMap, own: LanePath, theirs: LanePath) -> bool:
+    """Whether both come along the same edge, lanes apart."""
+    edges = {road.lanes[i].edge for i in own.lanes if not road.lanes[i].internal}
+    return road.lanes[theirs.lanes[0]].edge in edges
+
+
+def _beside(road: RoadMap, own: LanePath, theirs: LanePath) -> tuple[float, float, bool] | None:
+    """Where their lane comes to lie beside ours: arc on our path, arc on theirs, and whether on our right."""
+    place = {lane: float(start) for lane, start in zip(own.lanes, own.lane_start, strict=True)}
+    for lane, start in zip(theirs.lanes, theirs.lane_start, strict=True):
+        left, right = road.lanes[lane].left, road.lanes[lane].right
+        if left in place:
+            return place[left], float(start), True
+        if right in place:
+            return place[right], float(start), False
+    return None

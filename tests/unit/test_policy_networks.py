@@ -11,7 +11,7 @@ from cosim.types import KINEMATIC_FEATURES
 from policy.hpn import HPN, HpnConfig
 from policy.kinematic_branch import KinematicBranch, KinematicConfig, correct, sureness
 from policy.map_branch import MapBranch, MapBranchConfig
-from policy.situation import PER_LANE, SITUATION_INPUTS, situation
+from policy.situation import FAR, PER_LANE, SITUATION_INPUTS, situation
 from policy.tensors import KINEMATIC_INPUTS, kinematic_tensor, svo_tensor, to_batch
 from policy.vehicle_inputs import NEIGHBOUR_INPUTS, NEIGHBOURS, own_inputs
 from policy.vfn import VFN, VfnConfig
@@ -233,3 +233,23 @@ def test_the_ego_is_told_who_drives_around_it() -> None:
     assert keep == pytest.approx([0.4, -0.1, 0.25, 0.1], abs=0.02)
     assert left == pytest.approx([0.1, 0.0, 1.0, 0.0], abs=0.02)
     assert not right.any(), "there is no lane"
+
+
+def test_the_avs_know_in_which_order_they_reach_the_mission_vehicle() -> None:
+    road = straight_road(2, dead_end=0, at=500.0)
+    cars = [
+        Car("m", 320.0, 0, 18.0, mission=True),
+        Car("ahead", 340.0, 1, 20.0, is_av=True),
+        Car("guide", 300.0, 1, 20.0, is_av=True),
+        Car("later", 270.0, 1, 20.0, is_av=True),
+    ]
+    seen = histories(road, cars)
+    order = ("ahead", "guide", "later")
+    known = situation([seen[name] for name in order], road, shared=True)[:, -6:]
+    assert known[:, 0].tolist() == [1.0] * 3, "their lanes lie side by side"
+    assert np.diff(known[:, 1]) * FAR == pytest.approx([40.0, 30.0])
+    assert known[:, 2] == pytest.approx([-1.0, known[0, 1], known[1, 1]]), "who arrives next before it"
+    assert known[:, 3:5].tolist() == [[0.0, 1.0]] * 3, "beside, from the right"
+    assert known[:, 5] == pytest.approx([0.6] * 3)
+    alone = situation([seen[name] for name in order], road, shared=False)[:, -6:]
+    assert alone[:, 2].tolist() == [-1.0] * 3, "without V2V nobody knows of the others"

@@ -8,7 +8,17 @@ from __future__ import annotations
 import argparse
 
 from benchmarks import altruism, prioritizer
-from benchmarks.papers import conditions, decisions, figure9, phi, summary, t_figure8, t_figures, table3
+from benchmarks.papers import (
+    conditions,
+    decisions,
+    figure9,
+    learning,
+    phi,
+    summary,
+    t_figure8,
+    t_figures,
+    table3,
+)
 from benchmarks.papers.driving import add_arguments, settings_of
 from benchmarks.papers.pages import run_jobs
 
@@ -33,6 +43,7 @@ def main() -> None:
     settings = settings_of(args)
     run_jobs(JOBS, settings, args.dry_run)
     if not args.dry_run:
+        learning.write(settings)
         summary.write(settings)
 
 

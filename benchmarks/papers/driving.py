@@ -31,6 +31,7 @@ WORLDS = ("exit", "merge", "roundabout", "intersection", "highway")  # P's order
 SVO = 45.0  # deg, weighs oneself and the others alike
 PROBES = 2  # worlds in which an agent's cost is measured
 LEAST = 2  # episodes, however small the scale
+TRAININGS = Path("docs/results/trainings")  # logs of the trainings that made the shipped weights
 MARK = "#"  # between an agent's name and its fingerprint
 
 
@@ -88,9 +89,13 @@ class Settings:
         return max(math.ceil(full * self.scale), LEAST)
 
     def trained(self, policy: str) -> tuple[Path, ...]:
-        """The runs of `cosim train` it is known of: as told, else runs/POLICY and runs/POLICY-0, -1, ..."""
-        places = [Path("runs") / policy, *sorted(Path("runs").glob(f"{policy}-[0-9]*"))]
-        return self.trainings.get(policy, tuple(p for p in places if (p / "log.jsonl").is_file()))
+        """The runs of `cosim train` it is known of: as told, else runs/POLICY and runs/POLICY-0, -1, ...,
+        else the logs of the shipped weights' trainings."""
+        found: tuple[Path, ...] = ()
+        for root in (Path("runs"), TRAININGS):
+            places = [root / policy, *sorted(root.glob(f"{policy}-[0-9]*"))]
+            found = found or tuple(p for p in places if (p / "log.jsonl").is_file())
+        return self.trainings.get(policy, found)
 
     @property
     def flags(self) -> str:

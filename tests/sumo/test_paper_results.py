@@ -15,6 +15,7 @@ from benchmarks.papers import (
     decisions,
     driving,
     figure9,
+    learning,
     phi,
     summary,
     t_figure8,
@@ -52,6 +53,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Any:
         )
         drive([order for job in JOBS for order in job.orders()], settings, "small")
         run_jobs(JOBS, settings)
+        learning.write(settings)
         summary.write(settings)
         yield settings
 
@@ -97,6 +99,13 @@ def test_table_3_holds_every_approach_beside_the_unguarded_fleet(small: Settings
     assert {*table3.APPROACHES, "keep-lane", "idm", "maps, no mask", "no maps, mask gp"} <= set(arms)
     assert {x["n"] for x in rates} == {"1"}
     assert "not below P's 1.04" in page(small, "table3")  # one episode shows nothing
+
+
+def test_the_curves_of_learning_are_drawn_from_the_logs(small: Settings) -> None:
+    text = page(small, "learning")
+    assert "| vfn-p | ? | 40 | training drives | crashed, % | 50.0 | 0.0 |" in text
+    assert (small.out / "learning.png").stat().st_size > 1000
+    assert len(lines(small, "learning")) == 3 * 21  # figures x points
 
 
 def test_a_second_run_drives_nothing_and_writes_the_same(small: Settings, capfd: Any) -> None:

@@ -12,6 +12,7 @@ from cosim.road import LanePath, RoadMap
 from cosim.types import IS_MISSION, History
 
 LANE = 3.2  # m, SUMO's lane width
+CAR = 5.0  # m, between the centres of two cars that touch
 
 
 class Seen(NamedTuple):

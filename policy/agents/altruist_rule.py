@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from cosim.types import Decision, History, MetaAction, PolicyContext
-from policy.agents.idm import NO_MAPS
-from policy.meeting import LANE, Meeting, Seen, along, meet, missions
+from policy.agents.idm import NO_MAPS, wished_gap
+from policy.meeting import CAR, LANE, Meeting, Seen, along, meet, missions
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,13 +144,11 @@ class AltruistRule:
         return True
 
     def _too_close(self, history: History) -> bool:
-        """Closer to the leader than IDM's own wish (T = 0.8 s, d0 = 2 m, a = 3, b = 7 m/s2)."""
+        """Closer to a leader than IDM's own wish, even if the leader is getting away."""
         own, speed = history.route.paths[1], history.ego_speed
         if own is None:
             return False
         for ahead, other in along(history, own):
-            if ahead > 0.0:
-                wish = 2.0 + 0.8 * speed + speed * max(speed - other, 0.0) / (2.0 * 21.0**0.5)
-                if ahead - 5.0 < 1.1 * wish:
-                    return True
+            if ahead > 0.0 and ahead - CAR < 1.1 * wished_gap(speed, min(other, speed)):
+                return True
         return False

@@ -9,12 +9,11 @@ import numpy as np
 from cosim.actions import MAX_DECEL, TIME_CONSTANT, next_target, tracked_speeds
 from cosim.types import Floats32, History, MetaAction, PolicyContext
 from policy.agents.altruist_rule import AltruistRule
-from policy.meeting import along
+from policy.agents.idm import ACCEL, wished_gap
+from policy.meeting import CAR, along
 
 YIELD = 2.0  # his preference for what the scripted altruist commands: all others are below 0
-# He follows by IDM (contract.md, Vehicles), with a little more time gap, which spares him harsh steps:
-TIME_GAP, STANDSTILL, ACCEL, COMFORT = 1.0, 2.0, 3.0, 7.0  # s, m, m/s2, m/s2
-CAR = 5.0  # m, between the centres of two cars that touch
+TIME_GAP = 1.0  # s: he follows by IDM, with a little more than its time gap, which spares him harsh steps
 EAGER = 5.0  # m/s by which he wishes to drive faster than he may: IDM alone creeps up to its desired speed
 AHEAD = 0.4  # s, over which an action's acceleration is compared with IDM's
 HARD = 3.0  # m/s2: a braking that begins harder than this, and than IDM wishes, costs
@@ -56,9 +55,7 @@ class Mentor:
         leaders = [] if own is None else [(x, v) for x, v in along(history, own) if x > 0.0]
         if leaders:
             ahead, other = min(leaders)
-            closing = speed * (speed - other) / (2.0 * (ACCEL * COMFORT) ** 0.5)
-            wish = STANDSTILL + max(speed * TIME_GAP + closing, 0.0)
-            press = (wish / max(ahead - CAR, 0.5)) ** 2
+            press = (wished_gap(speed, other, TIME_GAP) / max(ahead - CAR, 0.5)) ** 2
         free = 1.0 - (speed / (limit + EAGER)) ** 4
         wished = min(max(ACCEL * (free - press), -speed, -MAX_DECEL), limit - speed)
         sought = np.array([next_target(target, speed, action, limit) for action in LONGITUDINAL])

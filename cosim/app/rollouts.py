@@ -90,7 +90,8 @@ def drive_episode(episode: Episode, agent: Explorer, drive: Drive, reward: Rewar
         )
     )
     label = f"{drive.lesson.scenario}/{drive.lesson.demand}/{drive.seed}"
-    agent.episode(label, drive.epsilon, generator(drive.seed, "explore"), drive.guided)
+    rng = generator(drive.seed, "explore")
+    agent.episode(label, drive.epsilon, rng, drive.guided, drive.record)
     earned: list[float] = []
     while True:
         decisions = agent.decide(histories)  # the last state is decided upon too: its mask is needed
@@ -115,7 +116,7 @@ def drive_episode(episode: Episode, agent: Explorer, drive: Drive, reward: Rewar
     figures["reward"] = float(np.sum(earned)) / max(avs * planned, 1.0)
     figures["steps"] = float(result.steps)
     figures |= {name: float(s) for name, s in episode.timings.items()}
-    return Drove(trajectories if drive.record else [], figures)
+    return Drove(trajectories, figures)
 
 
 class Rollouts:

@@ -59,9 +59,16 @@ class Explorer(PredictionAware):
         self.frozen.load_state_dict(self.vfn.state_dict())
         self._mentor = Mentor()
 
-    def episode(self, label: str, epsilon: float, rng: np.random.Generator, guided: bool = False) -> None:
-        """A new episode, with this much exploration (0 to 1), or `guided`: the mentor drives every AV."""
-        self._label, self._epsilon, self._rng, self._guided = label, epsilon, rng, guided
+    def episode(
+        self, label: str, epsilon: float, rng: np.random.Generator, guided: bool = False, record: bool = True
+    ) -> None:
+        """A new episode, with this much exploration (0 to 1), or `guided`: the mentor drives every AV.
+
+        Without `record` nobody learns: all drive greedily by the frozen network.
+        """
+        self._label, self._epsilon, self._rng = label, epsilon, rng
+        self._guided, self._learners = guided, self.explore.learners if record else 0
+        self._mentored = guided or (record and not self.explore.sample)
         self._mentor.reset(self._context)
         self.learning: dict[str, _Tape] = {}
         self._chosen = False
@@ -76,7 +83,9 @@ class Explorer(PredictionAware):
         if not self._chosen:
             self._choose_learners(inputs)
         scene = inputs.scene
-        advice = self._mentor.preferences(dict(zip(scene.agents, scene.histories, strict=True)))
+        advice = np.zeros((len(scene.agents), len(MetaAction)), np.float32)  # no opinion
+        if self._mentored:
+            advice = self._mentor.preferences(dict(zip(scene.agents, scene.histories, strict=True)))
         q = advice if self._guided else self._explored(self.values(inputs), inputs)
         decisions = self.choose(q, inputs)
         for b, av in enumerate(scene.agents):
@@ -120,7 +129,7 @@ class Explorer(PredictionAware):
         sees = [bool((h.kinematics[-1, :, IS_MISSION] * h.valid[-1] > 0.5).any()) for h in scene.histories]
         luck = self._rng.random(len(scene.agents))
         order = sorted(range(len(scene.agents)), key=lambda b: (not sees[b], luck[b]))
-        self.learning = {scene.agents[b]: _Tape() for b in sorted(order[: self.explore.learners])}
+        self.learning = {scene.agents[b]: _Tape() for b in sorted(order[: self._learners])}
         self._chosen = True
 
     def _explored(self, q: Floats32, inputs: Inputs) -> Floats32:

@@ -17,6 +17,7 @@ TIME_CONSTANT = 0.6  # s, with which the target speed is tracked
 MAX_DECEL = 8.0  # m/s2
 MAX_ACCEL = 3.0  # m/s2
 LANE_CHANGE_TIME = 2.0  # s, the same as SUMO's --lanechange.duration
+_ACTIONS, _ACCELERATE, _DECELERATE = len(MetaAction), int(MetaAction.ACCELERATE), int(MetaAction.DECELERATE)
 STEP = 0.1  # s, with which a rollout tracks the target speed (SUMO's step, contract.md)
 
 
@@ -29,12 +30,17 @@ def next_target(target: float, speed: float, action: int, speed_limit: float) ->
     Accelerate ends a braking at once. All others keep the target, on the grid or not, and no target exceeds
     the top.
     """
+    return float(_next_target(target, speed, int(action), speed_limit))
+
+
+@compiled
+def _next_target(target: float, speed: float, action: int, speed_limit: float) -> float:
     top = speed_limit + SPEED_MARGIN
     whole = math.floor(speed_limit / SPEED_STEP + 1e-6)  # the highest multiple of the step in the limit
-    if action == MetaAction.ACCELERATE:
+    if action == _ACCELERATE:
         level = math.ceil((max(target, speed) + LEAST_STEP) / SPEED_STEP - 1e-6)
         return level * SPEED_STEP if level <= whole else top
-    if action == MetaAction.DECELERATE:
+    if action == _DECELERATE:
         below = min(target, speed) - LEAST_STEP
         level = min(math.floor(below / SPEED_STEP + 1e-6), whole)
         return top if below >= top else max(level, 0) * SPEED_STEP
@@ -79,6 +85,38 @@ def braking_speeds(speed: float, target: float, frames: int, dt: float, period: 
             k += 1
             v = tracked_speed(v, target, dt / steps)
         out[t] = v
+    return out
+
+
+@compiled
+def speeds_ahead(
+    target: float, speed: float, limit: float, frames: int, stopping: int, dt: float, period: float
+) -> tuple[Floats, Floats, Floats]:
+    """What every action means: targets [A] m/s, speeds [A,frames+1] m/s while it is held, and [A,stopping+1]
+    when Decelerate follows at every decision, `period` s apart; frames are `dt` s apart."""
+    targets = np.empty(_ACTIONS)
+    for a in range(_ACTIONS):
+        targets[a] = _next_target(target, speed, a, limit)
+    held = tracked_speeds(speed, targets, frames, dt)
+    braked = np.empty((_ACTIONS, stopping + 1))
+    for a in range(_ACTIONS):
+        under = held[a]
+        if a == _DECELERATE:
+            under = braking_speeds(speed, targets[a], frames, dt, period)
+        braked[a] = braked_from(under, targets[a], round(period / dt), stopping, limit, dt, period)
+    return targets, held, braked
+
+
+@compiled
+def braked_from(
+    speeds: Floats, target: float, held: int, frames: int, limit: float, dt: float, period: float
+) -> Floats:
+    """[frames+1] m/s: the first `held` frames of `speeds`, at `target`, then Decelerate every `period` s."""
+    then = speeds[held]
+    out = np.empty(frames + 1)
+    out[:held] = speeds[:held]
+    lowered = _next_target(target, then, _DECELERATE, limit)
+    out[held:] = braking_speeds(then, lowered, frames - held, dt, period)
     return out
 
 

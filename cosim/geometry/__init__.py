@@ -22,6 +22,7 @@ from cosim.types import Bools, Floats, Ints, Snapshot
 
 Number = float | npt.NDArray[Any]
 INF = np.inf
+_Course = tuple[Any, Any, Any, Any, Any, Any, Any]  # x, y, cos and sin of the heading, speed, sizes
 EVERYWHERE: Bools = np.ones((1, 1), np.bool_)  # one road, on which all can touch
 
 
@@ -63,6 +64,17 @@ def time_to_collision(a: Boxes, b: Boxes, cap: float = INF) -> Floats:
     """
     with _quiet():
         return cast(Floats, kernels.ttc_ufunc(*_motions(a), *_motions(b), cap))
+
+
+def first_contacts(a: Boxes, b: Boxes, dt: float) -> Floats:
+    """When a's box on each of its courses first touches each b's: [k,n] s, inf for never.
+
+    a: x, y, heading, speed [k,t], one length and width; b: [n,t], sizes [n]. Frames are `dt` s apart;
+    between two of them, and one after the last, both boxes keep their velocity: nothing is jumped over.
+    """
+    mine: _Course = (a.x, a.y, np.cos(a.heading), np.sin(a.heading), a.speed, a.length, a.width)
+    theirs: _Course = (b.x, b.y, np.cos(b.heading), np.sin(b.heading), b.speed, b.length, b.width)
+    return kernels.first_contacts(*mine, *theirs, dt)
 
 
 def pairs_time_to_collision(all_boxes: Boxes, rows: npt.NDArray[Any], cap: float = INF) -> Floats:

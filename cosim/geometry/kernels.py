@@ -249,6 +249,28 @@ def pairs_ttc(table: Floats, rows: Ints, cap: float) -> Floats:
     return out
 
 
+# fmt: off
+@compiled
+def first_contacts(
+    ax: Floats, ay: Floats, ac: Floats, as_: Floats, av: Floats, al: float, aw: float,
+    bx: Floats, by: Floats, bc: Floats, bs: Floats, bv: Floats, bl: Floats, bw: Floats, dt: float,
+) -> Floats:
+    # fmt: on
+    """See `cosim.geometry.first_contacts`."""
+    count, frames = ax.shape
+    out = np.full((count, bx.shape[0]), np.inf)
+    for k in range(count):
+        for o in range(bx.shape[0]):
+            for t in range(frames):
+                a = (ax[k, t], ay[k, t], ac[k, t], as_[k, t], al, aw, av[k, t])
+                b = (bx[o, t], by[o, t], bc[o, t], bs[o, t], bl[o], bw[o], bv[o, t])
+                ttc = _ttc(a, b, dt)
+                if ttc < dt:
+                    out[k, o] = dt * t + ttc
+                    break
+    return out
+
+
 @compiled
 def watched_conflicts(
     x: Floats,

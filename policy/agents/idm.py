@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 from cosim.types import Decision, History, ObservationConfig, PolicyContext
@@ -13,7 +14,7 @@ TIME_GAP, STANDSTILL, ACCEL, COMFORT = 0.8, 2.0, 3.0, 7.0  # s, m, m/s2, m/s2
 
 def wished_gap(speed: float, leader_speed: float, time_gap: float = TIME_GAP) -> float:
     """The gap in m, bumper to bumper, that IDM wishes to its leader (P, section V-A.2); speeds in m/s."""
-    closing = speed * (speed - leader_speed) / (2.0 * (ACCEL * COMFORT) ** 0.5)
+    closing = speed * (speed - leader_speed) / (2.0 * math.sqrt(ACCEL * COMFORT))
     return STANDSTILL + max(speed * time_gap + closing, 0.0)
 
 

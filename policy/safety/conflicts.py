@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from cosim.geometry import Boxes, time_to_collision
+from cosim.compiled import compiled
+from cosim.geometry import Boxes, first_contacts
 from cosim.road import LanePath, RoadMap
 from cosim.types import Bools, Floats, MetaAction
 from policy.motion import Rollout, project_all
@@ -43,9 +44,7 @@ def first_contact(
     Between two frames both boxes keep their velocity, so nothing is jumped over.
     """
     touch = _sweep(ego, traffic, me, others, c.margin_length, c.margin_width, c.dt)
-    close = (touch == 0.0).any(
-        0
-    )  # within the margin already: only the cars themselves can tell actions apart
+    close = (touch == 0.0).any(0)  # within the margin already: only the cars themselves tell actions apart
     if close.any():
         touch[:, close] = _sweep(ego, traffic, me, others[close], 0.0, 0.0, c.dt)
     return touch
@@ -62,28 +61,11 @@ def _sweep(
 ) -> Floats:
     """`first_contact` with the ego's box made `longer` and `wider` (m)."""
     r = traffic.rollout
-    mine = Boxes(
-        ego.x[:, None],
-        ego.y[:, None],
-        ego.heading[:, None],
-        traffic.length[me] + longer,
-        traffic.width[me] + wider,
-        ego.speed[:, None],
-    )
-    frames = ego.x.shape[1]
-    theirs = Boxes(
-        r.x[None, others, :frames],
-        r.y[None, others, :frames],
-        r.heading[None, others, :frames],
-        traffic.length[others][None, :, None],
-        traffic.width[others][None, :, None],
-        r.speed[None, others, :frames],
-    )
-    ttc = time_to_collision(mine, theirs, dt)  # [A,O,T+1], dt where nothing happens before the next frame
-    hit = ttc < dt
-    step = np.argmax(hit, 2)
-    when = dt * step + np.take_along_axis(ttc, step[:, :, None], 2)[:, :, 0]
-    return np.where(hit.any(2), when, np.inf)
+    length, width = float(traffic.length[me]) + longer, float(traffic.width[me]) + wider
+    mine = Boxes(ego.x, ego.y, ego.heading, length, width, ego.speed)
+    x, y, heading, speed = (array[others, : ego.x.shape[1]] for array in (r.x, r.y, r.heading, r.speed))
+    theirs = Boxes(x, y, heading, traffic.length[others], traffic.width[others], speed)
+    return first_contacts(mine, theirs, dt)
 
 
 class Neighbours(NamedTuple):
@@ -135,22 +117,68 @@ def gap_margin(
     `follower_brake`. At the limit the score is safe_th, below it falls with the gap. Decelerating never makes
     a gap smaller.
     """
-    ego, r = futures.under, traffic.rollout
-    speed = r.speed[others, 0]
-    ratio = np.full(len(others), np.inf)  # of the gap there is to the gap needed
-    if action != MetaAction.DECELERATE:
-        soon = r.speed[others, min(round(c.reaction / c.dt), r.speed.shape[1] - 1)]
-        braking = np.where(intended[others], soon, speed)  # m/s when it begins to brake hard
-        theirs = braking**2 / (2 * c.leader_brake)
-        theirs = theirs + np.where(intended[others], 0.5 * (speed + soon) * c.reaction, 0.0)
-        need = np.maximum(futures.stopping[action] - theirs, 0.0) + c.standstill_gap
-        ratio = np.where(near.ahead, near.gap / need, ratio)
-    if changes:
-        closing = np.maximum(speed - ego.speed[action, 0], 0.0)
-        need = c.follower_gap + speed * c.follower_reaction + closing**2 / (2 * c.follower_brake)
-        ratio = np.where(near.behind, near.gap / need, ratio)
-        ratio = np.where(near.in_lane & (near.gap < c.standstill_gap), 0.0, ratio)
-    who = int(np.argmin(ratio))
-    if ratio[who] >= 1.0:
+    r = traffic.rollout
+    soon = r.speed[others, min(round(c.reaction / c.dt), r.speed.shape[1] - 1)]
+    ratio, who = _tightest(
+        action != MetaAction.DECELERATE,
+        changes,
+        float(futures.stopping[action]),
+        float(futures.under.speed[action, 0]),
+        *near,
+        r.speed[others, 0],
+        soon,
+        intended[others],
+        c.leader_brake,
+        c.reaction,
+        c.standstill_gap,
+        c.follower_gap,
+        c.follower_reaction,
+        c.follower_brake,
+    )
+    if ratio >= 1.0:
         return np.inf, who
-    return 0.999 * c.safe_th * max(float(ratio[who]), 0.0), who
+    return 0.999 * c.safe_th * max(ratio, 0.0), who
+
+
+@compiled
+def _tightest(
+    faces: bool,  # a leader counts
+    changes: bool,
+    stopping: float,
+    own_speed: float,
+    in_lane: Bools,
+    gap: Floats,
+    ahead: Bools,
+    behind: Bools,
+    speed: Floats,
+    soon: Floats,
+    intended: Bools,
+    leader_brake: float,
+    reaction: float,
+    standstill_gap: float,
+    follower_gap: float,
+    follower_reaction: float,
+    follower_brake: float,
+) -> tuple[float, int]:
+    """Smallest ratio of the gap there is to the gap needed, and whose; see `gap_margin`."""
+    best, who = np.inf, 0
+    for k in range(len(gap)):
+        ratio = np.inf
+        if faces and ahead[k]:
+            braking = soon[k] if intended[k] else speed[k]  # m/s when it begins to brake hard
+            theirs = braking * braking / (2 * leader_brake)
+            if intended[k]:
+                theirs += 0.5 * (speed[k] + soon[k]) * reaction
+            ratio = gap[k] / (max(stopping - theirs, 0.0) + standstill_gap)
+        if changes:
+            if behind[k]:
+                closing = max(speed[k] - own_speed, 0.0)
+                needed = (
+                    follower_gap + speed[k] * follower_reaction + closing * closing / (2 * follower_brake)
+                )
+                ratio = gap[k] / needed
+            if in_lane[k] and gap[k] < standstill_gap:
+                ratio = 0.0
+        if ratio < best:
+            best, who = ratio, k
+    return best, who

@@ -6,7 +6,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosim.actions import LANE_CHANGE_TIME, MAX_DECEL, braking_speeds, next_target, tracked_speeds
+from cosim.actions import (
+    LANE_CHANGE_TIME,
+    MAX_DECEL,
+    braked_from,
+    braking_speeds,
+    next_target,
+    speeds_ahead,
+)
 from cosim.road import LanePath, RoadMap
 from cosim.types import Bools, Floats, History, MetaAction
 from policy.motion import Rollout, fronts, pack, project, project_many, roll_out
@@ -78,33 +85,19 @@ def roll_ego(history: History, paths: list[LanePath], now: Floats, c: SafetyConf
     Decelerate is judged by that: it is safe as long as braking helps. The allies are told of one step of it.
     """
     speed, limit = float(now[2]), history.route.speed_limit
-    targets = np.array([next_target(history.target_speed, speed, a, limit) for a in ACTIONS], np.float64)
-    slower = ACTIONS.index(MetaAction.DECELERATE)
-    rows = [*range(len(ACTIONS)), slower]  # the last one: Decelerate once
-    speeds = tracked_speeds(speed, targets[rows], c.frames, c.dt)
-    speeds[slower] = braking_speeds(speed, targets[slower], c.frames, c.dt, c.reaction)
-    out = _roll(history, [paths[k] for k in rows], now, speeds, c)
-    told = [*rows[:slower], len(ACTIONS), *rows[slower + 1 : -1]]
-    held = round(c.reaction / c.dt)
-    stopping = np.array(
-        [
-            c.dt * float(np.trapezoid(_braked(speeds[a], targets[a], held, STOPPING, limit, c)))
-            for a in range(len(ACTIONS))
-        ]
+    targets, held, braked = speeds_ahead(
+        history.target_speed, speed, limit, c.frames, STOPPING, c.dt, c.reaction
     )
+    slower = ACTIONS.index(MetaAction.DECELERATE)
+    speeds = np.concatenate([held, held[slower][None]])  # the last one: Decelerate once
+    speeds[slower] = braking_speeds(speed, targets[slower], c.frames, c.dt, c.reaction)
+    out = _roll(history, [*paths, paths[slower]], now, speeds, c)
+    told = [*range(slower), len(ACTIONS), *range(slower + 1, len(ACTIONS))]
     return Futures(
         Rollout(*(array[: len(ACTIONS)] for array in out)),
         Rollout(*(array[told] for array in out)),
-        stopping,
+        np.asarray(c.dt * np.trapezoid(braked, axis=1)),
     )
-
-
-def _braked(speeds: Floats, target: float, held: int, frames: int, limit: float, c: SafetyConfig) -> Floats:
-    """[frames+1] m/s: the first `held` frames of `speeds`, at `target`, then Decelerate at every decision."""
-    then = float(speeds[held])
-    lowered = next_target(target, then, MetaAction.DECELERATE, limit)
-    after = braking_speeds(then, lowered, frames - held, c.dt, c.reaction)
-    return np.concatenate([speeds[:held], after])
 
 
 def roll_braked(
@@ -115,8 +108,8 @@ def roll_braked(
     speeds = under.speed[actions].copy()
     limit = history.route.speed_limit
     for row, a in zip(speeds, actions, strict=True):
-        target = next_target(history.target_speed, float(now[2]), ACTIONS[a], limit)
-        row[:] = _braked(row, target, held, c.frames, limit, c)
+        target = next_target(history.target_speed, float(now[2]), a, limit)
+        row[:] = braked_from(row, target, held, c.frames, limit, c.dt, c.reaction)
     return _roll(history, [path] * len(actions), now, speeds, c)
 
 

@@ -13,6 +13,7 @@ AVs decide front to back, each knowing the rollouts chosen before it (V2V intent
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -175,10 +176,9 @@ def evaluate(
             over = ego.arc[a] + 0.5 > way.path.length
             if over.any() and c.dt * int(np.argmax(over)) < contact[a]:
                 contact[a], blamed[a] = c.dt * int(np.argmax(over)), LANE_END
-    steps = c.dt * np.arange(1, round(c.horizon / c.dt) + 1)  # [M] s
-    weight = np.exp(-c.decay * (steps - steps[0]))
+    steps, weight, total = _weights(c)
     remaining = np.clip(contact[:, None] - steps, 0.0, c.cap)  # [A,M]: T - h
-    score = np.minimum(remaining @ weight / weight.sum(), limit)
+    score = np.minimum(remaining @ weight / total, limit)
     unsafe = (score < c.safe_th) | (remaining.min(1) < c.critical_th)
     for a, way in enumerate(ways):
         forbidden = way.forbidden
@@ -190,6 +190,14 @@ def evaluate(
             unsafe[a], score[a], blamed[a] = True, -1.0, forbidden
     blamed = [who if bad else None for who, bad in zip(blamed, unsafe, strict=True)]
     return Evaluation(np.minimum(contact, c.cap), score, unsafe, tuple(blamed), futures.intention)
+
+
+@cache
+def _weights(c: SafetyConfig) -> tuple[Floats, Floats, float]:
+    """The horizon's steps [M] s, their weights [M], and the sum of these."""
+    steps: Floats = c.dt * np.arange(1, round(c.horizon / c.dt) + 1, dtype=np.float64)
+    weight: Floats = np.exp(-c.decay * (steps - steps[0]))
+    return steps, weight, float(weight.sum())
 
 
 def front_to_back(scene: Scene, config: SafetyConfig) -> list[int]:

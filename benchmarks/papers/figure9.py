@@ -92,7 +92,8 @@ def write(results: Results, settings: Settings) -> None:
     """figure9.md, figure9.png, data/figure9.csv."""
     page = heading(JOB, results, settings, f"World `{WORLD}`, demand `{DEMAND}`, phi 45 degrees.")
     page += [
-        "Six networks, each trained by one command (killed? the same with `--resume` goes on):",
+        "Six networks, each trained by one command (killed? the same with `--resume` goes on; shorter with",
+        "`--iterations N`: how long these were trained stands above):",
         "",
         "```",
     ]

@@ -114,7 +114,8 @@ def networks(results: Results, settings: Settings) -> list[str]:
         if file is not None and not agent.preference:
             card = read_card(file)
             after = card["measured"].get("iteration")
-            told = "" if after is None else f", iteration {after}"
+            planned = card["data"].get("training", {}).get("iterations")
+            told = "" if after is None else f", iteration {after} of {planned or '?'}"
             name = agent.name if agent.weights else agent.base
             lines[f"- weights of `{name}`: SHA-256 {card['sha256'][:12]}{told}"] = None
     return list(lines)

@@ -132,13 +132,13 @@ def write_csv(path: Path, runs: Iterable[Training]) -> None:
 def draw(path: Path, runs: Sequence[Training]) -> None:
     """A row per part, a column per figure."""
     parts = [part for part in PARTS if any(p == part for run in runs for p, _ in run.courses)]
-    picture = Picture(figsize=(4.2 * len(COURSES), 3.2 * len(parts)), layout="constrained")
+    picture = Picture(figsize=(4.2 * len(COURSES) + 1.6, 3.2 * len(parts)), layout="constrained")
     axes = picture.subplots(len(parts), len(COURSES), squeeze=False)
     for row, part in enumerate(parts):
         for column, (name, title) in enumerate(COURSES.items()):
             _draw(axes[row, column], runs, (part, name))
             axes[row, column].set(title=f"{title} ({PARTS[part]})", xlabel="iterations")
-    axes[0, 0].legend(fontsize="small")
+    picture.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside right upper", fontsize="small")
     picture.savefig(path, dpi=DPI)
 
 

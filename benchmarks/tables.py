@@ -167,7 +167,7 @@ def picture(
     """
     most = max((len({g for f in arms.values() for g in f}) for arms in panels.values()), default=0)
     crowded = most > 6
-    size = (max(4.2 * len(panels), 4.2), 5.2 if crowded else 3.8)  # inches
+    size = (4.2 * len(panels) + 1.8, 5.2 if crowded else 3.8)  # inches, the legend's beside them
     drawn = Picture(figsize=size, layout="constrained")
     every = drawn.subplots(1, len(panels), squeeze=False)[0]
     for axes, (title, arms) in zip(every, panels.items(), strict=True):
@@ -184,7 +184,8 @@ def picture(
         axes.set_xticks(range(len(groups)), groups, rotation=90 if crowded else 20)
         axes.set(title=title, ylabel="%" if title in percent else "m")
         axes.grid(axis="y", alpha=0.3)
-    every[0].legend(fontsize="small")
+    lines = {name: line for a in every for line, name in zip(*a.get_legend_handles_labels(), strict=True)}
+    drawn.legend(lines.values(), lines, loc="outside right upper", fontsize="small")
     drawn.savefig(path, dpi=DPI)
 
 

@@ -21,7 +21,7 @@ from benchmarks.tables import (
     picture,
     table,
 )
-from cosim.evaluation.figures import RATES
+from cosim.evaluation.figures import RATES, Measure
 
 AGENT = "vfn-p"
 RANGES = (25.0, 50.0, 75.0, PERCEPTION)  # m
@@ -31,6 +31,11 @@ YARDSTICKS = (("vfn-p-egoistic", 0.0), ("idm", 45.0), ("altruist-rule", 45.0))
 EPISODES = 100
 FIGURES = ("collision_rate", "mission_success_rate", "dt_mean_m", "dt_mission_m", "veto_rate")
 COMPARED = ("collision_rate", "mission_success_rate", "dt_mean_m", "dt_mission_m")
+CRASHES = "crashes"
+SHOWN = {
+    CRASHES: RATES["collision_rate"],
+    "mission vehicle": Measure("dt_mission_m", "dt_mission_m", "m", "higher"),
+}
 
 
 def sensing() -> list[Agent]:
@@ -71,10 +76,10 @@ def write(results: Results, settings: Settings) -> None:
         traffic = f"{demand}, {behavior}"
         page += [f"## Senses: {world}, {traffic}", "", *_told(), *table(world, runs, FIGURES)]
         lines += lines_of(traffic, [world], runs, FIGURES)
-        rate = RATES["collision_rate"]
-        panels[f"crashes: {world}, {demand}"] = {
-            name: {world: found(of_world(run, world), rate)[0]} for name, run in runs.items()
-        }
+        for title, measure in SHOWN.items():
+            panels[f"{title}: {world}, {demand}"] = {
+                name: {world: found(of_world(run, world), measure)[0]} for name, run in runs.items()
+            }
         pairs = {
             name: {world: differences(runs[whole], run)[world]}
             for name, run in runs.items()
@@ -87,8 +92,9 @@ def write(results: Results, settings: Settings) -> None:
             page += difference_table({name: pair[world] for name, pair in pairs.items()}, COMPARED)
     if panels:
         settings.out.mkdir(parents=True, exist_ok=True)
-        picture(settings.out / "conditions.png", panels, list(panels))
-        page += ["![crashes](conditions.png)", ""]
+        shares = [title for title in panels if title.startswith(CRASHES)]
+        picture(settings.out / "conditions.png", panels, shares)
+        page += ["![crashes, distance of the mission vehicle](conditions.png)", ""]
     for behavior in DRIVEN_BY:
         wanted = {AGENT, *(name for name, _ in YARDSTICKS)}
         here = {one.name for one in results.driven if one.order.name in wanted}

@@ -92,19 +92,18 @@ def braking_speeds(speed: float, target: float, frames: int, dt: float, period: 
 def speeds_ahead(
     target: float, speed: float, limit: float, frames: int, stopping: int, dt: float, period: float
 ) -> tuple[Floats, Floats, Floats]:
-    """What every action means: targets [A] m/s, speeds [A,frames+1] m/s while it is held, and [A,stopping+1]
-    when Decelerate follows at every decision, `period` s apart; frames are `dt` s apart."""
+    """What every action means, speeds in m/s every `dt` s: [A,frames+1] its target tracked; [A,frames+1] it
+    held, Decelerate again at every decision, `period` s apart; [A,stopping+1] once, then Decelerate so."""
     targets = np.empty(_ACTIONS)
     for a in range(_ACTIONS):
         targets[a] = _next_target(target, speed, a, limit)
-    held = tracked_speeds(speed, targets, frames, dt)
+    once = tracked_speeds(speed, targets, frames, dt)
+    held = once.copy()
+    held[_DECELERATE] = braking_speeds(speed, targets[_DECELERATE], frames, dt, period)
     braked = np.empty((_ACTIONS, stopping + 1))
     for a in range(_ACTIONS):
-        under = held[a]
-        if a == _DECELERATE:
-            under = braking_speeds(speed, targets[a], frames, dt, period)
-        braked[a] = braked_from(under, targets[a], round(period / dt), stopping, limit, dt, period)
-    return targets, held, braked
+        braked[a] = braked_from(held[a], targets[a], round(period / dt), stopping, limit, dt, period)
+    return once, held, braked
 
 
 @compiled

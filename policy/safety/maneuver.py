@@ -10,7 +10,6 @@ from cosim.actions import (
     LANE_CHANGE_TIME,
     MAX_DECEL,
     braked_from,
-    braking_speeds,
     next_target,
     speeds_ahead,
 )
@@ -85,12 +84,11 @@ def roll_ego(history: History, paths: list[LanePath], now: Floats, c: SafetyConf
     Decelerate is judged by that: it is safe as long as braking helps. The allies are told of one step of it.
     """
     speed, limit = float(now[2]), history.route.speed_limit
-    targets, held, braked = speeds_ahead(
+    once, held, braked = speeds_ahead(
         history.target_speed, speed, limit, c.frames, STOPPING, c.dt, c.reaction
     )
     slower = ACTIONS.index(MetaAction.DECELERATE)
-    speeds = np.concatenate([held, held[slower][None]])  # the last one: Decelerate once
-    speeds[slower] = braking_speeds(speed, targets[slower], c.frames, c.dt, c.reaction)
+    speeds = np.concatenate([held, once[slower][None]])  # the last one: Decelerate once
     out = _roll(history, [*paths, paths[slower]], now, speeds, c)
     told = [*range(slower), len(ACTIONS), *range(slower + 1, len(ACTIONS))]
     return Futures(

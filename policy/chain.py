@@ -15,7 +15,7 @@ from policy.hpn import HPN
 from policy.kinematic_branch import Corrected, apply
 from policy.map_branch import MapBranch
 from policy.scene import Scene, pictured, rows_ahead
-from policy.tensors import Batch, kinematic_tensor, map_tensor
+from policy.tensors import Batch, kinematic_tensor, unit
 from policy.traffic import Traffic
 from policy.vehicle_inputs import vehicle_inputs
 
@@ -39,7 +39,7 @@ class ChainConfig:
 class Prediction(NamedTuple):
     """The M = horizon / every hypotheses of every AV."""
 
-    maps: torch.Tensor  # [B,M,C,H,W] float32 in [0,1], each in the predicted ego's frame
+    maps: torch.Tensor  # [B,M,C,H,W] each in the predicted ego's frame: uint8 as drawn, or float32 as decoded
     kinematics: torch.Tensor  # [B,M,R,F+1] scaled; the Gaussian process's (P, eq. 10), corrected by the HPN
     rows: Floats  # [B,horizon,R,8] every frame in m, m/s, rad, in the ego's frame at the newest frame
     valid: Bools  # [B,R]
@@ -109,7 +109,7 @@ def predict(
     branch = None if hpn is None else hpn.map_branch
     if branch is None:
         drawn = _rendered(scene, states, corrected, slice(every - 1, None, every), observation, raster)
-        return Prediction(map_tensor(drawn, device), kinematics[:, every - 1 :: every], rows, valid)
+        return Prediction(torch.from_numpy(drawn).to(device), kinematics[:, every - 1 :: every], rows, valid)
     reference = None
     if branch.config.correct:
         reference = _rendered(scene, states, corrected, slice(None), observation, raster)
@@ -151,7 +151,7 @@ def _chain(
             ahead = rendered[:, start : start + block]
             if ahead.shape[1] < block:  # the horizon ends within this block
                 ahead = np.concatenate([ahead, np.repeat(ahead[:, -1:], block - ahead.shape[1], 1)], 1)
-            drawn = _grouped(torch.from_numpy(ahead).to(device)).to(torch.float32).mul_(1.0 / 255.0)
+            drawn = _grouped(torch.from_numpy(ahead).to(device))
         guess, _ = branch(past, moved, drawn)  # its own K is replaced by the GP's (eq. 10)
         guess = guess.clamp_(0.0, 1.0)
         frames = guess.view(b, block, channels, h, w)
@@ -163,8 +163,8 @@ def _chain(
 
 
 def _grouped(maps: torch.Tensor) -> torch.Tensor:
-    """[B,T,C,H,W] -> [B,T*C,H,W] in channels_last."""
-    return maps.flatten(1, 2).contiguous(memory_format=torch.channels_last)
+    """[B,T,C,H,W] pixels -> [B,T*C,H,W] in [0,1], in channels_last."""
+    return unit(maps).flatten(1, 2).contiguous(memory_format=torch.channels_last)
 
 
 def _newest(groups: list[torch.Tensor], wanted: int) -> list[torch.Tensor]:

@@ -16,7 +16,7 @@ from policy.hpn import HPN
 from policy.map_branch import MapBranch
 from policy.predictors import Predictor
 from policy.scene import Scene, join, pictured
-from policy.tensors import Batch, to_batch, to_numpy
+from policy.tensors import Batch, to_batch, to_numpy, unit
 from policy.traffic import TrafficConfig
 from policy.training.moments import foresee, without_history
 from policy.vehicle_inputs import vehicle_inputs
@@ -57,7 +57,7 @@ def painted(
 
 def _encoded(branch: MapBranch, batch: Batch, b: int) -> list[Floats32]:
     """[k,h,w] of every encoder layer."""
-    z = batch.maps[b : b + 1, -branch.config.seen :].flatten(1, 2)
+    z = unit(batch.maps[b : b + 1, -branch.config.seen :]).flatten(1, 2)
     out = []
     for convolution, pool in zip(branch.encoder, branch._pools, strict=True):
         z = functional.relu(convolution(z))

@@ -16,7 +16,7 @@ from policy.chain import ChainConfig, predict
 from policy.hpn import HPN
 from policy.predictors import Predictor
 from policy.scene import join
-from policy.tensors import to_batch, to_numpy
+from policy.tensors import to_batch, to_numpy, unit
 from policy.traffic import TrafficConfig
 from policy.training.moments import foresee, without_history
 
@@ -93,5 +93,5 @@ class MapPredictors:
                 known = scene if history else without_history(scene)
                 forecast, traffic = foresee(known, self._predictor, self._road, self._traffic)
                 guess = predict(config, self._observation, self._raster, hpn, known, batch, forecast, traffic)
-                maps[name] = to_numpy(guess.maps)
+                maps[name] = to_numpy(unit(guess.maps))
         return Guess(scene.agents, maps)

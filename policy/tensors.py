@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from cosim.road import RoadMap
-from cosim.types import KINEMATIC_FEATURES, Bools, Bytes, Floats, Floats32, History
+from cosim.types import KINEMATIC_FEATURES, Bools, Floats, Floats32, History
 from policy.situation import situation
 
 # Scales that bring every kinematic feature to about [-1, 1]: row range, map half width, motorway speed,
@@ -21,7 +21,7 @@ KINEMATIC_INPUTS = len(KINEMATIC_FEATURES) + 1  # the features and the mask
 class Batch(NamedTuple):
     """What B AVs see."""
 
-    maps: torch.Tensor  # [B,N,C,H,W] float32 in [0,1]
+    maps: torch.Tensor  # [B,N,C,H,W] uint8 pixels: bytes until a convolution reads them
     kinematics: torch.Tensor  # [B,N,R,F+1] float32, scaled, the mask last; zeros in masked rows
 
 
@@ -30,7 +30,7 @@ def to_batch(histories: Sequence[History], device: str = "cpu") -> Batch:
     maps = np.stack([h.velocity_map for h in histories])
     kinematics = np.stack([h.kinematics for h in histories])
     valid = np.stack([h.valid for h in histories])
-    return Batch(map_tensor(maps, device), kinematic_tensor(kinematics, valid, device))
+    return Batch(torch.from_numpy(maps).to(device), kinematic_tensor(kinematics, valid, device))
 
 
 def situation_tensor(
@@ -45,9 +45,14 @@ def svo_tensor(svo: float, agents: int, device: str = "cpu") -> torch.Tensor:
     return torch.tensor([np.cos(svo), np.sin(svo)], dtype=torch.float32, device=device).expand(agents, 2)
 
 
-def map_tensor(maps: Bytes, device: str = "cpu") -> torch.Tensor:
-    """uint8 maps of any shape -> float32 in [0,1]."""
-    return torch.from_numpy(np.ascontiguousarray(maps)).to(device).to(torch.float32).mul_(1.0 / 255.0)
+def unit(maps: torch.Tensor) -> torch.Tensor:
+    """Maps of any shape, uint8 pixels or float32 in [0,1] already -> float32 in [0,1]."""
+    return maps if maps.is_floating_point() else maps.to(torch.float32).mul_(1.0 / 255.0)
+
+
+def pixels(maps: torch.Tensor) -> torch.Tensor:
+    """The inverse of `unit`, rounded: what a recording keeps of maps."""
+    return (maps * 255.0 + 0.5).to(torch.uint8) if maps.is_floating_point() else maps
 
 
 def kinematic_tensor(kinematics: Floats32 | Floats, valid: Bools, device: str = "cpu") -> torch.Tensor:

@@ -28,7 +28,7 @@ from policy.hpn import HPN
 from policy.predictors import make_predictor
 from policy.safety import prioritize
 from policy.scene import Scene, join
-from policy.tensors import situation_tensor, svo_tensor, to_batch, to_numpy
+from policy.tensors import pixels, situation_tensor, svo_tensor, to_batch, to_numpy
 from policy.traffic import Traffic, predict_traffic
 from policy.vfn import VFN
 
@@ -40,7 +40,7 @@ class Inputs(NamedTuple):
     """What B AVs that decide together know and predict; T = N past and M predicted frames."""
 
     scene: Scene
-    maps: torch.Tensor  # [B,T,C,H,W] in [0,1]
+    maps: torch.Tensor  # [B,T,C,H,W] uint8 pixels
     kinematics: torch.Tensor  # [B,T,R,F+1] scaled
     situation: torch.Tensor  # [B,SITUATION_INPUTS]
     phi: torch.Tensor  # [B,2]
@@ -113,7 +113,7 @@ class PredictionAware:
                 ahead = predict(
                     c.chain, c.observation, self._raster, self.hpn, scene, batch, forecast, traffic
                 )
-                maps = torch.cat([maps, ahead.maps], 1)
+                maps = torch.cat([maps, pixels(ahead.maps)], 1)
                 kinematics = torch.cat([kinematics, ahead.kinematics], 1)
         self._expected = scene.vehicles, traffic, forecast
         known = situation_tensor(scene.histories, context.road, scene.shared)

@@ -65,7 +65,7 @@ class Trajectory:
 class States(NamedTuple):
     """A batch of network inputs, as `policy.vfn.VFN` takes them."""
 
-    maps: torch.Tensor  # [B,T,C,H,W]
+    maps: torch.Tensor  # [B,T,C,H,W] uint8 pixels
     kinematics: torch.Tensor  # [B,T,R,F+1]
     situation: torch.Tensor  # [B,.]
     phi: torch.Tensor  # [B,2]
@@ -108,10 +108,8 @@ def states(chosen: list[tuple[Trajectory, int]], phi: Floats32, device: str = "c
         row[:past], row[past:] = trajectory.maps(t)
     kinematics = np.stack([trajectory.kinematics[t] for trajectory, t in chosen]).astype(np.float32)
     situation = np.stack([trajectory.situation[t] for trajectory, t in chosen])
-    # turned to channels last, as the first convolution wants them, while they are still bytes
-    turned = torch.from_numpy(maps).to(device).permute(0, 1, 3, 4, 2).contiguous()
     return States(
-        turned.to(torch.float32).mul_(1.0 / 255.0).permute(0, 1, 4, 2, 3),
+        torch.from_numpy(maps).to(device),
         torch.from_numpy(kinematics).to(device),
         torch.from_numpy(situation).to(device),
         torch.from_numpy(_direction(phi)).to(device),

@@ -162,8 +162,7 @@ class Explorer(PredictionAware):
             tape.frames.append(history.velocity_map[-stride:].copy())
         else:
             tape.frames.append(history.velocity_map.copy())
-        ahead = inputs.maps[b, n:]
-        tape.ahead.append((to_numpy(ahead) * 255.0 + 0.5).astype(np.uint8))
+        tape.ahead.append(inputs.maps[b, n:].numpy().copy())
         tape.kinematics.append(to_numpy(inputs.kinematics[b]).astype(np.float16))
         tape.situation.append(to_numpy(inputs.situation[b]))
         assert decision.q is not None

@@ -11,7 +11,7 @@ from torch import nn
 
 from cosim.seeding import generator, subseed
 from policy.map_branch import MapBranch, MapBranchConfig
-from policy.tensors import kinematic_tensor, map_tensor
+from policy.tensors import kinematic_tensor, unit
 from policy.training.loop import one_cycle
 from policy.training.moments import MapSample
 from policy.training.networks import adam_tensors, restore_adam, seeded
@@ -80,7 +80,8 @@ class MapTask:
 
     def _losses(self, samples: Sequence[MapSample]) -> dict[str, torch.Tensor]:
         c, t = self.network.config, self._training
-        maps = map_tensor(np.stack([s.unpacked()[: c.frames + c.block] for s in samples]), self._device)
+        seen = np.stack([s.unpacked()[: c.frames + c.block] for s in samples])
+        maps = unit(torch.from_numpy(seen).to(self._device))
         past = (
             maps[:, c.frames - c.seen : c.frames].flatten(1, 2).contiguous(memory_format=torch.channels_last)
         )

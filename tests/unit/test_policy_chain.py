@@ -17,7 +17,7 @@ from policy.hpn import HPN, HpnConfig
 from policy.map_branch import MapBranchConfig
 from policy.predictors import make_predictor
 from policy.scene import Scene, join
-from policy.tensors import to_batch
+from policy.tensors import to_batch, unit
 from policy.traffic import Traffic, TrafficConfig
 from policy.training.moments import foresee, without_history
 from policy.vehicle_inputs import vehicle_inputs
@@ -56,7 +56,7 @@ def test_untrained_it_returns_the_rendered_maps_step_after_step() -> None:
     _, drawn = chain(HPN(HpnConfig()).eval(), ChainConfig(every=1))
     _, corrected = chain(HPN(CORRECTED).eval(), ChainConfig(every=1))
     assert drawn.maps.shape == (2, 20, 4, 32, 128)
-    torch.testing.assert_close(corrected.maps, drawn.maps, rtol=0.0, atol=1e-6)
+    torch.testing.assert_close(corrected.maps, unit(drawn.maps), rtol=0.0, atol=1e-6)
     _, forecast = chain(None, ChainConfig(every=1))
     both = ((drawn.maps > 0) & (forecast.maps > 0)).sum() / ((drawn.maps > 0) | (forecast.maps > 0)).sum()
     assert both > 0.9, "on a straight road the forecast along the lane is the forecast"
@@ -133,7 +133,7 @@ def test_a_horizon_that_ends_within_a_block_is_cut() -> None:
     _, prediction = chain(HPN(CORRECTED).eval(), ChainConfig(horizon=7, every=1))
     _, drawn = chain(HPN(HpnConfig()).eval(), ChainConfig(horizon=7, every=1))
     assert prediction.maps.shape[1] == 7
-    torch.testing.assert_close(prediction.maps, drawn.maps, rtol=0.0, atol=1e-6)
+    torch.testing.assert_close(prediction.maps, unit(drawn.maps), rtol=0.0, atol=1e-6)
 
 
 def test_what_avs_share_is_known_once_and_alone_each_knows_its_own() -> None:

@@ -91,19 +91,25 @@ def braking_speeds(speed: float, target: float, frames: int, dt: float, period: 
 @compiled
 def speeds_ahead(
     target: float, speed: float, limit: float, frames: int, stopping: int, dt: float, period: float
-) -> tuple[Floats, Floats, Floats]:
-    """What every action means, speeds in m/s every `dt` s: [A,frames+1] its target tracked; [A,frames+1] it
-    held, Decelerate again at every decision, `period` s apart; [A,stopping+1] once, then Decelerate so."""
-    targets = np.empty(_ACTIONS)
+) -> tuple[Floats, Floats]:
+    """What every action means, every `dt` s, and how far it is to standstill.
+
+    Speeds [A+1,frames+1] m/s of the actions held, which for Decelerate means again at every decision,
+    `period` s apart; the last row is Decelerate once. [A] m driven within `stopping` frames when Decelerate
+    follows from the next decision on.
+    """
+    targets = np.empty(_ACTIONS + 1)
     for a in range(_ACTIONS):
         targets[a] = _next_target(target, speed, a, limit)
-    once = tracked_speeds(speed, targets, frames, dt)
-    held = once.copy()
+    targets[_ACTIONS] = targets[_DECELERATE]
+    held = tracked_speeds(speed, targets, frames, dt)
     held[_DECELERATE] = braking_speeds(speed, targets[_DECELERATE], frames, dt, period)
-    braked = np.empty((_ACTIONS, stopping + 1))
+    way = np.zeros(_ACTIONS)
     for a in range(_ACTIONS):
-        braked[a] = braked_from(held[a], targets[a], round(period / dt), stopping, limit, dt, period)
-    return once, held, braked
+        braked = braked_from(held[a], targets[a], round(period / dt), stopping, limit, dt, period)
+        for t in range(stopping):
+            way[a] += 0.5 * dt * (braked[t] + braked[t + 1])
+    return held, way
 
 
 @compiled

@@ -36,9 +36,9 @@ class Lane:
     end: str = ""  # junction where its edge ends
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LanePath:
-    """A lane's centre line followed ahead through its successors.
+    """A lane's centre line followed ahead through its successors; one object per way (`RoadMap.path`).
 
     `arc` starts at 0 at the beginning of the first lane; SUMO lane positions are scaled to it.
     """

@@ -87,12 +87,21 @@ def project_many(
 
 
 @compiled
-def project_all(points: Floats, arc: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """`project` of every point [k] onto one path."""
-    n = x.shape[0]
-    out_arc, out_offset = np.empty(n), np.empty(n)
-    for k in range(n):
-        out_arc[k], out_offset[k] = project(points, arc, 0, arc.shape[0], x[k], y[k], np.nan)
+def project_each(
+    points: Floats, arc: Floats, start: Ints, same: Ints, x: Floats, y: Floats
+) -> tuple[Floats, Floats]:
+    """`project` of every point [n] onto each of the first k paths: arc [k,n] m, offset [k,n] m.
+
+    same [k]: the first path that is the same, whose answer is taken over.
+    """
+    count, n = same.shape[0], x.shape[0]
+    out_arc, out_offset = np.empty((count, n)), np.empty((count, n))
+    for k in range(count):
+        if same[k] < k:
+            out_arc[k], out_offset[k] = out_arc[same[k]], out_offset[same[k]]
+            continue
+        for i in range(n):
+            out_arc[k, i], out_offset[k, i] = project(points, arc, start[k], start[k + 1], x[i], y[i], np.nan)
     return out_arc, out_offset
 
 
@@ -193,6 +202,73 @@ def roll_out(
     out = Rollout(*(np.empty_like(speed) for _ in range(6)))
     roll(*paths, begin, offset, aim, heading, rate, length, speed, stop, brake, dt, *out)
     return out
+
+
+@compiled
+def _roll_one(
+    points: Floats,
+    arc: Floats,
+    start: Ints,
+    now: Floats,
+    around: float,
+    speed: Floats,
+    beside: float,
+    change: float,
+    settle: float,
+    brake: float,
+    dt: float,
+) -> Floats:
+    """See `roll_one`; [6,k,T+1]."""
+    count = speed.shape[0]
+    begin, offset, rate = np.empty(count), np.empty(count), np.empty(count)
+    half = 0.5 * now[4]
+    x, y = now[0] + half * np.cos(now[3]), now[1] + half * np.sin(now[3])
+    for k in range(count):
+        begin[k], offset[k] = project(points, arc, start[k], start[k + 1], x, y, around)
+        rate[k] = change if abs(offset[k]) > beside else settle
+    out = np.empty((6, count, speed.shape[1]))
+    roll(
+        points,
+        arc,
+        start,
+        begin,
+        offset,
+        np.zeros(count),
+        np.full(count, now[3]),
+        rate,
+        np.full(count, now[4]),
+        speed,
+        np.full(count, np.inf),
+        brake,
+        dt,
+        out[0],
+        out[1],
+        out[2],
+        out[3],
+        out[4],
+        out[5],
+    )
+    return out
+
+
+def roll_one(
+    paths: Paths,
+    now: Floats,
+    around: float,
+    speed: Floats,
+    beside: float,
+    change: float,
+    settle: float,
+    brake: float,
+    dt: float,
+) -> Rollout:
+    """One vehicle on each of k paths, with the speeds [k,T+1] m/s of its row.
+
+    now [8]: KINEMATIC_FEATURES in the world; its front lies about `around` m along every path. Where it
+    stands more than `beside` m off the path the gap closes with `change` m/s (a lane change, new or under
+    way), else with `settle`.
+    """
+    return Rollout(*_roll_one(*paths, now, around, speed, beside, change, settle, brake, dt))
 
 
 def fronts(state: Floats) -> tuple[Floats, Floats]:

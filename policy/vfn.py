@@ -119,9 +119,9 @@ class VFN(nn.Module):
     def forward(
         self, maps: torch.Tensor | None, kinematics: torch.Tensor, situation: torch.Tensor, phi: torch.Tensor
     ) -> torch.Tensor:
-        """maps [B,T,C,H,W] uint8 pixels or in [0,1], kinematics [B,T,R,F+1], situation [B,.], phi [B,2] -> q [B,5].
+        """maps [B,T,C,H,W], kinematics [B,T,R,F+1], situation [B,.], phi [B,2] -> q [B,5].
 
-        Without maps that branch says nothing, and learning costs no convolutions.
+        Maps are uint8 pixels, or in [0,1]. Without maps that branch says nothing, and learning costs no convolutions.
         """
         z = self.features(maps, kinematics, situation, phi)
         q: torch.Tensor = self.value(z)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -14,13 +15,16 @@ from cosim.actions import (
     speeds_ahead,
 )
 from cosim.road import LanePath, RoadMap
-from cosim.types import Bools, Floats, History, MetaAction
-from policy.motion import Rollout, fronts, pack, project, project_many, roll_out
+from cosim.types import Bools, Floats, History, Ints, MetaAction
+from policy.motion import Paths, Rollout, pack, project, roll_one
 from policy.safety.config import SafetyConfig
 
 ACTIONS = tuple(MetaAction)
 KEEPING = [ACTIONS.index(a) for a in (MetaAction.IDLE, MetaAction.ACCELERATE)]  # that brake later, if ever
 SIDE = {MetaAction.LANE_LEFT: 0, MetaAction.LANE_RIGHT: 2}  # index into RouteAhead.paths
+SLOWER = ACTIONS.index(MetaAction.DECELERATE)
+BESIDE = 0.3  # m off a centre line, from which getting there is a lane change
+SETTLE = 0.3  # m/s with which a smaller offset closes
 STOPPING = 40  # frames: 8 s, in which every AV stands
 LANE_END = "(lane end)"
 ROAD_EDGE = "(no lane)"
@@ -69,71 +73,79 @@ def ways_of(history: History, road: RoadMap, lane: int) -> list[Way]:
     return ways
 
 
+class Ways(NamedTuple):
+    """The ways of all actions as the kernels take them."""
+
+    paths: Paths  # [A+1] of every action, then Decelerate's again
+    same: Ints  # [A] the first action with the same path
+    dead_end: Bools  # [A]
+    length: Floats  # [A] m
+
+
+@lru_cache(maxsize=1024)
+def packed(paths: tuple[LanePath, ...]) -> Ways:
+    """[A] paths; an AV asks for the same ones decision after decision."""
+    same = [next(k for k, other in enumerate(paths) if other is path) for path in paths]
+    return Ways(
+        pack([*paths, paths[SLOWER]]),
+        np.array(same, np.int64),
+        np.array([path.dead_end for path in paths]),
+        np.array([path.length for path in paths]),
+    )
+
+
 class Futures(NamedTuple):
     """The ego's possible futures."""
 
-    under: Rollout  # [A,T+1] what each action is judged by
-    intention: Rollout  # [A,T+1] what the allies are told
+    under: Rollout  # [A+1,T+1] what each action is judged by, then: Decelerate once
     stopping: Floats  # [A] m until standstill, when Decelerate follows from the next decision on
 
+    def told(self, action: int) -> list[Floats]:
+        """What the allies are told [6][T+1]: of one step of Decelerate."""
+        row = len(ACTIONS) if action == SLOWER else action
+        return [array[row] for array in self.under]
 
-def roll_ego(history: History, paths: list[LanePath], now: Floats, c: SafetyConfig) -> Futures:
-    """The ego (state `now` [8]) under every action, along the path of each.
+
+def roll_ego(history: History, paths: Paths, now: Floats, c: SafetyConfig) -> Futures:
+    """The ego (state `now` [8]) under every action, along the path [A+1] of each.
 
     An action is held, as P's algorithm 2 says. Decelerating again and again means braking to a standstill, so
-    Decelerate is judged by that: it is safe as long as braking helps. The allies are told of one step of it.
+    Decelerate is judged by that: it is safe as long as braking helps.
     """
-    speed, limit = float(now[2]), history.route.speed_limit
-    once, held, braked = speeds_ahead(
-        history.target_speed, speed, limit, c.frames, STOPPING, c.dt, c.reaction
+    speeds, stopping = speeds_ahead(
+        history.target_speed,
+        float(now[2]),
+        history.route.speed_limit,
+        c.frames,
+        STOPPING,
+        c.dt,
+        c.reaction,
     )
-    slower = ACTIONS.index(MetaAction.DECELERATE)
-    speeds = np.concatenate([held, once[slower][None]])  # the last one: Decelerate once
-    out = _roll(history, [*paths, paths[slower]], now, speeds, c)
-    told = [*range(slower), len(ACTIONS), *range(slower + 1, len(ACTIONS))]
-    return Futures(
-        Rollout(*(array[: len(ACTIONS)] for array in out)),
-        Rollout(*(array[told] for array in out)),
-        np.asarray(c.dt * np.trapezoid(braked, axis=1)),
-    )
+    return Futures(_roll(history, paths, now, speeds, c), stopping)
 
 
 def roll_braked(
     history: History, path: LanePath, now: Floats, under: Rollout, actions: list[int], c: SafetyConfig
 ) -> Rollout:
-    """[k,T+1] the ego on `path` under `actions` for `brake_after` s, as in `under` [A,T+1], then braking."""
+    """[k,T+1] the ego on `path` under `actions` for `brake_after` s, as in `under` [.,T+1], then braking."""
     held = min(round(c.brake_after / c.dt), c.frames)
-    speeds = under.speed[actions].copy()
+    speeds = under.speed[actions]
     limit = history.route.speed_limit
     for row, a in zip(speeds, actions, strict=True):
         target = next_target(history.target_speed, float(now[2]), a, limit)
         row[:] = braked_from(row, target, held, c.frames, limit, c.dt, c.reaction)
-    return _roll(history, [path] * len(actions), now, speeds, c)
+    return _roll(history, pack([path] * len(actions)), now, speeds, c)
 
 
-def _roll(history: History, paths: list[LanePath], now: Floats, speeds: Floats, c: SafetyConfig) -> Rollout:
+def _roll(history: History, paths: Paths, now: Floats, speeds: Floats, c: SafetyConfig) -> Rollout:
     """[k,T+1] the ego on each of the k paths with the speeds of its row."""
-    count = len(paths)
-    packed = pack(paths)
-    x, y = fronts(np.repeat(now[None], count, 0))
-    arc, offset = project_many(*packed, x, y, np.full(count, history.route.arc))
-    wide = np.abs(offset) > 0.3  # a lane change, new or under way
-    return roll_out(
-        packed,
-        arc,
-        offset,
-        np.zeros(count),
-        np.full(count, now[3]),
-        np.where(wide, 2 * c.lane_half / LANE_CHANGE_TIME, 0.3),
-        np.full(count, now[4]),
-        speeds,
-        np.full(count, np.inf),
-        MAX_DECEL,
-        c.dt,
-    )
+    change = 2 * c.lane_half / LANE_CHANGE_TIME
+    return roll_one(paths, now, history.route.arc, speeds, BESIDE, change, SETTLE, MAX_DECEL, c.dt)
 
 
-def straddles(ego: Rollout, c: SafetyConfig) -> Bools:
-    """[A] whether the ego would come to a stop across two lanes."""
-    standing = (ego.speed < 1.0) & (np.abs(ego.rear) > c.straddle)
-    return np.asarray(standing.any(1))
+def straddling(ego: Rollout, c: SafetyConfig) -> Ints:
+    """Under which actions the ego would come to a stop across two lanes."""
+    slow = ego.speed < 1.0
+    if not slow.any():
+        return np.zeros(0, np.int64)
+    return np.flatnonzero((slow & (np.abs(ego.rear) > c.straddle)).any(1))

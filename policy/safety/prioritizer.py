@@ -23,7 +23,7 @@ from cosim.road import RoadMap
 from cosim.types import Bools, Decision, Floats, Floats32, History, MetaAction
 from policy.motion import Rollout
 from policy.safety.config import SafetyConfig
-from policy.safety.conflicts import Neighbours, first_contact, gap_margin, others_near
+from policy.safety.conflicts import first_contact, gap_margin, neighbours, others_near
 from policy.safety.maneuver import (
     ACTIONS,
     KEEPING,
@@ -31,9 +31,11 @@ from policy.safety.maneuver import (
     REFUSED,
     STRADDLING,
     TOO_SLOW,
+    Futures,
+    packed,
     roll_braked,
     roll_ego,
-    straddles,
+    straddling,
     ways_of,
 )
 from policy.scene import Scene
@@ -47,7 +49,7 @@ class Evaluation(NamedTuple):
     score: Floats  # [A] s, P's weighted time to collision; -1 for impossible actions
     unsafe: Bools  # [A]
     blamed: tuple[str | None, ...]  # [A] who makes it unsafe
-    rollout: Rollout  # [A,T+1] the ego under each action, as its allies are told
+    futures: Futures  # the ego under each action
 
 
 def prioritize(
@@ -79,8 +81,8 @@ def prioritize(
         if share_intentions:
             me = name_row[scene.agents[b]]
             intended[me] = True
-            for mine, chosen in zip(ours, evaluation.rollout, strict=True):
-                mine[me] = chosen[decision.action]
+            for mine, told in zip(ours, evaluation.futures.told(decision.action), strict=True):
+                mine[me] = told
     return {agent: decisions[agent] for agent in scene.agents}
 
 
@@ -98,13 +100,13 @@ def select(
 
     `ties`: the order of equally valued actions (default: the configured one).
     """
-    order = sorted(ties or config.ties, key=lambda a: -float(q[a]))  # stable
+    values = q.tolist()
+    order = sorted(ties or config.ties, key=lambda a: -values[a])  # stable
     preferred = order[0]
-    safe = [a for a in order if not evaluation.unsafe[a]]
-    fallback = not safe
-    # equal scores: better slower than as preferred
-    last = max(order, key=lambda a: (float(evaluation.score[a]), a == MetaAction.DECELERATE))
-    chosen = safe[0] if safe else last
+    chosen = next((a for a in order if not evaluation.unsafe[a]), None)
+    fallback = chosen is None
+    if chosen is None:  # equal scores: better slower than as preferred
+        chosen = max(order, key=lambda a: (float(evaluation.score[a]), a == MetaAction.DECELERATE))
     return Decision(
         chosen,
         q=np.asarray(q, np.float32),
@@ -132,50 +134,43 @@ def evaluate(
     """
     c, history = config, scene.histories[b]
     me = int(scene.ego[b])
-    length = float(traffic.length[me])
+    now, length, width = scene.state[me, -1], float(traffic.length[me]), float(traffic.width[me])
     ways = ways_of(history, road, int(scene.lane[me]))
-    paths = [w.path for w in ways]
-    futures = roll_ego(history, paths, scene.state[me, -1], c)
-    ego = futures.under
-    others = others_near(b, me, scene, traffic, road, c.reach)
+    changes = np.array([way.changes for way in ways])
+    paths, same, dead_end, end = packed(tuple(way.path for way in ways))
+    futures = roll_ego(history, paths, now, c)
+    ego = Rollout(*(array[: len(ACTIONS)] for array in futures.under))
+    others = others_near(b, me, scene, traffic, road, c.reach, intended)
     contact = np.full(len(ACTIONS), np.inf)  # s
     limit = np.full(len(ACTIONS), np.inf)  # score allowed by the leader and follower limits
     blamed: list[str | None] = [None] * len(ACTIONS)
-    if len(others):
-        touch = first_contact(ego, traffic, me, others, c)  # [A,O] s
-        seen: dict[int, Neighbours] = {}
-        late: Floats | None = None  # [K,O] s first contact when braking follows
-        for a, way in enumerate(ways):
-            near = seen.get(id(way.path))
-            if near is None:
-                arc = ego.arc[a, 0] - 0.5 * length  # m, centre
-                near = Neighbours.of(way.path, arc, length, others, traffic, scene.state[me, -1], c)
-                seen[id(way.path)] = near
-            times = np.where(near.behind, np.inf, touch[a])  # followers brake: checked below for changes
-            if a in KEEPING and np.isfinite(times[near.ahead]).any() and c.brake_after < c.frames * c.dt:
-                if late is None:
-                    braked = roll_braked(history, way.path, scene.state[me, -1], ego, KEEPING, c)
-                    late = first_contact(braked, traffic, me, others, c)
-                leader = np.maximum(times, late[KEEPING.index(a)])
-                times = np.where(near.ahead, leader, times)
-            first = int(np.argmin(times))
-            contact[a] = times[first]
-            if np.isfinite(times[first]):
-                blamed[a] = scene.vehicles[others[first]]
-            allowed, who = gap_margin(a, way.changes, futures, near, traffic, others, intended, c)
-            if allowed < c.safe_th:
-                limit[a] = allowed
-                if contact[a] > c.horizon + c.critical_th:
-                    blamed[a] = scene.vehicles[others[who]]
-    for a in map(int, np.flatnonzero(straddles(ego, c))):
+    if len(others.rows):
+        centre = ego.arc[:, 0] - 0.5 * length
+        near = neighbours(paths, same, centre, float(now[3]), length, others, c)
+        times = first_contact(ego, length, width, others, c)  # [A,O] s
+        times[near.behind] = np.inf  # followers brake: checked below for changes
+        held, ahead = times[KEEPING], near.ahead[KEEPING]
+        if c.brake_after < c.frames * c.dt and np.isfinite(held[ahead]).any():
+            braked = roll_braked(history, ways[KEEPING[0]].path, now, ego, KEEPING, c)
+            late = first_contact(braked, length, width, others, c)
+            times[KEEPING] = np.where(ahead, np.maximum(held, late), held)
+        first = times.argmin(1)
+        contact = times[np.arange(len(ACTIONS)), first]
+        limit, who = gap_margin(futures.stopping, float(now[2]), changes, near, others, c)
+        for a, soonest in enumerate(contact):
+            if soonest > c.horizon + c.critical_th and limit[a] < c.safe_th:
+                blamed[a] = scene.vehicles[others.rows[who[a]]]
+            elif soonest < np.inf:
+                blamed[a] = scene.vehicles[others.rows[first[a]]]
+    for a in straddling(ego, c):
         if 0.9 * c.safe_th < limit[a]:
             limit[a] = 0.9 * c.safe_th
             blamed[a] = blamed[a] or STRADDLING
-    for a, way in enumerate(ways):
-        if way.path.dead_end:  # an obstacle at its end
-            over = ego.arc[a] + 0.5 > way.path.length
-            if over.any() and c.dt * int(np.argmax(over)) < contact[a]:
-                contact[a], blamed[a] = c.dt * int(np.argmax(over)), LANE_END
+    if dead_end.any():  # an obstacle at its end
+        over = (ego.arc + 0.5 > end[:, None]) & dead_end[:, None]
+        for a in np.flatnonzero(over.any(1)):
+            if (reached := c.dt * int(np.argmax(over[a]))) < contact[a]:
+                contact[a], blamed[a] = reached, LANE_END
     steps, weight, total = _weights(c)
     remaining = np.clip(contact[:, None] - steps, 0.0, c.cap)  # [A,M]: T - h
     score = np.minimum(remaining @ weight / total, limit)
@@ -189,7 +184,7 @@ def evaluate(
         if forbidden is not None:
             unsafe[a], score[a], blamed[a] = True, -1.0, forbidden
     blamed = [who if bad else None for who, bad in zip(blamed, unsafe, strict=True)]
-    return Evaluation(np.minimum(contact, c.cap), score, unsafe, tuple(blamed), futures.intention)
+    return Evaluation(np.minimum(contact, c.cap), score, unsafe, tuple(blamed), futures)
 
 
 @cache

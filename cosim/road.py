@@ -57,6 +57,11 @@ class LanePath:
         """m"""
         return float(self.arc[-1])
 
+    @cached_property
+    def next_lanes(self) -> Ints:
+        """Its first three lanes (or as many as there are)."""
+        return np.array(self.lanes[:3], np.int64)
+
     def pose(self, arc: Floats) -> tuple[Floats, Floats, Floats]:
         """Positions and headings at arc lengths. [k] m -> x [k] m, y [k] m, heading [k] rad.
 

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
+from cosim.compiled import compiled
 from cosim.road import LanePath, RoadMap
-from cosim.types import IS_MISSION, History
+from cosim.types import IS_MISSION, Bools, Floats, Floats32, History, Ints
 
 LANE = 3.2  # m, SUMO's lane width
 CAR = 5.0  # m, between the centres of two cars that touch
@@ -62,18 +64,28 @@ def meet(road: RoadMap, history: History, seen: Seen) -> Meeting | None:
     return Meeting(behind, True, False, seen.speed)
 
 
-def along(history: History, path: LanePath, side: float = 0.0) -> list[tuple[float, float]]:
-    """Vehicles on the path's next lanes, or behind on its course: m ahead of the ego (centres), m/s.
+def along(history: History, path: LanePath, side: float = 0.0) -> Floats:
+    """Vehicles on the path's next lanes, or behind on its course [k,2]: m ahead of the ego (centres), m/s.
 
     Upstream a lane has other names, so behind it is the place that counts: `side` m to the left.
     """
-    newest = history.kinematics[-1]
-    return [
-        (float(newest[r, 0]), float(newest[r, 2]))
-        for r in np.flatnonzero(history.valid[-1])[1:]
-        if int(history.lane[r]) in path.lanes[:3]
-        or (newest[r, 0] < 0.0 and abs(newest[r, 1] - side) < LANE / 2.0)
-    ]
+    return _along(history.kinematics[-1], history.valid[-1], history.lane, path.next_lanes, side)
+
+
+@compiled
+def _along(newest: Floats32, valid: Bools, lane: npt.NDArray[np.int32], lanes: Ints, side: float) -> Floats:
+    out = np.empty((len(valid), 2))
+    count = 0
+    for r in range(1, len(valid)):
+        if not valid[r]:
+            continue
+        on = newest[r, 0] < 0.0 and abs(newest[r, 1] - side) < 0.5 * LANE
+        for one in lanes:
+            on = on or lane[r] == one
+        if on:
+            out[count, 0], out[count, 1] = newest[r, 0], newest[r, 2]
+            count += 1
+    return out[:count]
 
 
 def _crosses_junction(road: RoadMap, path: LanePath) -> bool:

@@ -11,8 +11,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from cosim.actions import SPEED_STEP
-from cosim.road import LanePath, RoadMap
-from cosim.types import Floats32, History
+from cosim.compiled import compiled
+from cosim.road import RoadMap
+from cosim.types import Floats, Floats32, History
 from policy.meeting import LANE, Meeting, along, meet, missions
 
 LOOK_AHEAD = np.array([20.0, 50.0, 100.0])  # m, where the candidate centre lines are sampled
@@ -35,7 +36,8 @@ def situation(histories: Sequence[History], road: RoadMap, shared: bool) -> Floa
     right, its speed. `shared`: V2V, mission vehicles and places in that order are known to all.
     """
     met = _met(histories, road, shared)
-    return np.array([_own(h) + _lanes(h) + m for h, m in zip(histories, met, strict=True)], np.float32)
+    each = [np.concatenate([_own(h), _lanes(h), m]) for h, m in zip(histories, met, strict=True)]
+    return np.array(each, np.float32)
 
 
 def _own(history: History) -> list[float]:
@@ -51,34 +53,50 @@ def _own(history: History) -> list[float]:
     ]
 
 
-def _lanes(history: History) -> list[float]:
-    route, pose = history.route, history.pose
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    out: list[float] = []
+def _lanes(history: History) -> Floats:
+    """[3*PER_LANE] of the left, present and right lane."""
+    route = history.route
+    out = np.zeros((3, PER_LANE))
     for side, path in enumerate(route.paths):
-        if path is None:
-            out += [0.0] * PER_LANE
-            continue
-        x, y, heading = path.pose(route.arc + LOOK_AHEAD)
-        left = c * (y - pose[1]) - s * (x - pose[0])
-        turn = (heading - pose[2] + np.pi) % (2 * np.pi) - np.pi
-        out += [1.0, float(path.dead_end), min(route.to_end(side), FAR) / FAR]
-        out += [float(v) for v in left / 50.0] + [float(v) for v in turn / np.pi]
-        out += _neighbours(history, path, (1 - side) * LANE)
-    return out
+        if path is not None:
+            course = (path.points, path.arc, route.arc + LOOK_AHEAD, history.pose)
+            others = along(history, path, (1 - side) * LANE)
+            end = min(route.to_end(side), FAR) / FAR
+            _lane(*course, path.dead_end, end, others, history.ego_speed, out[side])
+    return out.ravel()
 
 
-def _neighbours(history: History, path: LanePath, side: float) -> list[float]:
-    """Gap (centres) and relative speed of the next vehicle ahead and behind; 1 and 0 where there is none."""
-    others = along(history, path, side)
-    out = []
-    for direction in (1.0, -1.0):
-        gap, speed = min(
-            ((direction * x, v) for x, v in others if direction * x > 0.0),
-            default=(NEAR, history.ego_speed),
-        )
-        out += [min(gap, NEAR) / NEAR, (speed - history.ego_speed) / FAST]
-    return out
+@compiled
+def _lane(
+    points: Floats,
+    arc: Floats,
+    places: Floats,
+    pose: Floats,
+    dead_end: bool,
+    end: float,
+    others: Floats,
+    speed: float,
+    out: Floats,
+) -> None:
+    """One lane that exists: its course at `places` m, and its next vehicles ahead and behind of `others`."""
+    out[0], out[1], out[2] = 1.0, dead_end, end
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    count = len(places)
+    for k in range(count):
+        i = min(max(np.searchsorted(arc, places[k], side="right") - 1, 0), len(arc) - 2)
+        dx, dy = points[i + 1, 0] - points[i, 0], points[i + 1, 1] - points[i, 1]
+        t = (places[k] - arc[i]) / max(arc[i + 1] - arc[i], 1e-9)
+        left = c * (points[i, 1] + t * dy - pose[1]) - s * (points[i, 0] + t * dx - pose[0])
+        out[3 + k] = left / 50.0
+        out[3 + count + k] = ((np.arctan2(dy, dx) - pose[2] + np.pi) % (2 * np.pi) - np.pi) / np.pi
+    at = 3 + 2 * count
+    for direction in (1.0, -1.0):  # gap (centres) and relative speed; 1 and 0 where there is nobody
+        gap, theirs = np.inf, speed
+        for k in range(len(others)):
+            if 0.0 < direction * others[k, 0] < gap:
+                gap, theirs = direction * others[k, 0], others[k, 1]
+        out[at], out[at + 1] = min(gap, NEAR) / NEAR, (theirs - speed) / FAST
+        at += 2
 
 
 def _met(histories: Sequence[History], road: RoadMap, shared: bool) -> list[list[float]]:

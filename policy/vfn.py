@@ -121,7 +121,8 @@ class VFN(nn.Module):
     ) -> torch.Tensor:
         """maps [B,T,C,H,W], kinematics [B,T,R,F+1], situation [B,.], phi [B,2] -> q [B,5].
 
-        Maps are uint8 pixels, or in [0,1]. Without maps that branch says nothing, and learning costs no convolutions.
+        Maps are uint8 pixels, or in [0,1]. Without them that branch says nothing, and learning costs no
+        convolutions.
         """
         z = self.features(maps, kinematics, situation, phi)
         q: torch.Tensor = self.value(z)

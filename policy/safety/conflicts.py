@@ -63,8 +63,12 @@ def first_contact(ego: Rollout, length: float, width: float, others: Others, c: 
     close = (touch == 0.0).any(0)  # within the margin already: only the cars themselves tell actions apart
     if close.any():
         exact = mine._replace(length=length, width=width)
-        touch[:, close] = first_contacts(exact, Boxes(*(array[close] for array in theirs)), c.dt)
+        touch[:, close] = first_contacts(exact, _only(theirs, close), c.dt)
     return touch
+
+
+def _only(boxes: Boxes, which: Bools) -> Boxes:
+    return Boxes(*(np.asarray(array)[which] for array in boxes))
 
 
 class Neighbours(NamedTuple):

@@ -162,13 +162,13 @@ def evaluate(
                 blamed[a] = scene.vehicles[others.rows[who[a]]]
             elif soonest < np.inf:
                 blamed[a] = scene.vehicles[others.rows[first[a]]]
-    for a in straddling(ego, c):
+    for a in map(int, straddling(ego, c)):
         if 0.9 * c.safe_th < limit[a]:
             limit[a] = 0.9 * c.safe_th
             blamed[a] = blamed[a] or STRADDLING
     if dead_end.any():  # an obstacle at its end
         over = (ego.arc + 0.5 > end[:, None]) & dead_end[:, None]
-        for a in np.flatnonzero(over.any(1)):
+        for a in map(int, np.flatnonzero(over.any(1))):
             if (reached := c.dt * int(np.argmax(over[a]))) < contact[a]:
                 contact[a], blamed[a] = reached, LANE_END
     steps, weight, total = _weights(c)

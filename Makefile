@@ -20,14 +20,16 @@ check: $(VENV)/.installed-dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-# Every table and figure of docs/results/ that is driven; killed? the same goes on. SCALE=0.1: a tenth of the
-# episodes. What lacks trained weights is left out and named; `python -m benchmarks.papers --dry-run` tells
+# Every table and figure of docs/results/: first what is measured (costs, predictions; better on a quiet
+# machine), then what is driven. Killed? the same goes on. SCALE=0.1: a tenth of the episodes. What lacks trained weights is left out and named; `python -m benchmarks.papers --dry-run` tells
 # what is still to be driven, and its CPU hours.
 results: $(VENV)/.installed-dev
+	$(BIN)/python -m benchmarks.measured
 	$(BIN)/python -m benchmarks.papers --scale $(SCALE) --workers $(WORKERS)
 
 # The same in small: one world, two episodes each, two seconds long, untrained networks. Shows that all works.
 results-small: $(VENV)/.installed-dev
+	$(BIN)/python -m benchmarks.measured --small --runs runs/results-small/measured --out runs/results-small/pages
 	$(BIN)/python -m benchmarks.papers --scale 0.001 --scenario merge --duration 2 --untrained \
 	    --workers $(WORKERS) --runs runs/results-small --out runs/results-small/pages
 

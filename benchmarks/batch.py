@@ -14,6 +14,7 @@ missing there is the engine's fault (start and end included), the rest is the ma
 from __future__ import annotations
 
 import argparse
+import json
 import statistics
 import tempfile
 import time
@@ -71,6 +72,7 @@ def main() -> None:
     parser.add_argument("--duration", type=float, default=10.0)
     parser.add_argument("--episodes", type=int, default=50)
     parser.add_argument("--rounds", type=int, default=4)
+    parser.add_argument("--json", action="store_true", help="one document in the end, and nothing else")
     args = parser.parse_args()
     seeds = (200_000, 200_000 + args.episodes)
     spec = Spec(("merge",), seeds, demand=(("dense",),), policy=(args.policy,), duration=args.duration)
@@ -82,6 +84,8 @@ def main() -> None:
             runs[workers].append(measured(plan, workers, progress))
             progress.done()
             last = runs[workers][-1]
+            if args.json:
+                continue
             print(
                 f"round {k + 1}: {workers} workers, {args.episodes} episodes of "
                 f"{statistics.median(last.episodes):.2f} s (median) in {last.wall:.1f} s, "
@@ -91,6 +95,20 @@ def main() -> None:
     one, two = (sum(r.wall for r in runs[n]) for n in (1, 2))
     gain = two / one
     overhead = sum(r.between for r in runs[1]) / sum(sum(r.episodes[1:]) for r in runs[1]) - 1.0
+    if args.json:
+        result = {
+            "episodes": args.rounds * args.episodes,
+            "episode_s": statistics.median(s for r in runs[1] for s in r.episodes),
+            "one_worker_s": one,
+            "two_workers_s": two,
+            "ratio": gain,
+            "target": GAIN,
+            "overhead": overhead,
+            "overhead_target": OVERHEAD,
+            "start_s": statistics.median(r.start for r in runs[1]),
+        }
+        print(json.dumps(result))
+        return
     print(f"{args.rounds * args.episodes} episodes: {one:.0f} s with one worker, {two:.0f} s with two")
     print(f"two workers take {gain:.2f} of the time of one (at most {GAIN})")
     print(f"the engine costs {overhead:.2%} of the serial time (at most {OVERHEAD:.0%})")

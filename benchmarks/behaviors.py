@@ -224,6 +224,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--population", type=int, default=5, help="of differential evolution, per parameter")
     parser.add_argument("--generations", type=int, default=2)
     parser.add_argument("--scale", type=float, default=1.0, help="factor on the report's simulated time")
+    parser.add_argument("--out", type=Path, metavar="FILE.md", help="the page, with new tables (in place)")
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -233,10 +234,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
             return
         tables = report(folder, options.scale)
     print(tables)
-    if options.scale == 1.0:
-        text = RESULTS.read_text(encoding="utf-8")
-        before, rest = text.split(BEGIN, 1)
-        RESULTS.write_text(f"{before}{BEGIN}\n{tables}\n{END}{rest.split(END, 1)[1]}", encoding="utf-8")
+    out = options.out or (RESULTS if options.scale == 1.0 else None)
+    if out is not None:
+        before, rest = RESULTS.read_text(encoding="utf-8").split(BEGIN, 1)
+        out.write_text(f"{before}{BEGIN}\n{tables}\n{END}{rest.split(END, 1)[1]}", encoding="utf-8")
 
 
 if __name__ == "__main__":

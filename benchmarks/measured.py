@@ -1,0 +1,172 @@
+"""The result pages that the papers' episodes do not make: predictions, costs, drivers, rewards, foreign nets.
+
+    python -m benchmarks.measured [--only NAME ...] [--again] [--small]        # part of `make results`
+
+Each page by its own command, one after the other. What is finished is not measured again until its command
+changes (`--again` does): killed, the same goes on. Costs are measured best on a machine with nothing else to
+do. `--small`: as little as possible of everything, to see that it works; its figures are worth nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+RESULTS = Path("docs/results")
+PREDICTED = (  # what `cosim bench predict` leaves of figures
+    *("position_error.png", "map_error.png", "hpn_training.png"),
+    *("data/position_error.csv", "data/interval_coverage.csv", "data/map_error.csv", "data/map_gain.csv"),
+)
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where one run of a page's commands reads and writes."""
+
+    out: Path  # pages and pictures; CSV files below it in data/
+    work: Path  # everything between
+    small: bool
+
+
+@dataclass(frozen=True)
+class Page:
+    """One page (or several made together)."""
+
+    name: str
+    commands: Callable[[Place], list[list[str]]]  # what to run, modules with their flags
+    files: tuple[str, ...]  # what they leave, relative to the results
+    drop: tuple[str, ...] = ()  # patterns of what they leave in work/NAME, to be brought to the results
+
+
+def prediction(place: Place) -> list[list[str]]:
+    """P's figures 5 to 8 and 10: how far off predictors and predicted maps are, on recorded episodes."""
+    flags = ["--seeds", "200000:200001", "--out", str(place.work / "prediction")]
+    if place.small:
+        flags += ["--scenario", "merge", "--demand", "dense", "--behavior", "mixed", "--policy", "idm"]
+    return [["cosim.app.cli", "bench", "predict", *flags]]
+
+
+def prediction_speed(place: Place) -> list[list[str]]:
+    """What predicting four seconds costs."""
+    size = ["--size", "compact", "--threads", "1"] if place.small else ["--threads", "2"]
+    flags = ["--rounds", "1", "--decisions", "1" if place.small else "12"]
+    return [["benchmarks.prediction_maps", *size, *flags, "--out", str(place.out / "prediction_speed.md")]]
+
+
+def agent(place: Place) -> list[list[str]]:
+    """What a decision costs, and how fast training is."""
+    flags = ["--size", "compact", "paper", "--threads", "1", "2", "--decisions", "12", "--episodes", "4"]
+    if place.small:
+        flags = ["--size", "compact", "--threads", "1", "--decisions", "1", "--only", "decision"]
+    return [["benchmarks.agent", *flags, "--out", str(place.out / "agent.md")]]
+
+
+def performance(place: Place) -> list[list[str]]:
+    """What the loop, a batch and the Gaussian process cost."""
+    where = str(place.work / "recordings")
+    traffic = ["--demand", "dense", "--behavior", "mixed"]
+    record = ["cosim.app.cli", "record", *traffic, "--out", where, "--resume"]
+    if place.small:
+        record += ["--scenario", "merge", "--seeds", "100000:100001", "--duration", "8"]
+    else:
+        worlds = ("exit", "merge", "roundabout", "intersection", "highway")
+        record += [word for world in worlds for word in ("--scenario", world)] + ["--seeds", "100000:100004"]
+    flags = ["--recordings", where, "--out", str(place.out / "performance.md")]
+    return [record, ["benchmarks.performance", *flags, *(["--small"] if place.small else [])]]
+
+
+def reward_balance(place: Place) -> list[list[str]]:
+    """Whether yielding pays."""
+    flags = ["--seeds", "150100:150101" if place.small else "150100:150106"]
+    flags += ["--scenario", "merge"] if place.small else []
+    return [["benchmarks.reward_balance", *flags, "--out", str(place.out / "reward_balance.md")]]
+
+
+def behaviors(place: Place) -> list[list[str]]:
+    """How faithfully LC2013 drives Table II."""
+    flags = ["--report", "--scale", "0.002" if place.small else "1"]
+    return [["benchmarks.behaviors", *flags, "--out", str(place.out / "behaviors.md")]]
+
+
+def real_nets(place: Place) -> list[list[str]]:
+    """A scenario of somebody else's."""
+    limit = ["--duration", "4"] if place.small else []
+    return [["benchmarks.real_nets", *limit, "--out", str(place.out / "real_nets.md")]]
+
+
+PAGES = (
+    Page("agent", agent, ("agent.md",)),
+    Page("prediction_speed", prediction_speed, ("prediction_speed.md",)),
+    Page("performance", performance, ("performance.md",)),
+    Page("reward_balance", reward_balance, ("reward_balance.md",)),
+    Page("real_nets", real_nets, ("real_nets.md",)),
+    Page("behaviors", behaviors, ("behaviors.md",)),
+    Page(
+        "prediction",
+        prediction,
+        ("prediction.md", "prediction_maps.md", *PREDICTED),
+        drop=("*.md", "*.png", "*.csv"),
+    ),
+)
+
+
+def make(page: Page, place: Place, *, again: bool = False) -> bool:
+    """Measure one page, unless it is finished; whether it was measured. Raises CalledProcessError."""
+    commands = page.commands(place)
+    mark = place.work / f"{page.name}.json"
+    there = all((place.out / file).is_file() for file in page.files)
+    if there and not again and mark.is_file() and json.loads(mark.read_text()) == commands:
+        return False
+    (place.out / "data").mkdir(parents=True, exist_ok=True)
+    place.work.mkdir(parents=True, exist_ok=True)
+    for words in commands:
+        subprocess.run([sys.executable, "-m", *words], check=True, stdout=subprocess.DEVNULL)
+    made = [file for pattern in page.drop for file in sorted((place.work / page.name).glob(pattern))]
+    for file in made:
+        shutil.copyfile(file, place.out / ("data" if file.suffix == ".csv" else "") / file.name)
+    if missing := [file for file in page.files if not (place.out / file).is_file()]:
+        raise SystemExit(f"error: {page.name}: did not leave {', '.join(missing)}")
+    mark.write_text(json.dumps(commands) + "\n")
+    return True
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.measured",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--only", nargs="+", choices=[page.name for page in PAGES], metavar="NAME")
+    parser.add_argument("--again", action="store_true", help="what is finished, too")
+    parser.add_argument("--small", action="store_true", help="hardly anything of everything")
+    parser.add_argument("--out", type=Path, default=RESULTS, metavar="DIR", help="pages and pictures")
+    parser.add_argument("--runs", type=Path, default=Path("runs/measured"), metavar="DIR")
+    args = parser.parse_args(arguments)
+    place = Place(args.out, args.runs, args.small)
+    pages = [page for page in PAGES if not args.only or page.name in args.only]
+    for number, page in enumerate(pages, 1):
+        began = time.perf_counter()
+        print(f"measured {number}/{len(pages)}: {page.name} ...", file=sys.stderr, flush=True)
+        try:
+            fresh = make(page, place, again=args.again)
+        except subprocess.CalledProcessError as error:
+            words = " ".join(["python", *error.cmd[1:]])
+            raise SystemExit(f"error: {page.name}: `{words}` ended with {error.returncode}") from None
+        except KeyboardInterrupt:
+            print("interrupted: the same command goes on", file=sys.stderr)
+            raise SystemExit(130) from None
+        told = f"{time.perf_counter() - began:.0f} s" if fresh else "finished before (--again measures anew)"
+        print(f"measured {number}/{len(pages)}: {page.name}: {told}", file=sys.stderr, flush=True)
+        print(place.out / page.files[0])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,7 +1,7 @@
 """What the agent costs: one decision for 8 AVs by its parts, simulation apart, and how fast it trains.
 
     python -m benchmarks.agent [--size compact paper] [--threads 1 2] [--decisions 40] [--out FILE.md]
-    python -m benchmarks.agent --only training [--episodes 6]
+    python -m benchmarks.agent --only training [--config paper] [--episodes 1]
 
 Decisions: real histories (highway, dense, tuning seed 100,000, the share of AVs chosen so that 8 decide) are
 gathered first, then prediction, values and prioritizer are timed on them; medians over decisions. Simulation
@@ -124,25 +124,29 @@ def training(config: str, lesson: Lesson, episodes: int) -> dict[str, float]:
         def drive(seed: int) -> Any:
             return actors.submit(Drive(lesson, seed, SVO, 0.5, "", "", True))
 
-        for future in [drive(seed) for seed in range(FILL)]:
+        fill = min(FILL, episodes)
+        for future in [drive(seed) for seed in range(fill)]:
             replay.add(future.result().trajectories)
         if not replay.size:
             raise SystemExit(f"nothing to learn from in {lesson.scenario}, {lesson.demand}: no AV decides")
         rng = np.random.default_rng(0)
         learner.update(replay.sample(rng))
         began, updates = time.perf_counter(), 0
-        waiting = [drive(FILL + seed) for seed in range(episodes)]
+        waiting = [drive(fill + seed) for seed in range(episodes)]
         while not all(future.done() for future in waiting):
             learner.update(replay.sample(rng))
             updates += 1
         elapsed = time.perf_counter() - began
         drove: list[Drove] = [future.result() for future in waiting]
     steps = sum(figure(one, "steps") for one in drove)
+    whole = file.training.iterations * file.training.episodes
     return {
         "joint decisions/s": steps / elapsed,
         "updates/s": updates / elapsed,
         "batch": float(file.training.replay.batch),
         "episodes/h": 3600.0 * episodes / elapsed,
+        "episodes of a whole training": float(whole),
+        "hours of a whole training, at this rate": whole * elapsed / (3600.0 * episodes),
         "simulation and observation, share of the rollout's time": sum(
             figure(one, name) for one in drove for name in ("reset_s", "simulation_s", "observation_s")
         )
@@ -185,9 +189,14 @@ def page(found: Mapping[str, Any], command: str) -> list[str]:
             "",
         ]
         lines += [markdown_row(["", "measured"]), "|---|---|"]
-        lines += [markdown_row([name, f"{value:.3g}"]) for name, value in rates.items()]
+        lines += [markdown_row([name, told_in(value)]) for name, value in rates.items()]
         lines += [""]
     return lines
+
+
+def told_in(value: float) -> str:
+    """Three digits, whole numbers whole."""
+    return f"{value:,.0f}" if value == round(value) or value >= 1000.0 else f"{value:.3g}"
 
 
 def verdict(value: float, limit: float, *, most: bool) -> str:
@@ -204,7 +213,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--decisions", type=int, default=40)
     parser.add_argument("--bf16", action="store_true", help="networks in bfloat16")
     parser.add_argument("--episodes", type=int, default=4, help="whole episodes, of driving and of training")
-    parser.add_argument("--config", default="compact", help="of the training")
+    parser.add_argument("--config", nargs="+", default=["compact"], help="of the training")
     parser.add_argument("--scenario", default="merge", help="of the training")
     parser.add_argument("--demand", default="contested", help="of the training")
     parser.add_argument("--only", choices=("decision", "loop", "training"))
@@ -223,7 +232,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         found["closed loop"] = closed_loop(scenario, args.episodes)
     if args.only in (None, "training"):
         lesson = Lesson(args.scenario, args.demand)
-        found["training"][args.config] = training(args.config, lesson, args.episodes)
+        for config in args.config:
+            episodes = 1 if config == "paper" else args.episodes  # minutes each
+            found["training"][config] = training(config, lesson, episodes)
     if args.json:
         print(json.dumps(found))
         return

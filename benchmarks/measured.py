@@ -62,10 +62,11 @@ def prediction_speed(place: Place) -> list[list[str]]:
 
 def agent(place: Place) -> list[list[str]]:
     """What a decision costs, and how fast training is."""
-    flags = ["--size", "compact", "paper", "--threads", "1", "2", "--decisions", "12", "--episodes", "4"]
+    sizes = ["compact"] if place.small else ["compact", "paper"]
+    flags = ["--size", *sizes, "--threads", "1", "2", "--decisions", "12", "--episodes", "4"]
     if place.small:
-        flags = ["--size", "compact", "--threads", "1", "--decisions", "1", "--only", "decision"]
-    return [["benchmarks.agent", *flags, "--out", str(place.out / "agent.md")]]
+        flags = ["--size", *sizes, "--threads", "1", "--decisions", "1", "--only", "decision"]
+    return [["benchmarks.agent", *flags, "--config", *sizes, "--out", str(place.out / "agent.md")]]
 
 
 def performance(place: Place) -> list[list[str]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
@@ -54,20 +55,58 @@ class Conv3dMaps(nn.Module):
     def forward(self, maps: torch.Tensor) -> torch.Tensor:
         """Fastest with the weights in channels_last_3d."""
         b, t = maps.shape[:2]
+        z = self.frames(maps.flatten(0, 1))
+        return self.stacked(z.view(b, t, *z.shape[1:]))
+
+    def frames(self, maps: torch.Tensor) -> torch.Tensor:
+        """Features of single frames: [n,C,H,W] -> [n,F,h,w], channels last."""
         # a (1,8,8) kernel is a 2D convolution of every frame; on a CPU planes are read faster as they are,
         # but the gradient of their kernel is found faster with channels last
         first = self.per_frame
         inner = torch.channels_last if torch.is_grad_enabled() else torch.contiguous_format
-        frames = unit(maps.flatten(0, 1)).contiguous(memory_format=inner)
         kernel = first.weight[:, :, 0].contiguous(memory_format=inner)
-        z = functional.conv2d(frames, kernel, first.bias, first.stride[1:], first.padding[1:])
-        z = functional.relu_(z).contiguous(memory_format=torch.channels_last)
-        # [B*T,h,w,32] in memory is [B,T,h,w,32]: channels_last_3d without a copy
-        z = z.view(b, t, *z.shape[1:]).transpose(1, 2)  # [B,32,T,h,w]
-        z = z.contiguous(memory_format=torch.channels_last_3d)
+        planes = unit(maps).contiguous(memory_format=inner)
+        z = functional.conv2d(planes, kernel, first.bias, first.stride[1:], first.padding[1:])
+        return functional.relu_(z).contiguous(memory_format=torch.channels_last)
+
+    def stacked(self, frames: torch.Tensor) -> torch.Tensor:
+        """The rest: features of frames [B,T,F,h,w] -> [B,flat]."""
+        # frames in channels last are channels_last_3d in memory: no copy
+        z = frames.transpose(1, 2).contiguous(memory_format=torch.channels_last_3d)  # [B,F,T,h,w]
         z = functional.relu_(self.second(z))
         z = functional.relu_(self.third(z))
         return z.flatten(1)
+
+
+class FrameMemory:
+    """Convolves every frame of the AVs' maps once, to the bit as if all were convolved at every decision.
+
+    A past frame's map is drawn in the ego's frame at its own time: it does not change while it ages, and
+    `fresh` frames later it stands that much further to the front of the `past` ones.
+    """
+
+    def __init__(self, extractor: Conv3dMaps, past: int, fresh: int) -> None:
+        self._extractor, self._past, self._aged = extractor, past, past - fresh
+        self._kept: dict[str, tuple[torch.Tensor, torch.Tensor]] = {}  # AV -> past maps, their features
+
+    def frames(self, names: Sequence[str], maps: torch.Tensor) -> torch.Tensor:
+        """maps [B,T,C,H,W] uint8 of the AVs `names`, the past ones first -> their features [B,T,F,h,w]."""
+        old, n = self._aged, self._past
+        known = {}
+        for b, name in enumerate(names):
+            seen = self._kept.get(name)
+            if seen is not None and torch.equal(seen[0][n - old :], maps[b, :old]):
+                known[b] = seen[1][n - old :]
+        new = torch.ones(maps.shape[:2], dtype=torch.bool)
+        new[list(known), :old] = False
+        made = self._extractor.frames(maps[new])
+        features, height, width = made.shape[1:]
+        z = made.new_empty(*maps.shape[:2], height, width, features).permute(0, 1, 4, 2, 3)  # channels last
+        z[new] = made
+        for b, frames in known.items():
+            z[b, :old] = frames
+        self._kept = {name: (maps[b, :n], z[b, :n]) for b, name in enumerate(names)}
+        return z
 
 
 class Conv2dMaps(nn.Module):

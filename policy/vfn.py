@@ -8,14 +8,14 @@ network with parts left out.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from torch import nn
 from torch.nn import functional
 
 from cosim.types import IS_MISSION, MetaAction
-from policy.extractors import Conv2dMaps, Conv3dMaps, Strides
+from policy.extractors import Conv2dMaps, Conv3dMaps, FrameMemory, Strides
 from policy.situation import SITUATION_INPUTS
 from policy.tensors import KINEMATIC_INPUTS
 
@@ -66,6 +66,12 @@ class Vehicles(nn.Module):
         return torch.cat([each[:, 0], each[:, 1:].amax(1), (each * mission[..., None]).sum(1)], 1)
 
 
+class Frames(NamedTuple):
+    """In place of maps: what the first layer made of each frame (`VFN.memory`)."""
+
+    features: torch.Tensor  # [B,T,F,h,w]
+
+
 class VFN(nn.Module):
     """Q(s, .; w) for the five meta-actions (with `critic`: log-preferences and V(s; w)).
 
@@ -104,20 +110,37 @@ class VFN(nn.Module):
         """The memory format in which its convolutions are fastest."""
         return torch.channels_last if self.config.extractor == "conv2d" else torch.channels_last_3d
 
+    def memory(self, past: int, fresh: int) -> FrameMemory | None:
+        """Makes `Frames` of maps, `fresh` of whose `past` ones are new at each decision; for one episode."""
+        return FrameMemory(self.maps, past, fresh) if isinstance(self.maps, Conv3dMaps) else None
+
     def features(
-        self, maps: torch.Tensor | None, kinematics: torch.Tensor, situation: torch.Tensor, phi: torch.Tensor
+        self,
+        maps: torch.Tensor | Frames | None,
+        kinematics: torch.Tensor,
+        situation: torch.Tensor,
+        phi: torch.Tensor,
     ) -> torch.Tensor:
         """The joined representation [B,joined]; arguments as in `forward`."""
         if maps is None:
             parts = [phi.new_zeros(len(phi), self.config.hidden)]
         else:
-            parts = [functional.relu(self.hidden(self.maps(maps)))]
+            if isinstance(maps, Frames):
+                assert isinstance(self.maps, Conv3dMaps)
+                seen = self.maps.stacked(maps.features)
+            else:
+                seen = self.maps(maps)
+            parts = [functional.relu(self.hidden(seen))]
         if self.kinematics is not None:
             parts += [self.kinematics(kinematics), self.situation(situation)]
         return functional.relu(self.joined(torch.cat([*parts, phi], 1)))
 
     def forward(
-        self, maps: torch.Tensor | None, kinematics: torch.Tensor, situation: torch.Tensor, phi: torch.Tensor
+        self,
+        maps: torch.Tensor | Frames | None,
+        kinematics: torch.Tensor,
+        situation: torch.Tensor,
+        phi: torch.Tensor,
     ) -> torch.Tensor:
         """maps [B,T,C,H,W], kinematics [B,T,R,F+1], situation [B,.], phi [B,2] -> q [B,5].
 

@@ -17,12 +17,14 @@ from cosim.types import (
     Floats32,
     Forecast,
     History,
+    Ints,
     MetaAction,
     PolicyContext,
 )
 from policy.agents.approaches import AgentConfig, compact
 from policy.chain import predict
 from policy.checkpoint import load
+from policy.extractors import FrameMemory
 from policy.forecast import KinematicForecast
 from policy.hpn import HPN
 from policy.predictors import make_predictor
@@ -30,7 +32,7 @@ from policy.safety import prioritize
 from policy.scene import Scene, join
 from policy.tensors import pixels, situation_tensor, svo_tensor, to_batch, to_numpy
 from policy.traffic import Traffic, predict_traffic
-from policy.vfn import VFN
+from policy.vfn import VFN, Frames
 
 UNTRAINED = "untrained"
 RETRY = 2.0  # s, a lane change's time: so long a refused one is not tried again
@@ -88,6 +90,7 @@ class PredictionAware:
         self._context = context
         self._expected: tuple[tuple[str, ...], Traffic, KinematicForecast] | None = None
         self._asked: dict[str, tuple[MetaAction, float]] = {}  # lane changes commanded last, when (s)
+        self._memories: dict[VFN, FrameMemory | None] = {}
         self._predictor = make_predictor(
             self.config.predictor, self.config.chain.horizon, context.timing.frame
         )
@@ -121,12 +124,20 @@ class PredictionAware:
 
     def values(self, inputs: Inputs) -> Floats32:
         """The action values [B,A]."""
-        return self.valued(self.vfn, inputs.maps, inputs.kinematics, inputs.situation, inputs.phi)
+        return self.valued(self.vfn, inputs, np.arange(len(inputs.scene.agents)))
 
-    def valued(self, network: VFN, *seen: torch.Tensor) -> Floats32:
-        """What `network` gives for its inputs [B,.]: [B,A]. Raises FloatingPointError when not finite."""
+    def valued(self, network: VFN, inputs: Inputs, rows: Ints) -> Floats32:
+        """What `network` gives for the AVs `rows`: [k,A]. Raises FloatingPointError when not finite."""
+        part = torch.from_numpy(rows)
+        maps, *rest = (t[part] for t in (inputs.maps, inputs.kinematics, inputs.situation, inputs.phi))
+        timing = self._context.timing
         with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=self.config.bf16):
-            q = to_numpy(network(*seen))
+            if network not in self._memories:
+                fresh = round(timing.decision / timing.frame)
+                self._memories[network] = network.memory(self.observation.frames, fresh)
+            memory = self._memories[network]
+            names = [inputs.scene.agents[b] for b in rows]
+            q = to_numpy(network(maps if memory is None else Frames(memory.frames(names, maps)), *rest))
         if not np.isfinite(q).all():
             raise FloatingPointError("the value network returned values that are not finite")
         return q

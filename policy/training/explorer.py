@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-import torch
 
 from cosim.rewards import RewardTerms
 from cosim.types import IS_MISSION, Bools, Decision, Floats32, History, MetaAction
@@ -97,11 +96,9 @@ class Explorer(PredictionAware):
         """The learner's values for learning AVs, the frozen ones for the others."""
         mine = np.array([av in self.learning for av in inputs.scene.agents])
         q = np.zeros((len(mine), len(MetaAction)), np.float32)
-        seen = (inputs.maps, inputs.kinematics, inputs.situation, inputs.phi)
         for rows, network in ((mine, self.vfn), (~mine, self.frozen)):
             if rows.any():
-                part = torch.from_numpy(np.flatnonzero(rows))
-                q[rows] = self.valued(network, *(t[part] for t in seen))
+                q[rows] = self.valued(network, inputs, np.flatnonzero(rows))
         return q
 
     def pay(self, terms: Mapping[str, RewardTerms], crashed: frozenset[str], present: frozenset[str]) -> None:

@@ -14,7 +14,7 @@ from policy.map_branch import MapBranch, MapBranchConfig
 from policy.situation import FAR, PER_LANE, SITUATION_INPUTS, situation
 from policy.tensors import KINEMATIC_INPUTS, kinematic_tensor, svo_tensor, to_batch
 from policy.vehicle_inputs import NEIGHBOUR_INPUTS, NEIGHBOURS, own_inputs
-from policy.vfn import VFN, VfnConfig
+from policy.vfn import VFN, Frames, VfnConfig
 
 
 def step(config: MapBranchConfig, batch: int = 2) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -253,3 +253,29 @@ def test_the_avs_know_in_which_order_they_reach_the_mission_vehicle() -> None:
     assert known[:, 5] == pytest.approx([0.6] * 3)
     alone = situation([seen[name] for name in order], road, shared=False)[:, -6:]
     assert alone[:, 2].tolist() == [-1.0] * 3, "without V2V nobody knows of the others"
+
+
+def test_frames_remembered_from_the_last_decision_give_the_same_values_to_the_bit() -> None:
+    torch.manual_seed(0)
+    network = VFN(VfnConfig()).eval()
+    torch.nn.init.normal_(network.value.weight)
+    pictures = torch.randint(0, 256, (3, 20, 4, 32, 128), dtype=torch.uint8)  # of three AVs, frame by frame
+    memory, calls = network.memory(10, 2), []
+    assert memory is not None
+    convolve = network.maps.frames
+    network.maps.frames = lambda maps: calls.append(len(maps)) or convolve(maps)
+    # the second AV joins late; after the third decision the first one's past is another (it was away)
+    for number, (names, start) in enumerate([("a", 0), ("ab", 2), ("abc", 4), ("ba", 8)]):
+        rows = ["abc".index(name) for name in names]
+        ahead = torch.randint(0, 256, (len(rows), 4, 4, 32, 128), dtype=torch.uint8)
+        maps = torch.cat([pictures[rows, start : start + 10], ahead], 1)
+        rest = (
+            torch.rand(len(rows), 14, 16, 9),
+            torch.rand(len(rows), SITUATION_INPUTS),
+            torch.rand(len(rows), 2),
+        )
+        with torch.inference_mode():
+            remembered = network(Frames(memory.frames(list(names), maps)), *rest)
+            convolved = calls[-1]
+            assert torch.equal(remembered, network(maps, *rest))
+        assert convolved == (14, 6 + 14, 6 + 6 + 14, 14 + 14)[number]

@@ -33,6 +33,10 @@ from cosim.evaluation.statistics import Figure
 DENSE, CONTESTED = 300, 100  # episodes a world
 TWIN = "vfn-p-egoistic"
 AGENTS = ("vfn-p", "vfn", TWIN, "altruist-rule", "idm", "keep-lane")
+ELSEWHERE = {  # (agent, demand) that this page does without
+    ("keep-lane", "contested"),  # nobody needs to see how hard that traffic is
+    ("vfn", "dense"),  # Table III has it, with more episodes
+}
 BEHAVIOR = {"dense": "mixed", "contested": "moderate"}  # contract.md, Demand and behaviour
 DIFFERENCES = (
     "mission_success_rate",
@@ -54,7 +58,7 @@ Runs = Mapping[str, Mapping[str, Run]]  # demand -> arm -> its episodes
 
 
 def orders() -> list[Order]:
-    """Everybody in every world; in `contested` nobody needs to see how hard the traffic is."""
+    """Everybody in every world and both demands, but for `ELSEWHERE`."""
     return [
         Order(Agent(name), world, demand, behavior, episodes, svo=svo(name))
         for demand, behavior, episodes in (
@@ -63,7 +67,7 @@ def orders() -> list[Order]:
         )
         for world in WORLDS
         for name in AGENTS
-        if demand == "dense" or name != "keep-lane"
+        if (name, demand) not in ELSEWHERE
     ]
 
 

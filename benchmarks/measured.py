@@ -56,7 +56,7 @@ def prediction(place: Place) -> list[list[str]]:
 def prediction_speed(place: Place) -> list[list[str]]:
     """What predicting four seconds costs."""
     size = ["--size", "compact", "--threads", "1"] if place.small else ["--threads", "2"]
-    flags = ["--rounds", "1", "--decisions", "1" if place.small else "12"]
+    flags = ["--rounds", "1", "--decisions", "2" if place.small else "12"]
     return [["benchmarks.prediction_maps", *size, *flags, "--out", str(place.out / "prediction_speed.md")]]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,7 +17,6 @@ from cosim.types import (
     Floats32,
     Forecast,
     History,
-    Ints,
     MetaAction,
     PolicyContext,
 )
@@ -47,6 +46,11 @@ class Inputs(NamedTuple):
     situation: torch.Tensor  # [B,SITUATION_INPUTS]
     phi: torch.Tensor  # [B,2]
     traffic: Traffic
+
+    @property
+    def seen(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+        """What a value network takes."""
+        return self.maps, self.kinematics, self.situation, self.phi
 
 
 class PredictionAware:
@@ -124,20 +128,21 @@ class PredictionAware:
 
     def values(self, inputs: Inputs) -> Floats32:
         """The action values [B,A]."""
-        return self.valued(self.vfn, inputs, np.arange(len(inputs.scene.agents)))
+        return self.valued(self.vfn, inputs.scene.agents, *inputs.seen)
 
-    def valued(self, network: VFN, inputs: Inputs, rows: Ints) -> Floats32:
-        """What `network` gives for the AVs `rows`: [k,A]. Raises FloatingPointError when not finite."""
-        part = torch.from_numpy(rows)
-        maps, *rest = (t[part] for t in (inputs.maps, inputs.kinematics, inputs.situation, inputs.phi))
+    def valued(
+        self, network: VFN, agents: Sequence[str], maps: torch.Tensor, *rest: torch.Tensor
+    ) -> Floats32:
+        """What `network` gives for what these AVs have `seen` [B,.]: [B,A]. Raises FloatingPointError when
+        not finite."""
         timing = self._context.timing
         with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=self.config.bf16):
             if network not in self._memories:
                 fresh = round(timing.decision / timing.frame)
                 self._memories[network] = network.memory(self.observation.frames, fresh)
             memory = self._memories[network]
-            names = [inputs.scene.agents[b] for b in rows]
-            q = to_numpy(network(maps if memory is None else Frames(memory.frames(names, maps)), *rest))
+            frames = maps if memory is None else Frames(memory.frames(agents, maps))
+            q = to_numpy(network(frames, *rest))
         if not np.isfinite(q).all():
             raise FloatingPointError("the value network returned values that are not finite")
         return q

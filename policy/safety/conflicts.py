@@ -10,8 +10,9 @@ from cosim.compiled import compiled
 from cosim.geometry import Boxes, first_contacts
 from cosim.road import RoadMap
 from cosim.types import Bools, Floats, Ints, MetaAction
-from policy.motion import Paths, Rollout, project_each
+from policy.motion import Rollout, project_each
 from policy.safety.config import SafetyConfig
+from policy.safety.maneuver import Ways
 from policy.scene import Scene
 from policy.traffic import Traffic
 
@@ -81,12 +82,10 @@ class Neighbours(NamedTuple):
 
 
 def neighbours(
-    paths: Paths, same: Ints, arc: Floats, heading: float, length: float, others: Others, c: SafetyConfig
+    course: Ways, arc: Floats, heading: float, length: float, others: Others, c: SafetyConfig
 ) -> Neighbours:
-    """The ego: its centre's place on the path of every action, arc [A] m, its heading, rad, and length, m.
-
-    same [A]: the first action that has the same path.
-    """
+    """The ego: its centre's place on the path of every action, arc [A] m, its heading, rad, and length, m."""
+    paths, same = course.paths, course.same
     soon = min(5, others.x.shape[1] - 1)  # 1 s ahead: who drifts in is in
     theirs, offset = project_each(*paths, same, others.x[:, 0], others.y[:, 0])
     _, later = project_each(*paths, same, others.x[:, soon], others.y[:, soon])

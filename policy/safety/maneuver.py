@@ -149,3 +149,11 @@ def straddling(ego: Rollout, c: SafetyConfig) -> Ints:
     if not slow.any():
         return np.zeros(0, np.int64)
     return np.flatnonzero((slow & (np.abs(ego.rear) > c.straddle)).any(1))
+
+
+def at_lane_end(ego: Rollout, course: Ways, c: SafetyConfig) -> dict[int, float]:
+    """When (s) each action reaches the end of its lane, for those that do: an obstacle stands there."""
+    if not course.dead_end.any():
+        return {}
+    over = (ego.arc + 0.5 > course.length[:, None]) & course.dead_end[:, None]
+    return {int(a): c.dt * int(np.argmax(over[a])) for a in np.flatnonzero(over.any(1))}

@@ -23,7 +23,7 @@ from cosim.road import RoadMap
 from cosim.types import Bools, Decision, Floats, Floats32, History, MetaAction
 from policy.motion import Rollout
 from policy.safety.config import SafetyConfig
-from policy.safety.conflicts import first_contact, gap_margin, neighbours, others_near
+from policy.safety.conflicts import Others, first_contact, gap_margin, neighbours, others_near
 from policy.safety.maneuver import (
     ACTIONS,
     KEEPING,
@@ -32,6 +32,9 @@ from policy.safety.maneuver import (
     STRADDLING,
     TOO_SLOW,
     Futures,
+    Way,
+    Ways,
+    at_lane_end,
     packed,
     roll_braked,
     roll_ego,
@@ -134,43 +137,19 @@ def evaluate(
     """
     c, history = config, scene.histories[b]
     me = int(scene.ego[b])
-    now, length, width = scene.state[me, -1], float(traffic.length[me]), float(traffic.width[me])
     ways = ways_of(history, road, int(scene.lane[me]))
-    changes = np.array([way.changes for way in ways])
-    paths, same, dead_end, end = packed(tuple(way.path for way in ways))
-    futures = roll_ego(history, paths, now, c)
+    course = packed(tuple(way.path for way in ways))
+    futures = roll_ego(history, course.paths, scene.state[me, -1], c)
     ego = Rollout(*(array[: len(ACTIONS)] for array in futures.under))
     others = others_near(b, me, scene, traffic, road, c.reach, intended)
-    contact = np.full(len(ACTIONS), np.inf)  # s
-    limit = np.full(len(ACTIONS), np.inf)  # score allowed by the leader and follower limits
-    blamed: list[str | None] = [None] * len(ACTIONS)
-    if len(others.rows):
-        centre = ego.arc[:, 0] - 0.5 * length
-        near = neighbours(paths, same, centre, float(now[3]), length, others, c)
-        times = first_contact(ego, length, width, others, c)  # [A,O] s
-        times[near.behind] = np.inf  # followers brake: checked below for changes
-        held, ahead = times[KEEPING], near.ahead[KEEPING]
-        if c.brake_after < c.frames * c.dt and np.isfinite(held[ahead]).any():
-            braked = roll_braked(history, ways[KEEPING[0]].path, now, ego, KEEPING, c)
-            late = first_contact(braked, length, width, others, c)
-            times[KEEPING] = np.where(ahead, np.maximum(held, late), held)
-        first = times.argmin(1)
-        contact = times[np.arange(len(ACTIONS)), first]
-        limit, who = gap_margin(futures.stopping, float(now[2]), changes, near, others, c)
-        for a, soonest in enumerate(contact):
-            if soonest > c.horizon + c.critical_th and limit[a] < c.safe_th:
-                blamed[a] = scene.vehicles[others.rows[who[a]]]
-            elif soonest < np.inf:
-                blamed[a] = scene.vehicles[others.rows[first[a]]]
+    contact, limit, blamed = _met(history, ways, course, futures.stopping, ego, others, scene, me, c)
     for a in map(int, straddling(ego, c)):
         if 0.9 * c.safe_th < limit[a]:
             limit[a] = 0.9 * c.safe_th
             blamed[a] = blamed[a] or STRADDLING
-    if dead_end.any():  # an obstacle at its end
-        over = (ego.arc + 0.5 > end[:, None]) & dead_end[:, None]
-        for a in map(int, np.flatnonzero(over.any(1))):
-            if (reached := c.dt * int(np.argmax(over[a]))) < contact[a]:
-                contact[a], blamed[a] = reached, LANE_END
+    for a, reached in at_lane_end(ego, course, c).items():
+        if reached < contact[a]:
+            contact[a], blamed[a] = reached, LANE_END
     steps, weight, total = _weights(c)
     remaining = np.clip(contact[:, None] - steps, 0.0, c.cap)  # [A,M]: T - h
     score = np.minimum(remaining @ weight / total, limit)
@@ -183,8 +162,47 @@ def evaluate(
             forbidden = REFUSED
         if forbidden is not None:
             unsafe[a], score[a], blamed[a] = True, -1.0, forbidden
-    blamed = [who if bad else None for who, bad in zip(blamed, unsafe, strict=True)]
-    return Evaluation(np.minimum(contact, c.cap), score, unsafe, tuple(blamed), futures)
+    who = tuple(name if bad else None for name, bad in zip(blamed, unsafe, strict=True))
+    return Evaluation(np.minimum(contact, c.cap), score, unsafe, who, futures)
+
+
+def _met(
+    history: History,
+    ways: list[Way],
+    course: Ways,
+    stopping: Floats,
+    ego: Rollout,
+    others: Others,
+    scene: Scene,
+    me: int,
+    c: SafetyConfig,
+) -> tuple[Floats, Floats, list[str | None]]:
+    """Whom each action meets: first contact [A] s, the score [A] s that leader and follower allow (both inf
+    for nobody), and who it is [A]."""
+    count = len(ACTIONS)
+    if not len(others.rows):
+        return np.full(count, np.inf), np.full(count, np.inf), [None] * count
+    now = scene.state[me, -1]
+    length, width = float(now[4]), float(now[5])
+    near = neighbours(course, ego.arc[:, 0] - 0.5 * length, float(now[3]), length, others, c)
+    times = first_contact(ego, length, width, others, c)  # [A,O] s
+    times[near.behind] = np.inf  # followers brake: a change asks by `gap_margin` whether they must
+    held, ahead = times[KEEPING], near.ahead[KEEPING]
+    if c.brake_after < c.frames * c.dt and np.isfinite(held[ahead]).any():
+        braked = roll_braked(history, ways[KEEPING[0]].path, now, ego, KEEPING, c)
+        late = first_contact(braked, length, width, others, c)
+        times[KEEPING] = np.where(ahead, np.maximum(held, late), held)
+    first = times.argmin(1)
+    contact = times[np.arange(count), first]
+    changes = np.array([way.changes for way in ways])
+    limit, tightest = gap_margin(stopping, float(now[2]), changes, near, others, c)
+    blamed: list[str | None] = [None] * count
+    for a in range(count):
+        if contact[a] > c.horizon + c.critical_th and limit[a] < c.safe_th:
+            blamed[a] = scene.vehicles[others.rows[tightest[a]]]
+        elif contact[a] < np.inf:
+            blamed[a] = scene.vehicles[others.rows[first[a]]]
+    return contact, limit, blamed
 
 
 @cache

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+import torch
 
 from cosim.rewards import RewardTerms
 from cosim.types import IS_MISSION, Bools, Decision, Floats32, History, MetaAction
@@ -98,7 +99,9 @@ class Explorer(PredictionAware):
         q = np.zeros((len(mine), len(MetaAction)), np.float32)
         for rows, network in ((mine, self.vfn), (~mine, self.frozen)):
             if rows.any():
-                q[rows] = self.valued(network, inputs, np.flatnonzero(rows))
+                part = np.flatnonzero(rows)
+                agents = [inputs.scene.agents[b] for b in part]
+                q[rows] = self.valued(network, agents, *(t[torch.from_numpy(part)] for t in inputs.seen))
         return q
 
     def pay(self, terms: Mapping[str, RewardTerms], crashed: frozenset[str], present: frozenset[str]) -> None:

@@ -193,6 +193,7 @@ def main() -> None:
     parser.add_argument("--decisions", type=int, default=75)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--resets", type=int, default=500)
+    parser.add_argument("--highway", type=int, default=60, help="decisions of HighwayEnv")
     parser.add_argument("--profile", action="store_true")
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
@@ -245,7 +246,7 @@ def main() -> None:
         result["resets"] = args.resets
         result["bare_load_ms"] = round(1e3 * statistics.median(worker.call("load_times", args.resets)), 2)
     with Worker(Highway) as worker:
-        simulated, seconds = worker.call("run", 60)
+        simulated, seconds = worker.call("run", args.highway)
     theirs = simulated / seconds
     mine = scenario.timing.decision / (result["compact"]["decision_us"] * 1e-6)
     result["highway_env"] = {

@@ -22,7 +22,7 @@ LOOP = ("--rounds", "11")
 BATCH = ("--episodes", "200", "--rounds", "1")
 PREDICTION = ("--moments", "600")
 SMALL = {
-    "loop": ("--rounds", "1", "--decisions", "5", "--resets", "3"),
+    "loop": ("--rounds", "1", "--decisions", "5", "--resets", "3", "--highway", "3"),
     "batch": ("--episodes", "2", "--rounds", "1", "--duration", "1", "--policy", "idm"),
     "prediction": ("--moments", "10", "--vehicles", "2", "--seconds", "0.1"),
 }

@@ -88,7 +88,7 @@ class FrameMemory:
     """
 
     def __init__(self, extractor: Conv3dMaps, past: int, fresh: int) -> None:
-        self._extractor, self._past, self._aged = extractor, past, past - fresh
+        self._extractor, self._past, self._aged = extractor, past, max(past - fresh, 0)
         self._kept: dict[str, tuple[Bytes, torch.Tensor]] = {}  # AV -> past maps, their features
 
     def frames(self, names: Sequence[str], maps: torch.Tensor) -> torch.Tensor:

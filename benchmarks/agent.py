@@ -183,7 +183,8 @@ def page(found: Mapping[str, Any], command: str) -> list[str]:
         lines += ["Whole episodes in one process, ms a decision (compact, one thread): "]
         lines += [", ".join(f"{name} {value:.1f}" for name, value in parts.items()) + ".", ""]
     for config, rates in found["training"].items():
-        told = verdict(rates["joint decisions/s"], TARGET_RATE, most=False)
+        rate = verdict(rates["joint decisions/s"], TARGET_RATE, most=False)
+        told = rate if config == "compact" else "measured"
         lines += [
             f"Training, `{config}`, a rollout process beside the learner (joint decisions/s: {told}):",
             "",

@@ -21,8 +21,9 @@ check: $(VENV)/.installed-dev
 	$(BIN)/lint-imports
 
 # Every table and figure of docs/results/: first what is measured (costs, predictions; better on a quiet
-# machine), then what is driven. Killed? the same goes on. SCALE=0.1: a tenth of the episodes. What lacks trained weights is left out and named; `python -m benchmarks.papers --dry-run` tells
-# what is still to be driven, and its CPU hours.
+# machine), then what is driven. Killed? the same goes on. SCALE=0.1: a tenth of the episodes. What lacks
+# trained weights is left out and named; `python -m benchmarks.papers --dry-run` tells what is still to be
+# driven, and its CPU hours.
 results: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.measured
 	$(BIN)/python -m benchmarks.papers --scale $(SCALE) --workers $(WORKERS)

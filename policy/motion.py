@@ -205,7 +205,7 @@ def roll_out(
 
 
 @compiled
-def _roll_one(
+def roll_one(
     points: Floats,
     arc: Floats,
     start: Ints,
@@ -218,7 +218,12 @@ def _roll_one(
     brake: float,
     dt: float,
 ) -> Floats:
-    """See `roll_one`; [6,k,T+1]."""
+    """One vehicle on each of k paths, with the speeds [k,T+1] m/s of its row: a `Rollout`'s arrays [6,k,T+1].
+
+    now [8]: KINEMATIC_FEATURES in the world; its front lies about `around` m along every path. Where it
+    stands more than `beside` m off the path the gap closes with `change` m/s (a lane change, new or under
+    way), else with `settle`.
+    """
     count = speed.shape[0]
     begin, offset, rate = np.empty(count), np.empty(count), np.empty(count)
     half = 0.5 * now[4]
@@ -249,26 +254,6 @@ def _roll_one(
         out[5],
     )
     return out
-
-
-def roll_one(
-    paths: Paths,
-    now: Floats,
-    around: float,
-    speed: Floats,
-    beside: float,
-    change: float,
-    settle: float,
-    brake: float,
-    dt: float,
-) -> Rollout:
-    """One vehicle on each of k paths, with the speeds [k,T+1] m/s of its row.
-
-    now [8]: KINEMATIC_FEATURES in the world; its front lies about `around` m along every path. Where it
-    stands more than `beside` m off the path the gap closes with `change` m/s (a lane change, new or under
-    way), else with `settle`.
-    """
-    return Rollout(*_roll_one(*paths, now, around, speed, beside, change, settle, brake, dt))
 
 
 def fronts(state: Floats) -> tuple[Floats, Floats]:

@@ -140,7 +140,8 @@ def roll_braked(
 def _roll(history: History, paths: Paths, now: Floats, speeds: Floats, c: SafetyConfig) -> Rollout:
     """[k,T+1] the ego on each of the k paths with the speeds of its row."""
     change = 2 * c.lane_half / LANE_CHANGE_TIME
-    return roll_one(paths, now, history.route.arc, speeds, BESIDE, change, SETTLE, MAX_DECEL, c.dt)
+    around = history.route.arc
+    return Rollout(*roll_one(*paths, now, around, speeds, BESIDE, change, SETTLE, MAX_DECEL, c.dt))
 
 
 def straddling(ego: Rollout, c: SafetyConfig) -> Ints:

@@ -12,6 +12,7 @@ from cosim.types import Floats32, History, MetaAction, PolicyContext
 from policy.agents.approaches import AgentConfig
 from policy.agents.prediction_aware import Inputs, PredictionAware
 from policy.scene import join
+from policy.tensors import States
 from policy.traffic import predict_traffic
 
 
@@ -40,7 +41,7 @@ class Unled(PredictionAware):
         traffic = predict_traffic(scene, forecast, context.road, c.traffic, c.safety.frames)
         self._expected = scene.vehicles, traffic, forecast
         none = torch.empty(0)
-        return Inputs(scene, none, none, none, none, traffic)
+        return Inputs(scene, States(none, none, none, none), traffic)
 
     def values(self, inputs: Inputs) -> Floats32:
         """All alike, or drawn anew."""

@@ -18,6 +18,15 @@ KINEMATIC_SCALE = np.array([125.0, 16.0, 30.0, np.pi, 10.0, 3.0, 1.0, 1.0], np.f
 KINEMATIC_INPUTS = len(KINEMATIC_FEATURES) + 1  # the features and the mask
 
 
+class States(NamedTuple):
+    """What a value network takes of B AVs; T = N past and M predicted frames."""
+
+    maps: torch.Tensor  # [B,T,C,H,W] uint8 pixels: bytes until a convolution reads them
+    kinematics: torch.Tensor  # [B,T,R,F+1] scaled
+    situation: torch.Tensor  # [B,SITUATION_INPUTS]
+    phi: torch.Tensor  # [B,2]
+
+
 class Batch(NamedTuple):
     """What B AVs see."""
 

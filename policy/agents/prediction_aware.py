@@ -29,7 +29,7 @@ from policy.hpn import HPN
 from policy.predictors import make_predictor
 from policy.safety import prioritize
 from policy.scene import Scene, join
-from policy.tensors import pixels, situation_tensor, svo_tensor, to_batch, to_numpy
+from policy.tensors import States, pixels, situation_tensor, svo_tensor, to_batch, to_numpy
 from policy.traffic import Traffic, predict_traffic
 from policy.vfn import VFN, Frames
 
@@ -38,19 +38,11 @@ RETRY = 2.0  # s, a lane change's time: so long a refused one is not tried again
 
 
 class Inputs(NamedTuple):
-    """What B AVs that decide together know and predict; T = N past and M predicted frames."""
+    """What B AVs that decide together know and predict."""
 
     scene: Scene
-    maps: torch.Tensor  # [B,T,C,H,W] uint8 pixels
-    kinematics: torch.Tensor  # [B,T,R,F+1] scaled
-    situation: torch.Tensor  # [B,SITUATION_INPUTS]
-    phi: torch.Tensor  # [B,2]
+    states: States
     traffic: Traffic
-
-    @property
-    def seen(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-        """What a value network takes."""
-        return self.maps, self.kinematics, self.situation, self.phi
 
 
 class PredictionAware:
@@ -124,25 +116,23 @@ class PredictionAware:
                 kinematics = torch.cat([kinematics, ahead.kinematics], 1)
         self._expected = scene.vehicles, traffic, forecast
         known = situation_tensor(scene.histories, context.road, scene.shared)
-        return Inputs(scene, maps, kinematics, known, svo_tensor(context.svo, len(known)), traffic)
+        return Inputs(scene, States(maps, kinematics, known, svo_tensor(context.svo, len(known))), traffic)
 
     def values(self, inputs: Inputs) -> Floats32:
         """The action values [B,A]."""
-        return self.valued(self.vfn, inputs.scene.agents, *inputs.seen)
+        return self.valued(self.vfn, inputs.scene.agents, inputs.states)
 
-    def valued(
-        self, network: VFN, agents: Sequence[str], maps: torch.Tensor, *rest: torch.Tensor
-    ) -> Floats32:
-        """What `network` gives for what these AVs have `seen` [B,.]: [B,A]. Raises FloatingPointError when
-        not finite."""
+    def valued(self, network: VFN, agents: Sequence[str], states: States) -> Floats32:
+        """What `network` gives for the states of these AVs: [B,A]. Raises FloatingPointError when not
+        finite."""
         timing = self._context.timing
         with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=self.config.bf16):
             if network not in self._memories:
                 fresh = round(timing.decision / timing.frame)
                 self._memories[network] = network.memory(self.observation.frames, fresh)
             memory = self._memories[network]
-            frames = maps if memory is None else Frames(memory.frames(agents, maps))
-            q = to_numpy(network(frames, *rest))
+            maps = states.maps if memory is None else Frames(memory.frames(agents, states.maps))
+            q = to_numpy(network(maps, *states[1:]))
         if not np.isfinite(q).all():
             raise FloatingPointError("the value network returned values that are not finite")
         return q

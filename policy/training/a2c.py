@@ -28,6 +28,7 @@ class A2cConfig:
     critic: float = 0.5  # weight of the value loss
     scale: float = 0.1  # of all rewards, as the DDQN's
     clip: float = 0.5  # largest gradient norm
+    imitation: float = 0.0  # weight of the mentor's advice: the chance of what he thinks right is to be 1
 
 
 class A2cLosses(NamedTuple):
@@ -36,6 +37,7 @@ class A2cLosses(NamedTuple):
     policy: float
     value: float
     entropy: float  # nat
+    imitation: float  # minus the log of the chance of what the mentor thinks right
 
 
 class A2cLearner:
@@ -82,7 +84,7 @@ class A2cLearner:
             out[t] = c.gamma ** np.arange(end - t) @ reward[t:end] + c.gamma ** (end - t) * values[end]
         return out
 
-    def _step(self, places: list[tuple[Trajectory, int]], returns: Floats32) -> tuple[float, float, float]:
+    def _step(self, places: list[tuple[Trajectory, int]], returns: Floats32) -> A2cLosses:
         c, device = self.config, self.device
         phi = np.array([t.phi for t, _ in places], np.float32)
         action = torch.tensor([int(t.action[k]) for t, k in places], device=device)
@@ -93,12 +95,15 @@ class A2cLearner:
         policy = -(advantage * logs.gather(1, action[:, None])[:, 0]).mean()
         worth = (goal - value).square().mean()
         entropy = -(logs.exp() * logs).sum(1).mean()
+        wrong = torch.from_numpy(np.stack([t.wrong[k] for t, k in places])).to(device)
+        imitation = -logs.masked_fill(wrong, -torch.inf).logsumexp(1).mean()  # 0 where he had no opinion
+        loss = policy + c.critic * worth - c.entropy * entropy + c.imitation * imitation
         self.optimizer.zero_grad(set_to_none=True)
-        (policy + c.critic * worth - c.entropy * entropy).backward()  # type: ignore[no-untyped-call]
+        loss.backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(self.online.parameters(), c.clip)
         self.optimizer.step()
         self.updates += 1
-        return float(policy.detach()), float(worth.detach()), float(entropy.detach())
+        return A2cLosses(*(float(x.detach()) for x in (policy, worth, entropy, imitation)))
 
     def tensors(self) -> dict[str, torch.Tensor]:
         """Network and optimiser as named tensors."""

@@ -81,8 +81,8 @@ class Learner:
         return Losses(*(float(x.detach()) for x in (td, unsafe, imitation, chosen.mean())))
 
     def imitate(self, batch: Advised) -> float:
-        """One step towards the mentor alone, without maps; returns how often the choice is one of his."""
-        q = self.online(None, batch.kinematics, batch.situation, batch.phi)
+        """One step towards the mentor alone; returns how often the choice is one of his."""
+        q = self.online(batch.maps, batch.kinematics, batch.situation, batch.phi)
         self._step(self.config.imitation * self._margin(q, batch.possible, batch.wrong))
         choice = q.masked_fill(~batch.possible, -torch.inf).argmax(1, keepdim=True)
         return 1.0 - float(batch.wrong.gather(1, choice).float().mean())

@@ -12,6 +12,7 @@ import numpy.typing as npt
 import torch
 
 from cosim.types import Bools, Bytes, Floats32
+from policy.tensors import States
 
 Ending = Literal["crashed", "left", "cut"]  # cut: the episode ended before the AV's drive did
 ENDINGS: tuple[Ending, ...] = ("crashed", "left", "cut")
@@ -62,18 +63,10 @@ class Trajectory:
         return [self.frames[start : start + self.past], self.ahead[t]]
 
 
-class States(NamedTuple):
-    """A batch of network inputs, as `policy.vfn.VFN` takes them."""
-
-    maps: torch.Tensor  # [B,T,C,H,W] uint8 pixels
-    kinematics: torch.Tensor  # [B,T,R,F+1]
-    situation: torch.Tensor  # [B,.]
-    phi: torch.Tensor  # [B,2]
-
-
 class Advised(NamedTuple):
-    """A batch for learning from the mentor alone, without maps."""
+    """A batch for learning from the mentor alone."""
 
+    maps: torch.Tensor | None  # [B,T,C,H,W] uint8 pixels; None: he is heard without, which is cheap
     kinematics: torch.Tensor  # [B,T,R,F+1]
     situation: torch.Tensor  # [B,.]
     phi: torch.Tensor  # [B,2]
@@ -81,38 +74,42 @@ class Advised(NamedTuple):
     wrong: torch.Tensor  # [B,A] bool, those of them that the mentor would not have taken
 
 
-def advised(chosen: list[tuple[Trajectory, int]], device: str = "cpu") -> Advised:
+def advised(chosen: list[tuple[Trajectory, int]], with_maps: bool, device: str = "cpu") -> Advised:
     """Stack what the mentor said, for the SVO of the drives."""
     phi = np.array([trajectory.phi for trajectory, _ in chosen], np.float32)
-    arrays = (
-        np.stack([trajectory.kinematics[t] for trajectory, t in chosen]).astype(np.float32),
-        np.stack([trajectory.situation[t] for trajectory, t in chosen]),
-        _direction(phi),
+    said = (
         np.stack([~trajectory.unsafe[t] for trajectory, t in chosen]),
         np.stack([trajectory.wrong[t] for trajectory, t in chosen]),
     )
-    return Advised(*(torch.from_numpy(array).to(device) for array in arrays))
-
-
-def _direction(phi: Floats32) -> Floats32:
-    """[B,2] of phi [B] rad, as the network takes it."""
-    return np.stack([np.cos(phi), np.sin(phi)], 1).astype(np.float32)
+    maps = _maps(chosen, device) if with_maps else None
+    return Advised(maps, *_known(chosen, phi, device), *(torch.from_numpy(x).to(device) for x in said))
 
 
 def states(chosen: list[tuple[Trajectory, int]], phi: Floats32, device: str = "cpu") -> States:
     """Stack states (trajectory, t) for the network; phi [B] rad."""
+    return States(_maps(chosen, device), *_known(chosen, phi, device))
+
+
+def _maps(chosen: list[tuple[Trajectory, int]], device: str) -> torch.Tensor:
     first = chosen[0][0]
     past, ahead = first.past, first.ahead.shape[1]
     maps = np.empty((len(chosen), past + ahead, *first.frames.shape[1:]), np.uint8)
     for row, (trajectory, t) in zip(maps, chosen, strict=True):
         row[:past], row[past:] = trajectory.maps(t)
+    return torch.from_numpy(maps).to(device)
+
+
+def _known(
+    chosen: list[tuple[Trajectory, int]], phi: Floats32, device: str
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Kinematics, situation and phi of `States`."""
     kinematics = np.stack([trajectory.kinematics[t] for trajectory, t in chosen]).astype(np.float32)
     situation = np.stack([trajectory.situation[t] for trajectory, t in chosen])
-    return States(
-        torch.from_numpy(maps).to(device),
+    direction = np.stack([np.cos(phi), np.sin(phi)], 1).astype(np.float32)
+    return (
         torch.from_numpy(kinematics).to(device),
         torch.from_numpy(situation).to(device),
-        torch.from_numpy(_direction(phi)).to(device),
+        torch.from_numpy(direction).to(device),
     )
 
 

@@ -12,7 +12,7 @@ from cosim.rewards import RewardTerms
 from cosim.types import IS_MISSION, Bools, Decision, Floats32, History, MetaAction
 from policy.agents.approaches import AgentConfig
 from policy.agents.prediction_aware import Inputs, PredictionAware
-from policy.tensors import to_numpy
+from policy.tensors import States, to_numpy
 from policy.training.experience import Ending, Trajectory
 from policy.training.mentor import AS_GOOD, YIELD, Mentor
 from policy.vfn import VFN
@@ -68,7 +68,7 @@ class Explorer(PredictionAware):
         """
         self._label, self._epsilon, self._rng = label, epsilon, rng
         self._guided, self._learners = guided, self.explore.learners if record else 0
-        self._mentored = guided or (record and not self.explore.sample)
+        self._mentored = guided or record
         self._mentor.reset(self._context)
         self.learning: dict[str, _Tape] = {}
         self._chosen = False
@@ -101,7 +101,8 @@ class Explorer(PredictionAware):
             if rows.any():
                 part = np.flatnonzero(rows)
                 agents = [inputs.scene.agents[b] for b in part]
-                q[rows] = self.valued(network, agents, *(t[torch.from_numpy(part)] for t in inputs.seen))
+                states = States(*(t[torch.from_numpy(part)] for t in inputs.states))
+                q[rows] = self.valued(network, agents, states)
         return q
 
     def pay(self, terms: Mapping[str, RewardTerms], crashed: frozenset[str], present: frozenset[str]) -> None:
@@ -162,9 +163,9 @@ class Explorer(PredictionAware):
             tape.frames.append(history.velocity_map[-stride:].copy())
         else:
             tape.frames.append(history.velocity_map.copy())
-        tape.ahead.append(inputs.maps[b, n:].numpy().copy())
-        tape.kinematics.append(to_numpy(inputs.kinematics[b]).astype(np.float16))
-        tape.situation.append(to_numpy(inputs.situation[b]))
+        tape.ahead.append(inputs.states.maps[b, n:].numpy().copy())
+        tape.kinematics.append(to_numpy(inputs.states.kinematics[b]).astype(np.float16))
+        tape.situation.append(to_numpy(inputs.states.situation[b]))
         assert decision.q is not None
         free = np.zeros(len(MetaAction), np.bool_)  # without a prioritizer nothing is masked
         unsafe = free if decision.unsafe is None else decision.unsafe

@@ -9,7 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from cosim.types import Bools, Floats32, Ints
-from policy.training.experience import Advised, States, Trajectory, advised, states
+from policy.tensors import States
+from policy.training.experience import Advised, Trajectory, advised, states
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,7 +19,7 @@ class ReplayConfig:
 
     capacity: int = 30_000  # decisions; P's 8,000 (Table I) are 20 episodes of 4 learners. 0.1 MB each
     batch: int = 64  # P, Table I
-    advised: int = 64  # states on which the mentor alone speaks, without maps (cheap)
+    advised: int = 64  # states of a batch on which the mentor alone speaks
     n_step: int = 8  # compute.md: one step did not learn altruism; 1 is the papers'
     gamma: float = 0.97  # a decision of 0.4 s; P: 0.95
     # shares of a batch, however rare such moments are (P, Alg. 4: rebalanced):
@@ -74,12 +75,12 @@ class Replay:
         wrong = np.stack([self.trajectories[k].wrong[t] for k, t in picks]) & ~relabelled[:, None]
         return self._batch(picks, np.where(relabelled, fresh, phi), wrong, device)
 
-    def advised(self, rng: np.random.Generator, device: str = "cpu") -> Advised:
+    def advised(self, rng: np.random.Generator, with_maps: bool, device: str = "cpu") -> Advised:
         """`advised` states for the mentor alone to speak on. Raises ValueError while nothing is stored."""
         if not self.size:
             raise ValueError("the replay is empty")
         picks = self._picks(rng, self.config.advised)
-        return advised([(self.trajectories[k], int(t)) for k, t in picks], device)
+        return advised([(self.trajectories[k], int(t)) for k, t in picks], with_maps, device)
 
     def _picks(self, rng: np.random.Generator, count: int) -> Ints:
         """[count,2] places, in the configured parts."""

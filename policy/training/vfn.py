@@ -53,7 +53,7 @@ class VfnTraining:
     updates: int = 40  # an iteration: one every five joint decisions (compute.md: 4 to 8)
     prefill: int = 2_000  # decisions recorded before the first update (Alg. 4), with epsilon 1
     warm_up: int = 0  # steps towards the mentor alone before the first update,
-    warm_up_after: int = 0  # from as many decisions at least, if the network sees kinematics
+    warm_up_after: int = 0  # from as many decisions at least
     epsilon: tuple[float, float] = (1.0, 0.05)  # P, Table I: linear
     epsilon_iterations: int = 200
     guided: tuple[float, float] = (0.5, 0.1)  # share of the episodes that the mentor drives, linear likewise
@@ -174,19 +174,19 @@ class Trainer:
 
     def _learn(self, k: int) -> dict[str, float]:
         c = self.config
-        learner, listens = self.learner, self._listens()
+        learner, listens, maps_alone = self.learner, c.ddqn.imitation > 0.0, not self.vfn.kinematic
         if isinstance(learner, A2cLearner) or self._fills():
             return {}
         rng = generator(c.seed, "replay", str(k))
         if listens and not learner.updates:
             for _ in range(c.warm_up):
-                learner.imitate(self.replay.advised(rng, self.device))
+                learner.imitate(self.replay.advised(rng, maps_alone, self.device))
             learner.follow()
         losses, agrees = [], []
         for _ in range(c.updates):
             losses.append(learner.update(self.replay.sample(rng, self.device)))
-            if listens:
-                agrees.append(learner.imitate(self.replay.advised(rng, self.device)))
+            if listens and not maps_alone:  # else an update hears him at the same price
+                agrees.append(learner.imitate(self.replay.advised(rng, False, self.device)))
         means = _named(Losses._fields, np.array(losses).mean(0))
         return means | ({"agrees": float(np.mean(agrees))} if agrees else {})
 
@@ -222,14 +222,10 @@ class Trainer:
         c = self.config
         return 1.0 if c.learning == "ddqn" and self._fills() else self._faded(c.epsilon, k)
 
-    def _listens(self) -> bool:
-        """Whether the mentor is heard without maps."""
-        return self.config.ddqn.imitation > 0.0 and bool(self.vfn.kinematic)
-
     def _fills(self) -> bool:
         """Whether the replay is still being filled."""
         c = self.config
-        return self.replay.size < (max(c.prefill, c.warm_up_after) if self._listens() else c.prefill)
+        return self.replay.size < (max(c.prefill, c.warm_up_after) if c.ddqn.imitation > 0.0 else c.prefill)
 
     def _guided(self, k: int, j: int) -> bool:
         c = self.config

@@ -214,13 +214,27 @@ def test_the_mentor_is_heard_without_maps_too_and_two_good_actions_are_not_told_
     learner = Learner(replace(TINY, kinematic=8), config, seed=1)
     replay, _ = only(ReplayConfig(advised=16, relabel=1.0), one)
     rng = np.random.default_rng(0)
-    agrees = [learner.imitate(replay.advised(rng)) for _ in range(100)]
+    agrees = [learner.imitate(replay.advised(rng, with_maps=False)) for _ in range(100)]
     assert agrees[-1] == 1.0
-    seen = replay.advised(rng)
+    seen = replay.advised(rng, with_maps=False)
     with torch.no_grad():
         q = learner.online(None, seen.kinematics, seen.situation, seen.phi)[0]
     assert q[[1, 4]].max() > q[[0, 2, 3]].max() + 0.08
     assert learner.updates == 0, "what is learned from rewards alone is counted"
+
+
+def test_a_network_that_sees_maps_alone_hears_the_mentor_on_them() -> None:
+    """He brakes where the map is dark and accelerates where it is bright: all else is alike."""
+    brakes, goes = (np.array([[k != a for k in range(5)]]) for a in (4, 3))
+    dark = trajectory([1], [(0.0, 0.0, 0.0)], situation=[0, 0])
+    bright = replace(dark, frames=np.full_like(dark.frames, 255), wrong=goes)
+    replay = Replay(ReplayConfig(advised=16))
+    replay.add([replace(dark, frames=np.zeros_like(dark.frames), wrong=brakes), bright])
+    learner = Learner(replace(TINY, kinematic=0), DdqnConfig(learning_rate=1e-2), seed=1)
+    rng = np.random.default_rng(0)
+    agrees = [learner.imitate(replay.advised(rng, with_maps=True)) for _ in range(60)]
+    assert agrees[-10:] == [1.0] * 10
+    assert learner.imitate(replay.advised(rng, with_maps=False)) < 0.9, "without them it cannot know"
 
 
 def test_advice_holds_for_the_orientation_of_the_drive_alone() -> None:
@@ -411,6 +425,16 @@ def test_actor_and_critic_learn_which_action_pays() -> None:
         drives = [trajectory([int(a)], [p], ending="crashed") for a, p in zip(actions, pay, strict=True)]
         learner.learn(drives, rng)
     assert chances[MetaAction.ACCELERATE] > 0.9
+
+
+def test_actor_and_critic_hear_the_mentor_where_nothing_else_speaks_for_it() -> None:
+    config = A2cConfig(learning_rate=1e-2, imitation=1.0)
+    learner = A2cLearner(replace(TINY, critic=True), config, seed=0)
+    one = replace(trajectory([1], [(0.0, 0.0, 0.0)]), wrong=BUT_BRAKE)
+    rng = np.random.default_rng(0)
+    losses = [learner.learn([one], rng) for _ in range(40)]
+    assert losses[0].imitation == pytest.approx(np.log(5.0))
+    assert losses[-1].imitation < 0.1, "the chance of braking"
 
 
 def test_another_configuration_is_not_gone_on_with(tmp_path: Path) -> None:

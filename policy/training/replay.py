@@ -19,7 +19,7 @@ class ReplayConfig:
 
     capacity: int = 30_000  # decisions; P's 8,000 (Table I) are 20 episodes of 4 learners. 0.1 MB each
     batch: int = 64  # P, Table I
-    advised: int = 64  # states of a batch on which the mentor alone speaks
+    advised: int = 64  # states on which the mentor alone speaks; with maps `batch`, for they cost as much
     n_step: int = 8  # compute.md: one step did not learn altruism; 1 is the papers'
     gamma: float = 0.97  # a decision of 0.4 s; P: 0.95
     # shares of a batch, however rare such moments are (P, Alg. 4: rebalanced):
@@ -76,10 +76,10 @@ class Replay:
         return self._batch(picks, np.where(relabelled, fresh, phi), wrong, device)
 
     def advised(self, rng: np.random.Generator, with_maps: bool, device: str = "cpu") -> Advised:
-        """`advised` states for the mentor alone to speak on. Raises ValueError while nothing is stored."""
+        """States for the mentor alone to speak on. Raises ValueError while nothing is stored."""
         if not self.size:
             raise ValueError("the replay is empty")
-        picks = self._picks(rng, self.config.advised)
+        picks = self._picks(rng, self.config.batch if with_maps else self.config.advised)
         return advised([(self.trajectories[k], int(t)) for k, t in picks], with_maps, device)
 
     def _picks(self, rng: np.random.Generator, count: int) -> Ints:

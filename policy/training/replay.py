@@ -1,4 +1,4 @@
-"""Replay of whole trajectories: n-step samples, in fixed parts from yielding, interaction and cruising."""
+"""Replay of whole trajectories: n-step samples, in fixed parts from the rare moments and the common ones."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosim.types import Bools, Floats32, Ints
+from cosim.types import Bools, Floats32, Ints, MetaAction
 from policy.tensors import States
 from policy.training.experience import Advised, Trajectory, advised, states
 
@@ -24,6 +24,7 @@ class ReplayConfig:
     gamma: float = 0.97  # a decision of 0.4 s; P: 0.95
     # shares of a batch, however rare such moments are (P, Alg. 4: rebalanced):
     yielding: float = 0.25  # where the mentor would have yielded; one AV in ten does, for some seconds
+    correcting: float = 0.0  # where going on as commanded is wrong in the mentor's eyes
     interaction: float = 0.25  # near a mission vehicle, or vetoed
     relabel: float = 0.5  # share of a batch that is learned for another SVO than it was driven with
     phi: tuple[float, float] = (0.0, 90.0)  # deg, what relabelling draws from; equal bounds: one SVO only
@@ -50,7 +51,7 @@ class Replay:
         self.config = config
         self.trajectories: deque[Trajectory] = deque()
         self.size = 0
-        self._index: list[Ints] | None = None  # [*,2] (trajectory, t): yielding, interacting, cruising
+        self._index: list[Ints] | None = None  # [*,2] (trajectory, t): the rare moments, then the rest
 
     def add(self, trajectories: list[Trajectory]) -> int:
         """Store them; returns how many of the oldest were dropped."""
@@ -85,7 +86,8 @@ class Replay:
     def _picks(self, rng: np.random.Generator, count: int) -> Ints:
         """[count,2] places, in the configured parts."""
         c = self.config
-        shares = (c.yielding, c.interaction, 1.0 - c.yielding - c.interaction)
+        rare = (c.yielding, c.correcting, c.interaction)
+        shares = (*rare, 1.0 - sum(rare))
         groups = [(p, share) for p, share in zip(self._places(), shares, strict=True) if len(p)]
         edges = np.cumsum([0.0] + [share for _, share in groups])
         counts = np.diff(np.round(count * edges / edges[-1]).astype(int)) if edges[-1] else [count]
@@ -128,10 +130,17 @@ class Replay:
             rows = [
                 np.stack([np.full(len(t), k), np.arange(len(t))], 1) for k, t in enumerate(self.trajectories)
             ]
-            every = np.concatenate(rows)
-            yields = np.concatenate([t.yielding for t in self.trajectories])
-            near = np.concatenate([t.interacting for t in self.trajectories])
-            self._index = [every[yields], every[near & ~yields], every[~near & ~yields]]
+            every, rest = np.concatenate(rows), np.ones(self.size, np.bool_)
+            wanted = self.config.correcting > 0.0
+            rare = [
+                (t.yielding, t.wrong[:, MetaAction.IDLE] & wanted, t.interacting) for t in self.trajectories
+            ]
+            self._index = []
+            for kind in zip(*rare, strict=True):
+                mine = np.concatenate(kind) & rest
+                self._index.append(every[mine])
+                rest &= ~mine
+            self._index.append(every[rest])
         return self._index
 
 

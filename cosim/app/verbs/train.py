@@ -20,7 +20,7 @@ def add(verbs: arguments.Verbs) -> None:
     )
     train.add_argument("what", choices=WHAT, help="which network")
     train.add_argument(
-        "--config", default="compact", metavar="FILE", help="compact, paper, smoke, or a YAML file"
+        "--config", default="compact", metavar="FILE", help="compact, maps, paper, smoke, or a YAML file"
     )
     train.add_argument("--policy", metavar="NAME", help="the approach (default: vfn-p; a2c: conv3d-a2c)")
     train.add_argument(

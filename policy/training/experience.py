@@ -91,6 +91,7 @@ def states(chosen: list[tuple[Trajectory, int]], phi: Floats32, device: str = "c
 
 
 def _maps(chosen: list[tuple[Trajectory, int]], device: str) -> torch.Tensor:
+    """[B,T,C,H,W] uint8 pixels, the past frames first."""
     first = chosen[0][0]
     past, ahead = first.past, first.ahead.shape[1]
     maps = np.empty((len(chosen), past + ahead, *first.frames.shape[1:]), np.uint8)
@@ -102,7 +103,7 @@ def _maps(chosen: list[tuple[Trajectory, int]], device: str) -> torch.Tensor:
 def _known(
     chosen: list[tuple[Trajectory, int]], phi: Floats32, device: str
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Kinematics, situation and phi of `States`."""
+    """Kinematics [B,T,R,F+1], situation [B,.] and phi [B,2] of `States`."""
     kinematics = np.stack([trajectory.kinematics[t] for trajectory, t in chosen]).astype(np.float32)
     situation = np.stack([trajectory.situation[t] for trajectory, t in chosen])
     direction = np.stack([np.cos(phi), np.sin(phi)], 1).astype(np.float32)

@@ -116,9 +116,8 @@ def test_rare_moments_have_their_share_of_a_batch() -> None:
     replay.add([replace(trajectory([3], [(0, 0, 0)]), yielding=np.ones(1, np.bool_))])
     actions = replay.sample(np.random.default_rng(0)).action
     assert [(actions == a).sum() for a in (3, 4, 1)] == [25, 50, 25]
-    on_is_wrong = np.array([[True, True, True, True, False]])
     replay = Replay(replace(config, correcting=0.2, interaction=0.3))
-    replay.add([far, near, replace(trajectory([0], [(0, 0, 0)], near=False), wrong=on_is_wrong)])
+    replay.add([far, near, replace(trajectory([0], [(0, 0, 0)], near=False), wrong=BUT_BRAKE)])
     actions = replay.sample(np.random.default_rng(0)).action
     assert [(actions == a).sum() for a in (0, 4, 1)] == [27, 40, 33]
 

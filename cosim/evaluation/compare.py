@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -69,6 +69,25 @@ class Check:
     figures: str = ""  # A, B and the difference, for who sees no table beside it
 
 
+class PairedFigures(Mapping[str, PairedFigure]):
+    """Every measure of a group by name, each bootstrapped when it is first asked for."""
+
+    def __init__(self, known: Mapping[str, Measure], pairs: Sequence[tuple[Row, Row]], seed: int) -> None:
+        self._known, self._pairs, self._seed = known, pairs, seed
+        self._found: dict[str, PairedFigure] = {}
+
+    def __getitem__(self, name: str) -> PairedFigure:
+        if name not in self._found:
+            self._found[name] = paired(self._known[name], self._pairs, self._seed)
+        return self._found[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._known)
+
+    def __len__(self) -> int:
+        return len(self._known)
+
+
 @dataclass(frozen=True)
 class Compared:
     """One group of pairs with its figures."""
@@ -78,9 +97,9 @@ class Compared:
     seed: int  # of the bootstrap
 
     @cached_property
-    def figures(self) -> dict[str, PairedFigure]:
+    def figures(self) -> PairedFigures:
         """Every measure by name."""
-        return {name: paired(measure, self.group.pairs, self.seed) for name, measure in self.known.items()}
+        return PairedFigures(self.known, self.group.pairs, self.seed)
 
     def check(self, threshold: Threshold) -> Check:
         """Hold one threshold against the group."""

@@ -28,9 +28,9 @@ import torch
 
 from benchmarks.prediction_maps import AGENTS, DECISION, PENETRATION, Gatherer
 from benchmarks.tables import markdown_row, write_page
+from cosim.app.configuration import configuration
 from cosim.app.rollouts import Rollouts
 from cosim.app.runner import Runner
-from cosim.app.train_vfn import configuration
 from cosim.memory import keep_freed_memory
 from cosim.scenario import Fleet, Scenario, load
 from cosim.types import EpisodeResult, History, PolicyContext
@@ -115,7 +115,7 @@ def training(config: str, lesson: Lesson, episodes: int) -> dict[str, float]:
 
     Joint decisions are those of all AVs of a world at a time; every one commands each AV on the road.
     """
-    _, file = configuration(config)
+    file = configuration(config).file
     agent = agent_config(POLICY, file)
     learner = Learner(agent.vfn, file.training.ddqn, seed=0)
     replay = Replay(file.training.replay)

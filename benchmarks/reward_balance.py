@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
+from cosim.app.configuration import configuration
 from cosim.app.progress import Progress
 from cosim.app.rollouts import Rollout
-from cosim.app.train_vfn import configuration
 from cosim.evaluation import statistics
 from cosim.rewards import RewardConfig, rewards
 from cosim.seeding import generator
@@ -35,7 +35,7 @@ TRIED = {
     "1/d, mission 60": RewardConfig(mission=60.0),
     "1/d from 30 m on, mission 600": RewardConfig(mission=600.0, nearest=30.0),
     "no decay, 250 m, mission 20": RewardConfig(eta=0.0, mission=20.0, perception_range=250.0),
-    "compact.yaml: no decay, 250 m, social 0.02, mission 150": configuration("compact")[1].reward,
+    "compact.yaml: no decay, 250 m, social 0.02, mission 150": configuration("compact").file.reward,
 }
 
 
@@ -108,7 +108,7 @@ def main() -> None:
     args = parser.parse_args()
     first, last = map(int, args.seeds.split(":"))
     worlds = args.scenario or list(WORLDS)
-    file = configuration("compact")[1]
+    file = configuration("compact").file
     agent = agent_config("vfn-p", file)
     progress, done = Progress("reward balance", "episodes"), 0
     drives: dict[str, dict[bool, list[dict[str, Any]]]] = {w: {False: [], True: []} for w in worlds}

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Any
 
 import yaml
 
@@ -29,11 +28,9 @@ from benchmarks.tables import (
     picture,
     table,
 )
-from cosim.app.train_vfn import configuration
 from cosim.evaluation.figures import RATES, Measure
 from cosim.evaluation.run_folder import Run
 from cosim.evaluation.statistics import Figure
-from cosim.yaml_input import document
 
 BEHAVIORS = ("conservative", "aggressive", "mixed")
 APPROACHES = ("vfn", "vfn-p")  # without and with prediction
@@ -67,14 +64,13 @@ def training() -> list[str]:
 
 def write_configurations(folder: Path) -> None:
     """The compact schedule, on the merge world alone and among one kind of drivers each."""
-    compact, _ = configuration("compact")
     folder.mkdir(parents=True, exist_ok=True)
     for behavior in BEHAVIORS:
-        schedule: dict[str, Any] = document(compact)  # type: ignore[assignment]
-        schedule["training"]["lessons"] = [
+        lessons = [
             {"scenario": WORLD, "demand": demand, "behavior": behavior, "weight": weight}
             for demand, weight in (("contested", CONTESTED), (DEMAND, DENSE))
         ]
+        schedule = {"base": "compact", "training": {"lessons": lessons}}
         (folder / f"{behavior}.yaml").write_text(yaml.safe_dump(schedule, sort_keys=False))
 
 

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from cosim.app import output
+from cosim.app.configuration import configuration
 from cosim.app.prediction_data import MAPLESS, episodes, followed, recorded_by, spread
 from cosim.app.progress import Progress
-from cosim.app.train_vfn import configuration
 from cosim.errors import BadInput
 from cosim.evaluation.engines import LocalEngine
 from cosim.evaluation.tasks import Task
@@ -35,7 +35,7 @@ TRAINING, VALIDATION = range(0, 100_000), range(100_000, 200_000)  # seeds (cont
 
 def train(args: argparse.Namespace) -> int:
     """`cosim train hpn`. Raises BadInput for whatever is wrong before anything is computed."""
-    _, file = configuration(args.config)
+    file = configuration(args.config).file
     name, training = args.variant, file.prediction
     if args.seed is not None:
         training = hpn.seeded(training, args.seed)

@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 import argparse
-import importlib.resources
 import math
-import shutil
 import sys
 from dataclasses import asdict, replace
-from pathlib import Path
 
-import policy
+import yaml
+
 from cosim.app import output
+from cosim.app.configuration import configuration
 from cosim.app.progress import Progress
 from cosim.app.rollouts import Rollouts
-from cosim.dataclass_input import dataclass_from
 from cosim.errors import BadInput
 from cosim.memory import keep_freed_memory
 from cosim.scenario import load
-from cosim.yaml_input import document
 from policy.agents.approaches import APPROACHES
 from policy.checkpoint import sha256
-from policy.training.config import TrainingFile, agent_config
+from policy.training.config import agent_config
 from policy.training.log import tensorboard
 from policy.training.networks import use_threads
 from policy.training.vfn import Lesson, Trainer, VfnTraining
@@ -32,7 +29,7 @@ CONTESTED = 2.0  # contested episodes for every dense one: altruism is learned w
 
 def train(args: argparse.Namespace) -> int:
     """`cosim train vfn|a2c`. Raises BadInput for whatever is wrong before anything is driven."""
-    path, file = configuration(args.config)
+    values, file = configuration(args.config)
     name = args.policy or ("conv3d-a2c" if args.what == "a2c" else "vfn-p")
     agent = agent_config(name, file)
     learning = APPROACHES[name].learning
@@ -44,7 +41,7 @@ def train(args: argparse.Namespace) -> int:
     folder = output.prepare_folder(args.out)
     if not args.resume and (folder / "state.json").exists():
         raise BadInput("holds a training run already: --resume goes on", field="--out", value=args.out)
-    shutil.copyfile(path, folder / "config.yaml")
+    (folder / "config.yaml").write_text(yaml.safe_dump(values, sort_keys=False), encoding="utf-8")
     about = {
         "policy": name,
         "scenarios": sorted({lesson.scenario for lesson in training.lessons}),
@@ -72,13 +69,6 @@ def train(args: argparse.Namespace) -> int:
     print(f"{name}: {trainer.iteration} iterations, {trainer.learner.updates} updates{best}")
     print(f"  {folder / 'best.safetensors'}")
     return 0
-
-
-def configuration(name: str) -> tuple[Path, TrainingFile]:
-    """A shipped configuration by name, or a file. Raises BadInput naming file, field and value."""
-    shipped = Path(str(importlib.resources.files(policy) / "configs" / f"{name}.yaml"))
-    path = shipped if shipped.is_file() else Path(name)
-    return path, dataclass_from(TrainingFile, document(path) or {}, path)
 
 
 def _scheduled(training: VfnTraining, args: argparse.Namespace, name: str) -> VfnTraining:

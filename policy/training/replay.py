@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cosim.errors import BadInput
 from cosim.types import Bools, Floats32, Ints, MetaAction
 from policy.tensors import States
 from policy.training.experience import Advised, Trajectory, advised, states
@@ -28,6 +29,17 @@ class ReplayConfig:
     interaction: float = 0.25  # near a mission vehicle, or vetoed
     relabel: float = 0.5  # share of a batch that is learned for another SVO than it was driven with
     phi: tuple[float, float] = (0.0, 90.0)  # deg, what relabelling draws from; equal bounds: one SVO only
+
+    def __post_init__(self) -> None:
+        """Raises BadInput when the shares leave nothing to share."""
+        if min(self.rare) < 0.0 or sum(self.rare) > 1.0:
+            problem = "must be shares of a batch: none below 0, together at most 1"
+            raise BadInput(problem, field="yielding, correcting, interaction", value=self.rare)
+
+    @property
+    def rare(self) -> tuple[float, float, float]:
+        """The shares of `yielding`, `correcting` and `interaction`."""
+        return self.yielding, self.correcting, self.interaction
 
 
 class Batch(NamedTuple):
@@ -85,8 +97,7 @@ class Replay:
 
     def _picks(self, rng: np.random.Generator, count: int) -> Ints:
         """[count,2] places, in the configured parts."""
-        c = self.config
-        rare = (c.yielding, c.correcting, c.interaction)
+        rare = self.config.rare
         shares = (*rare, 1.0 - sum(rare))
         groups = [(p, share) for p, share in zip(self._places(), shares, strict=True) if len(p)]
         edges = np.cumsum([0.0] + [share for _, share in groups])

@@ -179,10 +179,11 @@ def test_missing_weights_are_said_in_one_line_with_the_command_that_makes_them(
 
 
 def test_the_training_of_figure_9_is_six_configurations_that_can_be_read(tmp_path: Path) -> None:
-    from cosim.app.train_vfn import configuration
+    from cosim.app.configuration import configuration
 
     figure9.write_configurations(tmp_path)
     for behavior in figure9.BEHAVIORS:
         _, file = configuration(str(tmp_path / f"{behavior}.yaml"))
+        assert file.reward == configuration("compact").file.reward
         assert {lesson.behavior for lesson in file.training.lessons} == {behavior}
         assert {lesson.scenario for lesson in file.training.lessons} == {"merge"}

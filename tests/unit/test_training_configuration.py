@@ -1,0 +1,60 @@
+"""Configurations of a training: shipped ones, one's own, and those that change another one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import yaml
+
+from cosim.app.configuration import configuration
+from cosim.errors import BadInput
+from policy.training.config import TrainingFile
+
+
+def written(folder: Path, name: str, text: str) -> str:
+    file = folder / f"{name}.yaml"
+    file.write_text(text)
+    return str(file)
+
+
+@pytest.mark.parametrize("name", ["compact", "maps", "paper", "smoke"])
+def test_what_ships_can_be_read_and_written_whole(name: str, tmp_path: Path) -> None:
+    found = configuration(name)
+    whole = written(tmp_path, "whole", yaml.safe_dump(found.values))
+    assert configuration(whole).file == found.file != TrainingFile()
+
+
+def test_a_file_changes_only_what_it_says_of_its_base(tmp_path: Path) -> None:
+    written(tmp_path, "mine", "base: compact\nexplore: {learners: 7}\ntraining: {replay: {batch: 16}}")
+    found = configuration(
+        written(tmp_path, "again", "base: mine.yaml\ntraining: {iterations: 9, svo: [45]}")
+    ).file
+    compact = configuration("compact").file
+    training = replace(
+        compact.training, iterations=9, svo=(45.0,), replay=replace(compact.training.replay, batch=16)
+    )
+    assert found == replace(compact, explore=replace(compact.explore, learners=7), training=training)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            "base: compacd",
+            "mine.yaml: base='compacd': no such file, and none of that name ships, did you mean 'compact'?",
+        ),
+        ("base: [compact]", "mine.yaml: base=['compact']: the name of a configuration"),
+        ("base: other.yaml", "other.yaml: base='mine.yaml': is its own base"),
+        ("base: broken.yaml", "broken.yaml: training.iteration=3: unknown field"),
+        ("base: compact\ntraining: {replay: {yielding: 0.9}}", "yielding, correcting, interaction"),
+        ("base: compact\ntraining: 3", "mine.yaml: training=3: a mapping is needed"),
+    ],
+)
+def test_a_wrong_base_is_named_with_its_file(tmp_path: Path, text: str, said: str) -> None:
+    written(tmp_path, "other", "base: mine.yaml")
+    written(tmp_path, "broken", "training: {iteration: 3}")
+    with pytest.raises(BadInput) as refused:
+        configuration(written(tmp_path, "mine", text))
+    assert said in str(refused.value)

@@ -11,9 +11,7 @@ import torch
 from cosim.types import Floats32, History, MetaAction, PolicyContext
 from policy.agents.approaches import AgentConfig
 from policy.agents.prediction_aware import Inputs, PredictionAware
-from policy.scene import join
 from policy.tensors import States
-from policy.traffic import predict_traffic
 
 
 class Unled(PredictionAware):
@@ -35,11 +33,7 @@ class Unled(PredictionAware):
 
     def perceive(self, histories: Mapping[str, History]) -> Inputs:
         """What the prioritizer needs."""
-        c, context = self.config, self._context
-        scene = join(histories, context.observation.share_perception)
-        forecast = self._predictor.predict(scene.state, scene.valid)
-        traffic = predict_traffic(scene, forecast, context.road, c.traffic, c.safety.frames)
-        self._expected = scene.vehicles, traffic, forecast
+        scene, traffic, _ = self.foresee(histories)
         none = torch.empty(0)
         return Inputs(scene, States(none, none, none, none), traffic)
 

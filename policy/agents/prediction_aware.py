@@ -101,9 +101,7 @@ class PredictionAware:
     def perceive(self, histories: Mapping[str, History]) -> Inputs:
         """Predict the next seconds: what the value network and the prioritizer work on."""
         c, context = self.config, self._context
-        scene = join(histories, context.observation.share_perception)
-        forecast = self._predictor.predict(scene.state, scene.valid)
-        traffic = predict_traffic(scene, forecast, context.road, c.traffic, c.safety.frames)
+        scene, traffic, forecast = self.foresee(histories)
         with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=c.bf16):
             batch = to_batch(scene.histories)
             maps, kinematics = batch.maps, batch.kinematics
@@ -114,9 +112,17 @@ class PredictionAware:
                 )
                 maps = torch.cat([maps, pixels(ahead.maps)], 1)
                 kinematics = torch.cat([kinematics, ahead.kinematics], 1)
-        self._expected = scene.vehicles, traffic, forecast
         known = situation_tensor(scene.histories, context.road, scene.shared)
         return Inputs(scene, States(maps, kinematics, known, svo_tensor(context.svo, len(known))), traffic)
+
+    def foresee(self, histories: Mapping[str, History]) -> tuple[Scene, Traffic, KinematicForecast]:
+        """What all AVs see together, and where everybody in it will be."""
+        c, context = self.config, self._context
+        scene = join(histories, context.observation.share_perception)
+        forecast = self._predictor.predict(scene.state, scene.valid)
+        traffic = predict_traffic(scene, forecast, context.road, c.traffic, c.safety.frames)
+        self._expected = scene.vehicles, traffic, forecast
+        return scene, traffic, forecast
 
     def values(self, inputs: Inputs) -> Floats32:
         """The action values [B,A]."""

@@ -57,7 +57,7 @@ class Explorer(PredictionAware):
         self.explore = explore
         self.frozen = VFN(config.vfn).eval()
         self.frozen.load_state_dict(self.vfn.state_dict())
-        self._mentor = Mentor()
+        self._mentor = Mentor(knows_command=config.vfn.kinematic > 0)
 
     def episode(
         self, label: str, epsilon: float, rng: np.random.Generator, guided: bool = False, record: bool = True

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from cosim.actions import MAX_DECEL, TIME_CONSTANT, next_target, tracked_speeds
-from cosim.types import Floats32, History, MetaAction, PolicyContext
+from cosim.types import Floats, Floats32, History, MetaAction, PolicyContext
 from policy.agents.altruist_rule import AltruistRule
 from policy.agents.idm import ACCEL, wished_gap
 from policy.meeting import CAR, along
@@ -21,16 +21,19 @@ HARSH = 10.0  # m/s2 of misfit
 AS_GOOD = 1.0  # m/s2 of misfit more than the best action's, with which another is no worse advice
 NEVER = -20.0  # m/s2: he changes lanes only to yield
 LONGITUDINAL = (MetaAction.IDLE, MetaAction.ACCELERATE, MetaAction.DECELERATE)
+FELT = (0.0, 1.4, -2.0)  # m/s2 these stand for in the eyes of who does not know what it is commanded
 
 
 class Mentor:
     """What `AltruistRule` commands where it commands; else the speed limit, or IDM behind a leader.
 
-    An egoist (phi = 0) has a mentor too, who only cruises.
+    An egoist (phi = 0) has a mentor too, who only cruises. A learner that sees maps alone cannot tell an AV
+    that is braking already (Idle will do) from one that is not: its mentor does not look at the command.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, knows_command: bool = True) -> None:
         self._rule = AltruistRule()
+        self._fits = self._by_command if knows_command else self._by_sight
 
     def reset(self, context: PolicyContext) -> None:
         """A new episode."""
@@ -57,11 +60,21 @@ class Mentor:
             ahead, other = min(leaders)
             press = (wished_gap(speed, other, TIME_GAP) / max(ahead - CAR, 0.5)) ** 2
         free = 1.0 - (speed / (limit + EAGER)) ** 4
-        wished = min(max(ACCEL * (free - press), -speed, -MAX_DECEL), limit - speed)
+        fits = np.full(len(MetaAction), NEVER, np.float32)
+        fits[list(LONGITUDINAL)] = self._fits(ACCEL * (free - press), speed, target, limit)
+        return fits
+
+    @staticmethod
+    def _by_command(wished: float, speed: float, target: float, limit: float) -> Floats:
+        """By what each action would make of the commanded speed `target` within AHEAD."""
+        wished = min(max(wished, -speed, -MAX_DECEL), limit - speed)
         sought = np.array([next_target(target, speed, action, limit) for action in LONGITUDINAL])
         got = (tracked_speeds(speed, sought, 1, AHEAD)[:, 1] - speed) / AHEAD
         onset = np.maximum((sought - speed) / TIME_CONSTANT, -MAX_DECEL)
         harsh = (onset < -HARD) & (onset < wished)
-        fits = np.full(len(MetaAction), NEVER, np.float32)
-        fits[list(LONGITUDINAL)] = -np.abs(got - wished) - HARSH * harsh
-        return fits
+        return np.asarray(-np.abs(got - wished) - HARSH * harsh)
+
+    @staticmethod
+    def _by_sight(wished: float, *_: float) -> Floats:
+        """Faster, slower or neither, whatever is commanded."""
+        return np.asarray(-np.abs(np.array(FELT) - wished))

@@ -11,7 +11,7 @@ from torch import nn
 from torch.nn import functional
 
 from cosim.types import Bytes
-from policy.tensors import unit
+from policy.tensors import APART, apart, unit
 
 Strides = Literal["literal", "temporal"]
 
@@ -34,10 +34,12 @@ class Conv3dMaps(nn.Module):
         width: int,
         features: tuple[int, int, int],
         strides: Strides,
+        split: bool = False,  # pixels read by `policy.tensors.apart`
     ) -> None:
         super().__init__()
+        self.read = apart if split else unit
         shape: tuple[int, ...] = (frames, height, width)
-        widths = (channels, *features)
+        widths = (APART if split else channels, *features)
         layers: list[nn.Conv3d] = []
         for k, (stride, wanted) in enumerate(zip(STRIDES[strides], KERNELS, strict=True)):
             if strides == "temporal":
@@ -67,7 +69,7 @@ class Conv3dMaps(nn.Module):
         first = self.per_frame
         inner = torch.channels_last if torch.is_grad_enabled() else torch.contiguous_format
         kernel = first.weight[:, :, 0].contiguous(memory_format=inner)
-        planes = unit(maps).contiguous(memory_format=inner)
+        planes = self.read(maps).contiguous(memory_format=inner)
         z = functional.conv2d(planes, kernel, first.bias, first.stride[1:], first.padding[1:])
         return functional.relu_(z).contiguous(memory_format=torch.channels_last)
 
@@ -119,10 +121,17 @@ class Conv2dMaps(nn.Module):
     """The frames as channels of one picture: the same kernels without time (contract.md, conv2d-dqn)."""
 
     def __init__(
-        self, frames: int, channels: int, height: int, width: int, features: tuple[int, int, int]
+        self,
+        frames: int,
+        channels: int,
+        height: int,
+        width: int,
+        features: tuple[int, int, int],
+        split: bool = False,  # pixels read by `policy.tensors.apart`
     ) -> None:
         super().__init__()
-        widths, size = (frames * channels, *features), (height, width)
+        self.read = apart if split else unit
+        widths, size = (frames * (APART if split else channels), *features), (height, width)
         layers: list[nn.Module] = []
         for k, (kernel, stride) in enumerate(((8, 4), (4, 2), (3, 2))):
             layers += [nn.Conv2d(widths[k], widths[k + 1], kernel, stride, (kernel - 1) // 2), nn.ReLU()]
@@ -132,5 +141,8 @@ class Conv2dMaps(nn.Module):
 
     def forward(self, maps: torch.Tensor) -> torch.Tensor:
         """[B,T,C,H,W] -> [B,flat]."""
-        out: torch.Tensor = self.layers(unit(maps.flatten(1, 2))).flatten(1)
+        b, t = maps.shape[:2]
+        seen = self.read(maps.flatten(0, 1))
+        picture = seen.view(b, t * seen.shape[1], *seen.shape[2:])
+        out: torch.Tensor = self.layers(picture).flatten(1)
         return out

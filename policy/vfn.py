@@ -34,7 +34,7 @@ class VfnConfig:
     features: tuple[int, int, int] = (16, 32, 32)  # T, Table 1: 32, 64, 64
     hidden: int = 256  # T, Table 1: 512
     joined: int = 256  # T, Table 1
-    kinematic: int = 64  # features of a vehicle; 0: maps and phi are all the network sees
+    kinematic: int = 64  # features of a vehicle; 0: maps and phi are all the network sees, read by `apart`
     situation: int = 64  # width of the branch of what the ego knows besides; goes with `kinematic`
     extractor: Literal["conv3d", "conv2d"] = "conv3d"
     dueling: bool = True  # q = state value + advantage: how good the moment is drowns what an action changes
@@ -81,10 +81,12 @@ class VFN(nn.Module):
     def __init__(self, config: VfnConfig) -> None:
         super().__init__()
         self.config = c = config
+        maps_alone = c.kinematic == 0  # then what kinematics would tell must be found in pixels
+        shape = c.frames, c.channels, c.height, c.width
         if c.extractor == "conv2d":
-            self.maps: nn.Module = Conv2dMaps(c.frames, c.channels, c.height, c.width, c.features)
+            self.maps: nn.Module = Conv2dMaps(*shape, c.features, maps_alone)
         else:
-            self.maps = Conv3dMaps(c.frames, c.channels, c.height, c.width, c.features, c.strides)
+            self.maps = Conv3dMaps(*shape, c.features, c.strides, maps_alone)
         self.hidden = nn.Linear(int(self.maps.flat), c.hidden)
         self.kinematics = None
         if c.kinematic:

@@ -12,7 +12,7 @@ from policy.hpn import HPN, HpnConfig
 from policy.kinematic_branch import KinematicBranch, KinematicConfig, correct, sureness
 from policy.map_branch import MapBranch, MapBranchConfig
 from policy.situation import FAR, PER_LANE, SITUATION_INPUTS, situation
-from policy.tensors import KINEMATIC_INPUTS, kinematic_tensor, svo_tensor, to_batch
+from policy.tensors import KINEMATIC_INPUTS, apart, kinematic_tensor, svo_tensor, to_batch
 from policy.vehicle_inputs import NEIGHBOUR_INPUTS, NEIGHBOURS, own_inputs
 from policy.vfn import VFN, Frames, VfnConfig
 
@@ -279,3 +279,19 @@ def test_frames_remembered_from_the_last_decision_give_the_same_values_to_the_bi
             convolved = calls[-1]
             assert torch.equal(remembered, network(maps, *rest))
         assert convolved == (14, 6 + 14, 6 + 6 + 14, 14 + 14)[number]
+
+
+def test_maps_read_apart_say_who_is_where_and_how_fast() -> None:
+    def pixel(relative_speed: float) -> int:
+        return int(255 * (0.1 + 0.9 * (relative_speed + 30.0) / 60.0) + 0.5)
+
+    maps = torch.zeros(1, 4, 8, 8, dtype=torch.uint8)
+    maps[0, 2] = 255
+    maps[0, 0, 2, 1], maps[0, 1, 3, 5], maps[0, 3, 3, 5], maps[0, 3, 4, 4] = (
+        pixel(5.0), pixel(-10.0), pixel(-10.0), pixel(0.0)
+    )  # fmt: skip
+    *present, speed = apart(maps)[0]
+    assert torch.equal(torch.stack(present), (maps[0] > 0).to(torch.float32))
+    assert float(speed[2, 1]) == pytest.approx(5.0 / 15.0, abs=0.01)
+    assert float(speed[3, 5]) == pytest.approx(-10.0 / 15.0, abs=0.01)
+    assert int(speed.count_nonzero()) == 2

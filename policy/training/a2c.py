@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from cosim.types import Floats32
-from policy.training.experience import Trajectory, states
+from policy.training.experience import Advised, Trajectory, states
 from policy.training.networks import adam_tensors, restore_adam, seeded
 from policy.vfn import VFN, VfnConfig
 
@@ -49,6 +49,19 @@ class A2cLearner:
         self.online.to(device=device, memory_format=self.online.layout)  # type: ignore[call-overload]
         self.optimizer = torch.optim.Adam(self.online.parameters(), lr=config.learning_rate)
         self.updates = 0
+
+    @property
+    def listens(self) -> bool:
+        """Whether the mentor is heard."""
+        return self.config.imitation > 0.0
+
+    def imitate(self, batch: Advised) -> float:
+        """One step towards the mentor alone; returns the mean chance of what he thinks right."""
+        assert batch.maps is not None  # this network has nothing else
+        preference, _ = self.online.actor_critic(batch.maps, batch.kinematics, batch.situation, batch.phi)
+        loss = _unheard(preference.log_softmax(1), batch.wrong)
+        self._descend(loss)
+        return float((-loss.detach()).exp())
 
     def learn(self, drives: Sequence[Trajectory], rng: np.random.Generator) -> A2cLosses | None:
         """One pass over the decisions of `drives`, which were driven with the present weights, in random
@@ -96,14 +109,16 @@ class A2cLearner:
         worth = (goal - value).square().mean()
         entropy = -(logs.exp() * logs).sum(1).mean()
         wrong = torch.from_numpy(np.stack([t.wrong[k] for t, k in places])).to(device)
-        imitation = -logs.masked_fill(wrong, -torch.inf).logsumexp(1).mean()  # 0 where he had no opinion
-        loss = policy + c.critic * worth - c.entropy * entropy + c.imitation * imitation
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
-        nn.utils.clip_grad_norm_(self.online.parameters(), c.clip)
-        self.optimizer.step()
+        imitation = _unheard(logs, wrong)
+        self._descend(policy + c.critic * worth - c.entropy * entropy + c.imitation * imitation)
         self.updates += 1
         return A2cLosses(*(float(x.detach()) for x in (policy, worth, entropy, imitation)))
+
+    def _descend(self, loss: torch.Tensor) -> None:
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(self.online.parameters(), self.config.clip)
+        self.optimizer.step()
 
     def tensors(self) -> dict[str, torch.Tensor]:
         """Network and optimiser as named tensors."""
@@ -113,6 +128,11 @@ class A2cLearner:
         """Go on from what `tensors` gave after `updates` updates."""
         restore_adam(tensors, {"online": self.online}, self.optimizer)
         self.updates = updates
+
+
+def _unheard(logs: torch.Tensor, wrong: torch.Tensor) -> torch.Tensor:
+    """Minus the log of the chance of what the mentor thinks right, mean; 0 where he had no opinion."""
+    return -logs.masked_fill(wrong, -torch.inf).logsumexp(1).mean()
 
 
 def _batches(order: np.ndarray, size: int) -> Iterator[np.ndarray]:

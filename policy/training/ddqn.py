@@ -52,6 +52,11 @@ class Learner:
         self.optimizer = torch.optim.Adam(self.online.parameters(), lr=config.learning_rate)
         self.updates = 0
 
+    @property
+    def listens(self) -> bool:
+        """Whether the mentor is heard."""
+        return self.config.imitation > 0.0
+
     def update(self, batch: Batch) -> Losses:
         """One step of double Q-learning (P, equations 2 and 3) with masked targets."""
         c, device = self.config, self.device

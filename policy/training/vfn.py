@@ -146,14 +146,16 @@ class Trainer:
             judged = []
             if (k % c.validate_every == 0 and k > 0) or k + 1 == c.iterations:
                 judged = [self._actors.submit(d) for d in self._validation(weights)]
-            losses = self._learn(k)
+            fills, losses = self._fills(), self._learn(k)
             drove = [f.result() for f in driving]
-            if isinstance(self.learner, A2cLearner):
+            if isinstance(self.learner, A2cLearner) and not fills:
                 fresh = [t for one in drove for t in one.trajectories]
                 learned = self.learner.learn(fresh, generator(c.seed, "order", str(k)))
                 losses = {} if learned is None else _named(learned._fields, learned)
             else:
                 self._keep(k, drove)
+                if isinstance(self.learner, A2cLearner) and not self._fills():
+                    self._warm_up(generator(c.seed, "replay", str(k)))
             record = {
                 "iteration": k,
                 "updates": self.learner.updates,
@@ -173,22 +175,26 @@ class Trainer:
                 progress(self.iteration, c.iterations)
 
     def _learn(self, k: int) -> dict[str, float]:
-        c = self.config
-        learner, listens, maps_alone = self.learner, c.ddqn.imitation > 0.0, not self.vfn.kinematic
+        """The updates that do not wait for this iteration's drives."""
+        c, learner = self.config, self.learner
         if isinstance(learner, A2cLearner) or self._fills():
             return {}
         rng = generator(c.seed, "replay", str(k))
-        if listens and not learner.updates:
-            for _ in range(c.warm_up):
-                learner.imitate(self.replay.advised(rng, maps_alone, self.device))
+        if not learner.updates:
+            self._warm_up(rng)
             learner.follow()
         losses, agrees = [], []
         for _ in range(c.updates):
             losses.append(learner.update(self.replay.sample(rng, self.device)))
-            if listens and not maps_alone:  # else an update hears him at the same price
+            if learner.listens and self.vfn.kinematic:  # else an update hears him at the same price
                 agrees.append(learner.imitate(self.replay.advised(rng, False, self.device)))
         means = _named(Losses._fields, np.array(losses).mean(0))
         return means | ({"agrees": float(np.mean(agrees))} if agrees else {})
+
+    def _warm_up(self, rng: np.random.Generator) -> None:
+        """Steps towards the mentor alone, on what the replay holds; with maps for who sees nothing else."""
+        for _ in range(self.config.warm_up if self.learner.listens else 0):
+            self.learner.imitate(self.replay.advised(rng, not self.vfn.kinematic, self.device))
 
     def _drives(self, k: int, weights: str, frozen: str) -> list[Drive]:
         c = self.config
@@ -224,13 +230,15 @@ class Trainer:
 
     def _fills(self) -> bool:
         """Whether the replay is still being filled."""
-        c = self.config
-        return self.replay.size < (max(c.prefill, c.warm_up_after) if c.ddqn.imitation > 0.0 else c.prefill)
+        c, listens = self.config, self.learner.listens
+        prefill = c.prefill if listens or c.learning == "ddqn" else 0
+        return self.replay.size < (max(prefill, c.warm_up_after) if listens else prefill)
 
     def _guided(self, k: int, j: int) -> bool:
         c = self.config
-        luck = uniform(c.seed, "guided", str(k), str(j))
-        return c.learning == "ddqn" and luck < self._faded(c.guided, k)
+        if c.learning == "a2c":  # it learns by its own drives alone, once it has heard what he does in his
+            return self._fills()
+        return uniform(c.seed, "guided", str(k), str(j)) < self._faded(c.guided, k)
 
     def _faded(self, ends: tuple[float, float], k: int) -> float:
         first, last = ends

@@ -395,8 +395,12 @@ def test_a_killed_run_goes_on_exactly(tmp_path: Path) -> None:
     )  # 8 drives of 12 fit in 100; what left the replay is deleted
 
 
-def test_a_killed_a2c_run_goes_on_exactly_too(tmp_path: Path) -> None:
-    config, critic = replace(SHORT, learning="a2c", iterations=5), replace(TINY, critic=True, kinematic=0)
+@pytest.mark.parametrize("imitation", [0.0, 1.0])
+def test_a_killed_a2c_run_goes_on_exactly_too(imitation: float, tmp_path: Path) -> None:
+    """With a mentor the first two iterations' drives are his: they are kept, and learned from once."""
+    a2c = A2cConfig(imitation=imitation)
+    config = replace(SHORT, learning="a2c", iterations=6, warm_up=2, a2c=a2c)
+    critic = replace(TINY, critic=True, kinematic=0)
     Trainer(config, critic, Pretend(), tmp_path / "whole").run()
     killed = Trainer(config, critic, Pretend(), tmp_path / "killed")
 
@@ -410,7 +414,30 @@ def test_a_killed_a2c_run_goes_on_exactly_too(tmp_path: Path) -> None:
     assert again.resume()
     again.run()
     assert losses(tmp_path / "killed") == losses(tmp_path / "whole")
-    assert losses(tmp_path / "whole")[0]["loss/entropy"] == pytest.approx(np.log(5.0), abs=0.05)
+    learned = [line for line in losses(tmp_path / "whole") if "loss/entropy" in line]
+    assert [line["iteration"] for line in learned] == list(range(2 if imitation else 0, 6))
+    assert learned[0]["replay"] == (48 if imitation else 0)
+    assert learned[0]["loss/entropy"] == pytest.approx(np.log(5.0), abs=0.05)
+
+
+def test_while_a2c_listens_the_mentor_drives_and_afterwards_it_drives_alone(tmp_path: Path) -> None:
+    a2c = A2cConfig(learning_rate=1e-2, imitation=1.0)
+    config = replace(SHORT, learning="a2c", iterations=5, warm_up=60, a2c=a2c)
+    driven: list[Drive] = []
+
+    class Braking(Pretend):
+        def submit(self, drive: Drive) -> Future[Drove]:
+            driven.append(drive)
+            drove = super().submit(drive).result()
+            told = [replace(t, wrong=np.repeat(BUT_BRAKE, len(t), 0)) for t in drove.trajectories]
+            future: Future[Drove] = Future()
+            future.set_result(drove._replace(trajectories=told))
+            return future
+
+    Trainer(config, replace(TINY, critic=True, kinematic=0), Braking(), tmp_path).run()
+    assert [d.guided for d in driven if d.record] == [True] * 4 + [False] * 6
+    heard = [line["loss/imitation"] for line in losses(tmp_path) if "loss/imitation" in line]
+    assert heard[0] < 0.2, "he was heard before the first drive of its own"
 
 
 def test_actor_and_critic_learn_which_action_pays() -> None:

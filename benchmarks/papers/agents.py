@@ -53,8 +53,10 @@ class Agent:
         """What makes its weights."""
         if self.made_by:
             return self.made_by
-        what = "a2c" if APPROACHES[self.base].learning == "a2c" else "vfn"
-        return f"cosim train {what} --policy {self.base} --scenario all --out runs/{self.base}"
+        approach, name = APPROACHES[self.base], self.base
+        what = "a2c" if approach.learning == "a2c" else "vfn"
+        schedule = "" if approach.kinematics else " --config maps"
+        return f"cosim train {what} --policy {name}{schedule} --scenario all --out runs/{name}"
 
 
 def config(agent: Agent, untrained: bool = False) -> AgentConfig:

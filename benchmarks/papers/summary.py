@@ -240,10 +240,15 @@ def altruism(out: Path) -> str:
 def samples(out: Path) -> str:
     """T, figure 8: how many episodes of each kind."""
     lines = Lines(out, "t_figure8")
-    return _parts(
-        (kind, lines.get(kind, "vfn-p", scenario="merge"), 100.0, 0, " %")
-        for kind in (SLOWS, YIELDS, OVERTAKES)
-    )
+    told = []
+    for arm, demand in (("vfn-p", T_TRAFFIC), ("altruist-rule", "dense, mixed")):
+        kinds = _parts(
+            (kind, lines.get(kind, arm, scenario="merge", demand=demand), 100.0, 0, " %")
+            for kind in (SLOWS, YIELDS, OVERTAKES)
+        )
+        if kinds != NOT_RUN:
+            told.append(f"{arm}, {demand.split(',')[0]}: {kinds}")
+    return "; ".join(told) or NOT_RUN
 
 
 def payment(out: Path) -> str:

@@ -49,39 +49,43 @@ from cosim.evaluation.tasks import OK, Task
 EPISODES = 100
 FOLDER = "guide"  # in settings.runs
 AGENTS = ("vfn-p", "altruist-rule")  # the learned altruist, and what a scripted one does
+TRAFFIC = (("contested", "moderate"), ("dense", "mixed"))  # demand and HVs; T's is the first
 WANTED = (SLOWS, YIELDS, OVERTAKES)  # T's three samples, from left to right
 Watched = Mapping[str, Any]  # `GuideWatcher.run`, and the seed
 
 
 def orders() -> list[Order]:
-    """The contested merge."""
-    return [Order(Agent(name), "merge", "contested", "moderate", EPISODES, SVO) for name in AGENTS]
+    """The merge: contested, where nobody can pass to the left, and dense, where somebody may."""
+    return [Order(Agent(name), "merge", *traffic, EPISODES, SVO) for traffic in TRAFFIC for name in AGENTS]
 
 
 def write(results: Results, settings: Settings) -> None:
     """t_figure8.md, pictures of every sample, data/t_figure8.csv; watches what was not watched yet."""
-    traffic = "World `merge`, demand `contested`, HVs moderate, phi 45 degrees."
     page = [
-        *heading(JOB, results, settings, traffic),
+        *heading(JOB, results, settings, "World `merge`, phi 45 degrees."),
         "The guide AV is the one nearest to the merging vehicle when it merges, of those that perceive it",
         f"and drove in the lane it merges into within the {BEFORE:g} s before. It made room if it lost",
         f"{SLOWER:g} m/s or more in that time, or moved to the left. Every picture is 200 m wide.",
+        f'"{OTHER}": it merged, and nobody had to make room.',
         "",
     ]
     lines: list[Line] = []
-    found = watch([one for one in results.driven if one.rows], settings)
-    if found:
-        page += _counted(found, lines)
-    for name, episodes in found.items():
+    watched = watch([one for one in results.driven if one.rows], settings)
+    for traffic in TRAFFIC:
+        here = {one.name: seen for one, seen in watched if (one.order.demand, one.order.behavior) == traffic}
+        if here:
+            page += _counted(", ".join(traffic), here, lines)
+    for name in dict.fromkeys(one.name for one, _ in watched):
+        mine = [(one.order, episode) for one, seen in watched if one.name == name for episode in seen]
         for kind in WANTED:
-            mine = [e for e in episodes if e["guided"]["kind"] == kind]
             page += [f"## {name}: {kind}", ""]
-            page += _sample(name, kind, mine[0], settings) if mine else [f"None of {len(episodes)} episodes."]
+            first = next((found for found in mine if found[1]["guided"]["kind"] == kind), None)
+            page += _sample(name, kind, *first, settings) if first else [f"None of {len(mine)} episodes."]
             page += [""]
     save(JOB, settings, page, lines)
 
 
-def watch(driven: Sequence[Driven], settings: Settings) -> dict[str, list[Watched]]:
+def watch(driven: Sequence[Driven], settings: Settings) -> list[tuple[Driven, list[Watched]]]:
     """Every episode that came through once more, watched: a small file each, in settings.runs/guide.
 
     Raises CosimError when one is not the same again.
@@ -97,7 +101,7 @@ def watch(driven: Sequence[Driven], settings: Settings) -> dict[str, list[Watche
         ]
         engine = LocalEngine(GuideWatcher, (work.agents, settings.untrained), workers=settings.workers)
         _drive(todo, folder, engine, hashes)
-        return {one.name: _kept(folder, one) for one in driven}
+        return [(one, _kept(folder, one)) for one in driven]
 
 
 def _kept(folder: Path, one: Driven) -> list[Watched]:
@@ -106,10 +110,10 @@ def _kept(folder: Path, one: Driven) -> list[Watched]:
     return [json.loads(file.read_text()) for file in files if file.exists()]
 
 
-def _counted(found: Mapping[str, list[Watched]], lines: list[Line]) -> list[str]:
+def _counted(traffic: str, found: Mapping[str, list[Watched]], lines: list[Line]) -> list[str]:
     """How many episodes of each kind; rates with their intervals into `lines`."""
     heads = ["", *KINDS, "did not merge", "episodes"]
-    page = [markdown_row(heads), "|---" * len(heads) + "|"]
+    page = [f"## {traffic}", "", markdown_row(heads), "|---" * len(heads) + "|"]
     for name, episodes in found.items():
         cells = []
         merged = [e for e in episodes if e["guided"]["merged"] is not None]
@@ -119,12 +123,12 @@ def _counted(found: Mapping[str, list[Watched]], lines: list[Line]) -> list[str]
             figure = share(hits, len(episodes))
             cells.append(f"{hits} = {figure.text(0, 100.0)} %" if figure.known else "-")
             values = (figure.value, figure.low, figure.high, len(episodes), 0, None)
-            lines.append(Line("contested, moderate", "merge", name, "", kind, "share", *values))
+            lines.append(Line(traffic, "merge", name, "", kind, "share", *values))
         page.append(markdown_row([name, *cells, str(len(episodes))]))
-    return [*page, "", f'"{OTHER}": it merged, and nobody had to make room.', ""]
+    return [*page, ""]
 
 
-def _sample(name: str, kind: str, episode: Watched, settings: Settings) -> list[str]:
+def _sample(name: str, kind: str, order: Order, episode: Watched, settings: Settings) -> list[str]:
     """Speed profiles of the guide AV and of the merging vehicle, and the road at three moments."""
     g = episode["guided"]
     stem = f"t_figure8-{name.split(' (')[0]}-{WANTED.index(kind) + 1}"
@@ -140,8 +144,10 @@ def _sample(name: str, kind: str, episode: Watched, settings: Settings) -> list[
     axes.set(xlabel="s from the merge", ylabel="speed, m/s")
     axes.grid(alpha=0.3)
     axes.legend(fontsize="small")
-    page = [f"Seed {episode['seed']}, trace hash `{episode['trace_hash'][:16]}`; merged {g['merged']:.1f} s"]
-    page[0] += " after the episode began."
+    page = [
+        f"`{order.demand}`, {order.behavior} HVs, seed {episode['seed']}, trace hash"
+        f" `{episode['trace_hash'][:16]}`; merged {g['merged']:.1f} s after the episode began."
+    ]
     page += ["", save_picture(picture, settings.out / f"{stem}.svg"), ""]
     for k, (png, shift) in enumerate(zip(episode["pictures"], SHOWN, strict=False)):
         file = settings.out / f"{stem}-{k + 1}.png"

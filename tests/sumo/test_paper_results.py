@@ -135,7 +135,7 @@ def test_more_episodes_drive_only_those_that_are_missing(small: Settings) -> Non
 
 def test_what_was_watched_is_the_episode_that_was_counted(small: Settings) -> None:
     watched = [json.loads(p.read_text()) for p in (small.runs / t_figure8.FOLDER).glob("*.json")]
-    assert len(watched) == len(t_figure8.AGENTS)
+    assert len(watched) == len(t_figure8.AGENTS) * len(t_figure8.TRAFFIC)
     assert {one["seed"] for one in watched} == {200_000}
     assert all(len(one["trace_hash"]) == 64 for one in watched)
 

@@ -35,8 +35,8 @@ ABLATION = (
 )
 SCHOOL = (
     "",
-    "Our networks saw two drives an iteration, P's thousands of episodes: after so few, approaches that no",
-    "prioritizer guards have hardly learned to keep clear of others.",
+    "Our networks saw two drives an iteration, a mentor's among them (docs/training.md); P's saw thousands",
+    "of episodes and no mentor.",
 )
 ABLATED = (
     "Ablation: predicted maps yes or no, mask none, constant speed or Gaussian process. The networks are",

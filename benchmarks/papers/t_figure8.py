@@ -48,7 +48,7 @@ from cosim.evaluation.tasks import OK, Task
 
 FOLDER = "guide"  # in settings.runs
 AGENTS = ("vfn-p", "altruist-rule")  # the learned altruist, and what a scripted one does
-# demand and HVs; T's is the first. In dense traffic nine guides of ten are not needed: more episodes
+# demand and HVs; T's is the first. In most dense episodes no AV is near where the mission vehicle merges
 TRAFFIC = {("contested", "moderate"): 100, ("dense", "mixed"): 300}
 WANTED = (SLOWS, YIELDS, OVERTAKES)  # T's three samples, from left to right
 Watched = Mapping[str, Any]  # `GuideWatcher.run`, and the seed

@@ -17,6 +17,10 @@ from policy.situation import situation
 KINEMATIC_SCALE = np.array([125.0, 16.0, 30.0, np.pi, 10.0, 3.0, 1.0, 1.0], np.float32)
 KINEMATIC_INPUTS = len(KINEMATIC_FEATURES) + 1  # the features and the mask
 
+APART = 5  # channels of `apart`: AV, HV, road, ego or mission vehicle, relative speed
+STILL = 255 * 0.55  # pixel of a vehicle as fast as the ego (contract: 0.1 + 0.9 (dv + 30) / 60)
+BRISK = 255 * 0.9 / 60 * 15.0  # what 15 m/s of relative speed add to it: 1 in `apart`
+
 
 class States(NamedTuple):
     """What a value network takes of B AVs; T = N past and M predicted frames."""
@@ -76,11 +80,6 @@ def kinematic_tensor(kinematics: Floats32 | Floats, valid: Bools, device: str = 
 def to_numpy(values: torch.Tensor) -> Floats32:
     """Any tensor -> float32 numpy on the host."""
     return np.asarray(values.detach().to("cpu", torch.float32).numpy(), np.float32)
-
-
-APART = 5  # channels of `apart`: AV, HV, road, ego or mission vehicle, relative speed
-STILL = 255 * 0.55  # pixel of a vehicle as fast as the ego (contract: 0.1 + 0.9 (dv + 30) / 60)
-BRISK = 255 * 0.9 / 60 * 15.0  # what 15 m/s of relative speed add to it: 1 in `apart`
 
 
 def apart(maps: torch.Tensor) -> torch.Tensor:

@@ -59,7 +59,7 @@ class A2cLearner:
         """One step towards the mentor alone; returns the mean chance of what he thinks right."""
         assert batch.maps is not None  # this network has nothing else
         preference, _ = self.online.actor_critic(batch.maps, batch.kinematics, batch.situation, batch.phi)
-        loss = _unheard(preference.log_softmax(1), batch.wrong)
+        loss = _misfit(preference.log_softmax(1), batch.wrong)
         self._descend(loss)
         return float((-loss.detach()).exp())
 
@@ -109,7 +109,7 @@ class A2cLearner:
         worth = (goal - value).square().mean()
         entropy = -(logs.exp() * logs).sum(1).mean()
         wrong = torch.from_numpy(np.stack([t.wrong[k] for t, k in places])).to(device)
-        imitation = _unheard(logs, wrong)
+        imitation = _misfit(logs, wrong)
         self._descend(policy + c.critic * worth - c.entropy * entropy + c.imitation * imitation)
         self.updates += 1
         return A2cLosses(*(float(x.detach()) for x in (policy, worth, entropy, imitation)))
@@ -130,7 +130,7 @@ class A2cLearner:
         self.updates = updates
 
 
-def _unheard(logs: torch.Tensor, wrong: torch.Tensor) -> torch.Tensor:
+def _misfit(logs: torch.Tensor, wrong: torch.Tensor) -> torch.Tensor:
     """Minus the log of the chance of what the mentor thinks right, mean; 0 where he had no opinion."""
     return -logs.masked_fill(wrong, -torch.inf).logsumexp(1).mean()
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 import numpy as np
@@ -11,9 +11,10 @@ from torch import nn
 from torch.nn import functional
 
 from cosim.types import Bytes
-from policy.tensors import APART, apart, unit
+from policy.tensors import unit
 
 Strides = Literal["literal", "temporal"]
+Read = Callable[[torch.Tensor], torch.Tensor]  # maps [B,C,H,W] -> the channels that are convolved, float32
 
 # T gives no strides: two readings (compute.md, VFN). `literal` has no padding, `temporal` halves time too.
 STRIDES: dict[str, tuple[tuple[int, int, int], ...]] = {
@@ -24,7 +25,7 @@ KERNELS = ((1, 8, 8), (3, 4, 4), (3, 3, 3))  # T, Table 1
 
 
 class Conv3dMaps(nn.Module):
-    """Conv3D 32@(1,8,8), 64@(3,4,4), 64@(3,3,3): maps [B,T,C,H,W], pixels or in [0,1] -> [B,flat]."""
+    """Conv3D 32@(1,8,8), 64@(3,4,4), 64@(3,3,3): maps [B,T,C,H,W] as `read` takes them -> [B,flat]."""
 
     def __init__(
         self,
@@ -34,12 +35,12 @@ class Conv3dMaps(nn.Module):
         width: int,
         features: tuple[int, int, int],
         strides: Strides,
-        split: bool = False,  # pixels read by `policy.tensors.apart`
+        read: Read = unit,
     ) -> None:
         super().__init__()
-        self.read = apart if split else unit
+        self.read = read
         shape: tuple[int, ...] = (frames, height, width)
-        widths = (APART if split else channels, *features)
+        widths = (channels, *features)
         layers: list[nn.Conv3d] = []
         for k, (stride, wanted) in enumerate(zip(STRIDES[strides], KERNELS, strict=True)):
             if strides == "temporal":
@@ -127,11 +128,11 @@ class Conv2dMaps(nn.Module):
         height: int,
         width: int,
         features: tuple[int, int, int],
-        split: bool = False,  # pixels read by `policy.tensors.apart`
+        read: Read = unit,
     ) -> None:
         super().__init__()
-        self.read = apart if split else unit
-        widths, size = (frames * (APART if split else channels), *features), (height, width)
+        self.read = read
+        widths, size = (frames * channels, *features), (height, width)
         layers: list[nn.Module] = []
         for k, (kernel, stride) in enumerate(((8, 4), (4, 2), (3, 2))):
             layers += [nn.Conv2d(widths[k], widths[k + 1], kernel, stride, (kernel - 1) // 2), nn.ReLU()]

@@ -17,7 +17,7 @@ from torch.nn import functional
 from cosim.types import IS_MISSION, MetaAction
 from policy.extractors import Conv2dMaps, Conv3dMaps, FrameMemory, Strides
 from policy.situation import SITUATION_INPUTS
-from policy.tensors import KINEMATIC_INPUTS
+from policy.tensors import APART, KINEMATIC_INPUTS, apart, unit
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,12 +81,13 @@ class VFN(nn.Module):
     def __init__(self, config: VfnConfig) -> None:
         super().__init__()
         self.config = c = config
-        maps_alone = c.kinematic == 0  # then what kinematics would tell must be found in pixels
-        shape = c.frames, c.channels, c.height, c.width
+        # without kinematics what they would tell must be found in pixels
+        channels, read = (c.channels, unit) if c.kinematic else (APART, apart)
+        shape = c.frames, channels, c.height, c.width
         if c.extractor == "conv2d":
-            self.maps: nn.Module = Conv2dMaps(*shape, c.features, maps_alone)
+            self.maps: nn.Module = Conv2dMaps(*shape, c.features, read)
         else:
-            self.maps = Conv3dMaps(*shape, c.features, c.strides, maps_alone)
+            self.maps = Conv3dMaps(*shape, c.features, c.strides, read)
         self.hidden = nn.Linear(int(self.maps.flat), c.hidden)
         self.kinematics = None
         if c.kinematic:
@@ -146,8 +147,8 @@ class VFN(nn.Module):
     ) -> torch.Tensor:
         """maps [B,T,C,H,W], kinematics [B,T,R,F+1], situation [B,.], phi [B,2] -> q [B,5].
 
-        Maps are uint8 pixels, or in [0,1]. Without them that branch says nothing, and learning costs no
-        convolutions.
+        Maps are uint8 pixels; in [0,1] too where there are kinematics. Without maps that branch says nothing,
+        and learning costs no convolutions.
         """
         z = self.features(maps, kinematics, situation, phi)
         q: torch.Tensor = self.value(z)

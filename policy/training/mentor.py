@@ -66,7 +66,7 @@ class Mentor:
 
     @staticmethod
     def _by_command(wished: float, speed: float, target: float, limit: float) -> Floats:
-        """By what each action would make of the commanded speed `target` within AHEAD."""
+        """[3] m/s2 of LONGITUDINAL, by what each would make of the commanded speed `target` within AHEAD."""
         wished = min(max(wished, -speed, -MAX_DECEL), limit - speed)
         sought = np.array([next_target(target, speed, action, limit) for action in LONGITUDINAL])
         got = (tracked_speeds(speed, sought, 1, AHEAD)[:, 1] - speed) / AHEAD
@@ -76,5 +76,5 @@ class Mentor:
 
     @staticmethod
     def _by_sight(wished: float, *_: float) -> Floats:
-        """Faster, slower or neither, whatever is commanded."""
+        """[3] m/s2 of LONGITUDINAL: faster, slower or neither, whatever is commanded."""
         return np.asarray(-np.abs(np.array(FELT) - wished))

@@ -230,9 +230,12 @@ class Trainer:
 
     def _fills(self) -> bool:
         """Whether the replay is still being filled."""
-        c, listens = self.config, self.learner.listens
-        prefill = c.prefill if listens or c.learning == "ddqn" else 0
-        return self.replay.size < (max(prefill, c.warm_up_after) if listens else prefill)
+        c, needed = self.config, 0  # decisions; A2C that hears no mentor keeps none
+        if self.learner.listens:
+            needed = max(c.prefill, c.warm_up_after)
+        elif c.learning == "ddqn":
+            needed = c.prefill
+        return self.replay.size < needed
 
     def _guided(self, k: int, j: int) -> bool:
         c = self.config

@@ -5,8 +5,9 @@ BIN := $(VENV)/bin
 RUN ?= runs/demo
 SCALE ?= 1
 WORKERS ?= 2
+SAMPLE ?= 20
 
-.PHONY: demo test check nets results results-small image smoke clean
+.PHONY: demo test check nets results results-small audit image smoke clean
 
 demo: $(VENV)/.installed
 	$(BIN)/cosim run merge --demand contested --policy vfn-p --out $(RUN)
@@ -21,12 +22,17 @@ check: $(VENV)/.installed-dev
 	$(BIN)/lint-imports
 
 # Every table and figure of docs/results/: first what is measured (costs, predictions; better on a quiet
-# machine), then what is driven. Killed? the same goes on. SCALE=0.1: a tenth of the episodes. What lacks
-# trained weights is left out and named; `python -m benchmarks.papers --dry-run` tells what is still to be
-# driven, and its CPU hours.
+# machine), then what is driven. Killed? the same goes on. SCALE=0.1: a tenth of the episodes. Those in
+# docs/results/episodes/ need not be driven; ANEW=1 drives them all the same, `make audit` a few of them.
+# What lacks trained weights is left out and named; `python -m benchmarks.papers --dry-run` tells what is
+# still to be driven, and its CPU hours.
 results: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.measured
-	$(BIN)/python -m benchmarks.papers --scale $(SCALE) --workers $(WORKERS)
+	$(BIN)/python -m benchmarks.papers --scale $(SCALE) --workers $(WORKERS) $(if $(ANEW),--anew)
+
+# Some of the shipped episodes driven anew: are they the same in every figure and the trace hash?
+audit: $(VENV)/.installed-dev
+	$(BIN)/python -m benchmarks.papers.episodes check --sample $(SAMPLE) --workers $(WORKERS)
 
 # The same in small: one world, two episodes each, two seconds long, untrained networks. Shows that all works.
 results-small: $(VENV)/.installed-dev

@@ -1,7 +1,8 @@
 """Drives what the tables need, each episode once: one store for all of them, resumable, shared and growing.
 
 An episode counts only for the very agent (configuration, weights by hash), input files and versions it was
-driven with: newly trained weights are driven anew, all else stays. More episodes drive only what is missing.
+driven with: newly trained weights are driven anew, all else stays. More episodes drive only what is missing,
+and what came with the repository (`benchmarks.papers.shipped`) is missing only to those who say `--anew`.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import fmean
 
+from benchmarks.papers import shipped
 from benchmarks.papers.agents import Agent, build, fingerprint, missing, short
 from cosim.app.case_runner import CaseRunner
 from cosim.app.progress import Progress
@@ -83,6 +85,7 @@ class Settings:
     duration: float | None = None  # s; None: the scenario's own
     first: int = TEST_SEEDS  # seed; what is compared to tune something belongs on tuning seeds
     trainings: Mapping[str, tuple[Path, ...]] = field(default_factory=dict)  # policy -> runs of cosim train
+    shipped: Path | None = shipped.FOLDER  # episodes that need not be driven; None: every one is
 
     def episodes(self, full: int) -> int:
         """How many of `full` episodes are wanted."""
@@ -160,6 +163,7 @@ def drive(orders: Sequence[Order], settings: Settings, title: str) -> Results:
         RunFolder(str(settings.runs), resume=True, episodes=work.episodes) as folder,
         _store(folder.path) as store,
     ):
+        _take(work, store, settings, title)
         _drive(work, store, settings, title)
         rows: dict[str, list[Row]] = {}
         for row in store.rows():
@@ -202,13 +206,13 @@ def cost(orders: Sequence[Order], settings: Settings) -> list[tuple[str, int, fl
     """
     orders = [o for o in orders if not settings.scenarios or o.scenario in settings.scenarios]
     able = planned([o for o in orders if settings.untrained or not missing(o.agent)], settings)
-    done = _stored(settings)
+    held = _held(able, settings)
     probed = planned(orders, replace(settings, untrained=True))
     cells = {cell.name: cell for cell in probed.cells}
     left: dict[str, dict[str, int]] = {}  # agent -> cell -> episodes
     for order in orders:
         of_agent = left.setdefault(order.agent.name, {})
-        todo = settings.episodes(order.episodes) - done.get(able.cell_of.get(order, ""), 0)
+        todo = settings.episodes(order.episodes) - len(held.get(able.cell_of.get(order, ""), ()))
         cell = probed.cell_of[order]
         of_agent[cell] = max(of_agent.get(cell, 0), todo)
     engine = LocalEngine(AgentRunner, (probed.agents, True), workers=1)
@@ -235,9 +239,15 @@ class Planned(matrix.Plan):
     def episodes(self) -> int:
         return sum(self.counts)
 
+    @property
+    def wanted(self) -> dict[str, range]:
+        """Cell -> its seeds."""
+        return {cell.name: self.seeds[:n] for cell, n in zip(self.cells, self.counts, strict=True)}
+
     def cases(self) -> Iterator[tuple[matrix.Cell, Case]]:
-        for cell, count in zip(self.cells, self.counts, strict=True):
-            for seed in self.seeds[:count]:
+        wanted = self.wanted
+        for cell in self.cells:
+            for seed in wanted[cell.name]:
                 yield cell, cell.case.with_seed(seed)
 
 
@@ -293,12 +303,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--untrained", action="store_true", help="value networks as they are born, labelled so")
     add("--runs", type=Path, default=default.runs, help="where the episodes are kept")
     add("--out", type=Path, default=default.out, help="folder of pages, pictures and data/*.csv")
+    add("--anew", action="store_true", help="drive also the episodes that come with the repository")
     add("--training", action="append", default=[], metavar="POLICY=RUN", help="a run of cosim train")
     add("--dry-run", action="store_true", help="what is still to be driven, and its CPU hours")
 
 
 def settings_of(args: argparse.Namespace) -> Settings:
     """The settings as typed."""
+    default = Settings()
     trainings: dict[str, tuple[Path, ...]] = {}
     for text in args.training:
         policy, _, run = text.partition("=")
@@ -312,6 +324,7 @@ def settings_of(args: argparse.Namespace) -> Settings:
         untrained=args.untrained,
         duration=args.duration,
         trainings=trainings,
+        shipped=None if args.anew else default.shipped,
     )
 
 
@@ -339,13 +352,28 @@ def _drive(work: Planned, store: Store, settings: Settings, title: str) -> None:
         print(f"{title}: {fault.key}: our own code failed, no row: {fault.stderr}", file=sys.stderr)
 
 
-def _stored(settings: Settings) -> dict[str, int]:
-    """How many episodes of each cell the store holds."""
-    if not settings.runs.is_dir():
-        return {}
-    with _store(settings.runs) as store:
-        found: dict[str, int] = {}
-        for key in sorted(store.keys()):
-            cell = key.rpartition("-")[0]
-            found[cell] = found.get(cell, 0) + 1
-        return found
+def _take(work: Planned, store: Store, settings: Settings, title: str) -> None:
+    """What is shipped of it goes into the store; said on stderr, and why when it cannot."""
+    here = work.cells[0].manifest["versions"] if work.cells else {}
+    other = shipped.other_versions(here, settings.shipped)
+    taken = shipped.take(store, work.wanted, settings.shipped)
+    if other and work.cells:
+        told = f"{settings.shipped} was driven with {other}: what was not driven here is driven anew"
+        print(f"{title}: {told}", file=sys.stderr, flush=True)
+    if taken:
+        told = f"{taken} episodes taken from {settings.shipped} (--anew drives them)"
+        print(f"{title}: {told}", file=sys.stderr, flush=True)
+
+
+def _held(work: Planned, settings: Settings) -> dict[str, set[int]]:
+    """Which of the planned seeds need not be driven, by cell: the store's and the shipped ones."""
+    rows = [*shipped.episodes(settings.shipped).rows]
+    if settings.runs.is_dir():
+        with _store(settings.runs) as store:
+            rows += store.rows()
+    wanted = work.wanted
+    held: dict[str, set[int]] = {}
+    for row in rows:
+        if row["seed"] in wanted.get(row["cell"], ()):
+            held.setdefault(row["cell"], set()).add(row["seed"])
+    return held

@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks import measured
 from benchmarks.papers import learning
-from benchmarks.papers.__main__ import JOBS
+from benchmarks.papers.jobs import JOBS
 
 RESULTS = Path(__file__).parents[2] / measured.RESULTS
 

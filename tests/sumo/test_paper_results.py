@@ -14,9 +14,11 @@ from benchmarks.papers import (
     conditions,
     decisions,
     driving,
+    episodes,
     figure9,
     learning,
     phi,
+    shipped,
     summary,
     t_figure8,
     t_figures,
@@ -25,6 +27,7 @@ from benchmarks.papers import (
 from benchmarks.papers.agents import Agent, missing
 from benchmarks.papers.driving import Order, Settings, drive
 from benchmarks.papers.pages import Job, run_jobs
+from cosim.errors import BadInput
 
 JOBS = (table3.JOB, decisions.JOB, figure9.JOB, t_figures.JOB, t_figure8.JOB, phi.JOB, conditions.JOB)
 
@@ -131,6 +134,54 @@ def test_more_episodes_drive_only_those_that_are_missing(small: Settings) -> Non
         found = drive([order], replace(small, scale=1.0), "more")
     assert [row["seed"] for row in found.driven[0].rows] == [200_000]
     assert [key.rpartition("-")[2] for key in missed] == ["200001", "200002"]
+
+
+def test_shipped_episodes_are_taken_instead_of_driven_and_make_the_same_pages(
+    small: Settings, tmp_path: Path, capfd: Any
+) -> None:
+    jobs = (table3.JOB, phi.JOB)
+    kept = episodes.keep(replace(small, shipped=tmp_path / "episodes"), jobs)
+    elsewhere = replace(small, runs=tmp_path / "runs", out=tmp_path / "pages", shipped=tmp_path / "episodes")
+    capfd.readouterr()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(driving, "LocalEngine", _NoEngine)
+        run_jobs(jobs, elsewhere)
+    assert "episodes taken from" in capfd.readouterr().err
+    assert kept.total() == len({row["key"] for row in shipped.episodes(elsewhere.shipped).rows})
+    for job in jobs:
+        for name in (f"{job.name}.md", f"data/{job.name}.csv", f"{job.name}.svg"):
+            assert (elsewhere.out / name).read_bytes() == (small.out / name).read_bytes()
+
+
+class _NoEngine:
+    """Lets nothing be driven."""
+
+    def __init__(self, *_: Any, **__: Any) -> None: ...
+
+    def run(self, tasks: Any) -> Any:
+        assert not tasks
+        yield from ()
+
+
+def test_a_shipped_episode_that_is_not_the_same_again_is_found_and_named(
+    small: Settings, tmp_path: Path
+) -> None:
+    order = Order(Agent("idm"), "merge", "dense", "mixed", 1)
+    jobs = [Job("one", "One episode", lambda: [order], lambda *_: None)]
+    mine = replace(small, shipped=tmp_path)
+    with pytest.raises(BadInput, match="holds no shipped episodes"):
+        episodes.check(mine, 1, jobs=jobs)
+    episodes.keep(mine, jobs)
+    assert episodes.check(mine, 5, jobs=jobs) == episodes.Checked(1, (), 1, 0)
+    run = shipped.episodes(tmp_path)
+    shipped.write([{**run.rows[0], "collisions": 7}], run.manifest, tmp_path)
+    (line,) = episodes.check(mine, 5, jobs=jobs).differing
+    assert "idm in merge, dense, seed 200000: collisions is" in line
+    assert line.endswith("shipped is 7")
+    other = {**run.manifest, "versions": {"python": "2.7"}}
+    shipped.write([{**run.rows[0], "cell": "other"}], {**other, "cells": {"other": {}}}, tmp_path)
+    with pytest.raises(BadInput, match=r"other versions \(python 2\.7\) than are here"):
+        episodes.check(mine, 1, jobs=jobs)
 
 
 def test_what_was_watched_is_the_episode_that_was_counted(small: Settings) -> None:

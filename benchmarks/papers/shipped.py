@@ -1,0 +1,87 @@
+"""The episodes that come with the repository: what a page needs and was driven already is taken from here.
+
+An exported run like any other (`episodes.parquet`, `manifest.json`; `cosim.evaluation.run_folder` reads it),
+but for what belongs to the machine that drove it. A row is taken only for the very cell it was driven for:
+same agent, weights, input files and versions. `benchmarks.papers.episodes` keeps and checks them.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Container, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet
+
+from cosim.evaluation.export import arrow
+from cosim.evaluation.figures import Row
+from cosim.evaluation.run_folder import Run, read
+from cosim.evaluation.store import Store
+
+FOLDER = Path("docs/results/episodes")
+ROWS, MANIFEST = "episodes.parquet", "manifest.json"
+LEVEL = 19  # of zstd: written seldom
+OF_THE_MACHINE = ("timings", "stderr", "attempts")  # and every timing: not the same again
+
+
+def episodes(folder: Path | None) -> Run:
+    """What is shipped; no rows where nothing is.
+
+    Raises BadInput when the files are not ours.
+    """
+    if folder is None or not (folder / ROWS).is_file():
+        return Run(Path(), [])
+    return _read(folder, (folder / ROWS).stat().st_mtime_ns)
+
+
+def take(store: Store, wanted: Mapping[str, Container[int]], folder: Path | None) -> int:
+    """Put into the store what it lacks of the `wanted` seeds (by cell) and is shipped; how many were taken.
+
+    The store is begun, and its cells stay as they are.
+    """
+    found = episodes(folder)
+    known = store.keys()
+    rows = [
+        row for row in found.rows if row["seed"] in wanted.get(row["cell"], ()) and row["key"] not in known
+    ]
+    if not rows:
+        return 0
+    cells = found.manifest["cells"]
+    store.extend([{"cell": name, **cells[name]} for name in dict.fromkeys(row["cell"] for row in rows)])
+    store.add(rows)
+    document = store.document()
+    for name in ("units", "better"):
+        store.note(name, {**found.manifest[name], **document[name]})
+    return len(rows)
+
+
+def other_versions(here: Mapping[str, Any], folder: Path | None) -> str:
+    """Which versions drove what is shipped, where they are not those of `here`; "" where all are."""
+    found = episodes(folder).manifest.get("versions", {})
+    return ", ".join(f"{name} {v}" for name, v in found.items() if here.get(name) != v)
+
+
+def write(rows: Sequence[Row], manifest: Mapping[str, Any], folder: Path) -> None:
+    """The rows, by cell and seed, with the manifest (`cells`, `versions`, `units`, `better`); each file
+    whole or not at all."""
+    folder.mkdir(parents=True, exist_ok=True)
+    place = {name: k for k, name in enumerate(manifest["cells"])}
+    table = arrow([plain(row) for row in sorted(rows, key=lambda r: (place[r["cell"]], r["seed"]))])
+    drafts = {name: folder / f".{name}.part" for name in (ROWS, MANIFEST)}
+    pyarrow.parquet.write_table(table, drafts[ROWS], compression="zstd", compression_level=LEVEL)
+    drafts[MANIFEST].write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
+    for name, draft in drafts.items():
+        draft.replace(folder / name)
+
+
+def plain(row: Row) -> dict[str, Any]:
+    """The row without what belongs to the machine that drove it: equal whenever it is driven anew."""
+    timings = json.loads(row.get("timings") or "{}")
+    return {name: value for name, value in row.items() if name not in (*OF_THE_MACHINE, *timings)}
+
+
+@cache
+def _read(folder: Path, modified: int) -> Run:  # noqa: ARG001 - a changed file is read anew
+    return read(folder)

@@ -13,15 +13,15 @@ import argparse
 import random
 import sys
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from benchmarks.papers import shipped
-from benchmarks.papers.agents import missing
-from benchmarks.papers.driving import AgentRunner, Planned, Settings, planned
+from benchmarks.papers.agents import Agent, missing
+from benchmarks.papers.driving import MARK, AgentRunner, Planned, Settings, planned
 from benchmarks.papers.jobs import JOBS
 from benchmarks.papers.pages import Job
 from cosim.app.progress import Progress
@@ -29,6 +29,7 @@ from cosim.errors import BadInput, CosimError
 from cosim.evaluation.engines import LocalEngine
 from cosim.evaluation.figures import Row
 from cosim.evaluation.folder import RunFolder
+from cosim.evaluation.matrix import Cell
 from cosim.evaluation.records import row as row_of
 from cosim.evaluation.store import FILE, Store
 from cosim.evaluation.tasks import OK, Task
@@ -63,15 +64,19 @@ def keep(settings: Settings, jobs: Sequence[Job] = JOBS) -> Counter[str]:
         rows = {row["key"]: row for row in (*known.rows, *store.rows())}
         cells |= store.cells()
         document = store.document()
-    order = [cell.name for cell in work.cells]
-    kept = [row for row in rows.values() if row["cell"] in set(order) and row["status"] == OK]
+    ordered = {cell.name for cell in work.cells}
+    kept = [row for row in rows.values() if row["cell"] in ordered and row["status"] == OK]
     if not kept:
         raise BadInput("holds no episode that a page needs", field="--runs", value=str(settings.runs))
     present = {row["cell"] for row in kept}
     manifest = {
         "versions": work.cells[0].manifest["versions"],
         **{name: {**known.manifest.get(name, {}), **document[name]} for name in ("units", "better")},
-        "cells": {name: cells[name] for name in order if name in present},
+        "cells": {
+            cell.name: {"case": _case(cell, work.agents), "manifest": cells[cell.name]["manifest"]}
+            for cell in work.cells
+            if cell.name in present
+        },
     }
     shipped.write(kept, manifest, settings.shipped)
     return Counter(f"{row['demand']}/{row['scenario']}/{row['policy']}" for row in kept)
@@ -150,6 +155,12 @@ def _planned(jobs: Sequence[Job], settings: Settings) -> Planned:
     """Every cell that the jobs order and whose agent can drive."""
     orders = [o for job in jobs for o in job.orders() if settings.untrained or missing(o.agent) is None]
     return planned(list(dict.fromkeys(orders)), settings)
+
+
+def _case(cell: Cell, agents: Mapping[str, Agent]) -> dict[str, Any]:
+    """What `cosim replay` is to drive: by the name `--policy` has for the agent, where it has one."""
+    name = cell.case.policy.split(MARK)[0]
+    return replace(cell.case, policy=name if agents[name] == Agent(name) else cell.case.policy).document()
 
 
 def _drive(rows: Sequence[Row], work: Planned, settings: Settings) -> dict[str, dict[str, Any]]:

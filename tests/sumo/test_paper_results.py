@@ -174,6 +174,7 @@ def test_a_shipped_episode_that_is_not_the_same_again_is_found_and_named(
     episodes.keep(mine, jobs)
     assert episodes.check(mine, 5, jobs=jobs) == episodes.Checked(1, (), 1, 0)
     run = shipped.episodes(tmp_path)
+    assert [cell["case"]["policy"] for cell in run.manifest["cells"].values()] == ["idm"]  # replay drives it
     shipped.write([{**run.rows[0], "collisions": 7}], run.manifest, tmp_path)
     (line,) = episodes.check(mine, 5, jobs=jobs).differing
     assert "idm in merge, dense, seed 200000: collisions is" in line

@@ -38,9 +38,9 @@ from cosim.worker import Worker
 from policy.agents.approaches import AgentConfig, compact, paper
 from policy.agents.prediction_aware import PredictionAware
 from policy.training.config import agent_config
+from policy.training.curriculum import Drive, Drove, Lesson
 from policy.training.ddqn import Learner
 from policy.training.replay import Replay
-from policy.training.vfn import Drive, Drove, Lesson
 
 SIZES: Mapping[str, Callable[[str], AgentConfig]] = {"compact": compact, "paper": paper}
 POLICY = "vfn-p"

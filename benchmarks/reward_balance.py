@@ -25,7 +25,7 @@ from cosim.seeding import generator
 from cosim.types import PolicyContext
 from cosim.worker import Worker
 from policy.training.config import agent_config
-from policy.training.vfn import Lesson
+from policy.training.curriculum import Lesson
 
 WORLDS = ("merge", "exit", "roundabout", "intersection")
 PHI = math.radians(60.0)

@@ -20,8 +20,8 @@ from cosim.types import PolicyContext
 from cosim.worker import Worker
 from policy.agents.approaches import AgentConfig
 from policy.checkpoint import load as load_weights
+from policy.training.curriculum import Drive, Drove, Lesson
 from policy.training.explorer import ExploreConfig, Explorer
-from policy.training.vfn import Drive, Drove, Lesson
 
 FIGURES = (
     "crashed",

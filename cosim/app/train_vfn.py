@@ -19,9 +19,10 @@ from cosim.scenario import load
 from policy.agents.approaches import APPROACHES
 from policy.checkpoint import sha256
 from policy.training.config import agent_config
+from policy.training.curriculum import Lesson, VfnTraining
 from policy.training.log import tensorboard
 from policy.training.networks import use_threads
-from policy.training.vfn import Lesson, Trainer, VfnTraining
+from policy.training.vfn import Trainer
 from sumo_scenarios import names
 
 CONTESTED = 2.0  # contested episodes for every dense one: altruism is learned where somebody must yield
@@ -66,7 +67,7 @@ def train(args: argparse.Namespace) -> int:
         progress.done()
         writer.close()
     best = f", best validation reward {trainer.best:.3f}" if math.isfinite(trainer.best) else ""
-    print(f"{name}: {trainer.iteration} iterations, {trainer.learner.updates} updates{best}")
+    print(f"{name}: {trainer.iteration} iterations, {trainer.school.learner.updates} updates{best}")
     print(f"  {folder / 'best.safetensors'}")
     return 0
 

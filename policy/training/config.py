@@ -11,9 +11,9 @@ from policy.chain import ChainConfig
 from policy.hpn import HpnConfig
 from policy.safety import SafetyConfig
 from policy.traffic import TrafficConfig
+from policy.training.curriculum import VfnTraining
 from policy.training.explorer import ExploreConfig
 from policy.training.hpn import HpnTraining
-from policy.training.vfn import VfnTraining
 from policy.vfn import VfnConfig
 
 

@@ -11,82 +11,21 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from safetensors.torch import load_file, save_file
 
 from cosim.errors import BadInput
-from cosim.seeding import generator, subseed, uniform
 from policy import checkpoint
-from policy.training import experience
-from policy.training.a2c import A2cConfig, A2cLearner
-from policy.training.ddqn import DdqnConfig, Learner, Losses
-from policy.training.experience import Trajectory
-from policy.training.replay import Replay, ReplayConfig
+from policy.training import curriculum, experience
+from policy.training.curriculum import Drive, Drove, VfnTraining
+from policy.training.schools import school
 from policy.vfn import VFN, VfnConfig
-
-TRAINING_SEEDS = 100_000  # 0 to 99,999 are for training, the next as many for validation (contract.md)
-
-
-@dataclass(frozen=True, slots=True)
-class Lesson:
-    """One kind of episode and how often it is driven."""
-
-    scenario: str
-    demand: str = "contested"
-    behavior: str | None = None  # None: the demand's default
-    weight: float = 1.0
-
-
-@dataclass(frozen=True, slots=True)
-class VfnTraining:
-    """One training run. Defaults: what trains on two CPU cores (docs/training.md)."""
-
-    lessons: tuple[Lesson, ...] = (Lesson("merge"),)
-    iterations: int = 400
-    episodes: int = 2  # an iteration
-    updates: int = 40  # an iteration: one every five joint decisions (compute.md: 4 to 8)
-    prefill: int = 2_000  # decisions recorded before the first update (Alg. 4), with epsilon 1
-    warm_up: int = 0  # steps towards the mentor alone before the first update,
-    warm_up_after: int = 0  # from as many decisions at least
-    epsilon: tuple[float, float] = (1.0, 0.05)  # P, Table I: linear
-    epsilon_iterations: int = 200
-    guided: tuple[float, float] = (0.5, 0.1)  # share of the episodes that the mentor drives, linear likewise
-    disseminate: int = 5  # iterations between copies of the learner's weights to the frozen AVs
-    svo: tuple[float, ...] = (45.0, 60.0)  # deg, drawn per episode; (0,) trains the egoistic twin
-    seed: int = 0  # of everything
-    validate_every: int = 20  # iterations; the last one is validated too
-    validation: int = 4  # episodes of every lesson, greedy, on tuning seeds
-    save_every: int = 5  # iterations
-    learning: Literal["ddqn", "a2c"] = "ddqn"
-    replay: ReplayConfig = field(default_factory=ReplayConfig)
-    ddqn: DdqnConfig = field(default_factory=DdqnConfig)
-    a2c: A2cConfig = field(default_factory=A2cConfig)
-
-
-class Drive(NamedTuple):
-    """One episode to be driven; its outcome depends on nothing else."""
-
-    lesson: Lesson
-    seed: int
-    svo: float  # rad
-    epsilon: float
-    weights: str  # file of the learning AVs' network, "" for untrained
-    frozen: str  # file of the others'
-    record: bool  # False: validation, greedy, nothing is recorded
-    guided: bool = False  # by the mentor
-
-
-class Drove(NamedTuple):
-    """What came of it."""
-
-    trajectories: list[Trajectory]
-    figures: dict[str, float | None]  # crashed, mission_success, dt_..., reward (a decision and AV), steps
 
 
 class Actors(Protocol):
@@ -117,15 +56,9 @@ class Trainer:
         log: Log | None = None,
         about: Mapping[str, Any] | None = None,
     ) -> None:
-        self.config, self.vfn, self.folder, self.device = config, vfn, folder, device
+        self.config, self.vfn, self.folder = config, vfn, folder
         self._actors, self._log, self._about = actors, log, dict(about or {})
-        start = subseed(config.seed, "network") % 2**31
-        self.learner: Learner | A2cLearner
-        if config.learning == "a2c":
-            self.learner = A2cLearner(vfn, config.a2c, start, device)
-        else:
-            self.learner = Learner(vfn, config.ddqn, start, device)
-        self.replay = Replay(config.replay)
+        self.school = school(config, vfn, device)
         self._files: list[tuple[str, int]] = []  # replay files, oldest first, and their trajectories
         self._gone = 0  # trajectories of the oldest file that have left the replay already
         self.iteration = 0
@@ -137,35 +70,32 @@ class Trainer:
 
     def run(self, progress: Callable[[float, float], None] | None = None) -> None:
         """Train to the last iteration, from wherever `resume` left off."""
-        c = self.config
+        c, school = self.config, self.school
         while self.iteration < c.iterations:
             began = time.perf_counter()
             k = self.iteration
             weights, frozen = self._weights(k), self._weights(k - k % c.disseminate)
-            driving = [self._actors.submit(d) for d in self._drives(k, weights, frozen)]
-            judged = []
-            if (k % c.validate_every == 0 and k > 0) or k + 1 == c.iterations:
-                judged = [self._actors.submit(d) for d in self._validation(weights)]
-            fills, losses = self._fills(), self._learn(k)
+            driven = curriculum.drives(c, k, weights, frozen, school.epsilon(k), school.guided(k))
+            driving = [self._actors.submit(drive) for drive in driven]
+            judging = []
+            if curriculum.judged(c, k):
+                judging = [self._actors.submit(drive) for drive in curriculum.validation(c, weights)]
+            losses = school.meanwhile(k)
             drove = [f.result() for f in driving]
-            if isinstance(self.learner, A2cLearner) and not fills:
-                fresh = [t for one in drove for t in one.trajectories]
-                learned = self.learner.learn(fresh, generator(c.seed, "order", str(k)))
-                losses = {} if learned is None else _named(learned._fields, learned)
-            else:
+            kept = school.keeps
+            if kept:
                 self._keep(k, drove)
-                if isinstance(self.learner, A2cLearner) and not self._fills():
-                    self._warm_up(generator(c.seed, "replay", str(k)))
+            losses |= school.afterwards(k, [t for one in drove for t in one.trajectories], kept)
             record = {
                 "iteration": k,
-                "updates": self.learner.updates,
-                "replay": self.replay.size,
-                "epsilon": self._epsilon(k),
+                "updates": school.learner.updates,
+                "replay": school.replay.size,
+                "epsilon": school.epsilon(k),
                 **losses,
                 **_means("train", [d.figures for d in drove]),
             }
-            if judged:
-                record |= self._judge(k, [f.result().figures for f in judged])
+            if judging:
+                record |= self._judge(k, [f.result().figures for f in judging])
             record["iteration_s"] = time.perf_counter() - began
             self._write(record)
             self.iteration += 1
@@ -174,85 +104,12 @@ class Trainer:
             if progress is not None:
                 progress(self.iteration, c.iterations)
 
-    def _learn(self, k: int) -> dict[str, float]:
-        """The updates that do not wait for this iteration's drives."""
-        c, learner = self.config, self.learner
-        if isinstance(learner, A2cLearner) or self._fills():
-            return {}
-        rng = generator(c.seed, "replay", str(k))
-        if not learner.updates:
-            self._warm_up(rng)
-            learner.follow()
-        losses, agrees = [], []
-        for _ in range(c.updates):
-            losses.append(learner.update(self.replay.sample(rng, self.device)))
-            if learner.listens and self.vfn.kinematic:  # else an update hears him at the same price
-                agrees.append(learner.imitate(self.replay.advised(rng, False, self.device)))
-        means = _named(Losses._fields, np.array(losses).mean(0))
-        return means | ({"agrees": float(np.mean(agrees))} if agrees else {})
-
-    def _warm_up(self, rng: np.random.Generator) -> None:
-        """Steps towards the mentor alone, on what the replay holds; with maps for who sees nothing else."""
-        for _ in range(self.config.warm_up if self.learner.listens else 0):
-            self.learner.imitate(self.replay.advised(rng, not self.vfn.kinematic, self.device))
-
-    def _drives(self, k: int, weights: str, frozen: str) -> list[Drive]:
-        c = self.config
-        drives = []
-        for j in range(c.episodes):
-            seed = (k * c.episodes + j + subseed(c.seed, "episodes")) % TRAINING_SEEDS
-            drives.append(
-                Drive(
-                    _drawn(c.lessons, uniform(c.seed, "lesson", str(k), str(j))),
-                    seed,
-                    math.radians(c.svo[int(uniform(c.seed, "svo", str(k), str(j)) * len(c.svo))]),
-                    self._epsilon(k),
-                    weights,
-                    frozen,
-                    True,
-                    self._guided(k, j),
-                )
-            )
-        return drives
-
-    def _validation(self, weights: str) -> list[Drive]:
-        c = self.config
-        svo = math.radians(c.svo[len(c.svo) // 2])
-        return [
-            Drive(lesson, TRAINING_SEEDS + j, svo, 0.0, weights, weights, False)
-            for lesson in c.lessons
-            for j in range(c.validation)
-        ]
-
-    def _epsilon(self, k: int) -> float:
-        c = self.config
-        return 1.0 if c.learning == "ddqn" and self._fills() else self._faded(c.epsilon, k)
-
-    def _fills(self) -> bool:
-        """Whether the replay is still being filled."""
-        c, needed = self.config, 0  # decisions; A2C that hears no mentor keeps none
-        if self.learner.listens:
-            needed = max(c.prefill, c.warm_up_after)
-        elif c.learning == "ddqn":
-            needed = c.prefill
-        return self.replay.size < needed
-
-    def _guided(self, k: int, j: int) -> bool:
-        c = self.config
-        if c.learning == "a2c":  # it learns by its own drives alone, once it has heard what he does in his
-            return self._fills()
-        return uniform(c.seed, "guided", str(k), str(j)) < self._faded(c.guided, k)
-
-    def _faded(self, ends: tuple[float, float], k: int) -> float:
-        first, last = ends
-        return first + (last - first) * min(k / self.config.epsilon_iterations, 1.0)
-
     def _keep(self, k: int, drove: Sequence[Drove]) -> None:
         for j, one in enumerate(drove):
             name = f"{k:06d}-{j:02d}.npz"
             experience.save(self.folder / "replay" / name, one.trajectories)
             self._files.append((name, len(one.trajectories)))
-            self._drop(self.replay.add(one.trajectories))
+            self._drop(self.school.replay.add(one.trajectories))
 
     def _drop(self, trajectories: int) -> None:
         """Forget files whose trajectories have all left the replay; deleted with the next checkpoint."""
@@ -274,7 +131,7 @@ class Trainer:
             measured = {
                 "iteration": k,
                 "validation": means,
-                "tuning_seeds": [TRAINING_SEEDS, self.config.validation],
+                "tuning_seeds": [curriculum.TRAINING_SEEDS, self.config.validation],
             }
             card = checkpoint.read_card(source)
             networks = {"vfn": VFN(self.vfn)}
@@ -293,14 +150,16 @@ class Trainer:
             if k != self.iteration:
                 raise BadInput("weights of an earlier iteration are missing", file=path)
             about = {**self._about, "training": asdict(self.config)}
-            checkpoint.save(path, {"vfn": self.learner.online}, {"vfn": self.vfn}, {"iteration": k}, about)
+            checkpoint.save(
+                path, {"vfn": self.school.learner.online}, {"vfn": self.vfn}, {"iteration": k}, about
+            )
         return str(path)
 
     def save(self) -> None:
         """Checkpoint: everything that `resume` needs; whole or not at all."""
         state = {
             "iteration": self.iteration,
-            "updates": self.learner.updates,
+            "updates": self.school.learner.updates,
             "best": None if math.isinf(self.best) else self.best,
             "files": self._files,
             "gone": self._gone,
@@ -308,7 +167,7 @@ class Trainer:
         }
         name = f"state-{self.iteration:06d}.safetensors"
         draft = self.folder / ".state.part"
-        save_file(self.learner.tensors(), draft)
+        save_file(self.school.learner.tensors(), draft)
         draft.replace(self.folder / name)
         draft.write_text(json.dumps({**state, "tensors": name}, indent=1))
         draft.replace(self.folder / "state.json")
@@ -330,12 +189,12 @@ class Trainer:
             raise BadInput("was trained with another configuration", file=file, field=", ".join(differs))
         self.iteration, self._gone = state["iteration"], state["gone"]
         self.best = -math.inf if state["best"] is None else state["best"]
-        self.learner.restore(load_file(self.folder / state["tensors"]), state["updates"])
+        self.school.learner.restore(load_file(self.folder / state["tensors"]), state["updates"])
         self._files = [(name, count) for name, count in state["files"]]
         skip = self._gone
         for name, _ in self._files:
             trajectories = experience.load(self.folder / "replay" / name)
-            self.replay.add(trajectories[skip:])
+            self.school.replay.add(trajectories[skip:])
             skip = 0
         log = self.folder / "log.jsonl"
         if log.is_file():  # lines after the checkpoint will be written again
@@ -364,16 +223,6 @@ class Trainer:
             for name, value in record.items():
                 if isinstance(value, int | float) and math.isfinite(value):
                     self._log.add_scalar(name, value, record["iteration"])
-
-
-def _named(names: Sequence[str], values: Iterable[float]) -> dict[str, float]:
-    return {f"loss/{name}": float(v) for name, v in zip(names, values, strict=True)}
-
-
-def _drawn(lessons: Sequence[Lesson], luck: float) -> Lesson:
-    """The lesson at `luck` (0 to 1) of the weights laid end to end."""
-    edges = np.cumsum([lesson.weight for lesson in lessons])
-    return lessons[int(np.searchsorted(edges / edges[-1], luck, side="right").clip(0, len(lessons) - 1))]
 
 
 def _means(prefix: str, figures: Sequence[Mapping[str, float | None]]) -> dict[str, float]:

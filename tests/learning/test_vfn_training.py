@@ -27,11 +27,12 @@ from policy.situation import SITUATION_INPUTS
 from policy.tensors import KINEMATIC_INPUTS
 from policy.training import experience
 from policy.training.a2c import A2cConfig, A2cLearner
+from policy.training.curriculum import Drive, Drove, Lesson, VfnTraining
 from policy.training.ddqn import DdqnConfig, Learner
 from policy.training.experience import Trajectory
 from policy.training.explorer import ExploreConfig, Explorer
 from policy.training.replay import Replay, ReplayConfig
-from policy.training.vfn import Drive, Drove, Lesson, Trainer, VfnTraining
+from policy.training.vfn import Trainer
 from policy.vfn import VfnConfig
 
 torch.set_num_threads(1)

@@ -1,0 +1,121 @@
+"""What is driven when: lessons, seeds, exploration and who is at the wheel, all drawn from one seed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from cosim.seeding import subseed, uniform
+from policy.training.a2c import A2cConfig
+from policy.training.ddqn import DdqnConfig
+from policy.training.experience import Trajectory
+from policy.training.replay import ReplayConfig
+
+TRAINING_SEEDS = 100_000  # 0 to 99,999 are for training, the next as many for validation (contract.md)
+
+
+@dataclass(frozen=True, slots=True)
+class Lesson:
+    """One kind of episode and how often it is driven."""
+
+    scenario: str
+    demand: str = "contested"
+    behavior: str | None = None  # None: the demand's default
+    weight: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class VfnTraining:
+    """One training run. Defaults: what trains on two CPU cores (docs/training.md)."""
+
+    lessons: tuple[Lesson, ...] = (Lesson("merge"),)
+    iterations: int = 400
+    episodes: int = 2  # an iteration
+    updates: int = 40  # an iteration: one every five joint decisions (compute.md: 4 to 8)
+    prefill: int = 2_000  # decisions recorded before the first update (Alg. 4), with epsilon 1
+    warm_up: int = 0  # steps towards the mentor alone before the first update,
+    warm_up_after: int = 0  # from as many decisions at least
+    epsilon: tuple[float, float] = (1.0, 0.05)  # P, Table I: linear
+    epsilon_iterations: int = 200
+    guided: tuple[float, float] = (0.5, 0.1)  # share of the episodes that the mentor drives, linear likewise
+    disseminate: int = 5  # iterations between copies of the learner's weights to the frozen AVs
+    svo: tuple[float, ...] = (45.0, 60.0)  # deg, drawn per episode; (0,) trains the egoistic twin
+    seed: int = 0  # of everything
+    validate_every: int = 20  # iterations; the last one is validated too
+    validation: int = 4  # episodes of every lesson, greedy, on tuning seeds
+    save_every: int = 5  # iterations
+    learning: Literal["ddqn", "a2c"] = "ddqn"
+    replay: ReplayConfig = field(default_factory=ReplayConfig)
+    ddqn: DdqnConfig = field(default_factory=DdqnConfig)
+    a2c: A2cConfig = field(default_factory=A2cConfig)
+
+
+class Drive(NamedTuple):
+    """One episode to be driven; its outcome depends on nothing else."""
+
+    lesson: Lesson
+    seed: int
+    svo: float  # rad
+    epsilon: float
+    weights: str  # file of the learning AVs' network, "" for untrained
+    frozen: str  # file of the others'
+    record: bool  # False: validation, greedy, nothing is recorded
+    guided: bool = False  # by the mentor
+
+
+class Drove(NamedTuple):
+    """What came of it."""
+
+    trajectories: list[Trajectory]
+    figures: dict[str, float | None]  # crashed, mission_success, dt_..., reward (a decision and AV), steps
+
+
+def drives(c: VfnTraining, k: int, weights: str, frozen: str, epsilon: float, guided: float) -> list[Drive]:
+    """The episodes of iteration `k`; `guided`: the share of them that the mentor drives."""
+    drawn = []
+    for j in range(c.episodes):
+        luck = [uniform(c.seed, name, str(k), str(j)) for name in ("lesson", "svo", "guided")]
+        drawn.append(
+            Drive(
+                _drawn(c.lessons, luck[0]),
+                (k * c.episodes + j + subseed(c.seed, "episodes")) % TRAINING_SEEDS,
+                math.radians(c.svo[int(luck[1] * len(c.svo))]),
+                epsilon,
+                weights,
+                frozen,
+                record=True,
+                guided=luck[2] < guided,
+            )
+        )
+    return drawn
+
+
+def judged(c: VfnTraining, k: int) -> bool:
+    """Whether the weights that iteration `k` begins with are validated."""
+    return (k % c.validate_every == 0 and k > 0) or k + 1 == c.iterations
+
+
+def validation(c: VfnTraining, weights: str) -> list[Drive]:
+    """Every lesson in turn, greedy, on tuning seeds."""
+    svo = math.radians(c.svo[len(c.svo) // 2])
+    return [
+        Drive(lesson, TRAINING_SEEDS + j, svo, 0.0, weights, weights, record=False)
+        for lesson in c.lessons
+        for j in range(c.validation)
+    ]
+
+
+def faded(c: VfnTraining, ends: tuple[float, float], k: int) -> float:
+    """Between `ends`, linear over `epsilon_iterations`, then the last."""
+    first, last = ends
+    return first + (last - first) * min(k / c.epsilon_iterations, 1.0)
+
+
+def _drawn(lessons: Sequence[Lesson], luck: float) -> Lesson:
+    """The lesson at `luck` (0 to 1) of the weights laid end to end."""
+    edges = np.cumsum([lesson.weight for lesson in lessons])
+    return lessons[int(np.searchsorted(edges / edges[-1], luck, side="right").clip(0, len(lessons) - 1))]

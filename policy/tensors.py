@@ -17,6 +17,7 @@ from policy.situation import situation
 KINEMATIC_SCALE = np.array([125.0, 16.0, 30.0, np.pi, 10.0, 3.0, 1.0, 1.0], np.float32)
 KINEMATIC_INPUTS = len(KINEMATIC_FEATURES) + 1  # the features and the mask
 
+APART_OF = ("av", "hv", "road", "mission")  # channels that `apart` reads
 APART = 5  # channels of `apart`: AV, HV, road, ego or mission vehicle, relative speed
 STILL = 255 * 0.55  # pixel of a vehicle as fast as the ego (contract: 0.1 + 0.9 (dv + 30) / 60)
 BRISK = 255 * 0.9 / 60 * 15.0  # what 15 m/s of relative speed add to it: 1 in `apart`
@@ -83,7 +84,7 @@ def to_numpy(values: torch.Tensor) -> Floats32:
 
 
 def apart(maps: torch.Tensor) -> torch.Tensor:
-    """Maps [B,C,H,W] of the channels AV, HV, road, mission, as bytes -> [B,5,H,W]: who is where, how fast.
+    """Maps [B,4,H,W] of the channels APART_OF, as bytes -> [B,5,H,W]: who is where, how fast.
 
     A pixel's brightness says both at once, and 5 m/s more is a shade brighter: convolutions find it sooner
     where a vehicle is 1 whatever its speed, and relative speed stands in a channel of its own.

@@ -20,9 +20,12 @@ from cosim.evaluation.run_folder import Run
 from cosim.evaluation.statistics import Figure
 from cosim.evaluation.tasks import OK
 
-MOST, OTHERS = 1000, 300  # episodes a world of vfn and vfn-p, and of all others (1 % against 2 % needs many)
+MOST, OTHERS = (
+    1000,
+    300,
+)  # episodes a world of vfn and vfn-p, and of the baselines (1 % against 2 % needs many)
 Z = 1.96  # of a 95 % interval
-FEW = 100  # of the ablation
+FEW = 100  # of the ablation and the references
 REFERENCES = ("keep-lane", "idm")  # how hard the traffic is; what SUMO's own driver makes of it
 FIGURES = ("collision_rate", "av_caused_collision_rate", "dt_mean_m", "mission_success_rate", "veto_rate")
 COMPARED = ("collision_rate", "av_caused_collision_rate", "dt_mean_m", "mission_success_rate")
@@ -51,8 +54,8 @@ ABLATED = (
 
 def orders() -> list[Order]:
     """Every approach, reference and ablation in every world, `dense`, mixed."""
-    wanted = dict.fromkeys(ABLATION, FEW)
-    wanted |= {Agent(name): OTHERS for name in (*APPROACHES, *REFERENCES)}
+    wanted = dict.fromkeys((*ABLATION, *map(Agent, REFERENCES)), FEW)
+    wanted |= {Agent(name): OTHERS for name in APPROACHES}
     found = []
     for world in WORLDS:
         wanted |= {Agent(name): enough(world) for name in ("vfn", "vfn-p")}

@@ -12,6 +12,7 @@ from policy.chain import ChainConfig
 from policy.checkpoint import SHIPPED
 from policy.hpn import HpnConfig
 from policy.safety import SafetyConfig
+from policy.tensors import APART_OF
 from policy.traffic import TrafficConfig
 from policy.vfn import TABLE_1, VfnConfig
 
@@ -73,10 +74,16 @@ def paper(name: str) -> AgentConfig:
 def configure(
     name: str, observation: ObservationConfig, chain: ChainConfig, hpn: HpnConfig, vfn: VfnConfig
 ) -> AgentConfig:
-    """The approach `name` at any size; the VFN's inputs follow from it. Raises BadInput if unknown."""
+    """The approach `name` at any size; the VFN's inputs follow from it.
+
+    Raises BadInput if it is unknown, or reads pixels of other channels than there are.
+    """
     if name not in APPROACHES:
         raise BadInput(f"no such approach ({', '.join(APPROACHES)})", field="policy", value=name)
     approach = APPROACHES[name]
+    if not approach.kinematics and observation.channels != APART_OF:
+        problem = f"{name} sees maps alone and reads the channels {', '.join(APART_OF)}"
+        raise BadInput(problem, field="observation.channels", value=", ".join(observation.channels))
     return AgentConfig(
         observation=observation,
         predicted_maps=approach.predicted_maps,

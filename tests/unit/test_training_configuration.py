@@ -10,7 +10,7 @@ import yaml
 
 from cosim.app.configuration import configuration
 from cosim.errors import BadInput
-from policy.training.config import TrainingFile
+from policy.training.config import TrainingFile, agent_config
 
 
 def written(folder: Path, name: str, text: str) -> str:
@@ -58,3 +58,11 @@ def test_a_wrong_base_is_named_with_its_file(tmp_path: Path, text: str, said: st
     with pytest.raises(BadInput) as refused:
         configuration(written(tmp_path, "mine", text))
     assert said in str(refused.value)
+
+
+def test_a_network_of_maps_alone_refuses_channels_that_it_cannot_read(tmp_path: Path) -> None:
+    text = "base: compact\nobservation: {channels: [av, hv, road]}"
+    file = configuration(written(tmp_path, "mine", text)).file
+    assert agent_config("vfn-p", file).vfn.channels == 3
+    with pytest.raises(BadInput, match=r"observation\.channels='av, hv, road': conv2d-dqn sees maps alone"):
+        agent_config("conv2d-dqn", file)

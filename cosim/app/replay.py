@@ -7,7 +7,7 @@ import json
 import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from cosim.sumocfg import CLOCK, INPUTS, command_line, hint, keeps
 from cosim.types import EpisodeResult
 from cosim.vet import vetted
 from cosim.worker import Worker
+from policy.agents import check_name
 
 MANIFEST = "manifest.json"
 CASE, OPTIONS = "case", "sumo_arguments"  # what `cosim run --out` adds to the manifest
@@ -143,25 +144,47 @@ def drive(recorded: Recorded, scenario: Scenario, *, check: bool = True) -> tupl
     return result, recording
 
 
-def draw(recording: Recording, html: Path | None, mp4: Path | None, follow: str | None = None) -> None:
-    """Write the page and the film, each whole or not at all.
+def beside(recorded: Recorded, scenario: Scenario, policy: str) -> Recording:
+    """The same traffic and seed with another policy, driven and watched; the folder need not know it.
 
     Raises:
-        BadInput: `follow` is no vehicle of the episode; a file cannot be written.
+        BadInput: there is no such policy.
     """
-    names = list(dict.fromkeys(track.id for track in recording.tracks))
+    try:
+        check_name(policy)
+    except BadInput as error:
+        raise BadInput(error.problem, field="--beside", value=policy) from None
+    case = replace(recorded.case, policy=policy)
+    return drive(replace(recorded, case=case), scenario, check=False)[1]
+
+
+def draw(
+    recordings: Sequence[Recording],
+    html: Path | None = None,
+    mp4: Path | None = None,
+    gif: Path | None = None,
+    follow: str | None = None,
+) -> None:
+    """Write the page of the first recording, the film and the GIF of all, each whole or not at all.
+
+    Raises:
+        BadInput: `follow` is no vehicle of the episodes; a file cannot be written.
+    """
+    names = list(dict.fromkeys(track.id for r in recordings for track in r.tracks))
     if follow is not None and follow not in names:
         raise BadInput(f"no such vehicle{hint(follow, names)}", field="--follow", value=follow)
     if html is not None:
         from cosim.evaluation.replay.page import page
 
         with _writing(html) as draft:
-            draft.write_text(page(recording), "utf-8")
-    if mp4 is not None:
-        from cosim.evaluation.replay.video import film
+            draft.write_text(page(recordings[0]), "utf-8")
+    if mp4 is not None or gif is not None:
+        from cosim.evaluation.replay import video
 
-        with _progress("film", "pictures") as progress, _writing(mp4) as draft:
-            film(recording, draft, follow=follow, progress=progress)
+        for path, make in ((mp4, video.film), (gif, video.animation)):
+            if path is not None:
+                with _progress(path.name, "pictures") as progress, _writing(path) as draft:
+                    make(recordings, draft, follow=follow, progress=progress)
 
 
 def warn(lines: Sequence[str]) -> None:

@@ -133,6 +133,20 @@ def test_an_episode_of_a_batch_is_found_by_key_and_by_seed(
     assert page.stat().st_size > 30_000
 
 
+def test_another_policy_is_filmed_beside_it_on_the_same_traffic(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["replay", str(run), "--beside", "idm"]) == 0
+    assert "the same episode" in capsys.readouterr().out
+    assert (run / "replay-beside-idm.mp4").stat().st_size > 10_000
+    assert not list(run.glob("*.html"))
+    gif = run / "both.gif"
+    assert main(["replay", str(run), "--beside", "idm", "--gif", str(gif)]) == 0
+    assert gif.read_bytes()[:6] == b"GIF89a"
+    assert main(["replay", str(run), "--beside", "imd"]) == 2
+    assert "--beside='imd': unknown policy (did you mean 'idm'?)" in capsys.readouterr().err
+
+
 def test_a_run_can_draw_its_replay_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "run"
     assert main(["run", "merge", "--duration", "1", "--replay", "--out", str(out)]) == 0

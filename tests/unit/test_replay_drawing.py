@@ -15,6 +15,7 @@ from typing import Any
 import av
 import numpy as np
 import pytest
+from PIL import Image
 
 from cosim.app.output import document as facts
 from cosim.episode import Episode, run_episode
@@ -22,7 +23,7 @@ from cosim.evaluation.replay import packing, recorder
 from cosim.evaluation.replay.page import page
 from cosim.evaluation.replay.recorder import Recorder, Recording
 from cosim.evaluation.replay.strip import Strip, poses_at
-from cosim.evaluation.replay.video import HEIGHT, WIDTH, film
+from cosim.evaluation.replay.video import CAPTION, HEIGHT, LOW, SMALL, WIDTH, animation, film
 from cosim.types import Decision, Forecast, History, MetaAction, ObservationConfig, PolicyContext
 from policy.agents.keep_lane import KeepLane
 from tests.contracts.fake_worlds import platoon, scenario, wall
@@ -231,7 +232,7 @@ def test_a_vehicle_is_drawn_where_it_is(recording: Recording) -> None:
 
 def test_the_film_has_ten_pictures_a_second_that_move(recording: Recording, tmp_path: Path) -> None:
     path = tmp_path / "film.mp4"
-    film(recording, path, follow="human")
+    film([recording], path, follow="human")
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         assert stream.codec_context.name == "h264"
@@ -242,12 +243,41 @@ def test_the_film_has_ten_pictures_a_second_that_move(recording: Recording, tmp_
     assert [p.name for p in tmp_path.iterdir()] == ["film.mp4"]
 
 
+def test_two_episodes_are_filmed_one_above_the_other_and_the_shorter_one_waits(
+    recording: Recording, tmp_path: Path
+) -> None:
+    half = replace(recording, times=recording.times[: len(recording.times) // 2])
+    film([recording, half], tmp_path / "film.mp4")
+    with av.open(str(tmp_path / "film.mp4")) as container:
+        pictures = [f.to_ndarray(format="rgb24") for f in container.decode(container.streams.video[0])]
+    assert len(pictures) == 41
+    assert pictures[0].shape == (2 * HEIGHT, WIDTH, 3)
+    moved = np.abs(pictures[25].astype(int) - pictures[-1]).max((1, 2)) > 50
+    assert moved[:HEIGHT].any()
+    assert not moved[HEIGHT:].any()
+
+
+def test_the_gif_is_small_moves_and_runs_twice_as_fast(recording: Recording, tmp_path: Path) -> None:
+    path = tmp_path / "small.gif"
+    animation([recording, recording], path)
+    with Image.open(path) as gif:
+        assert gif.size == (SMALL, 2 * (LOW + CAPTION))
+        assert gif.n_frames == 11  # of 4 s
+        assert gif.info["duration"] == 200
+        first = np.asarray(gif.convert("RGB")).astype(int)
+        gif.seek(gif.n_frames - 1)
+        last = np.asarray(gif.convert("RGB")).astype(int)
+    assert np.abs(first - last).max() > 50
+    assert (first[: len(first) // 2] == first[len(first) // 2 :]).all()
+    assert [p.name for p in tmp_path.iterdir()] == ["small.gif"]
+
+
 def test_a_film_that_fails_leaves_nothing_behind(recording: Recording, tmp_path: Path) -> None:
     def stop(*_: float) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        film(recording, tmp_path / "film.mp4", progress=stop)
+        film([recording], tmp_path / "film.mp4", progress=stop)
     assert list(tmp_path.iterdir()) == []
 
 

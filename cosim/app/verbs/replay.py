@@ -14,7 +14,8 @@ def add(verbs: arguments.Verbs) -> None:
         "replay",
         help="draw an episode of a run as an interactive page and a film",
         description="Drive an episode once more from its manifest, check that it is the same (exit code 1 "
-        "when it is not), and draw it: an HTML file that needs no network, and an MP4.",
+        "when it is not), and draw it: an HTML file that needs no network, and an MP4. With --beside the "
+        "film shows what another policy makes of the same traffic and seed, one above the other.",
     )
     replay.add_argument("run", metavar="RUN", help="folder of `cosim run --out` or of `cosim evaluate`")
     replay.add_argument(
@@ -22,26 +23,33 @@ def add(verbs: arguments.Verbs) -> None:
     )
     replay.add_argument("--html", metavar="FILE", help="the page (default: replay*.html in RUN)")
     replay.add_argument("--mp4", metavar="FILE", help="the film (default: replay*.mp4 in RUN)")
+    replay.add_argument("--gif", metavar="FILE", help="a small picture that moves, for a page or a slide")
+    replay.add_argument("--beside", metavar="POLICY", help="drive it with this policy too, film both")
     replay.add_argument("--follow", metavar="ID", help="whom the film follows (default: the mission vehicle)")
     replay.add_argument("--no-check", action="store_true", help="draw it even when it is another one")
     replay.set_defaults(work=work)
 
 
 def work(args: argparse.Namespace) -> int:
-    """Check, drive, compare, draw. With only one of --html and --mp4 given, only that one is drawn."""
+    """Check, drive, compare, draw. Where a file is named, only those named are drawn."""
     from cosim.app import replay
 
     recorded = replay.find(Path(args.run), args.episode)
     scenario, warnings = replay.check_inputs(recorded)
     replay.warn(warnings)
-    html, mp4 = (None if name is None else Path(name) for name in (args.html, args.mp4))
-    if html is None and mp4 is None:
-        html, mp4 = (recorded.folder / f"{recorded.name}.{ending}" for ending in ("html", "mp4"))
+    html, mp4, gif = (None if name is None else Path(name) for name in (args.html, args.mp4, args.gif))
+    if html is None and mp4 is None and gif is None:
+        name = recorded.name if args.beside is None else f"{recorded.name}-beside-{args.beside}"
+        mp4 = recorded.folder / f"{name}.mp4"
+        html = recorded.folder / f"{name}.html" if args.beside is None else None
     result, recording = replay.drive(recorded, scenario, check=not args.no_check)
-    replay.draw(recording, html, mp4, args.follow)
+    recordings = [recording]
+    if args.beside is not None:
+        recordings += [replay.beside(recorded, scenario, args.beside)]
+    replay.draw(recordings, html, mp4, gif, args.follow)
     same = "the same episode" if result.trace_hash == recorded.trace_hash else "ANOTHER episode"
     print(f"{same}: trace hash {result.trace_hash}")
-    for path in (html, mp4):
+    for path in (html, mp4, gif):
         if path is not None:
             print(f"{path} ({path.stat().st_size / 1e6:.2f} MB)")
     return 0

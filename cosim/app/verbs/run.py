@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import shlex
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -92,13 +93,13 @@ def work(args: argparse.Namespace) -> int:
     if folder is not None:
         output.write_folder(folder, result)
         if recording is not None:
-            draw(recording, folder / "replay.html", folder / "replay.mp4")
+            draw([recording], folder / "replay.html", folder / "replay.mp4")
     if args.json:
         print(json.dumps(output.document(result)))
     else:
         print(output.table(result))
         if folder is not None:
-            print(f"  run folder               {folder}")
+            print(f"  run folder               {folder} (cosim replay {shlex.quote(args.out)} draws it)")
     return 0
 
 

@@ -1,9 +1,13 @@
-"""The replay as an MP4: a strip of road that follows one vehicle, and what is decided there, by PyAV."""
+"""The replay as an MP4 or a GIF: a strip of road that follows one vehicle, and what is decided there.
+
+Several episodes (the same seed with other policies, say) are drawn one above the other, each followed by a
+camera of its own, at equal times since they began.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import av
@@ -17,6 +21,9 @@ from cosim.types import Kind, MetaAction
 WIDTH, HEIGHT = 1280, 400  # pixels
 PANEL = 124  # pixels of text beneath the road
 RATE = 10  # pictures a second
+SMALL, LOW, CAPTION = 800, 112, 24  # pixels: width of a GIF, height of its road and of the line beneath
+STEP, SHOWN = 0.4, 0.2  # s from picture to picture of a GIF, and s that each is shown: twice as fast
+COLOURS = 64  # of a GIF
 SHOWN_CRASH = 4.0  # s that a collision stays marked
 QUIET, GOOD = (95, 107, 122), (21, 128, 61)
 ACTIONS = {
@@ -29,7 +36,7 @@ ACTIONS = {
 
 
 def film(
-    recording: Recording,
+    recordings: Sequence[Recording],
     path: Path,
     *,
     follow: str | None = None,
@@ -39,19 +46,16 @@ def film(
 
     The file appears whole or not at all. Raises OSError when it cannot be written.
     """
-    r = recording
-    begin, end = float(r.times[0]), float(r.times[-1])
-    count = max(round((end - begin) * RATE) + 1, 1)
-    camera = _Camera(r, follow)
+    reel = _Reel(recordings, follow, picture_at)
+    count = max(round(reel.seconds * RATE) + 1, 1)
     draft = path.with_name(f".{path.name}.part")
     try:
         with av.open(str(draft), "w", format="mp4", options={"movflags": "faststart"}) as container:
             stream = container.add_stream("libx264", rate=RATE)
-            stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+            stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT * len(recordings), "yuv420p"
             stream.options = {"crf": "23", "preset": "veryfast"}
             for k in range(count):
-                picture = picture_at(r, min(begin + k / RATE, end), camera)
-                frame = av.VideoFrame.from_ndarray(np.asarray(picture), format="rgb24")
+                frame = av.VideoFrame.from_ndarray(np.asarray(reel.picture(k / RATE)), format="rgb24")
                 for packet in stream.encode(frame):
                     container.mux(packet)
                 if progress is not None:
@@ -61,6 +65,64 @@ def film(
         draft.replace(path)
     finally:
         draft.unlink(missing_ok=True)
+
+
+def animation(
+    recordings: Sequence[Recording],
+    path: Path,
+    *,
+    follow: str | None = None,
+    progress: Callable[[float, float], None] | None = None,
+) -> None:
+    """Write a small GIF for a page or a slide: roads and outcomes without explanations, twice as fast.
+
+    `follow`, the file and errors as in `film`.
+    """
+    reel = _Reel(recordings, follow, caption_at)
+    count = max(round(reel.seconds / STEP) + 1, 1)
+    pictures = []
+    for k in range(count):
+        picture = reel.picture(k * STEP)
+        pictures.append(picture.quantize(COLOURS, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE))
+        if progress is not None:
+            progress(k + 1, count)
+    draft = path.with_name(f".{path.name}.part")
+    try:
+        first, *rest = pictures
+        times = round(1000 * SHOWN)  # ms
+        first.save(draft, "GIF", save_all=True, append_images=rest, duration=times, loop=0)
+        draft.replace(path)
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+class _Reel:
+    """Pictures of all recordings, one above the other."""
+
+    def __init__(
+        self,
+        recordings: Sequence[Recording],
+        follow: str | None,
+        draw: Callable[[Recording, float, _Camera], Image.Image],
+    ) -> None:
+        self._shots = [(r, _Camera(r, follow)) for r in recordings]
+        self._draw = draw
+        self.seconds = max(float(r.times[-1] - r.times[0]) for r in recordings)
+
+    def picture(self, since: float) -> Image.Image:
+        """At `since` s after the beginning of each; who ended earlier stands still."""
+        parts = [
+            self._draw(r, min(float(r.times[0]) + since, float(r.times[-1])), camera)
+            for r, camera in self._shots
+        ]
+        if len(parts) == 1:
+            return parts[0]
+        whole = Image.new("RGB", (parts[0].width, sum(part.height for part in parts)))
+        top = 0
+        for part in parts:
+            whole.paste(part, (0, top))
+            top += part.height
+        return whole
 
 
 class _Camera:
@@ -104,21 +166,42 @@ def picture_at(r: Recording, time: float, camera: _Camera) -> Image.Image:
             strip.choice(pose, choices[pose.track.id], by_name)
         if pose.track.mission or pose is shown:
             strip.name(pose)
-    for crash in r.collisions:
-        if math.isfinite(crash.x) and 0.0 <= time - crash.time + 0.05 < SHOWN_CRASH:
-            strip.crash(crash.x, crash.y)
-    board = _Board(strip.finished())
+    _crashes(strip, r, time)
+    board = _Board(strip.finished(), PANEL)
     board.legend(r)
     board.panel(r, time, camera, by_name, shown, choices)
     return board.picture
 
 
-class _Board:
-    """The whole picture: the strip above, words beneath."""
+def caption_at(r: Recording, time: float, camera: _Camera) -> Image.Image:
+    """One picture of the GIF, SMALL x (LOW + CAPTION)."""
+    poses = poses_at(r, time)
+    camera.look(poses)
+    strip = Strip(camera.x, camera.y, SMALL, LOW)
+    strip.road(r)
+    for pose in poses:
+        strip.vehicle(pose)
+    _crashes(strip, r, time)
+    board = _Board(strip.finished(), CAPTION)
+    board.legend(r)
+    board.caption(r, time)
+    return board.picture
 
-    def __init__(self, strip: Image.Image) -> None:
-        self.picture = Image.new("RGB", (WIDTH, HEIGHT), (255, 255, 255))
+
+def _crashes(strip: Strip, r: Recording, time: float) -> None:
+    """Marks the collisions of the last seconds."""
+    for crash in r.collisions:
+        if math.isfinite(crash.x) and 0.0 <= time - crash.time + 0.05 < SHOWN_CRASH:
+            strip.crash(crash.x, crash.y)
+
+
+class _Board:
+    """The whole picture: the strip above, `beneath` pixels of words below."""
+
+    def __init__(self, strip: Image.Image, beneath: int) -> None:
+        self.picture = Image.new("RGB", (strip.width, strip.height + beneath), (255, 255, 255))
         self.picture.paste(strip, (0, 0))
+        self._line_top = strip.height
         self._pen = ImageDraw.Draw(self.picture)
 
     def legend(self, r: Recording) -> None:
@@ -138,6 +221,16 @@ class _Board:
             self._line(x + 23, 8, name, TEXT, 12)
             x += 40 + self._pen.textlength(name, font(12))
 
+    def caption(self, r: Recording, time: float) -> None:
+        """One line: who drives, what has come of it, when."""
+        top = self._line_top + 4
+        policy = str(r.facts.get("policy"))
+        self._line(14, top, policy, TEXT, 13, bold=True)
+        outcome, colour = _outcome(r, time)
+        self._line(28 + self._pen.textlength(policy, font(13, True)), top, outcome, colour)
+        clock = f"{time - r.begin:.1f} s"
+        self._line(self.picture.width - 14 - self._pen.textlength(clock, font(13)), top, clock, QUIET)
+
     def panel(
         self,
         r: Recording,
@@ -148,7 +241,7 @@ class _Board:
         choices: Mapping[str, Choice],
     ) -> None:
         """What the page says too: the episode, the followed vehicle, and one AV's decision explained."""
-        f, line = r.facts, HEIGHT - PANEL
+        f, line = r.facts, self._line_top
         label = f" ({f['policy_label']})" if f.get("policy_label") else ""
         title = f"{f.get('scenario')} / {f.get('demand')} / {f.get('policy')}{label}"
         self._line(14, line + 8, title, TEXT, 15, bold=True)
@@ -212,4 +305,6 @@ def _outcome(r: Recording, time: float) -> tuple[str, Colour]:
     served = r.facts.get("mission_time_s")
     if served is not None and time - r.begin >= served - 0.05:
         return f"mission fulfilled at {served:.1f} s", GOOD
-    return "no collision so far", QUIET
+    if r.facts.get("mission_success") is None:
+        return "no collision so far", QUIET
+    return f"no collision, mission not fulfilled{' yet' if time < r.times[-1] - 0.05 else ''}", QUIET

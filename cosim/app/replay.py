@@ -27,6 +27,7 @@ from cosim.worker import Worker
 from policy.agents import check_name
 
 MANIFEST = "manifest.json"
+MOST_NAMED = 8  # episodes of one seed
 CASE, OPTIONS = "case", "sumo_arguments"  # what `cosim run --out` adds to the manifest
 
 
@@ -202,8 +203,10 @@ def _of_batch(folder: Path, episode: str | None) -> Recorded:
     if not found:
         raise BadInput(f"no such episode{hint(episode, keys)}", field="EPISODE", value=episode)
     if len(found) > 1:
-        some = ", ".join(r["key"] for r in found[:4]) + (", ..." if len(found) > 4 else "")
-        raise BadInput(f"{len(found)} episodes have this seed: {some}", field="EPISODE", value=episode)
+        some = [f"{r['key']} ({r['scenario']} / {r['demand']} / {r['policy']})" for r in found[:MOST_NAMED]]
+        more = ["..."] if len(found) > MOST_NAMED else []
+        problem = f"{len(found)} episodes have this seed: {', '.join([*some, *more])}"
+        raise BadInput(problem, field="EPISODE", value=episode)
     row = found[0]
     if row["status"] != OK:
         problem = f"was not driven to its end (status {row['status']}): nothing to compare with"

@@ -120,7 +120,7 @@ def test_an_episode_of_a_batch_is_found_by_key_and_by_seed(
     cell = next(c for c, v in manifest["cells"].items() if v["case"]["policy"] == "keep-lane")
     key = f"{cell}-200052"
     assert (batch / "outputs" / key / "tripinfo.xml").read_text().rstrip().endswith("</tripinfos>")
-    with pytest.raises(BadInput, match="2 episodes have this seed: "):
+    with pytest.raises(BadInput, match=rf"2 episodes have this seed: {key} \(merge / \w+ / keep-lane\), "):
         find(batch, "200052")
     with pytest.raises(BadInput, match="did you mean"):
         find(batch, key[:-1])

@@ -16,7 +16,7 @@ import yaml
 
 from benchmarks.arms import differences
 from benchmarks.papers.agents import Agent
-from benchmarks.papers.driving import Order, Results, Settings
+from benchmarks.papers.driving import TRAININGS, Order, Results, Settings
 from benchmarks.papers.pages import Job, heading, save
 from benchmarks.tables import (
     Line,
@@ -45,9 +45,10 @@ CONTESTED, DENSE = 1.0, 2.0  # weights of the lessons: tested is how safe it dri
 
 def agent(approach: str, behavior: str) -> Agent:
     """An approach that was trained among one kind of drivers."""
-    name = f"{approach}, {behavior}"
-    weights = f"{FOLDER}/{approach}-{behavior}/best.safetensors"
-    return Agent(name, approach, weights, made_by=command(approach, behavior))
+    places = [f"{FOLDER}/{approach}-{behavior}", str(TRAININGS / f"figure9-{approach}-{behavior}")]
+    weights = [f"{place}/best.safetensors" for place in places]  # trained here, else as shipped
+    found = next((file for file in weights if Path(file).is_file()), weights[0])
+    return Agent(f"{approach}, {behavior}", approach, found, made_by=command(approach, behavior))
 
 
 def command(approach: str, behavior: str) -> str:

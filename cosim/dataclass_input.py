@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import enum
 import math
 import types
 import typing
@@ -69,6 +70,11 @@ def _value(kind: Any, value: object, file: Path | None, where: str) -> Any:
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
             raise BadInput("a finite number is needed", file=file, field=where, value=value)
         return float(value)
+    if isinstance(kind, type) and issubclass(kind, enum.IntEnum):
+        if isinstance(value, bool) or not isinstance(value, int) or value not in [*kind]:
+            names = ", ".join(f"{int(member)} {member.name.lower()}" for member in kind)
+            raise BadInput(f"must be one of {names}", file=file, field=where, value=value)
+        return kind(value)
     wanted = {int: "a whole number", bool: "true or false", str: "text"}
     if kind not in wanted:
         raise TypeError(f"{where}: fields of type {kind} cannot be read from YAML")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import platform
+from collections.abc import Iterable
 from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 
 from cosim.scenario import Scenario
 
+POLICY_FILES = "policy_files"  # what decides how the policy drives: weights, or its own code
 PACKAGES = ("cosim", "libsumo", "numpy", "numba", "torch")
 
 
@@ -33,8 +35,13 @@ def manifest(scenario: Scenario, seed: int) -> dict[str, Any]:
         "sumo_options": dict(scenario.options),
         "options_not_passed_on": list(scenario.ignored),
         "versions": {"python": platform.python_version(), **{p: _version(p) for p in PACKAGES}},
-        "files": {path.name: _digest(str(path), path.stat().st_mtime_ns) for path in files},
+        "files": digests(files),
     }
+
+
+def digests(files: Iterable[Path]) -> dict[str, str]:
+    """Name -> SHA-256 of each file."""
+    return {path.name: _digest(str(path), path.stat().st_mtime_ns) for path in files}
 
 
 @lru_cache

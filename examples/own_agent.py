@@ -1,23 +1,35 @@
-"""A session driven by your own function: AVs keep their distance and let the mission vehicle in."""
+"""AVs keep their distance and let the mission vehicle in, by a function of what one of them sees.
+
+python examples/own_agent.py                          # a session, driven by your own loop
+cosim run merge --policy examples/own_agent.py:my_agent    # or by everything that cosim has
+"""
 
 import cosim
-from cosim.types import KINEMATIC_FEATURES, MetaAction
+from cosim.types import KINEMATIC_FEATURES, Bools, Floats32, MetaAction
 
 X, Y, SPEED, MISSION = (KINEMATIC_FEATURES.index(name) for name in ("x", "y", "speed", "is_mission"))
 
 
 def my_agent(seen: cosim.View) -> MetaAction:
-    """Fall back from whoever is close ahead in my lane; the mission vehicle counts beside it as well."""
-    others = seen.kinematics[-1, 1:][seen.valid[-1, 1:]]  # newest frame, rows that hold a vehicle
+    """What one AV does."""
+    return keep_distance(seen.kinematics[-1], seen.valid[-1])
+
+
+def keep_distance(rows: Floats32, valid: Bools) -> MetaAction:
+    """Fall back from whoever is close ahead in my lane; the mission vehicle counts beside it as well.
+
+    rows [R,F]: the newest frame, myself first; valid [R]: which rows hold a vehicle.
+    """
+    mine, others = float(rows[0, SPEED]), rows[1:][valid[1:]]
     reach = 2 + 4 * (others[:, MISSION] > 0)  # m to either side
     near = (others[:, X] > 0) & (abs(others[:, Y]) < reach)
     if not near.any():
         return MetaAction.ACCELERATE
     x, speed = min(others[near][:, (X, SPEED)].tolist())
-    gap = x - 5 + 2 * (speed - seen.ego_speed)  # m, bumper to bumper, 2 s from now
-    if gap < seen.ego_speed + 2:
+    gap = x - 5 + 2 * (speed - mine)  # m, bumper to bumper, 2 s from now
+    if gap < mine + 2:
         return MetaAction.DECELERATE
-    return MetaAction.ACCELERATE if gap > 1.5 * seen.ego_speed + 10 else MetaAction.IDLE
+    return MetaAction.ACCELERATE if gap > 1.5 * mine + 10 else MetaAction.IDLE
 
 
 def main() -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from cosim.app.case_runner import CaseRunner
+from cosim.app.policies import check
 from cosim.app.progress import Progress
 from cosim.errors import BadInput
 from cosim.evaluation import batch, matrix
@@ -24,7 +25,6 @@ from cosim.evaluation.folder import RunFolder
 from cosim.evaluation.store import FILE, Store
 from cosim.evaluation.summary import summarize
 from cosim.evaluation.supervisor import Limits
-from policy.agents import check_name
 
 LINES = 200  # cells that a dry run lists
 
@@ -52,7 +52,7 @@ def _plan(args: argparse.Namespace) -> matrix.Plan:
     if args.resume and args.spec is None and all(value is None for value in flags.values()):
         return _plan_of(args)
     spec = specs.read(None if args.spec is None else Path(args.spec), flags)
-    return matrix.plan(matrix.cells(spec), range(*spec.seeds), check_name)
+    return matrix.plan(matrix.cells(spec), range(*spec.seeds), check)
 
 
 def _plan_of(args: argparse.Namespace) -> matrix.Plan:
@@ -65,7 +65,7 @@ def _plan_of(args: argparse.Namespace) -> matrix.Plan:
         if store.spec_hash() is None:
             raise BadInput("holds no run to resume", field="--out", value=args.out)
         cases = [Case.read(cell["case"]) for cell in store.cells().values()]
-        return matrix.plan(cases, range(*store.document()["seeds"]), check_name)
+        return matrix.plan(cases, range(*store.document()["seeds"]), check)
 
 
 def _engine(args: argparse.Namespace) -> Engine:

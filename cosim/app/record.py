@@ -10,6 +10,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from cosim.app.policies import check
 from cosim.app.progress import Progress
 from cosim.app.runner import Runner
 from cosim.episode import Episode
@@ -19,10 +20,10 @@ from cosim.evaluation.engines import LocalEngine
 from cosim.evaluation.tasks import Progress as Heartbeat
 from cosim.evaluation.tasks import Task
 from cosim.manifest import manifest
+from cosim.policy_name import read
 from cosim.recording import Folder, RecordingSimulator, write
 from cosim.scenario import Scenario
 from cosim.vet import vetted
-from policy.agents import check_name
 
 
 def cases(
@@ -35,8 +36,9 @@ def cases(
     duration: float | None = None,
 ) -> list[Case]:
     """Every combination, seed by seed; what is left out is the scenario's own. Raises BadInput."""
+    policies = [read(policy).text for policy in policies]
     for policy in policies:
-        check_name(policy)
+        check(policy)
     found = [
         Case(
             what=what,

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from cosim.app.policies import check
 from cosim.app.progress import Progress
 from cosim.app.runner import Runner
 from cosim.errors import BadInput, CosimError
@@ -18,13 +19,13 @@ from cosim.evaluation import run_folder
 from cosim.evaluation.case import Case
 from cosim.evaluation.replay.recorder import Recording
 from cosim.evaluation.tasks import OK
-from cosim.manifest import manifest
+from cosim.manifest import POLICY_FILES, manifest
+from cosim.policy_name import label, read
 from cosim.scenario import Scenario
 from cosim.sumocfg import CLOCK, INPUTS, command_line, hint, keeps
 from cosim.types import EpisodeResult
 from cosim.vet import vetted
 from cosim.worker import Worker
-from policy.agents import check_name
 
 MANIFEST = "manifest.json"
 MOST_NAMED = 8  # episodes of one seed
@@ -128,14 +129,17 @@ def check_inputs(recorded: Recorded) -> tuple[Scenario, list[str]]:
 def drive(recorded: Recorded, scenario: Scenario, *, check: bool = True) -> tuple[EpisodeResult, Recording]:
     """Drive it again, watched.
 
-    Raises:
-        ReplayDiffers: the trace hash is another one (only with `check`).
+    Raises (only with `check`):
+        BadInput: the policy's weights or code have changed.
+        ReplayDiffers: the trace hash is another one.
     """
     case = recorded.case
-    with _progress(f"replay {scenario.name} {case.policy}", "s") as progress:
+    with _progress(f"replay {scenario.name} {label(case.policy)}", "s") as progress:
         worker = Worker(Runner, scenario, case.policy, math.radians(case.svo_deg), name="cosim-replay")
         with worker:
             result, recording = worker.call("record", case.seed, progress=progress)
+    if check:
+        _same_policy(recorded.manifest.get(POLICY_FILES, {}), result.manifest[POLICY_FILES])
     if check and result.trace_hash != recorded.trace_hash:
         raise ReplayDiffers(
             f"the replay is not the recorded episode: trace hash {result.trace_hash[:16]}... after "
@@ -151,11 +155,14 @@ def beside(recorded: Recorded, scenario: Scenario, policy: str) -> Recording:
     Raises:
         BadInput: there is no such policy.
     """
+    name = read(policy, field="--beside").text
     try:
-        check_name(policy)
+        check(name)
     except BadInput as error:
-        raise BadInput(error.problem, field="--beside", value=policy) from None
-    case = replace(recorded.case, policy=policy)
+        if error.field != "--policy":
+            raise
+        raise BadInput(error.problem, file=error.file, field="--beside", value=policy) from None
+    case = replace(recorded.case, policy=name)
     return drive(replace(recorded, case=case), scenario, check=False)[1]
 
 
@@ -214,6 +221,14 @@ def _of_batch(folder: Path, episode: str | None) -> Recorded:
     cell = run.manifest["cells"][row["cell"]]
     case = Case.read({**cell[CASE], "seed": row["seed"]})
     return Recorded(case, (), cell["manifest"], row["trace_hash"], folder)
+
+
+def _same_policy(then: Mapping[str, str], now: Mapping[str, str]) -> None:
+    """Raises BadInput when weights or code are not those that drove it."""
+    for name, before in then.items():
+        if name in now and now[name] != before:
+            problem = f"has changed since it drove (SHA-256 {before[:12]}..., now {now[name][:12]}...)"
+            raise BadInput(problem, file=name)
 
 
 def _lasting(name: str, document: Mapping[str, Any]) -> Any:

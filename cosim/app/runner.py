@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from cosim.app.output import document
+from cosim.app.policies import make
 from cosim.determinism import make_torch_deterministic
 from cosim.episode import Episode, run_episode
 from cosim.evaluation.replay.recorder import Recorder, Recording
+from cosim.manifest import POLICY_FILES, digests
 from cosim.scenario import Scenario
 from cosim.sumo_outputs import drafts
 from cosim.types import EpisodeResult, ObservationConfig, Policy
-from policy.agents import make
 
 
 class Runner:
@@ -33,6 +35,7 @@ class Runner:
         self._policy = make(policy) if isinstance(policy, str) else policy
         self._svo = svo
         wanted = observation or self._policy.observation
+        self._policy_files = digests(getattr(self._policy, "files", ()))
         make_torch_deterministic()
         self._simulator = SumoSimulator(
             scenario, av_parameters=self._policy.av_parameters, history=wanted.frames
@@ -76,7 +79,8 @@ class Runner:
         with drafts(outputs, folder) as files:
             self._simulator.write_outputs(files)
             try:
-                return run_episode(episode, policy, seed, svo=self._svo, progress=progress)
+                result = run_episode(episode, policy, seed, svo=self._svo, progress=progress)
+                return replace(result, manifest=result.manifest | {POLICY_FILES: self._policy_files})
             finally:
                 if files:
                     self._simulator.finish_outputs()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import shlex
 import sys
 from dataclasses import asdict, replace
 
@@ -15,6 +16,7 @@ from cosim.app.progress import Progress
 from cosim.app.rollouts import Rollouts
 from cosim.errors import BadInput
 from cosim.memory import keep_freed_memory
+from cosim.policy_name import BEST
 from cosim.scenario import load
 from policy.agents.approaches import APPROACHES
 from policy.checkpoint import sha256
@@ -25,6 +27,7 @@ from policy.training.networks import use_threads
 from policy.training.vfn import Trainer
 from sumo_scenarios import names
 
+ABOUT = ("observation", "hpn", "reward", "explore", "chain", "safety", "traffic")  # sections in the card
 CONTESTED = 2.0  # contested episodes for every dense one: altruism is learned where somebody must yield
 
 
@@ -46,7 +49,7 @@ def train(args: argparse.Namespace) -> int:
     about = {
         "policy": name,
         "scenarios": sorted({lesson.scenario for lesson in training.lessons}),
-        **{part: asdict(getattr(file, part)) for part in ("reward", "explore", "chain", "safety", "traffic")},
+        **{part: asdict(getattr(file, part)) for part in ABOUT},
     }
     if agent.predicted_maps and agent.chain.source == "hpn" and agent.hpn_weights is not None:
         about["hpn_sha256"] = sha256(agent.hpn_weights)
@@ -68,8 +71,13 @@ def train(args: argparse.Namespace) -> int:
         writer.close()
     best = f", best validation reward {trainer.best:.3f}" if math.isfinite(trainer.best) else ""
     print(f"{name}: {trainer.iteration} iterations, {trainer.school.learner.updates} updates{best}")
-    print(f"  {folder / 'best.safetensors'}")
+    print(f"  {folder / BEST}" + (f" (cosim run merge --policy {_typed(args.out)})" if best else ""))
     return 0
+
+
+def _typed(folder: str) -> str:
+    """The folder as `--policy` wants it: a bare word would be a policy that ships."""
+    return shlex.quote(folder if "/" in folder else f"./{folder}")
 
 
 def _scheduled(training: VfnTraining, args: argparse.Namespace, name: str) -> VfnTraining:

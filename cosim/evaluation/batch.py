@@ -13,6 +13,8 @@ from cosim.evaluation.matrix import Cell, Plan
 from cosim.evaluation.records import row
 from cosim.evaluation.store import Store
 from cosim.evaluation.tasks import BAD_INPUT, FAULT, Outcome, Progress, Task
+from cosim.manifest import POLICY_FILES
+from cosim.policy_name import label
 
 FAULTS = 10  # of our own code, before a batch stops: it is broken, not unlucky
 
@@ -108,6 +110,8 @@ def _compare(known: Mapping[str, Any], found: Mapping[str, Any], cell: Cell, whe
             differing = next((k for k in sorted({*a, *b}) if a.get(k) != b.get(k)), None)
             if differing is not None:
                 problem = f"is another one {where}: {b.get(differing)!r}, it was {a.get(differing)!r}"
+                if name == POLICY_FILES:
+                    raise BadInput(problem, file=differing, field="policy", value=label(cell.case.policy))
                 raise BadInput(problem, file=cell.scenario.config, field=f"{name}.{differing}")
         elif a != b:
             raise BadInput(f"is {b!r} {where}, it was {a!r}", file=cell.scenario.config, field=name)

@@ -9,6 +9,7 @@ from typing import Any
 from cosim.evaluation.case import Case
 from cosim.evaluation.matrix import Cell
 from cosim.evaluation.tasks import Outcome
+from cosim.policy_name import label
 
 # First in every table; all others follow in the order of `cosim run --json`.
 IDENTITY = (
@@ -40,7 +41,7 @@ def row(cell: Cell, case: Case, outcome: Outcome) -> dict[str, Any]:
         "status": outcome.status,
         "scenario": scenario.name,
         "demand": scenario.demand_name,
-        "policy": case.policy,
+        "policy": label(case.policy),
         "policy_label": None,
         "behavior": scenario.behavior,
         "driver_model": scenario.driver_model,

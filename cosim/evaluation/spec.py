@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import sumo_scenarios
-from cosim import yaml_input
+from cosim import policy_name, yaml_input
 from cosim.errors import BadInput
 from cosim.scenario import BEHAVIORS, DRIVER_MODELS
 from cosim.sumocfg import hint, one_of
@@ -31,7 +31,7 @@ class Spec:
     scenario: tuple[str, ...]  # names of worlds, absolute paths of .sumocfg
     seeds: tuple[int, int] = (200_000, 200_001)  # first, and one past the last
     demand: tuple[tuple[str, ...], ...] = ((),)  # each: names or files driven together; (): the scenario's
-    policy: tuple[str, ...] = ("idm",)
+    policy: tuple[str, ...] = ("idm",)  # as `cosim.policy_name` has it, files absolute
     behavior: tuple[str | None, ...] = (None,)  # None: the scenario's default
     driver_model: tuple[str, ...] = ("lc2013",)
     penetration: tuple[float | None, ...] = (None,)  # None: the scenario's own fleet
@@ -79,6 +79,8 @@ def read(path: Path | None, flags: Mapping[str, Any]) -> Spec:
             continue
         if name in ("scenario", "demand"):
             values[name] = tuple(_expand(item, Path.cwd(), None, f"--{name}", name) for item in given)
+        elif name == "policy":
+            values[name] = tuple(policy_name.read(item).text for item in given)
         elif name == "seeds":
             values[name] = seeds(given, None, "--seeds")
         else:
@@ -136,6 +138,8 @@ def _file(path: Path) -> dict[str, Any]:
             continue
         if name in ("scenario", "demand"):
             values[name] = tuple(_expand(item, folder, path, name, name) for item in top.names(name))
+        elif name == "policy":
+            values[name] = tuple(policy_name.read(item, folder, name, path).text for item in top.names(name))
         elif name == "seeds":
             values[name] = seeds(top.raw(name), path, name)
         elif name == "penetration":
@@ -193,6 +197,9 @@ def _checked(spec: Spec, file: object) -> Spec:
         one_of(model, DRIVER_MODELS, "driver_model", file)
     for preset in filter(None, spec.preset):
         one_of(preset, Preset.ALL, "preset", file)
+    labels = [policy_name.label(text) for text in spec.policy]
+    if twice := next((name for name in labels if labels.count(name) > 1), None):
+        raise BadInput(f"two are called {twice}: label them, LABEL=...", file=file, field="policy")
     chosen = [
         name
         for name, given in (

@@ -20,7 +20,7 @@ from cosim.types import (
     MetaAction,
     PolicyContext,
 )
-from policy.agents.approaches import AgentConfig, compact
+from policy.agents.approaches import AgentConfig, compact, shipped
 from policy.chain import predict
 from policy.checkpoint import load
 from policy.extractors import FrameMemory
@@ -70,6 +70,8 @@ class PredictionAware:
             if c.hpn_weights is not None:
                 load(c.hpn_weights, {"hpn": self.hpn}, {"hpn": c.hpn})
         self.label = c.note or _label(parts)
+        used = (*parts.values(), shipped(c.predictor))
+        self.files = tuple(path for path in used if path is not None)  # they decide how it drives
         self.vfn.to(memory_format=self.vfn.layout)  # type: ignore[call-overload]
         if self.hpn is not None:
             self.hpn.to(memory_format=torch.channels_last)  # type: ignore[call-overload]

@@ -8,6 +8,11 @@ from typing import Any
 
 Verbs = Any  # what ArgumentParser.add_subparsers returns: argparse keeps its type private
 
+POLICY = (
+    "who commands the AVs (default idm): a name; RUN or FILE.safetensors of cosim train; FILE.py:NAME or "
+    "MODULE:NAME, your own (docs/own_policy.md). LABEL= before a file says what tables call it"
+)
+
 
 def degrees(text: str) -> float:
     """An angle from 0 to 90 degrees."""

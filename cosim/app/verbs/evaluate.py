@@ -28,7 +28,7 @@ def add(verbs: arguments.Verbs) -> None:
         metavar="NAME|FILES",
         help="a name, or a file or glob (.rou.xml, .trips.xml, flows, .gz); A,B is one demand of two files",
     )
-    axes.add_argument("--policy", action="append", metavar="NAME", help="who commands the AVs (default idm)")
+    axes.add_argument("--policy", action="append", metavar="POLICY", help=arguments.POLICY)
     axes.add_argument("--behavior", action="append", choices=BEHAVIORS)
     axes.add_argument("--driver-model", action="append", choices=DRIVER_MODELS)
     axes.add_argument("--penetration", action="append", type=arguments.share, metavar="X", help="0..1")

@@ -23,7 +23,7 @@ def add(verbs: arguments.Verbs) -> None:
         "--demand", action="append", default=[], metavar="NAME|FILE", help="repeatable; one recording each"
     )
     record.add_argument("--behavior", action="append", default=[], choices=BEHAVIORS, help="repeatable")
-    record.add_argument("--policy", action="append", default=[], metavar="NAME", help="repeatable (idm)")
+    record.add_argument("--policy", action="append", default=[], metavar="POLICY", help=arguments.POLICY)
     record.add_argument("--svo", type=arguments.degrees, default=45.0, metavar="DEG", help="SVO angle, 0..90")
     record.add_argument("--seeds", type=seeds, required=True, metavar="A:B", help="A, A+1, ..., B-1")
     record.add_argument("--duration", type=arguments.positive, metavar="S")

@@ -13,6 +13,7 @@ from pathlib import Path
 from cosim.app.verbs import arguments
 from cosim.errors import BadInput
 from cosim.evaluation.case import Case
+from cosim.policy_name import label, read
 from cosim.scenario import BEHAVIORS, DRIVER_MODELS
 from cosim.types import Preset
 from cosim.xml_input import is_there
@@ -29,7 +30,7 @@ def add(verbs: arguments.Verbs) -> None:
     run.add_argument(
         "--demand", action="append", default=[], metavar="NAME|FILE", help="demand by name, or route files"
     )
-    run.add_argument("--policy", default="idm", metavar="NAME", help="who commands the AVs (default idm)")
+    run.add_argument("--policy", default="idm", metavar="POLICY", help=arguments.POLICY)
     run.add_argument("--svo", type=arguments.degrees, default=45.0, metavar="DEG", help="SVO angle, 0..90")
     run.add_argument("--behavior", choices=BEHAVIORS, help="Table II class of the human drivers")
     run.add_argument("--driver-model", choices=DRIVER_MODELS, default="lc2013")
@@ -61,24 +62,24 @@ def work(args: argparse.Namespace) -> int:
     """Drive it in a worker process, show the result."""
     from cosim import sumo_outputs
     from cosim.app import output
+    from cosim.app.policies import check
     from cosim.app.progress import Progress
     from cosim.app.replay import draw, remembered
     from cosim.app.runner import Runner
     from cosim.vet import vetted
     from cosim.worker import Worker
-    from policy.agents import check_name
 
     for flag, wanted in (("--output", args.output), ("--replay", args.replay)):
         if wanted and not args.out:
             raise BadInput("needs a run folder to write into: --out DIR", field=flag)
-    check_name(args.policy)
     case = case_of(args)
+    check(case.policy)
     scenario = case.scenario(args.sumo_options)
     sumo_outputs.check(case.outputs, scenario.options)
     scenario = vetted(scenario)
     folder = output.prepare_folder(args.out) if args.out else None
     files = folder / "outputs" if folder is not None and case.outputs else None
-    progress = Progress(f"{scenario.name} {args.policy}", "s")
+    progress = Progress(f"{scenario.name} {label(case.policy)}", "s")
     progress.starting()
     try:
         with Worker(Runner, scenario, case.policy, math.radians(case.svo_deg), name="cosim-run") as worker:
@@ -108,7 +109,7 @@ def case_of(args: argparse.Namespace) -> Case:
     return Case(
         what=_place(args.what),
         demand=tuple(map(_place, args.demand)),
-        policy=args.policy,
+        policy=read(args.policy).text,
         behavior=args.behavior,
         driver_model=args.driver_model,
         penetration=args.penetration,

@@ -1,0 +1,179 @@
+"""Weights of a training and somebody's own code as `--policy`: driven like what ships, mistakes named."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sqlite3
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cosim.app.cli import main
+from cosim.app.policies import check, make
+from cosim.errors import BadInput
+from cosim.evaluation.store import FILE
+from cosim.types import COMPACT
+from policy.checkpoint import SHIPPED
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+SEED = "200061"
+CODE = """
+from cosim.types import COMPACT, MetaAction, ObservationConfig
+
+class Holds:
+    observation = ObservationConfig(maps=False)
+    def reset(self, context): ...
+    def decide(self, histories): return {av: self.answer(av) for av in histories}
+    def answer(self, av): return 1
+
+class Raises(Holds):
+    def answer(self, av):
+        return 1 // 0
+
+class Text(Holds):
+    def answer(self, av): return "left"
+
+class Strangers(Holds):
+    def decide(self, histories): return {"nobody": None}
+
+class Lists(Holds):
+    def decide(self, histories): return [1]
+
+class Blind(Holds):
+    observation = None
+
+class Fails(Holds):
+    def __init__(self): raise OSError("no model file")
+
+class Nothing: ...
+
+def factory(): return Holds()
+def looks(seen): return None if seen.velocity_map.shape[-1] else MetaAction.IDLE
+number = 7
+"""
+
+
+@pytest.fixture
+def code(tmp_path: Path) -> Path:
+    file = tmp_path / "code.py"
+    file.write_text(CODE)
+    return file
+
+
+def run(policy: str, out: Path, *more: str) -> dict[str, Any]:
+    """Two seconds of the contested merge."""
+    arguments = ["run", "merge", "--demand", "contested", "--duration", "2", "--seed", SEED]
+    assert main([*arguments, "--policy", policy, "--out", str(out), *more]) == 0
+    found: dict[str, Any] = json.loads((out / "result.json").read_text())
+    return found
+
+
+def test_weights_of_a_training_drive_as_the_same_weights_that_ship(tmp_path: Path) -> None:
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    for ending in ("safetensors", "json"):
+        shutil.copy(SHIPPED / f"vfn.{ending}", folder / f"best.{ending}")
+    mine, ours = run(str(folder), tmp_path / "a"), run("vfn", tmp_path / "b")
+    assert mine["policy"] == "mine"
+    assert mine["policy_label"] == ours["policy_label"]
+    assert mine["trace_hash"] == ours["trace_hash"]
+    hashes = [list(x["manifest"]["policy_files"].values()) for x in (mine, ours)]
+    assert hashes[0] == hashes[1] != []
+
+
+@pytest.mark.parametrize("name", ["vfn-p", "vfn", "safe-dqn", "conv3d-a2c", "conv2d-dqn", "vfn-p-egoistic"])
+def test_the_card_of_what_ships_says_all_of_its_agent(name: str) -> None:
+    from cosim.app.trained_policy import config
+    from policy.agents.approaches import compact
+
+    assert config(SHIPPED / f"{name}.safetensors") == compact(name)
+
+
+def test_weights_that_are_no_value_networks_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match=r"hpn\.json: data\.policy: not the card of a value network"):
+        check(str(SHIPPED / "hpn.safetensors"))
+    for ending in ("safetensors", "json"):
+        shutil.copy(SHIPPED / f"vfn.{ending}", tmp_path / f"best.{ending}")
+    card = json.loads((tmp_path / "best.json").read_text())
+    card["data"]["safety"]["safe_the"] = 1
+    (tmp_path / "best.json").write_text(json.dumps(card))
+    with pytest.raises(BadInput, match=r"best\.json: data\.safety\.safe_the=1: unknown field, did you mean"):
+        check(f"{tmp_path}/")
+
+
+def test_a_class_a_factory_and_a_function_of_ones_own_drive(code: Path, tmp_path: Path) -> None:
+    results = [run(f"{code}:{name}", tmp_path / name) for name in ("Holds", "factory", "looks")]
+    ours = run("keep-lane", tmp_path / "ours")
+    assert [r["policy"] for r in results] == ["Holds", "factory", "looks"]
+    assert results[0]["trace_hash"] == results[1]["trace_hash"] == ours["trace_hash"]
+    assert make(f"{code}:looks").observation == COMPACT  # maps, unless it says otherwise: SUMO drives here
+    assert results[2]["trace_hash"] == run("idm", tmp_path / "idm")["trace_hash"]
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("Raises", "code.py:12: decide: ZeroDivisionError"),
+        ("Text", "decide='left': must decide for a Decision, a MetaAction (0 to 4) or None"),
+        ("Strangers", "decide: decided for one that is no AV on the road: 'nobody'"),
+        ("Lists", "decide='list': must return a mapping of AV to decision"),
+        ("Blind", "Blind.observation: must be a cosim.types.ObservationConfig"),
+        ("Fails", "Fails: OSError: no model file"),
+        ("Nothing", "Nothing: a policy needs observation, reset, decide (cosim.types.Policy)"),
+        ("number", "--policy='number': nothing to call of this name"),
+        ("Hold", "--policy='Hold': nothing to call of this name, did you mean 'Holds'?"),
+    ],
+)
+def test_a_mistake_in_it_is_one_line_that_names_its_file(
+    code: Path, name: str, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["run", "merge", "--demand", "contested", "--duration", "2", "--policy", f"{code}:{name}"]
+    assert main(arguments) == 2
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert error.startswith(f"cosim: {code}")
+    assert said in error
+
+
+def test_code_that_cannot_be_imported_is_named_with_its_line(tmp_path: Path) -> None:
+    (tmp_path / "broken.py").write_text("x = 1\nimport no_such_package\n")
+    with pytest.raises(BadInput, match=r"broken\.py:2: import: ModuleNotFoundError"):
+        check(f"{tmp_path}/broken.py:Agent")
+    with pytest.raises(BadInput, match="no_such_package: import: ModuleNotFoundError"):
+        check("no_such_package:Agent")
+    with pytest.raises(BadInput, match="a policy that ships is called idm"):
+        check(f"idm={tmp_path}/broken.py:Agent")
+
+
+def test_a_batch_compares_ones_own_with_ours_and_knows_when_it_was_changed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("own_policy.py", "own_agent.py"):
+        shutil.copy(EXAMPLES / name, tmp_path)
+    out = tmp_path / "out"
+    spec = tmp_path / "spec.yaml"
+    spec.write_text(
+        "scenario: merge\ndemand: contested\nduration: 2\nseeds: '200061:200063'\n"
+        "policy: [idm, mine=own_policy.py:NearMission, 'own_agent.py:my_agent']\n"
+    )
+    assert main(["evaluate", str(spec), "--workers", "1", "--no-report", "--out", str(out)]) == 0
+    assert main(["compare", str(out), "--baseline", "idm", "--candidate", "mine"]) == 0
+    assert "idm -> mine" in capsys.readouterr().out
+    cells = json.loads((out / "manifest.json").read_text())["cells"]
+    key = next(f"{k}-{SEED}" for k, cell in cells.items() if cell["case"]["policy"].startswith("mine="))
+    assert main(["replay", str(out), key, "--html", str(tmp_path / "page.html")]) == 0
+    with (tmp_path / "own_policy.py").open("a") as file:
+        file.write("# another one\n")
+    assert main(["replay", str(out), key, "--html", str(tmp_path / "page.html")]) == 2
+    assert "own_policy.py: has changed since it drove" in capsys.readouterr().err
+    with sqlite3.connect(out / FILE) as store:
+        store.execute("delete from cosim_episodes where key = ?", [key])
+    assert main(["evaluate", "--workers", "1", "--no-report", "--out", str(out), "--resume"]) == 2
+    assert "own_policy.py: policy='mine': is another one in a worker: " in capsys.readouterr().err
+
+
+def test_two_of_one_name_are_refused(code: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    policies = ["--policy", f"{code}:Holds", "--policy", f"Holds={code}:factory"]
+    assert main(["evaluate", "--scenario", "merge", *policies, "--out", str(tmp_path / "out")]) == 2
+    assert "policy: two are called Holds: label them, LABEL=..." in capsys.readouterr().err

@@ -5,17 +5,25 @@ from __future__ import annotations
 import json
 import shutil
 import sqlite3
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from cosim.app.cli import main
+from cosim.app.configuration import configuration
 from cosim.app.policies import check, make
+from cosim.app.train_vfn import ABOUT
+from cosim.app.trained_policy import config
 from cosim.errors import BadInput
 from cosim.evaluation.store import FILE
 from cosim.types import COMPACT
+from policy import checkpoint
+from policy.agents.approaches import compact
 from policy.checkpoint import SHIPPED
+from policy.training.config import agent_config
+from policy.vfn import VFN
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 SEED = "200061"
@@ -85,10 +93,22 @@ def test_weights_of_a_training_drive_as_the_same_weights_that_ship(tmp_path: Pat
 
 @pytest.mark.parametrize("name", ["vfn-p", "vfn", "safe-dqn", "conv3d-a2c", "conv2d-dqn", "vfn-p-egoistic"])
 def test_the_card_of_what_ships_says_all_of_its_agent(name: str) -> None:
-    from cosim.app.trained_policy import config
-    from policy.agents.approaches import compact
-
     assert config(SHIPPED / f"{name}.safetensors") == compact(name)
+
+
+def test_the_card_of_ones_own_training_says_its_sizes_and_thresholds(tmp_path: Path) -> None:
+    file = configuration("smoke").file
+    file = replace(file, safety=replace(file.safety, safe_th=2.5, ties=file.safety.ties[::-1]))
+    wanted = agent_config("vfn", file)
+    about = {"policy": "vfn", **{part: asdict(getattr(file, part)) for part in ABOUT}}
+    weights = tmp_path / "best.safetensors"
+    checkpoint.save(weights, {"vfn": VFN(wanted.vfn)}, {"vfn": wanted.vfn}, {}, about)
+    assert config(weights) == replace(wanted, vfn_weights=weights)
+    assert make(f"{tmp_path}/").observation == file.observation != COMPACT
+    checkpoint.save(
+        weights, {"vfn": VFN(wanted.vfn)}, {"vfn": wanted.vfn}, {}, about | {"hpn_sha256": "0" * 64}
+    )
+    assert make(f"{tmp_path}/").label == "trained with another HPN"
 
 
 def test_weights_that_are_no_value_networks_are_refused(tmp_path: Path) -> None:

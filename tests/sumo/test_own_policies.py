@@ -183,6 +183,8 @@ def test_a_batch_compares_ones_own_with_ours_and_knows_when_it_was_changed(
     cells = json.loads((out / "manifest.json").read_text())["cells"]
     key = next(f"{k}-{SEED}" for k, cell in cells.items() if cell["case"]["policy"].startswith("mine="))
     assert main(["replay", str(out), key, "--html", str(tmp_path / "page.html")]) == 0
+    assert main(["replay", str(out), key, "--beside", f"{tmp_path}/own_agent.py:my_agent"]) == 0
+    assert (out / f"replay-{key}-beside-my_agent.mp4").stat().st_size > 10_000
     with (tmp_path / "own_policy.py").open("a") as file:
         file.write("# another one\n")
     assert main(["replay", str(out), key, "--html", str(tmp_path / "page.html")]) == 2

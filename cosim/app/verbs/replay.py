@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from cosim.app.verbs import arguments
+from cosim.policy_name import read
 
 
 def add(verbs: arguments.Verbs) -> None:
@@ -39,7 +40,9 @@ def work(args: argparse.Namespace) -> int:
     replay.warn(warnings)
     html, mp4, gif = (None if name is None else Path(name) for name in (args.html, args.mp4, args.gif))
     if html is None and mp4 is None and gif is None:
-        name = recorded.name if args.beside is None else f"{recorded.name}-beside-{args.beside}"
+        name = recorded.name
+        if args.beside is not None:
+            name += f"-beside-{read(args.beside, field='--beside').label}"
         mp4 = recorded.folder / f"{name}.mp4"
         html = recorded.folder / f"{name}.html" if args.beside is None else None
     result, recording = replay.drive(recorded, scenario, check=not args.no_check)

@@ -1,6 +1,6 @@
 """Drives what the tables need, each episode once: one store for all of them, resumable, shared and growing.
 
-An episode counts only for the very agent (configuration, weights by hash), input files and versions it was
+An episode counts only for the very agent (configuration, weights by hash), input files and packages it was
 driven with: newly trained weights are driven anew, all else stays. More episodes drive only what is missing,
 and what came with the repository (`benchmarks.papers.shipped`) is missing only to those who say `--anew`.
 """
@@ -163,6 +163,7 @@ def drive(orders: Sequence[Order], settings: Settings, title: str) -> Results:
         RunFolder(str(settings.runs), resume=True, episodes=work.episodes) as folder,
         _store(folder.path) as store,
     ):
+        _write_down(work, store)
         _take(work, store, settings, title)
         _drive(work, store, settings, title)
         rows: dict[str, list[Row]] = {}
@@ -252,7 +253,7 @@ class Planned(matrix.Plan):
 
 
 def planned(orders: Sequence[Order], settings: Settings) -> Planned:
-    """Every cell that is ordered, once; its policy bears the fingerprint of agent, files and versions.
+    """Every cell that is ordered, once; its policy bears the fingerprint of agent, files and packages.
 
     Raises BadInput when a world or demand is wrong.
     """
@@ -267,7 +268,7 @@ def planned(orders: Sequence[Order], settings: Settings) -> Planned:
     counts: dict[str, int] = {}
     cell_of = {}
     for order, cell in zip(orders, plan.cells, strict=True):
-        mark = short([prints[order.agent.name], cell.manifest])
+        mark = short([prints[order.agent.name], shipped.lasting(cell.manifest)])
         cell = replace(cell, case=replace(cell.case, policy=f"{order.agent.name}{MARK}{mark}"))
         cells.setdefault(cell.name, cell)
         counts[cell.name] = max(counts.get(cell.name, 0), settings.episodes(order.episodes))
@@ -339,9 +340,6 @@ def _store(folder: Path) -> Store:
 
 
 def _drive(work: Planned, store: Store, settings: Settings, title: str) -> None:
-    store.extend(
-        [{"cell": c.name, "case": c.case.document(), "manifest": dict(c.manifest)} for c in work.cells]
-    )
     engine = LocalEngine(AgentRunner, (work.agents, settings.untrained), workers=settings.workers)
     progress = Progress(title, "episodes")
     try:
@@ -350,6 +348,17 @@ def _drive(work: Planned, store: Store, settings: Settings, title: str) -> None:
         progress.done()
     for fault in faults:
         print(f"{title}: {fault.key}: our own code failed, no row: {fault.stderr}", file=sys.stderr)
+
+
+def _write_down(work: Planned, store: Store) -> None:
+    """The cells of the plan, with the versions that drive them from now on."""
+    known = store.cells()
+    store.extend(
+        [{"cell": c.name, "case": c.case.document(), "manifest": dict(c.manifest)} for c in work.cells]
+    )
+    for cell in work.cells:
+        if cell.name in known and known[cell.name]["manifest"]["versions"] != cell.manifest["versions"]:
+            store.set_manifest(cell.name, known[cell.name]["manifest"] | cell.manifest)
 
 
 def _take(work: Planned, store: Store, settings: Settings, title: str) -> None:

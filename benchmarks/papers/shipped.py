@@ -2,7 +2,7 @@
 
 An exported run like any other (`episodes.parquet`, `manifest.json`; `cosim.evaluation.run_folder` reads it),
 but for what belongs to the machine that drove it. A row is taken only for the very cell it was driven for:
-same agent, weights, input files and versions. `benchmarks.papers.episodes` keeps and checks them.
+same agent, weights, input files and packages. `benchmarks.papers.episodes` keeps and checks them.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def episodes(folder: Path | None) -> Run:
 def take(store: Store, wanted: Mapping[str, Container[int]], folder: Path | None) -> int:
     """Put into the store what it lacks of the `wanted` seeds (by cell) and is shipped; how many were taken.
 
-    The store is begun, and its cells stay as they are.
+    The store knows these cells.
     """
     found = episodes(folder)
     known = store.keys()
@@ -48,8 +48,6 @@ def take(store: Store, wanted: Mapping[str, Container[int]], folder: Path | None
     ]
     if not rows:
         return 0
-    cells = found.manifest["cells"]
-    store.extend([{"cell": name, **cells[name]} for name in dict.fromkeys(row["cell"] for row in rows)])
     store.add(rows)
     document = store.document()
     for name in ("units", "better"):
@@ -57,10 +55,21 @@ def take(store: Store, wanted: Mapping[str, Container[int]], folder: Path | None
     return len(rows)
 
 
+def lasting(manifest: Mapping[str, Any]) -> dict[str, Any]:
+    """What of a cell's manifest decides how it is driven: not Python's own version, nor how a package was
+    built (`+cpu`). That this is so, `episodes check` shows."""
+    return {**manifest, "versions": packages(manifest["versions"])}
+
+
+def packages(versions: Mapping[str, str]) -> dict[str, str]:
+    """The versions without Python's own and without local labels."""
+    return {name: version.partition("+")[0] for name, version in versions.items() if name != "python"}
+
+
 def other_versions(here: Mapping[str, Any], folder: Path | None) -> str:
     """Which versions drove what is shipped, where they are not those of `here`; "" where all are."""
-    found = episodes(folder).manifest.get("versions", {})
-    return ", ".join(f"{name} {v}" for name, v in found.items() if here.get(name) != v)
+    found, mine = packages(episodes(folder).manifest.get("versions", {})), packages(here)
+    return ", ".join(f"{name} {v}" for name, v in found.items() if mine.get(name) != v)
 
 
 def write(rows: Sequence[Row], manifest: Mapping[str, Any], folder: Path) -> None:

@@ -179,9 +179,9 @@ def test_a_shipped_episode_that_is_not_the_same_again_is_found_and_named(
     (line,) = episodes.check(mine, 5, jobs=jobs).differing
     assert "idm in merge, dense, seed 200000: collisions is" in line
     assert line.endswith("shipped is 7")
-    other = {**run.manifest, "versions": {"python": "2.7"}}
+    other = {**run.manifest, "versions": {"python": "2.7", "torch": "0.1+cpu"}}
     shipped.write([{**run.rows[0], "cell": "other"}], {**other, "cells": {"other": {}}}, tmp_path)
-    with pytest.raises(BadInput, match=r"other versions \(python 2\.7\) than are here"):
+    with pytest.raises(BadInput, match=r"other versions \(torch 0\.1\) than are here"):
         episodes.check(mine, 1, jobs=jobs)
 
 

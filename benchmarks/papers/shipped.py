@@ -61,9 +61,9 @@ def lasting(manifest: Mapping[str, Any]) -> dict[str, Any]:
     return {**manifest, "versions": packages(manifest["versions"])}
 
 
-def packages(versions: Mapping[str, str]) -> dict[str, str]:
+def packages(versions: Mapping[str, str | None]) -> dict[str, str]:
     """The versions without Python's own and without local labels."""
-    return {name: version.partition("+")[0] for name, version in versions.items() if name != "python"}
+    return {name: (version or "").partition("+")[0] for name, version in versions.items() if name != "python"}
 
 
 def other_versions(here: Mapping[str, Any], folder: Path | None) -> str:

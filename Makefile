@@ -7,7 +7,7 @@ SCALE ?= 1
 WORKERS ?= 2
 SAMPLE ?= 20
 
-.PHONY: demo test check nets results results-small audit image smoke clean
+.PHONY: demo test check nets results pages results-small audit image smoke clean
 
 demo: $(VENV)/.installed
 	$(BIN)/cosim run merge --demand contested --policy vfn-p --out $(RUN)
@@ -29,6 +29,10 @@ check: $(VENV)/.installed-dev
 results: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.measured
 	$(BIN)/python -m benchmarks.papers --scale $(SCALE) --workers $(WORKERS) $(if $(ANEW),--anew)
+
+# The pages of the episodes that are there (docs/results/episodes/, runs/results): minutes, nothing is driven.
+pages: $(VENV)/.installed-dev
+	$(BIN)/python -m benchmarks.papers --held
 
 # Some of the shipped episodes driven anew: are they the same in every figure and the trace hash?
 audit: $(VENV)/.installed-dev

@@ -86,6 +86,7 @@ class Settings:
     first: int = TEST_SEEDS  # seed; what is compared to tune something belongs on tuning seeds
     trainings: Mapping[str, tuple[Path, ...]] = field(default_factory=dict)  # policy -> runs of cosim train
     shipped: Path | None = shipped.FOLDER  # episodes that need not be driven; None: every one is
+    held: bool = False  # drive nothing: pages of what there is, however many episodes of each
 
     def episodes(self, full: int) -> int:
         """How many of `full` episodes are wanted."""
@@ -106,6 +107,7 @@ class Settings:
         words = [] if self.scale == 1.0 else [f"--scale {self.scale:g}"]
         words += [f"--scenario {name}" for name in self.scenarios]
         words += [f"--duration {self.duration:g}"] if self.duration is not None else []
+        words += ["--held"] if self.held else []
         return " ".join(["", *words, *(["--untrained"] if self.untrained else [])])
 
 
@@ -145,6 +147,11 @@ class Results:
         return {name: Run(Path(name), rows, self.notes) for name, rows in found.items()}
 
     @property
+    def lacking(self) -> int:
+        """How many orders have no episode."""
+        return sum(not one.rows for one in self.driven)
+
+    @property
     def absent(self) -> list[str]:
         """What was not driven and why, a line per reason."""
         return reasons({one.order.agent: one.why for one in self.driven if one.why})
@@ -152,6 +159,8 @@ class Results:
 
 def drive(orders: Sequence[Order], settings: Settings, title: str) -> Results:
     """Drive what the store does not hold yet; what lacks weights is left out and named on stderr.
+
+    With `settings.held` nothing is driven, and orders may have fewer episodes than they want, or none.
 
     Raises BadInput (nothing is driven then) and CosimError as `cosim evaluate` does.
     """
@@ -165,7 +174,8 @@ def drive(orders: Sequence[Order], settings: Settings, title: str) -> Results:
     ):
         _write_down(work, store)
         _take(work, store, settings, title)
-        _drive(work, store, settings, title)
+        if not settings.held:
+            _drive(work, store, settings, title)
         rows: dict[str, list[Row]] = {}
         for row in store.rows():
             rows.setdefault(row["cell"], []).append(row)
@@ -304,6 +314,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--untrained", action="store_true", help="value networks as they are born, labelled so")
     add("--runs", type=Path, default=default.runs, help="where the episodes are kept")
     add("--out", type=Path, default=default.out, help="folder of pages, pictures and data/*.csv")
+    add("--held", action="store_true", help="drive nothing: pages of the episodes that there are")
     add("--anew", action="store_true", help="drive also the episodes that come with the repository")
     add("--training", action="append", default=[], metavar="POLICY=RUN", help="a run of cosim train")
     add("--dry-run", action="store_true", help="what is still to be driven, and its CPU hours")
@@ -326,6 +337,7 @@ def settings_of(args: argparse.Namespace) -> Settings:
         duration=args.duration,
         trainings=trainings,
         shipped=None if args.anew else default.shipped,
+        held=args.held,
     )
 
 

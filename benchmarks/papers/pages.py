@@ -41,15 +41,24 @@ class Job:
     write: Callable[[Results, Settings], None]
     package: str = "benchmarks.papers"  # where its module lies
     first: int = TEST_SEEDS  # seed
+    watches: bool = False  # whether its page needs episodes driven once more
 
     @property
     def command(self) -> str:
         return f"python -m {self.package}.{self.name}"
 
     def make(self, settings: Settings) -> None:
-        """Drive what is missing, then write the page with all there is."""
+        """Drive what is missing, then write the page with all there is.
+
+        Where nothing is to be driven (`settings.held`), a page that would lack an arm is left as it was.
+        """
         settings = replace(settings, first=self.first)
-        self.write(drive(self.orders(), settings, self.name), settings)
+        results = drive(self.orders(), settings, self.name)
+        if settings.held and (self.watches or results.lacking):
+            why = "its episodes are watched" if self.watches else f"{results.lacking} arms have no episode"
+            print(f"{self.name}: left as it is: {why}", file=sys.stderr)
+            return
+        self.write(results, settings)
         print(settings.out / f"{self.name}.md")
 
     def main(self) -> None:
@@ -92,6 +101,10 @@ def heading(job: Job, results: Results, settings: Settings, *more: str) -> list[
         "In episodes counted as `not comparable` vehicles found no room to enter; they are in all figures.",
         *more,
     ]
+    if settings.held:
+        lines += [
+            "Of every arm as many episodes as were driven so far (n); pairs on the seeds that both have."
+        ]
     if weights := networks(results, settings):
         lines += ["", *weights]
     if settings.untrained:

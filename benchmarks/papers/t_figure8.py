@@ -180,7 +180,7 @@ def _drive(todo: Sequence[Task], folder: Path, engine: LocalEngine, hashes: Mapp
         progress.done()
 
 
-JOB = Job("t_figure8", "Figure 8 of T: what the guide AV does", orders, write)
+JOB = Job("t_figure8", "Figure 8 of T: what the guide AV does", orders, write, watches=True)
 
 if __name__ == "__main__":
     JOB.main()

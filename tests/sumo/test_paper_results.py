@@ -153,6 +153,24 @@ def test_shipped_episodes_are_taken_instead_of_driven_and_make_the_same_pages(
             assert (elsewhere.out / name).read_bytes() == (small.out / name).read_bytes()
 
 
+def test_with_held_nothing_is_driven_and_a_page_that_would_lack_an_arm_is_left(
+    small: Settings, tmp_path: Path, capfd: Any
+) -> None:
+    held = replace(small, held=True, scale=1.0, out=tmp_path / "pages")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(driving, "LocalEngine", _NoEngine)
+        run_jobs([table3.JOB, t_figure8.JOB], held)
+        run_jobs([table3.JOB], replace(held, runs=tmp_path / "runs"))
+    said = capfd.readouterr().err
+    assert "t_figure8: left as it is: its episodes are watched" in said
+    assert f"table3: left as it is: {len(table3.orders()) // 5} arms have no episode" in said
+    text = page(held, "table3")
+    assert "Of every arm as many episodes as were driven so far (n)" in text
+    assert "python -m benchmarks.papers.table3 --scenario merge --duration 1.2 --held" in text
+    rates = [x for x in lines(held, "table3") if x["figure"] == "collision_rate" and not x["against"]]
+    assert {x["n"] for x in rates} == {"1"}
+
+
 class _NoEngine:
     """Lets nothing be driven."""
 

@@ -1,6 +1,6 @@
 """Train Stable-Baselines3's DQN on `cosim/Merge-v0` for a few thousand steps; its figures before and after.
 
-    python examples/train_sb3_dqn.py --steps 5000
+    python examples/train_sb3_dqn.py --steps 5000 --out runs/sb3-dqn.zip    # driven by examples/sb3_policy.py
 
 One AV learns (the one that meets the mission vehicle), nothing guards it; SUMO's IDM drives the others.
 A few thousand steps raise its return; a safe and altruistic driver takes far more (docs/results/).
@@ -29,6 +29,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--demand", default="contested")
     parser.add_argument("--svo", type=float, default=45.0, help="social value orientation, degrees")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", help="save the model here")
     args = parser.parse_args(arguments)
 
     # not at the top: the simulation's process imports this file again and needs none of it
@@ -58,6 +59,8 @@ def main(arguments: list[str] | None = None) -> None:
     report("before", evaluate(model, test_env, args.episodes))
     model.learn(args.steps)
     report(f"after {args.steps} steps", evaluate(model, test_env, args.episodes))
+    if args.out:
+        model.save(args.out)
     env.close()
     test_env.close()
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from cosim.envs.view import Packer, Unpacker, View
+from cosim.envs.view import View, views
 from cosim.errors import BadInput, CosimError
 from cosim.policy_name import PolicyName
 from cosim.sumocfg import hint
@@ -43,7 +43,8 @@ class OwnPolicy:
         self.label = str(getattr(inner, "label", ""))
         self.observation: ObservationConfig = inner.observation
         self.av_parameters: Mapping[str, str] = getattr(inner, "av_parameters", {})
-        self.files: tuple[Path, ...] = () if file is None else (file,)
+        more = self._guard("files", lambda: [Path(f) for f in getattr(inner, "files", ())])
+        self.files = tuple(f for f in (file, *more) if f is not None)
 
     def reset(self, context: PolicyContext) -> None:
         """A new episode begins."""
@@ -96,8 +97,7 @@ class PerVehicle:
 
     def decide(self, histories: Mapping[str, History]) -> dict[str, Any]:
         """What the function says of each."""
-        views = Unpacker().unpack(Packer().pack(histories, None))
-        return {av: self._act(view) for av, view in views.items()}
+        return {av: self._act(view) for av, view in views(histories).items()}
 
 
 def load(name: PolicyName) -> tuple[Any, Path | None]:

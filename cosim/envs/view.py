@@ -129,6 +129,11 @@ class Unpacker:
         )
 
 
+def views(histories: Mapping[str, History]) -> dict[str, View]:
+    """What an agent in the simulation's own process sees: AV id -> View."""
+    return Unpacker().unpack(Packer().pack(histories, None))
+
+
 def _numbers(h: History) -> tuple[float, ...]:
     route = h.route
     ends = (route.to_end(0), route.to_end(1), route.to_end(2))

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import shutil
 import sqlite3
+import subprocess
+import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -193,6 +195,19 @@ def test_a_batch_compares_ones_own_with_ours_and_knows_when_it_was_changed(
         store.execute("delete from cosim_episodes where key = ?", [key])
     assert main(["evaluate", "--workers", "1", "--no-report", "--out", str(out), "--resume"]) == 2
     assert "own_policy.py: policy='mine': is another one in a worker: " in capsys.readouterr().err
+
+
+def test_what_stable_baselines_learned_drives_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = tmp_path / "dqn.zip"
+    train = [sys.executable, str(EXAMPLES / "train_sb3_dqn.py"), "--steps", "40", "--episodes", "1"]
+    subprocess.run([*train, "--out", str(model)], check=True, capture_output=True)
+    monkeypatch.setenv("SB3_MODEL", str(model))
+    found = run(f"{EXAMPLES}/sb3_policy.py:Dqn", tmp_path / "run")
+    assert list(found["manifest"]["policy_files"]) == ["sb3_policy.py", "dqn.zip"]
+    assert found["steps"] == 5
+    model.unlink()
+    with pytest.raises(BadInput, match="Dqn: FileNotFoundError"):
+        make(f"{EXAMPLES}/sb3_policy.py:Dqn")
 
 
 def test_two_of_one_name_are_refused(code: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,0 +1,44 @@
+"""What `train_sb3_dqn.py --out runs/sb3-dqn.zip` learned, as a policy for everything that cosim has.
+
+SB3_MODEL=runs/sb3-dqn.zip cosim evaluate --scenario merge --demand contested --policy idm \
+    --policy examples/sb3_policy.py:Dqn --seeds 200000:200010 --out runs/sb3
+cosim compare runs/sb3 --baseline idm --candidate Dqn
+"""
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from stable_baselines3 import DQN
+
+from cosim.envs.gym import nearest_upstream
+from cosim.envs.spaces import observation
+from cosim.envs.view import views
+from cosim.types import COMPACT, History, PolicyContext
+
+
+class Dqn:
+    """Commands one AV, as in training: the one nearest upstream of the conflict zone (in training it was the
+    one that meets the mission vehicle); SUMO's IDM drives the others."""
+
+    observation = COMPACT  # as in training
+
+    def __init__(self) -> None:
+        model = Path(os.environ.get("SB3_MODEL", "runs/sb3-dqn.zip")).absolute()
+        self.files = [model]  # its hash goes into the manifest
+        self.model = DQN.load(model, device="cpu")
+
+    def reset(self, context: PolicyContext) -> None:
+        """Nobody is chosen yet."""
+        self.learner = ""
+
+    def decide(self, histories: Mapping[str, History]) -> dict[str, int]:
+        """The chosen AV's action, by its number."""
+        seen = views(histories)
+        if self.learner not in seen:
+            self.learner = nearest_upstream(seen)
+        if not self.learner:
+            return {}
+        numbers = observation(seen[self.learner], self.observation, "kinematics")
+        action, _ = self.model.predict(numbers, deterministic=True)
+        return {self.learner: int(action)}

@@ -22,7 +22,6 @@ from cosim.app.rollouts import Rollout
 from cosim.evaluation import statistics
 from cosim.rewards import RewardConfig, rewards
 from cosim.seeding import generator
-from cosim.types import PolicyContext
 from cosim.worker import Worker
 from policy.training.config import agent_config
 from policy.training.curriculum import Lesson
@@ -46,15 +45,7 @@ class Paid(Rollout):
         """Sums by setting, and what became of the mission vehicle."""
         episode, agent = self._episode(Lesson(world, "contested")), self._agent
         histories = episode.start(seed)
-        agent.reset(
-            PolicyContext(
-                road=episode.simulator.road,
-                timing=episode.scenario.timing,
-                observation=episode.observation,
-                svo=PHI if yields else 0.0,
-                rng=generator(seed, "policy"),
-            )
-        )
+        agent.reset(episode.context(PHI if yields else 0.0))
         agent.episode("balance", 0.0, generator(seed, "explore"), True)
         earned = dict.fromkeys(TRIED, 0.0)
         while not episode.over:

@@ -16,7 +16,6 @@ from cosim.rewards import RewardConfig, rewards
 from cosim.scenario import load
 from cosim.seeding import generator
 from cosim.simulation.sumo import SumoSimulator
-from cosim.types import PolicyContext
 from cosim.worker import Worker
 from policy.agents.approaches import AgentConfig
 from policy.checkpoint import load as load_weights
@@ -80,15 +79,7 @@ class Rollout:
 def drive_episode(episode: Episode, agent: Explorer, drive: Drive, reward: RewardConfig) -> Drove:
     """One whole episode with the learning agent; its networks are as they are."""
     histories = episode.start(drive.seed)
-    agent.reset(
-        PolicyContext(
-            road=episode.simulator.road,
-            timing=episode.scenario.timing,
-            observation=episode.observation,
-            svo=drive.svo,
-            rng=generator(drive.seed, "policy"),
-        )
-    )
+    agent.reset(episode.context(drive.svo))
     label = f"{drive.lesson.scenario}/{drive.lesson.demand}/{drive.seed}"
     rng = generator(drive.seed, "explore")
     agent.episode(label, drive.epsilon, rng, drive.guided, drive.record)

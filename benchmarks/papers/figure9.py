@@ -90,7 +90,7 @@ def write(results: Results, settings: Settings) -> None:
     page = heading(JOB, results, settings, f"World `{WORLD}`, demand `{DEMAND}`, phi 45 degrees.")
     page += [
         "Six networks, each trained by one command (killed? the same with `--resume` goes on; shorter with",
-        "`--iterations N`: how long these were trained stands above):",
+        "`--iterations N`: how long these were trained stands above). Ours lie in `trainings/figure9-*`.",
         "",
         "```",
     ]

@@ -164,7 +164,8 @@ def _picture(runs: dict[str, Run], names: dict[str, str], worlds: list[str], set
     """C% by world and approach with intervals; P's figures as crosses."""
     picture = drawing(2.2 + 1.9 * len(worlds), 3.6)
     axes = picture.subplots()
-    shown = {name: arm for arm, name in names.items() if name in runs}
+    arms = {name: arm for arm, name in names.items()}
+    shown = {name: arms[name] for name in runs}  # in P's order
     for k, (name, arm) in enumerate(shown.items()):
         shift = 0.8 * ((k + 0.5) / len(shown) - 0.5)
         for w, world in enumerate(worlds):

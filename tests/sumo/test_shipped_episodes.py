@@ -8,9 +8,15 @@ import pytest
 
 from benchmarks.papers import episodes, shipped
 from benchmarks.papers.driving import Settings
+from benchmarks.papers.jobs import JOBS
+from benchmarks.papers.pages import Job
 from cosim.errors import BadInput
 
-FOLDER = Path(__file__).parents[2] / shipped.FOLDER
+ROOT = Path(__file__).parents[2]
+FOLDER = ROOT / shipped.FOLDER
+HELD = [
+    job for job in JOBS if "--held`" in (ROOT / f"docs/results/{job.name}.md").read_text(encoding="utf-8")
+]
 
 
 def test_shipped_episodes_are_the_same_when_they_are_driven_anew() -> None:
@@ -23,6 +29,20 @@ def test_shipped_episodes_are_the_same_when_they_are_driven_anew() -> None:
     assert found.differing == ()
     assert found.driven == 4
     assert found.unknown == 0, "weights or worlds are new: make the pages anew, then `episodes keep`"
+
+
+@pytest.mark.parametrize("job", HELD, ids=lambda job: job.name)
+def test_a_page_of_what_was_driven_is_the_page_of_the_shipped_episodes(
+    job: Job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(ROOT)  # figure 9's networks lie there
+    out = tmp_path / "pages"
+    settings = Settings(runs=tmp_path / "runs", out=out, shipped=FOLDER, held=True)
+    job.make(settings)
+    if not (out / f"{job.name}.md").exists():
+        pytest.skip("other versions of the packages take no shipped episodes")
+    for name in (f"{job.name}.md", f"data/{job.name}.csv"):
+        assert (out / name).read_text() == (PAGES / name).read_text()
 
 
 def test_they_are_of_an_unguarded_fleet_without_anything_of_a_machine() -> None:

@@ -14,9 +14,8 @@ from cosim.errors import BadInput
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / shipped.FOLDER
-HELD = [
-    job for job in JOBS if "--held`" in (ROOT / f"docs/results/{job.name}.md").read_text(encoding="utf-8")
-]
+PAGES = ROOT / "docs" / "results"
+HELD = [job for job in JOBS if "--held`" in (PAGES / f"{job.name}.md").read_text(encoding="utf-8")]
 
 
 def test_shipped_episodes_are_the_same_when_they_are_driven_anew() -> None:

@@ -53,12 +53,17 @@ def keep(settings: Settings, jobs: Sequence[Job] = JOBS) -> Counter[str]:
 
     Episodes that failed are not shipped, and what no job orders any more is dropped.
 
-    Raises BadInput: no store there, or nothing to ship (nothing is written then).
+    Raises BadInput: no store there, nothing to ship, or what is shipped was driven with other versions
+    (nothing is written then).
     """
     if settings.shipped is None or not (settings.runs / FILE).is_file():
         raise BadInput("holds no episodes", field="--runs", value=str(settings.runs))
     work = _planned(jobs, settings)
     known = shipped.episodes(settings.shipped)
+    versions = work.cells[0].manifest["versions"]
+    if other := shipped.other_versions(versions, settings.shipped):
+        problem = f"were driven with {other}: to keep others would drop them all (remove the folder first)"
+        raise BadInput(problem, value=str(settings.shipped))
     cells: dict[str, Any] = dict(known.manifest.get("cells", {}))
     with RunFolder(str(settings.runs), resume=True, episodes=0), Store.in_folder(settings.runs) as store:
         rows = {row["key"]: row for row in (*known.rows, *store.rows())}
@@ -70,7 +75,7 @@ def keep(settings: Settings, jobs: Sequence[Job] = JOBS) -> Counter[str]:
         raise BadInput("holds no episode that a page needs", field="--runs", value=str(settings.runs))
     present = {row["cell"] for row in kept}
     manifest = {
-        "versions": work.cells[0].manifest["versions"],
+        "versions": versions,
         **{name: {**known.manifest.get(name, {}), **document[name]} for name in ("units", "better")},
         "cells": {
             cell.name: {"case": _case(cell, work.agents), "manifest": cells[cell.name]["manifest"]}

@@ -201,6 +201,8 @@ def test_a_shipped_episode_that_is_not_the_same_again_is_found_and_named(
     shipped.write([{**run.rows[0], "cell": "other"}], {**other, "cells": {"other": {}}}, tmp_path)
     with pytest.raises(BadInput, match=r"other versions \(torch 0\.1\) than are here"):
         episodes.check(mine, 1, jobs=jobs)
+    with pytest.raises(BadInput, match=r"were driven with torch 0\.1: to keep others would drop them all"):
+        episodes.keep(mine, jobs)
 
 
 def test_what_was_watched_is_the_episode_that_was_counted(small: Settings) -> None:

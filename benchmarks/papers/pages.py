@@ -53,10 +53,12 @@ class Job:
         Where nothing is to be driven (`settings.held`), a page that would lack an arm is left as it was.
         """
         settings = replace(settings, first=self.first)
+        if settings.held and self.watches:
+            print(f"{self.name}: left as it is: its episodes are watched", file=sys.stderr)
+            return
         results = drive(self.orders(), settings, self.name)
-        if settings.held and (self.watches or results.lacking):
-            why = "its episodes are watched" if self.watches else f"{results.lacking} arms have no episode"
-            print(f"{self.name}: left as it is: {why}", file=sys.stderr)
+        if settings.held and results.lacking:
+            print(f"{self.name}: left as it is: {results.lacking} arms have no episode", file=sys.stderr)
             return
         self.write(results, settings)
         print(settings.out / f"{self.name}.md")

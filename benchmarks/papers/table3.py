@@ -5,7 +5,7 @@ python -m benchmarks.papers.table3 [--scale 1] [--scenario merge] [--dry-run]
 
 from __future__ import annotations
 
-import math
+import itertools
 
 import numpy as np
 
@@ -17,14 +17,11 @@ from benchmarks.papers.pages import Job, drawing, heading, save, save_picture
 from benchmarks.tables import difference_lines, difference_table, found, lines_of, markdown_row, table
 from cosim.evaluation.figures import RATES
 from cosim.evaluation.run_folder import Run
-from cosim.evaluation.statistics import Figure
+from cosim.evaluation.statistics import Figure, share
 from cosim.evaluation.tasks import OK
 
-MOST, OTHERS = (
-    1000,
-    300,
-)  # episodes a world of vfn and vfn-p, and of the baselines (1 % against 2 % needs many)
-Z = 1.96  # of a 95 % interval
+MOST = 1000  # episodes a world of vfn and vfn-p: 1 % against 2 % needs many
+OTHERS = 300  # of the baselines
 FEW = 100  # of the ablation and the references
 REFERENCES = ("keep-lane", "idm")  # how hard the traffic is; what SUMO's own driver makes of it
 FIGURES = ("collision_rate", "av_caused_collision_rate", "dt_mean_m", "mission_success_rate", "veto_rate")
@@ -64,12 +61,9 @@ def orders() -> list[Order]:
 
 
 def enough(world: str) -> int:
-    """MOST, or as many as it takes that Wilson's bound of none crashed lies below P's figure of vfn-p.
-
-    That bound is z^2 / (n + z^2); rounded up to whole hundreds.
-    """
+    """MOST, or as many hundreds as it takes that the bound of none crashed lies below P's figure of vfn-p."""
     claimed = TABLE_3[world]["vfn-p"] / 100.0
-    return max(MOST, 100 * math.ceil(Z**2 * (1.0 - claimed) / claimed / 100.0))
+    return next(n for n in itertools.count(MOST, 100) if share(0, n).high < claimed)
 
 
 def write(results: Results, settings: Settings) -> None:

@@ -109,7 +109,7 @@ def check_inputs(recorded: Recorded) -> tuple[Scenario, list[str]]:
         if before != digest:
             problem = "was not among the files of the recorded run"
             if before is not None:
-                problem = f"has changed since it was driven (SHA-256 {before[:12]}..., now {digest[:12]}...)"
+                problem = _changed("it was driven", before, digest)
             raise BadInput(problem, file=paths[name])
     for name in sorted(then.get("files", {}).keys() - now["files"].keys()):
         raise BadInput("belonged to the recorded run, and to this one no more", file=name)
@@ -149,8 +149,8 @@ def drive(recorded: Recorded, scenario: Scenario, *, check: bool = True) -> tupl
     return result, recording
 
 
-def beside(recorded: Recorded, scenario: Scenario, policy: str) -> Recording:
-    """The same traffic and seed with another policy, driven and watched; the folder need not know it.
+def beside(recorded: Recorded, policy: str) -> Recorded:
+    """The same traffic and seed with another policy: nothing recorded to be compared with.
 
     Raises:
         BadInput: there is no such policy.
@@ -162,8 +162,7 @@ def beside(recorded: Recorded, scenario: Scenario, policy: str) -> Recording:
         if error.field != "--policy":
             raise
         raise BadInput(error.problem, file=error.file, field="--beside", value=policy) from None
-    case = replace(recorded.case, policy=name)
-    return drive(replace(recorded, case=case), scenario, check=False)[1]
+    return replace(recorded, case=replace(recorded.case, policy=name))
 
 
 def draw(
@@ -227,8 +226,11 @@ def _same_policy(then: Mapping[str, str], now: Mapping[str, str]) -> None:
     """Raises BadInput when weights or code are not those that drove it."""
     for name, before in then.items():
         if name in now and now[name] != before:
-            problem = f"has changed since it drove (SHA-256 {before[:12]}..., now {now[name][:12]}...)"
-            raise BadInput(problem, file=name)
+            raise BadInput(_changed("it drove", before, now[name]), file=name)
+
+
+def _changed(since: str, before: str, now: str) -> str:
+    return f"has changed since {since} (SHA-256 {before[:12]}..., now {now[:12]}...)"
 
 
 def _lasting(name: str, document: Mapping[str, Any]) -> Any:

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from cosim.app.verbs import arguments
-from cosim.policy_name import read
+from cosim.policy_name import label
 
 
 def add(verbs: arguments.Verbs) -> None:
@@ -38,17 +38,16 @@ def work(args: argparse.Namespace) -> int:
     recorded = replay.find(Path(args.run), args.episode)
     scenario, warnings = replay.check_inputs(recorded)
     replay.warn(warnings)
+    other = None if args.beside is None else replay.beside(recorded, args.beside)
     html, mp4, gif = (None if name is None else Path(name) for name in (args.html, args.mp4, args.gif))
     if html is None and mp4 is None and gif is None:
-        name = recorded.name
-        if args.beside is not None:
-            name += f"-beside-{read(args.beside, field='--beside').label}"
+        name = recorded.name if other is None else f"{recorded.name}-beside-{label(other.case.policy)}"
         mp4 = recorded.folder / f"{name}.mp4"
-        html = recorded.folder / f"{name}.html" if args.beside is None else None
+        html = recorded.folder / f"{name}.html" if other is None else None
     result, recording = replay.drive(recorded, scenario, check=not args.no_check)
     recordings = [recording]
-    if args.beside is not None:
-        recordings += [replay.beside(recorded, scenario, args.beside)]
+    if other is not None:
+        recordings += [replay.drive(other, scenario, check=False)[1]]
     replay.draw(recordings, html, mp4, gif, args.follow)
     same = "the same episode" if result.trace_hash == recorded.trace_hash else "ANOTHER episode"
     print(f"{same}: trace hash {result.trace_hash}")

@@ -6,8 +6,9 @@ camera of its own, at equal times since they began.
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import av
@@ -48,23 +49,19 @@ def film(
     """
     reel = _Reel(recordings, follow, picture_at)
     count = max(round(reel.seconds * RATE) + 1, 1)
-    draft = path.with_name(f".{path.name}.part")
-    try:
-        with av.open(str(draft), "w", format="mp4", options={"movflags": "faststart"}) as container:
-            stream = container.add_stream("libx264", rate=RATE)
-            stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT * len(recordings), "yuv420p"
-            stream.options = {"crf": "23", "preset": "veryfast"}
-            for k in range(count):
-                frame = av.VideoFrame.from_ndarray(np.asarray(reel.picture(k / RATE)), format="rgb24")
-                for packet in stream.encode(frame):
-                    container.mux(packet)
-                if progress is not None:
-                    progress(k + 1, count)
-            for packet in stream.encode():
+    fast = {"movflags": "faststart"}
+    with _whole(path) as draft, av.open(str(draft), "w", format="mp4", options=fast) as container:
+        stream = container.add_stream("libx264", rate=RATE)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT * len(recordings), "yuv420p"
+        stream.options = {"crf": "23", "preset": "veryfast"}
+        for k in range(count):
+            frame = av.VideoFrame.from_ndarray(np.asarray(reel.picture(k / RATE)), format="rgb24")
+            for packet in stream.encode(frame):
                 container.mux(packet)
-        draft.replace(path)
-    finally:
-        draft.unlink(missing_ok=True)
+            if progress is not None:
+                progress(k + 1, count)
+        for packet in stream.encode():
+            container.mux(packet)
 
 
 def animation(
@@ -86,11 +83,18 @@ def animation(
         pictures.append(picture.quantize(COLOURS, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE))
         if progress is not None:
             progress(k + 1, count)
+    first, *rest = pictures
+    times = round(1000 * SHOWN)  # ms
+    with _whole(path) as draft:
+        first.save(draft, "GIF", save_all=True, append_images=rest, duration=times, loop=0)
+
+
+@contextlib.contextmanager
+def _whole(path: Path) -> Iterator[Path]:
+    """A draft beside `path` that takes its place when the block ends well."""
     draft = path.with_name(f".{path.name}.part")
     try:
-        first, *rest = pictures
-        times = round(1000 * SHOWN)  # ms
-        first.save(draft, "GIF", save_all=True, append_images=rest, duration=times, loop=0)
+        yield draft
         draft.replace(path)
     finally:
         draft.unlink(missing_ok=True)

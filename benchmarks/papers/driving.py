@@ -13,14 +13,13 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from statistics import fmean
 
 from benchmarks.papers import shipped
 from benchmarks.papers.agents import Agent, build, fingerprint, missing, short
 from cosim.app.case_runner import CaseRunner
 from cosim.app.progress import Progress
 from cosim.app.runner import Runner
-from cosim.evaluation import batch, estimate, matrix
+from cosim.evaluation import batch, matrix
 from cosim.evaluation.case import Case
 from cosim.evaluation.engines import LocalEngine
 from cosim.evaluation.figures import Row
@@ -31,7 +30,6 @@ from cosim.evaluation.store import Store
 TEST_SEEDS = 200_000  # contract.md: tests from here on
 WORLDS = ("exit", "merge", "roundabout", "intersection", "highway")  # P's order
 SVO = 45.0  # deg, weighs oneself and the others alike
-PROBES = 2  # worlds in which an agent's cost is measured
 LEAST = 2  # episodes, however small the scale
 TRAININGS = Path("docs/results/trainings")  # logs of the trainings that made the shipped weights
 MARK = "#"  # between an agent's name and its fingerprint
@@ -91,6 +89,10 @@ class Settings:
     def episodes(self, full: int) -> int:
         """How many of `full` episodes are wanted."""
         return max(math.ceil(full * self.scale), LEAST)
+
+    def chosen(self, orders: Sequence[Order]) -> list[Order]:
+        """Those of the worlds that are wanted, each once."""
+        return [o for o in dict.fromkeys(orders) if not self.scenarios or o.scenario in self.scenarios]
 
     def trained(self, policy: str) -> tuple[Path, ...]:
         """The runs of `cosim train` it is known of: as told, else runs/POLICY and runs/POLICY-0, -1, ...,
@@ -164,7 +166,7 @@ def drive(orders: Sequence[Order], settings: Settings, title: str) -> Results:
 
     Raises BadInput (nothing is driven then) and CosimError as `cosim evaluate` does.
     """
-    orders = [o for o in dict.fromkeys(orders) if not settings.scenarios or o.scenario in settings.scenarios]
+    orders = settings.chosen(orders)
     absent = without_weights(orders, settings, title)
     work = planned([o for o in orders if o.agent not in absent], settings)
     settings.runs.mkdir(parents=True, exist_ok=True)
@@ -210,34 +212,6 @@ def reasons(absent: Mapping[Agent, str]) -> list[str]:
     return [f"{mine[0]}{more[why]}: {why}" for why, mine in names.items()]
 
 
-def cost(orders: Sequence[Order], settings: Settings) -> list[tuple[str, int, float]]:
-    """What is still to be driven: agent, episodes, CPU hours, reckoned from short episodes just now.
-
-    Agents without weights are counted with untrained networks, which cost the same.
-    """
-    orders = [o for o in orders if not settings.scenarios or o.scenario in settings.scenarios]
-    able = planned([o for o in orders if settings.untrained or not missing(o.agent)], settings)
-    held = _held(able, settings)
-    probed = planned(orders, replace(settings, untrained=True))
-    cells = {cell.name: cell for cell in probed.cells}
-    left: dict[str, dict[str, int]] = {}  # agent -> cell -> episodes
-    for order in orders:
-        of_agent = left.setdefault(order.agent.name, {})
-        todo = settings.episodes(order.episodes) - len(held.get(able.cell_of.get(order, ""), ()))
-        cell = probed.cell_of[order]
-        of_agent[cell] = max(of_agent.get(cell, 0), todo)
-    engine = LocalEngine(AgentRunner, (probed.agents, True), workers=1)
-    found = []
-    for name, of_agent in left.items():
-        worlds = {cells[cell].case.what: cells[cell] for cell, todo in of_agent.items() if todo}
-        costs = list(estimate.probe([*worlds.values()][:PROBES], engine).values())
-        if costs:
-            reset, second = fmean(c.reset for c in costs), fmean(c.second for c in costs)
-            spent = sum(n * (reset + second * cells[c].scenario.duration) for c, n in of_agent.items())
-            found.append((name, sum(of_agent.values()), spent / 3600.0))
-    return found
-
-
 @dataclass(frozen=True)
 class Planned(matrix.Plan):
     """A plan whose cells have numbers of episodes of their own."""
@@ -245,6 +219,7 @@ class Planned(matrix.Plan):
     counts: tuple[int, ...]
     cell_of: Mapping[Order, str]
     agents: Mapping[str, Agent]
+    untrained: bool  # driven with networks as they are born
 
     @property
     def episodes(self) -> int:
@@ -283,7 +258,9 @@ def planned(orders: Sequence[Order], settings: Settings) -> Planned:
         cells.setdefault(cell.name, cell)
         counts[cell.name] = max(counts.get(cell.name, 0), settings.episodes(order.episodes))
         cell_of[order] = cell.name
-    return Planned(tuple(cells.values()), plan.seeds, tuple(counts.values()), cell_of, agents)
+    return Planned(
+        tuple(cells.values()), plan.seeds, tuple(counts.values()), cell_of, agents, settings.untrained
+    )
 
 
 class AgentRunner(CaseRunner):
@@ -301,6 +278,20 @@ class AgentRunner(CaseRunner):
             self._runner = Runner(scenario, policy, math.radians(case.svo_deg))
             self._cell = case.cell
         return self._runner
+
+
+def held(work: Planned, settings: Settings) -> dict[str, set[int]]:
+    """Which of the planned seeds need not be driven, by cell: the store's and the shipped ones."""
+    rows = [*shipped.episodes(settings.shipped).rows]
+    if settings.runs.is_dir():
+        with _store(settings.runs) as store:
+            rows += store.rows()
+    wanted = work.wanted
+    found: dict[str, set[int]] = {}
+    for row in rows:
+        if row["seed"] in wanted.get(row["cell"], ()):
+            found.setdefault(row["cell"], set()).add(row["seed"])
+    return found
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -384,17 +375,3 @@ def _take(work: Planned, store: Store, settings: Settings, title: str) -> None:
     if taken:
         told = f"{taken} episodes taken from {settings.shipped} (--anew drives them)"
         print(f"{title}: {told}", file=sys.stderr, flush=True)
-
-
-def _held(work: Planned, settings: Settings) -> dict[str, set[int]]:
-    """Which of the planned seeds need not be driven, by cell: the store's and the shipped ones."""
-    rows = [*shipped.episodes(settings.shipped).rows]
-    if settings.runs.is_dir():
-        with _store(settings.runs) as store:
-            rows += store.rows()
-    wanted = work.wanted
-    held: dict[str, set[int]] = {}
-    for row in rows:
-        if row["seed"] in wanted.get(row["cell"], ()):
-            held.setdefault(row["cell"], set()).add(row["seed"])
-    return held

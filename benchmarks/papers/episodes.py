@@ -32,7 +32,7 @@ from cosim.evaluation.folder import RunFolder
 from cosim.evaluation.matrix import Cell
 from cosim.evaluation.records import row as row_of
 from cosim.evaluation.store import FILE, Store
-from cosim.evaluation.tasks import OK, Task
+from cosim.evaluation.tasks import OK
 
 SAMPLE = 20  # episodes
 DIFFERENT = 1  # exit code
@@ -172,9 +172,7 @@ def _drive(rows: Sequence[Row], work: Planned, settings: Settings) -> dict[str, 
     """These episodes anew: key -> row."""
     cells = {cell.name: cell for cell in work.cells}
     cases = {row["key"]: cells[row["cell"]].case.with_seed(row["seed"]) for row in rows}
-    tasks = [
-        Task(key, case.cell, (case, cells[case.cell].scenario.warnings, None)) for key, case in cases.items()
-    ]
+    tasks = [cells[case.cell].task(case) for case in cases.values()]
     engine = LocalEngine(AgentRunner, (work.agents, settings.untrained), workers=settings.workers)
     progress = Progress("check", "episodes")
     found = {}

@@ -13,13 +13,13 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure as Picture
 
 from benchmarks.papers.agents import config
+from benchmarks.papers.cost import Reckoning
 from benchmarks.papers.driving import (
     TEST_SEEDS,
     Order,
     Results,
     Settings,
     add_arguments,
-    cost,
     drive,
     settings_of,
 )
@@ -74,15 +74,11 @@ class Job:
 def run_jobs(jobs: Sequence[Job], settings: Settings, dry_run: bool = False) -> None:
     """One after the other; what a user did wrong ends it with one sentence and exit code 2."""
     try:
+        if dry_run:
+            _tell_cost(jobs, settings)
+            return
         for job in jobs:
-            if not dry_run:
-                job.make(settings)
-                continue
-            table = cost(job.orders(), replace(settings, first=job.first))
-            for agent, episodes, hours in table:
-                print(f"{job.name}: {agent}: {episodes} episodes, {hours:.2f} CPU hours")
-            episodes, hours = sum(n for _, n, _ in table), sum(h for *_, h in table)
-            print(f"{job.name}: {episodes} episodes, {hours:.1f} CPU hours", flush=True)
+            job.make(settings)
     except CosimError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(error.exit_code) from None
@@ -156,3 +152,24 @@ def save_picture(picture: Picture, path: Path) -> str:
     with rc_context(STYLE):
         picture.savefig(path, metadata={"Date": None, "Creator": None})
     return f"![{path.stem}]({path.name})"
+
+
+# ---- inside ----
+
+
+def _tell_cost(jobs: Sequence[Job], settings: Settings) -> None:
+    """A line per agent and page, and their sum."""
+    reckoning = Reckoning()
+    all_episodes, all_hours = 0, 0.0
+    for job in jobs:
+        found = reckoning.left(job.name, job.orders(), replace(settings, first=job.first))
+        for one in found:
+            told = "? (no short episode came through)" if one.hours is None else f"{one.hours:.2f}"
+            print(f"{job.name}: {one.agent}: {one.episodes} episodes, {told} CPU hours")
+        episodes, hours = sum(one.episodes for one in found), sum(one.hours or 0.0 for one in found)
+        print(f"{job.name}: {episodes} episodes, {hours:.1f} CPU hours", flush=True)
+        all_episodes, all_hours = all_episodes + episodes, all_hours + hours
+    if len(jobs) > 1:
+        print(
+            f"all: {all_episodes} episodes, {all_hours:.1f} CPU hours (those that pages share counted once)"
+        )

@@ -99,7 +99,7 @@ def watch(driven: Sequence[Driven], settings: Settings) -> list[tuple[Driven, li
     folder = settings.runs / FOLDER
     with RunFolder(str(folder), resume=True, episodes=0):
         todo = [
-            Task(case.key, cell.name, (case, cell.scenario.warnings, None))
+            cell.task(case)
             for cell, case in work.cases()
             if case.key in hashes and not (folder / f"{case.key}.json").exists()
         ]

@@ -12,7 +12,7 @@ from cosim.evaluation.engines import Engine
 from cosim.evaluation.matrix import Cell, Plan
 from cosim.evaluation.records import row
 from cosim.evaluation.store import Store
-from cosim.evaluation.tasks import BAD_INPUT, FAULT, Outcome, Progress, Task
+from cosim.evaluation.tasks import BAD_INPUT, FAULT, Outcome, Progress
 from cosim.manifest import POLICY_FILES
 from cosim.policy_name import label
 
@@ -55,8 +55,8 @@ def drive(plan: Plan, store: Store, engine: Engine, outputs: Path, progress: Pro
     refused = [(cell, case) for cell, case in cases.values() if cell.refused]
     store.add(row(cell, case, Outcome(case.key, BAD_INPUT, error=cell.refused)) for cell, case in refused)
     tasks = [
-        Task(key, cell.name, (case, cell.scenario.warnings, str(outputs) if case.outputs else None))
-        for key, (cell, case) in cases.items()
+        cell.task(case, outputs if case.outputs else None)
+        for cell, case in cases.values()
         if not cell.refused
     ]
     witness = _Witness(store)

@@ -9,7 +9,6 @@ from statistics import fmean
 
 from cosim.evaluation.engines import Engine
 from cosim.evaluation.matrix import Cell, Plan
-from cosim.evaluation.tasks import Task
 
 PROBES = 8  # cells at most: a dry run should stay a matter of seconds
 PROBE = 4.0  # counted s per probe: ten decisions
@@ -55,8 +54,8 @@ def probe(cells: Sequence[Cell], engine: Engine) -> dict[tuple[str, str], Cost]:
     """(world or file, policy) -> cost, of those cells whose short episode came through."""
     tasks = {}
     for cell in cells:
-        short = replace(cell.case, duration=min(PROBE, cell.scenario.duration), outputs=())
-        tasks[short.key] = cell, Task(short.key, short.cell, (short, cell.scenario.warnings, None))
+        case = replace(cell.case, duration=min(PROBE, cell.scenario.duration), outputs=())
+        tasks[case.key] = cell, replace(cell, case=case).task(case)
     costs = {}
     with closing(engine.run([task for _, task in tasks.values()])) as outcomes:
         for outcome in outcomes:

@@ -7,12 +7,14 @@ import itertools
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from cosim import sumo_outputs
 from cosim.errors import BadInput
 from cosim.evaluation.case import Case
 from cosim.evaluation.spec import Spec
+from cosim.evaluation.tasks import Task
 from cosim.manifest import manifest
 from cosim.scenario import Scenario
 from cosim.vet import vetted
@@ -32,6 +34,13 @@ class Cell:
     @property
     def name(self) -> str:
         return self.case.cell
+
+    def task(self, case: Case, outputs: Path | None = None) -> Task:
+        """One episode of this cell, for an engine that hosts a `run(case, warnings, outputs)`.
+
+        `outputs`: folder for SUMO's own outputs; None where the case wants none.
+        """
+        return Task(case.key, self.name, (case, self.scenario.warnings, outputs and str(outputs)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ Both hear the mentor, where their configuration wants it, before they learn anyt
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Protocol
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from policy.training.replay import Replay
 from policy.vfn import VfnConfig
 
 Told = dict[str, float]  # `loss/...` and the like, for the log
+AnyLearner = TypeVar("AnyLearner", Learner, A2cLearner)
 
 
 class School(Protocol):
@@ -47,19 +48,46 @@ class School(Protocol):
         """Learn from these drives, which are in the replay if they were `kept`."""
 
 
-class OffPolicy:
+class _Schooling(Generic[AnyLearner]):
+    """What both have: a learner, its replay, and a mentor who is heard first where that is wanted."""
+
+    def __init__(self, config: VfnTraining, vfn: VfnConfig, learner: AnyLearner, device: str) -> None:
+        self.config, self.device = config, device
+        self.learner: AnyLearner = learner
+        self.kinematic = vfn.kinematic
+        self.replay = Replay(config.replay)
+
+    def epsilon(self, k: int) -> float:
+        """Share of random actions."""
+        return faded(self.config, self.config.epsilon, k)
+
+    @property
+    def _short(self) -> bool:
+        """Whether the replay holds less than is wanted before anything is learned."""
+        c = self.config
+        return self.replay.size < (max(c.prefill, c.warm_up_after) if self.learner.listens else c.prefill)
+
+    def _random(self, k: int) -> np.random.Generator:
+        """Of what is drawn from the replay in iteration `k`."""
+        return generator(self.config.seed, "replay", str(k))
+
+    def _warm_up(self, rng: np.random.Generator) -> None:
+        """Steps towards the mentor alone, on what the replay holds; with maps for who sees nothing else."""
+        for _ in range(self.config.warm_up if self.learner.listens else 0):
+            self.learner.imitate(self.replay.advised(rng, not self.kinematic, self.device))
+
+
+class OffPolicy(_Schooling[Learner]):
     """P, algorithm 4: fill the replay by chance, hear the mentor, then so many updates an iteration."""
 
     keeps = True
 
     def __init__(self, config: VfnTraining, vfn: VfnConfig, device: str) -> None:
-        self.config, self.kinematic, self.device = config, vfn.kinematic, device
-        self.learner = Learner(vfn, config.ddqn, _start(config), device)
-        self.replay = Replay(config.replay)
+        super().__init__(config, vfn, Learner(vfn, config.ddqn, _start(config), device), device)
 
     def epsilon(self, k: int) -> float:
         """Share of random actions: all, while the replay is filled."""
-        return 1.0 if self._fills else faded(self.config, self.config.epsilon, k)
+        return 1.0 if self._short else super().epsilon(k)
 
     def guided(self, k: int) -> float:
         """Share of the episodes that the mentor drives."""
@@ -67,14 +95,14 @@ class OffPolicy:
 
     def meanwhile(self, k: int) -> Told:
         """This iteration's updates, on what the replay holds."""
-        if self._fills:
+        if self._short:
             return {}
-        c, learner, rng = self.config, self.learner, generator(self.config.seed, "replay", str(k))
+        learner, rng = self.learner, self._random(k)
         if not learner.updates:
-            warm_up(learner, self.replay, c.warm_up, rng, self.kinematic, self.device)
+            self._warm_up(rng)
             learner.follow()
         losses, agrees = [], []
-        for _ in range(c.updates):
+        for _ in range(self.config.updates):
             losses.append(learner.update(self.replay.sample(rng, self.device)))
             if learner.listens and self.kinematic:  # else an update hears him at the same price
                 agrees.append(learner.imitate(self.replay.advised(rng, False, self.device)))
@@ -85,23 +113,12 @@ class OffPolicy:
         """Nothing: they are learned from later."""
         return {}
 
-    @property
-    def _fills(self) -> bool:
-        c = self.config
-        return self.replay.size < (max(c.prefill, c.warm_up_after) if self.learner.listens else c.prefill)
 
-
-class OnPolicy:
+class OnPolicy(_Schooling[A2cLearner]):
     """T's A2C: each drive is learned from once. With a mentor, his drives are kept until he was heard."""
 
     def __init__(self, config: VfnTraining, vfn: VfnConfig, device: str) -> None:
-        self.config, self.kinematic, self.device = config, vfn.kinematic, device
-        self.learner = A2cLearner(vfn, config.a2c, _start(config), device)
-        self.replay = Replay(config.replay)
-
-    def epsilon(self, k: int) -> float:
-        """Share of random actions."""
-        return faded(self.config, self.config.epsilon, k)
+        super().__init__(config, vfn, A2cLearner(vfn, config.a2c, _start(config), device), device)
 
     def guided(self, k: int) -> float:
         """Share of the episodes that the mentor drives."""
@@ -114,8 +131,7 @@ class OnPolicy:
     @property
     def keeps(self) -> bool:
         """Whether the mentor has not shown enough yet; without him the replay stays empty."""
-        c = self.config
-        return self.learner.listens and self.replay.size < max(c.prefill, c.warm_up_after)
+        return self.learner.listens and self._short
 
     def afterwards(self, k: int, drives: Sequence[Trajectory], kept: bool) -> Told:
         """A pass over its own drives; of the mentor's only the last, when the steps towards him are made."""
@@ -123,8 +139,7 @@ class OnPolicy:
             learned = self.learner.learn(drives, generator(self.config.seed, "order", str(k)))
             return {} if learned is None else _named(learned._fields, learned)
         if not self.keeps:
-            rng = generator(self.config.seed, "replay", str(k))
-            warm_up(self.learner, self.replay, self.config.warm_up, rng, self.kinematic, self.device)
+            self._warm_up(self._random(k))
         return {}
 
 
@@ -133,17 +148,7 @@ def school(config: VfnTraining, vfn: VfnConfig, device: str) -> School:
     return (OnPolicy if config.learning == "a2c" else OffPolicy)(config, vfn, device)
 
 
-def warm_up(
-    learner: Learner | A2cLearner,
-    replay: Replay,
-    steps: int,
-    rng: np.random.Generator,
-    kinematic: int,
-    device: str,
-) -> None:
-    """Steps towards the mentor alone, on what the replay holds; with maps for who sees nothing else."""
-    for _ in range(steps if learner.listens else 0):
-        learner.imitate(replay.advised(rng, not kinematic, device))
+# ---- inside ----
 
 
 def _start(config: VfnTraining) -> int:

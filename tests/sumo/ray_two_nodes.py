@@ -16,7 +16,6 @@ from cosim.app.cli import parser
 from cosim.evaluation import matrix
 from cosim.evaluation.ray_engine import RayEngine
 from cosim.evaluation.spec import FIELDS, read
-from cosim.evaluation.tasks import Task
 from policy.agents import check_name
 
 
@@ -24,7 +23,7 @@ def main() -> None:
     args = parser().parse_args(["evaluate", *sys.argv[1:]])
     spec = read(None, {name: getattr(args, name) for name in FIELDS})
     plan = matrix.plan(matrix.cells(spec), range(*spec.seeds), check_name)
-    tasks = [Task(case.key, cell.name, (case, cell.scenario.warnings, None)) for cell, case in plan.cases()]
+    tasks = [cell.task(case) for cell, case in plan.cases()]
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
     doomed = cluster.add_node(num_cpus=1)
     hashes: dict[str, str] = {}

@@ -136,6 +136,26 @@ def test_more_episodes_drive_only_those_that_are_missing(small: Settings) -> Non
     assert [key.rpartition("-")[2] for key in missed] == ["200001", "200002"]
 
 
+def test_a_dry_run_counts_what_is_missing_once_and_writes_nothing(
+    small: Settings, tmp_path: Path, capfd: Any
+) -> None:
+    order = Order(Agent("keep-lane"), "merge", "dense", "mixed", 3)
+    jobs = [Job(name, name, lambda: [order], lambda *_: None) for name in ("one", "two")]
+    out = tmp_path / "pages"
+    run_jobs(jobs, replace(small, scale=1.0, out=out), dry_run=True)
+    said = capfd.readouterr()
+    assert said.err == "one: measuring what 1 agents cost ...\n"
+    lines = said.out.splitlines()
+    assert [line.partition(" episodes")[0] for line in lines] == [
+        "one: keep-lane: 2",
+        "one: 2",
+        "two: 0",
+        "all: 2",
+    ]
+    assert float(lines[0].split()[-3]) >= 0.0
+    assert not out.exists()
+
+
 def test_shipped_episodes_are_taken_instead_of_driven_and_make_the_same_pages(
     small: Settings, tmp_path: Path, capfd: Any
 ) -> None:

@@ -137,9 +137,9 @@ def drive(recorded: Recorded, scenario: Scenario, *, check: bool = True) -> tupl
     with _progress(f"replay {scenario.name} {label(case.policy)}", "s") as progress:
         worker = Worker(Runner, scenario, case.policy, math.radians(case.svo_deg), name="cosim-replay")
         with worker:
+            if check:
+                _same_policy(recorded.manifest.get(POLICY_FILES, {}), worker.call("policy_files"))
             result, recording = worker.call("record", case.seed, progress=progress)
-    if check:
-        _same_policy(recorded.manifest.get(POLICY_FILES, {}), result.manifest[POLICY_FILES])
     if check and result.trace_hash != recorded.trace_hash:
         raise ReplayDiffers(
             f"the replay is not the recorded episode: trace hash {result.trace_hash[:16]}... after "

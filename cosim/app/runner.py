@@ -42,6 +42,10 @@ class Runner:
         )
         self._episode = Episode(scenario, self._simulator, wanted)
 
+    def policy_files(self) -> dict[str, str]:
+        """SHA-256 of what decides how the policy drives, by file name: its weights, its own code."""
+        return self._policy_files
+
     def run(
         self,
         seed: int,

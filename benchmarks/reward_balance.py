@@ -53,8 +53,9 @@ class Paid(Rollout):
             before = episode.snapshot
             histories = episode.advance(decisions)
             actions = {av: d.action for av, d in decisions.items()}
+            collisions = episode.events.collisions
             for name, config in TRIED.items():
-                terms = rewards(before, episode.snapshot, tuple(decisions), actions, PHI, config)
+                terms = rewards(before, episode.snapshot, tuple(decisions), actions, PHI, config, collisions)
                 earned[name] += sum(t.total for t in terms.values())
         result = episode.result(agent.name)
         return {"earned": earned, "success": bool(result.value("mission_success"))}

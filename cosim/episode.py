@@ -19,6 +19,7 @@ from cosim.types import (
     Collision,
     Decision,
     EpisodeResult,
+    Events,
     History,
     Metric,
     ObservationConfig,
@@ -108,6 +109,11 @@ class Episode:
             svo=svo,
             rng=generator(self.seed, "policy"),
         )
+
+    @property
+    def events(self) -> Events:
+        """What happened since the last decision, in every frame."""
+        return Events.of(self.frames)
 
     @property
     def over(self) -> bool:

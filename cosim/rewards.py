@@ -63,18 +63,17 @@ def rewards(
     actions: Mapping[str, MetaAction],
     svo: float,
     config: RewardConfig,
-    collisions: Sequence[Collision] | None = None,
+    collisions: Sequence[Collision],
 ) -> dict[str, RewardTerms]:
     """The reward of each of `avs` for the decision that led from `before` to `after`.
 
     Neighbours are the vehicles of both snapshots within `config.perception_range` m of the AV in `after`.
     `actions`: what the AVs executed (an AV left out did nothing); `svo`: phi in rad, 0 egoistic, pi/2
-    altruistic. `collisions`: those of the whole decision; by default the ones in `after.events`, which hold
-    only the last frame's. An AV that is no longer on the road gets its crash and nothing else.
+    altruistic. `collisions`: those of the whole decision (`Episode.events`; `after.events` holds only the
+    last frame's). An AV that is no longer on the road gets its crash and nothing else.
     Source: P, section IV-B, equation (6); T, equation (2).
     """
-    crashes = after.events.collisions if collisions is None else collisions
-    crashed = {name for c in crashes for name in (c.collider, c.victim)}
+    crashed = {name for c in collisions for name in (c.collider, c.victim)}
     utility = vehicle_utility(before, after, crashed, config)  # [n]
     alive = [name for name in avs if name in after.row]
     rows = np.array([after.row[name] for name in alive], dtype=np.int64)  # [a]

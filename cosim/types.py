@@ -7,7 +7,7 @@ Letters in shapes: `n` vehicles, `N` past frames, `M` predicted frames, `C, H, W
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import IntEnum
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
@@ -84,6 +84,13 @@ class Events:
     arrived: tuple[str, ...] = ()
     teleported: tuple[str, ...] = ()
     emergency_stopped: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, frames: Sequence[Snapshot]) -> Events:
+        """What happened in all of `frames`, in their order."""
+        every = [frame.events for frame in frames]
+        names = [field.name for field in fields(cls)]
+        return cls(**{name: tuple(x for e in every for x in getattr(e, name)) for name in names})
 
 
 NO_EVENTS = Events()

@@ -90,7 +90,7 @@ def drive_episode(episode: Episode, agent: Explorer, drive: Drive, reward: Rewar
             break
         before = episode.snapshot
         histories = episode.advance(decisions)
-        collisions = [c for frame in episode.frames for c in frame.events.collisions]
+        collisions = episode.events.collisions
         actions = {av: decision.action for av, decision in decisions.items()}
         terms = rewards(before, episode.snapshot, tuple(decisions), actions, drive.svo, reward, collisions)
         earned += [t.total for t in terms.values()]

@@ -95,7 +95,7 @@ class Host:
         # sorted: SUMO takes commands in the order given, which must not hang on a caller's dict order
         decisions = {name: decisions[name] for name in self._histories if name in decisions}
         self._histories = episode.advance(decisions)
-        after, events = episode.snapshot, _merged(episode.frames)
+        after, events = episode.snapshot, episode.events
         avs = _avs(before)
         earned = rewards(
             before,
@@ -174,7 +174,7 @@ class Host:
             earned,
             ended,
             e.receipts,
-            _merged(e.frames),
+            e.events,
             _avs(e.snapshot),
             e.snapshot.time,
             e.elapsed,
@@ -205,17 +205,6 @@ class Host:
 
 def _avs(snapshot: Snapshot) -> tuple[str, ...]:
     return tuple(snapshot.ids[row] for row in np.flatnonzero(snapshot.kind == Kind.AV))
-
-
-def _merged(frames: tuple[Snapshot, ...]) -> Events:
-    """The events of several frames as one."""
-    every = [frame.events for frame in frames]
-    return Events(
-        *(
-            tuple(item for events in every for item in getattr(events, name))
-            for name in ("collisions", "departed", "arrived", "teleported", "emergency_stopped")
-        )
-    )
 
 
 def _common(observation: ObservationConfig, others: Policy) -> ObservationConfig:

@@ -52,7 +52,13 @@ def decide(
         made = Collision(0.4, *crashed, False, False, "collision", "sumo", "", 0.0, 0.0)
         snapshot = replace(snapshot, events=Events(collisions=(made,)))
     return rewards(
-        snapshot, snapshot, ["av", "ally"], IDLE | {"av": action}, float(np.radians(svo_deg)), config
+        snapshot,
+        snapshot,
+        ["av", "ally"],
+        IDLE | {"av": action},
+        float(np.radians(svo_deg)),
+        config,
+        snapshot.events.collisions,
     )["av"]
 
 
@@ -124,24 +130,27 @@ def test_a_crash_costs_whoever_is_in_it_and_whoever_cares() -> None:
     assert struck.av_social < 0.0
 
 
-def test_a_collision_in_an_earlier_frame_of_the_decision_can_be_handed_in() -> None:
+def test_a_collision_in_an_earlier_frame_of_the_decision_is_paid_for() -> None:
     snapshot = scene(av=(0.0, 20.0, Kind.AV, False), hv=(4.0, 20.0, Kind.HV, False))
     made = Collision(0.2, "av", "hv", True, False, "collision", "sumo", "", 0.0, 0.0)
-    terms = rewards(snapshot, snapshot, ["av"], {}, 0.0, P, collisions=[made])["av"]
+    frames = (replace(snapshot, events=Events(collisions=(made,), departed=("hv",))), snapshot)
+    events = Events.of(frames)
+    assert events.departed == ("hv",)
+    terms = rewards(snapshot, snapshot, ["av"], {}, 0.0, P, events.collisions)["av"]
     assert terms.ego == pytest.approx(4 / 3 + P.crash)
 
 
 def test_newcomers_do_not_count_and_a_vanished_av_gets_only_its_crash() -> None:
     before = scene(av=(0.0, 20.0, Kind.AV, False), gone=(50.0, 20.0, Kind.AV, False))
     after = scene(av=(8.0, 20.0, Kind.AV, False), newcomer=(30.0, 20.0, Kind.HV, False))
-    terms = rewards(before, after, ["av", "gone"], {}, float(np.pi / 4), P)
+    terms = rewards(before, after, ["av", "gone"], {}, float(np.pi / 4), P, ())
     assert terms["av"].hv_social == 0.0
     assert terms["gone"] == (0.0, 0.0, 0.0, 0.0)
 
 
 def test_distance_counts_what_was_driven_and_speed_what_is_driven_now() -> None:
     before, after = (scene(av=(0.0, v, Kind.AV, False)) for v in (10.0, 20.0))
-    assert rewards(before, after, ["av"], {}, 0.0, P)["av"].ego == pytest.approx(20 / 30 + 15 / 30)
+    assert rewards(before, after, ["av"], {}, 0.0, P, ())["av"].ego == pytest.approx(20 / 30 + 15 / 30)
 
 
 @pytest.mark.parametrize(

@@ -30,6 +30,9 @@ from cosim.types import (
     Snapshot,
 )
 
+# Of the vehicles that were due: if more were never inserted, the demand is above capacity. Fewer are a queue
+# that empties: somebody is always due at the very end.
+NO_ROOM = 0.05
 Progress = Callable[[float, float], None]  # simulated s so far, of s in all
 
 
@@ -189,12 +192,13 @@ class Episode:
     def _validity(self, metrics: Mapping[str, Metric]) -> tuple[str, ...]:
         """Why this result must not be compared with others; empty when nothing speaks against it."""
         reasons = list(self.scenario.warnings)
-        waiting, inserted = metrics["vehicles_never_inserted"].value, metrics["vehicles_inserted"].value
+        waiting = metrics["vehicles_never_inserted"].value or 0
+        inserted = metrics["vehicles_inserted"].value or 0
         if inserted == 0:
             reasons.append(
                 "no vehicle was ever inserted: the demand is empty for this time, or its routes are"
             )
-        if waiting:
+        if waiting > NO_ROOM * (waiting + inserted):
             reasons.append(f"{waiting} vehicles found no room and were never inserted: demand above capacity")
         if teleports := metrics["teleports"].value:
             reasons.append(f"{teleports} vehicles were teleported by SUMO")

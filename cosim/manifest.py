@@ -18,7 +18,6 @@ PACKAGES = ("cosim", "libsumo", "numpy", "numba", "torch")
 
 def manifest(scenario: Scenario, seed: int) -> dict[str, Any]:
     """A JSON document: versions, SHA-256 of every input file, seed, preset, fleet, driver model."""
-    files = (scenario.config, scenario.net, *scenario.demand, *scenario.additional)
     return {
         "seed": seed,
         "preset": scenario.preset,
@@ -35,13 +34,28 @@ def manifest(scenario: Scenario, seed: int) -> dict[str, Any]:
         "sumo_options": dict(scenario.options),
         "options_not_passed_on": list(scenario.ignored),
         "versions": {"python": platform.python_version(), **{p: _version(p) for p in PACKAGES}},
-        "files": digests(files),
+        "files": digests(scenario.files),
     }
 
 
 def digests(files: Iterable[Path]) -> dict[str, str]:
-    """Name -> SHA-256 of each file."""
-    return {path.name: _digest(str(path), path.stat().st_mtime_ns) for path in files}
+    """Name (`named`) -> SHA-256 of each file."""
+    return {name: _digest(str(path), path.stat().st_mtime_ns) for name, path in named(files).items()}
+
+
+def named(files: Iterable[Path]) -> dict[str, Path]:
+    """Each file by its name, or by as much of its path as tells it from the others."""
+    each = list(dict.fromkeys(files))
+
+    def end(path: Path, parts: int) -> str:
+        return "/".join(path.parts[-parts:])
+
+    found = {}
+    for path in each:
+        lengths = range(1, len(path.parts) + 1)
+        unique = (n for n in lengths if sum(end(other, n) == end(path, n) for other in each) == 1)
+        found[end(path, next(unique, len(path.parts)))] = path
+    return found
 
 
 @lru_cache

@@ -77,11 +77,20 @@ class Scenario:
     driver_model: str = "lc2013"
     demands: Mapping[str, Path] | None = None  # name -> file, of a built-in world
     title: str = ""
+    definition: Path | None = None  # the scenario.yaml of a built-in world
     warnings: tuple[str, ...] = ()  # what `cosim.vet` found odd: reasons not to compare the result
 
     @property
     def built_in(self) -> bool:
         return self.demands is not None
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Every file that has a say in the traffic, ours included."""
+        ours = [sumo_scenarios.TYPES] if self.definition is None else [self.definition]
+        if self.behavior != "as-is":
+            ours.append(sumo_scenarios.BEHAVIORS)
+        return (self.config, self.net, *self.demand, *self.additional, *ours)
 
 
 def load(
@@ -142,6 +151,7 @@ def _world(name: str) -> Scenario:
     return Scenario(
         name=name,
         title=top.text("title") or "",
+        definition=file,
         config=config.path,
         net=config.net,
         demand=(demands[demand],),

@@ -146,7 +146,7 @@ class History(NamedTuple):
     """What one AV knows at a decision: N frames, oldest first, and its own route.
 
     Rows follow the vehicle, not its rank: `ids[r]` names the vehicle of row r in every frame
-    ("" for an empty row); `valid[k, r]` says whether it was perceived at frame k. Row 0 is the ego.
+    ("" for an empty row); `valid[k, r]` says whether it was on the road at frame k. Row 0 is the ego.
     """
 
     velocity_map: Bytes  # [N,C,H,W] pixel * 255; each in the ego's frame at its own time

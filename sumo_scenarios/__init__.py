@@ -9,6 +9,7 @@ from cosim.errors import BadInput
 
 ROOT = Path(__file__).resolve().parent
 BEHAVIORS = ROOT / "behaviors.yaml"  # Table II and its IDM + LC2013 mapping
+TYPES = ROOT / "types.add.xml"  # the IDM + LC2013 type that vehicles of a user's file may get
 
 
 def names() -> tuple[str, ...]:

@@ -19,7 +19,7 @@ from cosim.evaluation import run_folder
 from cosim.evaluation.case import Case
 from cosim.evaluation.replay.recorder import Recording
 from cosim.evaluation.tasks import OK
-from cosim.manifest import POLICY_FILES, manifest
+from cosim.manifest import POLICY_FILES, manifest, named
 from cosim.policy_name import label, read
 from cosim.scenario import Scenario
 from cosim.sumocfg import CLOCK, INPUTS, command_line, hint, keeps
@@ -103,7 +103,7 @@ def check_inputs(recorded: Recorded) -> tuple[Scenario, list[str]]:
     """
     scenario = vetted(recorded.case.scenario(recorded.options))
     then, now = recorded.manifest, manifest(scenario, recorded.case.seed)
-    paths = {p.name: p for p in (scenario.config, scenario.net, *scenario.demand, *scenario.additional)}
+    paths = named(scenario.files)
     for name, digest in now["files"].items():
         before = then.get("files", {}).get(name)
         if before != digest:

@@ -89,8 +89,7 @@ class SumoEnv(gymnasium.Env[Observation, np.int64]):
         step = self._session.act({name: int(action)}, see=(name,))
         self._view = step.observations.get(name, self._view)  # gone: what it saw last
         reason = step.ended.get(name, "")
-        terminated = step.terminated[name] and reason.startswith("collision")
-        truncated = bool(reason) and not terminated
+        terminated, truncated = step.terminated[name], step.truncated[name]
         info = self._info(step)
         if reason:
             result = self._session.result()

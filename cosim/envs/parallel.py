@@ -36,8 +36,8 @@ class SumoParallelEnv(ParallelEnv):  # type: ignore[misc]
     `possible_agents` are slots av_0, av_1, ...: the k-th AV of the episode by departure (those that depart
     in the same step by id) has slot k, until the episode is over; `info["av"]` is its SUMO id. AVs beyond
     the last slot are driven by SUMO. An AV joins `agents` when it has departed and leaves when it is
-    terminated (it or the mission vehicle crashed, it arrived) or truncated (the duration is over, another
-    AV's collision ended the episode). While no agent is on the road and the episode goes on, it is driven
+    terminated (it or the mission vehicle crashed) or truncated (the duration is over, it left the road,
+    another AV's collision ended the episode). While no agent is on the road and the episode goes on, it is driven
     on until one is.
     """
 

@@ -30,15 +30,15 @@ if TYPE_CHECKING:
 
 FIRST_SEED = 0  # training seeds are 0-99,999 (contract.md)
 TIMEOUT = 120.0  # s without an answer; the first step of a machine compiles the kernels
-TERMINAL = ("collision", "collision of the mission vehicle", "arrived", "teleported")
+TERMINAL = ("collision", "collision of the mission vehicle")  # all else that ends it cuts it short
 
 
 class StepResult(NamedTuple):
     """What one `Session.act` (one decision, 0.4 s) brought; AVs are keyed by their ids.
 
     `rewards`, `terms`, `terminated` and `truncated` have every AV that was on the road before the step.
-    An AV is `terminated` when it crashed, the mission vehicle crashed, it arrived or was teleported;
-    `truncated` when the duration is over or another AV's collision ended the episode; `ended` says which.
+    An AV is `terminated` when it or the mission vehicle crashed; `truncated` when the duration is over, it
+    left the road (arrived, teleported) or another AV's collision ended the episode; `ended` says which.
     """
 
     observations: dict[str, View]  # AVs on the road now

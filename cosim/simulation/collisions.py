@@ -7,7 +7,7 @@ import numpy as np
 
 from cosim.geometry import boxes, overlapping_pairs
 from cosim.road import RoadMap
-from cosim.simulation.commands import Controlled
+from cosim.simulation.commands import Commander
 from cosim.simulation.convert import Body
 from cosim.types import Collision, Kind, Snapshot
 
@@ -20,15 +20,30 @@ class CollisionWatch:
 
     def __init__(self) -> None:
         self._seen: set[frozenset[str]] = set()
+        self._lanes: dict[str, int] = {}  # of every AV, in the last snapshot
 
     def reset(self) -> None:
         """A new episode."""
         self._seen.clear()
+        self._lanes.clear()
 
-    def from_sumo(
-        self, bodies: dict[str, Body], controlled: dict[str, Controlled], now: float
-    ) -> list[Collision]:
-        """What SUMO saw in the step that just ended (`getCollisions`)."""
+    def lane_changes(self, snapshot: Snapshot, road: RoadMap, commander: Commander) -> None:
+        """Note for the attribution of cut-ins when an AV that SUMO drives has changed lanes, as the commander
+        does for those it commands."""
+        for row in np.flatnonzero(snapshot.kind == Kind.AV):
+            name, lane = snapshot.ids[row], int(snapshot.lane[row])
+            before = self._lanes.get(name, lane)
+            self._lanes[name] = lane
+            if lane == before or name in commander.controlled or min(lane, before) < 0:
+                continue
+            if road.lanes[lane].edge == road.lanes[before].edge:
+                commander.lane_changes[name] = snapshot.time
+
+    def from_sumo(self, bodies: dict[str, Body], changes: dict[str, float], now: float) -> list[Collision]:
+        """What SUMO saw in the step that just ended (`getCollisions`).
+
+        `changes`: AV -> when it last changed lanes, s.
+        """
         found = []
         for c in libsumo.simulation.getCollisions():
             pair = frozenset((c.collider, c.victim))
@@ -39,15 +54,16 @@ class CollisionWatch:
                 x, y = libsumo.vehicle.getPosition(c.collider)[:2]
             except libsumo.TraCIException:
                 x = y = float("nan")
-            found.append(
-                _collision(now, c.collider, c.victim, c.type, "sumo", c.lane, x, y, bodies, controlled)
-            )
+            found.append(_collision(now, c.collider, c.victim, c.type, "sumo", c.lane, x, y, bodies, changes))
         return found
 
     def from_boxes(
-        self, snapshot: Snapshot, road: RoadMap, bodies: dict[str, Body], controlled: dict[str, Controlled]
+        self, snapshot: Snapshot, road: RoadMap, bodies: dict[str, Body], changes: dict[str, float]
     ) -> list[Collision]:
-        """Overlaps of an AV's box with anyone's that SUMO did not report (26 of 28 it does)."""
+        """Overlaps of an AV's box with anyone's that SUMO did not report (26 of 28 it does).
+
+        `changes`: AV -> when it last changed lanes, s.
+        """
         found = []
         for i, j in overlapping_pairs(boxes(snapshot)):
             if snapshot.kind[i] != int(Kind.AV) and snapshot.kind[j] != int(Kind.AV):
@@ -72,7 +88,7 @@ class CollisionWatch:
             found.append(
                 _collision(
                     snapshot.time, snapshot.ids[a], snapshot.ids[b], "overlap", "box", lane, x, y,
-                    bodies, controlled,
+                    bodies, changes,
                 )
             )  # fmt: skip
         return found
@@ -118,11 +134,10 @@ def _collision(
     x: float,
     y: float,
     bodies: dict[str, Body],
-    controlled: dict[str, Controlled],
+    changes: dict[str, float],
 ) -> Collision:
     hits, hit = bodies[collider], bodies[victim]
-    state = controlled.get(victim)
-    cut_in = state is not None and now - state.last_change <= CUT_IN_WINDOW
+    cut_in = now - changes.get(victim, -np.inf) <= CUT_IN_WINDOW
     return Collision(
         time=now,
         collider=collider,
@@ -135,5 +150,5 @@ def _collision(
         x=x,
         y=y,
         involves_mission=hits.mission or hit.mission,
-        av_caused=hits.kind == Kind.AV or (hit.kind == Kind.AV and cut_in),
+        av_caused=hits.kind == Kind.AV or (hit.kind == Kind.AV and bool(cut_in)),
     )

@@ -27,7 +27,6 @@ class Controlled:
     target: float  # m/s
     change: int = 0  # lane change under way: +1 left, -1 right
     change_until: float = -1.0  # s
-    last_change: float = -1e9  # s, start of the last lane change (attribution of cut-ins)
     requested: float = -1.0  # m/s, the last speed handed to SUMO
 
 
@@ -38,6 +37,7 @@ class Commander:
         self._preset = preset
         self._step = step  # s
         self.controlled: dict[str, Controlled] = {}
+        self.lane_changes: dict[str, float] = {}  # AV -> s, start of its last one (attribution of cut-ins)
 
     def take(self, command: Command, now: float) -> Receipt:
         """Start one command at time `now` (s). A vehicle is taken over from SUMO at its first command."""
@@ -63,7 +63,7 @@ class Commander:
         libsumo.vehicle.changeLaneRelative(name, command.lane_offset, command.hold)
         state.change = command.lane_offset
         state.change_until = now + LANE_CHANGE_TIME
-        state.last_change = now
+        self.lane_changes[name] = now
         return Receipt(name, True)
 
     def release(self, commanded: Sequence[Command]) -> None:
@@ -87,7 +87,7 @@ class Commander:
                 continue
             if abs(libsumo.vehicle.getLateralLanePosition(name)) < 0.05:
                 state.change, state.change_until = 0, -1.0
-                state.last_change = -1e9
+                self.lane_changes.pop(name, None)
                 confirmed[k] = Receipt(name, False, f"refused by SUMO's lane-change safety ({self._preset})")
         return tuple(confirmed)
 
@@ -104,6 +104,7 @@ class Commander:
     def forget(self, name: str) -> None:
         """The vehicle left the road."""
         self.controlled.pop(name, None)
+        self.lane_changes.pop(name, None)
 
     def _cannot_change(self, name: str, lane: str, state: Controlled, offset: int) -> str | None:
         if state.change:

@@ -14,11 +14,11 @@ from typing import Any
 import libsumo
 import yaml
 
+import sumo_scenarios
 from cosim.errors import BadInput
 from cosim.simulation.mobil import IdmParameters, MobilDriving, MobilParameters
 
-# The worlds lie beside this package, in a checkout and installed alike.
-BEHAVIORS_FILE = Path(__file__).resolve().parents[2] / "sumo_scenarios" / "behaviors.yaml"
+BEHAVIORS_FILE = sumo_scenarios.BEHAVIORS
 
 AS_IS = "as-is"
 MIXED = "mixed"

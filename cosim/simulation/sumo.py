@@ -10,6 +10,7 @@ from pathlib import Path
 import libsumo
 import numpy as np
 
+import sumo_scenarios
 from cosim.errors import BadInput, SimulationError, SimulationInUse
 from cosim.quiet import quiet
 from cosim.road import RoadMap
@@ -42,6 +43,7 @@ FORCED = {
     "duration-log.disable": "true",
     "xml-validation": "never",  # cosim.vet has read the files already
 }
+GIVES_UP = "max-depart-delay"  # SUMO drops who waited so long, and says so nowhere
 
 _in_use = False
 
@@ -73,6 +75,7 @@ class SumoSimulator:
         timing = scenario.timing
         self._steps_per_frame = round(timing.frame / timing.step)
         self._steps_per_decision = round(timing.decision / timing.step)
+        self._gives_up = GIVES_UP in dict(scenario.options)
         self._bodies: dict[str, Body] = {}
         self._watch = CollisionWatch()
         try:
@@ -97,6 +100,7 @@ class SumoSimulator:
         self._reader.forget()
         self._mission_found = bool(self._scenario.mission.vehicles) or self._scenario.mission.kind == "none"
         self._inserted = 0
+        self._waited: set[str] = set()  # only where SUMO gives up: seen waiting, not inserted since
         self._clear_events()
         steps = round(self._scenario.warmup / self._scenario.timing.step)
         first_kept = steps - (self._history - 1) * self._steps_per_frame
@@ -142,11 +146,10 @@ class SumoSimulator:
         return state.target, state.change if under_way else 0
 
     def counts(self) -> dict[str, int]:
-        """Vehicles since the start: `inserted`, and `waiting` ones that found no room (never inserted)."""
-        return {
-            "inserted": self._inserted,
-            "waiting": len(libsumo.simulation.getPendingVehicles()),
-        }
+        """Vehicles since the start: `inserted`, and `waiting`: were due and found no room, SUMO having given
+        them up (`max-depart-delay`) or not."""
+        waiting = self._waited.union(libsumo.simulation.getPendingVehicles())
+        return {"inserted": self._inserted, "waiting": len(waiting)}
 
     def write_outputs(self, files: Mapping[str, Path]) -> None:
         """SUMO's own outputs (name -> file, see `cosim.sumo_outputs`) of the episodes from the next on."""
@@ -197,7 +200,7 @@ class SumoSimulator:
         s = self._scenario
         additional = [*s.additional]
         if not s.built_in:
-            additional.append(Path(__file__).parents[2] / "sumo_scenarios" / "types.add.xml")
+            additional.append(sumo_scenarios.TYPES)
         settings, files = sumo_options(self._outputs, s)
         options = {
             "net-file": str(s.net),
@@ -230,6 +233,7 @@ class SumoSimulator:
         departed = simulation.getDepartedIDList()
         if departed:
             self._inserted += len(departed)
+            self._waited.difference_update(departed)
             self._departed += departed
             for name in departed:
                 self._bodies[name] = self._fleet.welcome(name, self._seed)
@@ -240,13 +244,15 @@ class SumoSimulator:
                 self._commander.forget(name)
                 self._routes.pop(name, None)
         if simulation.getCollidingVehiclesNumber():
-            self._collisions += self._watch.from_sumo(self._bodies, self._commander.controlled, now)
+            self._collisions += self._watch.from_sumo(self._bodies, self._commander.lane_changes, now)
         teleported = simulation.getStartingTeleportIDList()
         if teleported:
             self._teleported += teleported
         stopped = simulation.getEmergencyStoppingVehiclesIDList()
         if stopped:
             self._stopped += stopped
+        if self._gives_up:
+            self._waited.update(simulation.getPendingVehicles())
         self._drivers.step(now)
 
     def _snapshot(self) -> Snapshot:
@@ -261,7 +267,8 @@ class SumoSimulator:
         snapshot = self._reader.read(self._bodies, events)
         if not self._mission_found:
             snapshot = self._find_mission(snapshot)
-        extra = self._watch.from_boxes(snapshot, self.road, self._bodies, self._commander.controlled)
+        self._watch.lane_changes(snapshot, self.road, self._commander)
+        extra = self._watch.from_boxes(snapshot, self.road, self._bodies, self._commander.lane_changes)
         if extra:
             collisions = events.collisions + tuple(extra)
             snapshot = replace(snapshot, events=replace(events, collisions=collisions))

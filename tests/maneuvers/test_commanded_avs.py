@@ -144,6 +144,28 @@ def test_cutting_in_close_before_a_faster_car_is_the_av_s_fault(start: Start) ->
     assert crash.av_caused
 
 
+def test_a_cut_in_stays_the_av_s_fault_when_it_is_handed_back_to_sumo(start: Start) -> None:
+    cars = [vehicle("a", "av", 112.0, lane=0, speed=10.0), vehicle("h", "hv", 102.0, lane=1, speed=25.0)]
+    worker = start(cars)
+    _, first = drive(worker, [Command("a", 10.0, 1, HOLD)])
+    _, frames = drive(worker, [], 5)
+    crash = collisions(first + frames)[0]
+    assert (crash.collider, crash.victim) == ("h", "a")
+    assert crash.av_caused
+
+
+@pytest.mark.parametrize("options", [(), (("max-depart-delay", "3"),)], ids=["waits", "given up"])
+def test_who_found_no_room_is_counted_also_when_sumo_has_given_him_up(
+    start: Start, options: tuple[tuple[str, str], ...]
+) -> None:
+    cars = [vehicle(f"h{k:02}", "hv", 5.0) for k in range(30)]
+    worker = start(cars, options=options)
+    drive(worker, [], 25)
+    counts = worker.call("counts")
+    assert 1 < counts["inserted"] < 15
+    assert counts["inserted"] + counts["waiting"] == 30
+
+
 def test_passing_the_tail_of_a_car_that_changed_lanes_at_a_crawl_is_no_crash(start: Start) -> None:
     """SUMO leaves it 30 degrees askew, its tail in the lane it has left; its drivers do not see that tail."""
     cars = [vehicle("slow", "av", 130.0, lane=0, speed=0.4), vehicle("a", "av", 110.0, lane=0, speed=0.0)]

@@ -85,9 +85,9 @@ def test_somebody_else_s_scenario_runs_unmodified(a10kw: str) -> None:
     assert found["vehicles_inserted"] > 400
     assert found["hv_hv_collisions"] == 0
     assert found["mission_success"] is not None, "the mission vehicle is found from the net"
-    assert any("no room" in reason for reason in found["not_comparable_because"]) == bool(
-        found["vehicles_never_inserted"]
-    )
+    waiting, inserted = found["vehicles_never_inserted"], found["vehicles_inserted"]
+    told = any("no room" in reason for reason in found["not_comparable_because"])
+    assert told == (waiting > 0.05 * (waiting + inserted))
 
 
 def test_somebody_else_s_scenario_with_table_ii_drivers(a10kw: str) -> None:

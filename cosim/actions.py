@@ -1,4 +1,4 @@
-"""Meta-actions become commands: a target speed on a grid, and a lane (contract.md, Vehicles)."""
+"""Meta-actions become commands: a target speed on a grid, and a lane (definitions.md, Vehicles)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from cosim.compiled import compiled
 from cosim.types import LANE_OFFSET, Command, Decision, Floats, History, MetaAction
 
-SPEED_STEP = 5.0  # m/s between grid levels: "Decelerate" must be able to brake (compute.md)
+SPEED_STEP = 5.0  # m/s between grid levels: one step of Decelerate must really brake
 SPEED_MARGIN = 2.0  # m/s above the speed limit: the highest level
 LEAST_STEP = 1.0  # m/s: what a step changes at least
 TIME_CONSTANT = 0.6  # s, with which the target speed is tracked
@@ -18,7 +18,7 @@ MAX_DECEL = 8.0  # m/s2
 MAX_ACCEL = 3.0  # m/s2
 LANE_CHANGE_TIME = 2.0  # s, the same as SUMO's --lanechange.duration
 _ACTIONS, _ACCELERATE, _DECELERATE = len(MetaAction), int(MetaAction.ACCELERATE), int(MetaAction.DECELERATE)
-STEP = 0.1  # s, with which a rollout tracks the target speed (SUMO's step, contract.md)
+STEP = 0.1  # s, with which a rollout tracks the target speed (SUMO's step, definitions.md)
 
 
 def next_target(target: float, speed: float, action: int, speed_limit: float) -> float:
@@ -49,7 +49,7 @@ def _next_target(target: float, speed: float, action: int, speed_limit: float) -
 
 @compiled
 def tracked_speed(speed: float, target: float, step: float) -> float:
-    """Speed in m/s one simulation step (s) later, tracking `target` with the contract's limits."""
+    """Speed in m/s one simulation step (s) later, tracking `target` within an AV's limits."""
     accel = (target - speed) / TIME_CONSTANT
     return max(speed + min(max(accel, -MAX_DECEL), MAX_ACCEL) * step, 0.0)
 

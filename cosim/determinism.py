@@ -1,4 +1,4 @@
-"""One thread and deterministic kernels for whatever torch a policy brought (contract.md, Reproducibility)."""
+"""One thread, deterministic kernels for whatever torch a policy brought (definitions.md, Reproducibility)."""
 
 from __future__ import annotations
 

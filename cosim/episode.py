@@ -41,7 +41,7 @@ class Episode:
 
     `start` and `advance` return what every AV on the road observes; decisions given to `advance` are
     commanded, AVs without one are driven by SUMO. `terminated` after a collision of an AV or the mission
-    vehicle, `truncated` when the scenario's duration is over (contract.md, Episode).
+    vehicle, `truncated` when the scenario's duration is over (definitions.md, Episode).
     """
 
     def __init__(self, scenario: Scenario, simulator: Simulator, observation: ObservationConfig) -> None:
@@ -128,7 +128,7 @@ class Episode:
         return self.snapshot.time - self._begin
 
     def trace_hash(self) -> str:
-        """SHA-256 over every decision so far (contract.md, Reproducibility)."""
+        """SHA-256 over every decision so far (definitions.md, Reproducibility)."""
         return self._hash.hexdigest()
 
     def result(self, policy: str, label: str = "", svo: float = 0.0) -> EpisodeResult:

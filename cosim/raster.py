@@ -1,7 +1,7 @@
 """Draws VelocityMaps: rotated vehicle boxes and the road surface, in any ego frame (numba kernels).
 
 Rows run across the road (row 0 furthest to the left), columns along it (column 0 furthest behind);
-the ego's centre lies in the middle, looking towards rising columns. Pixel of a vehicle (contract.md):
+the ego's centre lies in the middle, looking towards rising columns. Pixel of a vehicle (definitions.md):
 0.1 + 0.9 clip((dv + 30) / 60, 0, 1), dv in m/s relative to the ego, stored as uint8 (255 = 1).
 """
 
@@ -51,7 +51,7 @@ def rasterize_road(road: RoadMap) -> RoadRaster:
 def channel_indices(config: ObservationConfig) -> npt.NDArray[np.int64]:
     """[5] index of each of CHANNELS in the config's channels, -1 where it has none.
 
-    Without an "ego" channel the ego is drawn into "mission" (contract.md: ego + mission vehicle).
+    Without an "ego" channel the ego is drawn into "mission" (definitions.md: ego + mission vehicle).
     """
     found = [config.channels.index(c) if c in config.channels else -1 for c in CHANNELS]
     if found[4] < 0:

@@ -252,7 +252,7 @@ def _with_sumo_options(scenario: Scenario, chosen: Mapping[str, str]) -> Scenari
 
 
 def _default_behavior(scenario: Scenario) -> str:
-    """contract.md: a user's file drives as it is; ours `mixed`, and `contested` with moderate HVs."""
+    """definitions.md: a user's file drives as it is; ours `mixed`, and `contested` with moderate HVs."""
     if scenario.demands is None or any(path not in scenario.demands.values() for path in scenario.demand):
         return "as-is"
     return "moderate" if scenario.demand_name == "contested" else "mixed"
@@ -270,7 +270,7 @@ def _timing(section: yaml_input.Section, file: Path) -> Timing:
 
 
 def _check_timing(timing: Timing, file: object, field: str, value: object) -> None:
-    """Each clock must be a whole number of the one below it (contract.md, Time)."""
+    """Each clock must be a whole number of the one below it (definitions.md, Time)."""
     for name, long, short in (
         ("frame", timing.frame, timing.step),
         ("decision", timing.decision, timing.frame),

@@ -1,7 +1,7 @@
 """Read a .sumocfg and the SUMO options of the command line, and sort them: kept, resolved, or set aside.
 
 A foreign configuration is never handed to SUMO as it is: its outputs could write anywhere and its
-`remote-port` would wait for ever (operations.md, hostile input). What changes the traffic is kept.
+`remote-port` would wait for ever (docs/sumo.md). What changes the traffic is kept.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ _KEPT = re.compile(
 _NEVER_KEPT = re.compile(
     r".+[.-](output|file)|.*output.*|tls\.actuated\.show-detectors|.*\.wkt|.*jupedsim\.py"
 )
-# Why an option of the command line cannot hold here (sumo-facts.md, decisions 1 and 6).
+# Why an option of the command line cannot hold here (docs/sumo.md).
 _REFUSED = {
     "configuration-file": "name the .sumocfg in place of a scenario",
     "seed": "use cosim's own --seed",

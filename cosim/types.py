@@ -46,7 +46,7 @@ class Kind(IntEnum):
 
 
 class Preset:
-    """Names of the two guards (docs/units_and_frames.md): every result says which one was on."""
+    """Names of the two guards (docs/definitions.md): every result says which one was on."""
 
     UNGUARDED = "unguarded"
     GUARDED = "guarded"
@@ -225,7 +225,7 @@ class Transition(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ObservationConfig:
-    """What an AV sees. Defaults: the compact size (docs/units_and_frames.md); `PAPER` is P and T's."""
+    """What an AV sees. Defaults: the compact size (docs/definitions.md); `PAPER` is P and T's."""
 
     height: int = 32  # pixels across the road
     width: int = 128  # pixels along the road

@@ -1,6 +1,6 @@
 """One object in a process of its own, supervised: SUMO may die, the caller must not.
 
-A net that SUMO cannot bear kills the process that imported libsumo (sumo-facts, Traps). So whatever drives
+A net that SUMO cannot bear kills the process that imported libsumo (docs/sumo.md). So whatever drives
 a simulation lives in a spawned worker, called through a pipe; its death or silence becomes an exception.
 """
 

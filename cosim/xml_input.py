@@ -1,7 +1,7 @@
 """Read one XML file of unknown origin as a stream, so that nothing in it can hurt the process that reads.
 
 SUMO itself answers a bad file with "Process Error", with gigabytes of memory or with SIGSEGV
-(operations.md, hostile input); everything SUMO is handed therefore passes through `scan` first. The
+(docs/sumo.md); everything SUMO is handed therefore passes through `scan` first. The
 parser is expat with defusedxml's three refusals (entities, external references, foreign encodings) and
 caps on depth, token length and unpacked size; memory does not grow with the file.
 """

@@ -19,12 +19,12 @@ from policy.tensors import Batch, kinematic_tensor, unit
 from policy.traffic import Traffic
 from policy.vehicle_inputs import vehicle_inputs
 
-FLOOR, SPAN, FASTEST = 0.1, 0.9, 30.0  # pixel of a vehicle (contract.md): 0.1 + 0.9 clip((dv + 30) / 60)
+FLOOR, SPAN, FASTEST = 0.1, 0.9, 30.0  # pixel of a vehicle (definitions.md): 0.1 + 0.9 clip((dv + 30) / 60)
 
 
 @dataclass(frozen=True, slots=True)
 class ChainConfig:
-    """How the next seconds are predicted (contract.md, Time)."""
+    """How the next seconds are predicted (definitions.md, Time)."""
 
     horizon: int = 20  # frames of 0.2 s: 4 s (P, Table I)
     every: int = 5  # the VFN takes every fifth frame, M = 4; paper: 1, M = 20

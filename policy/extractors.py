@@ -16,7 +16,7 @@ from policy.tensors import unit
 Strides = Literal["literal", "temporal"]
 Read = Callable[[torch.Tensor], torch.Tensor]  # maps [B,C,H,W] -> the channels that are convolved, float32
 
-# T gives no strides: two readings (compute.md, VFN). `literal` has no padding, `temporal` halves time too.
+# T gives no strides: two readings. `literal` has no padding, `temporal` halves time too.
 STRIDES: dict[str, tuple[tuple[int, int, int], ...]] = {
     "literal": ((1, 4, 4), (1, 2, 2), (1, 1, 1)),
     "temporal": ((1, 4, 4), (2, 2, 2), (2, 2, 2)),
@@ -119,7 +119,7 @@ class FrameMemory:
 
 
 class Conv2dMaps(nn.Module):
-    """The frames as channels of one picture: the same kernels without time (contract.md, conv2d-dqn)."""
+    """The frames as channels of one picture: the same kernels without time (definitions.md, conv2d-dqn)."""
 
     def __init__(
         self,

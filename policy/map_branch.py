@@ -24,8 +24,8 @@ class MapBranchConfig:
     channels: int = 4
     frames: int = 10  # N, 2 s of history (P, Table I)
     rows: int = 16
-    block: int = 5  # frames predicted per step; 1 is the paper's (contract.md, Time)
-    reading: Literal["s2fc", "pool"] = "pool"  # compute.md: stride 2 then FC, or stride 2 with pooling
+    block: int = 5  # frames predicted per step; 1 is the paper's (definitions.md, Time)
+    reading: Literal["s2fc", "pool"] = "pool"  # stride 2 then FC, or stride 2 with pooling
     history: bool = True  # False: the current frame only (P, figure 6)
     correct: bool = False  # True: see the rendered next map and predict its correction
     skips: bool = False  # add encoder features to the decoder's: P has none

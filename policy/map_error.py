@@ -1,4 +1,4 @@
-"""How far predicted maps are from what followed: PRE and occupancy IoU (contract.md, Observation)."""
+"""How far predicted maps are from what followed: PRE and occupancy IoU (definitions.md, Observation)."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from policy.tensors import to_batch, to_numpy, unit
 from policy.traffic import TrafficConfig
 from policy.training.moments import foresee, without_history
 
-OCCUPIED = 0.05  # a pixel above this is occupied (contract.md: IoU)
-HORIZONS = (0.2, 0.4, 1.0, 2.0, 3.0, 4.0)  # s (contract.md, Time)
+OCCUPIED = 0.05  # a pixel above this is occupied (definitions.md: IoU)
+HORIZONS = (0.2, 0.4, 1.0, 2.0, 3.0, 4.0)  # s (definitions.md, Time)
 
 
 def frame_of(horizon: float, dt: float = 0.2) -> int:

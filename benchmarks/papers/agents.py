@@ -20,7 +20,7 @@ from policy.checkpoint import sha256
 from policy.safety import SafetyConfig
 from policy.vfn import VFN, VfnConfig
 
-PERCEPTION = 125.0  # m, what an AV's own sensors reach (contract.md)
+PERCEPTION = 125.0  # m, what an AV's own sensors reach (definitions.md)
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,7 +37,7 @@ ELSEWHERE = {  # (agent, demand) that this page does without
     ("keep-lane", "contested"),  # nobody needs to see how hard that traffic is
     ("vfn", "dense"),  # Table III has it, with more episodes
 }
-BEHAVIOR = {"dense": "mixed", "contested": "moderate"}  # contract.md, Demand and behaviour
+BEHAVIOR = {"dense": "mixed", "contested": "moderate"}  # definitions.md, Demand and behaviour
 DIFFERENCES = (
     "mission_success_rate",
     "collision_rate",

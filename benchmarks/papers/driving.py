@@ -27,7 +27,7 @@ from cosim.evaluation.folder import RunFolder
 from cosim.evaluation.run_folder import Run
 from cosim.evaluation.store import Store
 
-TEST_SEEDS = 200_000  # contract.md: tests from here on
+TEST_SEEDS = 200_000  # definitions.md: tests from here on
 WORLDS = ("exit", "merge", "roundabout", "intersection", "highway")  # P's order
 SVO = 45.0  # deg, weighs oneself and the others alike
 LEAST = 2  # episodes, however small the scale

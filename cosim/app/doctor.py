@@ -15,7 +15,7 @@ from importlib import metadata, util
 from pathlib import Path
 
 OK, WARN, FAIL = "ok", "warn", "FAIL"
-# What `import libsumo` misses on a bare Debian or Ubuntu (operations.md, Set-up).
+# What `import libsumo` misses on a bare Debian or Ubuntu (docs/sumo.md).
 APT_LINE = "apt-get install libx11-6 libxext6 libxrender1 libgl1 libatomic1"
 NEEDED = (
     "numpy",

@@ -30,7 +30,7 @@ from policy.training.map_branch import MapTask
 from policy.training.moments import MapSample, Moment, map_sample, moment
 from policy.training.networks import use_threads
 
-TRAINING, VALIDATION = range(0, 100_000), range(100_000, 200_000)  # seeds (contract.md)
+TRAINING, VALIDATION = range(0, 100_000), range(100_000, 200_000)  # seeds (definitions.md)
 
 
 def train(args: argparse.Namespace) -> int:
@@ -148,7 +148,7 @@ def _checked(paths: Sequence[str], seeds: range, field: str) -> list[tuple[Path,
     wrong = sorted({s for _, key in found if (s := int(key.rsplit("-", 1)[1])) not in seeds})
     if wrong:
         raise BadInput(
-            f"seeds {seeds.start} to {seeds.stop - 1} are for this (contract), not {wrong[0]}",
+            f"seeds {seeds.start} to {seeds.stop - 1} are for this, not {wrong[0]}: cosim record --seeds chooses them",
             field=field,
             value=", ".join(paths),
         )

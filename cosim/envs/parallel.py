@@ -37,8 +37,8 @@ class SumoParallelEnv(ParallelEnv):  # type: ignore[misc]
     in the same step by id) has slot k, until the episode is over; `info["av"]` is its SUMO id. AVs beyond
     the last slot are driven by SUMO. An AV joins `agents` when it has departed and leaves when it is
     terminated (it or the mission vehicle crashed) or truncated (the duration is over, it left the road,
-    another AV's collision ended the episode). While no agent is on the road and the episode goes on, it is driven
-    on until one is.
+    another AV's collision ended the episode). While no agent is on the road and the episode goes on, it is
+    driven on until one is.
     """
 
     metadata = {  # noqa: RUF012 - PettingZoo's own form

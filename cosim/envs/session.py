@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from cosim.envs.host import Host, PolicyFactory, Reply, SimulatorFactory
     from cosim.road import RoadMap
 
-FIRST_SEED = 0  # training seeds are 0-99,999 (contract.md)
+FIRST_SEED = 0  # training seeds are 0-99,999 (definitions.md)
 TIMEOUT = 120.0  # s without an answer; the first step of a machine compiles the kernels
 TERMINAL = ("collision", "collision of the mission vehicle")  # all else that ends it cuts it short
 

@@ -41,7 +41,7 @@ _SCALE = np.array([SCALE[name] for name in KINEMATIC_FEATURES], np.float32)  # [
 
 FLATTEN = ("kinematics",)
 RENDER_MODES = ("rgb_array",)
-TRAINING_SEEDS = 100_000  # seeds 0 to 99,999 are for training (contract.md); tests begin at 200,000
+TRAINING_SEEDS = 100_000  # seeds 0 to 99,999 are for training (definitions.md); tests begin at 200,000
 
 
 def observation_space(config: ObservationConfig, flatten: str | None) -> Space:

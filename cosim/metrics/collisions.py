@@ -7,7 +7,7 @@ from cosim.types import Collision, Metric, Snapshot
 
 
 class Collisions:
-    """Every pair of vehicles counts once an episode; contract.md, Episode."""
+    """Every pair of vehicles counts once an episode; definitions.md, Episode."""
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._pairs: dict[frozenset[str], Collision] = {}

@@ -16,7 +16,7 @@ from cosim.types import Bools, Ints, Kind, Metric, Snapshot, Timing
 
 Table = TypeVar("Table", bound=npt.NDArray[Any])
 AV = int(Kind.AV)  # comparing arrays with an IntEnum member costs five times as much
-HORIZON = 10.0  # s, further ahead straight-line extrapolation says nothing (papers.md: cap ttc)
+HORIZON = 10.0  # s, further ahead straight-line extrapolation says nothing (docs/paper_map.md)
 
 
 class ConflictView:

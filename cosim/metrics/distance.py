@@ -11,7 +11,7 @@ from cosim.types import Bools, Floats, Ints, Metric, Snapshot
 
 
 class Distance:
-    """Mean over vehicles of the metres driven in the counted time (contract.md, Episode).
+    """Mean over vehicles of the metres driven in the counted time (definitions.md, Episode).
 
     The vehicles are those on the road at the first frame, so that a policy cannot change whom it is judged
     by; a vehicle that left keeps its distance. On a road that starts empty (a foreign scenario without

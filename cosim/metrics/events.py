@@ -1,4 +1,4 @@
-"""Teleports and emergency stops: three different things with collisions, so three figures (sumo-facts.md)."""
+"""Teleports and emergency stops: three different things with collisions, so three figures (docs/sumo.md)."""
 
 from __future__ import annotations
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from cosim.metrics.context import HORIZON, MetricContext
 from cosim.types import Metric, Snapshot
 
-CRITICAL = 1.5  # s, the usual bound of a serious conflict (van der Horst 1990); papers.md's critical_th
+CRITICAL = 1.5  # s, the usual bound of a serious conflict (van der Horst 1990); critical_th of P
 
 
 class TimeToCollision:

@@ -36,7 +36,7 @@ class Body:
 
 
 class SnapshotReader:
-    """Reads every vehicle with plain getters (measured faster than subscriptions, sumo-facts.md)."""
+    """Reads every vehicle with plain getters (measured faster than subscriptions, docs/sumo.md)."""
 
     def __init__(self, road: RoadMap) -> None:
         self._lane_index = road.index

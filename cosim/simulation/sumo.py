@@ -29,11 +29,11 @@ SUMO_ERRORS = (libsumo.TraCIException, libsumo.FatalTraCIError)
 
 # Ours, where a user's file does not say otherwise. A teleport would be a vehicle out of thin air.
 DEFAULTS = {
-    "lanechange.duration": "2",  # continuous lateral motion, contract.md
+    "lanechange.duration": "2",  # continuous lateral motion, definitions.md
     "time-to-teleport": "-1",
     "default.speeddev": "0",
 }
-# Ours whatever the file says: collisions must be seen (sumo-facts: never `collision.action none`).
+# Ours whatever the file says: collisions must be seen (docs/sumo.md: never `collision.action none`).
 FORCED = {
     "collision.action": "warn",
     "collision.check-junctions": "true",

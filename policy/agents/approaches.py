@@ -39,7 +39,7 @@ class AgentConfig:
 
 @dataclass(frozen=True, slots=True)
 class Approach:
-    """One row of contract.md's table of approaches."""
+    """One row of definitions.md's table of approaches."""
 
     extractor: Literal["conv3d", "conv2d"] = "conv3d"
     kinematics: bool = True  # K and the route join the maps

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from cosim.types import Decision, History, ObservationConfig, PolicyContext
 
 NO_MAPS = ObservationConfig(maps=False)
-# An AV as `idm` (contract.md, Vehicles):
+# An AV as `idm` (definitions.md, Vehicles):
 TIME_GAP, STANDSTILL, ACCEL, COMFORT = 0.8, 2.0, 3.0, 7.0  # s, m, m/s2, m/s2
 
 
@@ -19,7 +19,7 @@ def wished_gap(speed: float, leader_speed: float, time_gap: float = TIME_GAP) ->
 
 
 class Idm:
-    """Egoistic IDM + LC2013 (contract.md, Vehicles): no cooperation of any kind. The baseline `idm`."""
+    """Egoistic IDM + LC2013 (definitions.md, Vehicles): no cooperation of any kind. The baseline `idm`."""
 
     name = "idm"
     label = ""

@@ -9,7 +9,7 @@ from policy.agents.idm import NO_MAPS
 
 
 class KeepLane:
-    """Always Idle. Its crash rate stands beside C% so that the difficulty can be seen (contract.md)."""
+    """Always Idle. Its crash rate stands beside C% so that the difficulty can be seen (definitions.md)."""
 
     name = "keep-lane"
     label = ""

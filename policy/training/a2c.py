@@ -21,7 +21,7 @@ class A2cConfig:
     """Optimisation. T gives none of these: usual values."""
 
     learning_rate: float = 3e-4
-    n_step: int = 8  # as the DDQN's (compute.md); 1 is the papers'
+    n_step: int = 8  # as the DDQN's (docs/training.md); 1 is the papers'
     gamma: float = 0.97  # a decision of 0.4 s
     batch: int = 64
     entropy: float = 0.01  # keeps the policy from closing up early

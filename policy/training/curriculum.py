@@ -15,7 +15,7 @@ from policy.training.ddqn import DdqnConfig
 from policy.training.experience import Trajectory
 from policy.training.replay import ReplayConfig
 
-TRAINING_SEEDS = 100_000  # 0 to 99,999 are for training, the next as many for validation (contract.md)
+TRAINING_SEEDS = 100_000  # 0 to 99,999 are for training, the next as many for validation (definitions.md)
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ class VfnTraining:
     lessons: tuple[Lesson, ...] = (Lesson("merge"),)
     iterations: int = 400
     episodes: int = 2  # an iteration
-    updates: int = 40  # an iteration: one every five joint decisions (compute.md: 4 to 8)
+    updates: int = 40  # an iteration: one every five joint decisions; 4 to 8 do
     prefill: int = 2_000  # decisions recorded before the first update (Alg. 4), with epsilon 1
     warm_up: int = 0  # steps towards the mentor alone before the first update,
     warm_up_after: int = 0  # from as many decisions at least

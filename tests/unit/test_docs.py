@@ -9,6 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 PAGES = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "examples").rglob("*.md")]
+MADE = {"FILE.md"}  # what a command is told to write
 ROOMS = "docs|policy|benchmarks|tests|examples|sumo_scenarios|docker"
 
 
@@ -19,3 +20,15 @@ def test_links_pictures_and_files_named_in_a_page_exist(page: Path) -> None:
     assert [link for link in links if not (page.parent / link).exists()] == []
     files = re.findall(rf"`((?:{ROOMS})/[\w./-]+\.\w+)`", text)
     assert [file for file in files if not (ROOT / file).exists() and "NAME" not in file] == []
+
+
+@pytest.mark.parametrize("room", ["benchmarks", "cosim", "policy", "sumo_scenarios"])
+def test_pages_named_in_the_code_exist(room: str) -> None:
+    pages = {page.name for page in PAGES} | MADE
+    named = {
+        (file.relative_to(ROOT).as_posix(), name)
+        for file in (ROOT / room).rglob("*")
+        if file.suffix in (".py", ".yaml", ".xml")
+        for name in re.findall(r"[\w-]+\.md\b", file.read_text(encoding="utf-8"))
+    }
+    assert sorted((file, name) for file, name in named if name not in pages) == []

@@ -33,6 +33,7 @@ from cosim.app.rollouts import Rollouts
 from cosim.app.runner import Runner
 from cosim.memory import keep_freed_memory
 from cosim.scenario import Fleet, Scenario, load
+from cosim.seeding import TUNING_SEEDS
 from cosim.types import EpisodeResult, History, PolicyContext
 from cosim.worker import Worker
 from policy.agents.approaches import AgentConfig, compact, paper
@@ -44,7 +45,6 @@ from policy.training.replay import Replay
 
 SIZES: Mapping[str, Callable[[str], AgentConfig]] = {"compact": compact, "paper": paper}
 POLICY = "vfn-p"
-TUNING_SEED = 100_000
 TARGET_MS = 50.0  # compact size, 8 AVs, two cores; the period is 400 ms
 TARGET_RATE = 47.0  # joint decisions/s with the learner on the other core
 WARM_UP = 2  # decisions that are not counted: compilation, caches
@@ -87,7 +87,7 @@ def decisions(
     if size == "paper":
         config = replace(config, vfn_weights=None)  # compact ones are shipped
     with Worker(Gatherer, scenario, config.observation) as worker:
-        road, kept = worker.call("gather", TUNING_SEED, count)
+        road, kept = worker.call("gather", TUNING_SEEDS.start, count)
     context = PolicyContext(road, scenario.timing, config.observation, SVO, np.random.default_rng(0))
     found = {}
     before = torch.get_num_threads()
@@ -103,8 +103,8 @@ def decisions(
 def closed_loop(scenario: Scenario, episodes: int) -> dict[str, float]:
     """ms a decision of whole episodes driven by the compact agent in one process: who spends the time."""
     with Worker(Runner, scenario, POLICY, SVO) as worker:
-        worker.call("run", TUNING_SEED)  # compilation
-        done: list[EpisodeResult] = [worker.call("run", TUNING_SEED + 1 + k) for k in range(episodes)]
+        worker.call("run", TUNING_SEEDS.start)  # compilation
+        done: list[EpisodeResult] = [worker.call("run", TUNING_SEEDS.start + 1 + k) for k in range(episodes)]
     steps = sum(result.steps for result in done)
     parts = {"simulation": "simulation_s", "observation": "observation_s", "decision": "decision_s"}
     return {name: 1e3 * sum(r.timings[key] for r in done) / steps for name, key in parts.items()}

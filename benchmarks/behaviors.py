@@ -23,10 +23,10 @@ from scipy.optimize import Bounds, differential_evolution
 
 from benchmarks.lane_changes import CLASSES, Traffic, build_highway, measure
 from cosim.evaluation.statistics import median_of_blocks, quantile, rate, share
+from cosim.seeding import FIRST_TEST_SEED, TUNING_SEEDS
 from cosim.simulation.drivers import BEHAVIORS_FILE, LC2013, MIXED, MOBIL, Behaviors, load_behaviors
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results" / "behaviors.md"
-TUNING_SEEDS, TEST_SEEDS = 100_000, 200_000
 
 # ---------------------------------------------------------------- calibration
 
@@ -94,7 +94,7 @@ def calibrate(
         key = json.dumps([name, model, {k: round(v, 4) for k, v in sorted(values.items())}])
         if key not in cache:
             changed = with_attributes(behaviors, name, values)
-            traffic = measure(folder, name, model, TUNING_SEEDS, TUNING_DURATION[name], changed)
+            traffic = measure(folder, name, model, TUNING_SEEDS.start, TUNING_DURATION[name], changed)
             cache[key] = summary(traffic, name)
             cache_file.write_text(json.dumps(cache, indent=0))
         return cache[key]
@@ -117,7 +117,7 @@ def calibrate(
             objective,
             Bounds(*np.array([*FREE.values()]).T),
             x0=x0,
-            seed=TUNING_SEEDS,
+            seed=TUNING_SEEDS.start,
             popsize=population,
             maxiter=generations,
             polish=False,
@@ -155,7 +155,7 @@ def report(folder: Path, scale: float) -> str:
 
     def collect(behavior: str, model: str, used: Behaviors) -> Traffic:
         total = Traffic()
-        for seed in (TEST_SEEDS, TEST_SEEDS + 1):
+        for seed in (FIRST_TEST_SEED, FIRST_TEST_SEED + 1):
             total.add(measure(folder, behavior, model, seed, scale * REPORT_DURATION[behavior], used))
         return total
 

@@ -30,9 +30,9 @@ from benchmarks.tables import (
 )
 from cosim.evaluation.run_folder import Run
 from cosim.evaluation.statistics import Figure
+from cosim.seeding import TUNING_SEEDS
 from policy.safety import SafetyConfig
 
-TUNING_SEEDS = 100_000
 WORLDS = ("merge", "intersection")  # one where lanes meet, one where ways cross
 EPISODES = 6  # a world and setting; --scale for more
 DEFAULT = SafetyConfig()
@@ -196,7 +196,7 @@ JOB = Job(
     orders,
     write,
     "benchmarks",
-    TUNING_SEEDS,
+    TUNING_SEEDS.start,
 )
 
 if __name__ == "__main__":

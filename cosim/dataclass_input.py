@@ -10,8 +10,7 @@ import typing
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
-from cosim.errors import BadInput
-from cosim.sumocfg import hint
+from cosim.errors import BadInput, hint
 
 Config = TypeVar("Config")
 

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
+
+LISTED = 16  # known names at most that an error lists
+
 
 class CosimError(Exception):
     """Base of every error cosim raises on purpose; `exit_code` is what the command line returns."""
@@ -74,3 +79,20 @@ class SimulationInUse(SimulationError):
 
 class WeightsMismatch(BadInput):
     """A checkpoint's layout (names, shapes, hash) is not the one that the network needs."""
+
+
+def hint(name: str, known: Iterable[str]) -> str:
+    """ ", did you mean 'x'?" for the known name nearest to `name`; all of few when nothing is near."""
+    names = list(known)
+    close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+    if close:
+        return f", did you mean {close[0]!r}?"
+    return f", there are: {', '.join(names)}" if 0 < len(names) <= LISTED else ""
+
+
+def one_of(value: str, allowed: Iterable[str], field: str, file: object = None) -> str:
+    """`value` if it is one of the words `allowed`; raises BadInput with the nearest one."""
+    words = tuple(allowed)
+    if value not in words:
+        raise BadInput(f"unknown{hint(value, words)}", file=file, field=field, value=value)
+    return value

@@ -75,24 +75,6 @@ class LanePath:
         p = self.points[i] + s * d
         return p[:, 0], p[:, 1], np.arctan2(d[:, 1], d[:, 0])
 
-    def project(self, x: float, y: float, around: float | None = None) -> tuple[float, float]:
-        """Nearest arc length and signed lateral offset (left positive) of a point, both in m.
-
-        `around`: search only within 60 m of this arc length (for paths that cross themselves).
-        """
-        a, b = self.points[:-1], self.points[1:]
-        d = b - a
-        span2 = np.maximum((d * d).sum(1), 1e-12)
-        s = np.clip(((x - a[:, 0]) * d[:, 0] + (y - a[:, 1]) * d[:, 1]) / span2, 0.0, 1.0)
-        q = a + s[:, None] * d
-        distance2 = (x - q[:, 0]) ** 2 + (y - q[:, 1]) ** 2
-        if around is not None:
-            distance2 = np.where(np.abs(self.arc[:-1] - around) > 60.0, distance2 + 1e6, distance2)
-        i = int(np.argmin(distance2))
-        span = float(np.sqrt(span2[i]))
-        lateral = float((d[i, 0] * (y - a[i, 1]) - d[i, 1] * (x - a[i, 0])) / span)
-        return float(self.arc[i] + s[i] * span), lateral
-
 
 class RouteAhead(NamedTuple):
     """An AV's own route knowledge at one decision (contract, Observation)."""

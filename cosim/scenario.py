@@ -9,8 +9,7 @@ from pathlib import Path
 
 import sumo_scenarios
 from cosim import sumocfg, yaml_input
-from cosim.errors import BadInput
-from cosim.sumocfg import one_of
+from cosim.errors import BadInput, hint, one_of
 from cosim.types import Preset, Timing
 from cosim.xml_input import is_there, regular_file
 
@@ -180,7 +179,7 @@ def _foreign(what: str) -> Scenario:
     path = Path(what)
     names = sumo_scenarios.names()
     if not is_there(path) and path.suffix != ".sumocfg":
-        problem = f"no such scenario{sumocfg.hint(what, names)}"
+        problem = f"no such scenario{hint(what, names)}"
         raise BadInput(problem, field="scenario", value=what)
     config = sumocfg.read(regular_file(path, file=None, field="scenario"))
     if config.end is not None and config.end <= config.begin:
@@ -208,7 +207,7 @@ def _with_demand(scenario: Scenario, wanted: Sequence[str]) -> Scenario:
         elif is_there(Path(item)) or item.endswith((".xml", ".gz")):
             files.append(regular_file(Path(item).absolute(), file=None, field="--demand"))
         else:
-            problem = f"no such demand{sumocfg.hint(item, known)}"
+            problem = f"no such demand{hint(item, known)}"
             raise BadInput(problem, field="--demand", value=item)
         names.append(_demand_name(files[-1]))
     return replace(scenario, demand=tuple(files), demand_name="+".join(names))

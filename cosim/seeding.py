@@ -6,6 +6,12 @@ import hashlib
 
 import numpy as np
 
+# What a result may rest on (docs/definitions.md, Seeds); tests begin where tuning and validation end, and a
+# result on a test seed never changes a parameter.
+TRAINING_SEEDS = range(100_000)
+TUNING_SEEDS = range(100_000, 200_000)
+FIRST_TEST_SEED = TUNING_SEEDS.stop
+
 
 def subseed(seed: int, *purpose: str) -> int:
     """A 63-bit seed for one purpose; draws for other purposes or vehicles never shift it."""

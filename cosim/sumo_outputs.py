@@ -13,9 +13,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from cosim.errors import BadInput, SimulationError
+from cosim.errors import BadInput, SimulationError, one_of
 from cosim.scenario import Scenario
-from cosim.sumocfg import one_of
 
 DRAFT = ".part"  # folder of files that SUMO is still writing
 FIELD = "--output"

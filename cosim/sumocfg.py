@@ -6,10 +6,9 @@ A foreign configuration is never handed to SUMO as it is: its outputs could writ
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -201,23 +200,6 @@ def time_of(value: str, file: object, field: str) -> float:
     weights = (1.0, 60.0, 3600.0, 86400.0)
     seconds = sum(abs(n) * w for n, w in zip(reversed(numbers), weights, strict=False))
     return sign * seconds
-
-
-def hint(name: str, known: Iterable[str]) -> str:
-    """ ", did you mean 'x'?" for the known name nearest to `name`; all of them when nothing is near."""
-    names = list(known)
-    close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
-    if close:
-        return f", did you mean {close[0]!r}?"
-    return f", there are: {', '.join(names)}" if 0 < len(names) <= 12 else ""
-
-
-def one_of(value: str, allowed: Iterable[str], field: str, file: object = None) -> str:
-    """`value` if it is one of the words `allowed`; raises BadInput with the nearest one."""
-    words = tuple(allowed)
-    if value not in words:
-        raise BadInput(f"unknown{hint(value, words)}", file=file, field=field, value=value)
-    return value
 
 
 def _values(path: Path) -> dict[str, str]:

@@ -128,14 +128,6 @@ class Snapshot:
         return len(self.ids)
 
 
-class Observation(NamedTuple):
-    """One frame as one AV sees it, paper P equation (5): the VelocityMap and the kinematic matrix."""
-
-    velocity_map: Bytes  # [C,H,W] pixel * 255
-    kinematics: Floats32  # [R,F]
-    valid: Bools  # [R]
-
-
 # Columns of the kinematic matrix, in the ego's frame at the newest frame of the history
 # (x ahead, y to the left), so that one history lives in one fixed frame and series are smooth.
 KINEMATIC_FEATURES = ("x", "y", "speed", "heading", "length", "width", "is_av", "is_mission")
@@ -210,17 +202,6 @@ class Receipt(NamedTuple):
     vehicle: str
     executed: bool
     blocked: str | None = None  # why not
-
-
-class Transition(NamedTuple):
-    """One step of one AV, as learners store it."""
-
-    history: History
-    action: MetaAction
-    reward: float
-    next_history: History | None  # None when the AV is gone
-    terminated: bool
-    truncated: bool
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
-from cosim.errors import BadInput
+from cosim.errors import BadInput, hint
 from cosim.scenario import Scenario
-from cosim.sumocfg import FILE_OPTIONS, hint
+from cosim.sumocfg import FILE_OPTIONS
 from cosim.vet_demand import Demand, Use, read_demand
 from cosim.vet_net import Net, read_net
 from cosim.xml_input import regular_file

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
-from cosim.errors import BadInput
-from cosim.sumocfg import hint, time_of
+from cosim.errors import BadInput, hint
+from cosim.sumocfg import time_of
 from cosim.vet_rules import (
     DEMAND,
     LANE_CHANGE,

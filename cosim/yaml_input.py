@@ -10,8 +10,7 @@ from typing import Any
 
 import yaml
 
-from cosim.errors import BadInput
-from cosim.sumocfg import hint, one_of
+from cosim.errors import BadInput, hint, one_of
 from cosim.xml_input import regular_file
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, is_dataclass
+from dataclasses import MISSING, asdict, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -80,8 +80,9 @@ def load(path: Path, networks: Mapping[str, nn.Module], configs: Mapping[str, An
     """
     card = read_card(path)
     for name, config in configs.items():
-        wanted = json.loads(json.dumps(asdict(config) if is_dataclass(config) else config))  # type: ignore[arg-type]
-        found = card.get("configs", {}).get(name)
+        wanted, found = _plain(config), card.get("configs", {}).get(name)
+        if isinstance(found, dict):
+            found = _filled(found, _defaults(config))
         if found != wanted:
             differs = [k for k in wanted if not isinstance(found, dict) or found.get(k) != wanted[k]]
             raise WeightsMismatch(
@@ -119,6 +120,27 @@ def sha256(path: Path) -> str:
     """Hash of a file's content."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _plain(config: Any) -> Any:
+    """A configuration as JSON has it."""
+    return json.loads(json.dumps(asdict(config) if is_dataclass(config) else config))  # type: ignore[arg-type]
+
+
+def _defaults(config: Any) -> dict[str, Any]:
+    """What the fields of a configuration are when nobody sets them, as JSON has it."""
+    if not is_dataclass(config):
+        return {}
+    made = {f.name: f.default_factory() for f in fields(config) if f.default_factory is not MISSING}
+    made |= {f.name: f.default for f in fields(config) if f.default is not MISSING}
+    return {name: _plain(value) for name, value in made.items()}
+
+
+def _filled(found: dict[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
+    """A card's configuration with the defaults of options that are newer than the card (the default of a new
+    option must be what was done without it)."""
+    both = [k for k, v in found.items() if isinstance(v, dict) and isinstance(defaults.get(k), dict)]
+    return {**defaults, **found, **{k: _filled(found[k], defaults[k]) for k in both}}
 
 
 def _compare_names(path: Path, found: set[str], wanted: set[str]) -> None:

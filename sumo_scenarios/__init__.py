@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import difflib
 from pathlib import Path
 
-from cosim.errors import BadInput
+from cosim.errors import BadInput, hint
 
 ROOT = Path(__file__).resolve().parent
 BEHAVIORS = ROOT / "behaviors.yaml"  # Table II and its IDM + LC2013 mapping
@@ -26,6 +25,4 @@ def folder(name: str) -> Path:
     known = names()
     if name in known:
         return ROOT / name
-    near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-    hint = f"did you mean {near[0]!r}?" if near else f"there are: {', '.join(known)}"
-    raise BadInput(f"no such scenario; {hint}", field="scenario", value=name)
+    raise BadInput(f"no such scenario{hint(name, known)}", field="scenario", value=name)

@@ -15,7 +15,6 @@ from matplotlib.figure import Figure as Picture
 from benchmarks.papers.agents import config
 from benchmarks.papers.cost import Reckoning
 from benchmarks.papers.driving import (
-    TEST_SEEDS,
     Order,
     Results,
     Settings,
@@ -26,6 +25,7 @@ from benchmarks.papers.driving import (
 from benchmarks.tables import Line, write_csv, write_page
 from cosim.errors import CosimError
 from cosim.evaluation.tasks import OK
+from cosim.seeding import FIRST_TEST_SEED
 from policy.checkpoint import read_card
 
 STYLE: Any = {"svg.fonttype": "none", "svg.hashsalt": "cosim", "font.size": 9.0}  # equal figures, equal file
@@ -40,7 +40,7 @@ class Job:
     orders: Callable[[], list[Order]]
     write: Callable[[Results, Settings], None]
     package: str = "benchmarks.papers"  # where its module lies
-    first: int = TEST_SEEDS  # seed
+    first: int = FIRST_TEST_SEED  # seed
     watches: bool = False  # whether its page needs episodes driven once more
 
     @property

@@ -8,8 +8,7 @@ from typing import NamedTuple
 
 import policy
 from cosim.dataclass_input import dataclass_from
-from cosim.errors import BadInput
-from cosim.sumocfg import hint
+from cosim.errors import BadInput, hint
 from cosim.yaml_input import document
 from policy.training.config import TrainingFile
 

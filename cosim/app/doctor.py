@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib import metadata, util
 from pathlib import Path
@@ -17,17 +18,6 @@ from pathlib import Path
 OK, WARN, FAIL = "ok", "warn", "FAIL"
 # What `import libsumo` misses on a bare Debian or Ubuntu (docs/sumo.md).
 APT_LINE = "apt-get install libx11-6 libxext6 libxrender1 libgl1 libatomic1"
-NEEDED = (
-    "numpy",
-    "scipy",
-    "numba",
-    "torch",
-    "gymnasium",
-    "pettingzoo",
-    "PyYAML",
-    "defusedxml",
-    "safetensors",
-)
 # One version for all of them: libsumo and sumolib are pinned together, eclipse-sumo rebuilds the nets.
 SUMO_PACKAGES = ("libsumo", "sumolib", "traci", "eclipse-sumo", "sumo-data")
 PROBE_LIMIT = 120.0  # s for `sumo --version` and `import libsumo`: 300 MB of libraries from a cold, busy disk
@@ -97,6 +87,15 @@ def version_of(package: str) -> str | None:
         return None
 
 
+def requirements() -> list[str]:
+    """The distributions that cosim's own metadata asks for, but for extras and SUMO's."""
+    with suppress(metadata.PackageNotFoundError):
+        asked = [text for text in metadata.requires("cosim") or [] if "extra ==" not in text]
+        names = [re.split(r"[^\w.-]", text, maxsplit=1)[0] for text in asked]
+        return [name for name in names if name not in SUMO_PACKAGES]
+    return []
+
+
 def packages(version: Callable[[str], str | None]) -> Iterator[Check]:
     """cosim and what it imports."""
     own = version("cosim")
@@ -104,8 +103,9 @@ def packages(version: Callable[[str], str | None]) -> Iterator[Check]:
         yield Check("cosim", FAIL, "is not installed", "pip install -e . -c constraints.txt")
     else:
         yield Check("cosim", OK, own)
-    missing = [name for name in NEEDED if version(name) is None]
-    found = ", ".join(f"{name} {version(name)}" for name in NEEDED if name not in missing)
+    needed = requirements()
+    missing = [name for name in needed if version(name) is None]
+    found = ", ".join(f"{name} {version(name)}" for name in needed if name not in missing)
     if missing:
         mend = f"pip install -c constraints.txt {' '.join(missing)}"
         yield Check("packages", FAIL, f"missing: {', '.join(missing)}", mend)

@@ -19,6 +19,7 @@ from cosim.errors import BadInput
 from cosim.evaluation.prediction import Scores, interval_errors
 from cosim.memory import keep_freed_memory
 from cosim.recording import Folder, windows
+from cosim.seeding import TRAINING_SEEDS, TUNING_SEEDS
 from policy.checkpoint import save
 from policy.predictors import Predictor
 from policy.predictors.gp import GaussianProcessDirect, GaussianProcessIndirect
@@ -38,7 +39,6 @@ from policy.training.predictors import (
 
 EVERY = 5  # frames between two moments of an episode: 1 s, nearer ones are almost the same
 SCORED_EVERY = 10  # frames, on validation episodes
-TRAINING_SEEDS, TUNING_SEEDS = range(100_000), range(100_000, 200_000)
 NETS = {
     "lstm-direct": NetConfig("lstm", "direct"),
     "lstm-indirect": NetConfig("lstm", "indirect"),

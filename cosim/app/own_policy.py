@@ -15,9 +15,8 @@ from types import ModuleType
 from typing import Any
 
 from cosim.envs.view import View, views
-from cosim.errors import BadInput, CosimError
+from cosim.errors import BadInput, CosimError, hint
 from cosim.policy_name import PolicyName
-from cosim.sumocfg import hint
 from cosim.types import COMPACT, Decision, History, MetaAction, ObservationConfig, PolicyContext
 
 NEEDED = ("observation", "reset", "decide")  # of `cosim.types.Policy`; the rest has defaults

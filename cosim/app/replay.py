@@ -14,7 +14,7 @@ from typing import Any
 from cosim.app.policies import check
 from cosim.app.progress import Progress
 from cosim.app.runner import Runner
-from cosim.errors import BadInput, CosimError
+from cosim.errors import BadInput, CosimError, hint
 from cosim.evaluation import run_folder
 from cosim.evaluation.case import Case
 from cosim.evaluation.replay.recorder import Recording
@@ -22,7 +22,7 @@ from cosim.evaluation.tasks import OK
 from cosim.manifest import POLICY_FILES, manifest, named
 from cosim.policy_name import label, read
 from cosim.scenario import Scenario
-from cosim.sumocfg import CLOCK, INPUTS, command_line, hint, keeps
+from cosim.sumocfg import CLOCK, INPUTS, command_line, keeps
 from cosim.types import EpisodeResult
 from cosim.vet import vetted
 from cosim.worker import Worker

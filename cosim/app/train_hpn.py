@@ -19,6 +19,7 @@ from cosim.evaluation.engines import LocalEngine
 from cosim.evaluation.tasks import Task
 from cosim.memory import keep_freed_memory
 from cosim.recording import Folder, read
+from cosim.seeding import TRAINING_SEEDS, TUNING_SEEDS
 from cosim.types import COMPACT
 from policy.predictors import make_predictor
 from policy.traffic import TrafficConfig
@@ -29,8 +30,6 @@ from policy.training.loop import write_log
 from policy.training.map_branch import MapTask
 from policy.training.moments import MapSample, Moment, map_sample, moment
 from policy.training.networks import use_threads
-
-TRAINING, VALIDATION = range(0, 100_000), range(100_000, 200_000)  # seeds (definitions.md)
 
 
 def train(args: argparse.Namespace) -> int:
@@ -44,8 +43,8 @@ def train(args: argparse.Namespace) -> int:
             "recordings to train and to validate on are needed", field="--recordings, --validation"
         )
     found = {
-        "train": _checked(args.recordings, TRAINING, "--recordings"),
-        "validation": _checked(args.validation, VALIDATION, "--validation"),
+        "train": _checked(args.recordings, TRAINING_SEEDS, "--recordings"),
+        "validation": _checked(args.validation, TUNING_SEEDS, "--validation"),
     }
     folder = output.prepare_folder(args.out)
     keep_freed_memory()
@@ -148,7 +147,7 @@ def _checked(paths: Sequence[str], seeds: range, field: str) -> list[tuple[Path,
     wrong = sorted({s for _, key in found if (s := int(key.rsplit("-", 1)[1])) not in seeds})
     if wrong:
         raise BadInput(
-            f"seeds {seeds.start} to {seeds.stop - 1} are for this, not {wrong[0]}: cosim record --seeds chooses them",
+            f"seeds {seeds.start} to {seeds.stop - 1} are for this, not {wrong[0]} (cosim record --seeds)",
             field=field,
             value=", ".join(paths),
         )

@@ -8,10 +8,10 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from cosim.envs.view import Unpacker, View
-from cosim.errors import BadInput
+from cosim.errors import BadInput, hint
 from cosim.rewards import RewardConfig, RewardTerms
 from cosim.scenario import Fleet, Scenario, load
-from cosim.sumocfg import hint
+from cosim.seeding import TRAINING_SEEDS
 from cosim.types import (
     COMPACT,
     Bytes,
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from cosim.envs.host import Host, PolicyFactory, Reply, SimulatorFactory
     from cosim.road import RoadMap
 
-FIRST_SEED = 0  # training seeds are 0-99,999 (definitions.md)
 TIMEOUT = 120.0  # s without an answer; the first step of a machine compiles the kernels
 TERMINAL = ("collision", "collision of the mission vehicle")  # all else that ends it cuts it short
 
@@ -135,7 +134,7 @@ class Session:
         self._connect = connect
         self._caller: Caller | None = connect()
         self._unpacker = Unpacker()
-        self._next_seed = FIRST_SEED if seed is None else seed
+        self._next_seed = TRAINING_SEEDS.start if seed is None else seed
         self._views: dict[str, View] | None = None
         self._closed = False
         self.over = False

@@ -11,7 +11,8 @@ import numpy.typing as npt
 
 from cosim.envs.session import StepResult
 from cosim.envs.view import View
-from cosim.sumocfg import one_of
+from cosim.errors import one_of
+from cosim.seeding import TRAINING_SEEDS
 from cosim.types import KINEMATIC_FEATURES, Floats, Floats32, MetaAction, ObservationConfig
 
 Observation = dict[str, npt.NDArray[np.generic]] | Floats32
@@ -41,7 +42,6 @@ _SCALE = np.array([SCALE[name] for name in KINEMATIC_FEATURES], np.float32)  # [
 
 FLATTEN = ("kinematics",)
 RENDER_MODES = ("rgb_array",)
-TRAINING_SEEDS = 100_000  # seeds 0 to 99,999 are for training (definitions.md); tests begin at 200,000
 
 
 def observation_space(config: ObservationConfig, flatten: str | None) -> Space:
@@ -74,7 +74,7 @@ def checked(
 
 def training_seed(rng: np.random.Generator) -> int:
     """A seed for an episode nobody named one for."""
-    return int(rng.integers(TRAINING_SEEDS))
+    return int(rng.integers(len(TRAINING_SEEDS)))
 
 
 def action_space() -> gymnasium.spaces.Discrete:

@@ -13,13 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cosim.errors import BadInput
+from cosim.errors import BadInput, hint
 from cosim.evaluation import run_folder, wording
 from cosim.evaluation.figures import Row
 from cosim.evaluation.run_folder import Run
 from cosim.evaluation.summary import GROUP, not_comparable
 from cosim.evaluation.tasks import BAD_INPUT, OK
-from cosim.sumocfg import hint
 
 PAIR = tuple(name for name in GROUP if name != "policy")
 ACROSS = ("behavior", "penetration", "preset", "svo_deg", "driver_model")  # what A and B may differ in

@@ -13,9 +13,9 @@ from typing import Any
 
 import sumo_scenarios
 from cosim import policy_name, yaml_input
-from cosim.errors import BadInput
+from cosim.errors import BadInput, hint, one_of
 from cosim.scenario import BEHAVIORS, DRIVER_MODELS
-from cosim.sumocfg import hint, one_of
+from cosim.seeding import FIRST_TEST_SEED
 from cosim.types import Preset
 from cosim.xml_input import is_there
 
@@ -29,7 +29,7 @@ class Spec:
     """The axes of the matrix; every combination of one value each is a cell, driven once per seed."""
 
     scenario: tuple[str, ...]  # names of worlds, absolute paths of .sumocfg
-    seeds: tuple[int, int] = (200_000, 200_001)  # first, and one past the last
+    seeds: tuple[int, int] = (FIRST_TEST_SEED, FIRST_TEST_SEED + 1)  # first, and one past the last
     demand: tuple[tuple[str, ...], ...] = ((),)  # each: names or files driven together; (): the scenario's
     policy: tuple[str, ...] = ("idm",)  # as `cosim.policy_name` has it, files absolute
     behavior: tuple[str | None, ...] = (None,)  # None: the scenario's default

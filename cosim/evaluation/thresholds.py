@@ -14,10 +14,9 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from cosim.errors import BadInput
+from cosim.errors import BadInput, hint
 from cosim.evaluation.figures import Measure
 from cosim.evaluation.statistics import Figure
-from cosim.sumocfg import hint
 
 DIFFERENCE, CHANGE, ABSOLUTE = "difference", "change", "absolute"
 

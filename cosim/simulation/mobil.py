@@ -150,9 +150,10 @@ def is_safe(a: Accelerations, mobil: MobilParameters) -> bool:
     return a.new_follower_after > -mobil.safe_deceleration and a.ego_after > -mobil.safe_deceleration
 
 
-def wants_change(a: Accelerations, mobil: MobilParameters) -> bool:
-    """MOBIL's verdict: safe, and worth more than the threshold."""
-    return is_safe(a, mobil) and incentive(a, mobil.politeness) > mobil.threshold
+def worth(a: Accelerations, mobil: MobilParameters) -> float | None:
+    """MOBIL's verdict: the incentive (m/s2) of a change that is safe and beats the threshold, else None."""
+    gain = incentive(a, mobil.politeness)
+    return gain if gain > mobil.threshold and is_safe(a, mobil) else None
 
 
 # ---------------------------------------------------------------- reading and commanding SUMO
@@ -289,13 +290,12 @@ class MobilDriving:
         if best_incentive(own, mobil.politeness) <= mobil.threshold:
             return 0
         lane, lanes = libsumo.vehicle.getLaneIndex(vehicle), libsumo.edge.getLaneNumber(edge)
-        best, best_gain = 0, mobil.threshold
+        best, best_gain = 0, 0.0
         for direction in (LEFT, RIGHT):
             if not 0 <= lane + direction < lanes:
                 continue
-            a = accelerations(read_beside(own, vehicle, direction, self.known))
-            gain = incentive(a, mobil.politeness)
-            if gain > best_gain and is_safe(a, mobil) and route_allows(vehicle, direction):
+            gain = worth(accelerations(read_beside(own, vehicle, direction, self.known)), mobil)
+            if gain is not None and (not best or gain > best_gain) and route_allows(vehicle, direction):
                 best, best_gain = direction, gain
         return best
 

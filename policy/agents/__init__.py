@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable
 
-from cosim.errors import BadInput
+from cosim.errors import BadInput, hint
 from cosim.types import Policy
 
 # policy.agents.approaches has the table; its names alone are needed before torch is
@@ -39,9 +38,7 @@ POLICIES: dict[str, Callable[[], Policy]] = {
 def check_name(name: str) -> None:
     """Raises BadInput naming the nearest known name."""
     if name not in POLICIES:
-        near = difflib.get_close_matches(name, POLICIES, n=1)
-        hint = f" (did you mean '{near[0]}'?)" if near else ""
-        raise BadInput(f"unknown policy{hint}; known: {', '.join(POLICIES)}", field="--policy", value=name)
+        raise BadInput(f"unknown policy{hint(name, POLICIES)}", field="--policy", value=name)
 
 
 def make(name: str) -> Policy:

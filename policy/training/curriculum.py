@@ -9,13 +9,11 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from cosim.seeding import subseed, uniform
+from cosim.seeding import TRAINING_SEEDS, TUNING_SEEDS, subseed, uniform
 from policy.training.a2c import A2cConfig
 from policy.training.ddqn import DdqnConfig
 from policy.training.experience import Trajectory
 from policy.training.replay import ReplayConfig
-
-TRAINING_SEEDS = 100_000  # 0 to 99,999 are for training, the next as many for validation (definitions.md)
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +80,7 @@ def drives(c: VfnTraining, k: int, weights: str, frozen: str, epsilon: float, gu
         drawn.append(
             Drive(
                 _drawn(c.lessons, luck[0]),
-                (k * c.episodes + j + subseed(c.seed, "episodes")) % TRAINING_SEEDS,
+                (k * c.episodes + j + subseed(c.seed, "episodes")) % len(TRAINING_SEEDS),
                 math.radians(c.svo[int(luck[1] * len(c.svo))]),
                 epsilon,
                 weights,
@@ -103,7 +101,7 @@ def validation(c: VfnTraining, weights: str) -> list[Drive]:
     """Every lesson in turn, greedy, on tuning seeds."""
     svo = math.radians(c.svo[len(c.svo) // 2])
     return [
-        Drive(lesson, TRAINING_SEEDS + j, svo, 0.0, weights, weights, record=False)
+        Drive(lesson, TUNING_SEEDS[j], svo, 0.0, weights, weights, record=False)
         for lesson in c.lessons
         for j in range(c.validation)
     ]

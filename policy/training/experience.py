@@ -15,7 +15,6 @@ from cosim.types import Bools, Bytes, Floats32
 from policy.tensors import States
 
 Ending = Literal["crashed", "left", "cut"]  # cut: the episode ended before the AV's drive did
-ENDINGS: tuple[Ending, ...] = ("crashed", "left", "cut")
 Halves = npt.NDArray[np.float16]
 
 
@@ -51,11 +50,6 @@ class Trajectory:
     def past(self) -> int:
         """N, the past frames of a state."""
         return int(self.frames.shape[0] - len(self) * self.stride)
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of the arrays."""
-        return sum(a.nbytes for a in vars(self).values() if isinstance(a, np.ndarray))
 
     def maps(self, t: int) -> list[Bytes]:
         """The map groups of state `t`: past [N,C,H,W] and predicted [M,C,H,W] frames."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from cosim.errors import BadInput
 from policy import checkpoint
@@ -15,7 +15,6 @@ from policy.training.kinematics import KinematicTask, KinematicTraining
 from policy.training.loop import Line, LoopConfig
 from policy.training.map_branch import MapTask, MapTraining
 
-Variant = Literal["hpn", "hpn-no-history", "hpn-plain"]
 VARIANTS: dict[str, HpnConfig] = {
     "hpn": HpnConfig(),
     "hpn-no-history": HpnConfig(kinematic=KinematicConfig(history=False)),  # P, figure 6

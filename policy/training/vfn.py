@@ -21,6 +21,7 @@ import numpy as np
 from safetensors.torch import load_file, save_file
 
 from cosim.errors import BadInput
+from cosim.seeding import TUNING_SEEDS
 from policy import checkpoint
 from policy.training import curriculum, experience
 from policy.training.curriculum import Drive, Drove, VfnTraining
@@ -131,7 +132,7 @@ class Trainer:
             measured = {
                 "iteration": k,
                 "validation": means,
-                "tuning_seeds": [curriculum.TRAINING_SEEDS, self.config.validation],
+                "tuning_seeds": [TUNING_SEEDS.start, self.config.validation],
             }
             card = checkpoint.read_card(source)
             networks = {"vfn": VFN(self.vfn)}

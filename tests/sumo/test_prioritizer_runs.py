@@ -6,6 +6,7 @@ from pathlib import Path
 
 from benchmarks import prioritizer
 from benchmarks.papers.driving import Settings, drive
+from cosim.seeding import TUNING_SEEDS
 
 
 def test_settings_are_driven_once_on_tuning_seeds_and_shown(tmp_path: Path) -> None:
@@ -15,7 +16,7 @@ def test_settings_are_driven_once_on_tuning_seeds_and_shown(tmp_path: Path) -> N
         scale=1e-6,
         workers=1,
         duration=2.0,
-        first=prioritizer.TUNING_SEEDS,
+        first=TUNING_SEEDS.start,
     )
     wanted = ("cruise", "cruise, no mask")
     orders = [o for o in prioritizer.orders() if o.scenario == "merge" and o.agent.name in wanted]

@@ -144,7 +144,7 @@ def test_another_policy_is_filmed_beside_it_on_the_same_traffic(
     assert main(["replay", str(run), "--beside", "idm", "--gif", str(gif)]) == 0
     assert gif.read_bytes()[:6] == b"GIF89a"
     assert main(["replay", str(run), "--beside", "imd"]) == 2
-    assert "--beside='imd': unknown policy (did you mean 'idm'?)" in capsys.readouterr().err
+    assert "--beside='imd': unknown policy, did you mean 'idm'?" in capsys.readouterr().err
 
 
 def test_a_run_can_draw_its_replay_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

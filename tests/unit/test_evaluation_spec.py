@@ -140,7 +140,7 @@ def test_a_wrong_spec_is_one_clear_sentence(tmp_path: Path, text: str, sentence:
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("policy: vnf-p\n", r"unknown policy \(did you mean 'vfn-p'\?\)"),
+        ("policy: vnf-p\n", r"unknown policy, did you mean 'vfn-p'\?"),
         ("demand: contestd\n", r"no such demand.*contested"),
         ("output: [tripinfo, fdc]\n", r"--output='fdc'.*'fcd'"),
         ("av_type: avv\n", r"no such vehicle type in the demand.*'av'"),

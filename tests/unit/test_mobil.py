@@ -18,7 +18,7 @@ from cosim.simulation.mobil import (
     idm_acceleration,
     incentive,
     is_safe,
-    wants_change,
+    worth,
 )
 
 MODERATE_IDM = IdmParameters(1.0, 2.0, 3.0, 7.0)
@@ -61,14 +61,14 @@ def test_a_blocked_lane_beside_a_free_lane_is_worth_leaving() -> None:
     a = accelerations(s)
     assert a.ego < -5.0
     assert a.ego_after == pytest.approx(3.0 * (1 - 0.8**4))
-    assert wants_change(a, MODERATE)
+    assert worth(a, MODERATE) is not None
     assert incentive(a, 0.3) == pytest.approx(a.ego_after - a.ego)
 
 
 def test_two_equally_free_lanes_give_no_reason_to_change() -> None:
     a = accelerations(Situation(car(20.0), None, None, None, None))
     assert incentive(a, 0.0) == 0.0
-    assert not wants_change(a, MobilParameters(0.0, 0.0, 12.0))
+    assert worth(a, MobilParameters(0.0, 0.0, 12.0)) is None
 
 
 def test_a_fast_follower_close_behind_in_the_new_lane_forbids_the_change_whatever_it_is_worth() -> None:
@@ -77,9 +77,9 @@ def test_a_fast_follower_close_behind_in_the_new_lane_forbids_the_change_whateve
     assert incentive(a, 0.0) > 10.0
     assert a.new_follower_after < -6.0
     assert not is_safe(a, EGOIST)
-    assert not wants_change(a, EGOIST)
+    assert worth(a, EGOIST) is None
     far_back = accelerations(s._replace(new_follower=Beside(90.0, car(28.0, 30.0))))
-    assert wants_change(far_back, EGOIST)
+    assert worth(far_back, EGOIST) is not None
 
 
 def test_an_aggressive_driver_takes_a_gap_that_a_conservative_one_refuses() -> None:
@@ -87,7 +87,7 @@ def test_an_aggressive_driver_takes_a_gap_that_a_conservative_one_refuses() -> N
     s = Situation(car(20.0), Beside(12.0, car(12.0)), None, None, Beside(14.0, car(22.0)))
     a = accelerations(s)
     assert -12.0 < a.new_follower_after < -2.0
-    assert wants_change(a, drivers["aggressive"].mobil)
+    assert worth(a, drivers["aggressive"].mobil) is not None
     assert not is_safe(a, drivers["conservative"].mobil)
 
 
@@ -98,23 +98,23 @@ def test_full_politeness_refuses_a_change_that_costs_the_follower_more_than_it_g
     assert own > 0.1
     assert cost > own
     assert is_safe(a, ALTRUIST)
-    assert wants_change(a, EGOIST)
-    assert not wants_change(a, ALTRUIST)
+    assert worth(a, EGOIST) is not None
+    assert worth(a, ALTRUIST) is None
 
 
 def test_full_politeness_moves_over_for_a_pressing_follower_behind() -> None:
     s = Situation(car(20.0, 20.0), None, Beside(12.0, car(24.0, 30.0)), None, None)
     a = accelerations(s)
     assert a.ego_after == a.ego  # nothing in it for the driver itself
-    assert wants_change(a, ALTRUIST)
-    assert not wants_change(a, EGOIST)
+    assert worth(a, ALTRUIST) is not None
+    assert worth(a, EGOIST) is None
 
 
 def test_no_politeness_makes_a_driver_brake_harder_than_the_safe_limit_for_others() -> None:
     s = Situation(car(25.0, 30.0), None, Beside(3.0, car(30.0, 35.0)), Beside(8.0, car(10.0)), None)
     a = accelerations(s)
     assert incentive(a, 1.0) > 0.1
-    assert not wants_change(a, ALTRUIST)
+    assert worth(a, ALTRUIST) is None
 
 
 def test_the_new_follower_follows_the_new_leader_across_the_changers_place_until_the_change() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -50,6 +51,16 @@ def test_what_was_saved_is_loaded_bit_by_bit_with_its_card(saved: Path) -> None:
 def test_another_layout_is_refused_by_the_field_that_differs(saved: Path) -> None:
     other = VfnConfig(32, 128, frames=10)
     with pytest.raises(WeightsMismatch, match=r"configs\.vfn.*differs in height"):
+        load(saved, {"vfn": VFN(other)}, {"vfn": other})
+
+
+def test_a_card_older_than_an_option_is_read_with_the_option_s_default(saved: Path) -> None:
+    card = json.loads(saved.with_suffix(".json").read_text())
+    del card["configs"]["vfn"]["dueling"], card["configs"]["vfn"]["features"]
+    saved.with_suffix(".json").write_text(json.dumps(card))
+    assert load(saved, {"vfn": VFN(CONFIG)}, {"vfn": CONFIG})["sha256"] == sha256(saved)
+    other = replace(CONFIG, dueling=False)
+    with pytest.raises(WeightsMismatch, match=r"differs in dueling"):
         load(saved, {"vfn": VFN(other)}, {"vfn": other})
 
 

@@ -54,7 +54,6 @@ def test_a_pose_on_a_bend_turns_with_it_and_goes_straight_beyond_the_end() -> No
     assert x == pytest.approx([5.0, 10.0, 10.0, -2.0])
     assert y == pytest.approx([0.0, 5.0, 15.0, 0.0])
     assert heading == pytest.approx([0.0, np.pi / 2, np.pi / 2, 0.0])
-    assert path.project(9.0, 4.0) == pytest.approx((14.0, 1.0))  # left of the lane is positive
 
 
 def test_a_ring_is_followed_once_round_at_most() -> None:

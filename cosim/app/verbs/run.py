@@ -15,6 +15,7 @@ from cosim.errors import BadInput
 from cosim.evaluation.case import Case
 from cosim.policy_name import label, read
 from cosim.scenario import BEHAVIORS, DRIVER_MODELS
+from cosim.seeding import FIRST_TEST_SEED
 from cosim.types import Preset
 from cosim.xml_input import is_there
 
@@ -41,7 +42,7 @@ def add(verbs: arguments.Verbs) -> None:
     fleet.add_argument(
         "--penetration", type=arguments.share, metavar="P", help="this share of vehicles are AVs, 0..1"
     )
-    run.add_argument("--seed", type=arguments.seed, default=200_000, metavar="N")
+    run.add_argument("--seed", type=arguments.seed, default=FIRST_TEST_SEED, metavar="N")
     run.add_argument(
         "--duration", type=arguments.positive, metavar="S", help="counted s (default: the scenario's)"
     )

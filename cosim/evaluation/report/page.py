@@ -111,11 +111,7 @@ def _verdict(run: Run, found: Sequence[Block]) -> dict[str, Any]:
     elif ok < total:
         words = f"{total - ok} of {_count(total, 'episode')} gave no figures"
     else:
-        words = (
-            f"{'All' if total > 1 else 'The'} {_count(total, 'episode')} finished"
-            if total > 1
-            else "Finished"
-        )
+        words = f"All {_count(total, 'episode')} finished" if total > 1 else "Finished"
     cells = sum(len(block.series) for block in found)
     return {
         "words": words,

@@ -76,7 +76,7 @@ class Traffic:
 
 def build_highway(folder: Path) -> None:
     """The net in `folder`; needs netconvert (extra `tools`)."""
-    import sumo  # type: ignore[import-untyped]
+    import sumo
 
     nodes = f'<nodes><node id="a" x="0" y="0"/><node id="b" x="{LENGTH}" y="0"/></nodes>'
     (folder / "n.nod.xml").write_text(nodes)

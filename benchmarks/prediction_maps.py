@@ -30,7 +30,7 @@ from benchmarks.tables import markdown_row, write_page
 from cosim.memory import keep_freed_memory
 from cosim.raster import rasterize_road
 from cosim.scenario import Fleet, Scenario, load
-from cosim.types import COMPACT, PAPER, ObservationConfig
+from cosim.types import COMPACT, PAPER, History, ObservationConfig
 from cosim.worker import Worker
 from policy.chain import ChainConfig, predict
 from policy.hpn import HPN, HpnConfig
@@ -57,7 +57,7 @@ class Gatherer:
 
     def gather(self, seed: int, decisions: int) -> tuple[Any, list[Any]]:
         """The road, and histories of the first AGENTS AVs (copies)."""
-        kept = []
+        kept: list[dict[str, History]] = []
         histories = self._episode.start(seed)
         while not self._episode.over and len(kept) < decisions:
             chosen = sorted(histories)[:AGENTS]
@@ -200,7 +200,8 @@ def onnx(branch: MapBranch, past: torch.Tensor, rows: torch.Tensor, steps: int, 
     import onnxruntime
 
     file = io.BytesIO()
-    torch.onnx.export(branch, ([past], rows), file, dynamo=False)
+    export: Any = torch.onnx.export  # its types know of paths alone
+    export(branch, ([past], rows), file, dynamo=False)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()
     session = onnxruntime.InferenceSession(file.getvalue(), options)

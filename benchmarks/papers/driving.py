@@ -18,7 +18,6 @@ from benchmarks.papers import shipped
 from benchmarks.papers.agents import Agent, build, fingerprint, missing, short
 from cosim.app.case_runner import CaseRunner
 from cosim.app.progress import Progress
-from cosim.app.runner import Runner
 from cosim.evaluation import batch, matrix
 from cosim.evaluation.case import Case
 from cosim.evaluation.engines import LocalEngine
@@ -27,6 +26,7 @@ from cosim.evaluation.folder import RunFolder
 from cosim.evaluation.run_folder import Run
 from cosim.evaluation.store import Store
 from cosim.seeding import FIRST_TEST_SEED
+from cosim.types import Policy
 
 WORLDS = ("exit", "merge", "roundabout", "intersection", "highway")  # P's order
 SVO = 45.0  # deg, weighs oneself and the others alike
@@ -270,14 +270,9 @@ class AgentRunner(CaseRunner):
         super().__init__()
         self._agents, self._untrained = agents, untrained
 
-    def _open(self, case: Case, warnings: tuple[str, ...]) -> Runner:
-        if self._runner is None or case.cell != self._cell:
-            self.close()  # one simulation per process: the old one must go first
-            policy = build(self._agents[case.policy.split(MARK)[0]], self._untrained)
-            scenario = replace(case.scenario(), warnings=warnings)
-            self._runner = Runner(scenario, policy, math.radians(case.svo_deg))
-            self._cell = case.cell
-        return self._runner
+    def policy(self, case: Case) -> Policy:
+        """The agent whose name the case bears before the mark."""
+        return build(self._agents[case.policy.split(MARK)[0]], self._untrained)
 
 
 def held(work: Planned, settings: Settings) -> dict[str, set[int]]:

@@ -54,7 +54,7 @@ class GuideWatcher(AgentRunner):
         self, case: Case, warnings: tuple[str, ...], outputs: str | None, progress: Progress
     ) -> dict[str, Any]:
         """`seed`, `trace_hash`, `crashed`; `guided`: the fields of `Guided`; `pictures`: PNG files."""
-        result, recording = self._open(case, warnings).record(case.seed, progress)
+        result, recording = self.open(case, warnings).record(case.seed, progress)
         found = guided(recording)
         facts = {"seed": case.seed, "trace_hash": result.trace_hash, "crashed": result.value("crashed")}
         return {**facts, "guided": asdict(found), "pictures": _pictures(recording, found)}

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from cosim.app import output
 from cosim.evaluation.case import Case
 from cosim.evaluation.tasks import Progress
+from cosim.types import Policy
 
 if TYPE_CHECKING:
     from cosim.app.runner import Runner
@@ -29,22 +30,27 @@ class CaseRunner:
 
         `warnings` are those of vetting; SUMO's own outputs go to the folder `outputs`/key.
         """
-        runner = self._open(case, warnings)
+        runner = self.open(case, warnings)
         folder = None if outputs is None else Path(outputs) / case.key
         return output.document(runner.run(case.seed, progress, outputs=case.outputs, folder=folder))
+
+    def policy(self, case: Case) -> str | Policy:
+        """Who commands the AVs of `case`: a name that `--policy` knows, unless a subclass says otherwise."""
+        return case.policy
+
+    def open(self, case: Case, warnings: tuple[str, ...]) -> Runner:
+        """The runner of the case's cell, kept while cases of the same cell come."""
+        from cosim.app.runner import Runner  # libsumo: only here, in the worker's process
+
+        if self._runner is None or case.cell != self._cell:
+            self.close()  # one simulation per process: the old one must go first
+            scenario = replace(case.scenario(), warnings=warnings)
+            self._runner = Runner(scenario, self.policy(case), math.radians(case.svo_deg))
+            self._cell = case.cell
+        return self._runner
 
     def close(self) -> None:
         """End the simulation."""
         runner, self._runner = self._runner, None
         if runner is not None:
             runner.close()
-
-    def _open(self, case: Case, warnings: tuple[str, ...]) -> Runner:
-        from cosim.app.runner import Runner  # libsumo: only here, in the worker's process
-
-        if self._runner is None or case.cell != self._cell:
-            self.close()  # one simulation per process: the old one must go first
-            scenario = replace(case.scenario(), warnings=warnings)
-            self._runner = Runner(scenario, case.policy, math.radians(case.svo_deg))
-            self._cell = case.cell
-        return self._runner

@@ -130,9 +130,7 @@ def arguments(folder: Path, **changes: object) -> argparse.Namespace:
 
 
 def test_training_refuses_recordings_of_the_wrong_seeds_before_it_reads_one(folder: Path) -> None:
-    with pytest.raises(
-        BadInput, match=r"seeds 100000 to 199999 are for this, not 7 \(cosim record --seeds\)"
-    ):
+    with pytest.raises(BadInput, match=r"seeds 100000 to 199999 are for this, not 7 \("):
         train_hpn.train(arguments(folder))
     with pytest.raises(BadInput, match="recordings to train"):
         train_hpn.train(arguments(folder, recordings=[]))

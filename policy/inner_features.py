@@ -6,7 +6,6 @@ from collections.abc import Mapping
 
 import numpy as np
 import torch
-from torch.nn import functional
 
 from cosim.raster import rasterize_road
 from cosim.road import RoadMap
@@ -17,8 +16,7 @@ from policy.map_branch import MapBranch
 from policy.predictors import Predictor
 from policy.scene import Scene, join, pictured
 from policy.tensors import Batch, to_batch, to_numpy, unit
-from policy.traffic import TrafficConfig
-from policy.training.moments import foresee, without_history
+from policy.traffic import TrafficConfig, foresee
 from policy.vehicle_inputs import vehicle_inputs
 
 PAINTED = 8  # features shown of each layer: those that differ most
@@ -43,7 +41,7 @@ def painted(
     with torch.inference_mode():
         for name, hpn in hpns.items():
             if hpn.kinematic is not None:
-                known = scene if hpn.kinematic.config.history else without_history(scene)
+                known = scene if hpn.kinematic.config.history else scene.without_history()
                 inputs = vehicle_inputs(known, *foresee(known, predictor, road, TrafficConfig()))
                 features = hpn.kinematic.features(torch.from_numpy(inputs.own), torch.from_numpy(inputs.near))
                 values = to_numpy(features) * inputs.known[:, None]
@@ -57,14 +55,8 @@ def painted(
 
 def _encoded(branch: MapBranch, batch: Batch, b: int) -> list[Floats32]:
     """[k,h,w] of every encoder layer."""
-    z = unit(batch.maps[b : b + 1, -branch.config.seen :]).flatten(1, 2)
-    out = []
-    for convolution, pool in zip(branch.encoder, branch._pools, strict=True):
-        z = functional.relu(convolution(z))
-        out.append(to_numpy(z[0]))
-        if pool != (1, 1):
-            z = functional.max_pool2d(z, pool)
-    return out
+    _, layers = branch.encode(unit(batch.maps[b : b + 1, -branch.config.seen :]).flatten(1, 2))
+    return [to_numpy(layer[0]) for layer in layers]
 
 
 def _on_the_road(

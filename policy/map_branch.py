@@ -91,6 +91,16 @@ class MapBranch(nn.Module):
             nn.init.zeros_(last.weight)
             nn.init.zeros_(last.bias)
 
+    def encode(self, z: torch.Tensor) -> tuple[torch.Tensor, list[torch.Tensor]]:
+        """Frames [B,k*C,H,W] through the encoder: its output, and what every layer gave before pooling."""
+        layers: list[torch.Tensor] = []
+        for convolution, pool in zip(self.encoder, self._pools, strict=True):
+            z = functional.relu_(convolution(z))
+            layers.append(z)
+            if pool != (1, 1):
+                z = functional.max_pool2d(z, pool)
+        return z, layers
+
     def forward(
         self, past: Sequence[torch.Tensor], kinematics: torch.Tensor, rendered: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -106,12 +116,7 @@ class MapBranch(nn.Module):
             raise ValueError("a rendered map is needed exactly when the network corrects one")
         b = kinematics.shape[0]
         z = torch.cat([*past, rendered] if rendered is not None else list(past), 1)
-        skips: list[torch.Tensor] = []
-        for convolution, pool in zip(self.encoder, self._pools, strict=True):
-            z = functional.relu_(convolution(z))
-            skips.append(z)
-            if pool != (1, 1):
-                z = functional.max_pool2d(z, pool)
+        z, skips = self.encode(z)
         moved = self.kinematics_in(kinematics.flatten(1))
         latent = functional.relu(self.to_latent(z.flatten(1) + moved))  # P: elementwise addition
         z = functional.relu(self.from_latent(latent)).reshape(b, *self._core)

@@ -17,8 +17,7 @@ from policy.hpn import HPN
 from policy.predictors import Predictor
 from policy.scene import join
 from policy.tensors import to_batch, to_numpy, unit
-from policy.traffic import TrafficConfig
-from policy.training.moments import foresee, without_history
+from policy.traffic import TrafficConfig, foresee
 
 OCCUPIED = 0.05  # a pixel above this is occupied (definitions.md: IoU)
 HORIZONS = (0.2, 0.4, 1.0, 2.0, 3.0, 4.0)  # s (definitions.md, Time)
@@ -90,7 +89,7 @@ class MapPredictors:
             for name in self.names[1:]:
                 hpn = self._hpns.get(name)
                 history = hpn is None or hpn.kinematic is None or hpn.kinematic.config.history
-                known = scene if history else without_history(scene)
+                known = scene if history else scene.without_history()
                 forecast, traffic = foresee(known, self._predictor, self._road, self._traffic)
                 guess = predict(config, self._observation, self._raster, hpn, known, batch, forecast, traffic)
                 maps[name] = to_numpy(unit(guess.maps))

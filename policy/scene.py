@@ -30,6 +30,12 @@ class Scene(NamedTuple):
         """[B] each AV's place among the vehicles."""
         return np.asarray(self.row[:, 0])
 
+    def without_history(self) -> Scene:
+        """The same as known from the newest frame alone (P, figure 6: without history)."""
+        valid = self.valid.copy()
+        valid[:, :-1] = False
+        return self._replace(valid=valid)
+
 
 def join(histories: Mapping[str, History], share: bool = True) -> Scene:
     """Join the histories of AVs that decide together.

@@ -11,6 +11,7 @@ from cosim.road import LanePath, RoadMap
 from cosim.types import Bools, Floats
 from policy.forecast import KinematicForecast
 from policy.motion import Rollout, fronts, pack, project_many, roll_out
+from policy.predictors.protocol import Predictor
 from policy.scene import Scene
 
 
@@ -36,6 +37,14 @@ class Traffic(NamedTuple):
     stream: tuple[LanePath | None, ...]  # [V] the path each follows (its target lane's, when changing)
     drifting: Bools  # [V] changes lanes now
     known: Bools  # [V] perceived in the newest frame
+
+
+def foresee(
+    scene: Scene, predictor: Predictor, road: RoadMap, config: TrafficConfig
+) -> tuple[KinematicForecast, Traffic]:
+    """What the predictor says of every vehicle, and the same carried along the lanes."""
+    forecast = predictor.predict(scene.state, scene.valid)
+    return forecast, predict_traffic(scene, forecast, road, config, predictor.horizon)
 
 
 def predict_traffic(

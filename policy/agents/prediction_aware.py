@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,6 +30,7 @@ from policy.hpn import HPN
 from policy.predictors import make_predictor
 from policy.safety import prioritize
 from policy.scene import Scene, join
+from policy.seeded import seeded
 from policy.tensors import States, pixels, situation_tensor, svo_tensor, to_batch, to_numpy
 from policy.traffic import Traffic, predict_traffic
 from policy.vfn import VFN, Frames
@@ -57,11 +59,7 @@ class PredictionAware:
         self.config = c = config or compact(name)
         self.observation = c.observation
         self.av_parameters: Mapping[str, str] = {}
-        generator_state = torch.random.get_rng_state()
-        torch.manual_seed(c.init_seed)  # module initialisers know no generator
-        self.vfn = VFN(c.vfn).eval()
-        self.hpn = HPN(c.hpn).eval() if c.predicted_maps and c.chain.source == "hpn" else None
-        torch.random.set_rng_state(generator_state)
+        self.vfn, self.hpn = seeded(partial(_networks, c), c.init_seed)
         parts = {"value network": c.vfn_weights}
         if c.vfn_weights is not None:
             load(c.vfn_weights, {"vfn": self.vfn}, {"vfn": c.vfn})
@@ -195,6 +193,12 @@ class PredictionAware:
             else:
                 refused[name] = action
         return refused
+
+
+def _networks(c: AgentConfig) -> tuple[VFN, HPN | None]:
+    """As they are born."""
+    vfn = VFN(c.vfn).eval()
+    return vfn, HPN(c.hpn).eval() if c.predicted_maps and c.chain.source == "hpn" else None
 
 
 def _label(parts: Mapping[str, Path | None]) -> str:

@@ -11,8 +11,9 @@ import torch
 from torch import nn
 
 from cosim.types import Floats32
+from policy.seeded import seeded
 from policy.training.experience import Advised, Trajectory, states
-from policy.training.networks import adam_tensors, restore_adam, seeded
+from policy.training.networks import adam_tensors, restore_adam
 from policy.vfn import VFN, VfnConfig
 
 

@@ -10,8 +10,9 @@ import torch
 from torch import nn
 from torch.nn import functional
 
+from policy.seeded import seeded
 from policy.training.experience import Advised
-from policy.training.networks import adam_tensors, restore_adam, seeded
+from policy.training.networks import adam_tensors, restore_adam
 from policy.training.replay import Batch
 from policy.vfn import VFN, VfnConfig
 

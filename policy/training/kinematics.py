@@ -19,9 +19,10 @@ from torch import nn
 from cosim.seeding import generator, subseed
 from cosim.types import Bools, Floats32
 from policy.kinematic_branch import KinematicBranch, KinematicConfig, correct, sureness
+from policy.seeded import seeded
 from policy.training.loop import one_cycle
 from policy.training.moments import Moment
-from policy.training.networks import adam_tensors, restore_adam, seeded
+from policy.training.networks import adam_tensors, restore_adam
 
 HALF_LENGTH, HALF_WIDTH = 2.5, 1.0  # m, half a car: an error of that size loses half of the box
 WINDOW = (128.0, 16.0)  # m, what lies outside of both pictures counts for nothing

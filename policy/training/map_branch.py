@@ -11,10 +11,11 @@ from torch import nn
 
 from cosim.seeding import generator, subseed
 from policy.map_branch import MapBranch, MapBranchConfig
+from policy.seeded import seeded
 from policy.tensors import kinematic_tensor, unit
 from policy.training.loop import one_cycle
 from policy.training.moments import MapSample
-from policy.training.networks import adam_tensors, restore_adam, seeded
+from policy.training.networks import adam_tensors, restore_adam
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,10 +10,9 @@ import numpy as np
 
 from cosim.road import RoadMap
 from cosim.types import Bools, Bytes, Floats, Floats32, History, Ints, Snapshot
-from policy.forecast import KinematicForecast
 from policy.predictors import Predictor
-from policy.scene import Scene, join
-from policy.traffic import Traffic, TrafficConfig, predict_traffic
+from policy.scene import join
+from policy.traffic import TrafficConfig, foresee
 from policy.vehicle_inputs import vehicle_inputs
 
 TURN = 2 * np.pi
@@ -46,21 +45,6 @@ class MapSample(NamedTuple):
         return np.frombuffer(zlib.decompress(self.maps), np.uint8).reshape(self.shape)
 
 
-def foresee(
-    scene: Scene, predictor: Predictor, road: RoadMap, config: TrafficConfig
-) -> tuple[KinematicForecast, Traffic]:
-    """The two forecasts that the kinematic branch corrects."""
-    forecast = predictor.predict(scene.state, scene.valid)
-    return forecast, predict_traffic(scene, forecast, road, config, predictor.horizon)
-
-
-def without_history(scene: Scene) -> Scene:
-    """The same scene as known from the newest frame alone (P, figure 6: without history)."""
-    valid = scene.valid.copy()
-    valid[:, :-1] = False
-    return scene._replace(valid=valid)
-
-
 def moment(
     histories: Mapping[str, History],
     future: Sequence[Snapshot],
@@ -72,7 +56,7 @@ def moment(
     """One decision as the kinematic branch learns from it; `future`: the next M frames."""
     scene = join(histories)
     if not history:
-        scene = without_history(scene)
+        scene = scene.without_history()
     inputs = vehicle_inputs(scene, *foresee(scene, predictor, road, config))
     truth = states_of(scene.vehicles, future)  # [V,M,4]
     truth[..., 3] -= TURN * np.round((truth[..., 3] - inputs.lane[..., 3]) / TURN)

@@ -1,23 +1,11 @@
-"""Networks made from a seed, and networks with their optimiser as named tensors: nothing is ever pickled."""
+"""Networks with their optimiser as named tensors: nothing is ever pickled."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import TypeVar
+from collections.abc import Mapping
 
 import torch
 from torch import nn
-
-Network = TypeVar("Network", bound=nn.Module)
-
-
-def seeded(build: Callable[[], Network], seed: int) -> Network:
-    """The module that `build` makes, its weights drawn from `seed`; torch's generator is left as it was."""
-    state = torch.random.get_rng_state()
-    torch.manual_seed(seed)  # module initialisers know no generator
-    network = build()
-    torch.random.set_rng_state(state)
-    return network
 
 
 def adam_tensors(

@@ -18,7 +18,7 @@ from policy.gaussian_process import GaussianProcessBank, Operators
 from policy.kernel_prior import PriorNetwork, describe
 from policy.predictors.gp import GaussianProcessDirect, GaussianProcessIndirect
 from policy.predictors.learned import KinematicNet, NetConfig, features, integrate
-from policy.training.networks import seeded
+from policy.seeded import seeded
 
 COVERED = 0.9  # what an interval shall cover
 NORMAL = 1.645  # half its width in standard deviations, if errors were normal

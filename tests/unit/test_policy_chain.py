@@ -18,8 +18,7 @@ from policy.map_branch import MapBranchConfig
 from policy.predictors import make_predictor
 from policy.scene import Scene, join
 from policy.tensors import to_batch, unit
-from policy.traffic import Traffic, TrafficConfig
-from policy.training.moments import foresee, without_history
+from policy.traffic import Traffic, TrafficConfig, foresee
 from policy.vehicle_inputs import vehicle_inputs
 
 ROAD = straight_road(3)
@@ -195,7 +194,7 @@ def test_the_kinematic_branch_sees_a_scene_from_each_vehicle_and_nothing_of_the_
     np.testing.assert_allclose(
         vehicle_inputs(elsewhere, *forecasts(elsewhere)).own[at], inputs.own[at], atol=1e-4
     )
-    blind = vehicle_inputs(without_history(scene), *forecasts(without_history(scene)))
+    blind = vehicle_inputs(scene.without_history(), *forecasts(scene.without_history()))
     past = slice(11, 47)
     assert (blind.own[:, past] == 0.0).all(), "without history nothing of the past is left"
     assert (inputs.own[:, past] != 0.0).any()

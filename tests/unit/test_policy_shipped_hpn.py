@@ -21,9 +21,8 @@ from policy.map_error import MapPredictors
 from policy.predictors import make_predictor
 from policy.scene import Scene, join
 from policy.tensors import to_batch
-from policy.traffic import TrafficConfig
+from policy.traffic import TrafficConfig, foresee
 from policy.training import hpn as trained
-from policy.training.moments import foresee, without_history
 
 ROAD = straight_road(3)
 EGO = Car("ego", 300.0, 1, 20.0, is_av=True)
@@ -40,7 +39,7 @@ def ahead(cars: list[Car], road: RoadMap = ROAD, name: str = "hpn") -> tuple[Sce
     """The whole horizon, frame by frame, as the HPN called `name` sees it."""
     scene = join(histories(road, cars))
     if name == "hpn-no-history":
-        scene = without_history(scene)
+        scene = scene.without_history()
     forecast = foresee(scene, make_predictor("gp-indirect", 20, 0.2), road, TrafficConfig())
     batch = to_batch(scene.histories)
     with torch.inference_mode():

@@ -22,9 +22,10 @@ import numpy.typing as npt
 from scipy.optimize import Bounds, differential_evolution
 
 from benchmarks.lane_changes import CLASSES, Traffic, build_highway, measure
+from cosim.behaviors import LC2013, MIXED, MOBIL, Behaviors, load_behaviors
 from cosim.evaluation.statistics import median_of_blocks, quantile, rate, share
 from cosim.seeding import FIRST_TEST_SEED, TUNING_SEEDS
-from cosim.simulation.drivers import BEHAVIORS_FILE, LC2013, MIXED, MOBIL, Behaviors, load_behaviors
+from sumo_scenarios import BEHAVIORS
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results" / "behaviors.md"
 
@@ -124,7 +125,7 @@ def calibrate(
         )
         best = decode(result.x)
         found = evaluate(name, LC2013, best)
-        write_attributes(BEHAVIORS_FILE, name, best)
+        write_attributes(BEHAVIORS, name, best)
         print(f"{name}: {best}, loss {result.fun:.3f} (start {objective(x0):.3f}), b_safe {b_safe:g}")
         for key, value in found.items():
             print(f"    {key:14s} LC2013 {value:8.3f}   MOBIL {wanted[key]:8.3f}")

@@ -15,11 +15,12 @@ from pathlib import Path
 
 import libsumo
 
-from cosim.simulation.drivers import BEHAVIORS_FILE, Behaviors, DriverClass, Drivers
+import sumo_scenarios
+from cosim.behaviors import Behaviors, DriverClass, IdmParameters
+from cosim.simulation.drivers import Drivers
 from cosim.simulation.mobil import (
     LEFT,
     RIGHT,
-    IdmParameters,
     accelerations,
     changing,
     incentive,
@@ -108,7 +109,7 @@ def measure(
     flow = _flow(folder, inserted_as, WARM_UP + duration)
     options = "--step-length 0.1 --lanechange.duration 2 --no-step-log --no-warnings --time-to-teleport -1 "
     options += "--collision.action warn --collision.mingap-factor 0 --max-depart-delay 10"
-    net, types = str(folder / "net.xml"), str(BEHAVIORS_FILE.parent / "types.add.xml")
+    net, types = str(folder / "net.xml"), str(sumo_scenarios.TYPES)
     libsumo.start(["sumo", "-n", net, "-r", str(flow), "-a", types, *options.split(), "--seed", str(seed)])
     try:
         return _drive(Drivers(behavior, model, seed, behaviors), duration)

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import sumo_scenarios
 from cosim import sumocfg, yaml_input
+from cosim.behaviors import AS_IS, DRIVER_MODELS, LC2013, MIXED, load_behaviors
 from cosim.errors import BadInput, hint, one_of
 from cosim.types import Preset, Timing
 from cosim.xml_input import is_there, regular_file
 
-BEHAVIORS = ("conservative", "moderate", "aggressive", "mixed", "as-is")
-DRIVER_MODELS = ("lc2013", "mobil")
+BEHAVIORS = load_behaviors().names
 FOREIGN_DURATION = 60.0  # s, for a .sumocfg that names no end
 MISSIONS = ("merge", "exit", "roundabout", "intersection", "none", "auto")
 
@@ -72,8 +72,8 @@ class Scenario:
     zones: tuple[Zone, ...] = ()
     fleet: Fleet = Fleet()
     demand_name: str = "as-is"
-    behavior: str = "as-is"
-    driver_model: str = "lc2013"
+    behavior: str = AS_IS
+    driver_model: str = LC2013
     demands: Mapping[str, Path] | None = None  # name -> file, of a built-in world
     title: str = ""
     definition: Path | None = None  # the scenario.yaml of a built-in world
@@ -87,7 +87,7 @@ class Scenario:
     def files(self) -> tuple[Path, ...]:
         """Every file that has a say in the traffic, ours included."""
         ours = [sumo_scenarios.TYPES] if self.definition is None else [self.definition]
-        if self.behavior != "as-is":
+        if self.behavior != AS_IS:
             ours.append(sumo_scenarios.BEHAVIORS)
         return (self.config, self.net, *self.demand, *self.additional, *ours)
 
@@ -97,7 +97,7 @@ def load(
     *,
     demand: Sequence[str] = (),
     behavior: str | None = None,
-    driver_model: str = "lc2013",
+    driver_model: str = LC2013,
     preset: str | None = None,
     fleet: Fleet | None = None,
     duration: float | None = None,
@@ -253,8 +253,8 @@ def _with_sumo_options(scenario: Scenario, chosen: Mapping[str, str]) -> Scenari
 def _default_behavior(scenario: Scenario) -> str:
     """definitions.md: a user's file drives as it is; ours `mixed`, and `contested` with moderate HVs."""
     if scenario.demands is None or any(path not in scenario.demands.values() for path in scenario.demand):
-        return "as-is"
-    return "moderate" if scenario.demand_name == "contested" else "mixed"
+        return AS_IS
+    return "moderate" if scenario.demand_name == "contested" else MIXED
 
 
 def _timing(section: yaml_input.Section, file: Path) -> Timing:

@@ -75,6 +75,20 @@ class Section:
             raise self._wrong(name, value, f"must be {bound}")
         return float(value)
 
+    def needed(self, name: str, *, low: float = -math.inf, above: bool = False) -> float:
+        """`number`, which must be there."""
+        value = self.number(name, low=low, above=above)
+        if value is None:
+            raise BadInput("missing", file=self._file, field=self._name(name))
+        return value
+
+    def keys(self, name: str) -> tuple[str, ...]:
+        """The names in the mapping below `name`, of which there must be one."""
+        value = self._values.get(name)
+        if not isinstance(value, dict) or not value:
+            raise self._wrong(name, value, "a mapping is needed")
+        return tuple(map(str, value))
+
     def names(self, name: str) -> tuple[str, ...]:
         """A list of strings; one string stands for a list of one."""
         value = self._values.get(name, ())

@@ -13,8 +13,9 @@ from typing import Any
 
 import sumo_scenarios
 from cosim import policy_name, yaml_input
+from cosim.behaviors import DRIVER_MODELS
 from cosim.errors import BadInput, hint, one_of
-from cosim.scenario import BEHAVIORS, DRIVER_MODELS
+from cosim.scenario import BEHAVIORS
 from cosim.seeding import FIRST_TEST_SEED
 from cosim.types import Preset
 from cosim.xml_input import is_there

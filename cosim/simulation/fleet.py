@@ -7,10 +7,11 @@ from collections.abc import Mapping
 
 import libsumo
 
+from cosim.behaviors import AS_IS
 from cosim.scenario import Scenario
 from cosim.seeding import uniform
 from cosim.simulation.convert import Body
-from cosim.simulation.drivers import Drivers
+from cosim.simulation.drivers import IDM_TYPE, Drivers
 from cosim.types import Kind
 
 # definitions.md, Vehicles: what an AV drives with while nobody commands it (egoistic IDM).
@@ -20,7 +21,6 @@ AV_LANE_CHANGE = {
     "laneChangeModel.lcCooperativeSpeed": "0",
     "laneChangeModel.lcKeepRight": "0",
 }
-IDM_TYPE = "cosim.idm"  # from sumo_scenarios/types.add.xml: IDM + LC2013, for vehicles of a user's file
 
 
 class Fleet:
@@ -33,7 +33,7 @@ class Fleet:
         self._drivers = drivers
         self._av_parameters = av_parameters
         self._foreign = not scenario.built_in
-        self._rewrite_humans = scenario.behavior != "as-is"
+        self._rewrite_humans = scenario.behavior != AS_IS
 
     def welcome(self, vehicle: str, seed: int) -> Body:
         """A vehicle departed: give it its driver, say what it is."""

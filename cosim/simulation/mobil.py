@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import libsumo
+
+from cosim.behaviors import IdmParameters, MobilParameters
 
 FAR = 1.0e6  # m: the gap to nobody
 TOUCHING = 0.01  # m: smaller gaps (also overlaps) brake as hard as this one
@@ -30,25 +31,6 @@ LOOK_AHEAD = 300.0  # m beyond the end of the lane; on the lane itself SUMO look
 # there and back, as LC2013's own look-ahead of 10 s each way.
 RETURN_TIME = 20.0  # s
 CONFLICT_RANGE = 60.0  # m: two requests of one step into one lane this close: the first one goes
-
-
-@dataclass(frozen=True, slots=True)
-class IdmParameters:
-    """Longitudinal half of Table II."""
-
-    time_headway: float  # s, T
-    minimum_gap: float  # m, d0, bumper to bumper
-    max_acceleration: float  # m/s2, a_max
-    comfortable_deceleration: float  # m/s2, a_des
-
-
-@dataclass(frozen=True, slots=True)
-class MobilParameters:
-    """Lateral half of Table II."""
-
-    politeness: float  # p
-    threshold: float  # m/s2, a_th
-    safe_deceleration: float  # m/s2, b_safe
 
 
 class Car(NamedTuple):

@@ -11,13 +11,15 @@ import libsumo
 import pytest
 import sumo
 
+import sumo_scenarios
+from cosim.behaviors import load_behaviors
 from cosim.errors import BadInput
-from cosim.simulation.drivers import BEHAVIORS_FILE, IDM_TYPE, Drivers, load_behaviors
+from cosim.simulation.drivers import IDM_TYPE, Drivers
 from cosim.simulation.mobil import STRATEGIC_ONLY, idm_acceleration
 
 CLASSES = ("aggressive", "moderate", "conservative")
 TEST_SEED = 200_000
-BASE_TYPE_FILE = BEHAVIORS_FILE.parent / "types.add.xml"
+BASE_TYPE_FILE = sumo_scenarios.TYPES
 
 
 @pytest.fixture(scope="module")

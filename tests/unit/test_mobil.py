@@ -4,14 +4,12 @@ import math
 
 import pytest
 
+from cosim.behaviors import IdmParameters, MobilParameters, load_behaviors
 from cosim.errors import BadInput
-from cosim.simulation.drivers import BEHAVIORS_FILE, load_behaviors
 from cosim.simulation.mobil import (
     FAR,
     Beside,
     Car,
-    IdmParameters,
-    MobilParameters,
     Situation,
     accelerations,
     best_incentive,
@@ -20,6 +18,7 @@ from cosim.simulation.mobil import (
     is_safe,
     worth,
 )
+from sumo_scenarios import BEHAVIORS
 
 MODERATE_IDM = IdmParameters(1.0, 2.0, 3.0, 7.0)
 MODERATE = MobilParameters(0.3, 0.1, 6.0)
@@ -189,7 +188,7 @@ def test_the_desired_speed_follows_its_distribution_and_its_bounds() -> None:
     ],
 )
 def test_a_wrong_behaviors_file_is_refused_by_file_field_and_value(tmp_path, old, new, field, value) -> None:
-    text = BEHAVIORS_FILE.read_text(encoding="utf-8")
+    text = BEHAVIORS.read_text(encoding="utf-8")
     assert old in text
     file = tmp_path / "mine.yaml"
     file.write_text(text.replace(old, new, 1), encoding="utf-8")

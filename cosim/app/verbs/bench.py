@@ -6,6 +6,7 @@ import argparse
 
 from cosim.app.verbs import arguments
 from cosim.app.verbs.record import seeds
+from cosim.behaviors import AS_IS
 from cosim.scenario import BEHAVIORS
 
 DEMANDS = ("dense", "contested")
@@ -55,7 +56,7 @@ def work(args: argparse.Namespace) -> int:
         wanted = cases(
             args.scenario or sumo_scenarios.names(),
             args.demand or DEMANDS,
-            args.behavior or [b for b in BEHAVIORS if b != "as-is"],
+            args.behavior or [b for b in BEHAVIORS if b != AS_IS],
             args.policy or POLICIES,
             args.seeds,
         )

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 
 from cosim.app.verbs import arguments
-from cosim.scenario import BEHAVIORS, DRIVER_MODELS
+from cosim.behaviors import DRIVER_MODELS
+from cosim.scenario import BEHAVIORS
 from cosim.types import Preset
 
 

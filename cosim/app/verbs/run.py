@@ -11,10 +11,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from cosim.app.verbs import arguments
+from cosim.behaviors import DRIVER_MODELS
 from cosim.errors import BadInput
 from cosim.evaluation.case import Case
 from cosim.policy_name import label, read
-from cosim.scenario import BEHAVIORS, DRIVER_MODELS
+from cosim.scenario import BEHAVIORS
 from cosim.seeding import FIRST_TEST_SEED
 from cosim.types import Preset
 from cosim.xml_input import is_there

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from cosim.behaviors import AS_IS
 from cosim.road import RoadMap
 from cosim.types import (
     Collision,
@@ -31,7 +32,6 @@ from cosim.types import (
 )
 
 MOST = 400_000  # vehicle frames kept: about 2 MB of page; beyond, every second frame is given up
-AS_IS = "as-is"
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from cosim.evaluation.run_folder import Run
 from cosim.evaluation.statistics import NA, Figure
 from cosim.evaluation.summary import mean_document, not_comparable, rate_document
 from cosim.evaluation.tasks import OK
+from cosim.files import whole
 
 HEADS = {
     "collision_rate": "C%",
@@ -192,9 +193,8 @@ def picture(
 def write_page(path: Path, lines: Sequence[str]) -> None:
     """The Markdown page, whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_suffix(".part")
-    draft.write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
-    draft.replace(path)
+    with whole(path) as draft:
+        draft.write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
 
 
 def _difference(found: PairedFigure | None) -> str:

@@ -19,6 +19,7 @@ from safetensors.torch import save_file
 from torch import nn
 
 from cosim.errors import BadInput, WeightsMismatch
+from cosim.files import whole
 
 FORMAT = "cosim-weights-1"
 SHIPPED = Path(__file__).parent / "weights"
@@ -40,19 +41,17 @@ def save(
         for name, network in networks.items()
         for key, value in network.state_dict().items()
     }
-    draft = path.with_suffix(".part")
-    save_file(tensors, draft, metadata={"format": FORMAT})
+    with whole(path) as draft:
+        save_file(tensors, draft, metadata={"format": FORMAT})
     card = {
         "format": FORMAT,
-        "sha256": sha256(draft),
+        "sha256": sha256(path),
         "configs": {name: asdict(c) if is_dataclass(c) else c for name, c in configs.items()},  # type: ignore[arg-type]
         "measured": dict(measured or {}),
         "data": dict(data or {}),
     }
-    draft.replace(path)
-    text = path.with_suffix(".json.part")
-    text.write_text(json.dumps(card, indent=2, sort_keys=True) + "\n")
-    text.replace(path.with_suffix(".json"))
+    with whole(path.with_suffix(".json")) as draft:
+        draft.write_text(json.dumps(card, indent=2, sort_keys=True) + "\n")
 
 
 def read_card(path: Path) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from cosim.evaluation.export import arrow
 from cosim.evaluation.figures import Row
 from cosim.evaluation.run_folder import Run, read
 from cosim.evaluation.store import Store
+from cosim.files import whole
 
 FOLDER = Path("docs/results/episodes")
 ROWS, MANIFEST = "episodes.parquet", "manifest.json"
@@ -78,11 +79,9 @@ def write(rows: Sequence[Row], manifest: Mapping[str, Any], folder: Path) -> Non
     folder.mkdir(parents=True, exist_ok=True)
     place = {name: k for k, name in enumerate(manifest["cells"])}
     table = arrow([plain(row) for row in sorted(rows, key=lambda r: (place[r["cell"]], r["seed"]))])
-    drafts = {name: folder / f".{name}.part" for name in (ROWS, MANIFEST)}
-    pyarrow.parquet.write_table(table, drafts[ROWS], compression="zstd", compression_level=LEVEL)
-    drafts[MANIFEST].write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
-    for name, draft in drafts.items():
-        draft.replace(folder / name)
+    with whole(folder / ROWS) as rows_draft, whole(folder / MANIFEST) as draft:
+        pyarrow.parquet.write_table(table, rows_draft, compression="zstd", compression_level=LEVEL)
+        draft.write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
 
 
 def plain(row: Row) -> dict[str, Any]:

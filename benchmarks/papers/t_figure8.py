@@ -45,6 +45,7 @@ from cosim.evaluation.engines import LocalEngine
 from cosim.evaluation.folder import RunFolder
 from cosim.evaluation.statistics import share
 from cosim.evaluation.tasks import OK, Task
+from cosim.files import whole
 
 FOLDER = "guide"  # in settings.runs
 AGENTS = ("vfn-p", "altruist-rule")  # the learned altruist, and what a scripted one does
@@ -173,9 +174,8 @@ def _drive(todo: Sequence[Task], folder: Path, engine: LocalEngine, hashes: Mapp
                 if outcome.value["trace_hash"] != hashes[outcome.key]:
                     raise CosimError(f"{outcome.key}: watched, it is not the episode that was driven before")
                 pictures = [base64.b64encode(png).decode() for png in outcome.value["pictures"]]
-                draft = folder / f".{outcome.key}.part"
-                draft.write_text(json.dumps({**outcome.value, "pictures": pictures}))
-                draft.replace(folder / f"{outcome.key}.json")
+                with whole(folder / f"{outcome.key}.json") as draft:
+                    draft.write_text(json.dumps({**outcome.value, "pictures": pictures}))
     finally:
         progress.done()
 

@@ -16,6 +16,7 @@ from cosim.app.progress import Progress
 from cosim.errors import BadInput
 from cosim.evaluation import statistics
 from cosim.evaluation.prediction import LEVEL, Predicted, Scores
+from cosim.files import whole
 from cosim.recording import Folder, Recording, Windows, read, windows
 from cosim.road import RoadMap
 from cosim.types import Floats
@@ -166,13 +167,11 @@ def paired(scores: Scores) -> dict[str, Any]:
 
 def write_csv(file: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """Rows with a header; the file appears whole. NA is an empty field."""
-    draft = file.with_name(f".{file.name}.part")
-    with draft.open("w", newline="") as stream:
+    with whole(file) as draft, draft.open("w", newline="") as stream:
         writer = csv.DictWriter(stream, list(rows[0]))
         writer.writeheader()
         for row in rows:
             writer.writerow({k: _plain(v) for k, v in row.items()})
-    draft.replace(file)
 
 
 def markdown(

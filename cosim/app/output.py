@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from cosim.errors import BadInput
+from cosim.files import whole
 from cosim.types import EpisodeResult, Metric
 
 HEADLINE = (
@@ -90,17 +91,16 @@ def prepare_folder(path: str) -> Path:
 
 def write_folder(folder: Path, result: EpisodeResult) -> None:
     """`result.json`, `manifest.json` and `metrics.txt`; each appears whole or not at all."""
-    whole = document(result)
+    everything = document(result)
     texts = {
-        "manifest.json": json.dumps(whole["manifest"], indent=2),
+        "manifest.json": json.dumps(everything["manifest"], indent=2),
         "metrics.txt": table(result),
-        "result.json": json.dumps(whole, indent=2),
+        "result.json": json.dumps(everything, indent=2),
     }
     try:
         for name, text in texts.items():
-            draft = folder / f".{name}.part"
-            draft.write_text(text + "\n")
-            draft.replace(folder / name)
+            with whole(folder / name) as draft:
+                draft.write_text(text + "\n")
     except OSError as error:
         raise BadInput(f"cannot write: {error.strerror}", file=folder, field="--out") from None
 

@@ -19,6 +19,7 @@ from cosim.evaluation import run_folder
 from cosim.evaluation.case import Case
 from cosim.evaluation.replay.recorder import Recording
 from cosim.evaluation.tasks import OK
+from cosim.files import whole
 from cosim.manifest import POLICY_FILES, manifest, named
 from cosim.policy_name import label, read
 from cosim.scenario import Scenario
@@ -256,16 +257,13 @@ def _json(path: Path) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def _writing(path: Path) -> Iterator[Path]:
-    """A draft beside `path` that takes its place when the block ends well."""
-    draft = path.with_name(f".{path.name}.part")
+    """`whole`, in a folder that is made where it is not there. Raises BadInput when it cannot be written."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        yield draft
-        draft.replace(path)
+        with whole(path) as draft:
+            yield draft
     except OSError as error:
         raise BadInput(f"cannot write: {error.strerror or error}", file=path) from None
-    finally:
-        draft.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager

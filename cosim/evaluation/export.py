@@ -13,6 +13,7 @@ import pyarrow.parquet
 
 from cosim.errors import CosimError
 from cosim.evaluation.records import columns
+from cosim.files import whole
 
 Row = Mapping[str, Any]
 
@@ -34,9 +35,8 @@ def export(
     }
     try:
         for name, write in writers.items():
-            draft = folder / f".{name}.part"
-            write(draft)
-            draft.replace(folder / name)
+            with whole(folder / name) as draft:
+                write(draft)
     except OSError as error:
         raise CosimError(f"{folder}: cannot write: {error.strerror or error}") from None
 

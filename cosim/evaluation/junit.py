@@ -9,6 +9,7 @@ from junitparser import Error, Failure, JUnitXml, Skipped, TestCase, TestSuite
 
 from cosim.evaluation.compare import FAILED, SKIPPED, Check, Comparison
 from cosim.evaluation.pairing import Group
+from cosim.files import whole
 
 _NOT_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
@@ -24,12 +25,11 @@ def write(comparison: Comparison, path: Path) -> None:
     for compared in comparison.groups:
         if compared.group.failed or compared.group.refused:
             suite.add_testcase(_broken(compared.group))
-    whole = JUnitXml("cosim compare")
-    whole.add_testsuite(suite)
-    whole.update_statistics()  # type: ignore[no-untyped-call]
-    draft = path.with_name(f".{path.name}.part")
-    whole.write(str(draft), pretty=True)
-    draft.replace(path)
+    suites = JUnitXml("cosim compare")
+    suites.add_testsuite(suite)
+    suites.update_statistics()  # type: ignore[no-untyped-call]
+    with whole(path) as draft:
+        suites.write(str(draft), pretty=True)
 
 
 def _case(check: Check) -> TestCase:

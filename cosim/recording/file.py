@@ -15,6 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from cosim.errors import BadInput
+from cosim.files import whole
 from cosim.recording.tape import Knowledge, Tape
 from cosim.types import Collision, Events, Snapshot
 
@@ -112,11 +113,11 @@ def write(path: Path, tape: Tape, case: Mapping[str, Any]) -> None:
         columns["lane_changing"].append(np.array([0 if a is None else a.lane_changing for a in knowledge]))
         for name in (*WHOLE, *REAL):
             columns[name].append(getattr(s, name))
-    whole = {name: np.concatenate(parts) for name, parts in columns.items()}
-    order = np.lexsort((whole["frame"], whole["vehicle"]))  # a vehicle's frames together compress best
+    joined = {name: np.concatenate(parts) for name, parts in columns.items()}
+    order = np.lexsort((joined["frame"], joined["vehicle"]))  # a vehicle's frames together compress best
     arrays = []
     for field in SCHEMA:
-        values = whole[field.name][order]
+        values = joined[field.name][order]
         hidden = None
         if field.name == "route":
             hidden = values < 0
@@ -134,16 +135,15 @@ def write(path: Path, tape: Tape, case: Mapping[str, Any]) -> None:
         "events": events,
     }
     table = pa.Table.from_arrays(arrays, schema=SCHEMA.with_metadata({"cosim": json.dumps(about)}))
-    draft = path.with_name(f".{path.name}.part")
     try:
-        pq.write_table(
-            table,
-            draft,
-            compression="zstd",
-            use_dictionary=[n for n in SCHEMA.names if n not in REAL],
-            use_byte_stream_split=list(REAL),
-        )
-        draft.replace(path)
+        with whole(path) as draft:
+            pq.write_table(
+                table,
+                draft,
+                compression="zstd",
+                use_dictionary=[n for n in SCHEMA.names if n not in REAL],
+                use_byte_stream_split=list(REAL),
+            )
     except OSError as error:
         raise BadInput(f"cannot write: {error.strerror}", file=path) from None
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from cosim.errors import BadInput
+from cosim.files import whole
 from cosim.recording import roads
 from cosim.recording.file import FORMAT, Recording, read
 from cosim.road import RoadMap
@@ -94,9 +94,8 @@ class Folder:
 
 
 def _write_whole(file: Path, text: str) -> None:
-    draft = file.with_name(f".{file.name}.{os.getpid()}.part")  # two workers may store the same road
     try:
-        draft.write_text(text)
-        draft.replace(file)
+        with whole(file, contended=True) as draft:  # two workers may store the same road
+            draft.write_text(text)
     except OSError as error:
         raise BadInput(f"cannot write: {error.strerror}", file=file) from None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zipfile
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -11,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from cosim.files import whole
 from cosim.types import Bools, Bytes, Floats32
 from policy.tensors import States
 
@@ -114,14 +116,12 @@ def save(path: Path, trajectories: list[Trajectory]) -> None:
     for k, trajectory in enumerate(trajectories):
         for name, value in vars(trajectory).items():
             arrays[f"{k}.{name}"] = np.asarray(value)
-    draft = path.with_suffix(".part")
-    with zipfile.ZipFile(
-        draft, "w", zipfile.ZIP_DEFLATED, compresslevel=1
-    ) as file:  # mostly zeros: 1 will do
+    # mostly zeros: level 1 will do
+    deflated = partial(zipfile.ZipFile, compression=zipfile.ZIP_DEFLATED, compresslevel=1)
+    with whole(path) as draft, deflated(draft, "w") as file:
         for name, value in arrays.items():
             with file.open(f"{name}.npy", "w", force_zip64=True) as part:
                 np.lib.format.write_array(part, np.asarray(value), allow_pickle=False)
-    draft.replace(path)
 
 
 def load(path: Path) -> list[Trajectory]:

@@ -22,6 +22,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from cosim.errors import BadInput
+from cosim.files import whole
 from policy.training.log import tensorboard
 
 Progress = Callable[[float, float], None]  # updates so far, of updates in all
@@ -128,18 +129,15 @@ def one_cycle(number: int, updates: int, rate: float) -> float:
 def write_log(path: Path, log: Sequence[Line]) -> None:
     """The log as CSV: a column per loss, empty where it was not taken."""
     names = list(dict.fromkeys(name for line in log for name in line))
-    draft = path.with_suffix(".part")
-    with draft.open("w", newline="") as file:
+    with whole(path) as draft, draft.open("w", newline="") as file:
         rows = csv.DictWriter(file, names, restval="")
         rows.writeheader()
         rows.writerows({k: f"{v:.6g}" for k, v in line.items()} for line in log)
-    draft.replace(path)
 
 
 def _write(path: Path, about: Mapping[str, Any], tensors: dict[str, torch.Tensor]) -> None:
-    draft = path.with_suffix(".part")
-    save_file(tensors, draft, metadata={"about": json.dumps(about)})
-    draft.replace(path)
+    with whole(path) as draft:
+        save_file(tensors, draft, metadata={"about": json.dumps(about)})
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:

@@ -21,6 +21,7 @@ import numpy as np
 from safetensors.torch import load_file, save_file
 
 from cosim.errors import BadInput
+from cosim.files import whole
 from cosim.seeding import TUNING_SEEDS
 from policy import checkpoint
 from policy.training import curriculum, experience
@@ -167,11 +168,10 @@ class Trainer:
             "config": json.loads(json.dumps(asdict(self.config))),
         }
         name = f"state-{self.iteration:06d}.safetensors"
-        draft = self.folder / ".state.part"
-        save_file(self.school.learner.tensors(), draft)
-        draft.replace(self.folder / name)
-        draft.write_text(json.dumps({**state, "tensors": name}, indent=1))
-        draft.replace(self.folder / "state.json")
+        with whole(self.folder / name) as draft:
+            save_file(self.school.learner.tensors(), draft)
+        with whole(self.folder / "state.json") as draft:
+            draft.write_text(json.dumps({**state, "tensors": name}, indent=1))
         self._weights(self.iteration)
         self._sweep(name)
 

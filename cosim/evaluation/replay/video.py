@@ -6,9 +6,8 @@ camera of its own, at equal times since they began.
 
 from __future__ import annotations
 
-import contextlib
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import av
@@ -17,6 +16,7 @@ from PIL import Image, ImageDraw
 
 from cosim.evaluation.replay.recorder import Choice, Recording
 from cosim.evaluation.replay.strip import AV, BAD, TEXT, WARN, Colour, Pose, Strip, colour_of, font, poses_at
+from cosim.files import whole
 from cosim.types import Kind, MetaAction
 
 WIDTH, HEIGHT = 1280, 400  # pixels
@@ -50,7 +50,7 @@ def film(
     reel = _Reel(recordings, follow, picture_at)
     count = max(round(reel.seconds * RATE) + 1, 1)
     fast = {"movflags": "faststart"}
-    with _whole(path) as draft, av.open(str(draft), "w", format="mp4", options=fast) as container:
+    with whole(path) as draft, av.open(str(draft), "w", format="mp4", options=fast) as container:
         stream = container.add_stream("libx264", rate=RATE)
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT * len(recordings), "yuv420p"
         stream.options = {"crf": "23", "preset": "veryfast"}
@@ -85,19 +85,8 @@ def animation(
             progress(k + 1, count)
     first, *rest = pictures
     times = round(1000 * SHOWN)  # ms
-    with _whole(path) as draft:
+    with whole(path) as draft:
         first.save(draft, "GIF", save_all=True, append_images=rest, duration=times, loop=0)
-
-
-@contextlib.contextmanager
-def _whole(path: Path) -> Iterator[Path]:
-    """A draft beside `path` that takes its place when the block ends well."""
-    draft = path.with_name(f".{path.name}.part")
-    try:
-        yield draft
-        draft.replace(path)
-    finally:
-        draft.unlink(missing_ok=True)
 
 
 class _Reel:

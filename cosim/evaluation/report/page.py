@@ -20,6 +20,7 @@ from cosim.evaluation.report.worst import last_line, worst
 from cosim.evaluation.run_folder import Run
 from cosim.evaluation.summary import not_comparable, reasons, status_counts
 from cosim.evaluation.tasks import OK
+from cosim.files import whole
 
 FILE = "report.html"
 PLOTTED = 12  # blocks that get plots: a page of more cannot be read, and each takes a second to draw
@@ -55,10 +56,9 @@ def write(run: Run, path: Path | None = None, shown: str | None = None) -> Path:
     """
     path = run.path / FILE if path is None else path
     text = html(run, shown)
-    draft = path.with_name(f".{path.name}.part")
     try:
-        draft.write_text(text, encoding="utf-8")
-        draft.replace(path)
+        with whole(path) as draft:
+            draft.write_text(text, encoding="utf-8")
     except OSError as error:
         raise BadInput(f"cannot write the report: {error.strerror}", value=str(path)) from None
     return path

@@ -1,22 +1,25 @@
 """Draws VelocityMaps: rotated vehicle boxes and the road surface, in any ego frame (numba kernels).
 
 Rows run across the road (row 0 furthest to the left), columns along it (column 0 furthest behind);
-the ego's centre lies in the middle, looking towards rising columns. Pixel of a vehicle (definitions.md):
-0.1 + 0.9 clip((dv + 30) / 60, 0, 1), dv in m/s relative to the ego, stored as uint8 (255 = 1).
+the ego's centre lies in the middle, looking towards rising columns. Pixels are stored as uint8 (255 = 1).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from cosim.compiled import compiled, compiled_fast
 from cosim.road import RoadMap
-from cosim.types import Bools, Bytes, Floats, ObservationConfig
+from cosim.types import Bools, Bytes, Floats, Kind, ObservationConfig, Snapshot
 
 CHANNELS = ("av", "hv", "road", "mission", "ego")
+# A vehicle's pixel, of 1: FLOOR + SPAN clip((dv + SPEED) / (2 SPEED), 0, 1), dv in m/s relative to the ego.
+PIXEL_FLOOR, PIXEL_SPAN, PIXEL_SPEED = 0.1, 0.9, 30.0
 ROAD_SURFACE = 128  # a lane's surface
 ROAD_LINE = 255  # within LINE_WIDTH of a lane's edge, so that lanes can be told apart
 LINE_WIDTH = 0.5  # m
@@ -48,6 +51,7 @@ def rasterize_road(road: RoadMap) -> RoadRaster:
     return RoadRaster(cells, float(low[0]), float(low[1]), cell)
 
 
+@lru_cache
 def channel_indices(config: ObservationConfig) -> npt.NDArray[np.int64]:
     """[5] index of each of CHANNELS in the config's channels, -1 where it has none.
 
@@ -57,6 +61,37 @@ def channel_indices(config: ObservationConfig) -> npt.NDArray[np.int64]:
     if found[4] < 0:
         found[4] = found[3]
     return np.array(found, np.int64)
+
+
+def draw_snapshot(
+    out: Bytes,
+    slots: npt.NDArray[np.int64],
+    snapshot: Snapshot,
+    ego: npt.NDArray[np.int64],
+    seen: Bools,
+    raster: RoadRaster,
+    config: ObservationConfig,
+) -> None:
+    """The frame of every ego (rows `ego` [B] of the snapshot) into `out` [S,C,H,W] at `slots` [B].
+
+    `seen` [B,n]: who is perceived by whom; the ego itself is always drawn.
+    """
+    s = snapshot
+    vehicles = s.x, s.y, s.heading, s.speed, s.length, s.width, s.kind == int(Kind.AV), s.mission
+    draw_scene(out, slots, ego, *vehicles, seen, *_view(raster, config))
+
+
+def draw_kinematics(
+    out: Bytes, rows: Floats, valid: Bools, pose: Floats, raster: RoadRaster, config: ObservationConfig
+) -> None:
+    """A frame per batch entry into `out` [B,C,H,W]: rows [B,R,8], valid [B,R], pose [B,3] as `draw_rows` has
+    them."""
+    draw_rows(out, rows, valid, pose, *_view(raster, config))
+
+
+def _view(r: RoadRaster, c: ObservationConfig) -> tuple[Any, ...]:
+    """What both kernels are told of the picture and the road, in their order."""
+    return channel_indices(c), c.metres_across, c.metres_along, r.cells, r.x, r.y, r.cell
 
 
 @compiled_fast
@@ -190,9 +225,9 @@ def _draw_vehicle(
     # nan and far away fail these comparisons and draw nothing
     if not (abs(ahead) - reach_x < 0.5 * columns * along and abs(left) - reach_y < 0.5 * height * across):
         return
-    level = (dv + 30.0) / 60.0
+    level = (dv + PIXEL_SPEED) / (2.0 * PIXEL_SPEED)
     level = min(max(level, 0.0), 1.0)
-    value = np.uint8(255.0 * (0.1 + 0.9 * level) + 0.5)
+    value = np.uint8(255.0 * (PIXEL_FLOOR + PIXEL_SPAN * level) + 0.5)
     first = channels[4] if is_ego else (channels[0] if is_av else channels[1])
     second = channels[3] if mission and not is_ego else -1
     u0 = max(int(np.floor((ahead - reach_x) / along + 0.5 * columns)), 0)

@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import torch
 
-from cosim.raster import RoadRaster, channel_indices, draw_rows
+from cosim.raster import PIXEL_FLOOR, PIXEL_SPAN, PIXEL_SPEED, RoadRaster, draw_kinematics
 from cosim.types import Bools, Bytes, Floats, ObservationConfig
 from policy.forecast import KinematicForecast
 from policy.hpn import HPN
@@ -18,8 +18,6 @@ from policy.scene import Scene, pictured, rows_ahead
 from policy.tensors import Batch, kinematic_tensor, unit
 from policy.traffic import Traffic
 from policy.vehicle_inputs import vehicle_inputs
-
-FLOOR, SPAN, FASTEST = 0.1, 0.9, 30.0  # pixel of a vehicle (definitions.md): 0.1 + 0.9 clip((dv + 30) / 60)
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,19 +47,8 @@ def render(rows: Floats, valid: Bools, pose: Floats, config: ObservationConfig, 
     """Maps of predicted kinematics: rows [B,M,k,8], valid [B,k], pose [B,3] -> uint8 [B,M,C,H,W]."""
     b, m, r, f = rows.shape
     out = np.empty((b * m, len(config.channels), config.height, config.width), np.uint8)
-    draw_rows(
-        out,
-        np.ascontiguousarray(rows.reshape(b * m, r, f)),
-        np.repeat(valid, m, 0),
-        np.repeat(pose, m, 0),
-        channel_indices(config),
-        config.metres_across,
-        config.metres_along,
-        raster.cells,
-        raster.x,
-        raster.y,
-        raster.cell,
-    )
+    flat = np.ascontiguousarray(rows.reshape(b * m, r, f))
+    draw_kinematics(out, flat, np.repeat(valid, m, 0), np.repeat(pose, m, 0), raster, config)
     return out.reshape(b, m, *out.shape[1:])
 
 
@@ -72,9 +59,10 @@ def shade(rows: Floats, share: Floats) -> Floats:
     expected picture, which has the least squared error. Never darker than the floor: nobody vanishes.
     """
     out = rows.copy()
-    ego = rows[..., :1, 2]
-    level = FLOOR + SPAN * np.clip((rows[..., 2] - ego + FASTEST) / (2 * FASTEST), 0.0, 1.0)
-    out[..., 2] = ego + (np.maximum(level * share, FLOOR) - FLOOR) * (2 * FASTEST / SPAN) - FASTEST
+    ego, top = rows[..., :1, 2], PIXEL_SPEED
+    level = PIXEL_FLOOR + PIXEL_SPAN * np.clip((rows[..., 2] - ego + top) / (2 * top), 0.0, 1.0)
+    shaded = np.maximum(level * share, PIXEL_FLOOR) - PIXEL_FLOOR
+    out[..., 2] = ego + shaded * (2 * top / PIXEL_SPAN) - top
     out[..., 0, 2] = ego[..., 0]
     return out
 

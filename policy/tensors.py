@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from cosim.raster import PIXEL_FLOOR, PIXEL_SPAN, PIXEL_SPEED
 from cosim.road import RoadMap
 from cosim.types import KINEMATIC_FEATURES, Bools, Floats, Floats32, History
 from policy.situation import situation
@@ -19,8 +20,8 @@ KINEMATIC_INPUTS = len(KINEMATIC_FEATURES) + 1  # the features and the mask
 
 APART_OF = ("av", "hv", "road", "mission")  # channels that `apart` reads
 APART = 5  # channels of `apart`: AV, HV, road, ego or mission vehicle, relative speed
-STILL = 255 * 0.55  # pixel of a vehicle as fast as the ego (contract: 0.1 + 0.9 (dv + 30) / 60)
-BRISK = 255 * 0.9 / 60 * 15.0  # what 15 m/s of relative speed add to it: 1 in `apart`
+STILL = 255 * (PIXEL_FLOOR + PIXEL_SPAN / 2)  # pixel of a vehicle as fast as the ego
+BRISK = 255 * PIXEL_SPAN / (2 * PIXEL_SPEED) * 15.0  # what 15 m/s of relative speed add to it: 1 in `apart`
 
 
 class States(NamedTuple):

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from cosim.raster import CHANNELS, ROAD_LINE, channel_indices, draw_scene, rasterize_road
+from cosim.raster import CHANNELS, ROAD_LINE, draw_snapshot, rasterize_road
 from cosim.road import RoadMap
-from cosim.types import Bytes, Kind, ObservationConfig, Snapshot
+from cosim.types import Bytes, ObservationConfig, Snapshot
 
 # 64 m x 256 m at 0.4 m a pixel, the vehicle in the middle looking to the right
 VIEW = ObservationConfig(height=160, width=640, metres_across=0.4, metres_along=0.4, channels=CHANNELS)
@@ -19,7 +19,6 @@ class Painter:
 
     def __init__(self, road: RoadMap) -> None:
         self._raster = rasterize_road(road)
-        self._channels = channel_indices(VIEW)
         self._block = np.zeros((1, len(CHANNELS), VIEW.height, VIEW.width), np.uint8)
 
     def paint(self, s: Snapshot, vehicle: str | None) -> Bytes:
@@ -29,29 +28,8 @@ class Painter:
         if not s.n:
             return picture
         row = 0 if vehicle is None else s.row.get(vehicle, 0)
-        zero = np.zeros(1, np.int64)
-        raster = self._raster
-        draw_scene(
-            self._block,
-            zero,
-            np.array([row]),
-            s.x,
-            s.y,
-            s.heading,
-            s.speed,
-            s.length,
-            s.width,
-            s.kind == Kind.AV,
-            s.mission,
-            np.ones((1, s.n), np.bool_),
-            self._channels,
-            VIEW.metres_across,
-            VIEW.metres_along,
-            raster.cells,
-            raster.x,
-            raster.y,
-            raster.cell,
-        )
+        everybody = np.ones((1, s.n), np.bool_)
+        draw_snapshot(self._block, np.zeros(1, np.int64), s, np.array([row]), everybody, self._raster, VIEW)
         layers = dict(zip(CHANNELS, self._block[0], strict=True))
         picture[layers["road"] > 0] = SURFACE
         picture[layers["road"] == ROAD_LINE] = LINE

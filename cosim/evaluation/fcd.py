@@ -113,7 +113,7 @@ class _Counter:
         self._metrics = [METRICS[name]() for name in FIGURES]
         self._first: Step | None = None  # kept until the second one says how far apart they are
         self._interval = 0.0  # s between the file's steps
-        self._stride = 1  # every how manyth step is counted
+        self._stride = 1  # in steps: 2 counts every other
         self._index = 0  # of the step last seen
         self._time = 0.0  # s, of the step last seen
         self._newest: Snapshot | None = None

@@ -8,7 +8,7 @@ import numpy as np
 
 from cosim.observation.kinematics import choose_rows, fill_rows, never_left_out, perceived
 from cosim.observation.past import KinematicPast, MapPast
-from cosim.raster import RoadRaster, channel_indices, draw_scene, rasterize_road
+from cosim.raster import RoadRaster, draw_snapshot, rasterize_road
 from cosim.road import RoadMap
 from cosim.types import KINEMATIC_FEATURES, Bools, History, Ints, Kind, ObservationConfig, Snapshot
 
@@ -26,7 +26,6 @@ class Observer:
         self._road = road
         self._config = config
         self._raster: RoadRaster | None = rasterize_road(road) if config.maps else None
-        self._channels = channel_indices(config)
         self._maps = MapPast(config) if config.maps else None
         self.reset()
 
@@ -49,28 +48,7 @@ class Observer:
             return
         avs = [snapshot.ids[i] for i in self._egos]
         block, slots = self._maps.next_frame(avs)
-        raster = self._raster
-        draw_scene(
-            block,
-            slots,
-            self._egos,
-            snapshot.x,
-            snapshot.y,
-            snapshot.heading,
-            snapshot.speed,
-            snapshot.length,
-            snapshot.width,
-            snapshot.kind == int(Kind.AV),
-            snapshot.mission,
-            self._seen,
-            self._channels,
-            c.metres_across,
-            c.metres_along,
-            raster.cells,
-            raster.x,
-            raster.y,
-            raster.cell,
-        )
+        draw_snapshot(block, slots, snapshot, self._egos, self._seen, self._raster, c)
 
     def histories(self, route: RouteOf, commanded: CommandOf) -> dict[str, History]:
         """One History per AV on the road, at the newest frame."""

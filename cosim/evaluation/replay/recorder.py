@@ -113,7 +113,7 @@ class Recorder:
     bodies: dict[str, _Seen] = field(default_factory=dict)
     slots: dict[str, int] = field(default_factory=dict)
     now: float = 0.0  # s
-    stride: int = 1  # every how manyth frame is kept
+    stride: int = 1  # in frames: 2 keeps every other
     _frames_seen: int = 0
     _kept: int = 0
 

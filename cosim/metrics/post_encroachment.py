@@ -1,4 +1,4 @@
-"""Post-encroachment time: how soon after an AV or mission vehicle somebody crossed its path, or the reverse."""
+"""Post-encroachment time: how soon somebody crossed the path of an AV or mission vehicle, or the reverse."""
 
 from __future__ import annotations
 

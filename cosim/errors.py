@@ -81,6 +81,18 @@ class WeightsMismatch(BadInput):
     """A checkpoint's layout (names, shapes, hash) is not the one that the network needs."""
 
 
+def in_range(config: object, *, positive: str = "", not_negative: str = "") -> None:
+    """Refuse a configuration whose fields of these names (with spaces between) are out of range.
+
+    Raises BadInput naming the field and the value.
+    """
+    for name in f"{positive} {not_negative}".split():
+        value, zero = getattr(config, name), name in not_negative.split()
+        if value < 0 or (value == 0 and not zero):
+            problem = "must be 0 or more" if zero else "must be above 0"
+            raise BadInput(problem, field=name, value=value)
+
+
 def hint(name: str, known: Iterable[str]) -> str:
     """ ", did you mean 'x'?" for the known name nearest to `name`; all of few when nothing is near."""
     names = list(known)

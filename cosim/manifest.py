@@ -28,6 +28,7 @@ def manifest(scenario: Scenario, seed: int) -> dict[str, Any]:
             "step_s": scenario.timing.step,
             "frame_s": scenario.timing.frame,
             "decision_s": scenario.timing.decision,
+            "begin_s": scenario.begin,
             "warmup_s": scenario.warmup,
             "duration_s": scenario.duration,
         },

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from cosim.errors import in_range
+
 if TYPE_CHECKING:
     from cosim.road import RoadMap, RouteAhead
 
@@ -219,6 +221,11 @@ class ObservationConfig:
     perception_range: float = 125.0  # m, what one AV's own sensors reach
     share_perception: bool = True  # V2V: an AV also knows what its allies perceive
     maps: bool = True  # False: no VelocityMaps are drawn (for policies that use none)
+
+    def __post_init__(self) -> None:
+        """Raises BadInput when a size or a range is none."""
+        sizes = "height width metres_across metres_along frames rows"
+        in_range(self, positive=sizes, not_negative="row_range perception_range")
 
 
 COMPACT = ObservationConfig()

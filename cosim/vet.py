@@ -58,8 +58,9 @@ def vet(scenario: Scenario) -> VetReport:
     _check_drivers(demands)
     types = DEFAULT_TYPES.union(*(d.types for d in demands))
     if scenario.fleet.type is not None and scenario.fleet.type not in types:
-        problem = f"no such vehicle type in the demand{hint(scenario.fleet.type, sorted(types))}"
-        raise BadInput(problem, file=config, field="fleet.type", value=scenario.fleet.type)
+        where = ", ".join(path.name for path in scenario.demand) or "the demand"
+        problem = f"no such vehicle type in {where}{hint(scenario.fleet.type, sorted(types))}"
+        raise BadInput(problem, file=config, field="--av-type", value=scenario.fleet.type)
     flows = sum(d.flows for d in demands)
     return VetReport(
         edges=sum(1 for edge in net.lanes if not edge.startswith(":")),

@@ -193,6 +193,7 @@ def _serve(pipe: Connection, factory: Callable[..., Any], arguments: tuple[Any, 
     """The worker's whole life. Ends when the pipe breaks, so it never outlives its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
     keep_freed_memory()
+    os.dup2(2, 1)  # what a policy prints is for eyes: stdout belongs to the caller's document
     file = os.open(stderr, os.O_RDWR | os.O_APPEND)  # as `cosim.simulation.stderr` wants it, to read back
     os.dup2(file, 2)
     os.close(file)

@@ -142,7 +142,7 @@ def document(path: Path) -> object:
     """What the YAML file `path` holds. Raises BadInput: missing, not UTF-8, not YAML (with the line)."""
     regular_file(path, file=path, field="file")
     try:
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
+        return yaml.load(path.read_text(encoding="utf-8"), Loader=_OnceOnly)
     except UnicodeDecodeError as error:
         raise BadInput("is not UTF-8", file=path, field="byte", value=error.start) from None
     except yaml.YAMLError as error:
@@ -150,6 +150,19 @@ def document(path: Path) -> object:
         problem = f"not YAML: {getattr(error, 'problem', None) or 'malformed'}"
         line = None if mark is None else mark.line + 1
         raise BadInput(problem, file=path, field="line", value=line) from None
+
+
+class _OnceOnly(yaml.SafeLoader):
+    """Refuses a key that is twice in a mapping: YAML would keep the last without a word."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen: set[str] = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.value in seen:
+                problem = f"{key.value!r} is twice in this mapping"
+                raise yaml.constructor.ConstructorError(None, None, problem, key.start_mark)
+            seen.add(str(key.value))
+        return super().construct_mapping(node, deep)
 
 
 def check_pattern(pattern: str, file: object, field: str) -> None:

@@ -96,7 +96,8 @@ def heading(job: Job, results: Results, settings: Settings, *more: str) -> list[
     lines += [
         f"Preset `unguarded`, drivers `lc2013`, equal seeds from {settings.first:,} on. Rates with Wilson,",
         "means with bootstrap, differences of pairs with Tango's and bootstrap 95 % intervals; p: McNemar.",
-        "In episodes counted as `not comparable` over 5 % of the vehicles found no room; they are in all figures.",
+        "In episodes counted as `not comparable` over 5 % of the vehicles found no room to enter; they are",
+        "in all figures.",
         *more,
     ]
     if settings.held:

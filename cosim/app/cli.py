@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+import traceback
+from collections.abc import Iterator, Sequence
+from importlib import metadata
 
 from cosim.app.verbs import VERBS
-from cosim.errors import CosimError
+from cosim.errors import BadInput, CosimError
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -21,7 +26,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser().parse_args(arguments)
     args.sumo_options = options
     try:
-        return int(args.work(args))
+        if options and not getattr(args, "passes_on", False):
+            problem = "only `cosim run` passes options on to SUMO; else they belong into the .sumocfg"
+            raise BadInput(problem, field="--", value=" ".join(options))
+        with _terminable():
+            return int(args.work(args))
     except CosimError as error:
         print(f"cosim: {error}", file=sys.stderr)
         return error.exit_code
@@ -31,6 +40,27 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # `cosim ... | head`
         sys.stderr.close()
         return 0
+    except Exception:
+        traceback.print_exc()
+        print("cosim: this is a fault of cosim's own: please report it with the lines above", file=sys.stderr)
+        return CosimError.exit_code
+
+
+@contextlib.contextmanager
+def _terminable() -> Iterator[None]:
+    """SIGTERM (`docker stop`, a scheduler's limit) ends the work in order, as Ctrl-C does."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def end(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def parser() -> argparse.ArgumentParser:
@@ -38,6 +68,7 @@ def parser() -> argparse.ArgumentParser:
     top = argparse.ArgumentParser(
         prog="cosim", description="Altruistic cooperative driving in mixed traffic on SUMO."
     )
+    top.add_argument("--version", action="version", version=f"cosim {metadata.version('cosim')}")
     verbs = top.add_subparsers(required=True, metavar="VERB")
     for verb in VERBS:
         verb.add(verbs)

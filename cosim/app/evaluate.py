@@ -31,9 +31,6 @@ LINES = 200  # cells that a dry run lists
 
 def evaluate(args: argparse.Namespace) -> int:
     """The whole verb. Raises BadInput before anything is run, or CosimError when it cannot go on."""
-    if args.sumo_options:
-        problem = "options for SUMO belong into the .sumocfg here, where every worker finds them"
-        raise BadInput(problem, field="--", value=" ".join(args.sumo_options))
     plan = _plan(args)
     engine = _engine(args)
     if args.dry_run:
@@ -118,7 +115,7 @@ def _drive(plan: matrix.Plan, engine: Engine, store: Store, folder: Path, args: 
     seconds = time.monotonic() - began
     rows = store.rows()
     manifest = _manifest(plan, store)
-    summary = summarize(rows, manifest["units"], manifest["better"])
+    summary = {"planned": plan.episodes} | summarize(rows, manifest["units"], manifest["better"])
     export(folder, rows, manifest, summary)
     if not args.no_report:
         from cosim.evaluation import report  # matplotlib: a second that a run without a report need not pay
@@ -134,7 +131,8 @@ def _drive(plan: matrix.Plan, engine: Engine, store: Store, folder: Path, args: 
         driven = plan.episodes - done
         print(f"{plan.episodes} episodes of {len(plan.cells)} cells in {folder}")
         print(f"  driven now {driven} in {seconds:.1f} s ({driven / max(seconds, 1e-9):.2f} episodes/s)")
-        print("  status     " + ", ".join(f"{name} {n}" for name, n in summary["status"].items() if n))
+        status = {**summary["status"], "not driven": plan.episodes - len(rows)}
+        print("  status     " + ", ".join(f"{name} {n}" for name, n in status.items() if n))
     return 4 if faults else 0
 
 

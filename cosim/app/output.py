@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -69,12 +70,21 @@ def table(result: EpisodeResult) -> str:
     lines += [f"  {name:<24} {figure(result.metrics[name])}" for name in shown]
     for c in result.collisions:
         who = f"{c.kind}, {'AV-caused' if c.av_caused else 'not AV-caused'}"
-        lines.append(f"  collision at {c.time:.1f} s: {c.collider} hit {c.victim} on {c.lane} ({who})")
+        lines.append(
+            f"  collision at {_clock(c.time, result)}: {c.collider} hit {c.victim} on {c.lane} ({who})"
+        )
     lines += [f"  not comparable: {reason}" for reason in result.validity]
+    lines += [f"  not passed on to SUMO: {option}" for option in result.manifest["options_not_passed_on"]]
     lines.append(f"  trace_hash               {result.trace_hash}")
     times = ", ".join(f"{name.removesuffix('_s')} {value:.2f} s" for name, value in result.timings.items())
     lines.append(f"  time spent               {times}")
     return "\n".join(lines)
+
+
+def _clock(time: float, result: EpisodeResult) -> str:
+    """A moment of SUMO's clock in s, and as counted from the end of the warm-up."""
+    timing = result.manifest["timing"]
+    return f"{time - timing['begin_s'] - timing['warmup_s']:.1f} s (SUMO's clock: {time:.1f} s)"
 
 
 def prepare_folder(path: str) -> Path:
@@ -87,6 +97,14 @@ def prepare_folder(path: str) -> Path:
     if not os.access(folder, os.W_OK):
         raise BadInput("cannot write into this folder", field="--out", value=path)
     return folder
+
+
+def clear_folder(folder: Path, outputs: Sequence[str]) -> None:
+    """Remove what an earlier `cosim run` left there and this one, which wrote `outputs` of SUMO, did not."""
+    old = [*folder.glob("replay*.html"), *folder.glob("replay*.mp4"), *folder.glob("replay*.gif")]
+    old += [file for file in (folder / "outputs").glob("*.xml") if file.stem not in outputs]
+    for file in old:
+        file.unlink()
 
 
 def write_folder(folder: Path, result: EpisodeResult) -> None:

@@ -42,7 +42,15 @@ class OwnPolicy:
         self.label = str(getattr(inner, "label", ""))
         self.observation: ObservationConfig = inner.observation
         self.av_parameters: Mapping[str, str] = getattr(inner, "av_parameters", {})
+        for key, value in self.av_parameters.items():
+            if not (isinstance(key, str) and isinstance(value, str)):
+                raise self._wrong(
+                    "must map SUMO's parameters to text", f"{name.member}.av_parameters", (key, value)
+                )
         more = self._guard("files", lambda: [Path(f) for f in getattr(inner, "files", ())])
+        for path in more:
+            if not path.is_file():
+                raise self._wrong("no such file", f"{name.member}.files", str(path))
         self.files = tuple(f for f in (file, *more) if f is not None)
 
     def reset(self, context: PolicyContext) -> None:
@@ -59,12 +67,13 @@ class OwnPolicy:
             if av not in histories:
                 raise self._wrong(f"decided for one that is no AV on the road: {av!r}", "decide")
             if decision is not None:
-                found[av] = decision if isinstance(decision, Decision) else self._decision(decision)
+                found[av] = self._decision(decision)
         return found
 
     def _decision(self, value: Any) -> Decision:
+        whole: Decision = value if isinstance(value, Decision) else Decision(value)
         try:
-            return Decision(MetaAction(operator.index(value)))
+            return whole._replace(action=MetaAction(operator.index(whole.action)))
         except (TypeError, ValueError):
             problem = f"must decide for a Decision, a MetaAction ({ACTIONS}) or None"
             raise self._wrong(problem, "decide", value) from None
@@ -74,7 +83,7 @@ class OwnPolicy:
             return call(*arguments)
         except CosimError:
             raise
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise raised(error, self._place, what) from error
 
     def _wrong(self, problem: str, field: str, value: object = None) -> BadInput:
@@ -127,7 +136,7 @@ def own(name: PolicyName) -> OwnPolicy:
     return OwnPolicy(inner, name, file)
 
 
-def raised(error: Exception, place: object, what: str) -> BadInput:
+def raised(error: BaseException, place: object, what: str) -> BadInput:
     """What his code raised, in one line; of a file of his the deepest line that is in it."""
     lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == str(place)]
     where = f"{place}:{lines[-1]}" if lines else place

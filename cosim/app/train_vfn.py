@@ -23,7 +23,7 @@ from policy.checkpoint import sha256
 from policy.training.config import agent_config
 from policy.training.curriculum import Lesson, VfnTraining
 from policy.training.log import tensorboard
-from policy.training.networks import use_threads
+from policy.training.networks import usable, use_threads
 from policy.training.vfn import Trainer
 from sumo_scenarios import names
 
@@ -38,7 +38,10 @@ def train(args: argparse.Namespace) -> int:
     agent = agent_config(name, file)
     learning = APPROACHES[name].learning
     if (learning == "a2c") != (args.what == "a2c"):
-        raise BadInput(f"is trained by {learning}", field="--policy", value=name)
+        verb = "a2c" if learning == "a2c" else "vfn"
+        raise BadInput(f"is trained by cosim train {verb}", field="--policy", value=name)
+    if not usable(args.device):
+        raise BadInput("torch has no such device here", field="--device", value=args.device)
     training = _scheduled(file.training, args, name)
     for lesson in training.lessons:
         load(lesson.scenario, demand=[lesson.demand], behavior=lesson.behavior)

@@ -14,6 +14,7 @@ from cosim.envs.gym import no_av
 from cosim.envs.session import Session
 from cosim.envs.spaces import Observation
 from cosim.envs.view import View
+from cosim.errors import BadInput, hint
 from cosim.scenario import Scenario
 from cosim.types import COMPACT, Bytes, ObservationConfig
 
@@ -68,6 +69,7 @@ class SumoParallelEnv(ParallelEnv):  # type: ignore[misc]
         self.action_spaces = {a: spaces.action_space() for a in self.possible_agents}
         self._config, self._flatten = observation, flatten
         self._rng = np.random.default_rng(NATIVE_RANDOM)
+        self._slots: dict[str, str] = {}  # SUMO id -> agent, whoever had one in this episode
         self._session: Session = sessions.open(config, observation=observation, **words)
 
     @property
@@ -91,7 +93,7 @@ class SumoParallelEnv(ParallelEnv):  # type: ignore[misc]
             seed = spaces.training_seed(self._rng)
         else:
             self._rng = np.random.default_rng(seed)
-        self._slots: dict[str, str] = {}  # SUMO id -> agent, whoever had one in this episode
+        self._slots = {}
         self._views: dict[str, View] = {}
         self.agents = []
         views = self._session.reset(seed)
@@ -103,6 +105,10 @@ class SumoParallelEnv(ParallelEnv):  # type: ignore[misc]
 
     def step(self, actions: dict[str, int]) -> Step:
         """One decision of every agent; an agent without an action is handed to SUMO for this step."""
+        unknown = [agent for agent in actions if agent not in self.possible_agents]
+        if unknown:
+            problem = f"no such agent{hint(str(unknown[0]), self.agents)}"
+            raise BadInput(problem, field="actions", value=unknown[0])
         av_of = {agent: av for av, agent in self._slots.items()}
         acting = self.agents
         step = self._session.act({av_of[a]: int(actions[a]) for a in acting if a in actions})

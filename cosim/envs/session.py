@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import multiprocessing
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
@@ -161,14 +162,14 @@ class Session:
 
     def act(
         self,
-        actions: Mapping[str, int],
+        actions: Mapping[str, int | None],
         *,
         see: Sequence[str] | None = None,
     ) -> StepResult:
         """Carry out one meta-action per AV for one decision (0.4 s).
 
-        `see`: the AVs whose observation you want (all by default; fewer are faster). An AV without an action
-        is driven by `others`, or else by SUMO.
+        An AV without an action, or with None, is driven by `others`, or else by SUMO.
+        `see`: the AVs whose observation you want (all by default; fewer are faster).
 
         Raises:
             BadInput: an id that is not an AV on the road, something that is no meta-action, no episode.
@@ -259,17 +260,18 @@ class Session:
         self.elapsed = reply.elapsed
         self.over = reply.terminated or reply.truncated
 
-    def _checked(self, actions: Mapping[str, int]) -> dict[str, int]:
-        for name, action in actions.items():
+    def _checked(self, actions: Mapping[str, int | None]) -> dict[str, int]:
+        wanted = {name: action for name, action in actions.items() if action is not None}
+        for name, action in wanted.items():
             if name not in self.avs:
                 problem = f"no AV of that name is on the road{hint(name, self.avs)}"
                 raise BadInput(problem, field="actions", value=name)
             try:
-                MetaAction(action)
-            except ValueError:
+                MetaAction(operator.index(action))
+            except (TypeError, ValueError):
                 known = ", ".join(f"{a.value} {a.name}" for a in MetaAction)
                 raise BadInput(f"is no meta-action ({known})", field=name, value=action) from None
-        return {name: int(action) for name, action in actions.items()}
+        return {name: operator.index(action) for name, action in wanted.items()}
 
 
 class _InProcess:

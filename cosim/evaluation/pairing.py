@@ -103,9 +103,7 @@ def pair(a: Side, b: Side, across: Sequence[str] = ()) -> tuple[list[Group], tup
     """
     for name in across:
         if name not in ACROSS:
-            raise BadInput(
-                f"not one of {', '.join(ACROSS)}{hint(name, ACROSS)}", field="--across", value=name
-            )
+            raise BadInput(f"cannot be compared across{hint(name, ACROSS)}", field="--across", value=name)
     by_policy = _clear_policies(a, b)
     if by_policy:
         common = set(a.run.policies) & set(b.run.policies)

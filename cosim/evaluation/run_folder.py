@@ -14,6 +14,7 @@ import pyarrow.parquet
 
 from cosim.errors import BadInput
 from cosim.evaluation.figures import Measure, Row, measures
+from cosim.evaluation.store import FILE
 from cosim.evaluation.tasks import OK
 
 NEEDED = ("key", "cell", "status", "scenario", "demand", "policy", "seed")
@@ -37,6 +38,14 @@ class Run:
         """Names of the policies, in the order they come."""
         return list(dict.fromkeys(str(row["policy"]) for row in self.rows))
 
+    @property
+    def planned(self) -> int | None:
+        """How many episodes the run is to have; None where it does not say."""
+        seeds, cells = self.manifest.get("seeds"), self.manifest.get("cells")
+        if not (isinstance(seeds, list) and len(seeds) == 2 and cells):
+            return None
+        return len(cells) * (int(seeds[1]) - int(seeds[0]))
+
     def case(self, row: Row) -> dict[str, Any]:
         """What was asked for (`cosim.evaluation.case`), without policy and seed; {} where it is not known."""
         cell = self.manifest.get("cells", {}).get(row["cell"], {})
@@ -54,7 +63,10 @@ def read(path: str | Path) -> Run:
         raise BadInput("no such run folder", value=str(path))
     file = folder / "episodes.parquet"
     if not file.is_file():
-        raise BadInput("holds no episodes.parquet: is it a run of `cosim evaluate`?", file=folder)
+        problem = "holds no episodes.parquet: is it a run of `cosim evaluate`?"
+        if (folder / FILE).is_file():
+            problem = f"is not finished: `cosim evaluate --resume --out {folder}` goes on"
+        raise BadInput(problem, file=folder)
     try:
         rows: list[dict[str, Any]] = pa.parquet.read_table(file).to_pylist()
     except (pa.ArrowException, OSError) as error:

@@ -37,7 +37,7 @@ class Folder:
                 (self.path / part).mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise BadInput(
-                f"cannot make this folder: {error.strerror}", field="--out", value=self.path
+                f"cannot make this folder: {error.strerror}", field="--out", value=str(self.path)
             ) from None
 
     def episode_file(self, key: str) -> Path:

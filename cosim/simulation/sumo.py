@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -43,6 +44,10 @@ FORCED = {
     "duration-log.disable": "true",
     "xml-validation": "never",  # cosim.vet has read the files already
 }
+# What SUMO says in the middle of a run, where it loads routes, of a vehicle that cannot depart as written.
+WRONG_DEMAND = re.compile(
+    r"[Ii]nvalid depart|Departure \w+ .*for vehicle|has no valid route|No connection between edge"
+)
 GIVES_UP = "max-depart-delay"  # SUMO drops who waited so long, and says so nowhere
 
 _in_use = False
@@ -221,7 +226,11 @@ class SumoSimulator:
         words = " ".join((self._stderr.take() or str(error)).split())
         if starting:  # everything SUMO refuses before the first step is wrong input
             return BadInput(f"SUMO refuses it: {words}", file=self._scenario.config)
-        return SimulationError(f"{self._scenario.config}: SUMO failed: {words}")
+        told = "".join(f"; found before: {warning}" for warning in self._scenario.warnings)
+        if WRONG_DEMAND.search(words):
+            files = ", ".join(map(str, self._scenario.demand)) or self._scenario.config
+            return BadInput(f"SUMO refuses it: {words}{told}", file=files)
+        return SimulationError(f"{self._scenario.config}: SUMO failed: {words}{told}")
 
     def _step(self) -> None:
         simulation = libsumo.simulation

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from cosim.errors import in_range
 from cosim.types import Floats32
 from policy.seeded import seeded
 from policy.training.experience import Advised, Trajectory, states
@@ -30,6 +31,10 @@ class A2cConfig:
     scale: float = 0.1  # of all rewards, as the DDQN's
     clip: float = 0.5  # largest gradient norm
     imitation: float = 0.0  # weight of the mentor's advice: the chance of what he thinks right is to be 1
+
+    def __post_init__(self) -> None:
+        """Raises BadInput for a number out of range."""
+        in_range(self, positive="learning_rate n_step gamma batch scale clip", not_negative="imitation")
 
 
 class A2cLosses(NamedTuple):

@@ -10,6 +10,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
+from cosim.errors import in_range
 from policy.seeded import seeded
 from policy.training.experience import Advised
 from policy.training.networks import adam_tensors, restore_adam
@@ -29,6 +30,12 @@ class DdqnConfig:
     clip: float = 10.0  # largest gradient norm
     imitation: float = 1.0  # weight of the mentor's advice: his action is worth more than any other,
     margin: float = 0.3  # by this much (large-margin loss of deep Q-learning from demonstrations)
+
+    def __post_init__(self) -> None:
+        """Raises BadInput for a number out of range."""
+        in_range(
+            self, positive="learning_rate target_every scale clip", not_negative="refused imitation margin"
+        )
 
 
 class Losses(NamedTuple):

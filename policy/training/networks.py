@@ -36,6 +36,15 @@ def restore_adam(
     optimizer.load_state_dict(whole)
 
 
+def usable(device: str) -> bool:
+    """Whether torch can put a tensor on `device`."""
+    try:
+        torch.empty(1, device=device)
+    except (RuntimeError, AssertionError):  # AssertionError: torch built without CUDA
+        return False
+    return True
+
+
 def use_threads(count: int) -> None:
     """Threads of this process for torch: a learner beside actors wants one each."""
     torch.set_num_threads(count)

@@ -206,6 +206,28 @@ def test_the_mask_forbids_lane_changes_off_the_road_and_during_a_change(make: Ma
     assert info["action_mask"].tolist() == [0, 1, 1, 1, 1]
 
 
+def test_a_session_takes_none_for_sumo_and_refuses_what_is_no_whole_number() -> None:
+    words = {"simulator": fake_worlds.short_road, "worker": False, **FAST}
+    with cosim.open(fake_worlds.scenario(), **words) as session:
+        views = session.reset(1)
+        first = next(iter(views))
+        assert session.act({first: None}).receipts == {}
+        assert list(session.act({first: np.int64(1)}).receipts) == [first]
+        with pytest.raises(BadInput, match="is no meta-action"):
+            session.act({first: 1.0})  # type: ignore[dict-item]
+
+
+def test_agents_that_are_none_are_refused_and_so_is_a_step_before_the_reset() -> None:
+    with_fake = {"simulator": fake_worlds.short_road, "max_agents": 2, "worker": False, **FAST}
+    env = parallel_env(fake_worlds.scenario(), **with_fake)
+    with pytest.raises(BadInput, match="call reset first"):
+        env.step({})
+    env.reset(seed=1)
+    with pytest.raises(BadInput, match="actions='ghost': no such agent"):
+        env.step({"ghost": 1})
+    env.close()
+
+
 def test_agents_leave_one_by_one() -> None:
     with_fake = {"simulator": fake_worlds.short_road, "max_agents": 2, "worker": False, **FAST}
     env = parallel_env(fake_worlds.scenario(), **with_fake)

@@ -239,6 +239,38 @@ def test_what_only_sumo_finds_is_told_in_sumos_words(config: Path, capfd: pytest
     assert "Traceback" not in err
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ('departSpeed="max"', 'departSpeed="999"', "Departure speed"),
+        ('departLane="free"', 'departLane="77"', "Invalid departLane"),
+    ],
+)
+def test_what_sumo_finds_while_driving_is_the_route_file_s_and_nothing_is_left_behind(
+    old: str, new: str, told: str, config: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    swap(ROUTES, old, new)(config.parent)
+    out = config.parent / "out"
+    assert main(["run", str(config), "--out", str(out)]) == 2
+    err = capfd.readouterr().err
+    assert f"{ROUTES}: SUMO refuses it: {told}" in err
+    assert not out.exists()
+
+
+def test_options_after_two_dashes_are_refused_by_verbs_that_would_drop_them(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    for line in ("scenarios -- foo", "metrics a.xml -- --scale 3", "evaluate --out e -- --scale 3"):
+        assert main(line.split()) == 2
+        assert "only `cosim run` passes options on to SUMO" in capfd.readouterr().err
+
+
+def test_a_set_aside_option_of_the_file_is_told(config: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    config.write_text(config.read_text().replace("</configuration>", '<x value="3"/></configuration>'))
+    assert main(["run", str(config), "--duration", "1"]) == 0
+    assert "not passed on to SUMO: x=3" in capfd.readouterr().out
+
+
 def test_an_unknown_sumo_option_is_told_in_sumos_words(capfd: pytest.CaptureFixture[str]) -> None:
     assert "no-such-option" in refused(["merge", "--", "--no-such-option", "1"], capfd)
 

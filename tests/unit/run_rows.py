@@ -112,14 +112,19 @@ def cell(
     return [(c, row(c, **{name: column[k] for name, column in values.items()})) for k, c in enumerate(cases)]
 
 
-def write(folder: Path, *cells: list[tuple[Case, dict[str, Any]]], manifest: bool = True) -> Path:
-    """The run folder."""
+def write(
+    folder: Path,
+    *cells: list[tuple[Case, dict[str, Any]]],
+    manifest: bool = True,
+    planned: int | None = None,
+) -> Path:
+    """The run folder; `planned`: seeds of every cell (None: as many as the first one has)."""
     folder.mkdir(parents=True)
     pairs = [pair for one in cells for pair in one]
     rows = [found for _, found in pairs]
     document = {
         "command": "cosim evaluate --scenario merge",
-        "seeds": [200_000, 200_010],
+        "seeds": [200_000, 200_000 + (len(cells[0]) if planned is None else planned)],
         "versions": {"cosim": "0.1.0", "libsumo": "1.28.0"},
         "units": UNITS,
         "better": BETTER,

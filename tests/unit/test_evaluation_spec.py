@@ -143,7 +143,7 @@ def test_a_wrong_spec_is_one_clear_sentence(tmp_path: Path, text: str, sentence:
         ("policy: vnf-p\n", r"unknown policy, did you mean 'vfn-p'\?"),
         ("demand: contestd\n", r"no such demand.*contested"),
         ("output: [tripinfo, fdc]\n", r"--output='fdc'.*'fcd'"),
-        ("av_type: avv\n", r"no such vehicle type in the demand.*'av'"),
+        ("av_type: avv\n", r"no such vehicle type in dense.rou.xml.*'av'"),
         (
             "demand: other.rou.xml\n",
             r"other\.rou\.xml: route\.edges='nowhere': no such edge in net",

@@ -12,6 +12,7 @@ import pytest
 from run_rows import CASE, cell, failed, row, write
 
 from cosim.app.cli import main
+from cosim.errors import BadInput
 from cosim.evaluation import report
 from cosim.evaluation.run_folder import read
 
@@ -96,7 +97,7 @@ def test_figures_stand_with_intervals_and_counts(full: tuple[Path, Page]) -> Non
 def test_worst_episodes_come_with_their_replay_command(full: tuple[Path, Page]) -> None:
     text = full[1].text
     key = replace(CASE, policy="vfn-p", svo_deg=90.0).key
-    assert "AV-caused collision at 12.3 s: av.1 hit hv.7" in text
+    assert "AV-caused collision at 12.3 s of SUMO's clock: av.1 hit hv.7" in text
     assert f"cosim replay 'runs/my run' {key}" in text
     assert text.index("AV-caused collision at") < text.index("time to collision down to 0.90 s")
 
@@ -157,6 +158,16 @@ def test_a_run_without_any_figure_is_still_reported(tmp_path: Path) -> None:
     assert "None of the 3 episodes gave figures" in page.text
     assert "0 of 3 3 timeout" in page.text
     assert not any(tag == "svg" for tag, _ in page.tags)
+
+
+def test_a_run_that_lacks_episodes_says_so(tmp_path: Path) -> None:
+    folder = write(tmp_path / "run", cell("idm", 2), cell("own", 1), planned=2)
+    page = Page(report.write(read(folder)).read_text())
+    assert "1 of 4 episodes not driven: `cosim evaluate --resume` goes on" in page.text
+    (folder / "episodes.parquet").unlink()
+    (folder / "store.sqlite").touch()
+    with pytest.raises(BadInput, match="is not finished: `cosim evaluate --resume --out"):
+        read(folder)
 
 
 def test_na_everywhere_is_shown_as_na(tmp_path: Path) -> None:

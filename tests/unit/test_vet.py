@@ -283,7 +283,7 @@ def test_a_fifo_is_refused_instead_of_waited_for(case: Case, tmp_path: Path) -> 
 def test_the_av_type_must_be_in_the_demand(case: Case) -> None:
     assert case(fleet=Fleet(type="car")).vehicles == 3
     assert case(fleet=Fleet(type="truck")).vehicles == 3  # from the additional file
-    refused(lambda: case(fleet=Fleet(type="cra")), "c.sumocfg", "fleet.type", "cra", "'car'")
+    refused(lambda: case(fleet=Fleet(type="cra")), "c.sumocfg", "--av-type", "cra", "'car'")
 
 
 def test_unsorted_departures_are_a_warning_because_sumo_drops_them(case: Case) -> None:

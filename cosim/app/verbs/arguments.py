@@ -26,17 +26,17 @@ def share(text: str) -> float:
 
 def positive(text: str) -> float:
     """A positive number of seconds."""
-    return _number(text, 0.1, 1e6, "a positive number of seconds")
+    return _number(text, 0.1, 1e6, "a number of seconds from 0.1 to 1,000,000")
 
 
 def count(text: str) -> int:
     """A whole number of 1 or more."""
-    return _whole(text, 1, "a whole number of 1 or more")
+    return _whole(text, 1, "a whole number from 1 to 2^62")
 
 
 def seed(text: str) -> int:
     """A whole number of 0 or more."""
-    return _whole(text, 0, "a whole number of 0 or more")
+    return _whole(text, 0, "a whole number from 0 to 2^62")
 
 
 def _whole(text: str, low: int, what: str) -> int:

@@ -57,7 +57,7 @@ def add(verbs: arguments.Verbs) -> None:
     )
     run.add_argument("--replay", action="store_true", help="draw DIR/replay.html and DIR/replay.mp4 too")
     run.add_argument("--json", action="store_true", help="print exactly one JSON document on stdout")
-    run.set_defaults(work=work)
+    run.set_defaults(work=work, passes_on=True)
 
 
 def work(args: argparse.Namespace) -> int:
@@ -79,6 +79,7 @@ def work(args: argparse.Namespace) -> int:
     scenario = case.scenario(args.sumo_options)
     sumo_outputs.check(case.outputs, scenario.options)
     scenario = vetted(scenario)
+    new = bool(args.out) and not Path(args.out).exists()
     folder = output.prepare_folder(args.out) if args.out else None
     files = folder / "outputs" if folder is not None and case.outputs else None
     progress = Progress(f"{scenario.name} {label(case.policy)}", "s")
@@ -88,12 +89,17 @@ def work(args: argparse.Namespace) -> int:
             verb = "record" if args.replay else "run"
             answer = worker.call(verb, case.seed, progress=progress, outputs=case.outputs, folder=files)
             result, recording = answer if args.replay else (answer, None)
+    except BaseException:
+        if new and folder is not None:
+            shutil.rmtree(folder, ignore_errors=True)
+        raise
     finally:
         if files is not None:  # what a simulation that died leaves behind
             shutil.rmtree(files / sumo_outputs.DRAFT, ignore_errors=True)
-    progress.done()
+        progress.done()
     result = replace(result, manifest=result.manifest | remembered(case, args.sumo_options))
     if folder is not None:
+        output.clear_folder(folder, case.outputs)
         output.write_folder(folder, result)
         if recording is not None:
             draw([recording], folder / "replay.html", folder / "replay.mp4")

@@ -103,8 +103,13 @@ def _verdict(run: Run, found: Sequence[Block]) -> dict[str, Any]:
     """What can be said of the run as a whole: whether all was driven, and whether it may be compared."""
     status = {name: count for name, count in status_counts(run.rows).items() if count}
     total, ok = len(run.rows), status.get(OK, 0)
+    missing = max((run.planned or 0) - total, 0)
     odd = sum(not_comparable(row) for row in run.rows)
-    if not total:
+    if missing:
+        words = (
+            f"{missing} of {_count(total + missing, 'episode')} not driven: `cosim evaluate --resume` goes on"
+        )
+    elif not total:
         words = "No episodes: there is nothing to judge"
     elif not ok:
         words = f"None of the {_count(total, 'episode')} gave figures"
@@ -115,7 +120,7 @@ def _verdict(run: Run, found: Sequence[Block]) -> dict[str, Any]:
     cells = sum(len(block.series) for block in found)
     return {
         "words": words,
-        "tone": "bad" if not ok else "warn" if ok < total or odd else "good",
+        "tone": "bad" if not ok else "warn" if ok < total or odd or missing else "good",
         "status": status,
         "episodes": _count(total, "episode"),
         "cells": _count(cells, "cell"),

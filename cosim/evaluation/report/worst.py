@@ -65,4 +65,4 @@ def _collisions(row: Row) -> list[dict[str, Any]]:
 def _words(collision: dict[str, Any]) -> str:
     if not collision:
         return ""
-    return f" at {collision['time']:.1f} s: {collision['collider']} hit {collision['victim']}"
+    return f" at {collision['time']:.1f} s of SUMO's clock: {collision['collider']} hit {collision['victim']}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -123,7 +124,8 @@ class _Counter:
         self._unknown_types: set[str] = set()
         self._ever: set[str] = set()
         self._watched: set[str] = set()
-        self._laneless = 0
+        self._laneless = self._rows = 0  # vehicle frames
+        self._strange: Counter[str] = Counter()  # lanes that the road lacks
         self._driven = self._moved = 0.0  # m, by the speeds and by the positions
 
     def see(self, step: Step) -> None:
@@ -183,6 +185,9 @@ class _Counter:
         x, y, heading = centres(table[:, 0], table[:, 1], table[:, 2], 0.5 * length)
         index = self._road.index
         self._laneless += sum(math.isnan(r.pos) for r in rows)
+        self._rows += len(rows)
+        strange = [r.lane for r in rows if not math.isnan(r.pos) and r.lane not in index]
+        self._strange.update(strange)
         return Snapshot(
             time=step.time,
             ids=tuple(r.id for r in rows),
@@ -248,6 +253,9 @@ class _Counter:
                 "" if math.isinf(self._begin) and math.isinf(self._end) else " in the time that was asked for"
             )
             raise self._wrong(f"holds no vehicle{window}")
+        if self._strange.total() > 0.5 * self._rows:
+            problem = "no such lane in --net, which is not the net of this file"
+            raise self._wrong(problem, "vehicle.lane", self._strange.most_common(1)[0][0])
         figures: dict[str, Metric] = {}
         for metric in self._metrics:
             figures |= metric.result()
@@ -278,6 +286,9 @@ class _Counter:
             )
         if self._laneless:
             found.append(f"{self._laneless} vehicle frames have no lane position: no headway there")
+        if self._strange:
+            lanes = ", ".join(sorted(self._strange)[:5])
+            found.append(f"{self._strange.total()} vehicle frames on lanes that --net lacks: {lanes}")
         if self._stride > 1:
             found.append(
                 f"steps of {self._interval:g} s are thinned to frames of {self._stride * self._interval:g} s"

@@ -1,9 +1,10 @@
-"""What the README shows is what a reader gets: its Python snippet runs as it stands."""
+"""What the README shows is what a reader gets: its Python snippets run as they stand."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -14,7 +15,7 @@ README = Path(__file__).parents[2] / "README.md"
 
 
 def test_the_python_snippet_drives_a_whole_episode(capsys: pytest.CaptureFixture[str]) -> None:
-    (snippet,) = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
+    snippet, _ = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
     seen: list[View] = []
 
     def my_agent(view: View) -> MetaAction:
@@ -26,3 +27,11 @@ def test_the_python_snippet_drives_a_whole_episode(capsys: pytest.CaptureFixture
     printed = capsys.readouterr().out
     assert "EpisodeResult(scenario='merge', demand='contested', policy='external'" in printed
     assert "seed=200000" in printed
+
+
+def test_the_snippet_of_both_learning_faces_drives_too() -> None:
+    _, snippet = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
+    seen: dict[str, Any] = {}
+    exec(compile(snippet, "README.md", "exec"), seen)
+    assert seen["env"].agents == []
+    assert all(truncated or seen["terminated"][a] for a, truncated in seen["truncated"].items())

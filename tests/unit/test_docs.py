@@ -32,3 +32,13 @@ def test_pages_named_in_the_code_exist(room: str) -> None:
         for name in re.findall(r"[\w-]+\.md\b", file.read_text(encoding="utf-8"))
     }
     assert sorted((file, name) for file, name in named if name not in pages) == []
+
+
+def test_every_figure_of_an_episode_is_defined() -> None:
+    files = [*(ROOT / "cosim" / "metrics").glob("*.py"), ROOT / "cosim" / "episode.py"]
+    named = {
+        n for file in files for n in re.findall(r'"(\w+)": (?:Metric|self\._mean|_mean)', file.read_text())
+    }
+    defined = (ROOT / "docs" / "definitions.md").read_text()
+    assert len(named) > 20
+    assert sorted(name for name in named if f"`{name}`" not in defined) == []

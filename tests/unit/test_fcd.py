@@ -112,6 +112,12 @@ def test_only_the_chosen_vehicles_are_watched(fcd: Any) -> None:
     assert value(slow, "min_ttc_s") == pytest.approx(3.0)
 
 
+def test_another_net_is_refused_by_the_lane_that_it_lacks(fcd: Any) -> None:
+    path = fcd(following().replace('lane="', 'lane="elsewhere_'))
+    with pytest.raises(BadInput, match=r"vehicle\.lane='elsewhere_.*': no such lane in --net"):
+        analyse(path, road=straight_road(2, 2000.0, 25.0))
+
+
 def test_fine_steps_are_thinned_to_the_frames_of_an_episode(fcd: Any) -> None:
     fine = analyse(fcd(following(21, 0.1)))
     assert (fine.frames, fine.interval) == (11, 0.2)

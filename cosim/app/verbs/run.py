@@ -30,12 +30,22 @@ def add(verbs: arguments.Verbs) -> None:
     )
     run.add_argument("what", metavar="WHAT", help="a scenario's name (cosim scenarios) or any .sumocfg")
     run.add_argument(
-        "--demand", action="append", default=[], metavar="NAME|FILE", help="demand by name, or route files"
+        "--demand",
+        action="append",
+        default=[],
+        metavar="NAME|FILE",
+        help="demand by name (default of our worlds: dense), or route files",
     )
     run.add_argument("--policy", default="idm", metavar="POLICY", help=arguments.POLICY)
-    run.add_argument("--svo", type=arguments.degrees, default=45.0, metavar="DEG", help="SVO angle, 0..90")
-    run.add_argument("--behavior", choices=BEHAVIORS, help="Table II class of the human drivers")
-    run.add_argument("--driver-model", choices=DRIVER_MODELS, default="lc2013")
+    run.add_argument(
+        "--svo", type=arguments.degrees, default=45.0, metavar="DEG", help="SVO angle, 0..90 (default 45)"
+    )
+    run.add_argument(
+        "--behavior",
+        choices=BEHAVIORS,
+        help="Table II class of the human drivers (default: mixed; contested: moderate; your files: as-is)",
+    )
+    run.add_argument("--driver-model", choices=DRIVER_MODELS, default="lc2013", help="default lc2013")
     run.add_argument("--preset", choices=Preset.ALL, help="who guards the AVs (default: the scenario's)")
     fleet = run.add_mutually_exclusive_group()
     fleet.add_argument("--av-type", metavar="T", help="AVs are the vehicles of this vType")
@@ -43,7 +53,9 @@ def add(verbs: arguments.Verbs) -> None:
     fleet.add_argument(
         "--penetration", type=arguments.share, metavar="P", help="this share of vehicles are AVs, 0..1"
     )
-    run.add_argument("--seed", type=arguments.seed, default=FIRST_TEST_SEED, metavar="N")
+    run.add_argument(
+        "--seed", type=arguments.seed, default=FIRST_TEST_SEED, metavar="N", help=f"default {FIRST_TEST_SEED}"
+    )
     run.add_argument(
         "--duration", type=arguments.positive, metavar="S", help="counted s (default: the scenario's)"
     )

@@ -41,8 +41,10 @@ def work(args: argparse.Namespace) -> int:
         return 0
     for row in rows:
         print(f"{row['name']:<14}{row['title']}")
+        default = row["default_demand"]
+        demands = ", ".join(f"{d} (default)" if d == default else d for d in row["demands"])
         print(
-            f"{'':<14}demand {', '.join(row['demands'])}; mission {row['mission']}; "
+            f"{'':<14}demand {demands}; mission {row['mission']}; "
             f"{row['duration_s']:g} s after {row['warmup_s']:g} s of warm-up; {row['preset']}"
         )
     return 0

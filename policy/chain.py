@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import torch
 
+from cosim.errors import in_range
 from cosim.raster import PIXEL_FLOOR, PIXEL_SPAN, PIXEL_SPEED, RoadRaster, draw_kinematics
 from cosim.types import Bools, Bytes, Floats, ObservationConfig
 from policy.forecast import KinematicForecast
@@ -27,6 +28,10 @@ class ChainConfig:
     horizon: int = 20  # frames of 0.2 s: 4 s (P, Table I)
     every: int = 5  # the VFN takes every fifth frame, M = 4; paper: 1, M = 20
     source: Literal["hpn", "gp_raster"] = "hpn"  # gp_raster: maps rendered from the forecast as it is
+
+    def __post_init__(self) -> None:
+        """Raises BadInput for a number out of range."""
+        in_range(self, positive="horizon every")
 
     @property
     def hypotheses(self) -> int:

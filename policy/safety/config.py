@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cosim.errors import in_range
 from cosim.types import MetaAction
 
 
@@ -44,6 +45,15 @@ class SafetyConfig:
         MetaAction.LANE_LEFT,
         MetaAction.LANE_RIGHT,
     )
+
+    def __post_init__(self) -> None:
+        """Raises BadInput for a number out of range."""
+        lengths = "margin_length margin_width reach reaction brake_after standstill_gap follower_reaction"
+        in_range(
+            self,
+            positive="cap horizon dt leader_brake follower_brake straddle lane_half same_way",
+            not_negative=f"safe_th critical_th decay {lengths} follower_gap lane_change_speed resume_below",
+        )
 
     @property
     def frames(self) -> int:

@@ -30,7 +30,7 @@ from policy.vfn import VFN
 EXAMPLES = Path(__file__).parents[2] / "examples"
 SEED = "200061"
 CODE = """
-from cosim.types import COMPACT, MetaAction, ObservationConfig
+from cosim.types import COMPACT, Decision, MetaAction, ObservationConfig
 
 class Holds:
     observation = ObservationConfig(maps=False)
@@ -56,6 +56,18 @@ class Blind(Holds):
 
 class Fails(Holds):
     def __init__(self): raise OSError("no model file")
+
+class Wrapped(Holds):
+    def answer(self, av): return Decision("left")
+
+class Filed(Holds):
+    files = ["nowhere.zip"]
+
+class Numbered(Holds):
+    av_parameters = {"lcSpeedGain": 3}
+
+class Leaves(Holds):
+    def answer(self, av): raise SystemExit(3)
 
 class Nothing: ...
 
@@ -139,6 +151,10 @@ def test_a_class_a_factory_and_a_function_of_ones_own_drive(code: Path, tmp_path
     [
         ("Raises", "code.py:12: decide: ZeroDivisionError"),
         ("Text", "decide='left': must decide for a Decision, a MetaAction (0 to 4) or None"),
+        ("Wrapped", "must decide for a Decision, a MetaAction (0 to 4) or None"),
+        ("Filed", "Filed.files='nowhere.zip': no such file"),
+        ("Numbered", "Numbered.av_parameters=('lcSpeedGain', 3): must map SUMO's parameters to text"),
+        ("Leaves", "decide: SystemExit: 3"),
         ("Strangers", "decide: decided for one that is no AV on the road: 'nobody'"),
         ("Lists", "decide='list': must return a mapping of AV to decision"),
         ("Blind", "Blind.observation: must be a cosim.types.ObservationConfig"),

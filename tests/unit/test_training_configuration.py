@@ -49,6 +49,10 @@ def test_a_file_changes_only_what_it_says_of_its_base(tmp_path: Path) -> None:
         ("base: other.yaml", "other.yaml: base='mine.yaml': is its own base"),
         ("base: broken.yaml", "broken.yaml: training.iteration=3: unknown field"),
         ("base: compact\ntraining: {replay: {yielding: 0.9}}", "yielding, correcting, interaction"),
+        ("training: {ddqn: {learning_rate: -1}}", "training.ddqn.learning_rate=-1.0: must be above 0"),
+        ("observation: {height: -3}", "observation.height=-3: must be above 0"),
+        ("safety: {brake_after: -3}", "safety.brake_after=-3.0: must be 0 or more"),
+        ("svo: 1\nsvo: 2", "mine.yaml: line=2: not YAML: 'svo' is twice in this mapping"),
         ("base: compact\ntraining: 3", "mine.yaml: training=3: a mapping is needed"),
     ],
 )

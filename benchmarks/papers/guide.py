@@ -10,8 +10,8 @@ import numpy as np
 
 from benchmarks.papers.driving import AgentRunner
 from cosim.evaluation.case import Case
-from cosim.evaluation.replay.recorder import Recording, Track
 from cosim.evaluation.replay.strip import Strip, poses_at
+from cosim.evaluation.replay.watcher import Track, Watched
 from cosim.evaluation.tasks import Progress
 from cosim.road import Lane
 from cosim.types import Floats, Kind
@@ -54,13 +54,13 @@ class GuideWatcher(AgentRunner):
         self, case: Case, warnings: tuple[str, ...], outputs: str | None, progress: Progress
     ) -> dict[str, Any]:
         """`seed`, `trace_hash`, `crashed`; `guided`: the fields of `Guided`; `pictures`: PNG files."""
-        result, recording = self.open(case, warnings).record(case.seed, progress)
-        found = guided(recording)
+        result, watched = self.open(case, warnings).watch(case.seed, progress)
+        found = guided(watched)
         facts = {"seed": case.seed, "trace_hash": result.trace_hash, "crashed": result.value("crashed")}
-        return {**facts, "guided": asdict(found), "pictures": _pictures(recording, found)}
+        return {**facts, "guided": asdict(found), "pictures": _pictures(watched, found)}
 
 
-def guided(r: Recording) -> Guided:
+def guided(r: Watched) -> Guided:
     """Who made room, and how."""
     mission = next((t for t in r.tracks if t.mission), None)
     at = None if mission is None else _merge(r, mission)
@@ -86,7 +86,7 @@ def guided(r: Recording) -> Guided:
     )
 
 
-def _merge(r: Recording, mission: Track) -> int | None:
+def _merge(r: Watched, mission: Track) -> int | None:
     """The frame in which the merging vehicle is first on a lane that it changed to; None if it never is."""
     lanes = r.road.lanes
     for k in range(1, len(mission.lane)):
@@ -146,14 +146,14 @@ class _Frame:
 
 
 def _speeds(t: Track, frames: int) -> tuple[float | None, ...]:
-    """Its speed in every frame of the recording."""
+    """Its speed in every frame that was watched."""
     found: list[float | None] = [None] * frames
     for k, speed in enumerate(t.speed.tolist()):
         found[t.first + k] = round(speed, 3)
     return tuple(found)
 
 
-def _pictures(r: Recording, found: Guided) -> list[bytes]:
+def _pictures(r: Watched, found: Guided) -> list[bytes]:
     """The road around the merging vehicle at SHOWN; [] where there is no guide."""
     if not found.guide or found.merged is None:
         return []

@@ -17,7 +17,7 @@ from cosim.app.runner import Runner
 from cosim.errors import BadInput, CosimError, hint
 from cosim.evaluation import run_folder
 from cosim.evaluation.case import Case
-from cosim.evaluation.replay.recorder import Recording
+from cosim.evaluation.replay.watcher import Watched
 from cosim.evaluation.tasks import OK
 from cosim.files import whole
 from cosim.manifest import POLICY_FILES, manifest, named
@@ -127,7 +127,7 @@ def check_inputs(recorded: Recorded) -> tuple[Scenario, list[str]]:
     return scenario, warnings
 
 
-def drive(recorded: Recorded, scenario: Scenario, *, check: bool = True) -> tuple[EpisodeResult, Recording]:
+def drive(recorded: Recorded, scenario: Scenario, *, check: bool = True) -> tuple[EpisodeResult, Watched]:
     """Drive it again, watched.
 
     Raises (only with `check`):
@@ -140,14 +140,14 @@ def drive(recorded: Recorded, scenario: Scenario, *, check: bool = True) -> tupl
         with worker:
             if check:
                 _same_policy(recorded.manifest.get(POLICY_FILES, {}), worker.call("policy_files"))
-            result, recording = worker.call("record", case.seed, progress=progress)
+            result, watched = worker.call("watch", case.seed, progress=progress)
     if check and result.trace_hash != recorded.trace_hash:
         raise ReplayDiffers(
             f"the replay is not the recorded episode: trace hash {result.trace_hash[:16]}... after "
             f"{result.steps} decisions, recorded was {recorded.trace_hash[:16]}... (--no-check draws it all "
             "the same)"
         )
-    return result, recording
+    return result, watched
 
 
 def beside(recorded: Recorded, policy: str) -> Recorded:
@@ -167,32 +167,32 @@ def beside(recorded: Recorded, policy: str) -> Recorded:
 
 
 def draw(
-    recordings: Sequence[Recording],
+    episodes: Sequence[Watched],
     html: Path | None = None,
     mp4: Path | None = None,
     gif: Path | None = None,
     follow: str | None = None,
 ) -> None:
-    """Write the page of the first recording, the film and the GIF of all, each whole or not at all.
+    """Write the page of the first one, the film and the GIF of all, each whole or not at all.
 
     Raises:
         BadInput: `follow` is no vehicle of the episodes; a file cannot be written.
     """
-    names = list(dict.fromkeys(track.id for r in recordings for track in r.tracks))
+    names = list(dict.fromkeys(track.id for r in episodes for track in r.tracks))
     if follow is not None and follow not in names:
         raise BadInput(f"no such vehicle{hint(follow, names)}", field="--follow", value=follow)
     if html is not None:
         from cosim.evaluation.replay.page import page
 
         with _writing(html) as draft:
-            draft.write_text(page(recordings[0]), "utf-8")
+            draft.write_text(page(episodes[0]), "utf-8")
     if mp4 is not None or gif is not None:
         from cosim.evaluation.replay import video
 
         for path, make in ((mp4, video.film), (gif, video.animation)):
             if path is not None:
                 with _progress(path.name, "pictures") as progress, _writing(path) as draft:
-                    make(recordings, draft, follow=follow, progress=progress)
+                    make(episodes, draft, follow=follow, progress=progress)
 
 
 def warn(lines: Sequence[str]) -> None:

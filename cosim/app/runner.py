@@ -10,7 +10,7 @@ from cosim.app.output import document
 from cosim.app.policies import make
 from cosim.determinism import make_torch_deterministic
 from cosim.episode import Episode, run_episode
-from cosim.evaluation.replay.recorder import Recorder, Recording
+from cosim.evaluation.replay.watcher import Watched, Watcher
 from cosim.manifest import POLICY_FILES, digests
 from cosim.scenario import Scenario
 from cosim.sumo_outputs import drafts
@@ -57,19 +57,19 @@ class Runner:
         """One whole episode; SUMO's own `outputs` (`cosim.sumo_outputs`) go whole into `folder`."""
         return self._drive(self._episode, self._policy, seed, progress, outputs, folder)
 
-    def record(
+    def watch(
         self,
         seed: int,
         progress: Callable[[float, float], None] | None = None,
         *,
         outputs: Sequence[str] = (),
         folder: Path | None = None,
-    ) -> tuple[EpisodeResult, Recording]:
+    ) -> tuple[EpisodeResult, Watched]:
         """`run`, watched: the same result, and what a replay draws."""
-        recorder = Recorder(self._simulator, self._policy)
-        episode = Episode(self._episode.scenario, recorder.simulator, self._episode.observation)
-        result = self._drive(episode, recorder.policy, seed, progress, outputs, folder)
-        return result, recorder.recording(document(result))
+        watcher = Watcher(self._simulator, self._policy)
+        episode = Episode(self._episode.scenario, watcher.simulator, self._episode.observation)
+        result = self._drive(episode, watcher.policy, seed, progress, outputs, folder)
+        return result, watcher.watched(document(result))
 
     def _drive(
         self,

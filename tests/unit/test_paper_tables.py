@@ -14,7 +14,7 @@ from benchmarks.papers.driving import Settings
 from benchmarks.papers.guide import NONE, OTHER, OVERTAKES, SLOWS, YIELDS, guided
 from benchmarks.tables import Line, write_csv
 from cosim.app.bench_predict import EIGHT
-from cosim.evaluation.replay.recorder import Recording, Track
+from cosim.evaluation.replay.watcher import Track, Watched
 from cosim.evaluation.run_folder import Run
 from cosim.road import Lane, RoadMap
 from cosim.types import Floats, Kind
@@ -116,7 +116,7 @@ def track(
     return Track(name, kind, mission, "", 5.0, 2.0, 0, x, y, still, speed, still, lane)
 
 
-def drive(*others: Track) -> Recording:
+def drive(*others: Track) -> Watched:
     """The merging vehicle (20 m/s) is in the first main lane from frame MERGE on; `others` are beside it."""
     lanes = tuple(
         Lane(f"acc_{k}", "acc", k, np.array([[0.0, y], [2000.0, y]]), 2000.0, 3.2, 30.0)
@@ -127,7 +127,7 @@ def drive(*others: Track) -> Recording:
                     np.full(FRAMES, 20.0), Kind.HV, mission=True)  # fmt: skip
     facts: dict[str, Any] = {}
     tracks = (merging, *others)
-    return Recording(facts, RoadMap(lanes), 0.0, INTERVAL, times, tracks, times, (), (), ())
+    return Watched(facts, RoadMap(lanes), 0.0, INTERVAL, times, tracks, times, (), (), ())
 
 
 def lateral(*changes: tuple[int, float], start: float = LANES[1]) -> Floats:
@@ -175,6 +175,6 @@ def test_the_guide_is_the_nearest_and_an_episode_without_a_merge_has_none() -> N
     assert (found.guide, found.mission) == ("near", "mission")
     assert found.guide_speed[MERGE] == pytest.approx(18.0)
     assert found.times[MERGE] == 0.0
-    recording = drive(near)
-    alone = [t for t in recording.tracks if not t.mission]
-    assert guide.guided(Recording(**{**vars(recording), "tracks": tuple(alone)})).merged is None
+    watched = drive(near)
+    alone = [t for t in watched.tracks if not t.mission]
+    assert guide.guided(Watched(**{**vars(watched), "tracks": tuple(alone)})).merged is None

@@ -19,11 +19,11 @@ from PIL import Image
 
 from cosim.app.output import document as facts
 from cosim.episode import Episode, run_episode
-from cosim.evaluation.replay import packing, recorder
+from cosim.evaluation.replay import packing, watcher
 from cosim.evaluation.replay.page import page
-from cosim.evaluation.replay.recorder import Recorder, Recording
 from cosim.evaluation.replay.strip import Strip, poses_at
 from cosim.evaluation.replay.video import CAPTION, HEIGHT, LOW, SMALL, WIDTH, animation, film
+from cosim.evaluation.replay.watcher import Watched, Watcher
 from cosim.types import Decision, Forecast, History, MetaAction, ObservationConfig, PolicyContext
 from policy.agents.keep_lane import KeepLane
 from tests.contracts.fake_worlds import platoon, scenario, wall
@@ -73,17 +73,17 @@ class Explains:
         return dict.fromkeys(histories, why)
 
 
-def watched(world: Any = platoon, seconds: float = 4.0, policy: Any = None) -> tuple[Recording, str]:
+def driven(world: Any = platoon, seconds: float = 4.0, policy: Any = None) -> tuple[Watched, str]:
     """An episode on the fake simulator, and its trace hash."""
-    watch = Recorder(world(), policy or Explains())
+    watch = Watcher(world(), policy or Explains())
     episode = Episode(scenario(seconds), watch.simulator, watch.policy.observation)
     result = run_episode(episode, watch.policy, 200_000, svo=0.5)
-    return watch.recording(facts(result)), result.trace_hash
+    return watch.watched(facts(result)), result.trace_hash
 
 
 @pytest.fixture(scope="module")
-def recording() -> Recording:
-    return watched()[0]
+def watched() -> Watched:
+    return driven()[0]
 
 
 def unpacked(text: str) -> dict[str, Any]:
@@ -106,47 +106,47 @@ def test_an_episode_that_is_watched_is_the_same_episode() -> None:
     policy, world = Explains(), platoon()
     episode = Episode(scenario(), world, policy.observation)
     alone = run_episode(episode, policy, 200_000, svo=0.5)
-    assert watched()[1] == alone.trace_hash
+    assert driven()[1] == alone.trace_hash
 
 
-def test_every_vehicle_is_followed_through_every_frame(recording: Recording) -> None:
-    assert recording.times == pytest.approx(0.2 * np.arange(21))
-    assert sorted(t.id for t in recording.tracks) == ["a", "b", "c", "human"]
-    for track in recording.tracks:
+def test_every_vehicle_is_followed_through_every_frame(watched: Watched) -> None:
+    assert watched.times == pytest.approx(0.2 * np.arange(21))
+    assert sorted(t.id for t in watched.tracks) == ["a", "b", "c", "human"]
+    for track in watched.tracks:
         assert (track.first, len(track.x)) == (0, 21)
         driven = np.diff(track.x)
         assert driven == pytest.approx(0.2 * (track.speed[1:] + track.speed[:-1]) / 2, abs=0.25)
 
 
-def test_what_was_decided_predicted_and_refused_is_kept(recording: Recording) -> None:
-    assert recording.decided == pytest.approx(0.4 * np.arange(10))
-    assert set(recording.choices[0]) == {"a", "b", "c"}
-    blocked = [choices["a"].blocked for choices in recording.choices]
+def test_what_was_decided_predicted_and_refused_is_kept(watched: Watched) -> None:
+    assert watched.decided == pytest.approx(0.4 * np.arange(10))
+    assert set(watched.choices[0]) == {"a", "b", "c"}
+    blocked = [choices["a"].blocked for choices in watched.choices]
     assert blocked[0] is None  # the first change begins ...
     assert blocked[1] == "a lane change is under way"
     assert blocked[-1] == "no lane on that side"  # ... and there are two lanes only
-    forecast = recording.forecasts[3]
+    forecast = watched.forecasts[3]
     assert forecast is not None
     assert forecast.ids == ("a", "b", "c")
 
 
-def test_the_page_holds_the_positions_to_half_a_centimetre(recording: Recording) -> None:
-    data = unpacked(page(recording))
+def test_the_page_holds_the_positions_to_half_a_centimetre(watched: Watched) -> None:
+    data = unpacked(page(watched))
     names = [v[0] for v in data["vehicles"]]
     for packed in data["tracks"]:
-        track = next(t for t in recording.tracks if t.id == names[packed[0]])
+        track = next(t for t in watched.tracks if t.id == names[packed[0]])
         assert packed[1] == track.first
         assert restored(packed[2], 0.01, 2) == pytest.approx(track.x, abs=0.006)
         assert restored(packed[3], 0.01, 2) == pytest.approx(track.y, abs=0.006)
         assert restored(packed[5], 0.01) == pytest.approx(track.speed, abs=0.006)
     path = next(p for p in data["forecasts"][0] if names[p[0]] == "a")
-    assert recording.forecasts[0] is not None
-    assert restored(path[1], 0.1) == pytest.approx(recording.forecasts[0].x[0, 1::2], abs=0.051)
+    assert watched.forecasts[0] is not None
+    assert restored(path[1], 0.1) == pytest.approx(watched.forecasts[0].x[0, 1::2], abs=0.051)
     assert restored(path[3], 0.1) == pytest.approx(0.3 * np.arange(1, 10, 2), abs=0.051)
 
 
-def test_the_page_holds_values_vetoes_blame_and_refusals(recording: Recording) -> None:
-    data = unpacked(page(recording))
+def test_the_page_holds_values_vetoes_blame_and_refusals(watched: Watched) -> None:
+    data = unpacked(page(watched))
     names, words = [v[0] for v in data["vehicles"]], data["words"]
     vehicle, action, _, flags, blamed, blocked, q, score, ttc, unsafe = data["choices"][-1][0]
     assert names[vehicle] == "a"
@@ -160,15 +160,15 @@ def test_the_page_holds_values_vetoes_blame_and_refusals(recording: Recording) -
     assert unsafe == [1, 0, 0, 1, 0]
 
 
-def test_the_page_needs_no_network_and_names_no_other_file(recording: Recording) -> None:
-    text = page(recording)
+def test_the_page_needs_no_network_and_names_no_other_file(watched: Watched) -> None:
+    text = page(watched)
     assert "default-src 'none'" in text
     assert not re.search(r"https?://|\bsrc=|<link|@import|\bimport\(|fetch\(", text)
     assert len(text) < 100_000
 
 
 def test_names_from_outside_cannot_break_the_page() -> None:
-    found, _ = watched()
+    found, _ = driven()
     evil = "</script><img onerror=alert(1)>"
     found = replace(found, facts={**found.facts, "scenario": evil})
     text = page(found)
@@ -177,7 +177,7 @@ def test_names_from_outside_cannot_break_the_page() -> None:
 
 
 def test_a_collision_is_marked_where_it_happened() -> None:
-    found, _ = watched(wall, 6.0, KeepLane())
+    found, _ = driven(wall, 6.0, KeepLane())
     data = unpacked(page(found))
     assert [(c["collider"], c["victim"]) for c in data["collisions"]] == [("a", "standing")]
     crash = data["collisions"][0]
@@ -186,8 +186,8 @@ def test_a_collision_is_marked_where_it_happened() -> None:
 
 
 def test_a_long_recording_keeps_every_other_frame_and_stays_small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recorder, "MOST", 40)  # vehicle frames, of 84
-    found, _ = watched()
+    monkeypatch.setattr(watcher, "MOST", 40)  # vehicle frames, of 84
+    found, _ = driven()
     assert sum(len(t.x) for t in found.tracks) <= 40 + 4
     assert found.interval == pytest.approx(0.8)
     assert len(found.choices) == 10  # decisions are all kept
@@ -197,7 +197,7 @@ def test_a_long_recording_keeps_every_other_frame_and_stays_small(monkeypatch: p
 
 
 def test_a_vehicle_that_was_away_has_two_tracks() -> None:
-    watch = Recorder(platoon(), Explains())
+    watch = Watcher(platoon(), Explains())
     (first,) = watch.simulator.reset(0)
     gone = replace(
         first,
@@ -206,20 +206,20 @@ def test_a_vehicle_that_was_away_has_two_tracks() -> None:
     )
     watch.see(replace(gone, time=0.2))
     watch.see(replace(first, time=0.4))
-    tracks = [t for t in watch.recording({}).tracks if t.id == first.ids[0]]
+    tracks = [t for t in watch.watched({}).tracks if t.id == first.ids[0]]
     assert [(t.first, len(t.x)) for t in tracks] == [(0, 1), (2, 1)]
-    assert first.ids[0] not in {p.track.id for p in poses_at(watch.recording({}), 0.2)}
+    assert first.ids[0] not in {p.track.id for p in poses_at(watch.watched({}), 0.2)}
 
 
-def test_between_two_frames_a_vehicle_is_between_two_places(recording: Recording) -> None:
-    a, b = (next(p for p in poses_at(recording, t) if p.track.id == "human") for t in (1.0, 1.2))
-    middle = next(p for p in poses_at(recording, 1.1) if p.track.id == "human")
+def test_between_two_frames_a_vehicle_is_between_two_places(watched: Watched) -> None:
+    a, b = (next(p for p in poses_at(watched, t) if p.track.id == "human") for t in (1.0, 1.2))
+    middle = next(p for p in poses_at(watched, 1.1) if p.track.id == "human")
     assert middle.x == pytest.approx((a.x + b.x) / 2)
     assert a.x < middle.x < b.x
 
 
-def test_a_vehicle_is_drawn_where_it_is(recording: Recording) -> None:
-    pose = next(p for p in poses_at(recording, 0.0) if p.track.id == "human")
+def test_a_vehicle_is_drawn_where_it_is(watched: Watched) -> None:
+    pose = next(p for p in poses_at(watched, 0.0) if p.track.id == "human")
     strip = Strip(pose.x, pose.y, 640, 200)
     empty = np.asarray(strip.finished()).copy()
     strip.vehicle(pose)
@@ -230,9 +230,9 @@ def test_a_vehicle_is_drawn_where_it_is(recording: Recording) -> None:
     assert columns.max() - columns.min() == pytest.approx(5.0 * 640 / 200, abs=3)  # 5 m at 200 m a picture
 
 
-def test_the_film_has_ten_pictures_a_second_that_move(recording: Recording, tmp_path: Path) -> None:
+def test_the_film_has_ten_pictures_a_second_that_move(watched: Watched, tmp_path: Path) -> None:
     path = tmp_path / "film.mp4"
-    film([recording], path, follow="human")
+    film([watched], path, follow="human")
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         assert stream.codec_context.name == "h264"
@@ -244,10 +244,10 @@ def test_the_film_has_ten_pictures_a_second_that_move(recording: Recording, tmp_
 
 
 def test_two_episodes_are_filmed_one_above_the_other_and_the_shorter_one_waits(
-    recording: Recording, tmp_path: Path
+    watched: Watched, tmp_path: Path
 ) -> None:
-    half = replace(recording, times=recording.times[: len(recording.times) // 2])
-    film([recording, half], tmp_path / "film.mp4")
+    half = replace(watched, times=watched.times[: len(watched.times) // 2])
+    film([watched, half], tmp_path / "film.mp4")
     with av.open(str(tmp_path / "film.mp4")) as container:
         pictures = [f.to_ndarray(format="rgb24") for f in container.decode(container.streams.video[0])]
     assert len(pictures) == 41
@@ -257,9 +257,9 @@ def test_two_episodes_are_filmed_one_above_the_other_and_the_shorter_one_waits(
     assert not moved[HEIGHT:].any()
 
 
-def test_the_gif_is_small_moves_and_runs_twice_as_fast(recording: Recording, tmp_path: Path) -> None:
+def test_the_gif_is_small_moves_and_runs_twice_as_fast(watched: Watched, tmp_path: Path) -> None:
     path = tmp_path / "small.gif"
-    animation([recording, recording], path)
+    animation([watched, watched], path)
     with Image.open(path) as gif:
         assert gif.size == (SMALL, 2 * (LOW + CAPTION))
         assert gif.n_frames == 11  # of 4 s
@@ -272,21 +272,21 @@ def test_the_gif_is_small_moves_and_runs_twice_as_fast(recording: Recording, tmp
     assert [p.name for p in tmp_path.iterdir()] == ["small.gif"]
 
 
-def test_a_film_that_fails_leaves_nothing_behind(recording: Recording, tmp_path: Path) -> None:
+def test_a_film_that_fails_leaves_nothing_behind(watched: Watched, tmp_path: Path) -> None:
     def stop(*_: float) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        film([recording], tmp_path / "film.mp4", progress=stop)
+        film([watched], tmp_path / "film.mp4", progress=stop)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_an_empty_world_can_be_drawn() -> None:
-    watch = Recorder(platoon(), Explains())
+    watch = Watcher(platoon(), Explains())
     (first,) = watch.simulator.reset(0)
     nobody = {name: getattr(first, name)[:0] for name in COLUMNS}
     empty = replace(first, ids=(), **nobody)
     watch.start(empty)
-    data = packing.document(watch.recording({}))
+    data = packing.document(watch.watched({}))
     assert data["tracks"] == []
     assert math.isclose(data["begin"], 0.0)

@@ -98,9 +98,9 @@ def work(args: argparse.Namespace) -> int:
     progress.starting()
     try:
         with Worker(Runner, scenario, case.policy, math.radians(case.svo_deg), name="cosim-run") as worker:
-            verb = "record" if args.replay else "run"
+            verb = "watch" if args.replay else "run"
             answer = worker.call(verb, case.seed, progress=progress, outputs=case.outputs, folder=files)
-            result, recording = answer if args.replay else (answer, None)
+            result, watched = answer if args.replay else (answer, None)
     except BaseException:
         if new and folder is not None:
             shutil.rmtree(folder, ignore_errors=True)
@@ -113,8 +113,8 @@ def work(args: argparse.Namespace) -> int:
     if folder is not None:
         output.clear_folder(folder, case.outputs)
         output.write_folder(folder, result)
-        if recording is not None:
-            draw([recording], folder / "replay.html", folder / "replay.mp4")
+        if watched is not None:
+            draw([watched], folder / "replay.html", folder / "replay.mp4")
     if args.json:
         print(json.dumps(output.document(result)))
     else:

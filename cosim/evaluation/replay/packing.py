@@ -1,4 +1,4 @@
-"""A recording as a small JSON document: whole numbers, differences of differences, then gzip and base64.
+"""A watched episode as small JSON: whole numbers, differences of differences, then gzip and base64.
 
 A track's positions are centimetres; their second difference is an acceleration of a few units, which gzip
 packs to about a byte. `assets/data.js` is the way back.
@@ -15,22 +15,22 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cosim.evaluation.replay.recorder import Choice, Recording, Track
+from cosim.evaluation.replay.watcher import Choice, Track, Watched
 from cosim.types import Floats, Forecast
 
 MARGIN = 500.0  # m around the traffic: roads further away are left out
 FORECAST_EVERY = 2  # every second predicted frame is drawn
 
 
-def packed(recording: Recording) -> str:
+def packed(watched: Watched) -> str:
     """`document` as base64 of gzip of JSON."""
-    text = json.dumps(document(recording), separators=(",", ":"), allow_nan=False)
+    text = json.dumps(document(watched), separators=(",", ":"), allow_nan=False)
     return base64.b64encode(gzip.compress(text.encode(), 9, mtime=0)).decode()
 
 
-def document(recording: Recording) -> dict[str, Any]:
-    """The recording in plain JSON values; lengths in cm, times in ms, headings in mrad (see each line)."""
-    r = recording
+def document(watched: Watched) -> dict[str, Any]:
+    """The watched episode as plain JSON; lengths in cm, times in ms, headings in mrad (see each line)."""
+    r = watched
     number = {name: k for k, name in enumerate(dict.fromkeys(t.id for t in r.tracks))}
     words = _Words()
     window = _window(r)
@@ -64,7 +64,7 @@ def document(recording: Recording) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _facts(r: Recording) -> dict[str, Any]:
+def _facts(r: Watched) -> dict[str, Any]:
     """What stands at the head of the page and in its table of figures."""
     units = r.facts.get("units", {})
     names = (
@@ -78,7 +78,7 @@ def _facts(r: Recording) -> dict[str, Any]:
     }
 
 
-def _vehicles(r: Recording, number: dict[str, int]) -> list[list[Any]]:
+def _vehicles(r: Watched, number: dict[str, int]) -> list[list[Any]]:
     """[id, is AV, is mission, class, length cm, width cm] by number."""
     found: dict[str, list[Any]] = {}
     for t in r.tracks:
@@ -133,12 +133,12 @@ def _forecast(f: Forecast | None, number: dict[str, int]) -> list[Any] | None:
     ]
 
 
-def _forecast_interval(r: Recording) -> float | None:
+def _forecast_interval(r: Watched) -> float | None:
     first = next((f for f in r.forecasts if f is not None), None)
     return None if first is None else first.interval * FORECAST_EVERY
 
 
-def _window(r: Recording) -> tuple[Floats, Floats]:
+def _window(r: Watched) -> tuple[Floats, Floats]:
     """The traffic's bounding box with a margin: lower left and upper right corner, [2] m each."""
     if not r.tracks:
         return np.full(2, -np.inf), np.full(2, np.inf)
@@ -152,7 +152,7 @@ def _meets(shape: Floats, window: tuple[Floats, Floats]) -> bool:
     return bool((shape.max(0) >= window[0]).all() and (shape.min(0) <= window[1]).all())
 
 
-def _lane(r: Recording, k: int) -> list[Any]:
+def _lane(r: Watched, k: int) -> list[Any]:
     """[id, width cm, is internal, centre line]"""
     lane = r.road.lanes[k]
     return [lane.id, round(lane.width * 100), int(lane.internal), _line(lane.shape)]

@@ -7,20 +7,20 @@ from importlib import resources
 from string import Template
 
 from cosim.evaluation.replay.packing import packed
-from cosim.evaluation.replay.recorder import Recording
+from cosim.evaluation.replay.watcher import Watched
 
 SCRIPTS = ("data.js", "view.js", "draw.js", "panel.js", "main.js")
 
 
-def page(recording: Recording) -> str:
+def page(watched: Watched) -> str:
     """The whole page as text."""
     assets = resources.files(__package__).joinpath("assets")
-    facts = recording.facts
+    facts = watched.facts
     title = " / ".join(str(facts.get(name, "")) for name in ("scenario", "demand", "policy"))
     scripts = [assets.joinpath(name).read_text("utf-8") for name in SCRIPTS]
     return Template(assets.joinpath("page.html").read_text("utf-8")).substitute(
         title=html.escape(f"{title}, seed {facts.get('seed', '')}"),
         style=assets.joinpath("style.css").read_text("utf-8"),
         script="\n".join(scripts),
-        data=packed(recording),
+        data=packed(watched),
     )

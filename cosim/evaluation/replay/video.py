@@ -14,8 +14,8 @@ import av
 import numpy as np
 from PIL import Image, ImageDraw
 
-from cosim.evaluation.replay.recorder import Choice, Recording
 from cosim.evaluation.replay.strip import AV, BAD, TEXT, WARN, Colour, Pose, Strip, colour_of, font, poses_at
+from cosim.evaluation.replay.watcher import Choice, Watched
 from cosim.files import whole
 from cosim.types import Kind, MetaAction
 
@@ -37,7 +37,7 @@ ACTIONS = {
 
 
 def film(
-    recordings: Sequence[Recording],
+    episodes: Sequence[Watched],
     path: Path,
     *,
     follow: str | None = None,
@@ -47,12 +47,12 @@ def film(
 
     The file appears whole or not at all. Raises OSError when it cannot be written.
     """
-    reel = _Reel(recordings, follow, picture_at)
+    reel = _Reel(episodes, follow, picture_at)
     count = max(round(reel.seconds * RATE) + 1, 1)
     fast = {"movflags": "faststart"}
     with whole(path) as draft, av.open(str(draft), "w", format="mp4", options=fast) as container:
         stream = container.add_stream("libx264", rate=RATE)
-        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT * len(recordings), "yuv420p"
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT * len(episodes), "yuv420p"
         stream.options = {"crf": "23", "preset": "veryfast"}
         for k in range(count):
             frame = av.VideoFrame.from_ndarray(np.asarray(reel.picture(k / RATE)), format="rgb24")
@@ -65,7 +65,7 @@ def film(
 
 
 def animation(
-    recordings: Sequence[Recording],
+    episodes: Sequence[Watched],
     path: Path,
     *,
     follow: str | None = None,
@@ -75,7 +75,7 @@ def animation(
 
     `follow`, the file and errors as in `film`.
     """
-    reel = _Reel(recordings, follow, caption_at)
+    reel = _Reel(episodes, follow, caption_at)
     count = max(round(reel.seconds / STEP) + 1, 1)
     pictures = []
     for k in range(count):
@@ -90,17 +90,17 @@ def animation(
 
 
 class _Reel:
-    """Pictures of all recordings, one above the other."""
+    """Pictures of all episodes, one above the other."""
 
     def __init__(
         self,
-        recordings: Sequence[Recording],
+        episodes: Sequence[Watched],
         follow: str | None,
-        draw: Callable[[Recording, float, _Camera], Image.Image],
+        draw: Callable[[Watched, float, _Camera], Image.Image],
     ) -> None:
-        self._shots = [(r, _Camera(r, follow)) for r in recordings]
+        self._shots = [(r, _Camera(r, follow)) for r in episodes]
         self._draw = draw
-        self.seconds = max(float(r.times[-1] - r.times[0]) for r in recordings)
+        self.seconds = max(float(r.times[-1] - r.times[0]) for r in episodes)
 
     def picture(self, since: float) -> Image.Image:
         """At `since` s after the beginning of each; who ended earlier stands still."""
@@ -121,8 +121,8 @@ class _Reel:
 class _Camera:
     """Whom the film follows, and where it looks while that vehicle is not on the road."""
 
-    def __init__(self, recording: Recording, follow: str | None) -> None:
-        tracks = recording.tracks
+    def __init__(self, watched: Watched, follow: str | None) -> None:
+        tracks = watched.tracks
         wanted = [t for t in tracks if t.id == follow] if follow is not None else []
         wanted = wanted or [t for t in tracks if t.mission] or [t for t in tracks if t.kind == Kind.AV]
         self.follow = next(iter(wanted or tracks), None)
@@ -142,7 +142,7 @@ class _Camera:
         return min(avs, key=lambda p: math.hypot(p.x - self.x, p.y - self.y), default=None)
 
 
-def picture_at(r: Recording, time: float, camera: _Camera) -> Image.Image:
+def picture_at(r: Watched, time: float, camera: _Camera) -> Image.Image:
     """One picture of the film, WIDTH x HEIGHT."""
     poses = poses_at(r, time)
     shown = camera.look(poses)
@@ -166,7 +166,7 @@ def picture_at(r: Recording, time: float, camera: _Camera) -> Image.Image:
     return board.picture
 
 
-def caption_at(r: Recording, time: float, camera: _Camera) -> Image.Image:
+def caption_at(r: Watched, time: float, camera: _Camera) -> Image.Image:
     """One picture of the GIF, SMALL x (LOW + CAPTION)."""
     poses = poses_at(r, time)
     camera.look(poses)
@@ -181,7 +181,7 @@ def caption_at(r: Recording, time: float, camera: _Camera) -> Image.Image:
     return board.picture
 
 
-def _crashes(strip: Strip, r: Recording, time: float) -> None:
+def _crashes(strip: Strip, r: Watched, time: float) -> None:
     """Marks the collisions of the last seconds."""
     for crash in r.collisions:
         if math.isfinite(crash.x) and 0.0 <= time - crash.time + 0.05 < SHOWN_CRASH:
@@ -197,7 +197,7 @@ class _Board:
         self._line_top = strip.height
         self._pen = ImageDraw.Draw(self.picture)
 
-    def legend(self, r: Recording) -> None:
+    def legend(self, r: Watched) -> None:
         """Which colour is who, at the top."""
         kinds = {
             "mission vehicle"
@@ -214,7 +214,7 @@ class _Board:
             self._line(x + 23, 8, name, TEXT, 12)
             x += 40 + self._pen.textlength(name, font(12))
 
-    def caption(self, r: Recording, time: float) -> None:
+    def caption(self, r: Watched, time: float) -> None:
         """One line: who drives, what has come of it, when."""
         top = self._line_top + 4
         policy = str(r.facts.get("policy"))
@@ -226,7 +226,7 @@ class _Board:
 
     def panel(
         self,
-        r: Recording,
+        r: Watched,
         time: float,
         camera: _Camera,
         here: Mapping[str, Pose],
@@ -290,7 +290,7 @@ class _Board:
         self._pen.text((x, y), text, fill=colour, font=font(size, bold))
 
 
-def _outcome(r: Recording, time: float) -> tuple[str, Colour]:
+def _outcome(r: Watched, time: float) -> tuple[str, Colour]:
     """What has happened so far, in a few words."""
     crashes = [c for c in r.collisions if c.time <= time + 0.05]
     if crashes:

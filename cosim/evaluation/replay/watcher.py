@@ -1,6 +1,6 @@
 """Watches one episode from outside the loop: every vehicle's track, every decision and what became of it.
 
-The recorder stands around the simulator and around the policy, passes everything through unchanged and
+The watcher stands around the simulator and around the policy, passes everything through unchanged and
 notes what it sees; the episode, and so its trace hash, is the same with it and without it.
 """
 
@@ -36,7 +36,7 @@ MOST = 400_000  # vehicle frames kept: about 2 MB of page; beyond, every second 
 
 @dataclass(frozen=True)
 class Track:
-    """One vehicle's drive without a gap, k frames from frame `first` of the recording on."""
+    """One vehicle's drive without a gap, k frames from frame `first` on."""
 
     id: str
     kind: Kind
@@ -63,7 +63,7 @@ class Choice:
 
 
 @dataclass(frozen=True)
-class Recording:
+class Watched:
     """One episode as it was watched; times in s of simulation time."""
 
     facts: Mapping[str, Any]  # `cosim run --json`, filled in by whoever drew the result up
@@ -99,8 +99,8 @@ class _Seen:
 
 
 @dataclass
-class Recorder:
-    """Hand `simulator` and `policy` to an episode in place of those given here, then take `recording()`."""
+class Watcher:
+    """Hand `simulator` and `policy` to an episode in place of those given here, then take `watched()`."""
 
     inner_simulator: Simulator
     inner_policy: Policy
@@ -127,12 +127,12 @@ class Recorder:
         """The policy as it is, watched."""
         return _WatchedPolicy(self)
 
-    def recording(self, facts: Mapping[str, Any]) -> Recording:
+    def watched(self, facts: Mapping[str, Any]) -> Watched:
         """Everything seen since the last reset; `facts` go beside it."""
         # only SUMO's simulator knows them
         classes: dict[str, str] = getattr(self.inner_simulator, "driver_classes", dict)()
         times = np.array([f.time for f in self.frames])
-        return Recording(
+        return Watched(
             facts=facts,
             road=self.inner_simulator.road,
             begin=self.frames[0].time,
@@ -223,20 +223,20 @@ class Recorder:
 class _WatchedSimulator:
     """`cosim.types.Simulator`: the inner one, with a witness."""
 
-    def __init__(self, recorder: Recorder) -> None:
-        self._recorder, self._inner = recorder, recorder.inner_simulator
+    def __init__(self, watcher: Watcher) -> None:
+        self._watcher, self._inner = watcher, watcher.inner_simulator
         self.road, self.goal_lanes = self._inner.road, self._inner.goal_lanes
 
     def reset(self, seed: int) -> tuple[Snapshot, ...]:
         frames = self._inner.reset(seed)
-        self._recorder.start(frames[-1])
+        self._watcher.start(frames[-1])
         return frames
 
     def advance(self, commands: Sequence[Command]) -> tuple[tuple[Receipt, ...], tuple[Snapshot, ...]]:
         receipts, frames = self._inner.advance(commands)
-        self._recorder.learn(commands, receipts)
+        self._watcher.learn(commands, receipts)
         for frame in frames:
-            self._recorder.see(frame)
+            self._watcher.see(frame)
         return receipts, frames
 
     def route(self, vehicle: str) -> tuple[str, ...]:
@@ -255,8 +255,8 @@ class _WatchedSimulator:
 class _WatchedPolicy:
     """`cosim.types.Policy`: the inner one, with a witness."""
 
-    def __init__(self, recorder: Recorder) -> None:
-        self._recorder, self._inner = recorder, recorder.inner_policy
+    def __init__(self, watcher: Watcher) -> None:
+        self._watcher, self._inner = watcher, watcher.inner_policy
         self.name: str = self._inner.name
         self.label: str = self._inner.label
         self.observation: ObservationConfig = self._inner.observation
@@ -267,5 +267,5 @@ class _WatchedPolicy:
 
     def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
         decisions = self._inner.decide(histories)
-        self._recorder.choose(decisions)
+        self._watcher.choose(decisions)
         return decisions

@@ -177,7 +177,7 @@ def test_what_sumo_refuses_in_mid_run_costs_its_own_rows_and_the_next_cell_is_fi
     evaluate(flags, "--demand", tmp_path / "*.rou.xml", "--out", tmp_path / "run")
     found = {r["demand"]: r for r in rows(tmp_path / "run")}
     assert found["good"]["status"] == "ok"
-    assert found["bad"]["status"] == "sim_crash"
+    assert found["bad"]["status"] == "bad_input", "the demand is to blame, not the simulator"
     assert "no valid route" in found["bad"]["error"] or "main_out" in found["bad"]["error"]
 
 
@@ -217,7 +217,7 @@ def test_demand_from_sumo_s_own_tools_runs_as_it_comes(tmp_path: Path) -> None:
         ("--scenario merge --out {file}/run", "cannot make this folder"),
         ("--scenario merge --resume --ray-address x", "goes with --engine ray"),
         ("--scenario merge --store nonsense", "is no database URL"),
-        ("--scenario merge -- --scale 2", "options for SUMO belong into the .sumocfg"),
+        ("--scenario merge -- --scale 2", "else they belong into the .sumocfg"),
         ("--resume", "holds no run to resume"),
     ],
 )

@@ -15,7 +15,22 @@ import numpy.typing as npt
 
 from cosim.compiled import compiled, compiled_fast
 from cosim.road import RoadMap
-from cosim.types import Bools, Bytes, Floats, Kind, ObservationConfig, Snapshot
+from cosim.types import (
+    HEADING,
+    IS_AV,
+    IS_MISSION,
+    LENGTH,
+    SPEED,
+    WIDTH,
+    Bools,
+    Bytes,
+    Floats,
+    Kind,
+    ObservationConfig,
+    Snapshot,
+    X,
+    Y,
+)
 
 CHANNELS = ("av", "hv", "road", "mission", "ego")
 # A vehicle's pixel, of 1: FLOOR + SPAN clip((dv + SPEED) / (2 SPEED), 0, 1), dv in m/s relative to the ego.
@@ -164,7 +179,7 @@ def draw_rows(
     """One frame per batch entry from kinematic rows, seen from row 0: predicted kinematics as a map."""
     for b in range(out.shape[0]):
         out[b] = 0
-        ex, ey, eh = rows[b, 0, 0], rows[b, 0, 1], rows[b, 0, 3]
+        ex, ey, eh = rows[b, 0, X], rows[b, 0, Y], rows[b, 0, HEADING]
         if channels[2] >= 0:
             pc, ps = np.cos(pose[b, 2]), np.sin(pose[b, 2])
             _sample_road(
@@ -183,17 +198,17 @@ def draw_rows(
         for j in range(rows.shape[1]):
             if not valid[b, j]:
                 continue
-            dx, dy = rows[b, j, 0] - ex, rows[b, j, 1] - ey
+            dx, dy = rows[b, j, X] - ex, rows[b, j, Y] - ey
             _draw_vehicle(
                 out[b],
                 c * dx + s * dy,
                 c * dy - s * dx,
-                rows[b, j, 3] - eh,
-                rows[b, j, 2] - rows[b, 0, 2],
-                rows[b, j, 4],
-                rows[b, j, 5],
-                rows[b, j, 6] > 0.5,
-                rows[b, j, 7] > 0.5,
+                rows[b, j, HEADING] - eh,
+                rows[b, j, SPEED] - rows[b, 0, SPEED],
+                rows[b, j, LENGTH],
+                rows[b, j, WIDTH],
+                rows[b, j, IS_AV] > 0.5,
+                rows[b, j, IS_MISSION] > 0.5,
                 j == 0,
                 channels,
                 across,

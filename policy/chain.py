@@ -10,7 +10,7 @@ import torch
 
 from cosim.errors import in_range
 from cosim.raster import PIXEL_FLOOR, PIXEL_SPAN, PIXEL_SPEED, RoadRaster, draw_kinematics
-from cosim.types import Bools, Bytes, Floats, ObservationConfig
+from cosim.types import SPEED, Bools, Bytes, Floats, ObservationConfig
 from policy.forecast import KinematicForecast
 from policy.hpn import HPN
 from policy.kinematic_branch import Corrected, apply
@@ -64,11 +64,11 @@ def shade(rows: Floats, share: Floats) -> Floats:
     expected picture, which has the least squared error. Never darker than the floor: nobody vanishes.
     """
     out = rows.copy()
-    ego, top = rows[..., :1, 2], PIXEL_SPEED
-    level = PIXEL_FLOOR + PIXEL_SPAN * np.clip((rows[..., 2] - ego + top) / (2 * top), 0.0, 1.0)
+    ego, top = rows[..., :1, SPEED], PIXEL_SPEED
+    level = PIXEL_FLOOR + PIXEL_SPAN * np.clip((rows[..., SPEED] - ego + top) / (2 * top), 0.0, 1.0)
     shaded = np.maximum(level * share, PIXEL_FLOOR) - PIXEL_FLOOR
-    out[..., 2] = ego + shaded * (2 * top / PIXEL_SPAN) - top
-    out[..., 0, 2] = ego[..., 0]
+    out[..., SPEED] = ego + shaded * (2 * top / PIXEL_SPAN) - top
+    out[..., 0, SPEED] = ego[..., 0]
     return out
 
 

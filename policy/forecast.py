@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cosim.compiled import compiled
-from cosim.types import Bools, Floats
+from cosim.types import HEADING, SPEED, Bools, Floats, X, Y
 
 
 class KinematicForecast(NamedTuple):
@@ -34,8 +34,8 @@ def integrate_position(now: Floats, speed: Floats, heading: Floats, dt: float) -
 @compiled
 def _integrate(now: Floats, speed: Floats, heading: Floats, dt: float, x: Floats, y: Floats) -> None:
     for v in range(speed.shape[0]):
-        px, py = now[v, 0], now[v, 1]
-        vx, vy = now[v, 2] * np.cos(now[v, 3]), now[v, 2] * np.sin(now[v, 3])
+        px, py = now[v, X], now[v, Y]
+        vx, vy = now[v, SPEED] * np.cos(now[v, HEADING]), now[v, SPEED] * np.sin(now[v, HEADING])
         for k in range(speed.shape[1]):
             wx, wy = speed[v, k] * np.cos(heading[v, k]), speed[v, k] * np.sin(heading[v, k])
             px += 0.5 * dt * (vx + wx)
@@ -49,12 +49,12 @@ def motion_of(now: Floats, x: Floats, y: Floats, dt: float) -> tuple[Floats, Flo
 
     Who hardly moves keeps its heading.
     """
-    dx = np.diff(np.concatenate([now[:, :1], x], 1), axis=1)
-    dy = np.diff(np.concatenate([now[:, 1:2], y], 1), axis=1)
+    dx = np.diff(np.concatenate([now[:, X, None], x], 1), axis=1)
+    dy = np.diff(np.concatenate([now[:, Y, None], y], 1), axis=1)
     step = np.hypot(dx, dy)
-    turn = np.arctan2(dy, dx) - now[:, 3:4]
+    turn = np.arctan2(dy, dx) - now[:, HEADING, None]
     turn = (turn + np.pi) % (2 * np.pi) - np.pi
     moving = step > 0.1 * dt
     last = np.maximum.accumulate(np.where(moving, np.arange(1, x.shape[1] + 1), 0), axis=1)  # 0: never yet
     held = np.take_along_axis(np.concatenate([np.zeros_like(turn[:, :1]), turn], 1), last, 1)
-    return step / dt, now[:, 3:4] + np.unwrap(held, axis=1)
+    return step / dt, now[:, HEADING, None] + np.unwrap(held, axis=1)

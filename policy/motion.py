@@ -15,7 +15,7 @@ import numpy as np
 
 from cosim.compiled import compiled
 from cosim.road import LanePath
-from cosim.types import Floats, Ints
+from cosim.types import HEADING, LENGTH, Floats, Ints, X, Y
 
 
 class Paths(NamedTuple):
@@ -258,5 +258,5 @@ def roll_one(
 
 def fronts(state: Floats) -> tuple[Floats, Floats]:
     """Front bumper x [k] m, y [k] m of vehicles [k,8] (KINEMATIC_FEATURES in the world)."""
-    half = 0.5 * state[:, 4]
-    return state[:, 0] + half * np.cos(state[:, 3]), state[:, 1] + half * np.sin(state[:, 3])
+    half = 0.5 * state[:, LENGTH]
+    return state[:, X] + half * np.cos(state[:, HEADING]), state[:, Y] + half * np.sin(state[:, HEADING])

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from cosim.types import KINEMATIC_FEATURES, Bools, Floats, Floats32, History, Ints
+from cosim.types import HEADING, KINEMATIC_FEATURES, SPEED, Bools, Floats, Floats32, History, Ints, X, Y
 
 
 class Scene(NamedTuple):
@@ -82,10 +82,10 @@ def to_world(kinematics: Floats32 | Floats, pose: Floats) -> Floats:
     """[B,N,R,8] in each ego's frame, pose [B,3] -> the same in the world (m, m/s, rad)."""
     world = kinematics.astype(np.float64)
     c, s = np.cos(pose[:, 2])[:, None, None], np.sin(pose[:, 2])[:, None, None]
-    x, y = world[..., 0].copy(), world[..., 1].copy()
-    world[..., 0] = pose[:, 0, None, None] + c * x - s * y
-    world[..., 1] = pose[:, 1, None, None] + s * x + c * y
-    world[..., 3] += pose[:, 2, None, None]
+    x, y = world[..., X].copy(), world[..., Y].copy()
+    world[..., X] = pose[:, 0, None, None] + c * x - s * y
+    world[..., Y] = pose[:, 1, None, None] + s * x + c * y
+    world[..., HEADING] += pose[:, 2, None, None]
     return world
 
 
@@ -97,7 +97,9 @@ def rows_ahead(scene: Scene, x: Floats, y: Floats, speed: Floats, heading: Float
     known = (scene.row >= 0) & scene.valid[np.maximum(scene.row, 0), -1]  # [B,R]
     who = np.maximum(scene.row, 0)
     # headings of one vehicle continue its own history row: the same multiple of 2 pi
-    base = np.stack([h.kinematics[-1, :, 3] for h in scene.histories]) - scene.state[who, -1, 3]  # [B,R]
+    base = (
+        np.stack([h.kinematics[-1, :, HEADING] for h in scene.histories]) - scene.state[who, -1, HEADING]
+    )  # [B,R]
     return _rows(scene, who, known, base, (x, y, speed, heading)), known
 
 
@@ -131,10 +133,10 @@ def _rows(
     dx = x[who] - scene.pose[:, 0, None, None]  # [B,k,M]
     dy = y[who] - scene.pose[:, 1, None, None]
     c, s = np.cos(scene.pose[:, 2])[:, None, None], np.sin(scene.pose[:, 2])[:, None, None]
-    rows[..., 0] = (c * dx + s * dy).transpose(0, 2, 1)
-    rows[..., 1] = (c * dy - s * dx).transpose(0, 2, 1)
-    rows[..., 2] = speed[who].transpose(0, 2, 1)
-    rows[..., 3] = (heading[who] + base[..., None]).transpose(0, 2, 1)
+    rows[..., X] = (c * dx + s * dy).transpose(0, 2, 1)
+    rows[..., Y] = (c * dy - s * dx).transpose(0, 2, 1)
+    rows[..., SPEED] = speed[who].transpose(0, 2, 1)
+    rows[..., HEADING] = (heading[who] + base[..., None]).transpose(0, 2, 1)
     rows[..., 4:] = scene.state[who, -1, 4:][:, None]
     rows *= known[:, None, :, None]
     return rows

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cosim.road import LanePath, RoadMap
-from cosim.types import Bools, Floats
+from cosim.types import HEADING, LENGTH, SPEED, WIDTH, Bools, Floats, X, Y
 from policy.forecast import KinematicForecast
 from policy.motion import Rollout, fronts, pack, project_many, roll_out
 from policy.predictors.protocol import Predictor
@@ -62,7 +62,7 @@ def predict_traffic(
     known = forecast.valid & (scene.lane >= -1)
     speed = np.empty((count, frames + 1))
     m = min(forecast.speed.shape[1], frames)
-    speed[:, 0] = now[:, 2]
+    speed[:, 0] = now[:, SPEED]
     speed[:, 1 : m + 1] = forecast.speed[:, :m]
     speed[:, m + 1 :] = forecast.speed[:, m - 1 : m]
     on_lane = np.flatnonzero(known & (scene.lane >= 0))
@@ -85,15 +85,15 @@ def predict_traffic(
     rate = np.where(moving, np.clip(np.abs(drift), *c.drift_limits), c.settle_rate)
     end = np.array([p.length if p.dead_end else np.inf for p in paths])
     limit = np.array([road.lanes[k].speed_limit for k in lanes]) * c.speed_factor
-    top = np.maximum(limit, now[on_lane, 2])[:, None] if len(lanes) else np.zeros((0, 1))
+    top = np.maximum(limit, now[on_lane, SPEED])[:, None] if len(lanes) else np.zeros((0, 1))
     along = roll_out(
         packed,
         arc,
         offset,
         aim,
-        now[on_lane, 3],
+        now[on_lane, HEADING],
         rate,
-        now[on_lane, 4],
+        now[on_lane, LENGTH],
         np.minimum(speed[on_lane], top),
         end - 0.5,
         c.stop_brake,
@@ -110,7 +110,7 @@ def predict_traffic(
     for i, v in enumerate(on_lane):
         stream[v] = paths[i]
     drifting[on_lane] = moving
-    return Traffic(out, now[:, 4], now[:, 5], tuple(stream), drifting, known)
+    return Traffic(out, now[:, LENGTH], now[:, WIDTH], tuple(stream), drifting, known)
 
 
 def _sideways(
@@ -139,7 +139,7 @@ def _straight(
     dt: float,
 ) -> None:
     """Vehicles off every lane: the forecast's own positions, then straight on."""
-    out.x[rows, 0], out.y[rows, 0], out.heading[rows, 0] = now[rows, 0], now[rows, 1], now[rows, 3]
+    out.x[rows, 0], out.y[rows, 0], out.heading[rows, 0] = now[rows, X], now[rows, Y], now[rows, HEADING]
     out.x[rows, 1 : m + 1], out.y[rows, 1 : m + 1] = forecast.x[rows, :m], forecast.y[rows, :m]
     out.heading[rows, 1 : m + 1] = forecast.heading[rows, :m]
     later = dt * np.arange(1, out.x.shape[1] - m)

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cosim.compiled import compiled
-from cosim.types import Bools, Floats, Floats32, Ints
+from cosim.types import HEADING, IS_AV, IS_MISSION, LENGTH, SPEED, WIDTH, Bools, Floats, Floats32, Ints, X, Y
 from policy.forecast import KinematicForecast
 from policy.scene import Scene
 from policy.traffic import Traffic
@@ -76,15 +76,15 @@ def vehicle_inputs(scene: Scene, forecast: KinematicForecast, traffic: Traffic) 
 
 def _to_own(x: Floats, y: Floats, now: Floats) -> tuple[Floats, Floats]:
     """World points [V,k] in each vehicle's own frame, now [V,>=4] -> ahead, left [V,k] m."""
-    c, s = np.cos(now[:, 3:4]), np.sin(now[:, 3:4])
-    dx, dy = x - now[:, 0:1], y - now[:, 1:2]
+    c, s = np.cos(now[:, HEADING, None]), np.sin(now[:, HEADING, None])
+    dx, dy = x - now[:, X, None], y - now[:, Y, None]
     return c * dx + s * dy, c * dy - s * dx
 
 
 def _fixed(traffic: Traffic, now: Floats) -> Floats:
     """[V,FIXED] speed, size, kind, and the place on the road."""
     out = np.zeros((len(now), FIXED))
-    out[:, :5] = now[:, [2, 4, 5, 6, 7]] / (30.0, 10.0, 3.0, 1.0, 1.0)
+    out[:, :5] = now[:, [SPEED, LENGTH, WIDTH, IS_AV, IS_MISSION]] / (30.0, 10.0, 3.0, 1.0, 1.0)
     out[:, 5] = np.clip(traffic.rollout.rear[:, 0] / 3.2, -2.0, 2.0)  # in lane widths beside its path
     out[:, 6] = traffic.drifting
     at = [
@@ -105,13 +105,13 @@ def _fixed(traffic: Traffic, now: Floats) -> Floats:
 def _past(past: Floats, seen: Bools, now: Floats) -> Floats:
     """[V,5N-4] the past in the own frame, against straight on at the present speed; who was seen when."""
     v, n = seen.shape
-    ahead, left = _to_own(past[:, :-1, 0], past[:, :-1, 1], now)
+    ahead, left = _to_own(past[:, :-1, X], past[:, :-1, Y], now)
     elapsed = FRAME * np.arange(1 - n, 0)
     parts = np.empty((v, n - 1, 4))
-    parts[..., 0] = (ahead - now[:, 2:3] * elapsed) / 5.0
+    parts[..., 0] = (ahead - now[:, SPEED, None] * elapsed) / 5.0
     parts[..., 1] = left / 3.0
-    parts[..., 2] = (past[:, :-1, 2] - now[:, 2:3]) / 5.0
-    parts[..., 3] = (past[:, :-1, 3] - now[:, 3:4]) / 0.3
+    parts[..., 2] = (past[:, :-1, SPEED] - now[:, SPEED, None]) / 5.0
+    parts[..., 3] = (past[:, :-1, HEADING] - now[:, HEADING, None]) / 0.3
     parts *= seen[:, :-1, None]
     return np.concatenate([parts.reshape(v, -1), seen], 1)
 
@@ -119,12 +119,12 @@ def _past(past: Floats, seen: Bools, now: Floats) -> Floats:
 def _ahead(states: Floats, now: Floats) -> Floats:
     """[V,AHEAD*marks] a forecast at the MARKS, against straight on at the present speed."""
     at = states[:, MARKS]
-    ahead, left = _to_own(at[..., 0], at[..., 1], now)
+    ahead, left = _to_own(at[..., X], at[..., Y], now)
     out = np.empty((*ahead.shape, AHEAD))
-    out[..., 0] = (ahead - now[:, 2:3] * FRAME * (1 + MARKS)) / 15.0
+    out[..., 0] = (ahead - now[:, SPEED, None] * FRAME * (1 + MARKS)) / 15.0
     out[..., 1] = left / 8.0
-    out[..., 2] = (at[..., 2] - now[:, 2:3]) / 8.0
-    out[..., 3] = (at[..., 3] - now[:, 3:4]) / 0.8
+    out[..., 2] = (at[..., SPEED] - now[:, SPEED, None]) / 8.0
+    out[..., 3] = (at[..., HEADING] - now[:, HEADING, None]) / 0.8
     return out.reshape(len(now), -1)
 
 
@@ -132,7 +132,7 @@ def _accel(past: Floats, seen: Bools) -> Floats:
     """[V] m/s2 over the last 0.4 s; 0 where unknown."""
     if past.shape[1] < 3:
         return np.zeros(len(past))
-    return np.where(seen[:, -3] & seen[:, -1], (past[:, -1, 2] - past[:, -3, 2]) / (2 * FRAME), 0.0)
+    return np.where(seen[:, -3] & seen[:, -1], (past[:, -1, SPEED] - past[:, -3, SPEED]) / (2 * FRAME), 0.0)
 
 
 def _leaders(scene: Scene, traffic: Traffic, now: Floats, accel: Floats, known: Bools) -> Floats:
@@ -152,7 +152,7 @@ def _leaders(scene: Scene, traffic: Traffic, now: Floats, accel: Floats, known: 
         place,
         _owner(scene),
         scene.lane_position.astype(np.float64),
-        now[:, 4],
+        now[:, LENGTH],
         traffic.rollout.arc[:, 0],
     )
     there = who >= 0
@@ -160,8 +160,8 @@ def _leaders(scene: Scene, traffic: Traffic, now: Floats, accel: Floats, known: 
     out = np.empty((*who.shape, LEADER))
     out[..., 0] = 1.0
     out[..., 1] = np.exp(-np.maximum(gap, 0.0) / 20.0)
-    out[..., 2] = now[j, 2] / 30.0
-    out[..., 3] = (now[:, None, 2] - now[j, 2]) / 8.0
+    out[..., 2] = now[j, SPEED] / 30.0
+    out[..., 3] = (now[:, None, SPEED] - now[j, SPEED]) / 8.0
     out[..., 4] = accel[j] / 4.0
     return np.asarray((out * there[..., None]).reshape(len(now), -1))
 
@@ -204,7 +204,7 @@ def _near(scene: Scene, now: Floats, accel: Floats, lane: Floats, known: Bools) 
     v = len(now)
     out = np.zeros((v, NEIGHBOURS, NEIGHBOUR_INPUTS), np.float32)
     k = min(NEIGHBOURS, v)
-    square = (now[:, None, 0] - now[None, :, 0]) ** 2 + (now[:, None, 1] - now[None, :, 1]) ** 2
+    square = (now[:, None, X] - now[None, :, X]) ** 2 + (now[:, None, Y] - now[None, :, Y]) ** 2
     owner = _owner(scene)
     hidden = ~known[None] | (owner[:, None] != owner[None]) | (square > SIGHT**2)
     hidden[np.diag_indices(v)] = True
@@ -212,18 +212,18 @@ def _near(scene: Scene, now: Floats, accel: Floats, lane: Floats, known: Bools) 
     j = np.argpartition(square, k - 1, 1)[:, :k]  # [V,k]
     j = np.take_along_axis(j, np.argsort(np.take_along_axis(square, j, 1), 1, kind="stable"), 1)
     there = np.isfinite(np.take_along_axis(square, j, 1)) & known[:, None]
-    ahead, left = _to_own(now[j, 0], now[j, 1], now)
-    turn = now[j, 3] - now[:, 3:4]
+    ahead, left = _to_own(now[j, X], now[j, Y], now)
+    turn = now[j, HEADING] - now[:, HEADING, None]
     f = out[:, :k]
     f[..., 0] = 1.0
     f[..., 1], f[..., 2] = ahead / 40.0, left / 8.0
     f[..., 3], f[..., 4] = np.cos(turn), np.sin(turn)
-    f[..., 5], f[..., 6] = now[j, 2] / 30.0, (now[j, 2] - now[:, 2:3]) / 8.0
-    f[..., 7], f[..., 8], f[..., 9] = accel[j] / 4.0, now[j, 4] / 10.0, now[j, 6]
+    f[..., 5], f[..., 6] = now[j, SPEED] / 30.0, (now[j, SPEED] - now[:, SPEED, None]) / 8.0
+    f[..., 7], f[..., 8], f[..., 9] = accel[j] / 4.0, now[j, LENGTH] / 10.0, now[j, IS_AV]
     f[..., 10] = scene.lane[j] == scene.lane[:, None]
     for place, mark in enumerate(MARKS[:3]):
         mine = lane[:, mark]  # where each is then
-        ahead, left = _to_own(mine[j, 0], mine[j, 1], mine)
+        ahead, left = _to_own(mine[j, X], mine[j, Y], mine)
         f[..., 11 + 2 * place], f[..., 12 + 2 * place] = ahead / 40.0, left / 8.0
     np.nan_to_num(f, copy=False)
     np.clip(f, -CLIP, CLIP, out=f)

@@ -8,7 +8,7 @@ import numpy.typing as npt
 from cosim.compiled import compiled
 from cosim.geometry import gap_ahead
 from cosim.road import LaneGraph
-from cosim.types import Bools, Floats, Floats32, Ints, Snapshot
+from cosim.types import HEADING, SPEED, Bools, Floats, Floats32, Ints, Snapshot, X, Y
 
 
 @compiled
@@ -112,7 +112,7 @@ def fill_rows(
     frames = past.shape[0]
     for b in range(rows.shape[0]):
         ego = slots[rows[b, 0]]
-        x0, y0, h0 = past[frames - 1, ego, 0], past[frames - 1, ego, 1], past[frames - 1, ego, 3]
+        x0, y0, h0 = past[frames - 1, ego, X], past[frames - 1, ego, Y], past[frames - 1, ego, HEADING]
         c, s = np.cos(h0), np.sin(h0)
         for r in range(rows.shape[1]):
             j = rows[b, r]
@@ -123,19 +123,19 @@ def fill_rows(
                         kinematics[b, k, r, f] = 0.0
                 continue
             slot = slots[j]
-            turn = past[frames - 1, slot, 3] - h0
+            turn = past[frames - 1, slot, HEADING] - h0
             base = (turn + np.pi) % (2 * np.pi) - np.pi - turn - h0  # newest heading in (-pi, pi]
             for k in range(frames):
-                here = not np.isnan(past[k, slot, 0])
+                here = not np.isnan(past[k, slot, X])
                 valid[b, k, r] = here
                 if not here:
                     for f in range(8):
                         kinematics[b, k, r, f] = 0.0
                     continue
-                dx, dy = past[k, slot, 0] - x0, past[k, slot, 1] - y0
-                kinematics[b, k, r, 0] = c * dx + s * dy
-                kinematics[b, k, r, 1] = c * dy - s * dx
-                kinematics[b, k, r, 2] = past[k, slot, 2]
-                kinematics[b, k, r, 3] = past[k, slot, 3] + base
+                dx, dy = past[k, slot, X] - x0, past[k, slot, Y] - y0
+                kinematics[b, k, r, X] = c * dx + s * dy
+                kinematics[b, k, r, Y] = c * dy - s * dx
+                kinematics[b, k, r, SPEED] = past[k, slot, SPEED]
+                kinematics[b, k, r, HEADING] = past[k, slot, HEADING] + base
                 for f in range(4):
                     kinematics[b, k, r, 4 + f] = fixed[j, f]

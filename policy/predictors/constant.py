@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cosim.types import Bools, Floats
+from cosim.types import HEADING, SPEED, Bools, Floats
 from policy.forecast import KinematicForecast, integrate_position
 
 
@@ -19,7 +19,7 @@ class ConstantSpeed:
     def predict(self, kinematics: Floats, valid: Bools) -> KinematicForecast:
         """See `Predictor.predict`."""
         now, known = newest(kinematics, valid)
-        speed = np.repeat(now[:, 2:3], self.horizon, 1)
+        speed = np.repeat(now[:, SPEED, None], self.horizon, 1)
         return _straight(now, speed, known, self.dt)
 
 
@@ -36,11 +36,11 @@ class ConstantAcceleration:
         now, known = newest(kinematics, valid)
         accel = np.zeros(len(now))
         if kinematics.shape[1] > 1:
-            before = np.asarray(kinematics[:, -2, 2], dtype=np.float64)
+            before = np.asarray(kinematics[:, -2, SPEED], dtype=np.float64)
             usable = known & valid[:, -2] & np.isfinite(before)
-            accel = np.where(usable, (now[:, 2] - np.nan_to_num(before)) / self.dt, 0.0)
+            accel = np.where(usable, (now[:, SPEED] - np.nan_to_num(before)) / self.dt, 0.0)
         elapsed = self.dt * np.arange(1, self.horizon + 1)
-        speed = np.maximum(now[:, 2:3] + accel[:, None] * elapsed, 0.0)
+        speed = np.maximum(now[:, SPEED, None] + accel[:, None] * elapsed, 0.0)
         return _straight(now, speed, known, self.dt)
 
 
@@ -52,7 +52,7 @@ def newest(kinematics: Floats, valid: Bools) -> tuple[Floats, Bools]:
 
 
 def _straight(now: Floats, speed: Floats, known: Bools, dt: float) -> KinematicForecast:
-    heading = np.repeat(now[:, 3:4], speed.shape[1], 1)
+    heading = np.repeat(now[:, HEADING, None], speed.shape[1], 1)
     x, y = integrate_position(now, speed, heading, dt)
     zero = np.zeros_like(speed)
     return KinematicForecast(x, y, speed, heading, zero, zero, zero, zero, known)

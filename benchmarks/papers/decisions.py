@@ -60,7 +60,7 @@ Runs = Mapping[str, Mapping[str, Run]]  # demand -> arm -> its episodes
 def orders() -> list[Order]:
     """Everybody in every world and both demands, but for `ELSEWHERE`."""
     return [
-        Order(Agent(name), world, demand, behavior, episodes, svo=svo(name))
+        Order(Agent(name), world, demand, behavior, episodes, svo_deg=svo(name))
         for demand, behavior, episodes in (
             ("contested", BEHAVIOR["contested"], CONTESTED),
             ("dense", BEHAVIOR["dense"], DENSE),

@@ -44,7 +44,7 @@ class Order:
     demand: str
     behavior: str  # of the HVs
     episodes: int  # at scale 1
-    svo: float = SVO  # deg
+    svo_deg: float = SVO
     arm: str = ""  # its name in tables; "": the agent's
 
     @property
@@ -63,7 +63,7 @@ class Order:
             penetration=None,
             av_type=None,
             av_ids=None,
-            svo_deg=self.svo,
+            svo_deg=self.svo_deg,
             preset="unguarded",
             duration=None,
             seed=FIRST_TEST_SEED,

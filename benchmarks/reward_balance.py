@@ -43,7 +43,7 @@ class Paid(Rollout):
 
     def earn(self, world: str, seed: int, yields: bool) -> dict[str, Any]:
         """Sums by setting, and what became of the mission vehicle."""
-        episode, agent = self._episode(Lesson(world, "contested")), self._agent
+        episode, agent = self.episode(Lesson(world, "contested")), self.agent
         histories = episode.start(seed)
         agent.reset(episode.context(PHI if yields else 0.0))
         agent.episode("balance", 0.0, generator(seed, "explore"), True)
@@ -94,7 +94,7 @@ def page(drives: dict[str, dict[bool, list[dict[str, Any]]]], command: str) -> s
 def main() -> None:
     """Print the page, or write it."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    parser.add_argument("--seeds", default="150100:150106")
+    parser.add_argument("--seeds", default="150100:150120")
     parser.add_argument("--scenario", action="append", default=[])
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()

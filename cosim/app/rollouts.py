@@ -39,7 +39,7 @@ class Rollout:
 
     def __init__(self, name: str, agent: AgentConfig, explore: ExploreConfig, reward: RewardConfig) -> None:
         make_torch_deterministic()
-        self._agent = Explorer(name, agent, explore)
+        self.agent = Explorer(name, agent, explore)
         self._reward = reward
         self._lesson: Lesson | None = None
         self._loaded: dict[str, str] = {}
@@ -47,10 +47,23 @@ class Rollout:
 
     def drive(self, drive: Drive) -> Drove:
         """One whole episode."""
-        episode, agent = self._episode(drive.lesson), self._agent
+        episode, agent = self.episode(drive.lesson), self.agent
         self._weights("vfn", agent.vfn, drive.weights)
         self._weights("frozen", agent.frozen, drive.frozen)
         return drive_episode(episode, agent, drive, self._reward)
+
+    def episode(self, lesson: Lesson) -> Episode:
+        """Where this lesson is driven: that of the last one, where it is the same."""
+        if self._lesson != lesson:
+            self.close()
+            scenario = load(lesson.scenario, demand=[lesson.demand], behavior=lesson.behavior)
+            wanted = self.agent.observation
+            self._simulator = SumoSimulator(
+                scenario, av_parameters=self.agent.av_parameters, history=wanted.frames
+            )
+            self._current = Episode(scenario, self._simulator, wanted)
+            self._lesson = lesson
+        return self._current
 
     def close(self) -> None:
         """End the simulation."""
@@ -58,21 +71,9 @@ class Rollout:
             self._simulator.close()
             self._simulator = None
 
-    def _episode(self, lesson: Lesson) -> Episode:
-        if self._lesson != lesson:
-            self.close()
-            scenario = load(lesson.scenario, demand=[lesson.demand], behavior=lesson.behavior)
-            wanted = self._agent.observation
-            self._simulator = SumoSimulator(
-                scenario, av_parameters=self._agent.av_parameters, history=wanted.frames
-            )
-            self._current = Episode(scenario, self._simulator, wanted)
-            self._lesson = lesson
-        return self._current
-
     def _weights(self, slot: str, network: Any, file: str) -> None:
         if file and self._loaded.get(slot) != file:
-            load_weights(Path(file), {"vfn": network}, {"vfn": self._agent.config.vfn})
+            load_weights(Path(file), {"vfn": network}, {"vfn": self.agent.config.vfn})
             self._loaded[slot] = file
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -16,7 +15,7 @@ from cosim.app.progress import Progress
 from cosim.errors import BadInput
 from cosim.evaluation import statistics
 from cosim.evaluation.prediction import LEVEL, Predicted, Scores
-from cosim.files import whole
+from cosim.files import write_csv
 from cosim.recording import Folder, Recording, Windows, read, windows
 from cosim.road import RoadMap
 from cosim.types import Floats
@@ -85,10 +84,10 @@ def bench_maps(
         folder.path, weights=weights, scenarios=scenarios, behaviors=behaviors, seeds=seeds, workers=workers
     )
     table = map_bench.rows(episodes)
-    map_bench.write_table(out / "map_error.csv", table)
+    write_csv(out / "map_error.csv", table)
     compared = map_bench.against(episodes)
     if compared:
-        map_bench.write_table(out / "map_gain.csv", compared)
+        write_csv(out / "map_gain.csv", compared)
     map_figures.errors(table, out / "map_error.png")
     logs = {name: path.with_suffix(".csv") for name, path in weights.items()}
     if present := {name: log for name, log in logs.items() if log.is_file()}:
@@ -163,15 +162,6 @@ def paired(scores: Scores) -> dict[str, Any]:
                 theirs = [float(np.nanmean(errors[i])) for i in members]
                 found[name][scenario] = statistics.paired_mean(ours, theirs).document()
     return found
-
-
-def write_csv(file: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Rows with a header; the file appears whole. NA is an empty field."""
-    with whole(file) as draft, draft.open("w", newline="") as stream:
-        writer = csv.DictWriter(stream, list(rows[0]))
-        writer.writeheader()
-        for row in rows:
-            writer.writerow({k: _plain(v) for k, v in row.items()})
 
 
 def markdown(
@@ -274,9 +264,3 @@ def _share(coverage: float) -> str:
 
 def _row(cells: Sequence[str]) -> str:
     return f"| {' | '.join(cells)} |"
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, float):
-        return f"{value:.6g}" if math.isfinite(value) else ""
-    return value

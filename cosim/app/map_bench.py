@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +13,6 @@ from cosim.errors import BadInput
 from cosim.evaluation import statistics
 from cosim.evaluation.engines import LocalEngine
 from cosim.evaluation.tasks import Task
-from cosim.files import whole
 from cosim.recording import Folder, read
 from cosim.types import COMPACT, Floats
 from policy.checkpoint import SHIPPED
@@ -157,15 +155,6 @@ def rows(episodes: Sequence[EpisodeErrors]) -> list[dict[str, Any]]:
                 }
                 out.append(row)
     return out
-
-
-def write_table(path: Path, table: Sequence[Mapping[str, Any]]) -> None:
-    """`map_error.csv`, whole or not at all."""
-    with whole(path) as draft, draft.open("w", newline="") as file:
-        out = csv.DictWriter(file, list(table[0]))
-        out.writeheader()
-        for row in table:
-            out.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})
 
 
 def against(episodes: Sequence[EpisodeErrors], ours: str = "hpn") -> list[dict[str, Any]]:

@@ -13,6 +13,7 @@ from cosim.app import map_bench, train_hpn
 from cosim.app.prediction_data import HORIZON, MAPLESS, Followed, followed
 from cosim.episode import Episode
 from cosim.errors import BadInput
+from cosim.files import write_csv
 from cosim.recording import Folder, Recording, RecordingSimulator, histories, read, write
 from cosim.road import RoadMap
 from cosim.scenario import Mission, load
@@ -95,7 +96,7 @@ def test_map_errors_are_measured_against_what_followed(folder: Path, tmp_path: P
     table = map_bench.rows([episode])
     assert {row["scenario"] for row in table} == {"merge", "all"}
     assert {row["horizon_s"] for row in table} == {0.2, 0.4, 1.0, 2.0, 3.0, 4.0}
-    map_bench.write_table(tmp_path / "map_error.csv", table)
+    write_csv(tmp_path / "map_error.csv", table)
     head = (tmp_path / "map_error.csv").read_text().splitlines()[0]
     assert head.startswith("predictor,scenario,horizon_s,pre,")
     compared = map_bench.against([episode, episode])

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim.app.bench_predict import markdown, paired, plot, write_csv
+from cosim.app.bench_predict import markdown, paired, plot
 from cosim.evaluation.prediction import Predicted, Scores, interval_errors, position_error
+from cosim.files import write_csv
 
 STEPS = 20
 

@@ -27,10 +27,13 @@ def whole(path: Path, *, contended: bool = False) -> Iterator[Path]:
         draft.unlink(missing_ok=True)
 
 
-def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Rows with a header, whole or not at all; numbers with six digits, NA (nan, infinities) is empty."""
+def write_csv(path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None) -> None:
+    """Rows with a header, whole or not at all; numbers with six digits, NA (nan, infinities) is empty.
+
+    `columns`: needed where there may be no row; default: those of the first.
+    """
     with whole(path) as draft, draft.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
+        writer = csv.DictWriter(file, list(rows[0] if columns is None else columns))
         writer.writeheader()
         for row in rows:
             writer.writerow({name: _plain(value) for name, value in row.items()})

@@ -8,10 +8,12 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from cosim.errors import BadInput
+from cosim.evaluation.encounters import Encounters
 from cosim.evaluation.fcd_file import Row, Step, lanes_named, read_steps
 from cosim.evaluation.vehicle_types import DEFAULT, Size, size_of
 from cosim.metrics import METRICS, MetricContext
@@ -64,6 +66,7 @@ class Analysis:
     vehicles: int
     watched: int
     notes: tuple[str, ...]  # what was assumed, and what the file does not hold
+    encounters: tuple[Mapping[str, Any], ...] = ()  # `Encounters.found`, where they were asked for
 
 
 def analyse(
@@ -75,9 +78,11 @@ def analyse(
     begin: float = -math.inf,
     end: float = math.inf,
     frame: float | None = None,
+    critical: float | None = None,
     progress: Progress | None = None,
 ) -> Analysis:
     """Read the file once, as a stream. `begin`, `end` in s; `frame`: s between the frames that are counted.
+    `critical`: list the encounters with a time to collision (s) below this.
 
     Without a `road` vehicles on and below a bridge cannot be told apart, and a headway ends with the lane.
 
@@ -85,7 +90,10 @@ def analyse(
         BadInput: malformed or truncated, not FCD, a number missing or not finite, a vehicle twice in a step,
             times that do not increase evenly, positions in degrees, no vehicle at all.
     """
-    counter = _Counter(path, road or _loose_lanes(path), dict(sizes or {}), roles, (begin, end), frame)
+    road_or_lanes = road or _loose_lanes(path)
+    counter = _Counter(path, road_or_lanes, dict(sizes or {}), roles, (begin, end), frame)
+    if critical is not None:
+        counter.encounters = Encounters(road_or_lanes, critical)
     read_steps(path, counter.see, progress)
     return counter.finish(road is not None, sizes is not None)
 
@@ -112,6 +120,7 @@ class _Counter:
         self._begin, self._end = window
         self._wanted = frame
         self._metrics = [METRICS[name]() for name in FIGURES]
+        self.encounters: Encounters | None = None
         self._first: Step | None = None  # kept until the second one says how far apart they are
         self._interval = 0.0  # s between the file's steps
         self._stride = 1  # in steps: 2 counts every other
@@ -220,6 +229,8 @@ class _Counter:
                 metric.add(snapshot)
             else:
                 metric.reset(snapshot, self._context)
+        if self.encounters is not None:
+            self.encounters.add(snapshot)
         self._frames += 1
         self._span = (self._span[0] if self._frames > 1 else snapshot.time, snapshot.time)
         if self._driven < DRIVEN and self._newest is not None:
@@ -267,6 +278,7 @@ class _Counter:
             vehicles=len(self._ever),
             watched=len(self._watched),
             notes=tuple(self._notes(has_road, has_sizes)),
+            encounters=() if self.encounters is None else tuple(self.encounters.found()),
         )
 
     def _notes(self, has_road: bool, has_sizes: bool) -> list[str]:

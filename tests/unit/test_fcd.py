@@ -64,6 +64,30 @@ def test_front_bumpers_and_degrees_become_the_gap_between_two_cars(fcd: Any) -> 
     assert (found.frames, found.vehicles, found.watched, found.interval) == (11, 2, 2, 0.2)
 
 
+def test_every_single_conflict_is_listed_once_with_its_worst_moment(fcd: Any, tmp_path: Path) -> None:
+    apart = "".join(
+        step(t, car("fast", 140.0, 10.0), car("slow", 400.0, 10.0)) for t in (2.2, 2.4, 2.6, 2.8, 3.0, 3.2)
+    )
+    again = step(3.4, car("fast", 140.0, 10.0), car("slow", 155.0, 0.0))
+    path = fcd(following() + apart + again)
+    first, second = analyse(path, critical=4.0).encounters
+    assert (first["ego"], first["foe"]) == ("fast", "slow")
+    assert (first["begin_s"], first["end_s"], first["at_s"]) == (1.2, 2.0, 2.0)
+    assert first["min_ttc_s"] == pytest.approx(3.0)
+    assert first["max_drac_mps2"] == pytest.approx(10**2 / (2 * 30), rel=1e-3)
+    assert (first["ego_speed_mps"], first["foe_speed_mps"]) == (20.0, 10.0)
+    assert (second["begin_s"], second["min_ttc_s"]) == (3.4, pytest.approx(1.0))
+    assert analyse(path, critical=0.5).encounters == ()
+    out = tmp_path / "deep" / "conflicts.csv"
+    assert main(["metrics", str(path), "--conflicts", str(out), "--json"]) == 0
+    head, only = out.read_text().splitlines()
+    assert head.startswith("begin_s,end_s,ego,foe,min_ttc_s")
+    assert only.startswith("3.4,3.4,fast,slow,1,3.4")
+    assert main(["metrics", str(path), "--conflicts", str(out), "--ttc", "0.1"]) == 0
+    assert out.read_text().splitlines() == [head]
+    assert main(["metrics", str(path), "--conflicts", str(tmp_path)]) == 2
+
+
 def test_heading_north_is_no_other_thing_than_heading_east(fcd: Any) -> None:
     turned = re.sub(r'x="([\d.]+)" y="([\d.]+)" angle="90.00"', r'x="\2" y="\1" angle="0.00"', following())
     assert value(analyse(fcd(turned)), "min_ttc_s") == pytest.approx(3.0)

@@ -5,6 +5,9 @@ from __future__ import annotations
 import argparse
 import json
 import re
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +41,15 @@ def add(verbs: arguments.Verbs) -> None:
     metrics.add_argument(
         "--frame", type=arguments.positive, metavar="S", help="s between frames (default: 0.2, or the file's)"
     )
+    metrics.add_argument(
+        "--conflicts", metavar="CSV", help="write every single conflict there: who, when, where, how close"
+    )
+    metrics.add_argument(
+        "--ttc",
+        type=arguments.positive,
+        metavar="S",
+        help="a conflict is a time to collision below this (default 1.5)",
+    )
     metrics.add_argument("--json", action="store_true", help="print exactly one JSON document on stdout")
     metrics.set_defaults(work=work)
 
@@ -45,6 +57,7 @@ def add(verbs: arguments.Verbs) -> None:
 def work(args: argparse.Namespace) -> int:
     """Read it, count, print."""
     from cosim.app.progress import Progress
+    from cosim.evaluation.encounters import CRITICAL
     from cosim.evaluation.fcd import Roles, analyse
     from cosim.evaluation.vehicle_types import read_sizes
     from cosim.xml_input import regular_file
@@ -61,10 +74,14 @@ def work(args: argparse.Namespace) -> int:
         sizes=read_sizes(types) if types else None,
         roles=roles,
         frame=args.frame,
+        critical=(args.ttc or CRITICAL) if args.conflicts else None,
         progress=progress,
         **window,
     )
     progress.done()
+    if args.conflicts:
+        _write(Path(args.conflicts), found.encounters)
+        print(f"{len(found.encounters)} conflicts in {args.conflicts}", file=sys.stderr)
     whole: dict[str, Any] = {
         "file": str(path),
         "begin_s": found.begin,
@@ -92,6 +109,17 @@ def work(args: argparse.Namespace) -> int:
     for note in found.notes:
         print(f"  note: {note}")
     return 0
+
+
+def _write(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    from cosim.evaluation.encounters import Encounter
+    from cosim.files import write_csv
+
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_csv(path, rows, [field.name for field in fields(Encounter)])
+    except OSError as error:
+        raise BadInput(f"cannot write: {error.strerror}", field="--conflicts", value=str(path)) from None
 
 
 def _road(net: Path) -> Any:

@@ -69,6 +69,11 @@ class Numbered(Holds):
 class Leaves(Holds):
     def answer(self, av): raise SystemExit(3)
 
+class Prints(Holds):
+    def answer(self, av):
+        print("hello")
+        return 1
+
 class Nothing: ...
 
 def factory(): return Holds()
@@ -172,6 +177,34 @@ def test_a_mistake_in_it_is_one_line_that_names_its_file(
     error = capsys.readouterr().err.strip().splitlines()[-1]
     assert error.startswith(f"cosim: {code}")
     assert said in error
+
+
+def test_what_it_prints_leaves_stdout_to_the_document(code: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    arguments = ["run", "merge", "--demand", "contested", "--duration", "1", "--json"]
+    assert main([*arguments, "--policy", f"{code}:Prints"]) == 0
+    out, err = capfd.readouterr()
+    assert json.loads(out)["policy"] == "Prints"
+    assert "hello" in err
+
+
+def test_a_run_folder_holds_one_run(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    run("idm", out, "--output", "tripinfo", "--replay")
+    assert (out / "replay.mp4").is_file()
+    run("keep-lane", out, "--output", "fcd")
+    assert sorted(p.name for p in out.rglob("*") if p.is_file()) == [
+        "fcd.xml", "manifest.json", "metrics.txt", "result.json",
+    ]  # fmt: skip
+
+
+def test_a_device_that_is_not_there_is_refused_before_anything_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cosim.app.train_vfn.usable", lambda device: device == "cpu")
+    out = tmp_path / "out"
+    assert main(["train", "vfn", "--config", "smoke", "--device", "cuda", "--out", str(out)]) == 2
+    assert "--device='cuda': torch has no such device here" in capsys.readouterr().err
+    assert not out.exists()
 
 
 def test_code_that_cannot_be_imported_is_named_with_its_line(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from statistics import fmean
 
 from benchmarks.papers.agents import missing
-from benchmarks.papers.driving import MARK, AgentRunner, Order, Planned, Settings, held, planned
+from benchmarks.papers.driving import AgentRunner, Order, Planned, Settings, agent_of, held, planned
 from cosim.evaluation import estimate
 from cosim.evaluation.engines import LocalEngine
 from cosim.evaluation.matrix import Cell
@@ -47,7 +47,8 @@ class Reckoning:
             work = planned(group, drive)
             todo = self._todo(work, drive)
             self._measure(title, work, todo)
-            found += [self._of(name, work, todo) for name in dict.fromkeys(map(_agent, work.cells))]
+            names = dict.fromkeys(agent_of(cell.case.policy) for cell in work.cells)
+            found += [self._of(name, work, todo) for name in names]
         return [one for one in found if one.episodes]
 
     def _todo(self, work: Planned, settings: Settings) -> dict[str, int]:
@@ -64,8 +65,8 @@ class Reckoning:
         """What the agents cost that have something to drive and were not measured yet."""
         probes: dict[str, dict[str, Cell]] = {}  # agent -> world -> cell
         for cell in work.cells:
-            if todo[cell.name] and _agent(cell) not in self._costs:
-                probes.setdefault(_agent(cell), {}).setdefault(cell.case.what, cell)
+            if todo[cell.name] and agent_of(cell.case.policy) not in self._costs:
+                probes.setdefault(agent_of(cell.case.policy), {}).setdefault(cell.case.what, cell)
         if not probes:
             return
         print(f"{title}: measuring what {len(probes)} agents cost ...", file=sys.stderr, flush=True)
@@ -73,18 +74,13 @@ class Reckoning:
         engine = LocalEngine(AgentRunner, (work.agents, work.untrained), workers=1)
         self._costs |= {agent: [] for agent in probes}
         for (_, policy), cost in estimate.probe(chosen, engine).items():
-            self._costs[policy.split(MARK)[0]].append(cost)
+            self._costs[agent_of(policy)].append(cost)
 
     def _of(self, agent: str, work: Planned, todo: Mapping[str, int]) -> Left:
-        mine = [cell for cell in work.cells if _agent(cell) == agent]
+        mine = [cell for cell in work.cells if agent_of(cell.case.policy) == agent]
         episodes, costs = sum(todo[cell.name] for cell in mine), self._costs.get(agent, ())
         if not costs:
             return Left(agent, episodes, None)
         reset, second = fmean(c.reset for c in costs), fmean(c.second for c in costs)
         spent = sum(todo[cell.name] * (reset + second * cell.scenario.duration) for cell in mine)
         return Left(agent, episodes, spent / 3600.0)
-
-
-def _agent(cell: Cell) -> str:
-    """Who drives it."""
-    return cell.case.policy.split(MARK)[0]

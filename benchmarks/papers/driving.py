@@ -263,6 +263,11 @@ def planned(orders: Sequence[Order], settings: Settings) -> Planned:
     )
 
 
+def agent_of(policy: str) -> str:
+    """The agent's name in the policy of a planned case: what stands before the mark."""
+    return policy.split(MARK)[0]
+
+
 class AgentRunner(CaseRunner):
     """Hosted by the engine: like `cosim evaluate`, for agents that `--policy` does not know."""
 
@@ -271,8 +276,8 @@ class AgentRunner(CaseRunner):
         self._agents, self._untrained = agents, untrained
 
     def policy(self, case: Case) -> Policy:
-        """The agent whose name the case bears before the mark."""
-        return build(self._agents[case.policy.split(MARK)[0]], self._untrained)
+        """The agent whose name the case bears."""
+        return build(self._agents[agent_of(case.policy)], self._untrained)
 
 
 def held(work: Planned, settings: Settings) -> dict[str, set[int]]:

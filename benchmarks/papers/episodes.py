@@ -21,7 +21,7 @@ from typing import Any
 
 from benchmarks.papers import shipped
 from benchmarks.papers.agents import Agent, missing
-from benchmarks.papers.driving import MARK, AgentRunner, Planned, Settings, planned
+from benchmarks.papers.driving import AgentRunner, Planned, Settings, agent_of, planned
 from benchmarks.papers.jobs import JOBS
 from benchmarks.papers.pages import Job
 from cosim.app.progress import Progress
@@ -164,7 +164,7 @@ def _planned(jobs: Sequence[Job], settings: Settings) -> Planned:
 
 def _case(cell: Cell, agents: Mapping[str, Agent]) -> dict[str, Any]:
     """What `cosim replay` is to drive: by the name `--policy` has for the agent, where it has one."""
-    name = cell.case.policy.split(MARK)[0]
+    name = agent_of(cell.case.policy)
     return replace(cell.case, policy=name if agents[name] == Agent(name) else cell.case.policy).document()
 
 

@@ -99,23 +99,24 @@ def prepare_folder(path: str) -> Path:
     return folder
 
 
-def clear_folder(folder: Path, outputs: Sequence[str]) -> None:
-    """Remove what an earlier `cosim run` left there and this one, which wrote `outputs` of SUMO, did not."""
-    old = [*folder.glob("replay*.html"), *folder.glob("replay*.mp4"), *folder.glob("replay*.gif")]
-    old += [file for file in (folder / "outputs").glob("*.xml") if file.stem not in outputs]
-    for file in old:
-        file.unlink()
+def write_folder(folder: Path, result: EpisodeResult, outputs: Sequence[str] = ()) -> None:
+    """`result.json`, `manifest.json` and `metrics.txt`; each appears whole or not at all.
 
+    Films, pages and SUMO's outputs of an earlier run in this folder go, but for `outputs`, this run's own.
 
-def write_folder(folder: Path, result: EpisodeResult) -> None:
-    """`result.json`, `manifest.json` and `metrics.txt`; each appears whole or not at all."""
+    Raises BadInput when it cannot be written.
+    """
     everything = document(result)
     texts = {
         "manifest.json": json.dumps(everything["manifest"], indent=2),
         "metrics.txt": table(result),
         "result.json": json.dumps(everything, indent=2),
     }
+    old = [*folder.glob("replay*.html"), *folder.glob("replay*.mp4"), *folder.glob("replay*.gif")]
+    old += [file for file in (folder / "outputs").glob("*.xml") if file.stem not in outputs]
     try:
+        for file in old:
+            file.unlink()
         for name, text in texts.items():
             with whole(folder / name) as draft:
                 draft.write_text(text + "\n")

@@ -184,15 +184,15 @@ def draw(
     if html is not None:
         from cosim.evaluation.replay.page import page
 
-        with _writing(html) as draft:
+        with _writing(html), whole(html) as draft:
             draft.write_text(page(episodes[0]), "utf-8")
     if mp4 is not None or gif is not None:
         from cosim.evaluation.replay import video
 
         for path, make in ((mp4, video.film), (gif, video.animation)):
             if path is not None:
-                with _progress(path.name, "pictures") as progress, _writing(path) as draft:
-                    make(episodes, draft, follow=follow, progress=progress)
+                with _progress(path.name, "pictures") as progress, _writing(path):
+                    make(episodes, path, follow=follow, progress=progress)
 
 
 def warn(lines: Sequence[str]) -> None:
@@ -256,12 +256,11 @@ def _json(path: Path) -> dict[str, Any]:
 
 
 @contextlib.contextmanager
-def _writing(path: Path) -> Iterator[Path]:
-    """`whole`, in a folder that is made where it is not there. Raises BadInput when it cannot be written."""
+def _writing(path: Path) -> Iterator[None]:
+    """The folder is made where it is not there. Raises BadInput when `path` cannot be written."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with whole(path) as draft:
-            yield draft
+        yield
     except OSError as error:
         raise BadInput(f"cannot write: {error.strerror or error}", file=path) from None
 

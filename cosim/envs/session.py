@@ -261,17 +261,19 @@ class Session:
         self.over = reply.terminated or reply.truncated
 
     def _checked(self, actions: Mapping[str, int | None]) -> dict[str, int]:
-        wanted = {name: action for name, action in actions.items() if action is not None}
-        for name, action in wanted.items():
+        found = {}
+        for name, action in actions.items():
+            if action is None:
+                continue
             if name not in self.avs:
                 problem = f"no AV of that name is on the road{hint(name, self.avs)}"
                 raise BadInput(problem, field="actions", value=name)
             try:
-                MetaAction(operator.index(action))
+                found[name] = int(MetaAction(operator.index(action)))
             except (TypeError, ValueError):
                 known = ", ".join(f"{a.value} {a.name}" for a in MetaAction)
                 raise BadInput(f"is no meta-action ({known})", field=name, value=action) from None
-        return {name: operator.index(action) for name, action in wanted.items()}
+        return found
 
 
 class _InProcess:

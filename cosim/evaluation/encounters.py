@@ -9,10 +9,10 @@ import numpy as np
 
 from cosim.geometry import boxes, deceleration_to_avoid_crash, time_to_collision
 from cosim.metrics.context import watched
+from cosim.metrics.time_to_collision import CRITICAL
 from cosim.road import RoadMap
 from cosim.types import Snapshot
 
-CRITICAL = 1.5  # s, the bound of `ttc_below_1_5_share`
 APART = 1.0  # s without a critical frame: what follows is another encounter
 
 

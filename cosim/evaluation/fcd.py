@@ -90,10 +90,9 @@ def analyse(
         BadInput: malformed or truncated, not FCD, a number missing or not finite, a vehicle twice in a step,
             times that do not increase evenly, positions in degrees, no vehicle at all.
     """
-    road_or_lanes = road or _loose_lanes(path)
-    counter = _Counter(path, road_or_lanes, dict(sizes or {}), roles, (begin, end), frame)
-    if critical is not None:
-        counter.encounters = Encounters(road_or_lanes, critical)
+    lanes = road or _loose_lanes(path)
+    encounters = None if critical is None else Encounters(lanes, critical)
+    counter = _Counter(path, lanes, dict(sizes or {}), roles, (begin, end), frame, encounters)
     read_steps(path, counter.see, progress)
     return counter.finish(road is not None, sizes is not None)
 
@@ -115,12 +114,13 @@ class _Counter:
         roles: Roles,
         window: tuple[float, float],
         frame: float | None,
+        encounters: Encounters | None,
     ) -> None:
         self._path, self._road, self._sizes, self._roles = path, road, sizes, roles
         self._begin, self._end = window
         self._wanted = frame
         self._metrics = [METRICS[name]() for name in FIGURES]
-        self.encounters: Encounters | None = None
+        self._encounters = encounters
         self._first: Step | None = None  # kept until the second one says how far apart they are
         self._interval = 0.0  # s between the file's steps
         self._stride = 1  # in steps: 2 counts every other
@@ -229,8 +229,8 @@ class _Counter:
                 metric.add(snapshot)
             else:
                 metric.reset(snapshot, self._context)
-        if self.encounters is not None:
-            self.encounters.add(snapshot)
+        if self._encounters is not None:
+            self._encounters.add(snapshot)
         self._frames += 1
         self._span = (self._span[0] if self._frames > 1 else snapshot.time, snapshot.time)
         if self._driven < DRIVEN and self._newest is not None:
@@ -278,7 +278,7 @@ class _Counter:
             vehicles=len(self._ever),
             watched=len(self._watched),
             notes=tuple(self._notes(has_road, has_sizes)),
-            encounters=() if self.encounters is None else tuple(self.encounters.found()),
+            encounters=() if self._encounters is None else tuple(self._encounters.found()),
         )
 
     def _notes(self, has_road: bool, has_sizes: bool) -> list[str]:

@@ -24,6 +24,7 @@ from cosim.simulation.fleet import Fleet
 from cosim.simulation.stderr import SumoStderr
 from cosim.simulation.xerces import keep_awake
 from cosim.sumo_outputs import sumo_options
+from cosim.sumocfg import time_of
 from cosim.types import Bools, Collision, Command, Events, Kind, Receipt, Snapshot
 
 SUMO_ERRORS = (libsumo.TraCIException, libsumo.FatalTraCIError)
@@ -80,7 +81,8 @@ class SumoSimulator:
         timing = scenario.timing
         self._steps_per_frame = round(timing.frame / timing.step)
         self._steps_per_decision = round(timing.decision / timing.step)
-        self._gives_up = GIVES_UP in dict(scenario.options)
+        patience = time_of(dict(scenario.options).get(GIVES_UP, "-1"), scenario.config, GIVES_UP)  # s
+        self._gives_up = 0.0 <= patience < scenario.warmup + scenario.duration
         self._bodies: dict[str, Body] = {}
         self._watch = CollisionWatch()
         try:

@@ -57,9 +57,9 @@ def add(verbs: arguments.Verbs) -> None:
 def work(args: argparse.Namespace) -> int:
     """Read it, count, print."""
     from cosim.app.progress import Progress
-    from cosim.evaluation.encounters import CRITICAL
     from cosim.evaluation.fcd import Roles, analyse
     from cosim.evaluation.vehicle_types import read_sizes
+    from cosim.metrics.time_to_collision import CRITICAL
     from cosim.xml_input import regular_file
 
     path = regular_file(Path(args.fcd), file=None, field="FCD")

@@ -111,8 +111,7 @@ def work(args: argparse.Namespace) -> int:
         progress.done()
     result = replace(result, manifest=result.manifest | remembered(case, args.sumo_options))
     if folder is not None:
-        output.clear_folder(folder, case.outputs)
-        output.write_folder(folder, result)
+        output.write_folder(folder, result, case.outputs)
         if watched is not None:
             draw([watched], folder / "replay.html", folder / "replay.mp4")
     if args.json:

@@ -28,14 +28,14 @@ import torch
 
 from benchmarks.prediction_maps import AGENTS, DECISION, PENETRATION, Gatherer
 from benchmarks.tables import markdown_row, write_page
-from cosim.app.configuration import configuration
-from cosim.app.rollouts import Rollouts
-from cosim.app.runner import Runner
-from cosim.memory import keep_freed_memory
+from cosim.learning.configuration import configuration
+from cosim.learning.rollouts import Rollouts
+from cosim.runner import Runner
 from cosim.scenario import Fleet, Scenario, load
 from cosim.seeding import TUNING_SEEDS
 from cosim.types import EpisodeResult, History, PolicyContext
-from cosim.worker import Worker
+from cosim.workers.memory import keep_freed_memory
+from cosim.workers.worker import Worker
 from policy.agents.approaches import AgentConfig, compact, paper
 from policy.agents.prediction_aware import PredictionAware
 from policy.training.config import agent_config

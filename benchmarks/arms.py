@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from cosim.evaluation.compare import Compared, compare
-from cosim.evaluation.figures import Row
-from cosim.evaluation.pairing import Side
-from cosim.evaluation.run_folder import Run
+from cosim.report.compare import Compared, compare
+from cosim.report.figures import Row
+from cosim.report.pairing import Side
+from cosim.report.run_folder import Run
 
 
 def of_world(run: Run, world: str) -> list[Row]:

@@ -21,12 +21,13 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from cosim.app.case_runner import CaseRunner
-from cosim.app.progress import Progress
-from cosim.evaluation import batch, matrix
-from cosim.evaluation.engines import LocalEngine
-from cosim.evaluation.spec import Spec
-from cosim.evaluation.store import Store
+from cosim.batch import execution as batch
+from cosim.batch import matrix
+from cosim.batch.case_runner import CaseRunner
+from cosim.batch.spec import Spec
+from cosim.batch.store import Store
+from cosim.workers.engines import LocalEngine
+from cosim.workers.progress import Progress
 from policy.agents import check_name
 
 GAIN = 0.6  # of the time of one worker, at most, that two may take

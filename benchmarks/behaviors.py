@@ -22,8 +22,8 @@ import numpy.typing as npt
 from scipy.optimize import Bounds, differential_evolution
 
 from benchmarks.lane_changes import CLASSES, Traffic, build_highway, measure
-from cosim.behaviors import LC2013, MIXED, MOBIL, Behaviors, load_behaviors
-from cosim.evaluation.statistics import median_of_blocks, quantile, rate, share
+from cosim.report.statistics import median_of_blocks, quantile, rate, share
+from cosim.scenario.behaviors import LC2013, MIXED, MOBIL, Behaviors, load_behaviors
 from cosim.seeding import FIRST_TEST_SEED, TUNING_SEEDS
 from sumo_scenarios import BEHAVIORS
 

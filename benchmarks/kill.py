@@ -30,7 +30,7 @@ LIMIT = 600.0  # s for a round
 
 def command(out: Path, engine: str) -> list[str]:
     """`cosim evaluate` of the matrix, going on with whatever is in `out`."""
-    start = [sys.executable, "-m", "cosim.app.cli", "evaluate"]
+    start = [sys.executable, "-m", "cosim.cli.main", "evaluate"]
     return [*start, *MATRIX.split(), "--workers", "2", "--engine", engine, "--out", str(out), "--resume"]
 
 

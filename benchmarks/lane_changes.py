@@ -16,7 +16,7 @@ from pathlib import Path
 import libsumo
 
 import sumo_scenarios
-from cosim.behaviors import Behaviors, DriverClass, IdmParameters
+from cosim.scenario.behaviors import Behaviors, DriverClass, IdmParameters
 from cosim.simulation.drivers import Drivers
 from cosim.simulation.mobil import (
     LEFT,

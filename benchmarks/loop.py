@@ -23,7 +23,7 @@ from typing import Any
 
 from cosim.scenario import Fleet, Scenario, load
 from cosim.types import COMPACT, PAPER, ObservationConfig
-from cosim.worker import Worker
+from cosim.workers.worker import Worker
 
 TARGET = {"compact": 3.0, "paper": 6.0}  # times bare libsumo
 HIGHWAY_TARGET = 20.0  # times HighwayEnv's simulated seconds per second

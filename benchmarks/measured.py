@@ -50,7 +50,7 @@ def prediction(place: Place) -> list[list[str]]:
     flags = ["--seeds", "200000:200001", "--out", str(place.work / "prediction")]
     if place.small:
         flags += ["--scenario", "merge", "--demand", "dense", "--behavior", "mixed", "--policy", "idm"]
-    return [["cosim.app.cli", "bench", "predict", *flags]]
+    return [["cosim.cli.main", "bench", "predict", *flags]]
 
 
 def prediction_speed(place: Place) -> list[list[str]]:
@@ -73,7 +73,7 @@ def performance(place: Place) -> list[list[str]]:
     """What the loop, a batch and the Gaussian process cost."""
     where = str(place.work / "recordings")
     traffic = ["--demand", "dense", "--behavior", "mixed"]
-    record = ["cosim.app.cli", "record", *traffic, "--out", where, "--resume"]
+    record = ["cosim.cli.main", "record", *traffic, "--out", where, "--resume"]
     if place.small:
         record += ["--scenario", "merge", "--seeds", "100000:100001", "--duration", "8"]
     else:

@@ -22,11 +22,11 @@ from typing import Any
 
 import numpy as np
 
-from cosim.evaluation import statistics
-from cosim.evaluation.prediction import NORMAL
-from cosim.memory import keep_freed_memory
+from cosim.learning.prediction_scores import NORMAL
 from cosim.recording import Folder, windows
+from cosim.report import statistics
 from cosim.types import Floats
+from cosim.workers.memory import keep_freed_memory
 from policy.forecast import integrate_position
 from policy.gaussian_process import HEADING, SPEED, BankConfig, GaussianProcessBank
 from policy.maximum_likelihood import fit_series

@@ -27,11 +27,11 @@ import numpy as np
 import torch
 
 from benchmarks.tables import markdown_row, write_page
-from cosim.memory import keep_freed_memory
-from cosim.raster import rasterize_road
+from cosim.geometry.raster import rasterize_road
 from cosim.scenario import Fleet, Scenario, load
 from cosim.types import COMPACT, PAPER, History, ObservationConfig
-from cosim.worker import Worker
+from cosim.workers.memory import keep_freed_memory
+from cosim.workers.worker import Worker
 from policy.chain import ChainConfig, predict
 from policy.hpn import HPN, HpnConfig
 from policy.map_branch import MapBranch, MapBranchConfig

@@ -28,8 +28,8 @@ from benchmarks.tables import (
     picture,
     table,
 )
-from cosim.evaluation.run_folder import Run
-from cosim.evaluation.statistics import Figure
+from cosim.report.run_folder import Run
+from cosim.report.statistics import Figure
 from cosim.seeding import TUNING_SEEDS
 from policy.safety import SafetyConfig
 

@@ -40,7 +40,7 @@ def a10kw() -> Path:
 def drive(duration: float | None) -> dict[str, Any]:
     """The document of one run."""
     limit = [] if duration is None else ["--duration", f"{duration:g}"]
-    command = [sys.executable, "-m", "cosim.app.cli", "run", str(a10kw()), *FLAGS, *limit, "--json"]
+    command = [sys.executable, "-m", "cosim.cli.main", "run", str(a10kw()), *FLAGS, *limit, "--json"]
     found: dict[str, Any] = json.loads(
         subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
     )

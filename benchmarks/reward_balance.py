@@ -16,13 +16,13 @@ from typing import Any
 
 import numpy as np
 
-from cosim.app.configuration import configuration
-from cosim.app.progress import Progress
-from cosim.app.rollouts import Rollout
-from cosim.evaluation import statistics
+from cosim.learning.configuration import configuration
+from cosim.learning.rollouts import Rollout
+from cosim.report import statistics
 from cosim.rewards import RewardConfig, rewards
 from cosim.seeding import generator
-from cosim.worker import Worker
+from cosim.workers.progress import Progress
+from cosim.workers.worker import Worker
 from policy.training.config import agent_config
 from policy.training.curriculum import Lesson
 

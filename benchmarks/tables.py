@@ -12,14 +12,14 @@ import numpy as np
 from matplotlib.figure import Figure as Picture
 
 from benchmarks.arms import of_world
-from cosim.evaluation import wording
-from cosim.evaluation.compare import Compared, PairedFigure
-from cosim.evaluation.figures import Measure, Row
-from cosim.evaluation.run_folder import Run
-from cosim.evaluation.statistics import NA, Figure
-from cosim.evaluation.summary import mean_document, not_comparable, rate_document
-from cosim.evaluation.tasks import OK
 from cosim.files import whole
+from cosim.report import wording
+from cosim.report.compare import Compared, PairedFigure
+from cosim.report.figures import Measure, Row
+from cosim.report.run_folder import Run
+from cosim.report.statistics import NA, Figure
+from cosim.report.summary import mean_document, not_comparable, rate_document
+from cosim.workers.tasks import OK
 
 HEADS = {
     "collision_rate": "C%",

@@ -12,11 +12,11 @@ from typing import Literal, NamedTuple
 
 from benchmarks.arms import differences, of_world
 from benchmarks.tables import found
-from cosim.evaluation import wording
-from cosim.evaluation.compare import Compared, PairedFigure
-from cosim.evaluation.figures import RATES
-from cosim.evaluation.run_folder import Run
-from cosim.evaluation.statistics import Figure, paired_change
+from cosim.report import wording
+from cosim.report.compare import Compared, PairedFigure
+from cosim.report.figures import RATES
+from cosim.report.run_folder import Run
+from cosim.report.statistics import Figure, paired_change
 
 Sense = Literal["at least", "at most"]
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from cosim.envs.session import Session, StepResult, open
-    from cosim.envs.view import View
+    from cosim.observation.view import View
 
 __all__ = ["Session", "StepResult", "View", "__version__", "open"]
 

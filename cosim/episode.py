@@ -9,11 +9,11 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from cosim.actions import to_commands
-from cosim.manifest import manifest
+from cosim.control import to_commands
 from cosim.metrics import MetricContext, Metrics
 from cosim.observation import Observer
 from cosim.scenario import Scenario
+from cosim.scenario.manifest import manifest
 from cosim.seeding import generator
 from cosim.types import (
     Collision,

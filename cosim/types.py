@@ -6,25 +6,23 @@ Letters in shapes: `n` vehicles, `N` past frames, `M` predicted frames, `C, H, W
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from enum import IntEnum
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
+from cosim.arrays import Bools as Bools
+from cosim.arrays import Bytes as Bytes
+from cosim.arrays import Floats as Floats
+from cosim.arrays import Floats32 as Floats32
+from cosim.arrays import Ints as Ints
 from cosim.errors import in_range
-
-if TYPE_CHECKING:
-    from cosim.road import RoadMap, RouteAhead
-
-Floats = npt.NDArray[np.float64]
-Floats32 = npt.NDArray[np.float32]
-Bools = npt.NDArray[np.bool_]
-Ints = npt.NDArray[np.int64]
-Bytes = npt.NDArray[np.uint8]
+from cosim.road import RoadMap, RouteAhead
 
 
 class MetaAction(IntEnum):
@@ -327,3 +325,37 @@ class EpisodeResult:
     def value(self, name: str) -> float | int | bool | None:
         """The bare value of one metric."""
         return self.metrics[name].value
+
+    def document(self) -> dict[str, Any]:
+        """The JSON document of `cosim run --json`: metrics by name, their units beside them, NA null."""
+        return {
+            "scenario": self.scenario,
+            "demand": self.demand,
+            "policy": self.policy,
+            "policy_label": self.label,
+            "behavior": self.behavior,
+            "driver_model": self.driver_model,
+            "preset": self.preset,
+            "svo_deg": self.svo_deg,
+            "seed": self.seed,
+            "steps": self.steps,
+            **{name: _plain(metric.value) for name, metric in self.metrics.items()},
+            "trace_hash": self.trace_hash,
+            "timings": {name: round(value, 6) for name, value in self.timings.items()},
+            "comparable": not self.validity,
+            "not_comparable_because": list(self.validity),
+            "collision_list": [_collision(asdict(c)) for c in self.collisions],
+            "units": {name: metric.unit for name, metric in self.metrics.items()},
+            "better": {name: metric.better for name, metric in self.metrics.items()},
+            "manifest": self.manifest,
+        }
+
+
+def _plain(value: float | int | bool | None) -> float | int | bool | None:
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _collision(fields: dict[str, Any]) -> dict[str, Any]:
+    return {k: _plain(v) if isinstance(v, float) else v for k, v in fields.items()}

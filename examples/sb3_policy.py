@@ -13,7 +13,7 @@ from stable_baselines3 import DQN
 
 from cosim.envs.gym import nearest_upstream
 from cosim.envs.spaces import observation
-from cosim.envs.view import views
+from cosim.observation.view import views
 from cosim.types import COMPACT, History, PolicyContext
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from cosim.errors import in_range
-from cosim.raster import PIXEL_FLOOR, PIXEL_SPAN, PIXEL_SPEED, RoadRaster, draw_kinematics
+from cosim.geometry.raster import PIXEL_FLOOR, PIXEL_SPAN, PIXEL_SPEED, RoadRaster, draw_kinematics
 from cosim.types import SPEED, Bools, Bytes, Floats, ObservationConfig
 from policy.forecast import KinematicForecast
 from policy.hpn import HPN

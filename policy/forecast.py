@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosim.compiled import compiled
+from cosim.geometry.compiled import compiled
 from cosim.types import HEADING, SPEED, Bools, Floats, X, Y
 
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosim.compiled import compiled
+from cosim.geometry.compiled import compiled
 from cosim.types import Floats
 
 NEGLIGIBLE = 1e-5  # weight of a kernel that is left out: a hundred of them move a speed by mm/s

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 import torch
 
-from cosim.raster import rasterize_road
+from cosim.geometry.raster import rasterize_road
 from cosim.road import RoadMap
 from cosim.types import Floats, Floats32, History, ObservationConfig
 from policy.chain import render

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from cosim.compiled import compiled
+from cosim.geometry.compiled import compiled
 from cosim.types import Bools, Floats, Ints
 
 LAGS = np.array([1, 2, 4, 9])  # frames back over which speed and heading are compared with now

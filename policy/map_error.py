@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from cosim.raster import RoadRaster, rasterize_road
+from cosim.geometry.raster import RoadRaster, rasterize_road
 from cosim.road import RoadMap
 from cosim.types import Bytes, Floats, Floats32, History, ObservationConfig
 from policy.chain import ChainConfig, predict

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from cosim.compiled import compiled
+from cosim.geometry.compiled import compiled
 from cosim.road import LanePath, RoadMap
 from cosim.types import IS_MISSION, Bools, Floats, Floats32, History, Ints
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosim.compiled import compiled
+from cosim.geometry.compiled import compiled
 from cosim.road import LanePath
 from cosim.types import HEADING, LENGTH, Floats, Ints, X, Y
 

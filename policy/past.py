@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cosim.compiled import compiled
+from cosim.geometry.compiled import compiled
 from cosim.types import Bools, Floats, Ints
 
 ORDINARY = 3.0  # m/s2: who brakes harder than this now has hardly done so for two seconds

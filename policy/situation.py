@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from cosim.actions import SPEED_STEP
-from cosim.compiled import compiled
+from cosim.control import SPEED_STEP
+from cosim.geometry.compiled import compiled
 from cosim.road import RoadMap
 from cosim.types import Floats, Floats32, History
 from policy.meeting import LANE, Meeting, along, meet, missions

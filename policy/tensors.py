@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from cosim.raster import PIXEL_FLOOR, PIXEL_SPAN, PIXEL_SPEED
+from cosim.geometry.raster import PIXEL_FLOOR, PIXEL_SPAN, PIXEL_SPEED
 from cosim.road import RoadMap
 from cosim.types import KINEMATIC_FEATURES, Bools, Floats, Floats32, History
 from policy.situation import situation

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from cosim.compiled import compiled
+from cosim.geometry.compiled import compiled
 from cosim.types import HEADING, IS_AV, IS_MISSION, LENGTH, SPEED, WIDTH, Bools, Floats, Floats32, Ints, X, Y
 from policy.forecast import KinematicForecast
 from policy.scene import Scene

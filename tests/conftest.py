@@ -10,7 +10,7 @@ import pytest
 
 from cosim.scenario import Fleet, Mission, Scenario, load
 from cosim.simulation.sumo import SumoSimulator
-from cosim.worker import Worker
+from cosim.workers.worker import Worker
 
 TYPES = """<routes>
     <vType id="hv" length="5" width="2" carFollowModel="IDM" tau="1" minGap="2" accel="3" decel="7"

@@ -21,7 +21,7 @@ from benchmarks.tables import (
     picture,
     table,
 )
-from cosim.evaluation.figures import RATES, Measure
+from cosim.report.figures import RATES, Measure
 
 AGENT = "vfn-p"
 RANGES = (25.0, 50.0, 75.0, PERCEPTION)  # m

@@ -9,9 +9,9 @@ from statistics import fmean
 
 from benchmarks.papers.agents import missing
 from benchmarks.papers.driving import AgentRunner, Order, Planned, Settings, agent_of, held, planned
-from cosim.evaluation import estimate
-from cosim.evaluation.engines import LocalEngine
-from cosim.evaluation.matrix import Cell
+from cosim.batch import estimate
+from cosim.batch.matrix import Cell
+from cosim.workers.engines import LocalEngine
 
 PROBES = 2  # worlds in which an agent's cost is measured
 

@@ -27,8 +27,8 @@ from benchmarks.tables import (
     table,
 )
 from benchmarks.targets import Arms, Finding
-from cosim.evaluation.run_folder import Run
-from cosim.evaluation.statistics import Figure
+from cosim.report.run_folder import Run
+from cosim.report.statistics import Figure
 
 DENSE, CONTESTED = 300, 100  # episodes a world
 TWIN = "vfn-p-egoistic"

@@ -16,17 +16,18 @@ from pathlib import Path
 
 from benchmarks.papers import shipped
 from benchmarks.papers.agents import Agent, build, fingerprint, missing, short
-from cosim.app.case_runner import CaseRunner
-from cosim.app.progress import Progress
-from cosim.evaluation import batch, matrix
-from cosim.evaluation.case import Case
-from cosim.evaluation.engines import LocalEngine
-from cosim.evaluation.figures import Row
-from cosim.evaluation.folder import RunFolder
-from cosim.evaluation.run_folder import Run
-from cosim.evaluation.store import Store
+from cosim.batch import execution as batch
+from cosim.batch import matrix
+from cosim.batch.case_runner import CaseRunner
+from cosim.batch.folder import RunFolder
+from cosim.batch.store import Store
+from cosim.report.figures import Row
+from cosim.report.run_folder import Run
+from cosim.scenario.episode_id import Case
 from cosim.seeding import FIRST_TEST_SEED
 from cosim.types import Policy
+from cosim.workers.engines import LocalEngine
+from cosim.workers.progress import Progress
 
 WORLDS = ("exit", "merge", "roundabout", "intersection", "highway")  # P's order
 SVO = 45.0  # deg, weighs oneself and the others alike

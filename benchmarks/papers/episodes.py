@@ -24,15 +24,15 @@ from benchmarks.papers.agents import Agent, missing
 from benchmarks.papers.driving import AgentRunner, Planned, Settings, agent_of, planned
 from benchmarks.papers.jobs import JOBS
 from benchmarks.papers.pages import Job
-from cosim.app.progress import Progress
+from cosim.batch.folder import RunFolder
+from cosim.batch.matrix import Cell
+from cosim.batch.records import row as row_of
+from cosim.batch.store import FILE, Store
 from cosim.errors import BadInput, CosimError
-from cosim.evaluation.engines import LocalEngine
-from cosim.evaluation.figures import Row
-from cosim.evaluation.folder import RunFolder
-from cosim.evaluation.matrix import Cell
-from cosim.evaluation.records import row as row_of
-from cosim.evaluation.store import FILE, Store
-from cosim.evaluation.tasks import OK
+from cosim.report.figures import Row
+from cosim.workers.engines import LocalEngine
+from cosim.workers.progress import Progress
+from cosim.workers.tasks import OK
 
 SAMPLE = 20  # episodes
 DIFFERENT = 1  # exit code

@@ -28,9 +28,9 @@ from benchmarks.tables import (
     picture,
     table,
 )
-from cosim.evaluation.figures import RATES, Measure
-from cosim.evaluation.run_folder import Run
-from cosim.evaluation.statistics import Figure
+from cosim.report.figures import RATES, Measure
+from cosim.report.run_folder import Run
+from cosim.report.statistics import Figure
 
 BEHAVIORS = ("conservative", "aggressive", "mixed")
 APPROACHES = ("vfn", "vfn-p")  # without and with prediction

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from benchmarks.papers.driving import AgentRunner
-from cosim.evaluation.case import Case
-from cosim.evaluation.replay.strip import Strip, poses_at
-from cosim.evaluation.replay.watcher import Track, Watched
-from cosim.evaluation.tasks import Progress
+from cosim.recording.watcher import Track, Watched
+from cosim.report.replay.strip import Strip, poses_at
 from cosim.road import Lane
+from cosim.scenario.episode_id import Case
 from cosim.types import Floats, Kind
+from cosim.workers.tasks import Progress
 
 SLOWS, YIELDS, OVERTAKES, OTHER, NONE = KINDS = (
     "slows down in its lane",

@@ -24,8 +24,8 @@ from benchmarks.papers.driving import (
 )
 from benchmarks.tables import Line, write_csv, write_page
 from cosim.errors import CosimError
-from cosim.evaluation.tasks import OK
 from cosim.seeding import FIRST_TEST_SEED
+from cosim.workers.tasks import OK
 from policy.checkpoint import read_card
 
 STYLE: Any = {"svg.fonttype": "none", "svg.hashsalt": "cosim", "font.size": 9.0}  # equal figures, equal file

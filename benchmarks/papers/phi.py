@@ -15,8 +15,8 @@ from benchmarks.papers.agents import Agent
 from benchmarks.papers.driving import Driven, Order, Results, Settings
 from benchmarks.papers.pages import Job, drawing, heading, save, save_picture
 from benchmarks.tables import Line, difference_lines, difference_table, found, lines_of, table
-from cosim.evaluation.figures import Measure
-from cosim.evaluation.run_folder import Run
+from cosim.report.figures import Measure
+from cosim.report.run_folder import Run
 
 PHIS = (0.0, 15.0, 30.0, 45.0, 60.0, 75.0, 90.0)  # degrees: from egoist to whoever lives for others
 AGENT = "vfn-p"

@@ -1,6 +1,6 @@
 """The episodes that come with the repository: what a page needs and was driven already is taken from here.
 
-An exported run like any other (`episodes.parquet`, `manifest.json`; `cosim.evaluation.run_folder` reads it),
+An exported run like any other (`episodes.parquet`, `manifest.json`; `cosim.report.run_folder` reads it),
 but for what belongs to the machine that drove it. A row is taken only for the very cell it was driven for:
 same agent, weights, input files and packages. `benchmarks.papers.episodes` keeps and checks them.
 """
@@ -15,11 +15,11 @@ from typing import Any
 
 import pyarrow.parquet
 
-from cosim.evaluation.export import arrow
-from cosim.evaluation.figures import Row
-from cosim.evaluation.run_folder import Run, read
-from cosim.evaluation.store import Store
+from cosim.batch.export import arrow
+from cosim.batch.store import Store
 from cosim.files import whole
+from cosim.report.figures import Row
+from cosim.report.run_folder import Run, read
 
 FOLDER = Path("docs/results/episodes")
 ROWS, MANIFEST = "episodes.parquet", "manifest.json"

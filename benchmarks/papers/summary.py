@@ -19,7 +19,7 @@ from benchmarks.papers.driving import WORLDS, Settings, add_arguments, settings_
 from benchmarks.papers.figure9 import BEHAVIORS
 from benchmarks.papers.guide import OVERTAKES, SLOWS, YIELDS
 from benchmarks.tables import write_page
-from cosim.app.bench_predict import EIGHT
+from cosim.learning.bench_predict import EIGHT
 
 NOT_RUN = "not run yet"
 UNTRAINED = " **untrained**"

@@ -39,13 +39,13 @@ from benchmarks.papers.guide import (
 )
 from benchmarks.papers.pages import Job, drawing, heading, save, save_picture
 from benchmarks.tables import Line, markdown_row
-from cosim.app.progress import Progress
+from cosim.batch.folder import RunFolder
 from cosim.errors import CosimError
-from cosim.evaluation.engines import LocalEngine
-from cosim.evaluation.folder import RunFolder
-from cosim.evaluation.statistics import share
-from cosim.evaluation.tasks import OK, Task
 from cosim.files import whole
+from cosim.report.statistics import share
+from cosim.workers.engines import LocalEngine
+from cosim.workers.progress import Progress
+from cosim.workers.tasks import OK, Task
 
 FOLDER = "guide"  # in settings.runs
 AGENTS = ("vfn-p", "altruist-rule")  # the learned altruist, and what a scripted one does

@@ -21,10 +21,10 @@ from benchmarks.papers.driving import SVO, Order, Results, Settings
 from benchmarks.papers.pages import Job, drawing, heading, save, save_picture
 from benchmarks.tables import Line, difference_lines, difference_table, lines_of, markdown_row, table
 from benchmarks.targets import headline
-from cosim.evaluation.run_folder import Run
-from cosim.evaluation.statistics import quantile, share
-from cosim.evaluation.tasks import OK
+from cosim.report.run_folder import Run
+from cosim.report.statistics import quantile, share
 from cosim.types import Floats
+from cosim.workers.tasks import OK
 
 ALTRUIST, EGOIST = "vfn-p", "vfn-p-egoistic"
 EPISODES = 300  # T: 3,000 test episodes

@@ -15,10 +15,10 @@ from benchmarks.papers.claims import APPROACHES, TABLE_3
 from benchmarks.papers.driving import WORLDS, Order, Results, Settings
 from benchmarks.papers.pages import Job, drawing, heading, save, save_picture
 from benchmarks.tables import difference_lines, difference_table, found, lines_of, markdown_row, table
-from cosim.evaluation.figures import RATES
-from cosim.evaluation.run_folder import Run
-from cosim.evaluation.statistics import Figure, share
-from cosim.evaluation.tasks import OK
+from cosim.report.figures import RATES
+from cosim.report.run_folder import Run
+from cosim.report.statistics import Figure, share
+from cosim.workers.tasks import OK
 
 MOST = 1000  # episodes a world of vfn and vfn-p: 1 % against 2 % needs many
 OTHERS = 300  # of the baselines

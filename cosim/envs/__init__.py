@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from cosim.envs.gym import SumoEnv
     from cosim.envs.parallel import SumoParallelEnv, parallel_env
     from cosim.envs.session import Session, StepResult, open
-    from cosim.envs.view import View
+    from cosim.observation.view import View
 
 __all__ = ["Session", "StepResult", "SumoEnv", "SumoParallelEnv", "View", "open", "parallel_env"]
 

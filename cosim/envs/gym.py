@@ -13,8 +13,8 @@ import cosim.envs.session as sessions
 from cosim.envs import spaces
 from cosim.envs.session import Session, StepResult
 from cosim.envs.spaces import Observation
-from cosim.envs.view import View
 from cosim.errors import BadInput
+from cosim.observation.view import View
 from cosim.scenario import Scenario
 from cosim.types import COMPACT, Bytes, ObservationConfig
 

@@ -8,10 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosim.determinism import make_torch_deterministic
-from cosim.envs.view import Packed, Packer
 from cosim.episode import Episode
 from cosim.errors import BadInput
+from cosim.observation.view import Packed, Packer
 from cosim.rewards import RewardConfig, RewardTerms, rewards
 from cosim.road import RoadMap
 from cosim.scenario import Scenario
@@ -28,6 +27,7 @@ from cosim.types import (
     Simulator,
     Snapshot,
 )
+from cosim.workers.determinism import make_torch_deterministic
 
 SimulatorFactory = Callable[[Scenario, Mapping[str, str], int], Simulator]  # ..., AV parameters, frames kept
 PolicyFactory = Callable[[], Policy]

@@ -13,8 +13,8 @@ from cosim.envs import spaces
 from cosim.envs.gym import no_av
 from cosim.envs.session import Session
 from cosim.envs.spaces import Observation
-from cosim.envs.view import View
 from cosim.errors import BadInput, hint
+from cosim.observation.view import View
 from cosim.scenario import Scenario
 from cosim.types import COMPACT, Bytes, ObservationConfig
 

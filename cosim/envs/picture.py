@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cosim.raster import CHANNELS, ROAD_LINE, draw_snapshot, rasterize_road
+from cosim.geometry.raster import CHANNELS, ROAD_LINE, draw_snapshot, rasterize_road
 from cosim.road import RoadMap
 from cosim.types import Bytes, ObservationConfig, Snapshot
 

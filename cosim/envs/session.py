@@ -8,8 +8,8 @@ import operator
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
-from cosim.envs.view import Unpacker, View
 from cosim.errors import BadInput, hint
+from cosim.observation.view import Unpacker, View
 from cosim.rewards import RewardConfig, RewardTerms
 from cosim.scenario import Fleet, Scenario, load
 from cosim.seeding import TRAINING_SEEDS
@@ -23,7 +23,7 @@ from cosim.types import (
     Receipt,
     Snapshot,
 )
-from cosim.worker import Worker
+from cosim.workers.worker import Worker
 
 if TYPE_CHECKING:
     from cosim.envs.host import Host, PolicyFactory, Reply, SimulatorFactory
@@ -106,7 +106,7 @@ def open(
             options=options,
         )
     if simulator is None:
-        from cosim.vet import vetted
+        from cosim.scenario.vet import vetted
 
         scenario = vetted(scenario)
     arguments = (scenario, observation, math.radians(svo), reward or RewardConfig(), others, simulator)

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cosim.envs.session import StepResult
-from cosim.envs.view import View
 from cosim.errors import one_of
+from cosim.observation.view import View
 from cosim.seeding import TRAINING_SEEDS
 from cosim.types import KINEMATIC_FEATURES, Floats, Floats32, MetaAction, ObservationConfig
 

@@ -114,7 +114,7 @@ def conflicts(
     """Conflicts of the `watched` [n] vehicles with any of the n (arrays [n] each), up to `horizon` s ahead.
 
     The same as `time_to_collision` and `deceleration_to_avoid_crash` over all pairs, in one pass. `roads`:
-    each vehicle's road [n] and which roads can touch [S,S] (`cosim.contact`); without them all can.
+    each vehicle's road [n] and which roads can touch [S,S] (`cosim.road.contact`); without them all can.
     """
     x, y, heading, length, width, speed = (np.asarray(v, dtype=np.float64) for v in all_boxes)
     number, touch = (np.zeros(len(x), np.int64), EVERYWHERE) if roads is None else roads

@@ -15,7 +15,7 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from cosim.compiled import compiled
+from cosim.geometry.compiled import compiled
 from cosim.types import Bools, Floats, Ints
 
 FOLLOWING_COSINE = float(np.cos(np.radians(15.0)))  # headings closer than 15 degrees: following, not crossing

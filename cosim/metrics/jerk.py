@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from cosim.compiled import compiled
+from cosim.geometry.compiled import compiled
 from cosim.metrics.context import AV, MetricContext, Slots, grown
 from cosim.types import Floats, Ints, Metric, Snapshot
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from cosim.compiled import compiled
 from cosim.geometry import gap_ahead
+from cosim.geometry.compiled import compiled
 from cosim.road import LaneGraph
 from cosim.types import HEADING, SPEED, Bools, Floats, Floats32, Ints, Snapshot, X, Y
 

@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
+from cosim.geometry.raster import RoadRaster, draw_snapshot, rasterize_road
 from cosim.observation.kinematics import choose_rows, fill_rows, never_left_out, perceived
 from cosim.observation.past import KinematicPast, MapPast
-from cosim.raster import RoadRaster, draw_snapshot, rasterize_road
 from cosim.road import RoadMap
 from cosim.types import KINEMATIC_FEATURES, Bools, History, Ints, Kind, ObservationConfig, Snapshot
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import libsumo
 
-from cosim.actions import LANE_CHANGE_TIME, MAX_DECEL, tracked_speed
+from cosim.control import LANE_CHANGE_TIME, MAX_DECEL, tracked_speed
 from cosim.simulation.convert import may_change
 from cosim.simulation.fleet import AV_IDM
 from cosim.types import Command, Preset, Receipt

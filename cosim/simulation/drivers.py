@@ -1,4 +1,4 @@
-"""Makes each HV in SUMO drive like its class of Table II (`cosim.behaviors`)."""
+"""Makes each HV in SUMO drive like its class of Table II (`cosim.scenario.behaviors`)."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import hashlib
 
 import libsumo
 
-from cosim.behaviors import AS_IS, DRIVER_MODELS, MOBIL, Behaviors, DriverClass, load_behaviors
 from cosim.errors import BadInput
+from cosim.scenario.behaviors import AS_IS, DRIVER_MODELS, MOBIL, Behaviors, DriverClass, load_behaviors
 from cosim.simulation.mobil import MobilDriving
 
 # A vehicle cannot be given another car-following model while it drives, except through its type. A network

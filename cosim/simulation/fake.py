@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cosim.actions import tracked_speed
+from cosim.control import tracked_speed
 from cosim.road import Lane, RoadMap
 from cosim.types import Collision, Command, Events, Kind, Receipt, Snapshot, Timing
 

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 
 import libsumo
 
-from cosim.behaviors import AS_IS
 from cosim.scenario import Scenario
+from cosim.scenario.behaviors import AS_IS
 from cosim.seeding import uniform
 from cosim.simulation.convert import Body
 from cosim.simulation.drivers import IDM_TYPE, Drivers

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import libsumo
 
-from cosim.behaviors import IdmParameters, MobilParameters
+from cosim.scenario.behaviors import IdmParameters, MobilParameters
 
 FAR = 1.0e6  # m: the gap to nobody
 TOUCHING = 0.01  # m: smaller gaps (also overlaps) brake as hard as this one

@@ -15,7 +15,7 @@ class SumoStderr:
     """A context manager that sends file descriptor 2 to a file while SUMO works.
 
     In a worker process it goes to a file already, and stays there: should SUMO kill the process, the parent
-    finds SUMO's last words in it (`cosim.worker`). Elsewhere the file is a hidden one.
+    finds SUMO's last words in it (`cosim.workers.worker`). Elsewhere the file is a hidden one.
     """
 
     def __init__(self) -> None:
@@ -54,7 +54,7 @@ class SumoStderr:
 
 
 def _is_a_workers(descriptor: int) -> bool:
-    """A regular file that can be read back and is only appended to: how `cosim.worker` opens it."""
+    """A regular file that can be read back and is only appended to: how `cosim.workers.worker` opens it."""
     flags = fcntl.fcntl(descriptor, fcntl.F_GETFL)
     readable = flags & os.O_ACCMODE == os.O_RDWR
     return bool(readable and flags & os.O_APPEND and stat.S_ISREG(os.fstat(descriptor).st_mode))

@@ -13,9 +13,11 @@ import numpy as np
 
 import sumo_scenarios
 from cosim.errors import BadInput, SimulationError, SimulationInUse
-from cosim.quiet import quiet
 from cosim.road import RoadMap
 from cosim.scenario import Scenario
+from cosim.scenario.quiet import quiet
+from cosim.scenario.sumo_outputs import sumo_options
+from cosim.scenario.sumocfg import time_of
 from cosim.simulation.collisions import CollisionWatch
 from cosim.simulation.commands import Commander
 from cosim.simulation.convert import Body, SnapshotReader, read_road, struggling_lanes
@@ -23,8 +25,6 @@ from cosim.simulation.drivers import Drivers
 from cosim.simulation.fleet import Fleet
 from cosim.simulation.stderr import SumoStderr
 from cosim.simulation.xerces import keep_awake
-from cosim.sumo_outputs import sumo_options
-from cosim.sumocfg import time_of
 from cosim.types import Bools, Collision, Command, Events, Kind, Receipt, Snapshot
 
 SUMO_ERRORS = (libsumo.TraCIException, libsumo.FatalTraCIError)
@@ -43,7 +43,7 @@ FORCED = {
     "no-step-log": "true",
     "no-warnings": "true",
     "duration-log.disable": "true",
-    "xml-validation": "never",  # cosim.vet has read the files already
+    "xml-validation": "never",  # cosim.scenario.vet has read the files already
 }
 # What SUMO says in the middle of a run, where it loads routes, of a vehicle that cannot depart as written.
 WRONG_DEMAND = re.compile(
@@ -159,7 +159,7 @@ class SumoSimulator:
         return {"inserted": self._inserted, "waiting": len(waiting)}
 
     def write_outputs(self, files: Mapping[str, Path]) -> None:
-        """SUMO's own outputs (name -> file, see `cosim.sumo_outputs`) of the episodes from the next on."""
+        """SUMO's own outputs (name -> file, `cosim.scenario.sumo_outputs`) from the next episode on."""
         self._outputs = dict(files)
 
     def finish_outputs(self) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from cosim.errors import BadInput
-from cosim.raster import RoadRaster, rasterize_road
+from cosim.geometry.raster import RoadRaster, rasterize_road
 from cosim.road import RoadMap
 from cosim.types import (
     Decision,

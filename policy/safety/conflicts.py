@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosim.compiled import compiled
 from cosim.geometry import Boxes, first_contacts
+from cosim.geometry.compiled import compiled
 from cosim.road import RoadMap
 from cosim.types import Bools, Floats, Ints, MetaAction
 from policy.motion import Rollout, project_each

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosim.actions import (
+from cosim.control import (
     LANE_CHANGE_TIME,
     MAX_DECEL,
     braked_from,

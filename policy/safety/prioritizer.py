@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosim.actions import LANE_CHANGE_TIME
+from cosim.control import LANE_CHANGE_TIME
 from cosim.road import RoadMap
 from cosim.types import Bools, Decision, Floats, Floats32, History, MetaAction
 from policy.motion import Rollout

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from cosim.actions import MAX_DECEL, TIME_CONSTANT, next_target, tracked_speeds
+from cosim.control import MAX_DECEL, TIME_CONSTANT, next_target, tracked_speeds
 from cosim.types import Floats, Floats32, History, MetaAction, PolicyContext
 from policy.agents.altruist_rule import AltruistRule
 from policy.agents.idm import ACCEL, wished_gap

@@ -31,7 +31,7 @@ from policy.vfn import VFN, VfnConfig
 
 
 class Actors(Protocol):
-    """Where episodes are driven (cosim.app.rollouts)."""
+    """Where episodes are driven (cosim.learning.rollouts)."""
 
     def submit(self, drive: Drive) -> Future[Drove]:
         """Drive it soon."""

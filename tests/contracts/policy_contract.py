@@ -11,7 +11,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from cosim.actions import to_commands
+from cosim.control import to_commands
 from cosim.observation import Observer
 from cosim.seeding import generator
 from cosim.simulation.fake import FakeSimulator, FakeVehicle

@@ -59,7 +59,7 @@ class Probe:
 
 
 class World(Protocol):
-    """A `cosim.worker.Worker` around a Probe, or the like of it."""
+    """A `cosim.workers.worker.Worker` around a Probe, or the like of it."""
 
     def call(self, method: str, *arguments: Any) -> Any: ...
 

@@ -12,7 +12,7 @@ from simulator_contract import Here, Probe, SimulatorContract, World
 
 from cosim.scenario import Fleet, Mission, Scenario, load
 from cosim.simulation.fake import FakeSimulator, FakeVehicle
-from cosim.worker import Worker
+from cosim.workers.worker import Worker
 
 
 class TestFake(SimulatorContract):

@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 
-from cosim.app.runner import Runner
+from cosim.runner import Runner
 from cosim.scenario import load
-from cosim.worker import Worker
+from cosim.workers.worker import Worker
 
 FILE = Path(__file__).with_name("episodes.json")
 SEED = 200_011

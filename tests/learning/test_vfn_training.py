@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import torch
 
-from cosim.app.rollouts import drive_episode
 from cosim.episode import Episode
 from cosim.errors import BadInput
+from cosim.learning.rollouts import drive_episode
 from cosim.rewards import RewardConfig
 from cosim.scenario import Mission, Scenario
 from cosim.seeding import generator

@@ -11,7 +11,7 @@ from cosim.geometry import boxes, overlapping_pairs
 from cosim.scenario import Scenario, load
 from cosim.simulation.sumo import SumoSimulator
 from cosim.types import Collision, Command, Receipt, Snapshot
-from cosim.worker import Worker
+from cosim.workers.worker import Worker
 
 HOLD = 0.4  # s
 

@@ -11,11 +11,11 @@ import sys
 
 from ray.cluster_utils import Cluster
 
-from cosim.app.case_runner import CaseRunner
-from cosim.app.cli import parser
-from cosim.evaluation import matrix
-from cosim.evaluation.ray_engine import RayEngine
-from cosim.evaluation.spec import FIELDS, read
+from cosim.batch import matrix
+from cosim.batch.case_runner import CaseRunner
+from cosim.batch.spec import FIELDS, read
+from cosim.cli.main import parser
+from cosim.workers.ray_engine import RayEngine
 from policy.agents import check_name
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import sumo
 
-from cosim.app.cli import main
+from cosim.cli.main import main
 
 RAMP = Path(sumo.__file__).parent / "tools" / "game" / "ramp"  # a small net that none of us wrote
 NET, ROUTES, ADDITIONAL = "ramp.net.xml", "ramp.rou.xml", "more.add.xml"
@@ -286,7 +286,7 @@ def test_the_sound_scenario_runs_packed_as_well(config: Path, capfd: pytest.Capt
 def test_a_net_that_kills_sumo_leaves_a_live_process_and_exit_2(config: Path) -> None:
     """SUMO itself dies of a net without version (SIGSEGV): a fresh process shows that ours does not."""
     swap(NET, r'<net version="[^"]*"', "<net")(config.parent)
-    command = [sys.executable, "-m", "cosim.app.cli", "run", str(config), "--json"]
+    command = [sys.executable, "-m", "cosim.cli.main", "run", str(config), "--json"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 2
     assert done.stdout == ""

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from cosim.app import doctor
-from cosim.app.doctor import FAIL, OK, WARN
+from cosim.cli import doctor_work as doctor
+from cosim.cli.doctor_work import FAIL, OK, WARN
 
 
 def test_a_sound_installation_passes_with_a_simulated_second(capsys: pytest.CaptureFixture[str]) -> None:

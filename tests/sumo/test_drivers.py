@@ -12,8 +12,8 @@ import pytest
 import sumo
 
 import sumo_scenarios
-from cosim.behaviors import load_behaviors
 from cosim.errors import BadInput
+from cosim.scenario.behaviors import load_behaviors
 from cosim.simulation.drivers import IDM_TYPE, Drivers
 from cosim.simulation.mobil import STRATEGIC_ONLY, idm_acceleration
 

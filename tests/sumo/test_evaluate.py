@@ -18,7 +18,7 @@ from typing import Any
 import pyarrow.parquet
 import pytest
 
-from cosim.app.cli import main
+from cosim.cli.main import main
 
 MATRIX = "--scenario merge --demand free --policy idm --policy keep-lane --duration 4 --seeds 200000:200003"
 TIMES = {"timings", "reset_s", "simulation_s", "observation_s", "decision_s", "total_s", "attempts"}
@@ -88,7 +88,7 @@ def test_workers_and_parent_killed_and_resumed_every_episode_once_and_the_same(
     undisturbed: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "run"
-    command = [sys.executable, "-m", "cosim.app.cli", "evaluate", *MATRIX.split(), "--workers", "2"]
+    command = [sys.executable, "-m", "cosim.cli.main", "evaluate", *MATRIX.split(), "--workers", "2"]
     parent = subprocess.Popen([*command, "--out", str(out)], stderr=subprocess.PIPE)
     wait_for_rows(out, 1, parent)
     os.kill(workers_of(parent.pid)[0], signal.SIGKILL)

@@ -12,7 +12,7 @@ import pytest
 import yaml
 from junitparser import Failure, JUnitXml
 
-from cosim.evaluation.run_folder import read
+from cosim.report.run_folder import read
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "ci"
 GATES = {"altruist": 0, "reckless": 1}

@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
-from cosim.app.cli import main
-from cosim.app.runner import Runner
+from cosim.cli.main import main
 from cosim.errors import BadInput, SimulationError
+from cosim.runner import Runner
 from cosim.scenario import load
-from cosim.sumo_outputs import DRAFT, OUTPUTS, check, drafts
-from cosim.worker import Worker
+from cosim.scenario.sumo_outputs import DRAFT, OUTPUTS, check, drafts
+from cosim.workers.worker import Worker
 
 MERGE = Path(__file__).parents[2] / "sumo_scenarios" / "merge"
 ROOTS = {"fcd": "fcd-export", "tripinfo": "tripinfos", "ssm": "SSMLog", "statistic": "statistics"}

@@ -13,13 +13,13 @@ from typing import Any
 
 import pytest
 
-from cosim.app.cli import main
-from cosim.app.configuration import configuration
-from cosim.app.policies import check, make
-from cosim.app.train_vfn import ABOUT
-from cosim.app.trained_policy import config
+from cosim.batch.store import FILE
+from cosim.cli.main import main
 from cosim.errors import BadInput
-from cosim.evaluation.store import FILE
+from cosim.learning.configuration import configuration
+from cosim.learning.train_vfn import ABOUT
+from cosim.policies import check, make
+from cosim.policies.trained import config
 from cosim.types import COMPACT
 from policy import checkpoint
 from policy.agents.approaches import compact
@@ -200,7 +200,7 @@ def test_a_run_folder_holds_one_run(tmp_path: Path) -> None:
 def test_a_device_that_is_not_there_is_refused_before_anything_is_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cosim.app.train_vfn.usable", lambda device: device == "cpu")
+    monkeypatch.setattr("cosim.learning.train_vfn.usable", lambda device: device == "cpu")
     out = tmp_path / "out"
     assert main(["train", "vfn", "--config", "smoke", "--device", "cuda", "--out", str(out)]) == 2
     assert "--device='cuda': torch has no such device here" in capsys.readouterr().err

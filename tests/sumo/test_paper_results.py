@@ -271,7 +271,7 @@ def test_missing_weights_are_said_in_one_line_with_the_command_that_makes_them(
 
 
 def test_the_training_of_figure_9_is_six_configurations_that_can_be_read(tmp_path: Path) -> None:
-    from cosim.app.configuration import configuration
+    from cosim.learning.configuration import configuration
 
     figure9.write_configurations(tmp_path)
     for behavior in figure9.BEHAVIORS:

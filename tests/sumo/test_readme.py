@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from cosim.envs.view import View
+from cosim.observation.view import View
 from cosim.types import MetaAction
 
 README = Path(__file__).parents[2] / "README.md"

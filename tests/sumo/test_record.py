@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim.app.cli import main
+from cosim.cli.main import main
 from cosim.recording import Folder, histories, read
 from cosim.types import COMPACT
 
@@ -29,7 +29,7 @@ def test_killed_and_resumed_it_holds_every_episode_once(tmp_path: Path) -> None:
     command = [
         sys.executable,
         "-m",
-        "cosim.app.cli",
+        "cosim.cli.main",
         *FLAGS.split(),
         "--seeds",
         "0:3",

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from cosim.app.cli import main
-from cosim.app.replay import find
+from cosim.cli.main import main
 from cosim.errors import BadInput
+from cosim.report.replay.episode import find
 
 SEED = "200041"
 

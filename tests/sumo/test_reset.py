@@ -6,7 +6,7 @@ from cosim.scenario import Scenario, load
 from cosim.simulation.sumo import SumoSimulator
 from cosim.simulation.xerces import keep_awake
 from cosim.types import Snapshot
-from cosim.worker import Worker
+from cosim.workers.worker import Worker
 
 
 class Awake:

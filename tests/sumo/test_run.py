@@ -23,7 +23,7 @@ def run(*arguments: str, expect: int = 0) -> subprocess.CompletedProcess[str]:
     """The command line in a fresh process, SUMO_HOME unset."""
     environment = {k: v for k, v in os.environ.items() if k != "SUMO_HOME"}
     done = subprocess.run(
-        [sys.executable, "-m", "cosim.app.cli", "run", *arguments],
+        [sys.executable, "-m", "cosim.cli.main", "run", *arguments],
         capture_output=True,
         text=True,
         env=environment,
@@ -124,7 +124,7 @@ def test_sumo_s_own_options_pass_after_the_dashes() -> None:
 
 def test_the_scenarios_are_listed_for_machines() -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "cosim.app.cli", "scenarios", "--json"],
+        [sys.executable, "-m", "cosim.cli.main", "scenarios", "--json"],
         capture_output=True,
         text=True,
         check=True,

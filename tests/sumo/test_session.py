@@ -26,7 +26,7 @@ from cosim.episode import Episode
 from cosim.scenario import Scenario, load
 from cosim.simulation.sumo import SumoSimulator
 from cosim.types import COMPACT, SMOKE, Decision, Kind, MetaAction
-from cosim.worker import Worker
+from cosim.workers.worker import Worker
 from policy.agents import make
 
 SEED = 200_011

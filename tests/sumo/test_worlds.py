@@ -11,10 +11,10 @@ from xml.etree import ElementTree
 import pytest
 
 from cosim.scenario import Scenario, load
+from cosim.scenario.vet import vet
 from cosim.simulation.sumo import SumoSimulator
 from cosim.types import Kind, Snapshot
-from cosim.vet import vet
-from cosim.worker import Worker
+from cosim.workers.worker import Worker
 from sumo_scenarios import folder, names
 from sumo_scenarios.build import net_text
 

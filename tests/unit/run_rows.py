@@ -7,9 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from cosim.evaluation.case import Case
-from cosim.evaluation.export import export
-from cosim.evaluation.summary import summarize
+from cosim.batch.export import export
+from cosim.report.summary import summarize
+from cosim.scenario.episode_id import Case
 
 UNITS = {
     "crashed": "bool",

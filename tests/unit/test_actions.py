@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cosim.actions import next_target, tracked_speed
+from cosim.control import next_target, tracked_speed
 from cosim.types import MetaAction
 
 UP, DOWN, IDLE = MetaAction.ACCELERATE, MetaAction.DECELERATE, MetaAction.IDLE

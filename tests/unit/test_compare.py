@@ -10,13 +10,13 @@ import pytest
 from junitparser import Error, Failure, JUnitXml, Skipped
 from run_rows import CASE, cell, failed, row, write
 
-from cosim.app.cli import main
+from cosim.cli.main import main
 from cosim.errors import BadInput
-from cosim.evaluation.compare import FAILED, PASSED, SKIPPED, compare
-from cosim.evaluation.figures import RATES, Measure
-from cosim.evaluation.pairing import side
-from cosim.evaluation.statistics import Figure
-from cosim.evaluation.thresholds import ABSOLUTE, CHANGE, DIFFERENCE, parse
+from cosim.report.compare import FAILED, PASSED, SKIPPED, compare
+from cosim.report.figures import RATES, Measure
+from cosim.report.pairing import side
+from cosim.report.statistics import Figure
+from cosim.report.thresholds import ABSOLUTE, CHANGE, DIFFERENCE, parse
 
 KNOWN = {
     **RATES,

@@ -126,7 +126,7 @@ def test_every_service_is_locked_up(name: str) -> None:
 
 @pytest.mark.parametrize("name", sorted(compose()))
 def test_every_service_says_what_the_command_line_understands(name: str) -> None:
-    from cosim.app.cli import parser
+    from cosim.cli.main import parser
 
     command = [re.sub(r"\$\{\w+:-([^}]*)\}", r"\1", word) for word in compose()[name]["command"]]
     assert callable(parser().parse_args(command).work)

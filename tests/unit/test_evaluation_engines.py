@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 
 from cosim.errors import BadInput, SimulationError
-from cosim.evaluation.engines import LocalEngine
-from cosim.evaluation.supervisor import Limits, Supervisor
-from cosim.evaluation.tasks import Dispenser, Progress, Task
+from cosim.workers.engines import LocalEngine
+from cosim.workers.supervisor import Limits, Supervisor
+from cosim.workers.tasks import Dispenser, Progress, Task
 
 QUICK = Limits(step=0.5, start=30.0)
 

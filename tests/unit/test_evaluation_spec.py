@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
+from cosim.batch import matrix
+from cosim.batch.spec import FIELDS, Spec, read
 from cosim.errors import BadInput
-from cosim.evaluation import matrix
-from cosim.evaluation.case import Case
-from cosim.evaluation.spec import FIELDS, Spec, read
+from cosim.scenario.episode_id import Case
 from policy.agents import check_name
 
 ROUTES = """<routes><vType id="hv"/><vType id="av"/><route id="main" edges="main_in main_acc main_out"/>

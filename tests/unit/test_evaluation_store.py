@@ -13,15 +13,16 @@ import pyarrow.csv
 import pyarrow.parquet
 import pytest
 
+from cosim.batch import execution as batch
+from cosim.batch import matrix
+from cosim.batch.export import arrow, export
+from cosim.batch.folder import RunFolder
+from cosim.batch.records import row
+from cosim.batch.spec import Spec
+from cosim.batch.store import Store
 from cosim.errors import BadInput, CosimError
-from cosim.evaluation import batch, matrix
-from cosim.evaluation.case import Case
-from cosim.evaluation.export import arrow, export
-from cosim.evaluation.folder import RunFolder
-from cosim.evaluation.records import row
-from cosim.evaluation.spec import Spec
-from cosim.evaluation.store import Store
-from cosim.evaluation.tasks import Outcome, Task
+from cosim.scenario.episode_id import Case
+from cosim.workers.tasks import Outcome, Task
 from policy.agents import check_name
 
 

@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
-from cosim.app.cli import main
+from cosim.cli.main import main
 from cosim.errors import BadInput
-from cosim.evaluation.fcd import Analysis, Roles, analyse
-from cosim.evaluation.vehicle_types import Size, read_sizes, size_of
+from cosim.fcd import Analysis, Roles, analyse
+from cosim.fcd.vehicle_types import Size, read_sizes, size_of
 from cosim.simulation.fake import straight_road
 
 HEAD = '<fcd-export xmlns:xsi="http://www.w3.org/2001/XMLSchema-instance">\n'

@@ -4,8 +4,8 @@ import math
 
 import pytest
 
-from cosim.behaviors import IdmParameters, MobilParameters, load_behaviors
 from cosim.errors import BadInput
+from cosim.scenario.behaviors import IdmParameters, MobilParameters, load_behaviors
 from cosim.simulation.mobil import (
     FAR,
     Beside,

@@ -13,9 +13,9 @@ from benchmarks.papers.claims import APPROACHES
 from benchmarks.papers.driving import Settings
 from benchmarks.papers.guide import NONE, OTHER, OVERTAKES, SLOWS, YIELDS, guided
 from benchmarks.tables import Line, write_csv
-from cosim.app.bench_predict import EIGHT
-from cosim.evaluation.replay.watcher import Track, Watched
-from cosim.evaluation.run_folder import Run
+from cosim.learning.bench_predict import EIGHT
+from cosim.recording.watcher import Track, Watched
+from cosim.report.run_folder import Run
 from cosim.road import Lane, RoadMap
 from cosim.types import Floats, Kind
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from policy_scenes import LANE_WIDTH, Car, histories, straight_road
 
-from cosim.raster import rasterize_road
+from cosim.geometry.raster import rasterize_road
 from cosim.types import COMPACT, KINEMATIC_FEATURES
 from policy.chain import ChainConfig, Prediction, predict, shade
 from policy.forecast import KinematicForecast

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from cosim.errors import BadInput
-from cosim.policy_name import PolicyName, label, read
+from cosim.scenario.policy_name import PolicyName, label, read
 
 
 @pytest.fixture

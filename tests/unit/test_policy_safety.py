@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from policy_scenes import LANE_WIDTH, Car, histories, straight_road
 
-from cosim.actions import braking_speeds, next_target, tracked_speed, tracked_speeds
+from cosim.control import braking_speeds, next_target, tracked_speed, tracked_speeds
 from cosim.road import RoadMap
 from cosim.types import Decision, MetaAction
 from policy import motion

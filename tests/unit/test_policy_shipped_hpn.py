@@ -11,7 +11,7 @@ import torch
 from policy_scenes import LANE_WIDTH, Car, histories, straight_road
 
 from cosim.errors import BadInput, WeightsMismatch
-from cosim.raster import rasterize_road
+from cosim.geometry.raster import rasterize_road
 from cosim.road import Lane, RoadMap
 from cosim.types import COMPACT
 from policy.chain import ChainConfig, Prediction, predict

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim.app import map_bench, train_hpn
-from cosim.app.prediction_data import HORIZON, MAPLESS, Followed, followed
 from cosim.episode import Episode
 from cosim.errors import BadInput
 from cosim.files import write_csv
+from cosim.learning import map_bench, train_hpn
+from cosim.learning.prediction_data import HORIZON, MAPLESS, Followed, followed
 from cosim.recording import Folder, Recording, RecordingSimulator, histories, read, write
 from cosim.road import RoadMap
 from cosim.scenario import Mission, load

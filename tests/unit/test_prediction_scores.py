@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim.app.bench_predict import markdown, paired, plot
-from cosim.evaluation.prediction import Predicted, Scores, interval_errors, position_error
 from cosim.files import write_csv
+from cosim.learning.bench_predict import markdown, paired, plot
+from cosim.learning.prediction_scores import Predicted, Scores, interval_errors, position_error
 
 STEPS = 20
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import time
 
-from cosim.app.progress import STARTING, Progress
+from cosim.workers.progress import STARTING, Progress
 
 
 def test_a_slow_start_says_what_it_is_doing_and_a_quick_one_says_nothing() -> None:

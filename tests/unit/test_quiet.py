@@ -6,8 +6,8 @@ from xml.etree import ElementTree
 
 import pytest
 
-from cosim.quiet import quiet
 from cosim.scenario import Scenario, load
+from cosim.scenario.quiet import quiet
 
 LOUD = """<additional>
   <!-- file="comment.xml" stays -->

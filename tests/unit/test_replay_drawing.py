@@ -17,13 +17,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from cosim.app.output import document as facts
 from cosim.episode import Episode, run_episode
-from cosim.evaluation.replay import packing, watcher
-from cosim.evaluation.replay.page import page
-from cosim.evaluation.replay.strip import Strip, poses_at
-from cosim.evaluation.replay.video import CAPTION, HEIGHT, LOW, SMALL, WIDTH, animation, film
-from cosim.evaluation.replay.watcher import Watched, Watcher
+from cosim.recording import watcher
+from cosim.recording.watcher import Watched, Watcher
+from cosim.report.replay import packing
+from cosim.report.replay.page import page
+from cosim.report.replay.strip import Strip, poses_at
+from cosim.report.replay.video import CAPTION, HEIGHT, LOW, SMALL, WIDTH, animation, film
 from cosim.types import Decision, Forecast, History, MetaAction, ObservationConfig, PolicyContext
 from policy.agents.keep_lane import KeepLane
 from tests.contracts.fake_worlds import platoon, scenario, wall
@@ -78,7 +78,7 @@ def driven(world: Any = platoon, seconds: float = 4.0, policy: Any = None) -> tu
     watch = Watcher(world(), policy or Explains())
     episode = Episode(scenario(seconds), watch.simulator, watch.policy.observation)
     result = run_episode(episode, watch.policy, 200_000, svo=0.5)
-    return watch.watched(facts(result)), result.trace_hash
+    return watch.watched(result.document()), result.trace_hash
 
 
 @pytest.fixture(scope="module")

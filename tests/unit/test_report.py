@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 from run_rows import CASE, cell, failed, row, write
 
-from cosim.app.cli import main
+from cosim.cli.main import main
 from cosim.errors import BadInput
-from cosim.evaluation import report
-from cosim.evaluation.run_folder import read
+from cosim.report import html as report
+from cosim.report.run_folder import read
 
 VOID = {"meta", "br", "link", "img", "hr", "input"}
 

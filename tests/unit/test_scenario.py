@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 import sumo_scenarios
-from cosim import scenario, sumocfg
+from cosim import scenario
 from cosim.errors import BadInput
-from cosim.scenario import Fleet, load
+from cosim.scenario import Fleet, load, sumocfg
 from cosim.types import Preset
 
 WORLD = """

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from cosim.evaluation.statistics import (
+from cosim.report.statistics import (
     Figure,
     discordant,
     mcnemar,

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 from run_rows import BETTER, CASE, UNITS, cell, failed
 
-from cosim.evaluation.figures import measures
-from cosim.evaluation.summary import summarize
+from cosim.report.figures import measures
+from cosim.report.summary import summarize
 
 
 def rows(*cells: list) -> list:

@@ -19,8 +19,8 @@ from benchmarks.papers.agents import Agent
 from benchmarks.papers.driving import Driven, Order, Results, Settings
 from benchmarks.tables import difference_table, table
 from benchmarks.targets import Arms
-from cosim.evaluation.run_folder import Run
-from cosim.evaluation.statistics import Figure
+from cosim.report.run_folder import Run
+from cosim.report.statistics import Figure
 
 NOTES = {"units": run_rows.UNITS, "better": run_rows.BETTER}
 PARTS = Arms("vfn-p", "vfn-p-egoistic")

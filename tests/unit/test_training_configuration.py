@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from cosim.app.configuration import configuration
 from cosim.errors import BadInput
+from cosim.learning.configuration import configuration
 from policy.training.config import TrainingFile, agent_config
 
 

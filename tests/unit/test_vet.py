@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from cosim import vet as vetting
-from cosim import xml_input
 from cosim.errors import BadInput
+from cosim.files import xml_input
 from cosim.scenario import Fleet, load
-from cosim.vet import VetReport, vet
+from cosim.scenario import vet as vetting
+from cosim.scenario.vet import VetReport, vet
 
 NET = """<net version="1.20">
   <location netOffset="0,0" convBoundary="0,0,1000,0" origBoundary="0,0,1000,0" projParameter="!"/>

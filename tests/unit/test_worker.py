@@ -13,7 +13,7 @@ import pytest
 
 from cosim.errors import BadInput, CosimError, SimulationCrashed, SimulationError, SimulationTimeout
 from cosim.simulation.stderr import SumoStderr
-from cosim.worker import Worker
+from cosim.workers.worker import Worker
 
 
 class Servant:

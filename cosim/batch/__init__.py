@@ -1,0 +1,1 @@
+"""Many episodes: specification, matrix, execution, rows, store, export."""

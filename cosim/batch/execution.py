@@ -1,0 +1,117 @@
+"""The straight path of a batch: what is left to do -> engine -> row -> store, one episode at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from cosim.batch.matrix import Cell, Plan
+from cosim.batch.records import row
+from cosim.batch.store import Store
+from cosim.errors import BadInput, CosimError
+from cosim.scenario.manifest import POLICY_FILES
+from cosim.scenario.policy_name import label
+from cosim.workers.engines import Engine
+from cosim.workers.tasks import BAD_INPUT, FAULT, Outcome, Progress
+
+FAULTS = 10  # of our own code, before a batch stops: it is broken, not unlucky
+
+
+def begin(plan: Plan, store: Store, document: Mapping[str, Any]) -> None:
+    """Write down in a fresh store what is to be run. `document`: what the manifest shall say of it."""
+    cells = [
+        {"cell": cell.name, "case": cell.case.document(), "manifest": dict(cell.manifest)}
+        for cell in plan.cells
+    ]
+    seeds = [plan.seeds.start, plan.seeds.stop]
+    store.begin(plan.spec_hash, {**document, "seeds": seeds, "units": {}, "better": {}}, cells)
+
+
+def check_same(plan: Plan, store: Store) -> None:
+    """Raises BadInput unless the store was begun with this very plan, on the same files and versions."""
+    if store.spec_hash() != plan.spec_hash:
+        raise BadInput("holds the run of another spec: name another folder", field="--resume")
+    known = store.cells()
+    for cell in plan.cells:
+        _compare(known[cell.name]["manifest"], cell.manifest, cell, "since the run began")
+
+
+def drive(plan: Plan, store: Store, engine: Engine, outputs: Path, progress: Progress) -> list[Outcome]:
+    """Run every episode that the store does not hold yet, and keep each as it comes.
+
+    Returns those at which our own code failed: they have no row, so that a resumed run tries them again.
+
+    `outputs`: folder of SUMO's own outputs, one folder per episode in it. The engine hosts an object whose
+    `run(case, warnings, outputs)` returns the document of `cosim run --json`.
+
+    Raises:
+        BadInput: a worker saw other files or versions than the plan did.
+        CosimError: the store cannot be written any more, or our own code failed `FAULTS` times.
+    """
+    done = store.keys()
+    cases = {case.key: (cell, case) for cell, case in plan.cases() if case.key not in done}
+    refused = [(cell, case) for cell, case in cases.values() if cell.refused]
+    store.add(row(cell, case, Outcome(case.key, BAD_INPUT, error=cell.refused)) for cell, case in refused)
+    tasks = [
+        cell.task(case, outputs if case.outputs else None)
+        for cell, case in cases.values()
+        if not cell.refused
+    ]
+    witness = _Witness(store)
+    faults: list[Outcome] = []
+    finished = len(refused)
+    with closing(engine.run(tasks)) as outcomes:
+        for outcome in outcomes:
+            cell, case = cases[outcome.key]
+            finished += 1
+            progress(finished, len(cases))
+            if outcome.status == FAULT:
+                faults.append(outcome)
+                if len(faults) == FAULTS:
+                    raise CosimError(f"stopped at the {FAULTS}th fault of our own: {outcome.stderr}")
+                continue
+            if outcome.ok:
+                witness.see(cell, outcome.value)
+            store.add([row(cell, case, outcome)])
+    return faults
+
+
+class _Witness:
+    """Keeps what all episodes of a cell have in common once, and sees to it that they do have it."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._manifests: dict[str, Mapping[str, Any]] = {}
+        self._notes = {name: dict(store.document().get(name, {})) for name in ("units", "better")}
+
+    def see(self, cell: Cell, document: Mapping[str, Any]) -> None:
+        """One episode's document. Raises BadInput when its manifest is not that of the cell."""
+        found = {k: v for k, v in document["manifest"].items() if k != "seed"}
+        known = self._manifests.get(cell.name)
+        if known is None:
+            known = self._manifests[cell.name] = self._store.cells()[cell.name]["manifest"]
+        _compare(known, found, cell, "in a worker")
+        if found.keys() - known.keys():
+            self._manifests[cell.name] = {**known, **found}
+            self._store.set_manifest(cell.name, self._manifests[cell.name])
+        for name, notes in self._notes.items():
+            if document[name].keys() - notes.keys():
+                notes.update(document[name])
+                self._store.note(name, notes)
+
+
+def _compare(known: Mapping[str, Any], found: Mapping[str, Any], cell: Cell, where: str) -> None:
+    """Equal in all that both name: the planner does not know what only a worker can."""
+    for name in known.keys() & found.keys():
+        a, b = known[name], found[name]
+        if isinstance(a, Mapping) and isinstance(b, Mapping):
+            differing = next((k for k in sorted({*a, *b}) if a.get(k) != b.get(k)), None)
+            if differing is not None:
+                problem = f"is another one {where}: {b.get(differing)!r}, it was {a.get(differing)!r}"
+                if name == POLICY_FILES:
+                    raise BadInput(problem, file=differing, field="policy", value=label(cell.case.policy))
+                raise BadInput(problem, file=cell.scenario.config, field=f"{name}.{differing}")
+        elif a != b:
+            raise BadInput(f"is {b!r} {where}, it was {a!r}", file=cell.scenario.config, field=name)

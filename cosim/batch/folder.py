@@ -1,0 +1,109 @@
+"""The folder of a run: made, locked and measured before anything is run, left as it was if that fails."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+from pathlib import Path
+
+from cosim.batch.store import FILE
+from cosim.errors import BadInput
+
+ROOM = 32_000  # bytes per episode: 6 kB in the store, 2 kB exported, and the store's log beside it
+ROOM_AT_LEAST = 4_000_000  # bytes
+RESULTS = (FILE, "episodes.parquet", "episodes.csv", "summary.json", "manifest.json")
+
+
+class RunFolder:
+    """Holds the lock on a run folder until `close`.
+
+    Raises:
+        BadInput: the path cannot be made or written, has not room for `episodes`, is in use by another
+            process, or holds results already (without `resume`).
+    """
+
+    def __init__(self, path: str, *, resume: bool, episodes: int) -> None:
+        self.path = Path(path).absolute()
+        self._shown = path
+        self._lock: int | None = None
+        self._made = self._make()
+        try:
+            self._take_lock()
+            held = [name for name in RESULTS if (self.path / name).exists()]
+            if held and not resume:
+                raise self._wrong(f"holds {held[0]} already: go on with --resume, or name another folder")
+            self._check_room(max(episodes * ROOM, ROOM_AT_LEAST))
+        except BaseException:
+            self._remove_made()
+            raise
+
+    def undo(self) -> None:
+        """Nothing was run after all: leave the place as it was found (not after `resume`)."""
+        for name in (FILE, f"{FILE}-wal", f"{FILE}-shm"):
+            (self.path / name).unlink(missing_ok=True)
+        self._remove_made()
+
+    def close(self) -> None:
+        """Give up the lock."""
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
+
+    def __enter__(self) -> RunFolder:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def _make(self) -> list[Path]:
+        """Make it; the folders that were not there before, innermost first."""
+        missing = []
+        folder = self.path
+        try:
+            while not folder.exists():
+                missing.append(folder)
+                folder = folder.parent
+            self.path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            for made in missing:
+                if made.is_dir():
+                    made.rmdir()
+            raise self._wrong(f"cannot make this folder: {_words(error)}") from None
+        return missing
+
+    def _remove_made(self) -> None:
+        self.close()
+        for folder in self._made:
+            with contextlib.suppress(OSError):  # somebody put something there in the meantime
+                folder.rmdir()
+
+    def _take_lock(self) -> None:
+        """flock on the folder itself: gone with the process, however that ends."""
+        try:
+            self._lock = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY)
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise self._wrong("another process is working in it") from None
+        except OSError as error:
+            raise self._wrong(f"cannot lock this folder: {_words(error)}") from None
+
+    def _check_room(self, size: int) -> None:
+        """Write and remove a file of the size that the results may reach."""
+        probe = self.path / ".room.part"
+        try:
+            try:
+                with probe.open("wb") as file:
+                    os.posix_fallocate(file.fileno(), 0, size)
+            finally:
+                probe.unlink(missing_ok=True)
+        except OSError as error:
+            problem = f"cannot hold the results ({size / 1e6:.0f} MB at most): {_words(error)}"
+            raise self._wrong(problem) from None
+
+    def _wrong(self, problem: str) -> BadInput:
+        return BadInput(problem, field="--out", value=self._shown)
+
+
+def _words(error: OSError) -> str:
+    return (error.strerror or str(error)).lower()

@@ -1,0 +1,132 @@
+"""The matrix of a spec: every cell loaded and vetted before anything is run."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from cosim.batch.spec import Spec
+from cosim.errors import BadInput
+from cosim.scenario import Scenario, sumo_outputs
+from cosim.scenario.episode_id import Case
+from cosim.scenario.manifest import manifest
+from cosim.scenario.vet import vetted
+from cosim.workers.tasks import Task
+
+CheckPolicy = Callable[[str], None]  # raises BadInput for a name that is none
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """Cases that differ in nothing but the seed."""
+
+    case: Case  # of the first seed
+    scenario: Scenario  # vetted unless `refused`
+    manifest: Mapping[str, Any]  # `cosim.scenario.manifest` without the seed
+    refused: str | None = None  # why SUMO must not see this net: every episode of the cell is bad_input
+
+    @property
+    def name(self) -> str:
+        return self.case.cell
+
+    def task(self, case: Case, outputs: Path | None = None) -> Task:
+        """One episode of this cell, for an engine that hosts a `run(case, warnings, outputs)`.
+
+        `outputs`: folder for SUMO's own outputs; None where the case wants none.
+        """
+        return Task(case.key, self.name, (case, self.scenario.warnings, outputs and str(outputs)))
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """All that is to be run: cells times seeds, in this order."""
+
+    cells: tuple[Cell, ...]
+    seeds: range
+
+    @property
+    def episodes(self) -> int:
+        return len(self.cells) * len(self.seeds)
+
+    @property
+    def spec_hash(self) -> str:
+        """SHA-256 of what is to be run, in whatever order and notation it was asked for."""
+        text = json.dumps([sorted(cell.case.text() for cell in self.cells), self.seeds[0], self.seeds[-1]])
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def cases(self) -> Iterator[tuple[Cell, Case]]:
+        """Every episode with its cell."""
+        for cell in self.cells:
+            for seed in self.seeds:
+                yield cell, cell.case.with_seed(seed)
+
+
+def cells(spec: Spec) -> Iterator[Case]:
+    """The case of every cell's first seed."""
+    axes = itertools.product(
+        spec.scenario,
+        spec.demand,
+        spec.behavior,
+        spec.driver_model,
+        spec.penetration,
+        spec.preset,
+        spec.policy,
+        spec.svo,
+    )
+    for what, demand, behavior, driver_model, penetration, preset, policy, svo in axes:
+        yield Case(
+            what=what,
+            demand=demand,
+            policy=policy,
+            behavior=behavior,
+            driver_model=driver_model,
+            penetration=penetration,
+            av_type=spec.av_type,
+            av_ids=spec.av_ids,
+            svo_deg=svo,
+            preset=preset,
+            duration=spec.duration,
+            seed=spec.seeds[0],
+            outputs=spec.output,
+        )
+
+
+def plan(cases: Iterable[Case], seeds: range, check_policy: CheckPolicy) -> Plan:
+    """Load and vet every cell.
+
+    A net that would kill SUMO costs its own cells only: they become `refused`.
+
+    Raises:
+        BadInput: anything else that is wrong with a cell: an unknown policy, demand or output, a demand file
+            that is malformed or whose edges are not in the net, a vehicle type that is not there.
+    """
+    found = []
+    worlds: dict[Case, tuple[Scenario, Mapping[str, Any], str | None]] = {}
+    for case in cases:
+        check_policy(case.policy)
+        world = replace(case, policy="", svo_deg=0.0, seed=seeds[0])  # who drives changes nothing of it
+        if world not in worlds:
+            worlds[world] = _read(world)
+        found.append(Cell(replace(case, seed=seeds[0]), *worlds[world]))
+    return Plan(tuple(found), seeds)
+
+
+def _read(case: Case) -> tuple[Scenario, Mapping[str, Any], str | None]:
+    """The scenario, vetted unless its net is refused; its manifest without the seed; why it is refused."""
+    scenario = case.scenario()
+    sumo_outputs.check(case.outputs, scenario.options)
+    refused = None
+    try:
+        scenario = vetted(scenario)
+    except BadInput as error:
+        if error.file != str(scenario.net):
+            raise
+        refused = str(error)
+    document = manifest(scenario, case.seed)
+    del document["seed"]
+    return scenario, document, refused

@@ -1,0 +1,224 @@
+"""Where the rows of a run are kept as they come: one row per episode, exactly once, whatever is killed.
+
+SQLite in the run's folder by default (write-ahead log: a row is there whole or not at all, also after
+kill -9), or any database that SQLAlchemy reaches by URL. A database may hold many runs, told apart by name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy.exc import ArgumentError, IntegrityError, SQLAlchemyError
+
+from cosim.errors import BadInput, CosimError
+
+FILE = "store.sqlite"
+_NAME = sa.String(200)
+
+_tables = sa.MetaData()
+_runs = sa.Table(
+    "cosim_runs",
+    _tables,
+    sa.Column("run", _NAME, primary_key=True),
+    sa.Column("spec_hash", sa.String(64), nullable=False),
+    sa.Column("document", sa.JSON, nullable=False),  # spec, seeds, versions, command
+)
+_cells = sa.Table(
+    "cosim_cells",
+    _tables,
+    sa.Column("run", _NAME, primary_key=True),
+    sa.Column("cell", sa.String(32), primary_key=True),
+    sa.Column("place", sa.Integer, nullable=False),  # in the matrix
+    sa.Column("case", sa.JSON, nullable=False),
+    sa.Column("manifest", sa.JSON, nullable=False),
+)
+_episodes = sa.Table(
+    "cosim_episodes",
+    _tables,
+    sa.Column("run", _NAME, primary_key=True),
+    sa.Column("key", sa.String(64), primary_key=True),  # Case.key
+    sa.Column("cell", sa.String(32), nullable=False),
+    sa.Column("seed", sa.BigInteger, nullable=False),
+    sa.Column("status", sa.String(16), nullable=False),
+    sa.Column("trace_hash", sa.String(64)),
+    sa.Column("row", sa.JSON, nullable=False),  # every column of `cosim.batch.records`
+)
+
+
+class Store:
+    """The rows of one run. One process writes (`cosim.batch.folder` sees to that).
+
+    Raises:
+        BadInput: the database cannot be reached or written, before anything is kept.
+        CosimError: it cannot be written any more (disk full): what was kept is whole, --resume goes on.
+    """
+
+    def __init__(self, url: str, run: str = "") -> None:
+        self._run = run
+        self._url = url
+        try:
+            self._engine = sa.create_engine(url)
+            if self._engine.dialect.name == "sqlite":
+                sa.event.listen(self._engine, "connect", _sqlite)
+            _tables.create_all(self._engine)
+        except ArgumentError:
+            raise BadInput("is no database URL", field="--store", value=url) from None
+        except ModuleNotFoundError as error:
+            problem = f"needs the package {error.name} (pip install 'cosim[postgresql]')"
+            raise BadInput(problem, field="--store", value=self._shown) from None
+        except SQLAlchemyError as error:
+            raise BadInput(_first_line(error), field="--store", value=self._shown) from None
+
+    @classmethod
+    def in_folder(cls, folder: Path) -> Store:
+        """The store of a run folder: one SQLite file."""
+        return cls(f"sqlite:///{folder.absolute() / FILE}")
+
+    def begin(self, spec_hash: str, document: Mapping[str, Any], cells: Sequence[Mapping[str, Any]]) -> None:
+        """Write down what is to be run. `cells`: `cell`, `case` and `manifest`, in the matrix's order."""
+        rows = [{"run": self._run, "place": i, **cell} for i, cell in enumerate(cells)]
+        with self._writing() as connection:
+            connection.execute(
+                _runs.insert().values(run=self._run, spec_hash=spec_hash, document=dict(document))
+            )
+            if rows:
+                connection.execute(_cells.insert(), rows)
+
+    def extend(self, cells: Sequence[Mapping[str, Any]]) -> None:
+        """Write down further cells, as in `begin`, behind those that are there; known ones stay."""
+        known = self.cells()
+        new = [cell for cell in cells if cell["cell"] not in known]
+        rows = [{"run": self._run, "place": len(known) + i, **cell} for i, cell in enumerate(new)]
+        if rows:
+            with self._writing() as connection:
+                connection.execute(_cells.insert(), rows)
+
+    def spec_hash(self) -> str | None:
+        """The hash of what this run was begun with; None when it was not begun."""
+        with self._engine.connect() as connection:
+            found = connection.execute(sa.select(_runs.c.spec_hash).where(_runs.c.run == self._run))
+            return found.scalar_one_or_none()
+
+    def document(self) -> dict[str, Any]:
+        """What `begin` wrote down."""
+        with self._engine.connect() as connection:
+            found = connection.execute(sa.select(_runs.c.document).where(_runs.c.run == self._run))
+            return dict(found.scalar_one())
+
+    def cells(self) -> dict[str, dict[str, Any]]:
+        """Cell -> its `case` and `manifest`, in the matrix's order."""
+        query = sa.select(_cells).where(_cells.c.run == self._run).order_by(_cells.c.place)
+        with self._engine.connect() as connection:
+            return {
+                row.cell: {"case": row.case, "manifest": row.manifest} for row in connection.execute(query)
+            }
+
+    def set_manifest(self, cell: str, manifest: Mapping[str, Any]) -> None:
+        """The manifest of a cell's episodes, as the workers saw it."""
+        here = (_cells.c.run == self._run) & (_cells.c.cell == cell)
+        with self._writing() as connection:
+            connection.execute(_cells.update().where(here).values(manifest=dict(manifest)))
+
+    def note(self, name: str, value: Any) -> None:
+        """Set one field of what `begin` wrote down."""
+        document = {**self.document(), name: value}
+        with self._writing() as connection:
+            connection.execute(_runs.update().where(_runs.c.run == self._run).values(document=document))
+
+    def keys(self) -> set[str]:
+        """The episodes that are done."""
+        with self._engine.connect() as connection:
+            query = sa.select(_episodes.c.key).where(_episodes.c.run == self._run)
+            return set(connection.execute(query).scalars())
+
+    def add(self, rows: Iterable[Mapping[str, Any]]) -> None:
+        """Keep these rows, all of them or none. Raises CosimError when one is there already."""
+        values = [
+            {
+                "run": self._run,
+                "key": row["key"],
+                "cell": row["cell"],
+                "seed": row["seed"],
+                "status": row["status"],
+                "trace_hash": row.get("trace_hash"),
+                "row": dict(row),
+            }
+            for row in rows
+        ]
+        if values:
+            with self._writing() as connection:
+                connection.execute(_episodes.insert(), values)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Every row, by the cell's place in the matrix and the seed."""
+        query = (
+            sa.select(_episodes.c.row)
+            .join(_cells, (_cells.c.run == _episodes.c.run) & (_cells.c.cell == _episodes.c.cell))
+            .where(_episodes.c.run == self._run)
+            .order_by(_cells.c.place, _episodes.c.seed)
+        )
+        with self._engine.connect() as connection:
+            return [dict(row) for row in connection.execute(query).scalars()]
+
+    def close(self) -> None:
+        """Let go of the database."""
+        self._engine.dispose()
+
+    def __enter__(self) -> Store:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    # ---- inside ----
+
+    @property
+    def _shown(self) -> str:
+        """The URL without its password."""
+        return sa.engine.make_url(self._url).render_as_string(hide_password=True)
+
+    def _writing(self) -> _Writing:
+        return _Writing(self._engine, self._shown)
+
+
+class _Writing:
+    """One transaction; what a database cannot do becomes one sentence."""
+
+    def __init__(self, engine: sa.Engine, shown: str) -> None:
+        self._begin = engine.begin()
+        self._shown = shown
+
+    def __enter__(self) -> sa.Connection:
+        try:
+            return self._begin.__enter__()
+        except SQLAlchemyError as error:
+            raise self._explained(error) from None
+
+    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
+        try:
+            self._begin.__exit__(kind, error, trace)
+        except SQLAlchemyError as problem:
+            raise self._explained(problem) from None
+        if isinstance(error, SQLAlchemyError):
+            raise self._explained(error) from None
+
+    def _explained(self, error: SQLAlchemyError) -> CosimError:
+        if isinstance(error, IntegrityError):
+            return CosimError(f"{self._shown}: an episode was to be kept twice: {_first_line(error)}")
+        return CosimError(f"{self._shown}: cannot write: {_first_line(error)} (--resume goes on from here)")
+
+
+def _sqlite(connection: Any, _: object) -> None:
+    cursor = connection.cursor()
+    cursor.execute("PRAGMA journal_mode=WAL")
+    cursor.execute("PRAGMA synchronous=NORMAL")  # whole after kill -9; a power cut may cost the last rows
+    cursor.execute("PRAGMA busy_timeout=30000")  # ms
+    cursor.close()
+
+
+def _first_line(error: SQLAlchemyError) -> str:
+    text = str(getattr(error, "orig", None) or error).strip()
+    return text.splitlines()[0] if text else type(error).__name__

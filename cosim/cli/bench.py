@@ -1,0 +1,90 @@
+"""`cosim bench`: measurements a reader can repeat. `predict`: the predictors against recorded episodes."""
+
+from __future__ import annotations
+
+import argparse
+
+from cosim.cli import arguments
+from cosim.cli.record import seeds
+from cosim.scenario import BEHAVIORS
+from cosim.scenario.behaviors import AS_IS
+
+DEMANDS = ("dense", "contested")
+POLICIES = ("idm", "altruist-rule", "vfn")
+
+
+def add(verbs: arguments.Verbs) -> None:
+    """Register the verb and its flags."""
+    kinds = verbs.add_parser("bench", help="measure and write tables").add_subparsers(
+        required=True, metavar="WHAT"
+    )
+    predict = kinds.add_parser(
+        "predict",
+        help="position error, interval coverage and map error of the predictors",
+        description="Measure every predictor on recorded episodes; records what it needs itself unless "
+        "--recordings names a folder of `cosim record`.",
+    )
+    predict.add_argument("--scenario", action="append", default=[], metavar="S", help="repeatable (all five)")
+    predict.add_argument("--behavior", action="append", default=[], choices=BEHAVIORS, help="repeatable")
+    predict.add_argument("--demand", action="append", default=[], metavar="NAME", help="repeatable")
+    predict.add_argument("--policy", action="append", default=[], metavar="NAME", help="repeatable")
+    predict.add_argument("--seeds", type=seeds, required=True, metavar="A:B", help="test seeds, B left out")
+    predict.add_argument("--recordings", metavar="DIR", help="use these (seeds outside A:B are left out)")
+    predict.add_argument("--no-maps", action="store_true", help="kinematics only (the maps take longer)")
+    predict.add_argument("--workers", type=arguments.count, default=1, metavar="N", help="processes (1)")
+    predict.add_argument("--out", required=True, metavar="DIR")
+    predict.set_defaults(work=work)
+
+
+def work(args: argparse.Namespace) -> int:
+    """Record where needed, measure, print the tables."""
+    import shlex
+    import sys
+    from pathlib import Path
+
+    import sumo_scenarios
+    from cosim.batch.record import cases, record
+    from cosim.errors import BadInput
+    from cosim.files import prepare_folder
+    from cosim.learning.bench_predict import MAPS_PAGE, PAGE, bench_maps, bench_predict
+    from cosim.learning.prediction_data import recorded_by
+    from cosim.recording import Folder
+
+    out = prepare_folder(args.out)
+    where = Path(args.recordings) if args.recordings else out / "recordings"
+    if not args.recordings:
+        wanted = cases(
+            args.scenario or sumo_scenarios.names(),
+            args.demand or DEMANDS,
+            args.behavior or [b for b in BEHAVIORS if b != AS_IS],
+            args.policy or POLICIES,
+            args.seeds,
+        )
+        if failed := record(where, wanted, workers=args.workers, resume=True):
+            print(f"cosim: {len(failed)} episodes were not recorded: {failed[0]}", file=sys.stderr)
+    elif args.demand or args.policy:
+        raise BadInput("recordings are there already", field="--demand, --policy")
+    folder = Folder(where)
+    folder.manifest()
+    command = "\n".join([*recorded_by(folder.manifest()), "cosim " + shlex.join(sys.argv[1:])])
+    bench_predict(
+        folder,
+        out,
+        scenarios=args.scenario,
+        behaviors=args.behavior,
+        seeds=args.seeds,
+        command=command,
+    )
+    print((out / PAGE).read_text())
+    if not args.no_maps:
+        bench_maps(
+            folder,
+            out,
+            scenarios=args.scenario,
+            behaviors=args.behavior,
+            seeds=args.seeds,
+            workers=args.workers,
+            command=command,
+        )
+        print((out / MAPS_PAGE).read_text())
+    return 0

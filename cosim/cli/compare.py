@@ -1,0 +1,83 @@
+"""`cosim compare`: two policies or two runs on equal seeds, and whether B may replace A."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from cosim.cli import arguments
+from cosim.errors import BadInput
+
+EPILOG = """\
+A and B are run folders of `cosim evaluate`, or DIR:POLICY for one policy of it. With one folder, name both
+policies: cosim compare DIR --baseline idm --candidate altruist-rule. Two folders without a policy that hold
+several are compared policy by policy.
+
+thresholds:  METRIC[.upper|.lower]  >|<  [+|-]NUMBER[UNIT]
+  collision_rate > +0.5pp         B crashes in half a percentage point more of the episodes than A
+  collision_rate.upper > +2pp     the upper bound of that difference is above two points
+  collision_rate > 2%             B crashes in more than 2 % of the episodes, whatever A does
+  dt_av_m < -5%                   B's AVs get 5 % less far than A's
+  dt_mission_m < +50m             B's mission vehicle does not get 50 m further than A's
+
+exit codes:  0 passed, 1 a threshold failed, 2 bad input, 3 simulations failed among the compared
+"""
+
+
+def add(verbs: arguments.Verbs) -> None:
+    """Register the verb and its flags."""
+    compare = verbs.add_parser(
+        "compare",
+        help="compare two policies or runs on equal seeds, with thresholds for CI",
+        description="Compare A (baseline) with B (candidate), pair by pair on equal seeds.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    compare.add_argument("a", metavar="A", help="run folder, or DIR:POLICY")
+    compare.add_argument("b", metavar="B", nargs="?", help="the same; default: A's folder")
+    compare.add_argument("--baseline", metavar="POLICY", help="the policy of A")
+    compare.add_argument("--candidate", metavar="POLICY", help="the policy of B")
+    compare.add_argument(
+        "--fail-on", action="append", default=[], metavar="THRESHOLD", help="see below; repeatable"
+    )
+    compare.add_argument(
+        "--across",
+        action="append",
+        default=[],
+        metavar="FIELD",
+        help="A and B may differ in this: behavior, penetration, preset, svo_deg, driver_model; repeatable",
+    )
+    compare.add_argument("--junit", metavar="FILE", help="write a JUnit file")
+    compare.add_argument("--markdown", metavar="FILE", help="write a table for a pull request comment")
+    compare.add_argument("--json", action="store_true", help="print exactly one JSON document on stdout")
+    compare.set_defaults(work=work)
+
+
+def work(args: argparse.Namespace) -> int:
+    """Compare, show, and say by the exit code whether B passed."""
+    from cosim.report import junit, verdict
+    from cosim.report.compare import compare
+    from cosim.report.pairing import chosen, side
+
+    a = side(args.a)
+    if args.b is None and (args.baseline is None or args.candidate is None):
+        problem = "with one run name both policies: --baseline and --candidate"
+        raise BadInput(problem, field="B")
+    b = side(args.b) if args.b is not None else a
+    if args.baseline is not None:
+        a = chosen(a.run, args.baseline)
+    if args.candidate is not None:
+        b = chosen(b.run, args.candidate)
+    found = compare(a, b, args.fail_on, across=args.across)
+    for field, path, write in (
+        ("--junit", args.junit, lambda file: junit.write(found, file)),
+        ("--markdown", args.markdown, lambda file: file.write_text(verdict.markdown(found), "utf-8")),
+    ):
+        if path is not None:
+            try:
+                write(Path(path))
+            except OSError as error:
+                raise BadInput(f"cannot write: {error.strerror}", field=field, value=path) from None
+    print(json.dumps(verdict.document(found)) if args.json else verdict.text(found))
+    return found.exit_code

@@ -1,0 +1,48 @@
+"""`cosim fit-predictors`: fit the kinematic predictors on recorded episodes."""
+
+from __future__ import annotations
+
+import argparse
+
+from cosim.cli import arguments
+
+
+def add(verbs: arguments.Verbs) -> None:
+    """Register the verb and its flags."""
+    verb = verbs.add_parser(
+        "fit-predictors",
+        help="fit the kinematic predictors on recorded episodes",
+        description="Fit P's learned baselines and the Gaussian processes' prior over kernels on recordings "
+        "(cosim record) of training seeds; calibrate and measure on recordings of tuning seeds.",
+    )
+    verb.add_argument("--training", required=True, metavar="DIR", help="recordings, seeds below 100000")
+    verb.add_argument("--validation", required=True, metavar="DIR", help="recordings, seeds 100000..199999")
+    verb.add_argument("--only", action="append", default=[], metavar="NAME", help="repeatable (default all)")
+    verb.add_argument("--steps", type=arguments.count, metavar="N", help="gradient steps (6000)")
+    verb.add_argument("--out", required=True, metavar="DIR", help="for the weights and their cards")
+    verb.add_argument("--state", metavar="DIR", help="logs, and what a killed fit needs to go on")
+    verb.set_defaults(work=work)
+
+
+def work(args: argparse.Namespace) -> int:
+    """Fit, print what was measured."""
+    from pathlib import Path
+
+    from cosim.errors import BadInput
+    from cosim.learning.fit_predictors import FITTED, STEPS, fit_predictors
+
+    for name in args.only:
+        if name not in FITTED:
+            problem = f"nothing to fit for this one (one of {', '.join(FITTED)})"
+            raise BadInput(problem, field="--only", value=name)
+    measured = fit_predictors(
+        Path(args.training),
+        Path(args.validation),
+        Path(args.out),
+        args.only or FITTED,
+        args.steps or STEPS,
+        None if args.state is None else Path(args.state),
+    )
+    for name, figures in measured.items():
+        print(name, " ".join(f"{key.removeprefix('position_error_')}:{m:.3f}" for key, m in figures.items()))
+    return 0

@@ -1,0 +1,94 @@
+"""How one result is shown: a short table for people, a run folder to keep."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from cosim.errors import BadInput
+from cosim.files import whole
+from cosim.types import EpisodeResult, Metric
+
+HEADLINE = (
+    "crashed",
+    "collisions",
+    "av_caused_collisions",
+    "teleports",
+    "emergency_stops",
+    "mission_success",
+    "mission_time_s",
+    "dt_mean_m",
+    "dt_av_m",
+    "dt_mission_m",
+    "min_ttc_s",
+    "hard_brakings_av",
+    "veto_rate",
+    "vehicles_inserted",
+    "vehicles_never_inserted",
+)
+
+
+def table(result: EpisodeResult) -> str:
+    """A short table with units."""
+    label = f" ({result.label})" if result.label else ""
+    lines = [
+        f"{result.scenario} / {result.demand} / {result.policy}{label}",
+        f"  behaviour {result.behavior}, drivers {result.driver_model}, preset {result.preset}, "
+        f"svo {result.svo_deg:g} deg, seed {result.seed}, {result.steps} decisions",
+    ]
+    shown = [name for name in HEADLINE if name in result.metrics]
+    lines += [f"  {name:<24} {figure(result.metrics[name])}" for name in shown]
+    for c in result.collisions:
+        who = f"{c.kind}, {'AV-caused' if c.av_caused else 'not AV-caused'}"
+        lines.append(
+            f"  collision at {_clock(c.time, result)}: {c.collider} hit {c.victim} on {c.lane} ({who})"
+        )
+    lines += [f"  not comparable: {reason}" for reason in result.validity]
+    lines += [f"  not passed on to SUMO: {option}" for option in result.manifest["options_not_passed_on"]]
+    lines.append(f"  trace_hash               {result.trace_hash}")
+    times = ", ".join(f"{name.removesuffix('_s')} {value:.2f} s" for name, value in result.timings.items())
+    lines.append(f"  time spent               {times}")
+    return "\n".join(lines)
+
+
+def _clock(time: float, result: EpisodeResult) -> str:
+    """A moment of SUMO's clock in s, and as counted from the end of the warm-up."""
+    timing = result.manifest["timing"]
+    return f"{time - timing['begin_s'] - timing['warmup_s']:.1f} s (SUMO's clock: {time:.1f} s)"
+
+
+def write_folder(folder: Path, result: EpisodeResult, outputs: Sequence[str] = ()) -> None:
+    """`result.json`, `manifest.json` and `metrics.txt`; each appears whole or not at all.
+
+    Films, pages and SUMO's outputs of an earlier run in this folder go, but for `outputs`, this run's own.
+
+    Raises BadInput when it cannot be written.
+    """
+    everything = result.document()
+    texts = {
+        "manifest.json": json.dumps(everything["manifest"], indent=2),
+        "metrics.txt": table(result),
+        "result.json": json.dumps(everything, indent=2),
+    }
+    old = [*folder.glob("replay*.html"), *folder.glob("replay*.mp4"), *folder.glob("replay*.gif")]
+    old += [file for file in (folder / "outputs").glob("*.xml") if file.stem not in outputs]
+    try:
+        for file in old:
+            file.unlink()
+        for name, text in texts.items():
+            with whole(folder / name) as draft:
+                draft.write_text(text + "\n")
+    except OSError as error:
+        raise BadInput(f"cannot write: {error.strerror}", file=folder, field="--out") from None
+
+
+def figure(metric: Metric) -> str:
+    """One figure with its unit, as people read it; NA is said."""
+    value = metric.value
+    if value is None:
+        return "NA"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    shown = f"{value:.3g}" if isinstance(value, float) and abs(value) < 100 else f"{value:.0f}"
+    return f"{shown} {metric.unit}".rstrip()

@@ -1,0 +1,57 @@
+"""`cosim replay`: drive a recorded episode again, check that it is the same, draw it as a page and a film."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from cosim.cli import arguments
+from cosim.scenario.policy_name import label
+
+
+def add(verbs: arguments.Verbs) -> None:
+    """Register the verb and its flags."""
+    replay = verbs.add_parser(
+        "replay",
+        help="draw an episode of a run as an interactive page and a film",
+        description="Drive an episode once more from its manifest, check that it is the same (exit code 1 "
+        "when it is not), and draw it: an HTML file that needs no network, and an MP4. With --beside the "
+        "film shows what another policy makes of the same traffic and seed, one above the other.",
+    )
+    replay.add_argument("run", metavar="RUN", help="folder of `cosim run --out` or of `cosim evaluate`")
+    replay.add_argument(
+        "episode", nargs="?", metavar="EPISODE", help="its key, or its seed where only one episode has it"
+    )
+    replay.add_argument("--html", metavar="FILE", help="the page (default: replay*.html in RUN)")
+    replay.add_argument("--mp4", metavar="FILE", help="the film (default: replay*.mp4 in RUN)")
+    replay.add_argument("--gif", metavar="FILE", help="a small picture that moves, for a page or a slide")
+    replay.add_argument("--beside", metavar="POLICY", help="drive it with this policy too, film both")
+    replay.add_argument("--follow", metavar="ID", help="whom the film follows (default: the mission vehicle)")
+    replay.add_argument("--no-check", action="store_true", help="draw it even when it is another one")
+    replay.set_defaults(work=work)
+
+
+def work(args: argparse.Namespace) -> int:
+    """Check, drive, compare, draw. Where a file is named, only those named are drawn."""
+    from cosim.report.replay import episode as replay
+
+    recorded = replay.find(Path(args.run), args.episode)
+    scenario, warnings = replay.check_inputs(recorded)
+    replay.warn(warnings)
+    other = None if args.beside is None else replay.beside(recorded, args.beside)
+    html, mp4, gif = (None if name is None else Path(name) for name in (args.html, args.mp4, args.gif))
+    if html is None and mp4 is None and gif is None:
+        name = recorded.name if other is None else f"{recorded.name}-beside-{label(other.case.policy)}"
+        mp4 = recorded.folder / f"{name}.mp4"
+        html = recorded.folder / f"{name}.html" if other is None else None
+    result, recording = replay.drive(recorded, scenario, check=not args.no_check)
+    recordings = [recording]
+    if other is not None:
+        recordings += [replay.drive(other, scenario, check=False)[1]]
+    replay.draw(recordings, html, mp4, gif, args.follow)
+    same = "the same episode" if result.trace_hash == recorded.trace_hash else "ANOTHER episode"
+    print(f"{same}: trace hash {result.trace_hash}")
+    for path in (html, mp4, gif):
+        if path is not None:
+            print(f"{path} ({path.stat().st_size / 1e6:.2f} MB)")
+    return 0

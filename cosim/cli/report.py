@@ -1,0 +1,31 @@
+"""`cosim report`: a run as one HTML file to read and to pass on."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from cosim.cli import arguments
+
+
+def add(verbs: arguments.Verbs) -> None:
+    """Register the verb and its flags."""
+    report = verbs.add_parser(
+        "report",
+        help="write a run's report: one HTML file",
+        description="Write report.html: tables with intervals, plots, worst episodes, manifest. The file "
+        "needs no network.",
+    )
+    report.add_argument("run", metavar="DIR", help="run folder of `cosim evaluate`")
+    report.add_argument("--out", metavar="FILE", help="write it here (default: DIR/report.html)")
+    report.set_defaults(work=work)
+
+
+def work(args: argparse.Namespace) -> int:
+    """Write it and say where."""
+    from cosim.report import html as report
+    from cosim.report.run_folder import read
+
+    out = None if args.out is None else Path(args.out)
+    print(report.write(read(args.run), out, shown=args.run))
+    return 0

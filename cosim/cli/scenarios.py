@@ -1,0 +1,50 @@
+"""`cosim scenarios`: the worlds and their demands, for people and for machines."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from typing import Any
+
+from cosim.cli import arguments
+
+
+def add(verbs: arguments.Verbs) -> None:
+    """Register the verb and its flags."""
+    scenarios = verbs.add_parser("scenarios", help="list the worlds and their demands")
+    scenarios.add_argument("--json", action="store_true")
+    scenarios.set_defaults(work=work)
+
+
+def work(args: argparse.Namespace) -> int:
+    """List them."""
+    from cosim.scenario import load
+    from sumo_scenarios import names
+
+    rows: list[dict[str, Any]] = []
+    for name in names():
+        s = load(name)
+        rows.append(
+            {
+                "name": name,
+                "title": s.title,
+                "demands": sorted(s.demands or {}),
+                "default_demand": s.demand_name,
+                "mission": s.mission.kind,
+                "duration_s": s.duration,
+                "warmup_s": s.warmup,
+                "preset": s.preset,
+            }
+        )
+    if args.json:
+        print(json.dumps(rows))
+        return 0
+    for row in rows:
+        print(f"{row['name']:<14}{row['title']}")
+        default = row["default_demand"]
+        demands = ", ".join(f"{d} (default)" if d == default else d for d in row["demands"])
+        print(
+            f"{'':<14}demand {demands}; mission {row['mission']}; "
+            f"{row['duration_s']:g} s after {row['warmup_s']:g} s of warm-up; {row['preset']}"
+        )
+    return 0

@@ -1,0 +1,54 @@
+"""`cosim train`: train one of the networks; killed at any moment, `--resume` goes on exactly."""
+
+from __future__ import annotations
+
+import argparse
+
+from cosim.cli import arguments
+
+WHAT = ("vfn", "a2c", "hpn")
+VARIANTS = ("hpn", "hpn-no-history", "hpn-plain")
+
+
+def add(verbs: arguments.Verbs) -> None:
+    """Register the verb and its flags."""
+    train = verbs.add_parser(
+        "train",
+        help="train the value network, one of the baselines, or the predictor",
+        description="Train a network. The folder --out then holds log.jsonl, tensorboard/, best and last "
+        "weights with their configuration, and everything that --resume needs.",
+    )
+    train.add_argument("what", choices=WHAT, help="which network")
+    train.add_argument(
+        "--config", default="compact", metavar="FILE", help="compact, maps, paper, smoke, or a YAML file"
+    )
+    train.add_argument("--policy", metavar="NAME", help="the approach (default: vfn-p; a2c: conv3d-a2c)")
+    train.add_argument(
+        "--scenario", action="append", default=[], metavar="NAME", help="a world, or all (default: merge)"
+    )
+    train.add_argument("--iterations", type=arguments.count, metavar="N", help="instead of the file's")
+    train.add_argument(
+        "--seed", type=arguments.seed, metavar="N", help="of everything; instead of the file's"
+    )
+    train.add_argument("--resume", action="store_true", help="go on in --out")
+    train.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    train.add_argument("--workers", type=arguments.count, default=1, metavar="N", help="driving processes")
+    train.add_argument("--threads", type=arguments.count, default=1, metavar="N", help="of the learner")
+    recorded = train.add_argument_group("hpn", "learns from recordings (cosim record)")
+    recorded.add_argument("--recordings", action="append", default=[], metavar="DIR", help="training seeds")
+    recorded.add_argument("--validation", action="append", default=[], metavar="DIR", help="tuning seeds")
+    recorded.add_argument("--variant", choices=VARIANTS, default="hpn", help="hpn is the one that ships")
+    train.add_argument("--out", required=True, metavar="DIR")
+    train.set_defaults(work=work)
+
+
+def work(args: argparse.Namespace) -> int:
+    """Train until the last iteration."""
+    if args.what == "hpn":
+        from cosim.learning import train_hpn
+
+        train_hpn.check(args)
+        return train_hpn.train(args)
+    from cosim.learning.train_vfn import train
+
+    return train(args)

@@ -1,5 +1,0 @@
-"""The report of a run: one HTML file that needs nothing but itself."""
-
-from cosim.evaluation.report.page import html, write
-
-__all__ = ["html", "write"]

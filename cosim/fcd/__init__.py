@@ -1,0 +1,319 @@
+"""A user's floating-car data (SUMO's fcd-output) through the very metrics that an episode goes through."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cosim.errors import BadInput
+from cosim.fcd.encounters import Encounters
+from cosim.fcd.file import Row, Step, lanes_named, read_steps
+from cosim.fcd.vehicle_types import DEFAULT, Size, size_of
+from cosim.files.xml_input import Progress
+from cosim.metrics import METRICS, MetricContext
+from cosim.metrics.post_encroachment import LONGEST
+from cosim.road import Lane, RoadMap
+from cosim.simulation.conventions import centres
+from cosim.types import Kind, Metric, Snapshot, Timing
+
+FIGURES = ("time_to_collision", "post_encroachment", "drac", "hard_braking", "jerk", "headway")
+FRAME = Timing().frame  # s: finer data are thinned to it, so that figures compare with an episode's
+DRIVEN = 200.0  # m that all vehicles have driven before the positions are doubted
+WHOLE_LANE = 1e6  # m, of a lane whose length is not known
+
+
+@dataclass(frozen=True, slots=True)
+class Roles:
+    """Whose conflicts, braking, jerk and headways are counted: everybody's unless something is given."""
+
+    av_type: str | None = None
+    av_ids: re.Pattern[str] | None = None  # full match
+    mission: re.Pattern[str] | None = None  # full match
+
+    @property
+    def everybody(self) -> bool:
+        return self.av_type is None and self.av_ids is None and self.mission is None
+
+    def kind(self, vehicle: str, vehicle_type: str) -> tuple[Kind, bool]:
+        """(AV or HV, is a mission vehicle), by the rules of `cosim run`."""
+        if self.everybody:
+            return Kind.AV, False
+        if self.mission is not None and self.mission.fullmatch(vehicle):
+            return Kind.HV, True
+        if self.av_ids is not None:
+            is_av = self.av_ids.fullmatch(vehicle) is not None
+        else:
+            is_av = self.av_type is not None and vehicle_type.partition("@")[0] == self.av_type
+        return (Kind.AV if is_av else Kind.HV), False
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """The figures of one file."""
+
+    figures: Mapping[str, Metric]
+    begin: float  # s, first frame counted
+    end: float  # s, last one
+    interval: float  # s between the frames counted
+    frames: int
+    vehicles: int
+    watched: int
+    notes: tuple[str, ...]  # what was assumed, and what the file does not hold
+    encounters: tuple[Mapping[str, Any], ...] = ()  # `Encounters.found`, where they were asked for
+
+
+def analyse(
+    path: Path,
+    *,
+    road: RoadMap | None = None,
+    sizes: Mapping[str, Size] | None = None,
+    roles: Roles = Roles(),
+    begin: float = -math.inf,
+    end: float = math.inf,
+    frame: float | None = None,
+    critical: float | None = None,
+    progress: Progress | None = None,
+) -> Analysis:
+    """Read the file once, as a stream. `begin`, `end` in s; `frame`: s between the frames that are counted.
+    `critical`: list the encounters with a time to collision (s) below this.
+
+    Without a `road` vehicles on and below a bridge cannot be told apart, and a headway ends with the lane.
+
+    Raises:
+        BadInput: malformed or truncated, not FCD, a number missing or not finite, a vehicle twice in a step,
+            times that do not increase evenly, positions in degrees, no vehicle at all.
+    """
+    lanes = road or _loose_lanes(path)
+    encounters = None if critical is None else Encounters(lanes, critical)
+    counter = _Counter(path, lanes, dict(sizes or {}), roles, (begin, end), frame, encounters)
+    read_steps(path, counter.see, progress)
+    return counter.finish(road is not None, sizes is not None)
+
+
+def _loose_lanes(path: Path) -> RoadMap:
+    """The lanes that the file names, joined to nothing; vehicles on any two of them may touch."""
+    shape = np.array([[0.0, 0.0], [1.0, 0.0]])
+    return RoadMap(tuple(Lane(name, "", 0, shape, WHOLE_LANE, 3.2, 0.0) for name in lanes_named(path)))
+
+
+class _Counter:
+    """Steps become snapshots, snapshots figures."""
+
+    def __init__(
+        self,
+        path: Path,
+        road: RoadMap,
+        sizes: dict[str, Size],
+        roles: Roles,
+        window: tuple[float, float],
+        frame: float | None,
+        encounters: Encounters | None,
+    ) -> None:
+        self._path, self._road, self._sizes, self._roles = path, road, sizes, roles
+        self._begin, self._end = window
+        self._wanted = frame
+        self._metrics = [METRICS[name]() for name in FIGURES]
+        self._encounters = encounters
+        self._first: Step | None = None  # kept until the second one says how far apart they are
+        self._interval = 0.0  # s between the file's steps
+        self._stride = 1  # in steps: 2 counts every other
+        self._index = 0  # of the step last seen
+        self._time = 0.0  # s, of the step last seen
+        self._newest: Snapshot | None = None
+        self._frames = 0
+        self._span = (math.nan, math.nan)
+        self._known: dict[str, tuple[str, Kind, bool, Size]] = {}  # id -> type, kind, mission, size
+        self._unknown_types: set[str] = set()
+        self._ever: set[str] = set()
+        self._watched: set[str] = set()
+        self._laneless = self._rows = 0  # vehicle frames
+        self._strange: Counter[str] = Counter()  # lanes that the road lacks
+        self._driven = self._moved = 0.0  # m, by the speeds and by the positions
+
+    def see(self, step: Step) -> None:
+        """The next step of the file."""
+        if not self._begin - 1e-9 <= step.time <= self._end + 1e-9:
+            return
+        if self._first is None and not self._frames:
+            self._first = step
+            return
+        if self._first is not None:
+            first, self._first = self._first, None
+            self._set_clock(step.time - first.time, first.time)
+            self._count(self._snapshot(first))
+        self._advance(step)
+
+    def _set_clock(self, interval: float, first: float) -> None:
+        """The first two steps say how fine the file is."""
+        if interval <= 1e-9:
+            raise self._wrong("times must increase", "timestep.time", f"{first + interval:g}")
+        self._interval = interval = round(interval, 9)
+        wanted = self._wanted if self._wanted is not None else max(FRAME, interval)
+        ratio = wanted / interval
+        if abs(ratio - round(ratio)) > 1e-6:
+            if self._wanted is not None:
+                problem = f"must be a whole number of the file's steps of {interval:g} s"
+                raise BadInput(problem, field="--frame", value=f"{wanted:g}")
+            ratio = 1.0  # 0.2 s does not fit: the file's own steps
+        self._stride = max(round(ratio), 1)
+        timing = Timing(interval, self._stride * interval, self._stride * interval)
+        self._context = MetricContext(self._road, timing, "none", frozenset(), math.inf)
+        self._time = first
+
+    def _advance(self, step: Step) -> None:
+        passed = (step.time - self._time) / self._interval
+        if passed < 0.5:
+            raise self._wrong("times must increase", "timestep.time", f"{step.time:g}")
+        if abs(passed - round(passed)) > 0.01 * max(passed, 1.0):
+            apart = step.time - self._time
+            problem = f"steps are not evenly spaced: {self._interval:g} s at first, then {apart:g} s"
+            raise self._wrong(problem, "timestep.time", f"{step.time:g}")
+        skipped = range(self._index + 1, self._index + round(passed))
+        self._index += round(passed)
+        # steps with nobody on the road may be left out: nobody was there, as long as any memory reaches
+        for k in list(skipped)[-math.ceil(LONGEST / self._interval) - 1 :]:
+            if k % self._stride == 0:
+                empty = Step(step.time - (self._index - k) * self._interval)
+                self._count(self._snapshot(empty))
+        self._time = step.time
+        if self._index % self._stride == 0:
+            self._count(self._snapshot(step))
+
+    def _snapshot(self, step: Step) -> Snapshot:
+        rows = [step.rows[name] for name in sorted(step.rows)]
+        known = [self._who(row) for row in rows]
+        length = np.array([k[3].length for k in known], np.float64)  # [n] m
+        table = np.array([(r.x, r.y, r.angle, r.speed) for r in rows], np.float64).reshape(-1, 4)
+        x, y, heading = centres(table[:, 0], table[:, 1], table[:, 2], 0.5 * length)
+        index = self._road.index
+        self._laneless += sum(math.isnan(r.pos) for r in rows)
+        self._rows += len(rows)
+        strange = [r.lane for r in rows if not math.isnan(r.pos) and r.lane not in index]
+        self._strange.update(strange)
+        return Snapshot(
+            time=step.time,
+            ids=tuple(r.id for r in rows),
+            kind=np.array([k[1] for k in known], np.int8),
+            mission=np.array([k[2] for k in known], np.bool_),
+            x=x,
+            y=y,
+            heading=heading,
+            speed=table[:, 3].copy(),
+            accel=np.zeros(len(rows)),  # the metrics take theirs from the speeds
+            length=length,
+            width=np.array([k[3].width for k in known], np.float64),
+            lane=np.array([-1 if math.isnan(r.pos) else index.get(r.lane, -1) for r in rows], np.int32),
+            lane_position=np.array([r.pos for r in rows], np.float64),
+        )
+
+    def _who(self, row: Row) -> tuple[str, Kind, bool, Size]:
+        known = self._known.get(row.id)
+        if known is None or known[0] != row.type:
+            size = size_of(row.type, self._sizes)
+            if size is None:
+                self._unknown_types.add(row.type)
+                size = DEFAULT
+            known = self._known[row.id] = (row.type, *self._roles.kind(row.id, row.type), size)
+        return known
+
+    def _count(self, snapshot: Snapshot) -> None:
+        for metric in self._metrics:
+            if self._frames:
+                metric.add(snapshot)
+            else:
+                metric.reset(snapshot, self._context)
+        if self._encounters is not None:
+            self._encounters.add(snapshot)
+        self._frames += 1
+        self._span = (self._span[0] if self._frames > 1 else snapshot.time, snapshot.time)
+        if self._driven < DRIVEN and self._newest is not None:
+            self._doubt(self._newest, snapshot)
+        self._newest = snapshot
+        fresh = [i for i, name in enumerate(snapshot.ids) if name not in self._ever]
+        self._ever.update(snapshot.ids[i] for i in fresh)
+        self._watched.update(
+            snapshot.ids[i] for i in fresh if snapshot.kind[i] == Kind.AV or snapshot.mission[i]
+        )
+
+    def _doubt(self, before: Snapshot, after: Snapshot) -> None:
+        """Longitudes and latitudes hardly change while the speeds are those of cars."""
+        elapsed = after.time - before.time
+        for i, name in enumerate(after.ids):
+            j = before.row.get(name)
+            if j is not None:
+                self._driven += after.speed[i] * elapsed
+                self._moved += math.hypot(after.x[i] - before.x[j], after.y[i] - before.y[j])
+        if self._driven >= DRIVEN and self._moved < 0.01 * self._driven:
+            problem = "positions do not move with the speeds: degrees (fcd-output.geo)? metres are needed"
+            raise self._wrong(problem, "vehicle.x")
+
+    def finish(self, has_road: bool, has_sizes: bool) -> Analysis:
+        """The figures, or why there are none."""
+        if self._first is not None:  # a file of one step
+            self._set_clock(self._wanted or FRAME, self._first.time)
+            self._count(self._snapshot(self._first))
+        if not self._ever:
+            window = (
+                "" if math.isinf(self._begin) and math.isinf(self._end) else " in the time that was asked for"
+            )
+            raise self._wrong(f"holds no vehicle{window}")
+        if self._strange.total() > 0.5 * self._rows:
+            problem = "no such lane in --net, which is not the net of this file"
+            raise self._wrong(problem, "vehicle.lane", self._strange.most_common(1)[0][0])
+        figures: dict[str, Metric] = {}
+        for metric in self._metrics:
+            figures |= metric.result()
+        return Analysis(
+            figures,
+            *self._span,
+            interval=round(self._stride * self._interval, 9),
+            frames=self._frames,
+            vehicles=len(self._ever),
+            watched=len(self._watched),
+            notes=tuple(self._notes(has_road, has_sizes)),
+            encounters=() if self._encounters is None else tuple(self._encounters.found()),
+        )
+
+    def _notes(self, has_road: bool, has_sizes: bool) -> list[str]:
+        found = []
+        if self._roles.everybody:
+            found.append("every vehicle is watched (--av-type, --av-ids and --mission say otherwise)")
+        elif not self._watched:
+            found.append("no vehicle is an AV or a mission vehicle: nothing to count")
+        if not has_sizes:
+            found.append(f"every vehicle is taken as {_size(DEFAULT)} (--types FILE says otherwise)")
+        elif self._unknown_types:
+            names = ", ".join(sorted(self._unknown_types)[:5])
+            found.append(f"not in --types, taken as {_size(DEFAULT)}: {names}")
+        if not has_road:
+            found.append(
+                "without --net: vehicles on and below a bridge count as meeting, headways end with the lane"
+            )
+        if self._laneless:
+            found.append(f"{self._laneless} vehicle frames have no lane position: no headway there")
+        if self._strange:
+            lanes = ", ".join(sorted(self._strange)[:5])
+            found.append(f"{self._strange.total()} vehicle frames on lanes that --net lacks: {lanes}")
+        if self._stride > 1:
+            found.append(
+                f"steps of {self._interval:g} s are thinned to frames of {self._stride * self._interval:g} s"
+            )
+        if self._stride * self._interval > FRAME + 1e-9:
+            found.append(
+                f"frames every {self._stride * self._interval:g} s: brief events are missed, jerk is damped"
+            )
+        return found
+
+    def _wrong(self, problem: str, place: str | None = None, value: object = None) -> BadInput:
+        return BadInput(problem, file=self._path, field=place, value=value)
+
+
+def _size(size: Size) -> str:
+    return f"{size.length:g} x {size.width:g} m"

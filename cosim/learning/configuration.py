@@ -1,0 +1,54 @@
+"""The configuration file of a training: one that ships, one's own, or what one's own changes of another."""
+
+from __future__ import annotations
+
+import importlib.resources
+from pathlib import Path
+from typing import NamedTuple
+
+import policy
+from cosim.errors import BadInput, hint
+from cosim.files.dataclass_input import dataclass_from
+from cosim.files.yaml_input import document
+from policy.training.config import TrainingFile
+
+
+class Configuration(NamedTuple):
+    """A whole configuration, whatever files it is from."""
+
+    values: object  # as YAML has it
+    file: TrainingFile
+
+
+def configuration(name: str, beside: Path = Path(), above: tuple[Path, ...] = ()) -> Configuration:
+    """A shipped configuration by name, or a file (relative to the folder `beside`).
+
+    `base: NAME` in a file names another one of which it changes only what it says; `above`: the files that
+    name this one so.
+
+    Raises BadInput naming file, field and value.
+    """
+    shipped = Path(str(importlib.resources.files(policy) / "configs"))
+    path = shipped / f"{name}.yaml"
+    path = path if path.is_file() else beside / name
+    if not path.exists():
+        problem = "no such file, and none of that name ships"
+        problem += hint(name, sorted(file.stem for file in shipped.glob("*.yaml")))
+        where = {"file": above[-1], "field": "base"} if above else {"field": "--config"}
+        raise BadInput(problem, **where, value=name)
+    if path in above:
+        raise BadInput("is its own base", file=above[-1], field="base", value=name)
+    values = document(path) or {}
+    if isinstance(values, dict) and "base" in values:
+        base, values = values["base"], {key: value for key, value in values.items() if key != "base"}
+        if not isinstance(base, str):
+            raise BadInput("the name of a configuration is needed", file=path, field="base", value=base)
+        values = _over(configuration(base, path.parent, (*above, path)).values, values)
+    return Configuration(values, dataclass_from(TrainingFile, values, path))
+
+
+def _over(base: object, values: object) -> object:
+    """`values`, and what `base` has besides, section by section."""
+    if not isinstance(base, dict) or not isinstance(values, dict):
+        return values
+    return {**base, **{name: _over(base.get(name), value) for name, value in values.items()}}

@@ -1,0 +1,173 @@
+"""Fits everything the kinematic predictors learn from recordings, and writes it with its card."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cosim.errors import BadInput
+from cosim.learning.bench_predict import forecast
+from cosim.learning.prediction_data import recorded_by
+from cosim.learning.prediction_scores import Scores, interval_errors
+from cosim.recording import Folder, windows
+from cosim.seeding import TRAINING_SEEDS, TUNING_SEEDS
+from cosim.workers.memory import keep_freed_memory
+from cosim.workers.progress import Progress
+from policy.checkpoint import save
+from policy.predictors import Predictor
+from policy.predictors.gp import GaussianProcessDirect, GaussianProcessIndirect
+from policy.predictors.learned import Learned, NetConfig
+from policy.training.fitting import FitConfig, fit
+from policy.training.networks import use_threads
+from policy.training.predictors import (
+    GaussianProcess,
+    PriorFit,
+    Windows,
+    examples_for_net,
+    factors_for,
+    fresh_net,
+    in_own_frame,
+    net_loss,
+)
+
+EVERY = 5  # frames between two moments of an episode: 1 s, nearer ones are almost the same
+SCORED_EVERY = 10  # frames, on validation episodes
+NETS = {
+    "lstm-direct": NetConfig("lstm", "direct"),
+    "lstm-indirect": NetConfig("lstm", "indirect"),
+    "ae-direct": NetConfig("ae", "direct"),
+    "ae-indirect": NetConfig("ae", "indirect"),
+}
+PRIORS: dict[str, GaussianProcess] = {
+    "gp-direct": GaussianProcessDirect,
+    "gp-indirect": GaussianProcessIndirect,
+}
+FITTED = (*NETS, *PRIORS)
+STEPS = 6000  # of 1024 windows each, for every predictor alike
+# the predictor, its networks and their configurations by name, how it was fitted
+Fitted = tuple[Predictor, tuple[dict[str, Any], dict[str, Any]], FitConfig]
+
+
+def fit_predictors(
+    training: Path,
+    validation: Path,
+    out: Path,
+    names: Sequence[str] = FITTED,
+    steps: int = STEPS,
+    state: Path | None = None,
+) -> dict[str, dict[str, float]]:
+    """Fit `names` on the training seeds, calibrate and measure on the tuning seeds, write into `out`.
+
+    `state`: where every fit keeps its log and what it needs to go on after a kill. Returns what was measured.
+    Raises BadInput for recordings of other seeds: nothing is ever fitted on test seeds.
+    """
+    keep_freed_memory()
+    use_threads(1)
+    data = {
+        "training": _about(Folder(training), TRAINING_SEEDS),
+        "validation": _about(Folder(validation), TUNING_SEEDS),
+    }
+    learned = _windows(Folder(training))
+    checked = _windows(Folder(validation))
+    out.mkdir(parents=True, exist_ok=True)
+    measured = {}
+    for name in names:
+        kept = None if state is None else state / name
+        predictor, parts, config = (_fit_net if name in NETS else _fit_prior)(
+            name, learned, checked, steps, kept, Progress(f"fit {name}", "steps")
+        )
+        measured[name] = score(predictor, Folder(validation))
+        about = {**data, "fit": asdict(config)}
+        save(out / f"{name}.safetensors", *parts, measured=measured[name], data=about)
+    return measured
+
+
+def _fit_net(
+    name: str, learned: Windows, checked: Windows, steps: int, kept: Path | None, progress: Progress
+) -> Fitted:
+    config = FitConfig(steps=steps, learning_rate=2e-3)
+    network = fresh_net(NETS[name], config.seed)
+    examples, checks = examples_for_net(learned), examples_for_net(checked)
+    fit(network, partial(net_loss, network), config, examples, checks, folder=kept, progress=progress)
+    progress.done()
+    predictor = Learned(NETS[name], weights=network)
+    return predictor, ({"network": network}, {"network": NETS[name]}), config
+
+
+def _fit_prior(
+    name: str, learned: Windows, checked: Windows, steps: int, kept: Path | None, progress: Progress
+) -> Fitted:
+    config = FitConfig(steps=steps, learning_rate=1e-2)
+    prior = PriorFit(PRIORS[name], config.seed)
+    examples, checks = prior.examples(learned), prior.examples(checked)
+    fit(prior.network, prior.loss, config, examples, checks, folder=kept, progress=progress)
+    progress.done()
+    _calibrate(prior, checked)
+    return prior.fitted(), ({"prior": prior.network}, {"prior": prior.network.config}), config
+
+
+def score(predictor: Predictor, folder: Folder) -> dict[str, float]:
+    """Position error in m on a folder of recordings, every scenario counting the same."""
+    scores = Scores(predictor.horizon, predictor.dt)
+    for recording in folder.recordings():
+        w = windows(recording, every=SCORED_EVERY)
+        scores.add(recording.case, w.future, {predictor.name: forecast(predictor, w.past)})
+    rows = [r for r in scores.position_table() if r["scenario"] == "all" and r["behavior"] == "all"]
+    return {f"position_error_{r['horizon_s']}": round(r["mean_m"], 4) for r in rows}
+
+
+def _calibrate(prior: PriorFit, checked: Windows) -> None:
+    """Set the prior's calibration: factors with which its intervals cover 90 % of the tuning episodes.
+
+    Once for each number of known frames: the same moments, with what lies before them hidden.
+    """
+    predictor, factors = prior.fitted(), []
+    for known in range(1, checked.past.shape[1] + 1):
+        past = checked.past.copy()
+        past[:, :-known] = np.nan
+        predicted = forecast(predictor, past)
+        errors = interval_errors(predicted, checked.future)
+        used = [q for q, std in enumerate(predicted.std) if std.any()]
+        stds = tuple(predicted.std[q] for q in used)
+        factors.append(factors_for(stds, tuple(errors[q] for q in used), checked.weight))
+    prior.calibrate(np.stack(factors))
+
+
+def _windows(folder: Folder) -> Windows:
+    """Every recording's moments; every scenario has the same total weight."""
+    parts = [(r.case["scenario"], windows(r, every=EVERY)) for r in folder.recordings()]
+    scenario = np.concatenate([np.full(len(w.lane), name) for name, w in parts])
+    _, group, count = np.unique(scenario, return_inverse=True, return_counts=True)
+    return in_own_frame(
+        np.concatenate([w.past for _, w in parts]),
+        np.concatenate([w.future for _, w in parts]),
+        1.0 / count[group],
+    )
+
+
+def _about(folder: Folder, allowed: range) -> dict[str, Any]:
+    """What the data were, for the card. Raises BadInput when a seed is not one of `allowed`."""
+    found = folder.manifest()
+    seeds = found["seeds"]
+    if not all(seed in allowed for seed in seeds):
+        raise BadInput(
+            f"seeds must lie in {allowed.start}..{allowed.stop - 1}",
+            file=folder.manifest_file,
+            field="seeds",
+            value=seeds,
+        )
+    episodes = found.get("episodes", {})
+    digest = hashlib.sha256(json.dumps(episodes, sort_keys=True).encode()).hexdigest()
+    return {
+        "seeds": [min(seeds), max(seeds)],
+        "episodes": len(episodes),
+        "sha256": digest,
+        "commands": recorded_by(found),
+    }

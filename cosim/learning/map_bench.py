@@ -1,0 +1,221 @@
+"""The map half of `cosim bench predict`: PRE and IoU of every map predictor on recorded episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cosim.errors import BadInput
+from cosim.learning.prediction_data import followed, spread
+from cosim.recording import Folder, read
+from cosim.report import statistics
+from cosim.types import COMPACT, Floats
+from cosim.workers.engines import LocalEngine
+from cosim.workers.tasks import Task
+from policy.checkpoint import SHIPPED
+from policy.hpn import HPN
+from policy.map_error import HORIZONS, MapPredictors, frame_of, picture_error, vehicle_channels
+from policy.predictors import make_predictor
+from policy.training import hpn as trained
+from policy.training.networks import use_threads
+
+STRIDE = 10  # decisions, 4 s: nearer ones look at almost the same traffic
+
+
+class EpisodeErrors(NamedTuple):
+    """Means over one episode's samples (an AV at a decision each)."""
+
+    scenario: str
+    behavior: str
+    samples: int
+    pre: dict[str, Floats]  # predictor -> [H] at HORIZONS
+    iou: dict[str, Floats]
+
+
+def hpn_weights() -> dict[str, Path]:
+    """The HPNs that are shipped, by name; those that are not there are left out."""
+    found = {name: SHIPPED / f"{name}.safetensors" for name in trained.VARIANTS}
+    return {name: path for name, path in found.items() if path.is_file()}
+
+
+class MapMeter:
+    """Lives in a worker: predicts maps on recorded episodes and compares them with what followed."""
+
+    def __init__(self, weights: Mapping[str, str], stride: int) -> None:
+        use_threads(1)
+        self._hpns = load_hpns({name: Path(path) for name, path in weights.items()})
+        self._stride = stride
+        self._predictor = make_predictor("gp-indirect", 20, 0.2)
+        self._folders: dict[str, Folder] = {}
+        self._predictors: dict[str, MapPredictors] = {}  # by road
+
+    def run(self, path: str, key: str, progress: Any = None) -> EpisodeErrors | None:
+        """One episode; None when it is too short."""
+        folder = self._folders.setdefault(path, Folder(Path(path)))
+        recording = read(folder.episode_file(key))
+        case, name = recording.case, str(recording.case["road"])
+        road = folder.road(recording)
+        if name not in self._predictors:
+            self._predictors[name] = MapPredictors(self._hpns, self._predictor, COMPACT, road)
+        channels, at = vehicle_channels(COMPACT), [frame_of(h) for h in HORIZONS]
+        pre: dict[str, list[Floats]] = {}
+        iou: dict[str, list[Floats]] = {}
+        for now in followed(recording, road, COMPACT, self._stride, int(case["seed"])):
+            if not now.maps:
+                continue
+            guess = self._predictors[name].predict(now.histories)
+            if progress is not None:
+                progress(now.frame, len(recording.times))
+            for b, av in enumerate(guess.agents):
+                if av not in now.maps:
+                    continue
+                for predictor, maps in guess.maps.items():
+                    p, i = picture_error(maps[b, at], now.maps[av][at], channels)
+                    pre.setdefault(predictor, []).append(p)
+                    iou.setdefault(predictor, []).append(i)
+        if not pre:
+            return None
+        return EpisodeErrors(
+            str(case["scenario"]),
+            str(case["behavior"]),
+            len(next(iter(pre.values()))),
+            {k: np.mean(v, 0) for k, v in pre.items()},
+            {k: np.mean(v, 0) for k, v in iou.items()},
+        )
+
+    def close(self) -> None:
+        """Nothing to end."""
+
+
+def load_hpns(weights: Mapping[str, Path]) -> dict[str, HPN]:
+    """Trained HPNs. Raises BadInput, WeightsMismatch."""
+    return {name: trained.load(path)[1] for name, path in weights.items()}
+
+
+def measure(
+    folder: Path,
+    *,
+    weights: Mapping[str, Path] | None = None,
+    scenarios: Sequence[str] = (),
+    behaviors: Sequence[str] = (),
+    seeds: range | None = None,
+    stride: int = STRIDE,
+    workers: int = 1,
+) -> list[EpisodeErrors]:
+    """Every episode of a folder of recordings. Raises BadInput when nothing is left to measure."""
+    source = Folder(folder)
+    keys = [
+        key
+        for key in source.episodes()
+        if (seeds is None or int(key.rsplit("-", 1)[1]) in seeds)
+        and _wanted(read(source.episode_file(key)).case, scenarios, behaviors)
+    ]
+    chosen = hpn_weights() if weights is None else weights
+    engine = LocalEngine(MapMeter, ({k: str(p) for k, p in chosen.items()}, stride), workers=workers)
+    found = spread(engine, [Task(k, "", (str(folder), k)) for k in keys], "maps") if keys else []
+    measured = [episode for episode in found if episode is not None]
+    if not measured:
+        raise BadInput("no recorded episode is long enough to measure maps on", file=folder)
+    return measured
+
+
+def _wanted(case: Mapping[str, Any], scenarios: Sequence[str], behaviors: Sequence[str]) -> bool:
+    return (not scenarios or case["scenario"] in scenarios) and (
+        not behaviors or case["behavior"] in behaviors
+    )
+
+
+def rows(episodes: Sequence[EpisodeErrors]) -> list[dict[str, Any]]:
+    """The table: a row per predictor, scenario (and `all`) and horizon; intervals over episodes."""
+    pixels = len(vehicle_channels(COMPACT)) * COMPACT.height * COMPACT.width
+    out = []
+    worlds = sorted({e.scenario for e in episodes})
+    for world in (*worlds, "all"):
+        here = [e for e in episodes if world in ("all", e.scenario)]
+        for predictor in here[0].pre:
+            for k, horizon in enumerate(HORIZONS):
+                pre = statistics.mean([float(e.pre[predictor][k]) for e in here])
+                iou = statistics.mean([float(e.iou[predictor][k]) for e in here])
+                row = {
+                    "predictor": predictor,
+                    "scenario": world,
+                    "horizon_s": horizon,
+                    "pre": pre.value,
+                    "pre_low": pre.low,
+                    "pre_high": pre.high,
+                    "pre_sum": pre.value * pixels,
+                    "iou": iou.value,
+                    "iou_low": iou.low,
+                    "iou_high": iou.high,
+                    "n": sum(e.samples for e in here),
+                    "episodes": len(here),
+                }
+                out.append(row)
+    return out
+
+
+def against(episodes: Sequence[EpisodeErrors], ours: str = "hpn") -> list[dict[str, Any]]:
+    """How `ours` differs from every other predictor, relative to it, on the same episodes and over HORIZONS.
+
+    PRE below 0 and IoU above 0 say that ours is better; `everywhere`: at every horizon in the mean.
+    """
+    out: list[dict[str, Any]] = []
+    worlds = sorted({e.scenario for e in episodes})
+    for world in (*worlds, "all"):
+        here = [e for e in episodes if world in ("all", e.scenario)]
+        for other in (name for name in here[0].pre if name != ours and ours in here[0].pre):
+            row: dict[str, Any] = {"scenario": world, "against": other, "everywhere": True}
+            for name, sign in (("pre", -1.0), ("iou", 1.0)):
+                mine, theirs = (
+                    np.stack([getattr(e, name)[predictor] for e in here]) for predictor in (ours, other)
+                )  # [E,H]
+                figure = statistics.paired_change(theirs.mean(1), mine.mean(1))
+                row |= {
+                    f"{name}_change": figure.value,
+                    f"{name}_low": figure.low,
+                    f"{name}_high": figure.high,
+                }
+                row["everywhere"] &= bool((sign * (mine - theirs).mean(0) > 0.0).all())
+            out.append(row)
+    return out
+
+
+def markdown(
+    table: Sequence[Mapping[str, Any]], compared: Sequence[Mapping[str, Any]] = (), command: str = ""
+) -> str:
+    """The tables for people: PRE and IoU with their intervals, and what the HPN gains on the others."""
+    lines = ["# Predicted maps", ""]
+    if command:
+        lines += ["```", command, "```", ""]
+    total = [r for r in table if r["scenario"] == "all"]
+    lines += [
+        f"{total[0]['episodes']} episodes, {total[0]['n']} samples (an AV at a decision, one in {STRIDE}). "
+        "With 95 % intervals over episodes; PRE is the mean squared error per pixel of the vehicle channels, "
+        "IoU the overlap of occupied pixels.",
+    ]
+    if compared:
+        lines += ["", "## What the HPN gains, mean over the horizons", ""]
+        lines += ["| world | against | PRE | IoU | better at every horizon |", "|---|---|---|---|---|"]
+        for r in compared:
+            pre, iou = (
+                statistics.Figure(r[f"{n}_change"], r[f"{n}_low"], r[f"{n}_high"]).text(1, 100.0)
+                for n in ("pre", "iou")
+            )
+            said = "yes" if r["everywhere"] else "no"
+            lines.append(f"| {r['scenario']} | {r['against']} | {pre} % | {iou} % | {said} |")
+    keys = list(dict.fromkeys((row["scenario"], row["predictor"]) for row in table))
+    head = " | ".join(f"{h:g} s" for h in HORIZONS)
+    for name, title, scale, digits in (("pre", "PRE, 1e-5 per pixel", 1e5, 1), ("iou", "IoU", 1.0, 3)):
+        lines += ["", f"## {title}", "", f"| world | predictor | {head} |"]
+        lines += ["|" + "---|" * (2 + len(HORIZONS))]
+        for world, predictor in keys:
+            mine = [r for r in table if (r["scenario"], r["predictor"]) == (world, predictor)]
+            cells = [
+                statistics.Figure(r[name], r[f"{name}_low"], r[f"{name}_high"]).text(digits, scale)
+                for r in mine
+            ]
+            lines.append(f"| {world} | {predictor} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,102 @@
+"""Recordings as the predictor's data: decisions with the maps and states that really followed."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cosim.errors import CosimError
+from cosim.recording import Folder, Recording, histories
+from cosim.road import RoadMap
+from cosim.types import COMPACT, Bytes, History, ObservationConfig, Snapshot
+from cosim.workers.engines import Engine
+from cosim.workers.progress import Progress
+from cosim.workers.tasks import Task
+
+HORIZON = 20  # frames, 4 s
+
+
+class Followed(NamedTuple):
+    """One decision of a recorded episode and what came of it."""
+
+    frame: int
+    histories: dict[str, History]
+    future: list[Snapshot]  # the next HORIZON frames
+    maps: dict[str, Bytes]  # [HORIZON,C,H,W] uint8 of every AV that stays on the road; empty without maps
+
+
+def followed(
+    recording: Recording, road: RoadMap, observation: ObservationConfig, stride: int, first: int = 0
+) -> Iterator[Followed]:
+    """Every `stride`th decision, from number `first` on, that the recording follows for the whole horizon.
+
+    Decisions at which no AV knew anything are left out. Histories are copies and may be kept.
+    """
+    snapshots = recording.snapshots()
+    waiting: list[tuple[int, dict[str, History]]] = []
+    pictures: dict[int, dict[str, Bytes]] = {}
+    for number, (frame, seen) in enumerate(histories(recording, road, observation)):
+        if observation.maps:
+            # a decision comes every other frame; the map of the frame before lies in its history
+            for back in (1, 0):
+                pictures[frame - back] = {a: h.velocity_map[-1 - back].copy() for a, h in seen.items()}
+        if number % stride == first % stride and frame + HORIZON < len(snapshots) and seen:
+            kept = {a: h._replace(velocity_map=h.velocity_map.copy()) for a, h in seen.items()}
+            waiting.append((frame, kept))
+        while waiting and waiting[0][0] + HORIZON <= frame:
+            then, known = waiting.pop(0)
+            frames = range(then + 1, then + 1 + HORIZON)
+            maps = {
+                a: np.stack([pictures[k][a] for k in frames])
+                for a in known
+                if observation.maps and all(a in pictures.get(k, {}) for k in frames)
+            }
+            for k in [k for k in pictures if k <= then]:
+                del pictures[k]
+            yield Followed(then, known, snapshots[then + 1 : then + 1 + HORIZON], maps)
+
+
+def episodes(folders: list[Path]) -> list[tuple[Path, str]]:
+    """(folder, key) of every recorded episode. Raises BadInput for a folder that holds none."""
+    return [(path, key) for path in folders for key in _keys(Folder(path))]
+
+
+def recorded_by(manifest: Mapping[str, Any]) -> list[str]:
+    """The commands that drove a folder's episodes, without where they wrote: that is no part of the data."""
+    told = set()
+    for command in manifest["commands"]:
+        words = [w for k, w in enumerate(command) if "--out" not in (w, *command[max(k - 1, 0) : k])]
+        told.add("cosim record " + shlex.join(w for w in words if w != "--resume"))
+    return sorted(told)
+
+
+def _keys(folder: Folder) -> list[str]:
+    folder.manifest()
+    return folder.episodes()
+
+
+MAPLESS = ObservationConfig(
+    frames=COMPACT.frames,
+    rows=COMPACT.rows,
+    row_range=COMPACT.row_range,
+    perception_range=COMPACT.perception_range,
+    maps=False,
+)
+
+
+def spread(engine: Engine, tasks: Sequence[Task], title: str) -> list[Any]:
+    """What each task returned, in the order of the tasks. Raises CosimError for the first that failed."""
+    found: dict[str, Any] = {}
+    progress = Progress(title, "episodes")
+    for outcome in engine.run(tasks):
+        if not outcome.ok:
+            progress.done()
+            raise CosimError(f"{outcome.key}: {outcome.error}")
+        found[outcome.key] = outcome.value
+        progress(len(found), len(tasks))
+    progress.done()
+    return [found[task.key] for task in tasks]

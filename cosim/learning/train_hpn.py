@@ -1,0 +1,176 @@
+"""Training of the hybrid predictive network from recordings: `cosim train hpn`."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from cosim.errors import BadInput
+from cosim.files import prepare_folder
+from cosim.learning.configuration import configuration
+from cosim.learning.prediction_data import MAPLESS, episodes, followed, recorded_by, spread
+from cosim.recording import Folder, read
+from cosim.seeding import TRAINING_SEEDS, TUNING_SEEDS
+from cosim.types import COMPACT
+from cosim.workers.engines import LocalEngine
+from cosim.workers.memory import keep_freed_memory
+from cosim.workers.progress import Progress
+from cosim.workers.tasks import Task
+from policy.predictors import make_predictor
+from policy.traffic import TrafficConfig
+from policy.training import hpn
+from policy.training.kinematics import KinematicTask
+from policy.training.loop import train as run_loop
+from policy.training.loop import write_log
+from policy.training.map_branch import MapTask
+from policy.training.moments import MapSample, Moment, map_sample, moment
+from policy.training.networks import use_threads
+
+
+def train(args: argparse.Namespace) -> int:
+    """`cosim train hpn`. Raises BadInput for whatever is wrong before anything is computed."""
+    file = configuration(args.config).file
+    name, training = args.variant, file.prediction
+    if args.seed is not None:
+        training = hpn.seeded(training, args.seed)
+    if not args.recordings or not args.validation:
+        raise BadInput(
+            "recordings to train and to validate on are needed", field="--recordings, --validation"
+        )
+    found = {
+        "train": _checked(args.recordings, TRAINING_SEEDS, "--recordings"),
+        "validation": _checked(args.validation, TUNING_SEEDS, "--validation"),
+    }
+    folder = prepare_folder(args.out)
+    keep_freed_memory()
+    use_threads(args.threads)
+    data = {part: _manifest(keys) for part, keys in found.items()}
+    examples = {part: _gather(keys, name, training, args.workers, part) for part, keys in found.items()}
+    task: KinematicTask | MapTask
+    variant = hpn.VARIANTS[name]
+    loop, device = training.loop, args.device
+    if variant.maps == "plain":
+        loop = training.map_loop
+        samples = {part: [s for s in found if isinstance(s, MapSample)] for part, found in examples.items()}
+        task = MapTask(
+            variant.map_branch, training.maps, loop.updates, samples["train"], samples["validation"], device
+        )
+    else:
+        moments = {part: [m for m in found if isinstance(m, Moment)] for part, found in examples.items()}
+        task = KinematicTask(
+            variant.kinematic,
+            training.kinematics,
+            loop.updates,
+            moments["train"],
+            moments["validation"],
+            device,
+        )
+    progress = Progress(f"train {name}", "updates")
+    layout = hpn.layout(name, training, data)
+    log = run_loop(task, loop, folder, layout=layout, resume=args.resume, progress=progress)
+    progress.done()
+    file_name = folder / f"{name}.safetensors"
+    write_log(file_name.with_suffix(".csv"), log)
+    hpn.save(file_name, name, hpn.assemble(name, task), log[-1], {**data, "commands": _commands(args, found)})
+    print(f"{name}: {loop.updates} updates, validation loss {log[-1]['validation_loss']:.4f}")
+    print(f"  {file_name}")
+    return 0
+
+
+def _commands(args: argparse.Namespace, found: Mapping[str, Sequence[tuple[Path, str]]]) -> dict[str, Any]:
+    """How to train the same again, for the card: the training's command, and those of its recordings."""
+    seed = "" if args.seed is None else f" --seed {args.seed}"
+    recorders = {
+        f"{part} recordings": [
+            told
+            for path in sorted({path for path, _ in keys})
+            for told in recorded_by(Folder(path).manifest())
+        ]
+        for part, keys in found.items()
+    }
+    return {
+        "train": f"cosim train hpn --variant {args.variant} --config {Path(args.config).name}{seed}",
+        **recorders,
+    }
+
+
+class Gatherer:
+    """Lives in a worker: turns recorded episodes into what is learned from."""
+
+    def __init__(self, variant: str, training: hpn.HpnTraining) -> None:
+        self._variant, self._training = hpn.VARIANTS[variant], training
+        self._predictor = make_predictor("gp-indirect", 20, 0.2)
+        self._folders: dict[str, Folder] = {}
+
+    def run(self, path: str, key: str, progress: object = None) -> list[Moment] | list[MapSample]:
+        """Everything that one episode gives."""
+        folder = self._folders.setdefault(path, Folder(Path(path)))
+        recording = read(folder.episode_file(key))
+        road, seed, t = folder.road(recording), int(recording.case["seed"]), self._training
+        if self._variant.maps == "plain":
+            return [
+                map_sample(at.histories[name], at.maps[name], at.future)
+                for at in followed(recording, road, COMPACT, t.map_stride, seed)
+                for name in sorted(at.maps)[seed % 2 :: 4]  # every fourth AV: allies see the same cars
+            ]
+        seen = self._variant.kinematic.history
+        return [
+            moment(at.histories, at.future, road, self._predictor, TrafficConfig(), seen)
+            for at in followed(recording, road, MAPLESS, t.stride, seed)
+        ]
+
+    def close(self) -> None:
+        """Nothing to end."""
+
+
+def _gather(
+    keys: Sequence[tuple[Path, str]], variant: str, training: hpn.HpnTraining, workers: int, part: str
+) -> list[Moment] | list[MapSample]:
+    """Examples of every episode, in the order of the keys whichever worker was faster."""
+    tasks = [Task(f"{path} {key}", str(path), (str(path), key)) for path, key in keys]
+    found = spread(LocalEngine(Gatherer, (variant, training), workers=workers), tasks, f"read {part}")
+    flat = [example for examples in found for example in examples]
+    if not flat:
+        raise BadInput("no episode is long enough to learn from", field="--recordings")
+    return flat
+
+
+def _checked(paths: Sequence[str], seeds: range, field: str) -> list[tuple[Path, str]]:
+    found = episodes([Path(p) for p in paths])
+    if not found:
+        raise BadInput("holds no episodes", field=field, value=", ".join(paths))
+    wrong = sorted({s for _, key in found if (s := int(key.rsplit("-", 1)[1])) not in seeds})
+    if wrong:
+        raise BadInput(
+            f"seeds {seeds.start} to {seeds.stop - 1} are for this, not {wrong[0]} (cosim record --seeds)",
+            field=field,
+            value=", ".join(paths),
+        )
+    return found
+
+
+def _manifest(keys: Sequence[tuple[Path, str]]) -> dict[str, Any]:
+    """What data it was, short enough for a card: how it was recorded, how much of it, and a hash."""
+    names = sorted(key for _, key in keys)
+    seeds = [int(name.rsplit("-", 1)[1]) for name in names]
+    folders = [Folder(path).manifest() for path in sorted({path for path, _ in keys})]
+    return {
+        "episodes": len(names),
+        "seeds": [min(seeds), max(seeds)],
+        "keys_sha256": hashlib.sha256(json.dumps(names).encode()).hexdigest(),
+        "cells": sum(len(found.get("cells", {})) for found in folders),
+    }
+
+
+def check(args: argparse.Namespace) -> None:
+    """Refuse flags that say nothing to an HPN. Raises BadInput."""
+    for flag in ("policy", "iterations"):
+        if getattr(args, flag) is not None:
+            raise BadInput("is not for hpn", field=f"--{flag}", value=getattr(args, flag))
+    if args.scenario:
+        print("cosim: --scenario is not for hpn: the recordings say which worlds", file=sys.stderr)

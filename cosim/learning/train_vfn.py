@@ -1,0 +1,104 @@
+"""Training of the value networks from a configuration file: the roof over trainer and rollouts."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import shlex
+import sys
+from dataclasses import asdict, replace
+
+import yaml
+
+from cosim.errors import BadInput
+from cosim.files import prepare_folder
+from cosim.learning.configuration import configuration
+from cosim.learning.rollouts import Rollouts
+from cosim.scenario import load
+from cosim.scenario.policy_name import BEST
+from cosim.workers.memory import keep_freed_memory
+from cosim.workers.progress import Progress
+from policy.agents.approaches import APPROACHES
+from policy.checkpoint import sha256
+from policy.training.config import agent_config
+from policy.training.curriculum import Lesson, VfnTraining
+from policy.training.log import tensorboard
+from policy.training.networks import usable, use_threads
+from policy.training.vfn import Trainer
+from sumo_scenarios import names
+
+ABOUT = ("observation", "hpn", "reward", "explore", "chain", "safety", "traffic")  # sections in the card
+CONTESTED = 2.0  # contested episodes for every dense one: altruism is learned where somebody must yield
+
+
+def train(args: argparse.Namespace) -> int:
+    """`cosim train vfn|a2c`. Raises BadInput for whatever is wrong before anything is driven."""
+    values, file = configuration(args.config)
+    name = args.policy or ("conv3d-a2c" if args.what == "a2c" else "vfn-p")
+    agent = agent_config(name, file)
+    learning = APPROACHES[name].learning
+    if (learning == "a2c") != (args.what == "a2c"):
+        verb = "a2c" if learning == "a2c" else "vfn"
+        raise BadInput(f"is trained by cosim train {verb}", field="--policy", value=name)
+    if not usable(args.device):
+        raise BadInput("torch has no such device here", field="--device", value=args.device)
+    training = _scheduled(file.training, args, name)
+    for lesson in training.lessons:
+        load(lesson.scenario, demand=[lesson.demand], behavior=lesson.behavior)
+    folder = prepare_folder(args.out)
+    if not args.resume and (folder / "state.json").exists():
+        raise BadInput("holds a training run already: --resume goes on", field="--out", value=args.out)
+    (folder / "config.yaml").write_text(yaml.safe_dump(values, sort_keys=False), encoding="utf-8")
+    about = {
+        "policy": name,
+        "scenarios": sorted({lesson.scenario for lesson in training.lessons}),
+        **{part: asdict(getattr(file, part)) for part in ABOUT},
+    }
+    if agent.predicted_maps and agent.chain.source == "hpn" and agent.hpn_weights is not None:
+        about["hpn_sha256"] = sha256(agent.hpn_weights)
+    explore = replace(file.explore, sample=learning == "a2c")
+    keep_freed_memory()
+    use_threads(args.threads)  # more threads than cores stall each other (docs/training.md)
+    writer = tensorboard(folder)
+    progress = Progress(f"train {name}", "iterations")
+    try:
+        with Rollouts(args.workers, name, agent, explore, file.reward) as actors:
+            trainer = Trainer(
+                training, agent.vfn, actors, folder, device=args.device, log=writer, about=about
+            )
+            if args.resume and not trainer.resume():
+                print("nothing to resume: starting anew", file=sys.stderr)
+            trainer.run(progress)
+    finally:
+        progress.done()
+        writer.close()
+    best = f", best validation reward {trainer.best:.3f}" if math.isfinite(trainer.best) else ""
+    print(f"{name}: {trainer.iteration} iterations, {trainer.school.learner.updates} updates{best}")
+    print(f"  {folder / BEST}" + (f" (cosim run merge --policy {_typed(args.out)})" if best else ""))
+    return 0
+
+
+def _typed(folder: str) -> str:
+    """The folder as `--policy` wants it: a bare word would be a policy that ships."""
+    return shlex.quote(folder if "/" in folder else f"./{folder}")
+
+
+def _scheduled(training: VfnTraining, args: argparse.Namespace, name: str) -> VfnTraining:
+    """The file's schedule with what the command line and the approach say otherwise."""
+    worlds = names() if "all" in args.scenario else tuple(args.scenario)
+    if worlds:
+        training = replace(
+            training,
+            lessons=tuple(
+                Lesson(world, demand, weight=weight)
+                for world in worlds
+                for demand, weight in (("contested", CONTESTED), ("dense", 1.0))
+            ),
+        )
+    if name.endswith("-egoistic"):  # the twin never weighs anybody's interest but its own
+        training = replace(training, svo=(0.0,), replay=replace(training.replay, phi=(0.0, 0.0)))
+    if args.iterations is not None:
+        training = replace(training, iterations=args.iterations)
+    if args.seed is not None:
+        training = replace(training, seed=args.seed)
+    return replace(training, learning=APPROACHES[name].learning)

@@ -1,0 +1,42 @@
+"""Every policy that `--policy` can name: those that ship, weights of a training, somebody's own code."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from cosim.errors import BadInput
+from cosim.policies.own import load, own
+from cosim.scenario.policy_name import WEIGHTS, read
+from cosim.types import Policy
+from policy import agents
+
+
+def check(text: str) -> None:
+    """Raises BadInput when there is no such policy: names the nearest, or what its file lacks."""
+    name = read(text)
+    if name.ships:
+        if name.label not in agents.POLICIES and Path(name.label).is_dir():
+            problem = f"no policy of this name ships; the folder beside you is written ./{name.label}"
+            raise BadInput(problem, field="--policy", value=text)
+        agents.check_name(name.label)
+    elif name.label in agents.POLICIES:
+        problem = f"a policy that ships is called {name.label}: label yours otherwise"
+        raise BadInput(problem, field="--policy", value=text)
+    elif name.place.endswith(WEIGHTS):
+        from cosim.policies.trained import config  # torch: only when it is asked for
+
+        config(Path(name.place))
+    else:
+        load(name)
+
+
+def make(text: str) -> Policy:
+    """A fresh policy. Raises BadInput as `check`, and when its weights or its code do not do."""
+    name = read(text)
+    if name.ships:
+        return agents.make(name.label)
+    if not name.place.endswith(WEIGHTS):
+        return own(name)
+    from cosim.policies.trained import trained
+
+    return trained(name)

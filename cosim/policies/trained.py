@@ -1,0 +1,59 @@
+"""The agent of a training, built again from its weights and what their card says of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+from cosim.errors import BadInput
+from cosim.files.dataclass_input import dataclass_from
+from cosim.scenario.policy_name import PolicyName
+from cosim.types import COMPACT, PAPER, ObservationConfig
+from policy.agents.approaches import APPROACHES, AgentConfig, configure, shipped
+from policy.agents.prediction_aware import PredictionAware
+from policy.chain import ChainConfig
+from policy.checkpoint import read_card, sha256
+from policy.hpn import HpnConfig
+from policy.safety import SafetyConfig
+from policy.traffic import TrafficConfig
+from policy.vfn import VfnConfig
+
+OTHER_HPN = "trained with another HPN"
+Section = TypeVar("Section")
+
+
+def trained(name: PolicyName) -> PredictionAware:
+    """The approach at the sizes it was trained with; HPN and predictors are the shipped ones.
+
+    Raises BadInput (WeightsMismatch is one) when the card or the weights do not fit.
+    """
+    return PredictionAware(name.label, config(Path(name.place)))
+
+
+def config(weights: Path) -> AgentConfig:
+    """What the card of `weights` says of the agent. Raises BadInput naming the card and the field."""
+    card, file = read_card(weights), weights.with_suffix(".json")
+    about: dict[str, Any] = card["data"]
+    approach = about.get("policy")
+    if approach not in APPROACHES or "vfn" not in card["configs"]:
+        raise BadInput("not the card of a value network", file=file, field="data.policy", value=approach)
+
+    def section(kind: type[Section], name: str) -> Section:
+        return dataclass_from(kind, about.get(name, {}), file, f"data.{name}")
+
+    vfn = dataclass_from(VfnConfig, card["configs"]["vfn"], file, "configs.vfn")
+    # cards of before observations were told are of one of the two sizes that ship
+    seen = PAPER if vfn.height == PAPER.height else COMPACT
+    if "observation" in about:
+        seen = section(ObservationConfig, "observation")
+    hpn = shipped("hpn")
+    other = hpn is not None and about.get("hpn_sha256", sha256(hpn)) != sha256(hpn)
+    return replace(
+        configure(approach, seen, section(ChainConfig, "chain"), section(HpnConfig, "hpn"), vfn),
+        safety=section(SafetyConfig, "safety"),
+        traffic=section(TrafficConfig, "traffic"),
+        vfn_weights=weights,
+        hpn_weights=hpn,
+        note=OTHER_HPN if other else "",
+    )

@@ -1,0 +1,1 @@
+"""What rows say: statistics, comparisons and gates, reports, replays."""

@@ -1,0 +1,229 @@
+"""A against B on equal traffic: their figures, the differences of pairs, and the verdict on thresholds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from cosim.errors import BadInput
+from cosim.report import wording
+from cosim.report.figures import Measure, Row
+from cosim.report.pairing import Group, Side, pair, title
+from cosim.report.statistics import (
+    NA,
+    Figure,
+    discordant,
+    mcnemar,
+    mean,
+    paired_change,
+    paired_mean,
+    paired_share,
+    share,
+)
+from cosim.report.thresholds import CHANGE, DIFFERENCE, Threshold, parse
+
+PASSED, FAILED, SKIPPED = "passed", "failed", "skipped"
+
+
+@dataclass(frozen=True, slots=True)
+class PairedFigure:
+    """One measure of A and of B over the pairs in which it applies to both."""
+
+    measure: Measure
+    a: Figure
+    b: Figure
+    difference: Figure  # b - a
+    n: int  # pairs it is from
+    na: int  # pairs in which it is NA on either side
+    na_on_both: int  # of these
+    hits: tuple[int, int] | None = None  # episodes of A and of B in which it happened, of a rate
+    p: float | None = None  # exact McNemar, of a rate
+
+    def document(self) -> dict[str, Any]:
+        """Plain JSON values."""
+        found = {
+            "a": self.a.document(),
+            "b": self.b.document(),
+            "difference": self.difference.document(),
+            "n": self.n,
+            "na": self.na,
+            "unit": self.measure.unit,
+            "better": self.measure.better,
+        }
+        if self.hits is not None:
+            found |= {"hits_a": self.hits[0], "hits_b": self.hits[1], "p": self.p}
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One threshold in one group."""
+
+    threshold: Threshold
+    group: Group
+    status: str  # PASSED, FAILED or SKIPPED
+    finding: str  # what the threshold was held against
+    figures: str = ""  # A, B and the difference, for who sees no table beside it
+
+
+class PairedFigures(Mapping[str, PairedFigure]):
+    """Every measure of a group by name, each bootstrapped when it is first asked for."""
+
+    def __init__(self, known: Mapping[str, Measure], pairs: Sequence[tuple[Row, Row]], seed: int) -> None:
+        self._known, self._pairs, self._seed = known, pairs, seed
+        self._found: dict[str, PairedFigure] = {}
+
+    def __getitem__(self, name: str) -> PairedFigure:
+        if name not in self._found:
+            self._found[name] = paired(self._known[name], self._pairs, self._seed)
+        return self._found[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._known)
+
+    def __len__(self) -> int:
+        return len(self._known)
+
+
+@dataclass(frozen=True)
+class Compared:
+    """One group of pairs with its figures."""
+
+    group: Group
+    known: dict[str, Measure]
+    seed: int  # of the bootstrap
+
+    @cached_property
+    def figures(self) -> PairedFigures:
+        """Every measure by name."""
+        return PairedFigures(self.known, self.group.pairs, self.seed)
+
+    def check(self, threshold: Threshold) -> Check:
+        """Hold one threshold against the group."""
+        return Check(threshold, self.group, *_judge(threshold, self))
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Everything that `cosim compare` shows."""
+
+    a: str
+    b: str
+    groups: list[Compared]
+    checks: list[Check]
+    alone: tuple[list[str], list[str]]  # cells that only A, only B has
+
+    @property
+    def exit_code(self) -> int:
+        """0 passed, 1 a threshold failed, 2 input refused, 3 simulations failed among the compared."""
+        if any(g.group.refused for g in self.groups):
+            return 2
+        if any(g.group.failed for g in self.groups):
+            return 3
+        return int(any(check.status == FAILED for check in self.checks))
+
+    @property
+    def verdict(self) -> str:
+        """The same in words."""
+        refused = sum(len(g.group.refused) for g in self.groups)
+        failed = sum(len(g.group.failed) for g in self.groups)
+        if refused:
+            return f"no verdict: {refused} compared episodes had bad input"
+        if failed:
+            return f"no verdict: {failed} of the compared simulations crashed or timed out"
+        if not self.checks:
+            return "compared, no threshold was given"
+        bad = sum(check.status == FAILED for check in self.checks)
+        if bad:
+            return f"failed: {bad} of {len(self.checks)} checks"
+        skipped = sum(check.status == SKIPPED for check in self.checks)
+        passed = f"passed: {len(self.checks) - skipped} of {len(self.checks)} checks"
+        return f"{passed}, {skipped} do not apply" if skipped else passed
+
+
+def compare(
+    a: Side, b: Side, fail_on: Sequence[str] = (), *, across: Sequence[str] = (), seed: int = 0
+) -> Comparison:
+    """Pair the episodes and hold every threshold against every group.
+
+    `across`: what A and B may differ in, e.g. ("svo_deg",). `seed` fixes the bootstrap.
+
+    Raises:
+        BadInput: see `pair`; a threshold that cannot be read, or that applies to no group.
+    """
+    known = {**b.run.measures, **a.run.measures}
+    thresholds = [parse(text, known) for text in fail_on]
+    found, alone = pair(a, b, across)
+    groups = [Compared(group, known, seed) for group in found]
+    checks = [group.check(threshold) for group in groups for threshold in thresholds]
+    for threshold in thresholds:
+        mine = [check for check in checks if check.threshold is threshold]
+        if all(check.status == SKIPPED for check in mine):
+            problem = f"{threshold.measure.name} is NA in every compared episode"
+            raise BadInput(problem, field="--fail-on", value=threshold.text)
+    return Comparison(title(a), title(b), groups, checks, alone)
+
+
+def paired(measure: Measure, pairs: Sequence[tuple[Row, Row]], seed: int = 0) -> PairedFigure:
+    """One measure over the pairs; those in which it is NA on either side are left out, and counted."""
+    before, after = (measure.values(rows) for rows in ([a for a, _ in pairs], [b for _, b in pairs]))
+    both = [(x, y) for x, y in zip(before, after, strict=True) if not math.isnan(x) and not math.isnan(y)]
+    neither = sum(math.isnan(x) and math.isnan(y) for x, y in zip(before, after, strict=True))
+    n, na = len(both), len(pairs) - len(both)
+    x, y = [x for x, _ in both], [y for _, y in both]
+    if not measure.is_rate:
+        difference = paired_mean(x, y, seed)
+        return PairedFigure(measure, mean(x, seed), mean(y, seed), difference, n, na, neither)
+    was, now = [v > 0 for v in x], [v > 0 for v in y]
+    hits = (sum(was), sum(now))
+    difference = paired_share(was, now) if n else NA
+    p = mcnemar(*discordant(was, now)) if n else None
+    return PairedFigure(measure, share(hits[0], n), share(hits[1], n), difference, n, na, neither, hits, p)
+
+
+# ---- inside ----
+
+
+def _judge(threshold: Threshold, compared: Compared) -> tuple[str, str, str]:
+    """Status, finding and figures of one threshold in one group."""
+    measure, pairs = threshold.measure, compared.group.pairs
+    found = compared.figures[measure.name]
+    if not pairs:
+        return FAILED, "no pair of episodes finished on both sides", ""
+    if found.na_on_both == len(pairs):
+        return SKIPPED, f"{measure.name} is NA in all {len(pairs)} pairs", ""
+    x, y = (measure.values([both[k] for both in pairs]) for k in (0, 1))
+    count = f"{found.n} pairs" + (f", NA in {found.na} more" if found.na else "")
+    if threshold.kind == CHANGE:
+        figure, what = paired_change(x, y, compared.seed), "B / A - 1"
+        shown = [wording.change(v) for v in (threshold.of(figure), figure.value, figure.low, figure.high)]
+        whole = f"{shown[1]} ({shown[2]} to {shown[3]})"
+    elif threshold.kind == DIFFERENCE:
+        figure, what = found.difference, "B - A"
+        shown = [wording.number(threshold.of(figure), measure, signed=True)]
+        whole = wording.interval(figure, measure, signed=True)
+    else:  # of B alone: pairs in which only A is NA count too
+        y = [value for value in y if not math.isnan(value)]
+        figure = share(int(sum(y)), len(y)) if measure.is_rate else mean(y, compared.seed)
+        what, count = "B", f"{int(sum(y))} of {len(y)} episodes" if measure.is_rate else f"{len(y)} episodes"
+        shown = [wording.number(threshold.of(figure), measure)]
+        whole = wording.interval(figure, measure)
+    finding = f"{what} is {whole}, {count}"
+    if threshold.bound != "value":
+        finding = f"{threshold.bound} bound is {shown[0]}: {finding}"
+    return FAILED if threshold.fails(threshold.of(figure)) else PASSED, finding, _figures(found)
+
+
+def _figures(found: PairedFigure) -> str:
+    """`A 2.5 % (0.4 to 12.9) = 1/40, B ..., B - A ..., p 1`"""
+    m = found.measure
+    counts = [f" = {hits}/{found.n}" for hits in found.hits] if found.hits else ["", ""]
+    parts = [
+        f"A {wording.interval(found.a, m)}{counts[0]}",
+        f"B {wording.interval(found.b, m)}{counts[1]}",
+        f"B - A {wording.interval(found.difference, m, signed=True)}",
+    ]
+    return ", ".join(parts if found.p is None else [*parts, wording.p_value(found.p)])

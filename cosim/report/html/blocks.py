@@ -1,0 +1,118 @@
+"""The rows of a run as the report shows them: blocks of equal traffic, and in each the series that drove it.
+
+Only figures of one block stand side by side: its series met the same traffic on the same seeds.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from cosim.report.compare import PairedFigure, paired
+from cosim.report.figures import Measure, Row
+from cosim.report.run_folder import Run
+from cosim.report.summary import GROUP, group_figures, groups
+from cosim.workers.tasks import OK
+
+EGOISTIC = "idm"  # the baseline of the papers: AVs that nobody commands
+TRAFFIC = tuple(name for name in GROUP if name not in ("policy", "svo_deg"))
+
+
+@dataclass(frozen=True)
+class Series:
+    """One cell: a policy with one SVO in one traffic."""
+
+    identity: dict[str, Any]  # by the names of `GROUP`, and cell, policy_label
+    rows: list[Row]
+    known: dict[str, Measure]
+    label: str  # tells it apart within its block
+    colour: int  # the policy's place in the run
+
+    @cached_property
+    def ok(self) -> list[Row]:
+        """Episodes that have figures."""
+        return [row for row in self.rows if row["status"] == OK]
+
+    @cached_property
+    def figures(self) -> dict[str, Any]:
+        """Counts, rates and means (`summary.group_figures`)."""
+        return group_figures(self.rows, self.known)
+
+    def values(self, name: str) -> list[float]:
+        """One measure of every ok episode, nan for NA."""
+        return self.known[name].values(self.ok) if name in self.known else []
+
+
+@dataclass(frozen=True)
+class Difference:
+    """A series against the baseline of its block, on equal seeds."""
+
+    series: Series
+    baseline: Series
+    figures: dict[str, PairedFigure]
+    pairs: int
+
+
+@dataclass(frozen=True)
+class Block:
+    """Series that met the same traffic."""
+
+    identity: dict[str, Any]  # by the names of `TRAFFIC`
+    series: list[Series]
+
+    def differences(self, names: Iterable[str]) -> list[Difference]:
+        """Every other series against the baseline: `idm` where it is there, else the first one."""
+        names = tuple(names)
+        first = self.series[0]
+        policy = EGOISTIC if any(s.identity["policy"] == EGOISTIC for s in self.series) else None
+        baselines = [s for s in self.series if s.identity["policy"] == (policy or first.identity["policy"])]
+        found = []
+        for series in self.series:
+            if series in baselines and (series is baselines[0] or policy is not None):
+                continue
+            alike = [s for s in baselines if s.identity["svo_deg"] == series.identity["svo_deg"]]
+            baseline = (alike or baselines)[0] if policy is not None else baselines[0]
+            before = {row["seed"]: row for row in baseline.ok}
+            pairs = [(before[row["seed"]], row) for row in series.ok if row["seed"] in before]
+            if pairs:
+                figures = {n: paired(series.known[n], pairs) for n in names if n in series.known}
+                found.append(Difference(series, baseline, figures, len(pairs)))
+        return found
+
+
+def blocks(run: Run) -> list[Block]:
+    """The run's cells by traffic, in the order they come."""
+    found: dict[str, list[tuple[dict[str, Any], list[Row]]]] = {}
+    for identity, rows in groups(run.rows):
+        case = {k: v for k, v in run.case(rows[0]).items() if k not in ("svo_deg", "outputs")}
+        traffic = [identity[name] for name in TRAFFIC]
+        found.setdefault(json.dumps([traffic, case], sort_keys=True, default=str), []).append(
+            (identity, rows)
+        )
+    colours = {policy: k for k, policy in enumerate(run.policies)}
+    return [
+        Block(
+            {name: members[0][0][name] for name in TRAFFIC},
+            [
+                Series(identity, rows, run.measures, label, colours[identity["policy"]])
+                for (identity, rows), label in zip(members, _labels([i for i, _ in members]), strict=True)
+            ],
+        )
+        for members in found.values()
+    ]
+
+
+def _labels(identities: list[dict[str, Any]]) -> list[str]:
+    """The policy, its SVO where several are there, its cell where even that is not enough."""
+    several = len({identity["svo_deg"] for identity in identities}) > 1
+    labels = [
+        f"{i['policy']} {i['svo_deg']:g}°" if several and i["svo_deg"] is not None else str(i["policy"])
+        for i in identities
+    ]
+    return [
+        f"{label} ({i['cell']})" if labels.count(label) > 1 else label
+        for label, i in zip(labels, identities, strict=True)
+    ]

@@ -1,0 +1,228 @@
+"""The plots of the report, one row per series each: rates, distances, times to collision, Pareto, vetoes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
+
+from cosim.report.html.blocks import Block, Series
+from cosim.report.html.svg import FAINT, INK, SERIES, canvas, render, themed
+from cosim.report.statistics import mean
+
+CRITICAL = 1.5  # s, below it a conflict is serious (cosim.metrics.time_to_collision)
+HORIZON = 10.0  # s, times to collision beyond it are NA
+BIN = 0.5  # s
+
+
+@dataclass(frozen=True, slots=True)
+class Plot:
+    """A drawing with what it shows."""
+
+    title: str
+    svg: Markup
+    note: str  # how to read it
+
+
+def plots(block: Block) -> list[Plot]:
+    """Every plot that has something to show."""
+    series = [s for s in block.series if s.ok]
+    if not series:
+        return []
+    with themed():
+        return [plot for plot in _all(series) if plot is not None]
+
+
+def _all(series: list[Series]) -> list[Plot | None]:
+    return [
+        _rates(series, "collision_rate", "Episodes with a collision"),
+        _rates(series, "av_caused_collision_rate", "Episodes with a collision that an AV caused"),
+        _rates(series, "mission_success_rate", "Missions fulfilled"),
+        _spread(series, "dt_mission_m", "Distance of the mission vehicle", "m"),
+        _spread(series, "dt_av_m", "Distance of the AVs", "m"),
+        _times(series),
+        _pareto(series),
+        _vetoes(series),
+    ]
+
+
+def _rates(series: list[Series], name: str, title: str) -> Plot | None:
+    """Shares with Wilson's intervals."""
+    found = [s.figures["rates"].get(name) for s in series]
+    if not any(f and f["n"] for f in found):
+        return None
+
+    def draw(axes: Axes, place: float, one: Series) -> str:
+        f = one.figures["rates"][name]
+        if not f["n"]:
+            return "NA"
+        _interval(axes, place, 100 * f["value"], 100 * f["low"], 100 * f["high"], one)
+        return f"{f['hits']}/{f['n']}"
+
+    svg = _rows(series, title, "% of episodes", draw, limits=(0.0, None))
+    return Plot(title, svg, "Point: share; bar: Wilson's 95 % interval; beside it the counts.")
+
+
+def _vetoes(series: list[Series]) -> Plot | None:
+    """Mean veto rates with bootstrap intervals."""
+    name, title = "veto_rate", "Decisions vetoed by the safety mask"
+    if not any(s.figures["means"].get(name, {}).get("n") for s in series):
+        return None
+
+    def draw(axes: Axes, place: float, one: Series) -> str:
+        f = one.figures["means"][name]
+        if not f["n"]:
+            return "NA"
+        low, high = (f["value"] if f[k] is None else f[k] for k in ("low", "high"))
+        _interval(axes, place, 100 * f["value"], 100 * low, 100 * high, one)
+        return f"n {f['n']}"
+
+    svg = _rows(series, title, "% of decisions", draw, limits=(0.0, None))
+    return Plot(title, svg, "Point: mean over episodes; bar: bootstrap 95 % interval.")
+
+
+def _spread(series: list[Series], name: str, title: str, unit: str) -> Plot | None:
+    """Every episode as a dot, with quartiles."""
+    if all(math.isnan(v) for s in series for v in s.values(name)):
+        return None
+
+    def draw(axes: Axes, place: float, one: Series) -> str:
+        values = np.array([v for v in one.values(name) if not math.isnan(v)])  # [n]
+        if not len(values):
+            return "NA"
+        jitter = np.random.default_rng(0).uniform(-0.22, 0.22, len(values))
+        colour = _colour(one)
+        axes.scatter(values, place + jitter, s=7, color=colour, alpha=0.35, linewidths=0)
+        low, middle, high = np.percentile(values, [25, 50, 75])
+        axes.plot([low, high], [place, place], color=colour, linewidth=3.0, solid_capstyle="round")
+        axes.plot([middle], [place], "o", markersize=6, color=colour, markeredgecolor=INK)
+        return f"n {len(values)}"
+
+    svg = _rows(series, title, unit, draw)
+    return Plot(title, svg, "Dots: episodes; bar: middle half; point: median.")
+
+
+def _times(series: list[Series]) -> Plot | None:
+    """Histograms of the smallest time to collision, a row each."""
+    name, title = "min_ttc_s", "Smallest time to collision in each episode"
+    if not any(s.values(name) for s in series):
+        return None
+    edges = np.arange(0.0, HORIZON + BIN / 2, BIN)  # [k+1] s
+    shares = {
+        id(s): np.histogram([v for v in s.values(name) if not math.isnan(v)], edges)[0] / len(s.ok)
+        for s in series
+    }  # [k] of the series' episodes
+    tallest = max(float(share.max()) for share in shares.values()) or 1.0
+
+    def draw(axes: Axes, place: float, one: Series) -> str:
+        heights = -0.8 * shares[id(one)] / tallest  # rows are counted downwards
+        axes.bar(edges[:-1], heights, 0.92 * BIN, place + 0.4, align="edge", color=_colour(one))
+        missing = sum(math.isnan(v) for v in one.values(name))
+        return f"n {len(one.ok) - missing}" + (f", {missing} none" if missing else "")
+
+    svg = _rows(series, title, "s", draw, limits=(0.0, HORIZON), mark=CRITICAL)
+    return Plot(
+        title,
+        svg,
+        f"Share of episodes; line: {CRITICAL:g} s, critical; none: nobody came within {HORIZON:g} s.",
+    )
+
+
+def _pareto(series: list[Series]) -> Plot | None:
+    """What the AVs give and what the others get; an SVO sweep is a line."""
+    others = {"dt_mission_m": "mission vehicle", "dt_hv_m": "human drivers"}
+    name = next((n for n in others if any(not math.isnan(v) for s in series for v in s.values(n))), None)
+    if name is None:
+        return None
+    who = others[name]
+    points = [(s, mean(s.values("dt_av_m")), mean(s.values(name))) for s in series]
+    points = [(s, x, y) for s, x, y in points if x.known and y.known]
+    if len(points) < 2:
+        return None
+    figure, axes = canvas(7.0)
+    axes.grid(axis="y")
+    for policy in dict.fromkeys(s.identity["policy"] for s, _, _ in points):
+        mine = [p for p in points if p[0].identity["policy"] == policy]
+        mine.sort(key=lambda p: p[0].identity["svo_deg"] or 0.0)
+        colour = _colour(mine[0][0])
+        axes.plot([x.value for _, x, _ in mine], [y.value for _, _, y in mine], color=colour, linewidth=1.0)
+        for _, x, y in mine:
+            for xs, ys in (((x.low, x.high), (y.value,) * 2), ((x.value,) * 2, (y.low, y.high))):
+                axes.plot(xs, ys, color=colour, linewidth=1.6, alpha=0.5)
+            axes.plot([x.value], [y.value], "o", markersize=6, color=colour)
+    axes.set_xlabel("mean distance of the AVs, m")
+    axes.set_ylabel(f"mean distance of the {who}, m")
+    axes.tick_params(axis="y", colors=FAINT, labelsize=8.5)
+    axes.margins(0.15)
+    _name_points(axes, [(one.label, x.value, y.value) for one, x, y in points])
+    title = f"What AVs give, what the {who} get" + ("s" if who.endswith("vehicle") else "")
+    return Plot(title, render(figure, title), "Up and to the right is better for all; bars: 95 % intervals.")
+
+
+# ---- inside ----
+
+
+def _rows(
+    series: list[Series],
+    title: str,
+    label: str,
+    draw: Callable[[Axes, float, Series], str],
+    *,
+    limits: tuple[float | None, float | None] = (None, None),
+    mark: float | None = None,
+) -> Markup:
+    """A drawing with a row per series, first on top; `draw` returns what stands at the row's right end."""
+    figure, axes = canvas(len(series))
+    if mark is not None:
+        axes.axvline(mark, color=FAINT, linewidth=1.0, linestyle=(0, (4, 3)))
+    texts = [draw(axes, float(k), one) for k, one in enumerate(series)]
+    axes.set_yticks(range(len(series)), [s.label for s in series])
+    axes.tick_params(axis="y", pad=9)
+    axes.set_ylim(len(series) - 0.45, -0.55)
+    axes.set_xlim(*limits)
+    axes.xaxis.set_major_locator(MaxNLocator(6))
+    axes.set_xlabel(label)
+    right = axes.twinx()
+    right.set_ylim(*axes.get_ylim())
+    right.set_yticks(range(len(series)), texts)
+    right.tick_params(axis="y", colors=FAINT, labelsize=8.0, length=0)
+    right.grid(visible=False)
+    for side in right.spines.values():
+        side.set_visible(False)
+    return render(figure, title)
+
+
+def _interval(axes: Axes, place: float, value: float, low: float, high: float, one: Series) -> None:
+    colour = _colour(one)
+    axes.plot([low, high], [place, place], color=colour, linewidth=2.5, alpha=0.55, solid_capstyle="round")
+    axes.plot([value], [place], "o", markersize=6.5, color=colour, clip_on=False, zorder=3)
+
+
+def _name_points(axes: Axes, points: list[tuple[str, float, float]]) -> None:
+    """Write each name beside its point; below it where another one stands above already."""
+    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    taken: list[tuple[float, float]] = []  # shares of the drawing's width and height
+    for label, x, y in sorted(points, key=lambda p: p[1]):
+        place = ((x - left) / (right - left), (y - bottom) / (top - bottom))
+        crowded = sum(abs(place[0] - u) < 0.25 and abs(place[1] - v) < 0.07 for u, v in taken)
+        offset = ((6, 6), (6, -13), (-6, 6), (-6, -13))[crowded % 4]
+        side = "left" if offset[0] > 0 else "right"
+        axes.annotate(
+            label,
+            (x, y),
+            offset,
+            textcoords="offset points",
+            fontsize=8.5,
+            color=INK,
+            horizontalalignment=side,
+        )
+        taken.append(place)
+
+
+def _colour(one: Series) -> str:
+    return SERIES[one.colour % len(SERIES)]

@@ -1,0 +1,187 @@
+"""The tables of the report, as plain cells: what is written, what it is sorted by, what is said beside it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from cosim.report import wording
+from cosim.report.compare import PairedFigure
+from cosim.report.figures import HEADLINE, Measure
+from cosim.report.html.blocks import Block, Difference, Series
+from cosim.report.statistics import CONFIDENCE, Figure
+from cosim.report.summary import GROUP
+
+TITLES = {
+    "scenario": "scenario",
+    "demand": "demand",
+    "policy": "policy",
+    "behavior": "behaviour",
+    "penetration": "penetration",
+    "preset": "preset",
+    "svo_deg": "SVO",
+    "driver_model": "drivers",
+    "collision_rate": "collisions",
+    "av_caused_collision_rate": "AV-caused",
+    "mission_success_rate": "mission",
+    "dt_mission_m": "mission vehicle",
+    "dt_av_m": "AVs",
+    "dt_mean_m": "all",
+    "min_ttc_s": "min TTC",
+    "hard_brakings_av": "hard brakings of AVs",
+    "veto_rate": "vetoes",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One cell of a table."""
+
+    text: str
+    sort: str  # what its column is sorted by
+    small: tuple[str, ...] = ()  # interval and counts, a line each
+    tone: str = ""  # "good", "bad", "warn" or ""
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Heads and rows; `common` says what all rows share."""
+
+    heads: list[str]
+    rows: list[list[Cell]]
+    common: list[str]
+
+
+def figures(blocks: Sequence[Block], known: dict[str, Measure]) -> Table:
+    """One row per cell of the run with its headline figures."""
+    series = [s for block in blocks for s in block.series]
+    varying = [n for n in GROUP if len({s.identity[n] for s in series}) > 1]
+    names = [n for n in HEADLINE if n in known]
+    rows = [
+        [_named(s, varying), _episodes(s), *(_figure(_counts(s, n), known[n]) for n in names)] for s in series
+    ]
+    heads = ["policy", "episodes", *(head(known[n]) for n in names)]
+    common = [
+        f"{TITLES[n]} {_plain(series[0].identity[n])}{'°' * (n == 'svo_deg')}"
+        for n in GROUP
+        if series and n != "policy" and n not in varying and series[0].identity[n] is not None
+    ]
+    return Table(heads, rows, common)
+
+
+def differences(found: Sequence[Difference]) -> Table | None:
+    """Every series of a block against its baseline, pair by pair; None where there is no pair."""
+    if not found:
+        return None
+    names = dict.fromkeys(n for d in found for n in d.figures)
+    shown = [n for n in names if any(d.figures[n].n for d in found)]
+    measures = found[0].figures
+    rows = [
+        [
+            Cell(d.series.label, d.series.label, (f"against {d.baseline.label}",)),
+            Cell(str(d.pairs), str(d.pairs)),
+            *(_difference(d.figures[n]) for n in shown),
+        ]
+        for d in found
+    ]
+    return Table(["policy", "pairs", *(head(measures[n].measure) for n in shown)], rows, [])
+
+
+def everything(block: Block) -> Table:
+    """Every figure of every series of a block: measures down, series across."""
+    known = block.series[0].known
+    rows = []
+    for name, measure in known.items():
+        counts = [_counts(s, name) for s in block.series]
+        rows.append(
+            [
+                Cell(name, name, (measure.unit,) if measure.unit else ()),
+                *(_figure(c, measure) for c in counts),
+            ]
+        )
+    return Table(["figure", *(s.label for s in block.series)], rows, [])
+
+
+def head(measure: Measure) -> str:
+    """The short name of a measure with the direction that is better."""
+    arrow = {"higher": " ↑", "lower": " ↓"}.get(measure.better, "")
+    return TITLES.get(measure.name, measure.name) + arrow
+
+
+def tone(figure: PairedFigure) -> str:
+    """Whether a difference is good or bad news; "" where chance may have made it.
+
+    That is where its interval holds 0, or, of a rate, McNemar's exact p is 5 % or more: with a handful of
+    crashes Tango's interval can leave 0 out where the exact test does not agree.
+    """
+    d = figure.difference
+    if math.isnan(d.low) or d.low <= 0.0 <= d.high or not figure.measure.better:
+        return ""
+    if figure.p is not None and figure.p >= 1.0 - CONFIDENCE:
+        return ""
+    return "good" if (d.value > 0.0) == (figure.measure.better == "higher") else "bad"
+
+
+# ---- inside ----
+
+
+def _counts(series: Series, name: str) -> dict[str, Any]:
+    found = series.figures
+    return found["rates"].get(name) or found["means"].get(name) or found["timings"].get(name) or {}
+
+
+def _named(series: Series, varying: Sequence[str]) -> Cell:
+    """Policy and SVO above, below it whatever else tells the cell apart: one column, so that it can stick."""
+    identity = series.identity
+    text = str(identity["policy"])
+    if "svo_deg" in varying and identity["svo_deg"] is not None:
+        text += f" {identity['svo_deg']:g}°"
+    others = [_plain(identity[n]) for n in varying if n not in ("policy", "svo_deg")]
+    label = f"({identity['policy_label']})" if identity["policy_label"] else ""
+    small = tuple(filter(None, (" / ".join(others), label)))
+    return Cell(text, " ".join((*others, text)), small)
+
+
+def _plain(value: Any) -> str:
+    return "–" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _episodes(series: Series) -> Cell:
+    ok, total = len(series.ok), len(series.rows)
+    others = [f"{count} {name}" for name, count in series.figures["status"].items() if count and name != "ok"]
+    odd = series.figures["not_comparable"]
+    small = (*others, *([f"{odd} not comparable"] if odd else []))
+    text = str(ok) if ok == total else f"{ok} of {total}"
+    return Cell(text, str(ok), small, "bad" if ok < total else "warn" if odd else "")
+
+
+def _figure(counts: dict[str, Any], measure: Measure) -> Cell:
+    """Value above, interval and counts below."""
+    n, na = counts.get("n", 0), counts.get("na", 0)
+    if not n:
+        return Cell(wording.NA_TEXT, "", (f"{na} NA",) if na else ())
+    value, low, high = (math.nan if counts[k] is None else counts[k] for k in ("value", "low", "high"))
+    text, bounds = _split(wording.interval(Figure(value, low, high), measure))
+    if counts.get("rule_of_three") is not None:
+        bounds = f"below {100 * counts['rule_of_three']:.3g} % (3/n)"
+    elif not bounds and n > 1 and counts.get("hits") is None:
+        bounds = "all alike"
+    return Cell(text, repr(value), tuple(filter(None, (bounds, wording.sample(counts)))))
+
+
+def _difference(figure: PairedFigure) -> Cell:
+    if not figure.n:
+        return Cell(wording.NA_TEXT, "")
+    text, bounds = _split(wording.interval(figure.difference, figure.measure, signed=True))
+    p = "" if figure.p is None else wording.p_value(figure.p)
+    pairs = f"{figure.n} pairs" if figure.na else ""
+    small = tuple(filter(None, (bounds, ", ".join(filter(None, (p, pairs))))))
+    return Cell(text, repr(figure.difference.value), small, tone(figure))
+
+
+def _split(interval: str) -> tuple[str, str]:
+    """`12.5 % (4.4 to 26.1)` -> `12.5 %`, `4.4 to 26.1`"""
+    text, _, bounds = interval.partition(" (")
+    return text, bounds.rstrip(")")

@@ -1,0 +1,224 @@
+"""Which episode of A belongs to which of B: the same traffic, driven by another policy or another version.
+
+A pair is one episode of each side that agree in all of `PAIR` and in the seed; a group is the pairs that
+agree in `PAIR`. Nothing is pooled over groups.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from cosim.errors import BadInput, hint
+from cosim.report import run_folder, wording
+from cosim.report.figures import Row
+from cosim.report.run_folder import Run
+from cosim.report.summary import GROUP, not_comparable
+from cosim.workers.tasks import BAD_INPUT, OK
+
+PAIR = tuple(name for name in GROUP if name != "policy")
+ACROSS = ("behavior", "penetration", "preset", "svo_deg", "driver_model")  # what A and B may differ in
+
+
+@dataclass(frozen=True, slots=True)
+class Side:
+    """One of the two: a run, or one policy of it."""
+
+    run: Run
+    policy: str | None = None
+
+
+@dataclass(frozen=True)
+class Group:
+    """The pairs of one cell."""
+
+    identity: dict[str, Any]  # by the names of `PAIR`
+    a: dict[str, Any]  # who drove: policy, policy_label, and whatever A and B differ in
+    b: dict[str, Any]
+    pairs: list[tuple[Row, Row]]  # both ok, by seed
+    failed: list[Row]  # sim_crash and timeout among the pairs
+    refused: list[Row]  # bad_input among the pairs
+    unpaired: tuple[int, int]  # episodes of A and of B without a partner
+
+    @property
+    def name(self) -> str:
+        """`merge / contested / ... / lc2013: idm -> altruist-rule`"""
+        return f"{wording.group(self.identity)}: {who(self.a)} -> {who(self.b)}"
+
+    @property
+    def not_comparable(self) -> int:
+        """Pairs in which either episode says that it must not be compared."""
+        return sum(not_comparable(a) or not_comparable(b) for a, b in self.pairs)
+
+    @property
+    def identical(self) -> int:
+        """Pairs in which both drove exactly alike."""
+        return sum(a.get("trace_hash") == b.get("trace_hash") for a, b in self.pairs)
+
+
+def side(text: str) -> Side:
+    """`DIR` or `DIR:POLICY`.
+
+    Raises:
+        BadInput: no such run, or no such policy in it.
+    """
+    folder, _, policy = text.rpartition(":")
+    if Path(text).is_dir() or not folder:
+        return Side(run_folder.read(text))
+    return chosen(run_folder.read(folder), policy)
+
+
+def chosen(run: Run, policy: str) -> Side:
+    """One policy of a run. Raises BadInput when it is not in it."""
+    if policy not in run.policies:
+        near = hint(policy, run.policies)
+        raise BadInput(f"no episode of this policy in {run.path}{near}", field="policy", value=policy)
+    return Side(run, policy)
+
+
+def title(one: Side) -> str:
+    """`DIR` or `DIR:POLICY`."""
+    return str(one.run.path) if one.policy is None else f"{one.run.path}:{one.policy}"
+
+
+def who(one: Mapping[str, Any]) -> str:
+    """`vfn-p (untrained) svo_deg=45.0`"""
+    label = f" ({one['policy_label']})" if one["policy_label"] else ""
+    others = [f" {k}={v}" for k, v in one.items() if k not in ("policy", "policy_label")]
+    return str(one["policy"]) + label + "".join(others)
+
+
+def pair(a: Side, b: Side, across: Sequence[str] = ()) -> tuple[list[Group], tuple[list[str], list[str]]]:
+    """Groups of pairs in A's order, and the names of the cells that only one side has.
+
+    `across`: names of `ACROSS` in which A and B may differ.
+
+    Raises:
+        BadInput: nothing to pair, no seed in common, a side's policy is not clear, two cells that would be
+            the same partner.
+    """
+    for name in across:
+        if name not in ACROSS:
+            raise BadInput(f"cannot be compared across{hint(name, ACROSS)}", field="--across", value=name)
+    by_policy = _clear_policies(a, b)
+    if by_policy:
+        common = set(a.run.policies) & set(b.run.policies)
+        if not common:
+            problem = f"no policy in common: A has {_words(a.run.policies)}, B has {_words(b.run.policies)}"
+            raise BadInput(problem + "; choose with DIR:POLICY")
+    fields = tuple(name for name in PAIR if name not in across) + (("policy",) if by_policy else ())
+    same_folder = a.run.path.resolve() == b.run.path.resolve()
+    all_a, all_b = (_cells(one, fields, across, same_folder) for one in (a, b))
+    groups = []
+    for key, cells_a in all_a.items():
+        for rows_a, rows_b in itertools.product(cells_a.values(), all_b.get(key, {}).values()):
+            seeds = sorted(rows_a.keys() & rows_b.keys())
+            if seeds:
+                pairs = [(rows_a[s], rows_b[s]) for s in seeds]
+                groups.append(_group(pairs, fields, (len(rows_a), len(rows_b))))
+    if not groups:
+        raise BadInput(_why_none(all_a, all_b, fields))
+    only_a, only_b = (
+        [
+            _name(next(iter(rows.values())))
+            for key, cells in mine.items()
+            for rows in cells.values()
+            if key not in others
+        ]
+        for mine, others in ((all_a, all_b), (all_b, all_a))
+    )
+    return groups, (only_a, only_b)
+
+
+# ---- inside ----
+
+_Key = tuple[Any, ...]
+
+
+def _clear_policies(a: Side, b: Side) -> bool:
+    """Whether each policy is paired with itself; otherwise each side is of one policy."""
+    several = [one.policy is None and len(one.run.policies) > 1 for one in (a, b)]
+    if not any(several):
+        return False
+    if a.policy is None and b.policy is None and all(several):
+        return True
+    name, one = ("A", a) if several[0] else ("B", b)
+    problem = f"{name} holds several policies, choose one with DIR:POLICY: {_words(one.run.policies)}"
+    raise BadInput(problem, value=str(one.run.path))
+
+
+_Cells = dict[_Key, dict[_Key, dict[int, Row]]]
+
+
+def _cells(one: Side, fields: tuple[str, ...], across: Sequence[str], same_folder: bool) -> _Cells:
+    """Rows by pairing key, then by the values of `across`, then by seed.
+
+    Raises BadInput when two rows would be one.
+    """
+    found: _Cells = {}
+    for row in one.run.rows:
+        if one.policy is not None and row["policy"] != one.policy:
+            continue
+        key: _Key = tuple(row.get(name) for name in fields)
+        if same_folder:  # then files can be told apart even where their names are equal
+            case = {k: v for k, v in one.run.case(row).items() if k not in (*across, "outputs")}
+            key += (json.dumps(case, sort_keys=True),)
+        rows = found.setdefault(key, {}).setdefault(tuple(row.get(name) for name in across), {})
+        twin = rows.setdefault(row["seed"], row)
+        if twin is not row:
+            problem = f"two cells would be one, {twin['cell']} and {row['cell']}: both are {_name(row)}"
+            raise BadInput(f"{problem} with seed {row['seed']}", file=one.run.path)
+    return found
+
+
+def _group(pairs: list[tuple[Row, Row]], fields: tuple[str, ...], episodes: tuple[int, int]) -> Group:
+    first_a, first_b = pairs[0]
+    differing = [n for n in PAIR if n not in fields and first_a.get(n) != first_b.get(n)]
+    drivers = [
+        {
+            "policy": row["policy"],
+            "policy_label": next((p[k]["policy_label"] for p in pairs if p[k].get("policy_label")), ""),
+            **{name: row.get(name) for name in differing},
+        }
+        for k, row in enumerate((first_a, first_b))
+    ]
+    wrong = [row for pair in pairs for row in pair if row["status"] != OK]
+    return Group(
+        identity={n: first_a.get(n) for n in PAIR if n not in differing},
+        a=drivers[0],
+        b=drivers[1],
+        pairs=[(x, y) for x, y in pairs if x["status"] == OK and y["status"] == OK],
+        failed=[row for row in wrong if row["status"] != BAD_INPUT],
+        refused=[row for row in wrong if row["status"] == BAD_INPUT],
+        unpaired=(episodes[0] - len(pairs), episodes[1] - len(pairs)),
+    )
+
+
+def _name(row: Row) -> str:
+    return wording.group({name: row.get(name) for name in GROUP})
+
+
+def _why_none(a: _Cells, b: _Cells, fields: tuple[str, ...]) -> str:
+    """Why nothing could be paired, in one sentence."""
+    if common := a.keys() & b.keys():
+        spans = []
+        for cells in (a, b):
+            seeds = [seed for key in common for rows in cells[key].values() for seed in rows]
+            spans.append(f"{min(seeds)} to {max(seeds)}")
+        return f"A and B have no seed in common: A has {spans[0]}, B has {spans[1]}"
+    for k, name in enumerate(fields):
+        has = [{key[k] for key in cells} for cells in (a, b)]
+        if not has[0] & has[1]:
+            way = f" (--across {name} compares them all the same)" if name in ACROSS else ""
+            return (
+                f"A and B have nothing in common: {name} is {_words(has[0])} in A, {_words(has[1])} in B{way}"
+            )
+    return "A and B have no cell in common: no " + " x ".join(fields) + " is in both"
+
+
+def _words(values: Iterable[Any]) -> str:
+    return ", ".join(sorted("none" if v is None else str(v) for v in values)) or "none"

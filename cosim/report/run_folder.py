@@ -1,0 +1,96 @@
+"""Reads back what `cosim evaluate` left in a run folder: its rows and its manifest."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet
+
+from cosim.batch.store import FILE
+from cosim.errors import BadInput
+from cosim.report.figures import Measure, Row, measures
+from cosim.workers.tasks import OK
+
+NEEDED = ("key", "cell", "status", "scenario", "demand", "policy", "seed")
+
+
+@dataclass(frozen=True)
+class Run:
+    """The episodes of one run folder."""
+
+    path: Path
+    rows: list[Row]
+    manifest: Mapping[str, Any] = field(default_factory=dict)
+
+    @cached_property
+    def measures(self) -> dict[str, Measure]:
+        """Every figure of these episodes by name."""
+        return measures(self.rows, self.manifest.get("units"), self.manifest.get("better"))
+
+    @property
+    def policies(self) -> list[str]:
+        """Names of the policies, in the order they come."""
+        return list(dict.fromkeys(str(row["policy"]) for row in self.rows))
+
+    @property
+    def planned(self) -> int | None:
+        """How many episodes the run is to have; None where it does not say."""
+        seeds, cells = self.manifest.get("seeds"), self.manifest.get("cells")
+        if not (isinstance(seeds, list) and len(seeds) == 2 and cells):
+            return None
+        return len(cells) * (int(seeds[1]) - int(seeds[0]))
+
+    def case(self, row: Row) -> dict[str, Any]:
+        """What was asked for (`EpisodeId`), without policy and seed; {} where not known."""
+        cell = self.manifest.get("cells", {}).get(row["cell"], {})
+        return {k: v for k, v in cell.get("case", {}).items() if k not in ("policy", "seed")}
+
+
+def read(path: str | Path) -> Run:
+    """The run in the folder `path`.
+
+    Raises:
+        BadInput: no such folder, no `episodes.parquet` in it, or one that is not ours.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        raise BadInput("no such run folder", value=str(path))
+    file = folder / "episodes.parquet"
+    if not file.is_file():
+        problem = "holds no episodes.parquet: is it a run of `cosim evaluate`?"
+        if (folder / FILE).is_file():
+            problem = f"is not finished: `cosim evaluate --resume --out {folder}` goes on"
+        raise BadInput(problem, file=folder)
+    try:
+        rows: list[dict[str, Any]] = pa.parquet.read_table(file).to_pylist()
+    except (pa.ArrowException, OSError) as error:
+        raise BadInput(f"cannot be read: {str(error).splitlines()[0]}", file=file) from None
+    for name in NEEDED:
+        if rows and name not in rows[0]:
+            raise BadInput("has no such column: is it a run of `cosim evaluate`?", file=file, field=name)
+    return Run(folder, _named_alike(rows), _manifest(folder / "manifest.json"))
+
+
+def _manifest(file: Path) -> Mapping[str, Any]:
+    """The manifest; {} when there is none."""
+    if not file.is_file():
+        return {}
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"))
+    except (ValueError, OSError) as error:
+        raise BadInput(f"cannot be read: {error}", file=file) from None
+    if not isinstance(found, dict):
+        raise BadInput("is not a manifest of ours", file=file)
+    return found
+
+
+def _named_alike(rows: list[dict[str, Any]]) -> list[Row]:
+    """Episodes that failed bear the policy's name as typed; give them the one that it gives itself."""
+    names = {row["cell"]: row["policy"] for row in rows if row["status"] == OK}
+    return [{**row, "policy": names.get(row["cell"], row["policy"])} for row in rows]

@@ -1,0 +1,134 @@
+"""The figures of a run, cell by cell, with intervals and counts: what summary.json holds."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from cosim.report.figures import TIMINGS, Measure, Row, measures
+from cosim.report.statistics import CONFIDENCE, mean, rule_of_three, share
+from cosim.workers.tasks import BAD_INPUT, OK, SIM_CRASH, TIMEOUT
+
+STATUSES = (OK, SIM_CRASH, TIMEOUT, BAD_INPUT)
+
+# What must be equal for episodes to be counted together; rows of different cells never are.
+GROUP = (
+    "scenario",
+    "demand",
+    "policy",
+    "behavior",
+    "penetration",
+    "preset",
+    "svo_deg",
+    "driver_model",
+)
+
+
+def summarize(
+    rows: Sequence[Row],
+    units: Mapping[str, str] | None = None,
+    better: Mapping[str, str] | None = None,
+    *,
+    seed: int = 0,
+) -> dict[str, Any]:
+    """Plain JSON values: counts of the whole, and one entry per group with its rates, means and timings.
+
+    Only episodes of status ok enter a figure; `status` says how many there are of each. Every figure has its
+    `n` beside it and its `na`: ok episodes in which it does not apply. `seed` fixes the bootstrap.
+    """
+    known = measures(rows, units, better)
+    return {
+        "episodes": len(rows),
+        "status": status_counts(rows),
+        "not_comparable": sum(not_comparable(row) for row in rows),
+        "confidence": CONFIDENCE,
+        "bootstrap_seed": seed,
+        "groups": [{**identity, **group_figures(members, known, seed)} for identity, members in groups(rows)],
+    }
+
+
+def groups(rows: Sequence[Row]) -> list[tuple[dict[str, Any], list[Row]]]:
+    """The rows by scenario x demand x policy x ... (`GROUP`) and cell, in the order they come."""
+    found: dict[tuple[Any, ...], list[Row]] = {}
+    for row in rows:
+        found.setdefault((*(row.get(name) for name in GROUP), row.get("cell")), []).append(row)
+    return [
+        (
+            {**dict(zip(GROUP, key[:-1], strict=True)), "cell": key[-1], "policy_label": _label(members)},
+            members,
+        )
+        for key, members in found.items()
+    ]
+
+
+def group_figures(rows: Sequence[Row], known: Mapping[str, Measure], seed: int = 0) -> dict[str, Any]:
+    """Counts, rates, means and timings of episodes of one group."""
+    ok = [row for row in rows if row.get("status", OK) == OK]
+    rates = {m.name: rate_document(m, ok) for m in known.values() if m.is_rate}
+    means = {m.name: mean_document(m, ok, seed) for m in known.values() if not m.is_rate}
+    return {
+        "episodes": len(rows),
+        "ok": len(ok),
+        "status": status_counts(rows),
+        "not_comparable": sum(not_comparable(row) for row in ok),
+        "not_comparable_because": reasons(ok),
+        "rates": rates,
+        "means": {name: found for name, found in means.items() if name not in TIMINGS},
+        "timings": {name: found for name, found in means.items() if name in TIMINGS},
+    }
+
+
+def rate_document(measure: Measure, rows: Sequence[Row]) -> dict[str, Any]:
+    """Share of the rows with Wilson's interval; `rule_of_three` where it was never seen."""
+    values = [v for v in measure.values(rows) if not math.isnan(v)]
+    hits = int(sum(values))
+    never = bool(values) and hits == 0
+    return {
+        **share(hits, len(values)).document(),
+        "hits": hits if values else None,
+        "n": len(values),
+        "na": len(rows) - len(values),
+        "rule_of_three": rule_of_three(len(values)) if never else None,
+        "better": measure.better,
+    }
+
+
+def mean_document(measure: Measure, rows: Sequence[Row], seed: int = 0) -> dict[str, Any]:
+    """Mean over the rows with its bootstrap interval."""
+    values = [v for v in measure.values(rows) if not math.isnan(v)]
+    return {
+        **mean(values, seed).document(),
+        "n": len(values),
+        "na": len(rows) - len(values),
+        "unit": measure.unit,
+        "better": measure.better,
+    }
+
+
+def status_counts(rows: Sequence[Row]) -> dict[str, int]:
+    """How many episodes of each status, zeros too."""
+    found = Counter(str(row.get("status", OK)) for row in rows)
+    return {name: found[name] for name in (*STATUSES, *(found.keys() - set(STATUSES)))}
+
+
+def not_comparable(row: Row) -> bool:
+    """Whether an episode says of itself that it must not be compared (`EpisodeResult.validity`)."""
+    return row.get("status", OK) == OK and row.get("comparable") is False
+
+
+def reasons(rows: Sequence[Row]) -> dict[str, int]:
+    """Why episodes are not comparable and how many say so; numbers in a reason become "n"."""
+    found: Counter[str] = Counter()
+    for row in rows:
+        said = row.get("not_comparable_because") or []
+        for reason in json.loads(said) if isinstance(said, str) else said:
+            found[re.sub(r"(?<![\w.])\d+(\.\d+)?", "n", reason)] += 1
+    return dict(found.most_common())
+
+
+def _label(rows: Sequence[Row]) -> str:
+    return next((str(row["policy_label"]) for row in rows if row.get("policy_label")), "")

@@ -1,0 +1,112 @@
+"""The small language of `cosim compare --fail-on`, e.g. `collision_rate.upper > +0.5pp`.
+
+    METRIC[.upper|.lower]  >|<  [+|-]NUMBER[UNIT]
+
+With a sign it bounds the difference B - A on equal seeds, without one the figure of B itself. UNIT: `pp`
+(a difference of shares, in percentage points), `%` (a share; with a sign the change of a mean relative to
+A's), or the metric's own unit, which may be left out. `.upper` and `.lower` take that bound of the 95 %
+interval instead of the value. A share needs its unit, unless it is 0: 0.5 might be a half or half a per cent.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from cosim.errors import BadInput, hint
+from cosim.report.figures import Measure
+from cosim.report.statistics import Figure
+
+DIFFERENCE, CHANGE, ABSOLUTE = "difference", "change", "absolute"
+
+_FORM = re.compile(
+    r"""\s*(?P<metric>[A-Za-z]\w*) (\s*\.\s*(?P<bound>\w+))?
+        \s*(?P<sense>[<>])
+        \s*(?P<sign>[+-]?)\s*(?P<number>(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?)
+        \s*(?P<unit>\S.*?)?\s*""",
+    re.VERBOSE,
+)
+_SLACK = 1e-12  # 1 of 200 is not more than 0.5 %, whatever float arithmetic makes of it
+
+
+@dataclass(frozen=True, slots=True)
+class Threshold:
+    """One `--fail-on`: fails when the figure is beyond `limit` in the direction of `sense`."""
+
+    text: str  # as the user typed it
+    measure: Measure
+    bound: str  # "value", "upper" or "lower"
+    sense: str  # ">" or "<"
+    limit: float  # in the metric's own unit; of a CHANGE and of shares as a fraction
+    kind: str  # DIFFERENCE, CHANGE or ABSOLUTE
+
+    def of(self, figure: Figure) -> float:
+        """The number that is held against the limit; nan where there is none."""
+        return {"value": figure.value, "upper": figure.high, "lower": figure.low}[self.bound]
+
+    def fails(self, number: float) -> bool:
+        """Whether it is beyond the limit. NA, or no such bound, fails: it proves nothing."""
+        slack = _SLACK * max(1.0, abs(self.limit))
+        return not (number <= self.limit + slack if self.sense == ">" else number >= self.limit - slack)
+
+
+def parse(text: str, known: Mapping[str, Measure]) -> Threshold:
+    """Read one threshold; `known`: the figures that the runs hold.
+
+    Raises:
+        BadInput: not of that form, an unknown metric (with the nearest name), a unit that is not its own.
+    """
+    found = _FORM.fullmatch(text)
+    if found is None:
+        problem = "write METRIC[.upper|.lower] > or < [+|-]NUMBER[UNIT], as in 'collision_rate > +0.5pp'"
+        raise _wrong(problem, text)
+    names = {**{m.column: m for m in known.values() if m.is_rate}, **known}  # `crashed` is `collision_rate`
+    measure = names.get(found["metric"])
+    if measure is None:
+        near = hint(found["metric"], known)
+        raise _wrong(f"unknown metric {found['metric']!r}{near or _list(known)}", text)
+    bound = found["bound"] or "value"
+    if bound not in ("value", "upper", "lower"):
+        raise _wrong(f"unknown bound .{bound}: there are .upper and .lower", text)
+    number = float(found["number"])
+    kind, scale = _unit(measure, found["sign"], number, found["unit"], text)
+    limit = scale * number * (-1.0 if found["sign"] == "-" else 1.0)
+    return Threshold(" ".join(text.split()), measure, bound, found["sense"], limit, kind)
+
+
+def _unit(measure: Measure, sign: str, number: float, unit: str | None, text: str) -> tuple[str, float]:
+    """What is bounded, and what one of the unit is in the metric's own."""
+    kind = DIFFERENCE if sign else ABSOLUTE
+    if unit is None and measure.is_share and number != 0.0:
+        raise _wrong(f"{measure.name} is a share: write {'pp' if sign else '%'} behind the number", text)
+    if unit is None or (unit == measure.unit and unit not in ("%", "pp")):
+        return kind, 1.0
+    if unit == "pp":
+        if measure.is_share and sign:
+            return DIFFERENCE, 0.01
+        why = "write + or - before it" if measure.is_share else f"{measure.name} is in {_unit_of(measure)}"
+        raise _wrong(f"pp is for differences of shares: {why}", text)
+    if unit == "%":
+        if measure.is_share and sign:
+            raise _wrong("a difference of shares is given in pp (percentage points)", text)
+        if measure.is_share:
+            return ABSOLUTE, 0.01
+        if sign:
+            return CHANGE, 0.01
+        raise _wrong(f"{measure.name} is in {_unit_of(measure)}; with + or - it may be a change in %", text)
+    raise _wrong(f"unknown unit {unit!r}: {measure.name} is in {_unit_of(measure)}", text)
+
+
+def _unit_of(measure: Measure) -> str:
+    return (
+        f"{measure.unit} (% or pp)" if measure.is_share else measure.unit or "a unit this run does not name"
+    )
+
+
+def _list(known: Mapping[str, Measure]) -> str:
+    return f", there are: {', '.join(known)}"
+
+
+def _wrong(problem: str, text: str) -> BadInput:
+    return BadInput(problem, field="--fail-on", value=text)

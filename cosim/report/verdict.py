@@ -1,0 +1,157 @@
+"""A comparison for people and machines: text for a terminal, Markdown for a pull request, JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from cosim.report import wording
+from cosim.report.compare import FAILED, PASSED, SKIPPED, Compared, Comparison, PairedFigure
+from cosim.report.figures import HEADLINE
+from cosim.report.pairing import who
+
+_MARK = {PASSED: "pass", FAILED: "FAIL", SKIPPED: "n/a "}
+_EMOJI = {PASSED: "✅ pass", FAILED: "❌ **fail**", SKIPPED: "n/a"}
+_SHOWN = 20  # failed simulations and lonely cells that are listed by name
+
+
+def document(comparison: Comparison) -> dict[str, Any]:
+    """Plain JSON values."""
+    return {
+        "a": comparison.a,
+        "b": comparison.b,
+        "verdict": comparison.verdict,
+        "exit_code": comparison.exit_code,
+        "checks": [
+            {
+                "threshold": check.threshold.text,
+                "group": check.group.name,
+                "status": check.status,
+                "finding": check.finding,
+            }
+            for check in comparison.checks
+        ],
+        "groups": [_group_document(compared) for compared in comparison.groups],
+        "only_in_a": comparison.alone[0],
+        "only_in_b": comparison.alone[1],
+    }
+
+
+def text(comparison: Comparison) -> str:
+    """Tables and verdict for a terminal."""
+    lines = [f"A  {comparison.a}", f"B  {comparison.b}", ""]
+    for compared in comparison.groups:
+        lines += [compared.group.name, *(f"  {note}" for note in _notes(compared))]
+        table = [("", "A", "B", "B - A"), *(_cells(figure) for figure in _shown(comparison, compared))]
+        widths = [max(len(row[k]) for row in table) for k in range(4)]
+        lines += [
+            "  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+            for row in table
+        ]
+        for check in comparison.checks:
+            if check.group is compared.group:
+                lines.append(f"  {_MARK[check.status]}  {check.threshold.text}:  {check.finding}")
+        lines.append("")
+    lines += _lonely(comparison)
+    return "\n".join([*lines, comparison.verdict])
+
+
+def markdown(comparison: Comparison) -> str:
+    """Tables and verdict for a pull request comment."""
+    lines = [f"### cosim compare: {comparison.verdict}", ""]
+    lines += [f"A: `{comparison.a}`, B: `{comparison.b}`; 95 % intervals, pairs on equal seeds", ""]
+    if comparison.checks:
+        lines += ["| | fails on | group | finding |", "|---|---|---|---|"]
+        for check in comparison.checks:
+            group, finding = _html(check.group.name), _html(check.finding)
+            lines.append(_row((_EMOJI[check.status], f"`{check.threshold.text}`", group, finding)))
+        lines.append("")
+    for compared in comparison.groups:
+        lines += ["<details>", f"<summary>{_html(compared.group.name)}</summary>", ""]
+        lines += [f"{_html(note)}  " for note in _notes(compared)]
+        lines += ["", "| | A | B | B - A |", "|---|---|---|---|"]
+        lines += [_row([_html(cell) for cell in _cells(figure)]) for figure in _shown(comparison, compared)]
+        lines += ["", "</details>", ""]
+    lines += [f"{_html(line)}  " for line in _lonely(comparison)]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+# ---- inside ----
+
+
+def _group_document(compared: Compared) -> dict[str, Any]:
+    group = compared.group
+    return {
+        **group.identity,
+        "name": group.name,
+        "a": group.a,
+        "b": group.b,
+        "pairs": len(group.pairs),
+        "identical": group.identical,
+        "not_comparable": group.not_comparable,
+        "failed": [row["key"] for row in group.failed],
+        "refused": [row["key"] for row in group.refused],
+        "only_in_a": group.unpaired[0],
+        "only_in_b": group.unpaired[1],
+        "figures": {name: figure.document() for name, figure in compared.figures.items()},
+    }
+
+
+def _shown(comparison: Comparison, compared: Compared) -> list[PairedFigure]:
+    """Headline figures and those that a threshold asks for, as far as they apply."""
+    asked = [check.threshold.measure.name for check in comparison.checks]
+    names = [name for name in dict.fromkeys((*HEADLINE, *asked)) if name in compared.known]
+    return [compared.figures[name] for name in names if compared.figures[name].n]
+
+
+def _cells(figure: PairedFigure) -> tuple[str, str, str, str]:
+    """Name, A, B, B - A, with intervals and counts."""
+    m = figure.measure
+    arrow = {"higher": " ↑", "lower": " ↓"}.get(m.better, "")
+    counts = [f", {hits}/{figure.n}" for hits in figure.hits] if figure.hits else ["", ""]
+    difference = wording.interval(figure.difference, m, signed=True)
+    if figure.p is not None:
+        difference += f", {wording.p_value(figure.p)}"
+    if figure.na:
+        difference += f", {figure.n} pairs"
+    return (
+        m.name + arrow,
+        wording.interval(figure.a, m) + counts[0],
+        wording.interval(figure.b, m) + counts[1],
+        difference,
+    )
+
+
+def _notes(compared: Compared) -> list[str]:
+    """What a reader must know before the figures."""
+    group = compared.group
+    notes = [f"{len(group.pairs)} pairs, A {who(group.a)}, B {who(group.b)}"]
+    if group.identical:
+        notes.append(f"{group.identical} pairs drove exactly alike (same trace hash)")
+    if group.not_comparable:
+        notes.append(f"{group.not_comparable} pairs hold an episode that says it is not comparable")
+    for side, count in zip("AB", group.unpaired, strict=True):
+        if count:
+            notes.append(f"{count} episodes of {side} have no partner and do not count")
+    for row in [*group.failed, *group.refused][:_SHOWN]:
+        reason = str(row.get("error") or "no reason given")
+        notes.append(f"{row['status']} {row['key']} ({row['policy']}, seed {row['seed']}): {reason}")
+    hidden = len(group.failed) + len(group.refused) - _SHOWN
+    return [*notes, f"and {hidden} more"] if hidden > 0 else notes
+
+
+def _lonely(comparison: Comparison) -> list[str]:
+    lines = []
+    for side, names in zip("AB", comparison.alone, strict=True):
+        if names:
+            more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+            lines.append(f"only in {side}, not compared: {'; '.join(names[:_SHOWN])}{more}")
+    return lines
+
+
+def _row(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
+
+
+def _html(text: str) -> str:
+    return text.replace("&", "&amp;").replace("<", "&lt;").replace("\n", " ")

@@ -1,0 +1,84 @@
+"""How figures are spelled for people: per cent and percentage points, units, intervals, NA."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from cosim.report.figures import Measure
+from cosim.report.statistics import Figure
+
+NA_TEXT = "NA"
+
+
+def number(
+    value: float, measure: Measure, *, signed: bool = False, unit: bool = True, places: int | None = None
+) -> str:
+    """`12.5 %`, `+0.5 pp` (a signed share is a difference of shares), `543 m`, `NA`.
+
+    `places`: decimals; by default three significant digits or so.
+    """
+    if math.isnan(value):
+        return NA_TEXT
+    name = measure.unit
+    if measure.is_share:
+        value, name = 100.0 * value, "pp" if signed else "%"
+    text = _digits(value, signed, places)
+    return f"{text} {name}" if unit and name else text
+
+
+def change(value: float) -> str:
+    """A relative change: `-3.2 %`."""
+    return NA_TEXT if math.isnan(value) else f"{_digits(100.0 * value, True, 1)} %"
+
+
+def interval(figure: Figure, measure: Measure, *, signed: bool = False) -> str:
+    """`12.5 % (4.4 to 26.1)`, to two digits of the interval's width; bare where there is no interval."""
+    width = (figure.high - figure.low) * (100.0 if measure.is_share else 1.0)
+    if not figure.known or not 0.0 < width < math.inf:
+        return number(figure.value, measure, signed=signed)
+    places = min(max(1 - math.floor(math.log10(width)), 1 if measure.is_share else 0), 4)
+    value, low, high = (
+        number(x, measure, signed=signed, unit=unit, places=places)
+        for x, unit in ((figure.value, True), (figure.low, False), (figure.high, False))
+    )
+    return f"{value} ({low} to {high})"
+
+
+def sample(counts: Mapping[str, Any]) -> str:
+    """`3/40` of a rate, `n 40` of a mean, with the NA beside them."""
+    text = f"{counts['hits']}/{counts['n']}" if counts.get("hits") is not None else f"n {counts['n']}"
+    return f"{text}, {counts['na']} NA" if counts.get("na") else text
+
+
+def p_value(p: float) -> str:
+    """`p 0.03`, `p < 0.001`."""
+    return "p < 0.001" if p < 0.001 else f"p {p:.2g}"
+
+
+def group(identity: Mapping[str, Any], *, policy: bool = True) -> str:
+    """`merge / contested / idm / moderate / unguarded / svo 45 / lc2013`."""
+    words = [identity.get("scenario"), identity.get("demand"), identity.get("policy") if policy else None]
+    words += [identity.get("behavior"), identity.get("preset")]
+    if identity.get("svo_deg") is not None:
+        words.append(f"svo {identity['svo_deg']:g}")
+    if identity.get("penetration") is not None:
+        words.append(f"penetration {identity['penetration']:g}")
+    words.append(identity.get("driver_model"))
+    return " / ".join(str(word) for word in words if word is not None)
+
+
+def _digits(value: float, signed: bool, places: int | None = None) -> str:
+    """Never an exponent below a million, never a minus before a zero."""
+    sign = "+" if signed else ""
+    size = abs(value)
+    if math.isinf(value) or size >= 1e6:
+        return f"{value:{sign}.3g}"
+    if places is None:
+        places = 0 if size >= 100 else 1 if size >= 10 or size == 0 else 2 if size >= 1 else 3
+        text = f"{value:{sign}.{places}f}"
+        text = text.rstrip("0").rstrip(".") if places else text
+    else:
+        text = f"{value:{sign}.{places}f}"
+    return text.lstrip("+-") if not text.strip("+-0.") else text

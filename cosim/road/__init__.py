@@ -1,0 +1,253 @@
+"""The road as pure data: lanes with centre lines, how they connect, and the paths ahead of a vehicle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from cosim.arrays import Floats, Ints
+from cosim.road.contact import Contact
+from cosim.road.lane import Lane as Lane
+
+PATH_HORIZON = 400.0  # m: further than any AV drives within the 4 s horizon, and than arms are long
+
+
+@dataclass(frozen=True, eq=False)
+class LanePath:
+    """A lane's centre line followed ahead through its successors; one object per way (`RoadMap.path`).
+
+    `arc` starts at 0 at the beginning of the first lane; SUMO lane positions are scaled to it.
+    """
+
+    points: Floats  # [p,2] m
+    arc: Floats  # [p] m, distance along `points`
+    lanes: tuple[int, ...]  # lanes passed, in order
+    lane_start: Floats  # [len(lanes)] m, arc where each lane begins
+    dead_end: bool  # ends because the lane (or its use for this route) ends, not at the horizon
+    leaves: bool  # ends because the route is finished there (the vehicle arrives)
+    scale: float  # arc length per SUMO lane position on the first lane
+    conflict: float  # m, arc where the conflict zone begins; inf when the path meets none
+
+    @property
+    def length(self) -> float:
+        """m"""
+        return float(self.arc[-1])
+
+    @cached_property
+    def next_lanes(self) -> Ints:
+        """Its first three lanes (or as many as there are)."""
+        return np.array(self.lanes[:3], np.int64)
+
+    def pose(self, arc: Floats) -> tuple[Floats, Floats, Floats]:
+        """Positions and headings at arc lengths. [k] m -> x [k] m, y [k] m, heading [k] rad.
+
+        Beyond either end the path goes on straight.
+        """
+        a = np.asarray(arc, dtype=np.float64)
+        i = np.clip(np.searchsorted(self.arc, a, side="right") - 1, 0, len(self.arc) - 2)
+        d = self.points[i + 1] - self.points[i]  # [k,2]
+        span = np.maximum(self.arc[i + 1] - self.arc[i], 1e-9)
+        s = ((a - self.arc[i]) / span)[:, None]
+        p = self.points[i] + s * d
+        return p[:, 0], p[:, 1], np.arctan2(d[:, 1], d[:, 0])
+
+
+class RouteAhead(NamedTuple):
+    """An AV's own route knowledge at one decision (contract, Observation)."""
+
+    paths: tuple[LanePath | None, LanePath | None, LanePath | None]  # left, keep, right; None: no lane
+    arc: float  # m, the vehicle centre's place along every path
+    conflict_distance: float  # m to the conflict zone along the present lane; inf when none is ahead
+    speed_limit: float  # m/s
+
+    def to_end(self, side: int) -> float:
+        """m until the path ends in a dead end; inf when it does not (side 0 left, 1 keep, 2 right)."""
+        path = self.paths[side]
+        if path is None:
+            return 0.0
+        return path.length - self.arc if path.dead_end else float("inf")
+
+
+@dataclass(frozen=True)
+class ConflictZone:
+    """Where streams meet: a set of lanes (indices into RoadMap.lanes)."""
+
+    name: str
+    lanes: frozenset[int]
+
+
+class LaneGraph(NamedTuple):
+    """Which lane follows which, for walking ahead quickly; l lanes as in RoadMap.lanes."""
+
+    following: Ints  # [l] the lane one drives on to, -1 at the end
+    length: Floats  # [l] m
+
+
+@dataclass(frozen=True)
+class RoadMap:
+    """Every lane of a net. Paths are cached, so asking again is free."""
+
+    lanes: tuple[Lane, ...]
+    zones: tuple[ConflictZone, ...] = ()
+    junctions: tuple[Floats, ...] = ()  # [p,2] m, outlines
+    _paths: dict[tuple[int, tuple[str, ...] | None], LanePath] = field(default_factory=dict, repr=False)
+    index: dict[str, int] = field(default_factory=dict, repr=False)
+
+    def __post_init__(self) -> None:
+        self.index.update({lane.id: i for i, lane in enumerate(self.lanes)})
+
+    def path(self, lane: int, route: tuple[str, ...] | None = None) -> LanePath:
+        """The way ahead from the start of `lane`.
+
+        `route`: edges from the lane's own edge on (internal edges left out); the path follows them and
+        dead-ends where the lane does not lead on. Without a route (other drivers' is unknown) it takes
+        the straightest successor.
+        """
+        key = (lane, route)
+        found = self._paths.get(key)
+        if found is None:
+            found = self._paths[key] = self._follow(lane, route)
+        return found
+
+    @cached_property
+    def contact(self) -> Contact:
+        """Which lanes' vehicles can touch: roads on a bridge and below it do not."""
+        return Contact(self.lanes)
+
+    def connected(self, a: int, b: int) -> bool:
+        """Whether vehicles on lanes `a` and `b` can touch; -1 (off every lane) touches all."""
+        return bool(self.contact.touch(a, np.array([b]))[0])
+
+    @cached_property
+    def straight_on(self) -> LaneGraph:
+        """The straightest successor of every lane (another vehicle's route is unknown)."""
+        steps = [self._successor(k, None, 0) for k in range(len(self.lanes))]
+        following = [-1 if step is None else step[0] for step in steps]
+        lengths = [lane.length for lane in self.lanes]
+        return LaneGraph(np.array(following, np.int64), np.array(lengths, np.float64))
+
+    def ahead(self, lane: int, lane_position: float, length: float, route: tuple[str, ...]) -> RouteAhead:
+        """Route knowledge of a vehicle of `length` m whose front bumper is at `lane_position` m of `lane`."""
+        here = self.lanes[lane]
+        keep = self.path(lane, route)
+        left = None if here.left < 0 else self.path(here.left, route)
+        right = None if here.right < 0 else self.path(here.right, route)
+        arc = (lane_position - 0.5 * length) * keep.scale
+        conflict = max(keep.conflict - arc - 0.5 * length, 0.0)
+        return RouteAhead((left, keep, right), arc, conflict, here.speed_limit)
+
+    @cached_property
+    def _lengths(self) -> list[float]:
+        """Every lane's length along its centre line, m (`Lane.length` is SUMO's)."""
+        return [float(np.sqrt((np.diff(lane.shape, axis=0) ** 2).sum(1)).sum()) for lane in self.lanes]
+
+    @cached_property
+    def _exits(self) -> list[float]:
+        """Every lane's heading at its end, rad."""
+        last = [lane.shape[-1] - lane.shape[-2] for lane in self.lanes]
+        return [float(np.arctan2(d[1], d[0])) for d in last]
+
+    def _follow(self, first: int, route: tuple[str, ...] | None) -> LanePath:
+        lanes = [first]
+        total = self._lengths[first]
+        place = 0  # where on the route we are
+        dead_end = leaves = False
+        while total < PATH_HORIZON + self._lengths[first]:
+            lane = self.lanes[lanes[-1]]
+            if route is not None and place >= len(route) - 1 and not lane.internal:
+                leaves = True
+                break
+            step = self._successor(lanes[-1], route, place)
+            if step is None:
+                dead_end = True
+                if route is None and not lane.successors:
+                    beside = [self.lanes[o] for o in (lane.left, lane.right) if o >= 0]
+                    dead_end = any(other.successors for other in beside)
+                    leaves = not dead_end
+                break
+            following, place = step
+            if following in lanes:  # a ring: once round is far enough
+                break
+            lanes.append(following)
+            total += self._lengths[following]
+        return self._join(tuple(lanes), dead_end, leaves)
+
+    def _successor(self, index: int, route: tuple[str, ...] | None, place: int) -> tuple[int, int] | None:
+        lane = self.lanes[index]
+        if not lane.successors:
+            return None
+        if route is None:
+            return min(lane.successors, key=lambda s: abs(_wrap(self._exits[s] - self._exits[index]))), place
+        fitting = self._fitting(lane, route, place)
+        if not fitting:
+            return None
+        best = fitting[0]
+        if len(fitting) > 1:  # the road widens: SUMO takes the lane that follows the route furthest
+            best = max(fitting, key=lambda s: self._reach(s, route, self._place_on(s, place), 300.0))
+        return best, self._place_on(best, place)
+
+    def _fitting(self, lane: Lane, route: tuple[str, ...], place: int) -> list[int]:
+        """Successors that lead to the route's next edge."""
+        wanted = route[place + 1] if place + 1 < len(route) else None
+        return [s for s in lane.successors if self._leads_to(s, wanted)]
+
+    def _place_on(self, lane: int, place: int) -> int:
+        return place if self.lanes[lane].internal else place + 1
+
+    def _reach(self, lane: int, route: tuple[str, ...], place: int, left: float) -> float:
+        """How many of the next `left` m of the route can be driven from the start of `lane` on, in m."""
+        here = self.lanes[lane]
+        own = self._lengths[lane]
+        if own >= left or (place >= len(route) - 1 and not here.internal):
+            return left
+        further = (
+            self._reach(s, route, self._place_on(s, place), left - own)
+            for s in self._fitting(here, route, place)
+        )
+        return own + max(further, default=0.0)
+
+    def _leads_to(self, lane: int, edge: str | None) -> bool:
+        """Whether the lane is on `edge`, or is an internal lane that ends there."""
+        seen = 0
+        while self.lanes[lane].internal and self.lanes[lane].successors and seen < 8:
+            lane = self.lanes[lane].successors[0]
+            seen += 1
+        return self.lanes[lane].edge == edge
+
+    def _join(self, indices: tuple[int, ...], dead_end: bool, leaves: bool) -> LanePath:
+        pieces: list[Floats] = []
+        starts = []  # m
+        total = 0.0
+        for i in indices:
+            shape = self.lanes[i].shape
+            starts.append(total)
+            pieces.append(shape if not pieces else shape[1:])
+            total += self._lengths[i]
+        points = np.concatenate(pieces)
+        step = np.sqrt((np.diff(points, axis=0) ** 2).sum(1))
+        keep = np.concatenate([[True], step > 1e-6])
+        if keep.sum() < 2:
+            keep[-1] = True
+        points = points[keep]
+        arc = np.concatenate([[0.0], np.cumsum(np.sqrt((np.diff(points, axis=0) ** 2).sum(1)))])
+        conflict = [
+            start for start, i in zip(starts, indices, strict=True) if any(i in z.lanes for z in self.zones)
+        ]
+        first = self.lanes[indices[0]]
+        return LanePath(
+            points,
+            arc,
+            indices,
+            np.array(starts),
+            dead_end,
+            leaves,
+            scale=self._lengths[indices[0]] / max(first.length, 1e-6),
+            conflict=min(conflict, default=np.inf),
+        )
+
+
+def _wrap(angle: float) -> float:
+    return float((angle + np.pi) % (2 * np.pi) - np.pi)

@@ -1,0 +1,297 @@
+"""What to simulate: one of our worlds by name, or any user's .sumocfg, read into one `Scenario`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import sumo_scenarios
+from cosim.errors import BadInput, hint, one_of
+from cosim.files import yaml_input
+from cosim.files.xml_input import is_there, regular_file
+from cosim.scenario import sumocfg
+from cosim.scenario.behaviors import AS_IS, DRIVER_MODELS, LC2013, MIXED, load_behaviors
+from cosim.types import Preset, Timing
+
+BEHAVIORS = load_behaviors().names
+FOREIGN_DURATION = 60.0  # s, for a .sumocfg that names no end
+MISSIONS = ("merge", "exit", "roundabout", "intersection", "none", "auto")
+
+
+@dataclass(frozen=True, slots=True)
+class Mission:
+    """The vehicle that needs somebody's help. `auto`: found from the net while running."""
+
+    kind: str = "auto"
+    vehicles: str = ""  # regular expression on vehicle ids; full match
+    goal: tuple[str, ...] = ()  # edges; being on one of them is success (off internal lanes)
+
+
+@dataclass(frozen=True, slots=True)
+class Zone:
+    """A conflict zone as written in scenario.yaml: edges, internal edges (":J") included."""
+
+    name: str
+    edges: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Fleet:
+    """Which vehicles are AVs: by vehicle type, by id, or a share of all (the first one given holds)."""
+
+    type: str | None = None
+    ids: str | None = None  # regular expression, full match
+    penetration: float | None = None  # 0..1, drawn per vehicle id from the seed
+
+    def describe(self) -> str:
+        if self.type is not None:
+            return f"type {self.type}"
+        if self.ids is not None:
+            return f"ids {self.ids}"
+        return f"penetration {self.penetration:g}" if self.penetration is not None else "none"
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """Everything the simulator needs; paths are absolute."""
+
+    name: str
+    config: Path  # the .sumocfg
+    net: Path
+    demand: tuple[Path, ...]
+    additional: tuple[Path, ...] = ()
+    options: tuple[tuple[str, str], ...] = ()  # further SUMO options that change the traffic
+    ignored: tuple[str, ...] = ()  # options of the .sumocfg that were not passed on (outputs and such)
+    begin: float = 0.0  # s
+    warmup: float = 0.0  # s, not counted
+    duration: float = 60.0  # s, counted
+    timing: Timing = Timing()
+    preset: str = Preset.UNGUARDED
+    mission: Mission = Mission()
+    zones: tuple[Zone, ...] = ()
+    fleet: Fleet = Fleet()
+    demand_name: str = "as-is"
+    behavior: str = AS_IS
+    driver_model: str = LC2013
+    demands: Mapping[str, Path] | None = None  # name -> file, of a built-in world
+    title: str = ""
+    definition: Path | None = None  # the scenario.yaml of a built-in world
+    warnings: tuple[str, ...] = ()  # what `cosim.scenario.vet` found odd: reasons not to compare the result
+
+    @property
+    def built_in(self) -> bool:
+        return self.demands is not None
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Every file that has a say in the traffic, ours included."""
+        ours = [sumo_scenarios.TYPES] if self.definition is None else [self.definition]
+        if self.behavior != AS_IS:
+            ours.append(sumo_scenarios.BEHAVIORS)
+        return (self.config, self.net, *self.demand, *self.additional, *ours)
+
+
+def load(
+    what: str,
+    *,
+    demand: Sequence[str] = (),
+    behavior: str | None = None,
+    driver_model: str = LC2013,
+    preset: str | None = None,
+    fleet: Fleet | None = None,
+    duration: float | None = None,
+    options: Sequence[str] = (),
+) -> Scenario:
+    """The scenario `what` (a world's name or a .sumocfg), with what the command line says otherwise.
+
+    `demand`: names of the world's demands or files; `options`: SUMO options as typed after `--`, which win
+    over the file's. `duration` in s. Only this file's own syntax is checked: `cosim.scenario.vet` reads the
+    rest.
+
+    Raises:
+        BadInput: names file (or option), field and value, with the nearest name where one is near.
+    """
+    chosen = sumocfg.command_line(options)
+    scenario = _world(what) if what in sumo_scenarios.names() else _foreign(what)
+    if demand:
+        scenario = _with_demand(scenario, demand)
+    scenario = _with_sumo_options(scenario, chosen)
+    if duration is not None:
+        if not (math.isfinite(duration) and duration > 0.0):
+            raise BadInput("must be a positive number of seconds", field="--duration", value=duration)
+        scenario = replace(scenario, duration=float(duration))
+    if behavior is None:
+        behavior = _default_behavior(scenario)
+    return replace(
+        scenario,
+        behavior=one_of(behavior, BEHAVIORS, "--behavior"),
+        driver_model=one_of(driver_model, DRIVER_MODELS, "--driver-model"),
+        preset=one_of(scenario.preset if preset is None else preset, Preset.ALL, "--preset"),
+        fleet=scenario.fleet if fleet is None else _checked_fleet(fleet),
+    )
+
+
+def _world(name: str) -> Scenario:
+    """One of our worlds: its scenario.yaml over its .sumocfg."""
+    folder = sumo_scenarios.folder(name)
+    file = folder / "scenario.yaml"
+    known = ("name", "title", "duration", "warmup", "timing", "preset", "demand", "fleet", "mission")
+    top = yaml_input.read(file, (*known, "conflict_zones"))
+    if top.text("name", name) != name:
+        raise BadInput("differs from its folder's name", file=file, field="name", value=top.text("name"))
+    config = sumocfg.read(folder / f"{name}.sumocfg")
+    demands = {_demand_name(path): path for path in sorted((folder / "demand").glob("*.rou.xml"))}
+    if not demands:
+        raise BadInput("holds no *.rou.xml", file=file, field="demand", value=str(folder / "demand"))
+    demand = top.choice("demand", demands, next(iter(demands)))
+    fleet = top.section("fleet", ("type", "ids", "penetration"))
+    mission = top.section("mission", ("kind", "vehicles", "goal"))
+    zones = top.sections("conflict_zones", ("name", "edges"))
+    return Scenario(
+        name=name,
+        title=top.text("title") or "",
+        definition=file,
+        config=config.path,
+        net=config.net,
+        demand=(demands[demand],),
+        demand_name=demand,
+        demands=demands,
+        additional=config.additional,
+        options=config.options,
+        ignored=config.ignored,
+        begin=config.begin,
+        warmup=top.number("warmup", low=0.0) or 0.0,
+        duration=top.number("duration", low=0.0, above=True) or FOREIGN_DURATION,
+        timing=_timing(top.section("timing", ("step", "frame", "decision")), file),
+        preset=top.choice("preset", Preset.ALL, Preset.UNGUARDED),
+        mission=Mission(
+            mission.choice("kind", MISSIONS, "auto"), mission.pattern("vehicles") or "", mission.names("goal")
+        ),
+        zones=tuple(Zone(z.text("name") or f"zone{i}", z.names("edges")) for i, z in enumerate(zones)),
+        fleet=_checked_fleet(
+            Fleet(fleet.text("type"), fleet.pattern("ids"), fleet.number("penetration")), file, "fleet."
+        ),
+    )
+
+
+def _foreign(what: str) -> Scenario:
+    """Somebody's .sumocfg: its own duration, types and options; our clocks."""
+    path = Path(what)
+    names = sumo_scenarios.names()
+    if not is_there(path) and path.suffix != ".sumocfg":
+        problem = f"no such scenario{hint(what, names)}"
+        raise BadInput(problem, field="scenario", value=what)
+    config = sumocfg.read(regular_file(path, file=None, field="scenario"))
+    if config.end is not None and config.end <= config.begin:
+        raise BadInput("ends before it begins", file=path, field="end", value=f"{config.end:g}")
+    return Scenario(
+        name=path.name.removesuffix(".sumocfg"),
+        config=config.path,
+        net=config.net,
+        demand=config.routes,
+        additional=config.additional,
+        options=config.options,
+        ignored=config.ignored,
+        begin=config.begin,
+        duration=FOREIGN_DURATION if config.end is None else config.end - config.begin,
+    )
+
+
+def _with_demand(scenario: Scenario, wanted: Sequence[str]) -> Scenario:
+    """`--demand`: each a name of the world's demands, or else a file; they replace the file's routes."""
+    known = scenario.demands or {}
+    files, names = [], []
+    for item in wanted:
+        if item in known:
+            files.append(known[item])
+        elif is_there(Path(item)) or item.endswith((".xml", ".gz")):
+            files.append(regular_file(Path(item).absolute(), file=None, field="--demand"))
+        else:
+            problem = f"no such demand{hint(item, known)}"
+            raise BadInput(problem, field="--demand", value=item)
+        names.append(_demand_name(files[-1]))
+    return replace(scenario, demand=tuple(files), demand_name="+".join(names))
+
+
+def _with_sumo_options(scenario: Scenario, chosen: Mapping[str, str]) -> Scenario:
+    """SUMO options typed after `--`: files and clocks to their fields, the rest over the file's own."""
+    if not chosen:
+        return scenario
+    here, place = Path.cwd(), "command line"
+    begin = scenario.begin
+    duration = scenario.duration
+    if "begin" in chosen:
+        begin = sumocfg.time_of(chosen["begin"], place, "--begin")
+        if not scenario.built_in:
+            duration += scenario.begin - begin  # the file's end stays where it is
+    if "end" in chosen:
+        duration = sumocfg.time_of(chosen["end"], place, "--end") - begin
+    if duration <= 0.0:
+        raise BadInput("ends before it begins", file=place, field="--begin/--end", value=f"{duration:g} s")
+    timing = scenario.timing
+    if "step-length" in chosen:
+        timing = replace(timing, step=sumocfg.time_of(chosen["step-length"], place, "--step-length"))
+        _check_timing(timing, place, "--step-length", chosen["step-length"])
+    files = {
+        name: sumocfg.files(chosen[name], here, place, f"--{name}")
+        for name in sumocfg.INPUTS
+        if name in chosen
+    }
+    others = {k: v for k, v in chosen.items() if k not in (*sumocfg.INPUTS, *sumocfg.CLOCK)}
+    return replace(
+        scenario,
+        net=(*files.get("net-file", ()), scenario.net)[0],
+        demand=files.get("route-files", scenario.demand),
+        additional=files.get("additional-files", scenario.additional),
+        begin=begin,
+        duration=duration,
+        timing=timing,
+        options=tuple({**dict(scenario.options), **others}.items()),
+    )
+
+
+def _default_behavior(scenario: Scenario) -> str:
+    """definitions.md: a user's file drives as it is; ours `mixed`, and `contested` with moderate HVs."""
+    if scenario.demands is None or any(path not in scenario.demands.values() for path in scenario.demand):
+        return AS_IS
+    return "moderate" if scenario.demand_name == "contested" else MIXED
+
+
+def _timing(section: yaml_input.Section, file: Path) -> Timing:
+    default = Timing()
+    timing = Timing(
+        section.number("step", low=0.0, above=True) or default.step,
+        section.number("frame", low=0.0, above=True) or default.frame,
+        section.number("decision", low=0.0, above=True) or default.decision,
+    )
+    _check_timing(timing, file, "timing.step", timing.step)
+    return timing
+
+
+def _check_timing(timing: Timing, file: object, field: str, value: object) -> None:
+    """Each clock must be a whole number of the one below it (definitions.md, Time)."""
+    for name, long, short in (
+        ("frame", timing.frame, timing.step),
+        ("decision", timing.decision, timing.frame),
+    ):
+        ratio = long / short if short > 0.0 else 0.0
+        if ratio < 0.999 or abs(ratio - round(ratio)) > 1e-6:
+            problem = f"a {name} of {long:g} s is not a whole number of {short:g} s"
+            raise BadInput(problem, file=file, field=field, value=value)
+
+
+def _checked_fleet(fleet: Fleet, file: object = None, prefix: str = "--av-") -> Fleet:
+    if fleet.ids is not None:
+        yaml_input.check_pattern(fleet.ids, file, f"{prefix}ids")
+    share = fleet.penetration
+    if share is not None and not 0.0 <= share <= 1.0:
+        field = "--penetration" if file is None else f"{prefix}penetration"
+        raise BadInput("must be between 0 and 1", file=file, field=field, value=share)
+    return fleet
+
+
+def _demand_name(path: Path) -> str:
+    """merge/demand/dense.rou.xml -> dense"""
+    return path.name.removesuffix(".gz").removesuffix(".xml").removesuffix(".rou")

@@ -1,0 +1,92 @@
+"""Keep a user's additional files from writing: copies of them in which every output goes nowhere.
+
+Detectors, edgeData and timed events write wherever their `file` or `dest` says, beside the scenario as a
+rule (A10KW: netstate.xml, tlsstate.xml). That fails in a read-only folder, is overwritten by the next run,
+races between workers, and `host:port` opens a connection. The elements stay, so that whatever refers to a
+detector still finds it; only the name of the file becomes SUMO's own word for no file.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from xml.parsers import expat
+
+from cosim.files.xml_input import content
+from cosim.scenario import Scenario
+from cosim.scenario.vet_demand import OUTPUT_PARAMETERS, OUTPUTS
+
+NOWHERE = "NUL"  # SUMO's OutputDevice makes no file of it, on every system
+# Attributes by which a file reads another one, relative to itself: absolute in a copy.
+_INPUTS = {
+    "include": "href",
+    "rerouter": "file",
+    "variableSpeedSign": "file",
+    "poly": "imgFile",
+    "poi": "imgFile",
+}
+_TAG = re.compile(rb"<(?:[^\"'>]|\"[^\"]*\"|'[^']*')*>")
+
+
+def quiet(scenario: Scenario, folder: Path) -> Scenario:
+    """`scenario` with its writing files replaced by silent copies in `folder`; the others stay as they are.
+
+    Call after `cosim.scenario.vet.vet`: the files are taken to be sound XML.
+    """
+    return replace(
+        scenario,
+        additional=tuple(_silenced(path, folder) for path in scenario.additional),
+        demand=tuple(_silenced(path, folder) for path in scenario.demand),
+    )
+
+
+def _silenced(path: Path, folder: Path) -> Path:
+    """`path` itself when it writes nothing, else its copy in `folder`."""
+    whole = content(path)
+    edits = _edits(whole, path, folder)
+    if not any(writes for *_, writes in edits):
+        return path
+    parts, done = [], 0
+    for begin, end, value, _ in edits:
+        parts += [whole[done:begin], value]
+        done = end
+    parts.append(whole[done:])
+    folder.mkdir(parents=True, exist_ok=True)
+    copy = folder / f"{sum(1 for _ in folder.iterdir())}-{path.name.removesuffix('.gz')}"
+    copy.write_bytes(b"".join(parts))
+    return copy
+
+
+def _edits(whole: bytes, path: Path, folder: Path) -> list[tuple[int, int, bytes, bool]]:
+    """(first byte, byte after the last, new value, whether it is about writing), in the file's order."""
+    found: list[tuple[int, int, bytes, bool]] = []
+    parser = expat.ParserCreate()
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        is_parameter = tag == "param" and attributes.get("key") in OUTPUT_PARAMETERS
+        written = "value" if is_parameter else OUTPUTS.get(tag)
+        if written is not None and attributes.get(written):
+            found.append((*_place(whole, parser.CurrentByteIndex, written), NOWHERE.encode(), True))
+        read = _INPUTS.get(tag)
+        if read is not None and attributes.get(read):
+            source = path.parent / attributes[read]
+            target = _silenced(source, folder) if tag == "include" else source
+            text = str(target.absolute()).replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")
+            place = _place(whole, parser.CurrentByteIndex, read)
+            found.append((*place, text.replace("'", "&apos;").encode(), target != source))
+
+    parser.StartElementHandler = start
+    parser.Parse(whole, True)
+    return found
+
+
+def _place(whole: bytes, tag_begin: int, attribute: str) -> tuple[int, int]:
+    """Where the value of `attribute` lies in the tag that begins at byte `tag_begin`."""
+    tag = _TAG.match(whole, tag_begin)
+    assert tag is not None, "vetted XML"
+    for match in re.finditer(rb"([\w:.-]+)\s*=\s*(?:\"([^\"]*)\"|'([^']*)')", tag[0]):
+        if match[1] == attribute.encode():
+            group = 2 if match[2] is not None else 3
+            return tag_begin + match.start(group), tag_begin + match.end(group)
+    raise AssertionError("vetted XML")

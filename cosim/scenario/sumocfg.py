@@ -1,0 +1,249 @@
+"""Read a .sumocfg and the SUMO options of the command line, and sort them: kept, resolved, or set aside.
+
+A foreign configuration is never handed to SUMO as it is: its outputs could write anywhere and its
+`remote-port` would wait for ever (docs/sumo.md). What changes the traffic is kept.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from cosim.errors import BadInput
+from cosim.files.xml_input import is_there, regular_file, scan
+
+# SUMO's own synonyms (sumo --help).
+_SYNONYMS = {
+    "c": "configuration-file",
+    "configuration": "configuration-file",
+    "n": "net-file",
+    "net": "net-file",
+    "r": "route-files",
+    "routes": "route-files",
+    "a": "additional-files",
+    "additional": "additional-files",
+    "w": "weight-files",
+    "weights": "weight-files",
+    "b": "begin",
+    "e": "end",
+    "v": "verbose",
+    "X": "xml-validation",
+    "W": "no-warnings",
+    "l": "log",
+    "s": "seed",
+    "srand": "seed",
+    "h": "help",
+    "V": "version",
+    "C": "save-configuration",
+    "save-config": "save-configuration",
+}
+_AS_OURS = {("step-length", "0.1"), ("collision.action", "warn")}  # nothing is lost with these
+INPUTS = ("net-file", "route-files", "additional-files")
+CLOCK = ("begin", "end", "step-length")
+# Options whose value is a list of files to read; relative to the configuration's folder.
+FILE_OPTIONS = frozenset(
+    {
+        "weight-files",
+        "load-state",
+        "astar.all-distances",
+        "astar.landmark-distances",
+        "device.fcd-replay.files",
+    }
+)
+# Everything of SUMO's topics `processing`, `routing` and of the devices that change how vehicles drive.
+_KEPT = re.compile(
+    r"""weight-(files|attribute) | load-state(\..+)? | junction-taz | step-method\.ballistic
+    | extrapolate-departpos | route-steps | no-internal-links
+    | ignore-(junction-blocker|route-errors|accidents)
+    | collision\.(stoptime|check-junctions|check-junctions\.mingap|mingap-factor)
+    | intermodal-collision\.(action|stoptime) | keep-after-arrival | max-num-(vehicles|persons|teleports)
+    | scale | scale-suffix | time-to-(teleport|impatience)(\..+)? | waiting-time-memory
+    | startup-wait-threshold | max-depart-delay | (sloppy|eager|emergency)-insert | insertion-checks
+    | random-depart-offset | lanechange\.(duration|overtake-right)
+    | (tls|railsignal|default|overhead-wire|pedestrian|ride|mapmatch|weights|persontrip|railway|astar)\..+
+    | railsignal-moving-block | slope-centered | emergencydecel\.warning-threshold | parking\.maneuver
+    | use-stop-(ended|started) | routing-algorithm | replay-rerouting
+    | (person-)?device\.(rerouting|toc|driverstate|bluelight|taxi|glosa|friction|stationfinder|battery
+        |elechybrid|fcd-replay)\..+""",
+    re.VERBOSE,
+)
+_NEVER_KEPT = re.compile(
+    r".+[.-](output|file)|.*output.*|tls\.actuated\.show-detectors|.*\.wkt|.*jupedsim\.py"
+)
+# Why an option of the command line cannot hold here (docs/sumo.md).
+_REFUSED = {
+    "configuration-file": "name the .sumocfg in place of a scenario",
+    "seed": "use cosim's own --seed",
+    "random": "an episode is repeatable by its --seed; SUMO's --random is not",
+    "remote-port": "cosim steps the simulation itself; nobody else can connect",
+    "num-clients": "cosim steps the simulation itself; nobody else can connect",
+    "save-configuration": "SUMO would write its options and stop",
+    "save-template": "SUMO would write its options and stop",
+    "save-schema": "SUMO would write its schema and stop",
+    "help": "SUMO would print its help and stop",
+    "version": "use `cosim doctor`",
+    "mesosim": "the mesoscopic model has no vehicle positions",
+    "lateral-resolution": "LC2013, which is what drives here, has no sublane model",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class SumoConfig:
+    """A .sumocfg, read: files absolute, options sorted. Times in s; None where the file is silent."""
+
+    path: Path
+    net: Path
+    routes: tuple[Path, ...]
+    additional: tuple[Path, ...]
+    begin: float
+    end: float | None
+    options: tuple[tuple[str, str], ...]  # kept: they change the traffic
+    ignored: tuple[str, ...]  # set aside, "name=value" with the reason where there is one
+
+
+def read(path: Path) -> SumoConfig:
+    """The configuration `path` with its relative names resolved against its own folder.
+
+    Raises:
+        BadInput: the file is missing or malformed, names no net, or names files that are not there.
+    """
+    path = path.absolute()
+    values = _values(path)
+    folder = path.parent
+    net = files(values.get("net-file", ""), folder, path, "net-file")
+    if len(net) != 1:
+        raise BadInput("one net is needed", file=path, field="net-file", value=values.get("net-file", ""))
+    kept, ignored = [], []
+    for name, value in values.items():
+        if name in INPUTS or name in ("begin", "end"):
+            continue
+        if name == "mesosim" and boolean(value):
+            raise BadInput(_REFUSED["mesosim"], file=path, field=name, value=value)
+        _check_finite(value, path, name)
+        if (name, value) in _AS_OURS:
+            continue
+        if not keeps(name):
+            ignored.append(f"{name}={value}{_reason(name)}")
+        elif name in FILE_OPTIONS:
+            kept.append((name, ",".join(str(p) for p in files(value, folder, path, name))))
+        else:
+            kept.append((name, value))
+    end = time_of(values["end"], path, "end") if "end" in values else None
+    return SumoConfig(
+        path=path,
+        net=net[0],
+        routes=files(values.get("route-files", ""), folder, path, "route-files"),
+        additional=files(values.get("additional-files", ""), folder, path, "additional-files"),
+        begin=time_of(values["begin"], path, "begin") if "begin" in values else 0.0,
+        end=end if end is not None and end >= 0.0 else None,  # SUMO's default end is -1: no end
+        options=tuple(kept),
+        ignored=tuple(ignored),
+    )
+
+
+def command_line(arguments: Sequence[str]) -> dict[str, str]:
+    """SUMO options as typed after `--` -> {long name: value}; an option without a value is "true".
+
+    Outputs are let through here: the user asked for them by name.
+
+    Raises:
+        BadInput: not an option, or one that cannot hold in a co-simulation.
+    """
+    options: dict[str, str] = {}
+    rest = list(arguments)
+    while rest:
+        word = rest.pop(0)
+        match = re.fullmatch(r"--([A-Za-z][\w.-]*)(?:=(.*))?|-([A-Za-z])(?:=(.*))?", word, re.DOTALL)
+        if match is None:
+            raise BadInput("is not a SUMO option (expected --name value)", field="SUMO options", value=word)
+        name = match[1] or match[3]
+        name = _SYNONYMS.get(name, name)
+        value = match[2] if match[1] else match[4]
+        if value is None:
+            value = rest.pop(0) if rest and not re.match(r"--?[A-Za-z]", rest[0]) else "true"
+        if name in _REFUSED and boolean(value):
+            raise BadInput(_REFUSED[name], field=f"--{name}", value=value)
+        if name == "collision.action" and value != "warn":
+            raise BadInput("collisions are counted, never removed", field=f"--{name}", value=value)
+        _check_finite(value, None, f"--{name}")
+        options[name] = value
+    return options
+
+
+def keeps(name: str) -> bool:
+    """Whether an option of a .sumocfg changes the traffic and writes nothing."""
+    return _KEPT.fullmatch(name) is not None and _NEVER_KEPT.fullmatch(name) is None
+
+
+def boolean(value: str) -> bool:
+    """SUMO's reading of a truth value; anything that is not a clear no counts as yes."""
+    return value.strip().lower() not in ("false", "f", "0", "no", "off", "-", "x")
+
+
+def time_of(value: str, file: object, field: str) -> float:
+    """SUMO's time formats, in s: "90", "0:01:30", "0:00:01:30" (days first).
+
+    Raises:
+        BadInput: not a time, NaN or infinite.
+    """
+    parts = value.strip().split(":")
+    try:
+        numbers = [float(part) for part in parts]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (1, 3, 4) or not all(map(math.isfinite, numbers)):
+        raise BadInput("is not a time (seconds or H:M:S)", file=file, field=field, value=value)
+    sign = -1.0 if parts[0].strip().startswith("-") else 1.0
+    weights = (1.0, 60.0, 3600.0, 86400.0)
+    seconds = sum(abs(n) * w for n, w in zip(reversed(numbers), weights, strict=False))
+    return sign * seconds
+
+
+def _values(path: Path) -> dict[str, str]:
+    """Every option with its value: `<name value="x"/>` or `<name v="x"/>`; SUMO's groups have none."""
+    regular_file(path, file=path, field="scenario")
+    values: dict[str, str] = {}
+
+    def start(tag: str, attributes: dict[str, str], line: int) -> None:
+        value = attributes.get("value", attributes.get("v"))
+        if value is None:
+            return
+        name = _SYNONYMS.get(tag, tag)
+        if name in values and values[name] != value:
+            raise BadInput(f"is given twice (line {line})", file=path, field=name, value=value)
+        values[name] = value
+
+    scan(path, ("configuration", "sumoConfiguration"), start)
+    return values
+
+
+def files(value: str, folder: Path, file: object, field: str) -> tuple[Path, ...]:
+    """SUMO's comma (or space) separated list of files, absolute, each one checked to be there."""
+    # Spaces separate only where the whole is not a file: folders may have spaces in their names.
+    found: list[Path] = []
+    for name in filter(None, map(str.strip, value.split(","))):
+        for part in [name] if is_there(folder / name) else name.split():
+            try:
+                found.append(regular_file((folder / part).absolute(), file=file, field=field))
+            except BadInput as error:
+                raise BadInput(error.problem, file=file, field=field, value=part) from None
+    return tuple(found)
+
+
+def _check_finite(value: str, file: object, field: str) -> None:
+    """SUMO takes `scale` NaN without a word."""
+    if value.strip().lstrip("+-").lower() in ("nan", "inf", "infinity"):
+        raise BadInput("must be finite", file=file, field=field, value=value)
+
+
+def _reason(name: str) -> str:
+    if name == "step-length":
+        return " (cosim's own step is used; `-- --step-length X` overrides it)"
+    if name in ("seed", "random"):
+        return " (the episode's --seed decides)"
+    if name == "collision.action":
+        return " (collisions are counted, never removed)"
+    return ""

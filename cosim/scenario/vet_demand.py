@@ -1,0 +1,230 @@
+"""Read a route or additional file as a stream: check its numbers and names, note what it refers to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+
+from cosim.errors import BadInput, hint
+from cosim.files.xml_input import regular_file, scan
+from cosim.scenario.sumocfg import time_of
+from cosim.scenario.vet_rules import (
+    DEMAND,
+    LANE_CHANGE,
+    SL2015_ONLY,
+    VEHICLE_TYPE,
+    VEHICLE_TYPE_TEXT,
+    clip,
+    problem,
+    words,
+)
+
+ROUTE_ROOTS = ("routes", "route-alternatives", "trips", "vehicles", "additional", "add")
+# SUMO takes any root in an additional file; these are kinds of their own, given by mistake.
+NOT_ADDITIONAL = frozenset(
+    {"net", "nodes", "edges", "connections", "types", "configuration", "sumoConfiguration", "html", "project"}
+)
+_DRIVERS = frozenset({"vehicle", "trip", "flow"})
+_MOVING = _DRIVERS | {"person", "personFlow", "container", "containerFlow"}
+_TRAVEL = _DRIVERS | {"route", "walk", "ride", "personTrip", "transport", "tranship", "stop"}
+_EDGE_LISTS = ("edges", "via")
+_EDGE_NAMES = ("from", "to", "edge")
+_ON_A_LANE = words(
+    "stop busStop trainStop containerStop chargingStation parkingArea inductionLoop e1Detector "
+    "instantInductionLoop laneAreaDetector e2Detector detEntry detExit"
+)
+# Attributes by which an additional file writes files; `file` of other elements is read.
+OUTPUTS: Mapping[str, str] = {
+    **dict.fromkeys(
+        words(
+            "edgeData laneData inductionLoop e1Detector instantInductionLoop laneAreaDetector e2Detector "
+            "entryExitDetector e3Detector routeProbe vTypeProbe"
+        ),
+        "file",
+    ),
+    "timedEvent": "dest",
+    "calibrator": "output",
+}
+OUTPUT_PARAMETERS = frozenset({"device.ssm.file", "device.toc.file", "device.rerouting.output"})
+
+
+@dataclass(frozen=True, slots=True)
+class Use:
+    """Where a name was first used: for the error, should it not exist."""
+
+    field: str
+    owner: str
+    line: int
+
+
+@dataclass(slots=True)
+class Demand:
+    """What one route or additional file defines and what it refers to."""
+
+    path: Path
+    types: set[str] = field(default_factory=set)
+    routes: set[str] = field(default_factory=set)
+    drivers: dict[str, int] = field(default_factory=dict)  # vehicle, trip or flow -> line
+    flows: int = 0
+    used_types: dict[str, Use] = field(default_factory=dict)
+    used_routes: dict[str, Use] = field(default_factory=dict)
+    used_edges: dict[str, Use] = field(default_factory=dict)
+    used_lanes: dict[str, Use] = field(default_factory=dict)
+    used_junctions: dict[str, Use] = field(default_factory=dict)
+    steps: dict[tuple[str, str], Use] = field(default_factory=dict)  # (edge, next edge) of whole routes
+    includes: list[Path] = field(default_factory=list)
+    outputs: list[str] = field(default_factory=list)  # files SUMO would write, as written
+    warnings: list[str] = field(default_factory=list)
+
+
+def read_demand(path: Path, *, additional: bool) -> Demand:
+    """The file `path`, its numbers and lane-change attributes checked, its references noted.
+
+    Raises:
+        BadInput: what `cosim.files.xml_input.scan` refuses; NaN, infinite or negative numbers; unknown
+            lane-change attributes (with the nearest name); the same vehicle twice; a missing include.
+    """
+    reader = _DemandReader(path, additional)
+    root = scan(path, () if additional else ROUTE_ROOTS, reader.start, reader.end)
+    if root in NOT_ADDITIONAL:
+        raise BadInput("wrong root element, <additional> is needed", file=path, field="root", value=root)
+    return reader.finish()
+
+
+class _DemandReader:
+    """The handlers of one pass over a route or additional file."""
+
+    def __init__(self, path: Path, additional: bool) -> None:
+        self._path = path
+        self._additional = additional
+        self.found = Demand(path)
+        self._owners: list[tuple[str, str]] = []  # (tag, id) of every open element
+        self._seen_lists: set[str] = set()
+        self._last_depart = 0.0  # s
+        self._unsorted: list[str] = []
+
+    def start(self, tag: str, attributes: dict[str, str], line: int) -> None:
+        owner = attributes.get("id") or (self._owners[-1][1] if self._owners else "")
+        is_type = tag == "vType" or tag.startswith("carFollowing-")
+        rules = VEHICLE_TYPE if is_type else DEMAND.get(tag)
+        if rules is not None:
+            for name, value in attributes.items():
+                rule = rules.get(name)
+                if rule is not None:
+                    wrong = problem(value, rule)
+                    if wrong is not None:
+                        self._refuse(tag, name, value, wrong, owner, line)
+                elif is_type and name not in VEHICLE_TYPE_TEXT:
+                    self._unknown(tag, name, value, owner, line)
+        if is_type:
+            self._type(attributes, owner)
+        elif tag in _MOVING:
+            self._driver(tag, attributes, owner, line)
+        elif tag in ("route", "routeDistribution"):
+            if "id" in attributes:
+                self.found.routes.add(attributes["id"])
+        elif tag == "vTypeDistribution" and "id" in attributes:
+            self.found.types.add(attributes["id"])
+        elif tag == "include":
+            self._include(attributes, line)
+        if tag in _TRAVEL:
+            self._edges(tag, attributes, owner, line)
+        if tag in _ON_A_LANE and "lane" in attributes:
+            self.found.used_lanes.setdefault(attributes["lane"], Use(f"{tag}.lane", owner, line))
+        if tag in OUTPUTS and OUTPUTS[tag] in attributes:
+            self.found.outputs.append(attributes[OUTPUTS[tag]])
+        elif tag == "param" and attributes.get("key") in OUTPUT_PARAMETERS and attributes.get("value"):
+            self.found.outputs.append(attributes["value"])
+        self._owners.append((tag, owner))
+
+    def end(self, tag: str) -> None:
+        self._owners.pop()
+
+    def finish(self) -> Demand:
+        if self._unsorted:
+            some = ", ".join(self._unsorted[:3]) + (", ..." if len(self._unsorted) > 3 else "")
+            self.found.warnings.append(
+                f"{self._path}: not sorted by departure: SUMO drops {len(self._unsorted)} of them ({some})"
+            )
+        return self.found
+
+    def _type(self, attributes: dict[str, str], owner: str) -> None:
+        if "id" in attributes:
+            self.found.types.add(attributes["id"])
+        idle = sorted(SL2015_ONLY & attributes.keys())
+        if idle:
+            self._warn(f"vType {owner!r}: {', '.join(idle)} only work with SL2015, LC2013 drives here")
+
+    def _unknown(self, tag: str, name: str, value: str, owner: str, line: int) -> None:
+        """An attribute of a vehicle type that SUMO would ignore without a word."""
+        if name.startswith("xsi:") or name.startswith("xmlns"):
+            return
+        lane_change = name.lower().startswith("lc")
+        if lane_change or name.startswith("jm"):
+            kind, known = ("lane-change", LANE_CHANGE) if lane_change else ("junction", VEHICLE_TYPE.keys())
+            problem_ = f"unknown {kind} attribute{hint(name, sorted(known))}"
+            self._refuse(tag, name, value, problem_, owner, line)
+        near = hint(name, [*VEHICLE_TYPE, *VEHICLE_TYPE_TEXT])
+        self._warn(f"vType {owner!r}: SUMO ignores the unknown attribute {name!r}{near}")
+
+    def _driver(self, tag: str, attributes: dict[str, str], owner: str, line: int) -> None:
+        if "type" in attributes:
+            self.found.used_types.setdefault(attributes["type"], Use(f"{tag}.type", owner, line))
+        if tag not in _DRIVERS or "id" not in attributes:
+            return  # flows inside a calibrator have no id of their own
+        name = attributes["id"]
+        if name in self.found.drivers:
+            first = self.found.drivers[name]
+            self._refuse(tag, "id", name, f"is there twice, first in line {first}", "", line)
+        self.found.drivers[name] = line
+        self.found.flows += tag == "flow"
+        if "route" in attributes:
+            self.found.used_routes.setdefault(attributes["route"], Use(f"{tag}.route", owner, line))
+        # a flow that names no begin begins with the simulation, so it is late behind anything later
+        depart = attributes.get("begin", "0") if tag == "flow" else attributes.get("depart", "")
+        if self._additional or not depart[:1].isdigit():  # an additional file is loaded whole: order is free
+            return
+        when = time_of(depart, self._path, f"{tag}.depart")
+        if when < self._last_depart:
+            self._unsorted.append(name)
+        else:
+            self._last_depart = when
+
+    def _edges(self, tag: str, attributes: dict[str, str], owner: str, line: int) -> None:
+        for name in _EDGE_NAMES:
+            if name in attributes and (name == "edge" or tag != "stop"):
+                self.found.used_edges.setdefault(attributes[name], Use(f"{tag}.{name}", owner, line))
+        for name in _EDGE_LISTS:
+            value = attributes.get(name)
+            if value is None or value in self._seen_lists:
+                continue
+            self._seen_lists.add(value)
+            use = Use(f"{tag}.{name}", owner, line)
+            edges = value.split()
+            for edge in edges:
+                self.found.used_edges.setdefault(edge, use)
+            if name == "edges" and tag == "route":
+                for pair in pairwise(edges):
+                    self.found.steps.setdefault(pair, use)
+        for name in ("fromJunction", "toJunction"):
+            if name in attributes:
+                self.found.used_junctions.setdefault(attributes[name], Use(f"{tag}.{name}", owner, line))
+
+    def _include(self, attributes: dict[str, str], line: int) -> None:
+        href = attributes.get("href", "")
+        try:
+            found = regular_file(self._path.parent / href, file=self._path, field="include.href")
+        except BadInput as error:
+            problem_ = f"{error.problem} (line {line})"
+            raise BadInput(problem_, file=self._path, field="include.href", value=href) from None
+        self.found.includes.append(found)
+
+    def _warn(self, text: str) -> None:
+        if len(self.found.warnings) < 20:  # a type may be written a thousand times
+            self.found.warnings.append(f"{self._path}: {text}")
+
+    def _refuse(self, tag: str, name: str, value: str, wrong: str, owner: str, line: int) -> None:
+        place = f"{owner}, line {line}" if owner else f"line {line}"
+        raise BadInput(f"{wrong} ({place})", file=self._path, field=f"{tag}.{name}", value=clip(value))

@@ -1,0 +1,230 @@
+"""Read a SUMO net as a stream: refuse what would kill or fool SUMO, keep what routes are checked against."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from cosim.errors import BadInput
+from cosim.files.xml_input import scan
+from cosim.scenario.vet_rules import NET, SHAPES, clip, problem, shape_problem
+
+_CROSSING = re.compile(r":(.+)_c\d+")  # netconvert's name for the crossings of a junction
+
+
+@dataclass(frozen=True, slots=True)
+class Net:
+    """What is left of a net after reading: names and how they connect, no geometry."""
+
+    path: Path
+    lanes: Mapping[str, int]  # edge -> number of lanes; internal edges (":...") included
+    junctions: frozenset[str]
+    links: frozenset[tuple[str, str]]  # (edge, edge) pairs that a connection joins
+
+    def has_lane(self, lane: str) -> bool:
+        """Whether "edge_2" is a lane of this net."""
+        edge, _, index = lane.rpartition("_")
+        return index.isdigit() and int(index) < self.lanes.get(edge, 0)
+
+
+def read_net(path: Path) -> Net:
+    """The net `path`, checked.
+
+    Raises:
+        BadInput: what `cosim.files.xml_input.scan` refuses; no `version` (SUMO dies of it); NaN, infinite or
+            negative numbers; gaps in lane indices; connections to lanes that are not there; junctions
+            whose right-of-way table does not fit their connections (SUMO dies of that too).
+    """
+    reader = _NetReader(path)
+    scan(path, ("net",), reader.start, reader.end)
+    return reader.finish()
+
+
+class _NetReader:
+    """The handlers of one pass over a net."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._lanes: dict[str, int] = {}
+        self._origins: dict[str, str] = {}  # edge -> junction it comes from; not for internal ones
+        self._ends: dict[str, str] = {}  # edge -> junction it leads to
+        self._junctions: dict[str, str] = {}  # junction -> type
+        self._requests: Counter[str] = Counter()  # junction -> rows of its right-of-way table
+        self._inside: dict[str, list[str]] = {}  # junction -> its internal lanes
+        self._links: dict[tuple[str, str, str, str], tuple[int, str]] = {}  # -> line, via
+        self._edge: str | None = None
+        self._junction = ""
+        self._is_first = True
+
+    def start(self, tag: str, attributes: dict[str, str], line: int) -> None:
+        if self._is_first:
+            self._is_first = False
+            self._check_version(attributes)
+        rules = NET.get(tag)
+        if rules is None:
+            if tag == "request":
+                self._request(attributes, line)
+            return
+        for name, value in attributes.items():
+            if name in rules:
+                wrong = problem(value, rules[name])
+            elif name in SHAPES:
+                wrong = shape_problem(value)
+            else:
+                continue
+            if wrong is not None:
+                self._refuse(tag, name, value, wrong, attributes.get("id"), line)
+        if tag == "lane":
+            self._lane(attributes, line)
+        elif tag == "edge":
+            self._open_edge(attributes, line)
+        elif tag == "junction":
+            self._junction = self._need("junction", "id", attributes, line)
+            kind = self._junctions[self._junction] = attributes.get("type", "")
+            if self._junction.startswith(":") != (kind == "internal"):
+                self._refuse(tag, "type", kind, "does not fit the junction's id", self._junction, line)
+            self._inside[self._junction] = attributes.get("intLanes", "").split()
+        elif tag == "connection":
+            names = ("from", "to", "fromLane", "toLane")
+            a, b, i, j = (self._need("connection", name, attributes, line) for name in names)
+            self._links[a, b, i, j] = (line, attributes.get("via", ""))
+
+    def end(self, tag: str) -> None:
+        if tag == "edge" and self._edge is not None:
+            if not self._lanes[self._edge]:
+                raise BadInput("has no lane", file=self._path, field="edge.id", value=self._edge)
+            self._edge = None
+
+    def finish(self) -> Net:
+        """The net, once every connection is known to join lanes that are there."""
+        counts = Counter[str]()
+        for (a, b, i, j), (line, via) in self._links.items():
+            for end, edge, lane in (("from", a, i), ("to", b, j)):
+                if edge not in self._lanes:
+                    self._refuse("connection", end, edge, "no such edge in the net", None, line)
+                if int(lane) >= self._lanes[edge]:
+                    self._refuse(
+                        "connection", f"{end}Lane", lane, f"edge {edge} has no such lane", None, line
+                    )
+            if via and not self._has_lane(via):
+                self._refuse("connection", "via", via, "no such lane in the net", None, line)
+            if a in self._ends and not b.startswith(":"):  # ":J_w0" is a sidewalk
+                counts[self._ends[a]] += 1
+        self._check_ends()
+        self._check_inside()
+        self._check_junctions(counts)
+        if not self._lanes:
+            raise BadInput("holds no edge", file=self._path, field="net", value=0)
+        return Net(
+            path=self._path,
+            lanes=self._lanes,
+            junctions=frozenset(self._junctions),
+            links=frozenset((a, b) for a, b, _, _ in self._links),
+        )
+
+    def _check_version(self, attributes: dict[str, str]) -> None:
+        version = attributes.get("version")
+        if version is None:
+            problem_ = "is missing (SUMO dies on such a net): build it with netconvert"
+            raise BadInput(problem_, file=self._path, field="net.version", value="")
+        if not re.fullmatch(r"\d+(\.\d+)*", version) or int(version.split(".")[0]) > 1:
+            raise BadInput(
+                "is not a version SUMO 1 knows", file=self._path, field="net.version", value=version
+            )
+
+    def _open_edge(self, attributes: dict[str, str], line: int) -> None:
+        edge = self._need("edge", "id", attributes, line)
+        if edge in self._lanes:
+            self._refuse("edge", "id", edge, "is there twice", None, line)
+        self._edge = edge
+        self._lanes[edge] = 0
+        if edge.startswith(":"):
+            if attributes.get("function") not in ("internal", "crossing", "walkingarea"):
+                self._refuse(
+                    "edge", "function", attributes.get("function", ""), "must be internal", edge, line
+                )
+            return
+        for name, ends in (("from", self._origins), ("to", self._ends)):
+            ends[edge] = self._need("edge", name, attributes, line)
+
+    def _lane(self, attributes: dict[str, str], line: int) -> None:
+        lane = self._need("lane", "id", attributes, line)
+        for name in ("index", "length", "speed", "shape"):
+            self._need("lane", name, attributes, line)
+        if self._edge is None:
+            self._refuse("lane", "id", lane, "is outside every edge", None, line)
+            return
+        expected = self._lanes[self._edge]
+        internal = self._edge.startswith(":")  # netconvert itself repeats an index inside junctions
+        if attributes["index"] != str(expected) and not (internal and int(attributes["index"]) < expected):
+            gap = f"lane indices must run 0, 1, 2, ...: {expected} is due"
+            self._refuse("lane", "index", attributes["index"], gap, lane, line)
+        if lane != f"{self._edge}_{expected}":
+            self._refuse("lane", "id", lane, f"must be {self._edge}_{expected}", None, line)
+        if len(attributes["shape"].split()) < 2:
+            self._refuse("lane", "shape", attributes["shape"], "needs at least two points", lane, line)
+        self._lanes[self._edge] = expected + 1
+
+    def _request(self, attributes: dict[str, str], line: int) -> None:
+        """A row of the right-of-way table: SUMO indexes with what it says."""
+        due = self._requests[self._junction]
+        self._requests[self._junction] += 1
+        for name, allowed in (("index", (str(due),)), ("cont", ("0", "1", "false", "true"))):
+            if attributes.get(name, allowed[0]) not in allowed:
+                problem_ = f"must be {' or '.join(allowed)}"
+                self._refuse("request", name, attributes[name], problem_, self._junction, line)
+
+    def _check_ends(self) -> None:
+        """Every edge runs from a junction that is there to one that is there."""
+        for field, ends in (("edge.from", self._origins), ("edge.to", self._ends)):
+            for edge, junction in ends.items():
+                if junction not in self._junctions:
+                    problem_ = f"no such junction in the net (edge {edge})"
+                    raise BadInput(problem_, file=self._path, field=field, value=junction)
+
+    def _check_inside(self) -> None:
+        """A lane inside a junction that a connection uses must lead out of it: SUMO follows it blindly."""
+        leaving = {link for link in self._links if link[0].startswith(":")}
+        with_via = {self._ends[a] for (a, *_), (_, via) in self._links.items() if via and a in self._ends}
+        for (a, b, _, j), (line, via) in self._links.items():
+            edge, _, index = via.rpartition("_")
+            if via and (edge, b, index, j) not in leaving:
+                self._refuse("connection", "via", via, f"leads from {a} to nowhere near {b}_{j}", None, line)
+            if via and a in self._ends and not via.startswith(f":{self._ends[a]}_"):
+                self._refuse("connection", "via", via, f"is not in junction {self._ends[a]}", None, line)
+            if via and a.startswith(":") and via not in self._junctions:
+                self._refuse("connection", "via", via, "no such internal junction in the net", None, line)
+            if not via and not b.startswith(":") and self._ends.get(a) in with_via:
+                self._refuse("connection", "via", "", f"is missing, {a} to {b}", None, line)
+
+    def _check_junctions(self, connections: Mapping[str, int]) -> None:
+        """A junction's right-of-way table has one row for each connection through it (and crossing)."""
+        crossings = Counter(m[1] for m in map(_CROSSING.fullmatch, self._lanes) if m)
+        for junction, rows in self._requests.items():
+            wanted = connections.get(junction, 0) + crossings[junction]
+            if rows != wanted:
+                problem_ = (
+                    f"has {rows} right-of-way rows for {wanted} connections: rebuild it with netconvert"
+                )
+                raise BadInput(problem_, file=self._path, field="junction.id", value=junction)
+        for junction, lanes in self._inside.items():
+            for lane in lanes:
+                if not self._has_lane(lane):
+                    problem_ = f"no such lane in the net (junction {junction})"
+                    raise BadInput(problem_, file=self._path, field="junction.intLanes", value=lane)
+
+    def _has_lane(self, lane: str) -> bool:
+        edge, _, index = lane.rpartition("_")
+        return index.isdigit() and int(index) < self._lanes.get(edge, 0)
+
+    def _need(self, tag: str, name: str, attributes: dict[str, str], line: int) -> str:
+        if name not in attributes:
+            self._refuse(tag, name, "", "is missing", attributes.get("id"), line)
+        return attributes[name]
+
+    def _refuse(self, tag: str, name: str, value: str, wrong: str, owner: str | None, line: int) -> None:
+        place = f"{owner}, line {line}" if owner else f"line {line}"
+        raise BadInput(f"{wrong} ({place})", file=self._path, field=f"{tag}.{name}", value=clip(value))

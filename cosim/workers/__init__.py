@@ -1,0 +1,1 @@
+"""Objects in supervised processes of their own: one worker, its supervisor, the engines that spread tasks."""

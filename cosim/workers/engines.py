@@ -1,0 +1,92 @@
+"""Who drives the tasks: one small protocol, and the engine that uses processes of this machine."""
+
+from __future__ import annotations
+
+import os
+import queue
+import threading
+from collections.abc import Generator, Sequence
+from typing import Any, Protocol
+
+from cosim.workers.supervisor import Factory, Limits, Supervisor
+from cosim.workers.tasks import Dispenser, Outcome, Task
+
+ENDING = 10.0  # s that a worker may take to end
+
+
+class Engine(Protocol):
+    """Spreads tasks over worker processes and yields an outcome for each, in the order they come in.
+
+    Closing the generator (or leaving the loop by an exception) ends everything that it started.
+    """
+
+    def run(self, tasks: Sequence[Task]) -> Generator[Outcome, None, None]:
+        """Exactly one outcome per task."""
+
+
+class LocalEngine:
+    """`workers` supervised processes on this machine, each watched by a thread of its own.
+
+    `factory(*arguments)` builds the hosted object in each process.
+    """
+
+    def __init__(
+        self,
+        factory: Factory,
+        arguments: tuple[Any, ...] = (),
+        *,
+        workers: int | None = None,
+        limits: Limits | None = None,
+    ) -> None:
+        self._factory = factory
+        self._arguments = arguments
+        self._workers = workers or cores()
+        self._limits = limits or Limits()
+
+    def run(self, tasks: Sequence[Task]) -> Generator[Outcome, None, None]:
+        """Exactly one outcome per task."""
+        dispenser = Dispenser(tasks)
+        arrived: queue.SimpleQueue[Outcome | BaseException] = queue.SimpleQueue()
+        supervisors = [
+            Supervisor(self._factory, self._arguments, self._limits)
+            for _ in range(min(self._workers, len(tasks)))
+        ]
+        stopped = threading.Event()
+
+        def watch(supervisor: Supervisor) -> None:
+            group: str | None = None
+            try:
+                while not stopped.is_set() and (task := dispenser.take(group)) is not None:
+                    group = task.group
+                    arrived.put(supervisor.run(task))
+            except BaseException as error:  # ours: the caller's thread must hear of it
+                arrived.put(error)
+            finally:
+                supervisor.close()
+
+        threads = [
+            threading.Thread(target=watch, args=(s,), name=f"cosim-watch-{i}", daemon=True)
+            for i, s in enumerate(supervisors)
+        ]
+        for thread in threads:
+            thread.start()
+        try:
+            for _ in tasks:
+                outcome = arrived.get()
+                if isinstance(outcome, BaseException):
+                    raise outcome
+                yield outcome
+            for thread in threads:
+                thread.join(timeout=ENDING)
+        finally:
+            stopped.set()
+            waiting = [(s, t) for s, t in zip(supervisors, threads, strict=True) if t.is_alive()]
+            for supervisor, _ in waiting:
+                supervisor.kill()
+            for _, thread in waiting:
+                thread.join(timeout=ENDING)
+
+
+def cores() -> int:
+    """Cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,0 +1,174 @@
+"""The engine that spreads tasks over a Ray cluster: an extra, imported only when it is asked for.
+
+An actor per worker holds the same `Supervisor` as the local engine does, so that crashes, hangs and retries
+are treated alike and SUMO never runs inside a Ray process. What Ray adds is the loss of an actor, with its
+node or without: its task goes back and another actor takes it.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections import Counter
+from collections.abc import Generator, Sequence
+from typing import Any
+
+from cosim.errors import BadInput, CosimError
+from cosim.workers.supervisor import Factory, Limits, Supervisor
+from cosim.workers.tasks import SIM_CRASH, Dispenser, Outcome, Task
+
+LOSSES = 6  # actors that may die under one task: as often as a process may be killed under it
+PATIENCE = 30.0  # s without a single living actor before we say that we wait
+
+
+class RayEngine:
+    """Workers on an existing cluster (`address`) or on a local one, started and ended with the run.
+
+    `workers`: how many actors of one core each; by default one per core of the cluster. Each node needs
+    cosim installed, in the same versions, and a user's files under the same paths (our worlds come with
+    the installation).
+
+    Raises:
+        BadInput: ray is not installed, or no cluster answers at the address.
+        CosimError: the cluster is gone.
+    """
+
+    def __init__(
+        self,
+        factory: Factory,
+        arguments: tuple[Any, ...] = (),
+        *,
+        workers: int | None = None,
+        limits: Limits | None = None,
+        address: str | None = None,
+    ) -> None:
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # no run of ours reports to anybody
+        try:
+            import ray
+        except ModuleNotFoundError:
+            raise BadInput(
+                "ray is not installed: pip install 'cosim[ray]'", field="--engine", value="ray"
+            ) from None
+        self._ray: Any = ray
+        self._factory = factory
+        self._arguments = arguments
+        self._workers = workers
+        self._limits = limits or Limits()
+        self._address = address
+
+    def run(self, tasks: Sequence[Task]) -> Generator[Outcome, None, None]:
+        """Exactly one outcome per task."""
+        if not tasks:
+            return
+        own = not self._ray.is_initialized()
+        self._connect()
+        fleet = _Fleet(self._ray, self._factory, self._arguments, self._limits)
+        try:
+            count = self._workers or int(self._ray.cluster_resources().get("CPU", 1))
+            yield from fleet.drive(tasks, min(count, len(tasks)))
+        except self._ray.exceptions.RaySystemError as error:
+            raise CosimError(f"the Ray cluster is gone: {error} (--resume goes on from here)") from None
+        finally:
+            fleet.close()
+            if own:
+                self._ray.shutdown()
+
+    def _connect(self) -> None:
+        if self._ray.is_initialized():  # the caller's own connection
+            return
+        local = {"num_cpus": self._workers} if self._address is None else {}
+        try:
+            self._ray.init(
+                address=self._address or "local",
+                include_dashboard=None if self._address else False,
+                log_to_driver=False,
+                logging_level="ERROR",
+                **local,
+            )
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            words = str(error).strip().splitlines()[0]
+            raise BadInput(
+                f"no Ray cluster answers: {words}", field="--ray-address", value=self._address
+            ) from None
+
+
+class _Fleet:
+    """The actors, and which task each of them is at."""
+
+    def __init__(self, ray: Any, factory: Factory, arguments: tuple[Any, ...], limits: Limits) -> None:
+        self._ray = ray
+        # never restarted by Ray: a fresh actor in its place is the same, and may start on another node
+        self._actor = ray.remote(num_cpus=1, max_restarts=0, max_task_retries=0)(_Attendant)
+        self._settings = (factory, arguments, limits)
+        self._calls: dict[Any, tuple[Any, Task | None, str | None]] = {}  # future -> actor, task, its group
+        self._losses: Counter[str] = Counter()
+
+    def drive(self, tasks: Sequence[Task], count: int) -> Generator[Outcome, None, None]:
+        """Spread the tasks over `count` actors."""
+        errors = self._ray.exceptions
+        dispenser = Dispenser(tasks)
+        left = len(tasks)
+        for _ in range(count):
+            self._hire()
+        while left:
+            ready, _ = self._ray.wait(list(self._calls), num_returns=1, timeout=PATIENCE)
+            if not ready and all(task is None for _, task, _ in self._calls.values()):
+                print("cosim: waiting for the Ray cluster to offer a core", file=sys.stderr, flush=True)
+            for future in ready:
+                actor, task, group = self._calls.pop(future)
+                try:
+                    outcome = self._ray.get(future)
+                except (errors.RayTaskError, errors.RaySystemError):  # a bug of ours; the cluster is gone
+                    raise
+                except errors.RayError as error:  # the actor died, or its node with the result
+                    self._ray.kill(actor)
+                    dispenser.leave(group)
+                    outcome = None if task is None else self._lost(task, error, dispenser)
+                    self._hire()
+                else:
+                    self._assign(actor, dispenser, group)
+                if outcome is not None:
+                    left -= 1
+                    yield outcome
+
+    def close(self) -> None:
+        """End every actor; their worker processes end with them."""
+        for actor, _, _ in self._calls.values():
+            self._ray.kill(actor)
+        self._calls.clear()
+
+    def _hire(self) -> None:
+        """One more actor. It gets no task before it answers: a cluster that lost a node may have no room."""
+        actor = self._actor.remote(*self._settings)
+        self._calls[actor.ready.remote()] = (actor, None, None)
+
+    def _assign(self, actor: Any, dispenser: Dispenser, group: str | None) -> None:
+        task = dispenser.take(group)
+        if task is None:
+            self._ray.kill(actor)  # should another actor die, a new one is hired in its place
+        else:
+            self._calls[actor.run.remote(task)] = (actor, task, task.group)
+
+    def _lost(self, task: Task, error: Exception, dispenser: Dispenser) -> Outcome | None:
+        """The task of a dead actor goes back, unless too many died under it."""
+        self._losses[task.key] += 1
+        if self._losses[task.key] < LOSSES:
+            dispenser.put_back(task)
+            return None
+        words = " ".join(str(error).split())[:500]
+        problem = f"{LOSSES} Ray workers died at it: {words}"
+        return Outcome(task.key, SIM_CRASH, error=problem, attempts=LOSSES)
+
+
+class _Attendant:
+    """The actor: one supervised worker process on its node."""
+
+    def __init__(self, factory: Factory, arguments: tuple[Any, ...], limits: Limits) -> None:
+        self._supervisor = Supervisor(factory, arguments, limits)
+
+    def ready(self) -> None:
+        """The actor has a core and lives."""
+
+    def run(self, task: Task) -> Outcome:
+        """One task."""
+        return self._supervisor.run(task)

@@ -1,0 +1,196 @@
+"""One worker process that may crash or hang, and what is done about it: tasks in, an outcome for each.
+
+The hosted object (`cosim.workers.tasks.Hosted`) is built in the process; nothing here knows what it does.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from cosim.errors import BadInput, CosimError, SimulationCrashed, SimulationError, SimulationTimeout
+from cosim.workers.tasks import BAD_INPUT, FAULT, OK, SIM_CRASH, TIMEOUT, Hosted, Outcome, Progress, Task
+from cosim.workers.worker import Worker
+
+Factory = Callable[..., Hosted]
+
+# SUMO never sends itself these: somebody else (a person, the kernel short of memory) ended the process.
+KILLED_FROM_OUTSIDE = frozenset(-s for s in (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP, signal.SIGINT))
+SIGN_OF_LIFE = 1.0  # s between two that are sent: a step of 2 ms must not pay for a message
+PR_SET_PDEATHSIG = 1  # linux/prctl.h
+
+# How an attempt can end, and the status a task gets when it is not tried again.
+_STATUS = {
+    "done": OK,
+    "refused": BAD_INPUT,  # the same would be refused again
+    "failed": SIM_CRASH,  # it raised, and would raise again
+    "crashed": SIM_CRASH,
+    "killed": SIM_CRASH,
+    "hung": TIMEOUT,
+    "fault": FAULT,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """How long to wait, how often to try."""
+
+    step: float = 120.0  # s of silence while a task runs: a decision takes ms, seconds on a busy machine
+    start: float = 600.0  # s until its first sign of life: process, net, warm-up (A10KW: 3 s)
+    crashes: int = 2  # attempts when the process dies of itself: the second tells chance from cause
+    kills: int = 6  # attempts when it is killed from outside, which says nothing about the task
+    timeouts: int = 1  # attempts when it hangs: the second would hang as long
+    recycle: int = 200  # tasks before a fresh process: memory was flat over 120 episodes, a precaution
+
+
+class Supervisor:
+    """Owns one worker process at a time. `run` never raises for what a task does; it restarts what died.
+
+    To be created, used and closed by one thread: the process ends with the thread that started it
+    (PR_SET_PDEATHSIG), so that nothing is left behind a parent that was killed. `kill` may come from any.
+    """
+
+    def __init__(
+        self, factory: Factory, arguments: tuple[Any, ...] = (), limits: Limits | None = None
+    ) -> None:
+        self._factory = factory
+        self._arguments = arguments
+        self._limits = limits or Limits()
+        self._worker: Worker | None = None
+        self._tasks = 0  # done by the present process
+        self._ended = False
+
+    @property
+    def pid(self) -> int | None:
+        """The present worker process."""
+        return None if self._worker is None else self._worker.pid
+
+    def run(self, task: Task) -> Outcome:
+        """One task, attempted as often as the limits say."""
+        allowed = {
+            "crashed": self._limits.crashes,
+            "killed": self._limits.kills,
+            "hung": self._limits.timeouts,
+        }
+        ends: Counter[str] = Counter()
+        while True:
+            began = time.monotonic()
+            end, value, error, stderr = self._attempt(task)
+            ends[end] += 1
+            if end != "done":
+                if end != "refused":
+                    self._drop()  # whatever it is in now, the next task must not meet it
+                if ends[end] < allowed.get(end, 1) and not self._ended:
+                    continue
+            seconds = time.monotonic() - began
+            return Outcome(task.key, _STATUS[end], value, error, stderr, ends.total(), seconds)
+
+    def kill(self) -> None:
+        """End the process at once, from another thread; `run` comes back and tries no more."""
+        self._ended = True
+        worker = self._worker
+        if worker is not None:
+            worker.kill()
+
+    def close(self) -> None:
+        """Ask the process to end, and see to it that it does."""
+        self._ended = True
+        self._drop()
+
+    # ---- inside ----
+
+    def _attempt(self, task: Task) -> tuple[str, Any, str | None, str | None]:
+        """How it ended, the value, the error in one line, the dead process's stderr."""
+        try:
+            worker = self._ready()
+            value = worker.call("run", task.arguments, progress=_nothing)
+        except BadInput as error:
+            return "refused", None, _line(error), None
+        except SimulationTimeout as error:
+            return "hung", None, _line(error), error.stderr or None
+        except SimulationCrashed as error:
+            end = "killed" if error.exitcode in KILLED_FROM_OUTSIDE else "crashed"
+            return end, None, _line(error), error.stderr or None
+        except SimulationError as error:
+            return "failed", None, _line(error), None
+        except CosimError as error:
+            return "fault", None, _line(error), str(error)
+        self._tasks += 1
+        return "done", value, None, None
+
+    def _ready(self) -> Worker:
+        if self._ended:
+            raise SimulationCrashed("no more tasks: it was told to end")
+        worker = self._worker
+        if worker is not None and (self._tasks >= self._limits.recycle or worker.pid is None):
+            self._drop()
+        if self._worker is None:
+            self._tasks = 0
+            self._worker = Worker(
+                _Shell,
+                os.getpid(),
+                self._factory,
+                self._arguments,
+                timeout=self._limits.step + SIGN_OF_LIFE,
+                start_timeout=self._limits.start,
+                name="cosim-evaluation",
+                wait=False,  # `kill` must reach a process that is still starting
+            )
+        return self._worker
+
+    def _drop(self) -> None:
+        worker, self._worker = self._worker, None
+        if worker is not None:
+            worker.close()
+
+
+class _Shell:
+    """The worker's side: builds the hosted object, thins its signs of life, dies with the parent."""
+
+    def __init__(self, parent: int, factory: Factory, arguments: tuple[Any, ...]) -> None:
+        _die_with(parent)
+        self._hosted = factory(*arguments)
+
+    def run(self, arguments: tuple[Any, ...], progress: Progress) -> Any:
+        """One task."""
+        last = 0.0
+
+        def thinned(done: float, total: float) -> None:
+            nonlocal last
+            now = time.monotonic()
+            if now - last >= SIGN_OF_LIFE:
+                last = now
+                progress(done, total)
+
+        return self._hosted.run(*arguments, progress=thinned)
+
+    def close(self) -> None:
+        """The process ends."""
+        self._hosted.close()
+
+
+def _die_with(parent: int) -> None:
+    """Have the kernel kill this process when its parent is gone, even in the midst of a step of SUMO's."""
+    if not hasattr(ctypes, "CDLL") or os.uname().sysname != "Linux":
+        return  # elsewhere the broken pipe ends it at the next sign of life
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:  # it was gone before we asked
+        os._exit(1)
+
+
+def _nothing(done: float, total: float) -> None:
+    """Progress of a task that nobody watches: still the sign of life."""
+
+
+def _line(error: Exception) -> str:
+    """The error in one line: of a traceback, which keeps its place in stderr, the first and the last."""
+    lines = str(error).strip().splitlines()
+    if len(lines) > 1:
+        lines = [lines[0], lines[-1]]
+    return " ".join(" ".join(lines).split())

@@ -1,0 +1,226 @@
+"""One object in a process of its own, supervised: SUMO may die, the caller must not.
+
+A net that SUMO cannot bear kills the process that imported libsumo (docs/sumo.md). So whatever drives
+a simulation lives in a spawned worker, called through a pipe; its death or silence becomes an exception.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import pickle
+import signal
+import sys
+import tempfile
+import threading
+import traceback
+from collections.abc import Callable, Iterator
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from cosim.errors import CosimError, SimulationCrashed, SimulationTimeout
+from cosim.workers.memory import keep_freed_memory
+
+STDERR_KEPT = 4000  # characters of a dead process's stderr that its error carries
+
+_CONTEXT = multiprocessing.get_context("spawn")
+_STARTING = threading.Lock()
+
+
+class Worker:
+    """`factory(*arguments)` built in a spawned process; `call` runs one of its methods there.
+
+    Everything that crosses must be picklable. `timeout` is the longest silence in s that a call may keep
+    (progress counts as a sign of life); `start_timeout` is the longest one before the first sign of life, of
+    the factory and of each call (default: the same). Raises whatever CosimError the method raised,
+    SimulationCrashed when the process died, SimulationTimeout when it stayed silent. A worker whose process
+    is gone stays gone: make a new one. Without `wait` the first call waits for the start, and raises what the
+    factory raised.
+    """
+
+    def __init__(
+        self,
+        factory: Callable[..., Any],
+        *arguments: Any,
+        timeout: float = 300.0,
+        start_timeout: float | None = None,
+        name: str = "cosim",
+        wait: bool = True,
+    ) -> None:
+        self._timeout = timeout
+        self._start_timeout = start_timeout
+        handle, path = tempfile.mkstemp(prefix="cosim-worker-", suffix=".stderr")
+        os.close(handle)
+        self._stderr = Path(path)
+        self._heard = 0  # bytes of it that belong to earlier calls
+        self._pipe, theirs = _CONTEXT.Pipe()
+        self._process = _CONTEXT.Process(
+            target=_serve, args=(theirs, factory, arguments, path), name=name, daemon=True
+        )
+        with _script_left_out(factory, arguments):
+            self._process.start()
+        theirs.close()
+        self._closed = False
+        self._started = False
+        if wait:
+            self._wait()
+
+    @property
+    def pid(self) -> int | None:
+        """The process id of the worker; None once it is closed."""
+        return None if self._closed else self._process.pid
+
+    def call(
+        self, method: str, *arguments: Any, progress: Callable[..., None] | None = None, **options: Any
+    ) -> Any:
+        """Run one method in the worker. `progress` receives what the method passes to its own `progress`."""
+        if self._closed:
+            raise SimulationCrashed("the simulation's process has ended already")
+        self._wait()
+        self._heard = self._stderr.stat().st_size
+        try:
+            self._pipe.send((method, arguments, options, progress is not None))
+        except (BrokenPipeError, OSError):
+            raise self._died(method) from None
+        return self._answer(method, progress)
+
+    def kill(self) -> None:
+        """End the process at once; a call that another thread is waiting for raises SimulationCrashed."""
+        with contextlib.suppress(ValueError):  # closed in the meantime
+            self._process.kill()
+
+    def close(self) -> None:
+        """Ask the worker to end, and see to it that it does. Safe to call twice."""
+        if self._closed:
+            return
+        self._closed = True
+        with contextlib.suppress(BrokenPipeError, OSError):
+            self._pipe.send(None)
+        self._process.join(5.0)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
+        self._process.close()  # frees its descriptors now, not when the garbage collector comes
+        self._pipe.close()
+        self._stderr.unlink(missing_ok=True)
+
+    def __enter__(self) -> Worker:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def __del__(self) -> None:
+        with contextlib.suppress(Exception):
+            self.close()
+
+    def _wait(self) -> None:
+        """Until the factory has built its object."""
+        if self._started:
+            return
+        try:
+            self._answer("start", None)
+        except BaseException:
+            self.close()
+            raise
+        self._started = True
+
+    def _answer(self, method: str, progress: Callable[..., None] | None) -> Any:
+        patience = self._timeout if self._start_timeout is None else self._start_timeout
+        while True:
+            try:
+                if not self._pipe.poll(patience):
+                    self._process.kill()
+                    self._process.join()
+                    error = SimulationTimeout(
+                        f"no sign of life for {patience:g} s during '{method}': process killed",
+                        stderr=self._last_words(),
+                    )
+                    self.close()
+                    raise error
+                kind, value = self._pipe.recv()
+                patience = self._timeout
+            except (EOFError, ConnectionResetError):
+                raise self._died(method) from None
+            if kind == "progress":
+                if progress is not None:
+                    progress(*value)
+            elif kind == "error":
+                raise value
+            else:
+                return value
+
+    def _died(self, method: str) -> SimulationCrashed:
+        self._process.join(5.0)
+        code = self._process.exitcode
+        how = f"exit code {code}"
+        if code is not None and code < 0:
+            how = f"killed by {signal.Signals(-code).name}"
+        stderr = self._last_words()
+        words = f"; last words: {stderr.splitlines()[-1]}" if stderr else ""
+        self.close()
+        problem = f"the simulation's process died during '{method}' ({how}){words}"
+        return SimulationCrashed(problem, exitcode=code, stderr=stderr)
+
+    def _last_words(self) -> str:
+        """What the process wrote during this call."""
+        return self._stderr.read_bytes()[self._heard :].decode("utf-8", "replace").strip()[-STDERR_KEPT:]
+
+
+@contextlib.contextmanager
+def _script_left_out(*needed: object) -> Iterator[None]:
+    """Keep multiprocessing from running the caller's script once more in the worker, which needs nothing of
+    it unless something `needed` is defined there: so scripts need no `if __name__ == "__main__"`, and what
+    a trainer imports (torch) is not imported again beside every simulation."""
+    main = sys.modules["__main__"]
+    if b"__main__" in pickle.dumps(needed):
+        yield
+        return
+    with _STARTING:
+        hidden = {name: getattr(main, name, None) for name in ("__spec__", "__file__")}
+        for name in hidden:
+            setattr(main, name, None)
+        try:
+            yield
+        finally:
+            for name, value in hidden.items():
+                setattr(main, name, value)
+
+
+def _serve(pipe: Connection, factory: Callable[..., Any], arguments: tuple[Any, ...], stderr: str) -> None:
+    """The worker's whole life. Ends when the pipe breaks, so it never outlives its parent."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
+    keep_freed_memory()
+    os.dup2(2, 1)  # what a policy prints is for eyes: stdout belongs to the caller's document
+    file = os.open(stderr, os.O_RDWR | os.O_APPEND)  # as `cosim.simulation.stderr` wants it, to read back
+    os.dup2(file, 2)
+    os.close(file)
+    target = None
+
+    def attempt(work: Callable[[], Any]) -> bool:
+        try:
+            pipe.send(("value", work()))
+            return True
+        except CosimError as error:
+            pipe.send(("error", error))
+        except Exception as error:  # a bug of ours: the caller needs to see where
+            words = "".join(traceback.format_exception(error)).rstrip()
+            pipe.send(("error", CosimError(f"internal error in the simulation's process:\n{words}")))
+        return False
+
+    def build() -> None:
+        nonlocal target
+        target = factory(*arguments)
+
+    with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
+        if attempt(build):
+            while (message := pipe.recv()) is not None:
+                method, args, options, wants_progress = message
+                if wants_progress:
+                    options["progress"] = lambda *values: pipe.send(("progress", values))
+                attempt(lambda: getattr(target, method)(*args, **options))  # noqa: B023
+    if target is not None and hasattr(target, "close"):
+        with contextlib.suppress(Exception):
+            target.close()

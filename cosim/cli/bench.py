@@ -43,7 +43,7 @@ def work(args: argparse.Namespace) -> int:
     from pathlib import Path
 
     import sumo_scenarios
-    from cosim.batch.record import cases, record
+    from cosim.batch.record import planned, record
     from cosim.errors import BadInput
     from cosim.files import prepare_folder
     from cosim.learning.bench_predict import MAPS_PAGE, PAGE, bench_maps, bench_predict
@@ -53,7 +53,7 @@ def work(args: argparse.Namespace) -> int:
     out = prepare_folder(args.out)
     where = Path(args.recordings) if args.recordings else out / "recordings"
     if not args.recordings:
-        wanted = cases(
+        wanted = planned(
             args.scenario or sumo_scenarios.names(),
             args.demand or DEMANDS,
             args.behavior or [b for b in BEHAVIORS if b != AS_IS],

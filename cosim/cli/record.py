@@ -50,13 +50,13 @@ def work(args: argparse.Namespace) -> int:
     import sys
     from pathlib import Path
 
-    from cosim.batch.record import cases, record
+    from cosim.batch.record import planned, record
     from cosim.errors import SimulationError
 
     policies = args.policy or ["idm"]
-    wanted = cases(args.scenario, args.demand, args.behavior, policies, args.seeds, args.svo, args.duration)
+    wanted = planned(args.scenario, args.demand, args.behavior, policies, args.seeds, args.svo, args.duration)
     failed = record(Path(args.out), wanted, workers=args.workers, resume=args.resume)
-    print(f"{len(wanted) - len(failed)} episodes in {args.out}")
+    print(f"{wanted.episodes - len(failed)} episodes in {args.out}")
     for line in failed:
         print(f"cosim: not recorded: {line}", file=sys.stderr)
     return SimulationError.exit_code if failed else 0

@@ -76,9 +76,9 @@ def work(args: argparse.Namespace) -> int:
     """Drive it in a worker process, show the result."""
     from cosim.cli import output
     from cosim.files import prepare_folder
+    from cosim.host import Host
     from cosim.policies import check
     from cosim.report.replay.episode import draw, remembered
-    from cosim.runner import Runner
     from cosim.scenario import sumo_outputs
     from cosim.scenario.vet import vetted
     from cosim.workers.progress import Progress
@@ -98,7 +98,7 @@ def work(args: argparse.Namespace) -> int:
     progress = Progress(f"{scenario.name} {label(case.policy)}", "s")
     progress.starting()
     try:
-        with Worker(Runner, scenario, case.policy, math.radians(case.svo_deg), name="cosim-run") as worker:
+        with Worker(Host, scenario, case.policy, math.radians(case.svo_deg), name="cosim-run") as worker:
             verb = "watch" if args.replay else "run"
             answer = worker.call(verb, case.seed, progress=progress, outputs=case.outputs, folder=files)
             result, watched = answer if args.replay else (answer, None)

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from cosim.runner import Runner
+from cosim.host import Host
 from cosim.scenario import load
 from cosim.workers.worker import Worker
 
@@ -31,7 +31,7 @@ FIGURES = (
 
 def drive(world: str, demand: str, policy: str) -> dict[str, Any]:
     """The figures of one episode."""
-    with Worker(Runner, load(world, demand=[demand]), policy, math.pi / 4) as worker:
+    with Worker(Host, load(world, demand=[demand]), policy, math.pi / 4) as worker:
         result = worker.call("run", SEED)
     return {
         name: result.steps if name == "steps" else result.value(name) for name in FIGURES.split()

@@ -13,10 +13,10 @@ from typing import Any
 
 from cosim.errors import BadInput, CosimError, hint
 from cosim.files import whole
+from cosim.host import Host
 from cosim.policies import check
-from cosim.recording.watcher import Watched
+from cosim.recording.watched import Watched
 from cosim.report import run_folder
-from cosim.runner import Runner
 from cosim.scenario import Scenario
 from cosim.scenario.episode_id import Case
 from cosim.scenario.manifest import POLICY_FILES, manifest, named
@@ -136,7 +136,7 @@ def drive(recorded: Recorded, scenario: Scenario, *, check: bool = True) -> tupl
     """
     case = recorded.case
     with _progress(f"replay {scenario.name} {label(case.policy)}", "s") as progress:
-        worker = Worker(Runner, scenario, case.policy, math.radians(case.svo_deg), name="cosim-replay")
+        worker = Worker(Host, scenario, case.policy, math.radians(case.svo_deg), name="cosim-replay")
         with worker:
             if check:
                 _same_policy(recorded.manifest.get(POLICY_FILES, {}), worker.call("policy_files"))

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cosim.recording.watcher import Choice, Track, Watched
+from cosim.recording import Choice
+from cosim.recording.watched import Track, Watched
 from cosim.types import Floats, Forecast
 
 MARGIN = 500.0  # m around the traffic: roads further away are left out

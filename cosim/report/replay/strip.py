@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from cosim.recording.watcher import Choice, Track, Watched
+from cosim.recording import Choice
+from cosim.recording.watched import Track, Watched
 from cosim.types import Floats, Kind, MetaAction
 
 FINE = 2  # drawn this much larger, then reduced: smooth edges

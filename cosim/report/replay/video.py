@@ -15,7 +15,8 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from cosim.files import whole
-from cosim.recording.watcher import Choice, Watched
+from cosim.recording import Choice
+from cosim.recording.watched import Watched
 from cosim.report.replay.strip import AV, BAD, TEXT, WARN, Colour, Pose, Strip, colour_of, font, poses_at
 from cosim.types import Kind, MetaAction
 

@@ -13,7 +13,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from cosim.errors import BadInput
 from cosim.files import whole
 from cosim.report import wording
-from cosim.report.figures import Row
+from cosim.report.figures import HEADLINE, Row
 from cosim.report.html import tables
 from cosim.report.html.blocks import Block, Difference, blocks
 from cosim.report.html.plots import plots
@@ -27,17 +27,8 @@ PLOTTED = 12  # blocks that get plots: a page of more cannot be read, and each t
 FINDINGS = 8  # before the fold
 FAILURES = 50  # listed by name
 MANIFEST = 200_000  # characters of it on the page
-COMPARED = (  # of each block against its baseline
-    "collision_rate",
-    "av_caused_collision_rate",
-    "mission_success_rate",
-    "dt_mission_m",
-    "dt_av_m",
-    "dt_mean_m",
-    "min_ttc_s",
-    "hard_brakings_av",
-)
-TOLD = {  # of these in the verdict, in words
+COMPARED = tuple(name for name in HEADLINE if name != "veto_rate")  # of each block against its baseline
+IN_WORDS = {  # of these in the verdict, in words
     "collision_rate": "collisions",
     "av_caused_collision_rate": "AV-caused collisions",
     "mission_success_rate": "mission success",
@@ -133,24 +124,24 @@ def _findings(found: Sequence[Block], differences: Sequence[list[Difference]]) -
     lines = []
     for block, mine in zip(found, differences, strict=True):
         for difference in mine:
-            told, untold = [], []
+            changed, alike = [], []
             for name, figure in difference.figures.items():
-                if name not in TOLD or not figure.n:
+                if name not in IN_WORDS or not figure.n:
                     continue
                 tone = tables.tone(figure)
                 if tone:
                     value = wording.interval(figure.difference, figure.measure, signed=True)
-                    told.append({"name": TOLD[name], "value": value, "tone": tone})
+                    changed.append({"name": IN_WORDS[name], "value": value, "tone": tone})
                 else:
-                    untold.append(TOLD[name])
+                    alike.append(IN_WORDS[name])
             lines.append(
                 {
                     "block": wording.group(block.identity),
                     "series": difference.series.label,
                     "baseline": difference.baseline.label,
                     "pairs": difference.pairs,
-                    "told": told,
-                    "untold": untold,
+                    "changed": changed,
+                    "alike": alike,
                 }
             )
     return lines

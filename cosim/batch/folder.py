@@ -58,12 +58,9 @@ class RunFolder:
 
     def _make(self) -> list[Path]:
         """Make it; the folders that were not there before, innermost first."""
-        missing = []
-        folder = self.path
+        missing: list[Path] = []
         try:
-            while not folder.exists():
-                missing.append(folder)
-                folder = folder.parent
+            missing += [folder for folder in (self.path, *self.path.parents) if not folder.exists()]
             self.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             for made in missing:

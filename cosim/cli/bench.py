@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from cosim.cli import arguments
-from cosim.cli.record import seeds
+from cosim.cli.arguments import seeds
 from cosim.scenario import BEHAVIORS
 from cosim.scenario.behaviors import AS_IS
 

@@ -66,7 +66,7 @@ class _Version(argparse.Action):
     """Looked up when it is asked for: no other command has to wait for it, or needs cosim to be installed."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
-        from cosim.cli.doctor_work import version_of
+        from cosim.cli.doctor import version_of
 
         parser.exit(message=f"cosim {version_of('cosim') or 'is not installed'}\n")
 

@@ -74,10 +74,10 @@ def add(verbs: arguments.Verbs) -> None:
 
 def work(args: argparse.Namespace) -> int:
     """Drive it in a worker process, show the result."""
-    from cosim.cli import output
     from cosim.files import prepare_folder
     from cosim.host import Host
     from cosim.policies import check
+    from cosim.report import result as output
     from cosim.report.replay.episode import draw, remembered
     from cosim.scenario import sumo_outputs
     from cosim.scenario.vet import vetted

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Files that appear whole or not at all, and what is said when they cannot be written."""
 
 from __future__ import annotations
 
@@ -27,6 +27,15 @@ def whole(path: Path, *, contended: bool = False) -> Iterator[Path]:
         draft.replace(path)
     finally:
         draft.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def writing(problem: str = "cannot write", **place: Any) -> Iterator[None]:
+    """Raises BadInput for an OSError of the block; `place`: the file, field and value that it names."""
+    try:
+        yield
+    except OSError as error:
+        raise BadInput(f"{problem}: {error.strerror or error}", **place) from None
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None) -> None:

@@ -1,9 +1,9 @@
-"""Reads back what `cosim evaluate` left in a run folder: its rows and its manifest."""
+"""What `cosim evaluate` leaves in a run folder, written and read back: rows, manifest, summary."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -12,9 +12,11 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet
 
+from cosim.batch import export as files
 from cosim.batch.store import FILE
 from cosim.errors import BadInput
 from cosim.report.figures import Measure, Row, measures
+from cosim.report.summary import summarize
 from cosim.workers.tasks import OK
 
 NEEDED = ("key", "cell", "status", "scenario", "demand", "policy", "seed")
@@ -50,6 +52,16 @@ class Run:
         """What was asked for (`EpisodeId`), without policy and seed; {} where not known."""
         cell = self.manifest.get("cells", {}).get(row["cell"], {})
         return {k: v for k, v in cell.get("case", {}).items() if k not in ("policy", "seed")}
+
+
+def export(folder: Path, rows: Sequence[Row], manifest: Mapping[str, Any], planned: int) -> dict[str, Any]:
+    """Write the rows, the manifest and their summary, which is returned; `planned`: episodes of the run.
+
+    Raises CosimError as `cosim.batch.export`.
+    """
+    summary = {"planned": planned} | summarize(rows, manifest["units"], manifest["better"])
+    files.export(folder, rows, manifest, summary)
+    return summary
 
 
 def read(path: str | Path) -> Run:

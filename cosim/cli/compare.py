@@ -8,6 +8,7 @@ from pathlib import Path
 
 from cosim.cli import arguments
 from cosim.errors import BadInput
+from cosim.files import cannot
 
 EPILOG = """\
 A and B are run folders of `cosim evaluate`, or DIR:POLICY for one policy of it. With one folder, name both
@@ -75,9 +76,7 @@ def work(args: argparse.Namespace) -> int:
         ("--markdown", args.markdown, lambda file: file.write_text(verdict.markdown(found), "utf-8")),
     ):
         if path is not None:
-            try:
+            with cannot("write", field=field, value=path):
                 write(Path(path))
-            except OSError as error:
-                raise BadInput(f"cannot write: {error.strerror}", field=field, value=path) from None
     print(json.dumps(verdict.document(found)) if args.json else verdict.text(found))
     return found.exit_code

@@ -113,13 +113,11 @@ def work(args: argparse.Namespace) -> int:
 
 def _write(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     from cosim.fcd.encounters import Encounter
-    from cosim.files import write_csv
+    from cosim.files import cannot, write_csv
 
-    try:
+    with cannot("write", field="--conflicts", value=str(path)):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_csv(path, rows, [field.name for field in fields(Encounter)])
-    except OSError as error:
-        raise BadInput(f"cannot write: {error.strerror}", field="--conflicts", value=str(path)) from None
 
 
 def _road(net: Path) -> Any:

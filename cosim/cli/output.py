@@ -6,8 +6,7 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from cosim.errors import BadInput
-from cosim.files import whole
+from cosim.files import cannot, whole
 from cosim.types import EpisodeResult, Metric
 
 HEADLINE = (
@@ -73,14 +72,12 @@ def write_folder(folder: Path, result: EpisodeResult, outputs: Sequence[str] = (
     }
     old = [*folder.glob("replay*.html"), *folder.glob("replay*.mp4"), *folder.glob("replay*.gif")]
     old += [file for file in (folder / "outputs").glob("*.xml") if file.stem not in outputs]
-    try:
+    with cannot("write", file=folder, field="--out"):
         for file in old:
             file.unlink()
         for name, text in texts.items():
             with whole(folder / name) as draft:
                 draft.write_text(text + "\n")
-    except OSError as error:
-        raise BadInput(f"cannot write: {error.strerror}", file=folder, field="--out") from None
 
 
 def figure(metric: Metric) -> str:

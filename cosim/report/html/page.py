@@ -10,8 +10,7 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from cosim.errors import BadInput
-from cosim.files import whole
+from cosim.files import cannot, whole
 from cosim.report import wording
 from cosim.report.figures import Row
 from cosim.report.html import tables
@@ -56,11 +55,8 @@ def write(run: Run, path: Path | None = None, shown: str | None = None) -> Path:
     """
     path = run.path / FILE if path is None else path
     text = html(run, shown)
-    try:
-        with whole(path) as draft:
-            draft.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise BadInput(f"cannot write the report: {error.strerror}", value=str(path)) from None
+    with cannot("write the report", value=str(path)), whole(path) as draft:
+        draft.write_text(text, encoding="utf-8")
     return path
 
 

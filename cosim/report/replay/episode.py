@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from cosim.errors import BadInput, CosimError, hint
-from cosim.files import whole
+from cosim.files import cannot, read_json, whole
 from cosim.policies import check
 from cosim.recording.watcher import Watched
 from cosim.report import run_folder
@@ -29,6 +28,7 @@ from cosim.workers.tasks import OK
 from cosim.workers.worker import Worker
 
 MANIFEST = "manifest.json"
+ABSENT = "no such file: a folder of cosim run --out or cosim evaluate is needed"
 MOST_NAMED = 8  # episodes of one seed
 CASE, OPTIONS = "case", "sumo_arguments"  # what `cosim run --out` adds to the manifest
 
@@ -78,7 +78,7 @@ def find(folder: Path, episode: str | None) -> Recorded:
         BadInput: no such folder, not a run folder, no such episode (with the nearest key), one that was not
             driven to its end.
     """
-    document = _json(folder / MANIFEST)
+    document = read_json(folder / MANIFEST, ABSENT)
     if "cells" in document:
         return _of_batch(folder, episode)
     if CASE not in document:
@@ -87,7 +87,7 @@ def find(folder: Path, episode: str | None) -> Recorded:
         Case.read(document[CASE]),
         tuple(document.get(OPTIONS, ())),
         document,
-        _json(folder / "result.json").get("trace_hash", ""),
+        read_json(folder / "result.json", ABSENT).get("trace_hash", ""),
         folder,
     )
     if episode is not None and episode not in (recorded.case.key, str(recorded.case.seed)):
@@ -240,29 +240,12 @@ def _lasting(name: str, document: Mapping[str, Any]) -> Any:
     return {k: v for k, v in value.items() if keeps(k)} if name == "sumo_options" else value
 
 
-def _json(path: Path) -> dict[str, Any]:
-    try:
-        document = json.loads(path.read_text("utf-8"))
-    except FileNotFoundError:
-        problem = "no such file: a folder of cosim run --out or cosim evaluate is needed"
-        raise BadInput(problem, file=path) from None
-    except OSError as error:
-        raise BadInput(f"cannot be read: {error.strerror}", file=path) from None
-    except ValueError as error:
-        raise BadInput(f"not JSON: {error}", file=path) from None
-    if not isinstance(document, dict):
-        raise BadInput("not a JSON object", file=path)
-    return document
-
-
 @contextlib.contextmanager
 def _writing(path: Path) -> Iterator[None]:
     """The folder is made where it is not there. Raises BadInput when `path` cannot be written."""
-    try:
+    with cannot("write", file=path):
         path.parent.mkdir(parents=True, exist_ok=True)
         yield
-    except OSError as error:
-        raise BadInput(f"cannot write: {error.strerror or error}", file=path) from None
 
 
 @contextlib.contextmanager

@@ -37,7 +37,7 @@ def document(path: Path) -> dict[Any, Any]:
         line = None if mark is None else mark.line + 1
         raise BadInput(problem, file=path, field="line", value=line) from None
     with inside("file", path):
-        return _mapping({} if found is None else found, empty=True)
+        return mapping({} if found is None else found)
 
 
 def check_known(values: Mapping[Any, object], known: Iterable[str]) -> None:
@@ -64,7 +64,7 @@ def dataclass_from(cls: type[Config], values: object, file: Path | None, where: 
             dataclass itself refuses.
     """
     with inside(where, file):
-        return typing.cast(Config, _instance(cls, _mapping(values, empty=True)))
+        return typing.cast(Config, _instance(cls, mapping(values)))
 
 
 def value_of(kind: Any, value: object) -> Any:
@@ -80,9 +80,9 @@ def value_of(kind: Any, value: object) -> Any:
     if origin is tuple:
         return _tuple(arguments, value)
     if origin is Mapping:
-        return {str(name): _part(str(name), arguments[1], v) for name, v in _mapping(value).items()}
+        return {str(name): _part(str(name), arguments[1], v) for name, v in mapping(value).items()}
     if dataclasses.is_dataclass(kind):
-        return _instance(kind, _mapping(value, empty=True))
+        return _instance(kind, mapping(value))
     if kind is float or origin is Annotated:
         return _number(value, arguments[1] if arguments else Range())
     problem = None
@@ -120,8 +120,9 @@ def _part(name: str, kind: Any, value: object) -> Any:
         return value_of(kind, value)
 
 
-def _mapping(value: object, *, empty: bool = False) -> dict[Any, object]:
-    if not isinstance(value, dict) or not (value or empty):
+def mapping(value: object) -> dict[Any, Any]:
+    """`value` if it is a mapping. Raises BadInput."""
+    if not isinstance(value, dict):
         raise BadInput("a mapping is needed", value=value)
     return value
 

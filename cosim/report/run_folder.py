@@ -15,6 +15,7 @@ from cosim.batch.store import FILE
 from cosim.errors import BadInput
 from cosim.files import read_json
 from cosim.report.figures import Measure, Row, measures
+from cosim.scenario.manifest import checked
 from cosim.workers.tasks import OK
 
 NEEDED = ("key", "cell", "status", "scenario", "demand", "policy", "seed")
@@ -75,7 +76,9 @@ def read(path: str | Path) -> Run:
         if rows and name not in rows[0]:
             raise BadInput("has no such column: is it a run of `cosim evaluate`?", file=file, field=name)
     manifest = folder / "manifest.json"
-    return Run(folder, _named_alike(rows), read_json(manifest) if manifest.is_file() else {})
+    return Run(
+        folder, _named_alike(rows), checked(read_json(manifest), manifest) if manifest.is_file() else {}
+    )
 
 
 def _named_alike(rows: list[dict[str, Any]]) -> list[Row]:

@@ -90,7 +90,7 @@ def test_one_value_stands_for_a_list_of_one(tmp_path: Path) -> None:
         ("open: 1", "open=1: true or false is needed"),
         ("spare: {radius: .inf}", "spare.radius=inf: must be finite"),
         ("axles: {front: {radius: much}}", "axles.front.radius='much': a finite number is needed"),
-        ("axles: {}", "axles={}: a mapping is needed"),
+        ("axles: 3", "axles=3: a mapping is needed"),
         ("- 1", "file=[1]: a mapping is needed"),
     ],
 )

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from cosim.cli import arguments
 from cosim.errors import BadInput
-from cosim.files import writing
+from cosim.files import cannot
 
 EPILOG = """\
 A and B are run folders of `cosim evaluate`, or DIR:POLICY for one policy of it. With one folder, name both
@@ -70,10 +70,10 @@ def work(args: argparse.Namespace) -> int:
     b = b if args.candidate is None else chosen(b.run, args.candidate)
     found = compare(a, b, args.fail_on, across=args.across)
     if args.junit is not None:
-        with writing(field="--junit", value=args.junit):
+        with cannot("write", field="--junit", value=args.junit):
             junit.write(found, Path(args.junit))
     if args.markdown is not None:
-        with writing(field="--markdown", value=args.markdown):
+        with cannot("write", field="--markdown", value=args.markdown):
             Path(args.markdown).write_text(verdict.markdown(found), "utf-8")
     print(json.dumps(verdict.document(found)) if args.json else verdict.text(found))
     return found.exit_code

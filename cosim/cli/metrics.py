@@ -59,7 +59,7 @@ def work(args: argparse.Namespace) -> int:
     from cosim.fcd import Roles, analyse
     from cosim.fcd.encounters import Encounter
     from cosim.fcd.vehicle_types import read_sizes
-    from cosim.files import write_csv, writing
+    from cosim.files import cannot, write_csv
     from cosim.files.xml_input import regular_file
     from cosim.metrics.time_to_collision import CRITICAL
     from cosim.report.result import figure
@@ -84,7 +84,7 @@ def work(args: argparse.Namespace) -> int:
     progress.done()
     if args.conflicts:
         file = Path(args.conflicts)
-        with writing(field="--conflicts", value=args.conflicts):
+        with cannot("write", field="--conflicts", value=args.conflicts):
             file.parent.mkdir(parents=True, exist_ok=True)
             write_csv(file, found.encounters, [field.name for field in fields(Encounter)])
         print(f"{len(found.encounters)} conflicts in {args.conflicts}", file=sys.stderr)

@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from cosim.errors import BadInput
-from cosim.files import whole
+from cosim.files import cannot, whole
 from cosim.recording.recorder import Knowledge, Recorder
 from cosim.types import Collision, Events, Snapshot
 
@@ -123,29 +123,25 @@ def write(path: Path, recorder: Recorder, case: Mapping[str, Any]) -> None:
         "events": events,
     }
     table = pa.Table.from_arrays(arrays, schema=SCHEMA.with_metadata({"cosim": json.dumps(about)}))
-    try:
-        with whole(path) as draft:
-            pq.write_table(
-                table,
-                draft,
-                compression="zstd",
-                use_dictionary=[n for n in SCHEMA.names if n not in REAL],
-                use_byte_stream_split=list(REAL),
-            )
-    except OSError as error:
-        raise BadInput(f"cannot write: {error.strerror}", file=path) from None
+    with cannot("write", file=path), whole(path) as draft:
+        pq.write_table(
+            table,
+            draft,
+            compression="zstd",
+            use_dictionary=[n for n in SCHEMA.names if n not in REAL],
+            use_byte_stream_split=list(REAL),
+        )
 
 
 def read(path: Path) -> Recording:
     """Read one episode. Raises BadInput when the file is not a recording."""
     try:
-        file = pq.ParquetFile(path)
-        about = json.loads((file.schema_arrow.metadata or {}).get(b"cosim", b"null"))
-        if not isinstance(about, dict) or about.get("format") != FORMAT:
-            raise BadInput(f"not a recording of format {FORMAT}", file=path)
-        table = file.read()
-    except OSError as error:
-        raise BadInput(f"cannot read: {error}", file=path) from None
+        with cannot("read", file=path):
+            file = pq.ParquetFile(path)
+            about = json.loads((file.schema_arrow.metadata or {}).get(b"cosim", b"null"))
+            if not isinstance(about, dict) or about.get("format") != FORMAT:
+                raise BadInput(f"not a recording of format {FORMAT}", file=path)
+            table = file.read()
     except (pa.ArrowException, ValueError) as error:
         raise BadInput(f"not a recording: {error}", file=path) from None
     fill = {"route": -1, "target_speed": float("nan")}

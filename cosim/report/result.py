@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from cosim.files import whole, writing
+from cosim.files import cannot, whole
 from cosim.report.figures import EPISODE
 from cosim.types import EpisodeResult, Metric
 
@@ -55,7 +55,7 @@ def write_folder(folder: Path, result: EpisodeResult, outputs: Sequence[str] = (
     }
     old = [*folder.glob("replay*.html"), *folder.glob("replay*.mp4"), *folder.glob("replay*.gif")]
     old += [file for file in (folder / "outputs").glob("*.xml") if file.stem not in outputs]
-    with writing(file=folder, field="--out"):
+    with cannot("write", file=folder, field="--out"):
         for file in old:
             file.unlink()
         for name, text in texts.items():

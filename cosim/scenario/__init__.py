@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import sumo_scenarios
-from cosim.errors import BadInput, hint, one_of
+from cosim.errors import BadInput, check_pattern, hint, one_of
 from cosim.files import yaml_input
 from cosim.files.xml_input import is_there, regular_file
+from cosim.files.yaml_input import NonNegative, Positive
 from cosim.scenario import sumocfg
 from cosim.scenario.behaviors import AS_IS, DRIVER_MODELS, LC2013, MIXED, load_behaviors
 from cosim.types import Preset, Timing
@@ -33,8 +34,8 @@ class Mission:
 class Zone:
     """A conflict zone as written in scenario.yaml: edges, internal edges (":J") included."""
 
-    name: str
-    edges: tuple[str, ...]
+    name: str = ""
+    edges: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,25 +134,40 @@ def load(
     )
 
 
+@dataclass(frozen=True, slots=True)
+class _WorldFile:
+    """scenario.yaml as written."""
+
+    name: str = ""
+    title: str = ""
+    duration: Positive = FOREIGN_DURATION
+    warmup: NonNegative = 0.0
+    timing: Timing = Timing()
+    preset: str = Preset.UNGUARDED
+    demand: str = ""
+    fleet: Fleet = Fleet()
+    mission: Mission = Mission()
+    conflict_zones: tuple[Zone, ...] = ()
+
+
 def _world(name: str) -> Scenario:
     """One of our worlds: its scenario.yaml over its .sumocfg."""
     folder = sumo_scenarios.folder(name)
     file = folder / "scenario.yaml"
-    known = ("name", "title", "duration", "warmup", "timing", "preset", "demand", "fleet", "mission")
-    top = yaml_input.read(file, (*known, "conflict_zones"))
-    if top.text("name", name) != name:
-        raise BadInput("differs from its folder's name", file=file, field="name", value=top.text("name"))
+    top = yaml_input.read(file, _WorldFile)
+    if top.name not in ("", name):
+        raise BadInput("differs from its folder's name", file=file, field="name", value=top.name)
     config = sumocfg.read(folder / f"{name}.sumocfg")
     demands = {_demand_name(path): path for path in sorted((folder / "demand").glob("*.rou.xml"))}
     if not demands:
         raise BadInput("holds no *.rou.xml", file=file, field="demand", value=str(folder / "demand"))
-    demand = top.choice("demand", demands, next(iter(demands)))
-    fleet = top.section("fleet", ("type", "ids", "penetration"))
-    mission = top.section("mission", ("kind", "vehicles", "goal"))
-    zones = top.sections("conflict_zones", ("name", "edges"))
+    demand = one_of(top.demand or next(iter(demands)), demands, "demand", file)
+    one_of(top.mission.kind, MISSIONS, "mission.kind", file)
+    check_pattern(top.mission.vehicles, "mission.vehicles", file)
+    _check_timing(top.timing, file, "timing.step", top.timing.step)
     return Scenario(
         name=name,
-        title=top.text("title") or "",
+        title=top.title,
         definition=file,
         config=config.path,
         net=config.net,
@@ -162,17 +178,13 @@ def _world(name: str) -> Scenario:
         options=config.options,
         ignored=config.ignored,
         begin=config.begin,
-        warmup=top.number("warmup", low=0.0) or 0.0,
-        duration=top.number("duration", low=0.0, above=True) or FOREIGN_DURATION,
-        timing=_timing(top.section("timing", ("step", "frame", "decision")), file),
-        preset=top.choice("preset", Preset.ALL, Preset.UNGUARDED),
-        mission=Mission(
-            mission.choice("kind", MISSIONS, "auto"), mission.pattern("vehicles") or "", mission.names("goal")
-        ),
-        zones=tuple(Zone(z.text("name") or f"zone{i}", z.names("edges")) for i, z in enumerate(zones)),
-        fleet=_checked_fleet(
-            Fleet(fleet.text("type"), fleet.pattern("ids"), fleet.number("penetration")), file, "fleet."
-        ),
+        warmup=top.warmup,
+        duration=top.duration,
+        timing=top.timing,
+        preset=one_of(top.preset, Preset.ALL, "preset", file),
+        mission=top.mission,
+        zones=tuple(replace(z, name=z.name or f"zone{i}") for i, z in enumerate(top.conflict_zones)),
+        fleet=_checked_fleet(top.fleet, file, "fleet."),
     )
 
 
@@ -259,17 +271,6 @@ def _default_behavior(scenario: Scenario) -> str:
     return "moderate" if scenario.demand_name == "contested" else MIXED
 
 
-def _timing(section: yaml_input.Section, file: Path) -> Timing:
-    default = Timing()
-    timing = Timing(
-        section.number("step", low=0.0, above=True) or default.step,
-        section.number("frame", low=0.0, above=True) or default.frame,
-        section.number("decision", low=0.0, above=True) or default.decision,
-    )
-    _check_timing(timing, file, "timing.step", timing.step)
-    return timing
-
-
 def _check_timing(timing: Timing, file: object, field: str, value: object) -> None:
     """Each clock must be a whole number of the one below it (definitions.md, Time)."""
     for name, long, short in (
@@ -284,7 +285,7 @@ def _check_timing(timing: Timing, file: object, field: str, value: object) -> No
 
 def _checked_fleet(fleet: Fleet, file: object = None, prefix: str = "--av-") -> Fleet:
     if fleet.ids is not None:
-        yaml_input.check_pattern(fleet.ids, file, f"{prefix}ids")
+        check_pattern(fleet.ids, f"{prefix}ids", file)
     share = fleet.penetration
     if share is not None and not 0.0 <= share <= 1.0:
         field = "--penetration" if file is None else f"{prefix}penetration"

@@ -4,15 +4,25 @@ from __future__ import annotations
 
 import hashlib
 import platform
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from cosim.errors import inside
+from cosim.files.yaml_input import mapping, value_of
 from cosim.scenario import Scenario
 
 POLICY_FILES = "policy_files"  # what decides how the policy drives: weights, or its own code
+_KINDS: Mapping[str, Any] = {  # what is read again of the documents of `cosim run` and `cosim evaluate`
+    **dict.fromkeys(("files", POLICY_FILES, "sumo_options", "units", "better"), Mapping[str, str]),
+    "versions": Mapping[str, str | None],
+    "sumo_arguments": tuple[str, ...],
+    "seed": int,
+    "seeds": tuple[int, int],
+    "trace_hash": str,
+}
 PACKAGES = ("cosim", "libsumo", "numpy", "numba", "torch")
 
 
@@ -37,6 +47,25 @@ def manifest(scenario: Scenario, seed: int) -> dict[str, Any]:
         "versions": {"python": platform.python_version(), **{p: _version(p) for p in PACKAGES}},
         "files": digests(scenario.files),
     }
+
+
+def checked(document: object, file: Path, where: str = "") -> dict[str, Any]:
+    """`document`, a manifest as `file` has it (there called `where`), with what is read again of its kind.
+
+    Raises:
+        BadInput: a field of another type, in the manifest itself or in those of its cells.
+    """
+    with inside(where, file):
+        found = mapping(document)
+        for name in found.keys() & _KINDS.keys():
+            with inside(name):
+                value_of(_KINDS[name], found[name])
+    cells = checked(found["cells"], file, "cells") if "cells" in found else {}
+    for name in cells:
+        cell = checked(cells[name], file, f"cells.{name}")
+        for part in cell.keys() & {"case", "manifest"}:
+            checked(cell[part], file, f"cells.{name}.{part}")
+    return found
 
 
 def digests(files: Iterable[Path]) -> dict[str, str]:

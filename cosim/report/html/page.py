@@ -11,7 +11,7 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from cosim.files import whole, writing
+from cosim.files import cannot, whole
 from cosim.report import wording
 from cosim.report.figures import HEADLINE, Row
 from cosim.report.html import tables
@@ -46,7 +46,7 @@ def write(run: Run, path: Path | None = None, shown: str | None = None) -> Path:
     """
     path = run.path / FILE if path is None else path
     text = html(run, shown)
-    with writing("cannot write the report", value=str(path)), whole(path) as draft:
+    with cannot("write the report", value=str(path)), whole(path) as draft:
         draft.write_text(text, encoding="utf-8")
     return path
 

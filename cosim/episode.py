@@ -11,7 +11,7 @@ import numpy as np
 
 from cosim.control import to_commands
 from cosim.metrics import MetricContext, Metrics
-from cosim.observation import Observer
+from cosim.observation.observer import Observer
 from cosim.scenario import Scenario
 from cosim.scenario.manifest import manifest
 from cosim.seeding import generator

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import hashlib
 import platform
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from cosim.scenario import Scenario
+from cosim.scenario.episode_id import Case
+from cosim.scenario.sumocfg import CLOCK, INPUTS, command_line, keeps
 
 POLICY_FILES = "policy_files"  # what decides how the policy drives: weights, or its own code
+CASE, OPTIONS = "case", "sumo_arguments"  # what `cosim run --out` adds
 PACKAGES = ("cosim", "libsumo", "numpy", "numba", "torch")
 
 
@@ -37,6 +40,20 @@ def manifest(scenario: Scenario, seed: int) -> dict[str, Any]:
         "versions": {"python": platform.python_version(), **{p: _version(p) for p in PACKAGES}},
         "files": digests(scenario.files),
     }
+
+
+def remembered(case: Case, options: Sequence[str]) -> dict[str, Any]:
+    """What a manifest has to hold beside the usual so that `cosim replay` finds the episode again.
+
+    Outputs are left out: a replay does not write them again.
+    """
+    kept: list[str] = []
+    for name, value in command_line(options).items():
+        if name in INPUTS:
+            value = ",".join(str(Path(part.strip()).absolute()) for part in value.split(","))
+        if name in (*INPUTS, *CLOCK) or keeps(name):
+            kept += [f"--{name}={value}"]
+    return {CASE: case.document(), OPTIONS: kept}
 
 
 def digests(files: Iterable[Path]) -> dict[str, str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import importlib
 import signal
 import sys
 import threading
@@ -22,7 +23,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if "--" in arguments:
         cut = arguments.index("--")
         arguments, options = arguments[:cut], arguments[cut + 1 :]
-    args = parser().parse_args(arguments)
+    args = parser(*arguments[:1]).parse_args(arguments)
     args.sumo_options = options
     try:
         if options and not getattr(args, "passes_on", False):
@@ -71,15 +72,15 @@ class _Version(argparse.Action):
         parser.exit(message=f"cosim {version_of('cosim') or 'is not installed'}\n")
 
 
-def parser() -> argparse.ArgumentParser:
-    """Every verb and flag."""
+def parser(verb: str = "") -> argparse.ArgumentParser:
+    """Every flag of one verb, or of all."""
     top = argparse.ArgumentParser(
         prog="cosim", description="Altruistic cooperative driving in mixed traffic on SUMO."
     )
     top.add_argument("--version", action=_Version, nargs=0, help="cosim's version")
     verbs = top.add_subparsers(required=True, metavar="VERB")
-    for verb in VERBS:
-        verb.add(verbs)
+    for name in (verb,) if verb in VERBS else VERBS:
+        importlib.import_module(f"cosim.cli.{name.replace('-', '_')}").add(verbs)
     return top
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import platform
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
@@ -13,6 +13,8 @@ from typing import Any
 from cosim.errors import inside
 from cosim.files.yaml_input import mapping, value_of
 from cosim.scenario import Scenario
+from cosim.scenario.episode_id import Case
+from cosim.scenario.sumocfg import CLOCK, INPUTS, command_line, keeps
 
 POLICY_FILES = "policy_files"  # what decides how the policy drives: weights, or its own code
 _KINDS: Mapping[str, Any] = {  # what is read again of the documents of `cosim run` and `cosim evaluate`
@@ -23,6 +25,7 @@ _KINDS: Mapping[str, Any] = {  # what is read again of the documents of `cosim r
     "seeds": tuple[int, int],
     "trace_hash": str,
 }
+CASE, OPTIONS = "case", "sumo_arguments"  # what `cosim run --out` adds
 PACKAGES = ("cosim", "libsumo", "numpy", "numba", "torch")
 
 
@@ -66,6 +69,20 @@ def checked(document: object, file: Path, where: str = "") -> dict[str, Any]:
         for part in cell.keys() & {"case", "manifest"}:
             checked(cell[part], file, f"cells.{name}.{part}")
     return found
+
+
+def remembered(case: Case, options: Sequence[str]) -> dict[str, Any]:
+    """What a manifest has to hold beside the usual so that `cosim replay` finds the episode again.
+
+    Outputs are left out: a replay does not write them again.
+    """
+    kept: list[str] = []
+    for name, value in command_line(options).items():
+        if name in INPUTS:
+            value = ",".join(str(Path(part.strip()).absolute()) for part in value.split(","))
+        if name in (*INPUTS, *CLOCK) or keeps(name):
+            kept += [f"--{name}={value}"]
+    return {CASE: case.document(), OPTIONS: kept}
 
 
 def digests(files: Iterable[Path]) -> dict[str, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
 
 from cosim.errors import BadInput, hint
@@ -11,27 +12,23 @@ from cosim.types import Policy
 LEARNING = ("vfn-p", "vfn", "vfn-p-egoistic", "safe-dqn", "conv3d-dqn", "conv3d-a2c", "conv2d-dqn")
 
 
-def _prediction_aware(name: str) -> Callable[[], Policy]:
-    def build() -> Policy:
-        from policy.agents.prediction_aware import PredictionAware  # torch: only when it is asked for
+def _lazily(module: str, kind: str, *arguments: str) -> Callable[[], Policy]:
+    """A policy's class by name: its module (torch, compiled kernels) is imported when one is made."""
 
-        return PredictionAware(name)
+    def build() -> Policy:
+        made: Policy = getattr(importlib.import_module(f"policy.agents.{module}"), kind)(*arguments)
+        return made
 
     return build
 
 
-def _rules() -> dict[str, Callable[[], Policy]]:
-    from policy.agents.altruist_rule import AltruistRule
-    from policy.agents.idm import Idm, IdmCourteous
-    from policy.agents.keep_lane import KeepLane
-    from policy.agents.random import Random
-
-    return {c.name: c for c in (Idm, IdmCourteous, KeepLane, Random, AltruistRule)}
-
-
 POLICIES: dict[str, Callable[[], Policy]] = {
-    **_rules(),
-    **{name: _prediction_aware(name) for name in LEARNING},
+    "idm": _lazily("idm", "Idm"),
+    "idm-courteous": _lazily("idm", "IdmCourteous"),
+    "keep-lane": _lazily("keep_lane", "KeepLane"),
+    "random": _lazily("random", "Random"),
+    "altruist-rule": _lazily("altruist_rule", "AltruistRule"),
+    **{name: _lazily("prediction_aware", "PredictionAware", name) for name in LEARNING},
 }
 
 

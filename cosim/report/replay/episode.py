@@ -19,9 +19,9 @@ from cosim.recording.watched import Watched
 from cosim.report import run_folder
 from cosim.scenario import Scenario
 from cosim.scenario.episode_id import Case
-from cosim.scenario.manifest import POLICY_FILES, checked, manifest, named
+from cosim.scenario.manifest import CASE, OPTIONS, POLICY_FILES, checked, manifest, named
 from cosim.scenario.policy_name import label, read
-from cosim.scenario.sumocfg import CLOCK, INPUTS, command_line, keeps
+from cosim.scenario.sumocfg import keeps
 from cosim.scenario.vet import vetted
 from cosim.types import EpisodeResult
 from cosim.workers.progress import Progress
@@ -31,7 +31,6 @@ from cosim.workers.worker import Worker
 MANIFEST = "manifest.json"
 ABSENT = "no such file: a folder of cosim run --out or cosim evaluate is needed"
 MOST_NAMED = 8  # episodes of one seed
-CASE, OPTIONS = "case", "sumo_arguments"  # what `cosim run --out` adds to the manifest
 
 
 class ReplayDiffers(CosimError):
@@ -54,20 +53,6 @@ class Recorded:
     def name(self) -> str:
         """Of the files that are drawn."""
         return f"replay-{self.case.key}" if (self.folder / "episodes.parquet").exists() else "replay"
-
-
-def remembered(case: Case, options: Sequence[str]) -> dict[str, Any]:
-    """What a manifest has to hold beside the usual so that `find` finds the episode again.
-
-    Outputs are left out: a replay does not write them again.
-    """
-    kept: list[str] = []
-    for name, value in command_line(options).items():
-        if name in INPUTS:
-            value = ",".join(str(Path(part.strip()).absolute()) for part in value.split(","))
-        if name in (*INPUTS, *CLOCK) or keeps(name):
-            kept += [f"--{name}={value}"]
-    return {CASE: case.document(), OPTIONS: kept}
 
 
 def find(folder: Path, episode: str | None) -> Recorded:

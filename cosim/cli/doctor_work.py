@@ -16,6 +16,7 @@ from importlib import metadata, util
 from pathlib import Path
 
 OK, WARN, FAIL = "ok", "warn", "FAIL"
+DISTRIBUTION = "cosim-sumo"  # cosim's name on a package index
 # What `import libsumo` misses on a bare Debian or Ubuntu (docs/sumo.md).
 APT_LINE = "apt-get install libx11-6 libxext6 libxrender1 libgl1 libatomic1"
 # One version for all of them: libsumo and sumolib are pinned together, eclipse-sumo rebuilds the nets.
@@ -90,7 +91,7 @@ def version_of(package: str) -> str | None:
 def requirements() -> list[str]:
     """The distributions that cosim's own metadata asks for, but for extras and SUMO's."""
     with suppress(metadata.PackageNotFoundError):
-        asked = [text for text in metadata.requires("cosim") or [] if "extra ==" not in text]
+        asked = [text for text in metadata.requires(DISTRIBUTION) or [] if "extra ==" not in text]
         names = [re.split(r"[^\w.-]", text, maxsplit=1)[0] for text in asked]
         return [name for name in names if name not in SUMO_PACKAGES]
     return []
@@ -98,7 +99,7 @@ def requirements() -> list[str]:
 
 def packages(version: Callable[[str], str | None]) -> Iterator[Check]:
     """cosim and what it imports."""
-    own = version("cosim")
+    own = version(DISTRIBUTION)
     if own is None:
         yield Check("cosim", FAIL, "is not installed", "pip install -e . -c constraints.txt")
     else:

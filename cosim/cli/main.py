@@ -10,6 +10,7 @@ import threading
 import traceback
 from collections.abc import Iterator, Sequence
 
+from cosim import __version__
 from cosim.cli import VERBS
 from cosim.errors import BadInput, CosimError
 
@@ -62,21 +63,12 @@ def _terminable() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-class _Version(argparse.Action):
-    """Looked up when it is asked for: no other command has to wait for it, or needs cosim to be installed."""
-
-    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
-        from cosim.cli.doctor_work import version_of
-
-        parser.exit(message=f"cosim {version_of('cosim') or 'is not installed'}\n")
-
-
 def parser() -> argparse.ArgumentParser:
     """Every verb and flag."""
     top = argparse.ArgumentParser(
         prog="cosim", description="Altruistic cooperative driving in mixed traffic on SUMO."
     )
-    top.add_argument("--version", action=_Version, nargs=0, help="cosim's version")
+    top.add_argument("--version", action="version", version=f"cosim {__version__}", help="cosim's version")
     verbs = top.add_subparsers(required=True, metavar="VERB")
     for verb in VERBS:
         verb.add(verbs)

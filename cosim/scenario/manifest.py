@@ -13,7 +13,8 @@ from typing import Any
 from cosim.scenario import Scenario
 
 POLICY_FILES = "policy_files"  # what decides how the policy drives: weights, or its own code
-PACKAGES = ("cosim", "libsumo", "numpy", "numba", "torch")
+# A name in the manifest -> the distribution whose version it is.
+PACKAGES = {"cosim": "cosim-sumo", "libsumo": "libsumo", "numpy": "numpy", "numba": "numba", "torch": "torch"}
 
 
 def manifest(scenario: Scenario, seed: int) -> dict[str, Any]:
@@ -34,7 +35,10 @@ def manifest(scenario: Scenario, seed: int) -> dict[str, Any]:
         },
         "sumo_options": dict(scenario.options),
         "options_not_passed_on": list(scenario.ignored),
-        "versions": {"python": platform.python_version(), **{p: _version(p) for p in PACKAGES}},
+        "versions": {
+            "python": platform.python_version(),
+            **{name: _version(distribution) for name, distribution in PACKAGES.items()},
+        },
         "files": digests(scenario.files),
     }
 
@@ -60,9 +64,9 @@ def named(files: Iterable[Path]) -> dict[str, Path]:
 
 
 @lru_cache
-def _version(package: str) -> str | None:
+def _version(distribution: str) -> str | None:
     try:
-        return metadata.version(package)
+        return metadata.version(distribution)
     except metadata.PackageNotFoundError:
         return None
 

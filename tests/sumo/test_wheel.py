@@ -101,7 +101,9 @@ def test_the_agent_drives_from_the_wheel_is_evaluated_reported_and_replayed(inst
     assert {file: file.stat().st_mtime_ns for file in installed.home.rglob("*.nb[ci]")} == kernels
 
     matrix = ("--scenario", "merge", "--policy", "idm", "--policy", "altruist-rule", "--seeds", "0:2")
-    installed.command("evaluate", *matrix, "--duration", "2", "--workers", "2", "--no-report", "--out", "batch")
+    installed.command(
+        "evaluate", *matrix, "--duration", "2", "--workers", "2", "--no-report", "--out", "batch"
+    )
     groups = json.loads((work / "batch" / "summary.json").read_text())["groups"]
     assert sum(group["episodes"] for group in groups) == 4
     installed.command("report", "batch")

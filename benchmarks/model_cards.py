@@ -31,8 +31,8 @@ MAPS_UNUSED = (
 )
 MAPS_ONLY = "It sees nothing but maps, brakes for whatever is near, and has been trained for minutes only."
 DRIVING_LIMITS = (
-    "It learned from a scripted demonstrator (`altruist-rule` and a cruise rule, docs/training.md) as well as "
-    "from rewards, and chooses as that does in most states: what rewards added has not been measured apart.",
+    "It learned from a scripted demonstrator (`altruist-rule` and a cruise rule, docs/training.md) as well "
+    "as from rewards, and chooses as that does in most states: what rewards added has not been measured apart.",
     "The human drivers of its training never err. It knows no traffic light, no speed limit of a junction's "
     "lane, no pedestrian and no bicycle; in `unguarded` it drives through red lights.",
 )
@@ -86,8 +86,8 @@ def driving(name: str, card: Card) -> Iterator[str]:
     )
     hours = sum(row["iteration_s"] for row in log) / 3600
     yield (
-        f"- Shipped: iteration {last['iteration']}, after {last['updates']:,} updates and {hours:.1f} hours by "
-        f"its log; the best mean reward in {training['validation']} validation drives a case on tuning seeds."
+        f"- Shipped: iteration {last['iteration']}, after {last['updates']:,} updates and {hours:.1f} hours "
+        f"by its log; the best mean reward in {training['validation']} validation drives a case on tuning seeds."
     )
     yield from ("- Measured (test seeds, preset `unguarded`):", "", *measured(name), "")
     yield from (
@@ -136,7 +136,8 @@ def predicting(name: str, card: Card) -> Iterator[str]:
         )
         yield "- Predicts each vehicle's trajectory for 4 s (docs/prediction.md)."
         page, unit = "docs/results/prediction.md", "m"
-    yield f"- Data: {train['episodes']} recorded episodes, by {len(recorded)} commands such as `{recorded[0]}`."
+    count = len(recorded)
+    yield f"- Data: {train['episodes']} episodes, recorded by {count} commands such as `{recorded[0]}`."
     yield f"- Training: {training}, {steps} updates." + (
         f" {data['note'].capitalize()}." if "note" in data else ""
     )

@@ -69,7 +69,7 @@ class Store:
         except ArgumentError:
             raise BadInput("is no database URL", field="--store", value=url) from None
         except ModuleNotFoundError as error:
-            problem = f"needs the package {error.name} (pip install 'cosim[postgresql]')"
+            problem = f"needs the package {error.name} (pip install 'cosim-sumo[postgresql]')"
             raise BadInput(problem, field="--store", value=self._shown) from None
         except SQLAlchemyError as error:
             raise BadInput(_first_line(error), field="--store", value=self._shown) from None

@@ -19,6 +19,7 @@ from pathlib import Path
 from cosim.cli import arguments
 
 OK, WARN, FAIL = "ok", "warn", "FAIL"
+DISTRIBUTION = "cosim-sumo"  # cosim's name on a package index
 INSTALL = "pip install -e . -c constraints.txt"
 REINSTALL = "pip install --force-reinstall libsumo"
 # What `import libsumo` misses on a bare Debian or Ubuntu (docs/sumo.md).
@@ -102,7 +103,7 @@ def version_of(package: str) -> str | None:
 def requirements() -> list[str]:
     """The distributions that cosim's own metadata asks for, but for extras and SUMO's."""
     with suppress(metadata.PackageNotFoundError):
-        asked = [text for text in metadata.requires("cosim") or [] if "extra ==" not in text]
+        asked = [text for text in metadata.requires(DISTRIBUTION) or [] if "extra ==" not in text]
         names = [re.split(r"[^\w.-]", text, maxsplit=1)[0] for text in asked]
         return [name for name in names if name not in SUMO_PACKAGES]
     return []
@@ -110,7 +111,7 @@ def requirements() -> list[str]:
 
 def packages(version: Callable[[str], str | None]) -> Iterator[Check]:
     """cosim and what it imports."""
-    own = version("cosim")
+    own = version(DISTRIBUTION)
     yield Check("cosim", OK, own) if own else Check("cosim", FAIL, "is not installed", INSTALL)
     found = {name: version(name) for name in requirements()}
     if missing := [name for name, number in found.items() if number is None]:

@@ -11,6 +11,7 @@ import threading
 import traceback
 from collections.abc import Iterator, Sequence
 
+from cosim import __version__
 from cosim.cli import VERBS
 from cosim.errors import BadInput, CosimError
 
@@ -67,9 +68,8 @@ class _Version(argparse.Action):
     """Looked up when it is asked for: no other command has to wait for it, or needs cosim to be installed."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
-        from cosim.cli.doctor import version_of
 
-        parser.exit(message=f"cosim {version_of('cosim') or 'is not installed'}\n")
+        parser.exit(message=f"cosim {__version__}\n")
 
 
 def parser(verb: str = "") -> argparse.ArgumentParser:

@@ -124,9 +124,9 @@ def work(args: argparse.Namespace) -> int:
 
 def _drive(args: argparse.Namespace, case: Case, worker: Worker) -> int:
     """The worker is loading meanwhile, and is not waited for when something is wrong."""
-    from cosim.report import result as output
     from cosim.files import prepare_folder
     from cosim.policies import check
+    from cosim.report import result as output
     from cosim.scenario import sumo_outputs
     from cosim.scenario.manifest import remembered
     from cosim.scenario.vet import vetted

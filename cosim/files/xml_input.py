@@ -2,7 +2,7 @@
 
 SUMO itself answers a bad file with "Process Error", with gigabytes of memory or with SIGSEGV
 (docs/sumo.md); everything SUMO is handed therefore passes through `scan` first. The
-parser is expat with defusedxml's three refusals (entities, external references, foreign encodings) and
+parser is expat with three refusals (entities, external references, foreign encodings) and
 caps on depth, token length and unpacked size; memory does not grow with the file.
 """
 

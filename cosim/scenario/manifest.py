@@ -26,7 +26,8 @@ _KINDS: Mapping[str, Any] = {  # what is read again of the documents of `cosim r
     "trace_hash": str,
 }
 CASE, OPTIONS = "case", "sumo_arguments"  # what `cosim run --out` adds
-PACKAGES = ("cosim", "libsumo", "numpy", "numba", "torch")
+# A name in the manifest -> the distribution whose version it is.
+PACKAGES = {"cosim": "cosim-sumo", "libsumo": "libsumo", "numpy": "numpy", "numba": "numba", "torch": "torch"}
 
 
 def manifest(scenario: Scenario, seed: int) -> dict[str, Any]:
@@ -47,7 +48,10 @@ def manifest(scenario: Scenario, seed: int) -> dict[str, Any]:
         },
         "sumo_options": dict(scenario.options),
         "options_not_passed_on": list(scenario.ignored),
-        "versions": {"python": platform.python_version(), **{p: _version(p) for p in PACKAGES}},
+        "versions": {
+            "python": platform.python_version(),
+            **{name: _version(distribution) for name, distribution in PACKAGES.items()},
+        },
         "files": digests(scenario.files),
     }
 
@@ -106,9 +110,9 @@ def named(files: Iterable[Path]) -> dict[str, Path]:
 
 
 @lru_cache
-def _version(package: str) -> str | None:
+def _version(distribution: str) -> str | None:
     try:
-        return metadata.version(package)
+        return metadata.version(distribution)
     except metadata.PackageNotFoundError:
         return None
 

@@ -49,7 +49,7 @@ def test_a_sumo_package_of_another_version_is_named() -> None:
 
 
 def test_missing_packages_are_listed_with_the_line_that_installs_them() -> None:
-    versions = {"cosim": "0.1.0", "numpy": "2.0"}
+    versions = {"cosim-sumo": "0.1.0", "numpy": "2.0"}
     checks = list(doctor.packages(versions.get))
     assert [check.state for check in checks] == [OK, FAIL, OK]
     assert "torch" in checks[1].detail

@@ -64,20 +64,12 @@ def _terminable() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-class _Version(argparse.Action):
-    """Looked up when it is asked for: no other command has to wait for it, or needs cosim to be installed."""
-
-    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
-
-        parser.exit(message=f"cosim {__version__}\n")
-
-
 def parser(verb: str = "") -> argparse.ArgumentParser:
     """Every flag of one verb, or of all."""
     top = argparse.ArgumentParser(
         prog="cosim", description="Altruistic cooperative driving in mixed traffic on SUMO."
     )
-    top.add_argument("--version", action=_Version, nargs=0, help="cosim's version")
+    top.add_argument("--version", action="version", version=f"cosim {__version__}", help="cosim's version")
     verbs = top.add_subparsers(required=True, metavar="VERB")
     for name in (verb,) if verb in VERBS else VERBS:
         importlib.import_module(f"cosim.cli.{name.replace('-', '_')}").add(verbs)

@@ -15,7 +15,7 @@ from cosim.errors import BadInput
 from cosim.policies import check
 from cosim.recording import Folder, RecordingSimulator, write
 from cosim.runner import Runner
-from cosim.scenario import Scenario
+from cosim.scenario import Scenario, place
 from cosim.scenario.episode_id import Case
 from cosim.scenario.manifest import manifest
 from cosim.scenario.policy_name import read
@@ -41,7 +41,7 @@ def cases(
         check(policy)
     found = [
         Case(
-            what=what,
+            what=place(what),
             demand=(demand,) if demand else (),
             policy=policy,
             behavior=behavior or None,

@@ -17,7 +17,11 @@ def add(verbs: arguments.Verbs) -> None:
         "processes; one Parquet file an episode, written whole.",
     )
     record.add_argument(
-        "--scenario", action="append", required=True, metavar="WHAT", help="a world or a .sumocfg; repeatable"
+        "--scenario",
+        action="append",
+        required=True,
+        metavar="WHAT",
+        help="a world, its folder or a .sumocfg; repeatable",
     )
     record.add_argument(
         "--demand", action="append", default=[], metavar="NAME|FILE", help="repeatable; one recording each"

@@ -19,6 +19,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from sumo_scenarios import names
+
 RESULTS = Path("docs/results")
 PREDICTED = (  # what `cosim bench predict` leaves of figures
     *("position_error.png", "map_error.png", "hpn_training.png"),
@@ -77,8 +79,7 @@ def performance(place: Place) -> list[list[str]]:
     if place.small:
         record += ["--scenario", "merge", "--seeds", "100000:100001", "--duration", "8"]
     else:
-        worlds = ("exit", "merge", "roundabout", "intersection", "highway")
-        record += [word for world in worlds for word in ("--scenario", world)] + ["--seeds", "100000:100004"]
+        record += [word for world in names() for word in ("--scenario", world)] + ["--seeds", "100000:100004"]
     flags = ["--recordings", where, "--out", str(place.out / "performance.md")]
     return [record, ["benchmarks.performance", *flags, *(["--small"] if place.small else [])]]
 

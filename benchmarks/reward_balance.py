@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.worlds import WITH_MISSION
 from cosim.episode import Episode, Hook, Step, run_episode
 from cosim.learning.configuration import configuration
 from cosim.learning.rollouts import Rollout
@@ -28,7 +29,6 @@ from policy.training.config import agent_config
 from policy.training.curriculum import Lesson
 from policy.training.explorer import Explorer
 
-WORLDS = ("merge", "exit", "roundabout", "intersection")
 PHI = math.radians(60.0)
 TRIED = {
     "P: 1/d, a mission vehicle counts 1": RewardConfig(mission=1.0),
@@ -109,7 +109,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     first, last = map(int, args.seeds.split(":"))
-    worlds = args.scenario or list(WORLDS)
+    worlds = args.scenario or WITH_MISSION
     file = configuration("compact").file
     agent = agent_config("vfn-p", file)
     progress, done = Progress("reward balance", "episodes"), 0

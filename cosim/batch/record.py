@@ -15,6 +15,7 @@ from cosim.batch.spec import Spec
 from cosim.errors import BadInput
 from cosim.policies import check
 from cosim.recording import Folder, Recorder, write
+from cosim.scenario import place
 from cosim.scenario.episode_id import Case
 from cosim.scenario.policy_name import read
 from cosim.workers.engines import LocalEngine
@@ -36,7 +37,7 @@ def planned(
 ) -> Plan:
     """Every combination; what is left out is the scenario's own. Raises BadInput."""
     spec = Spec(
-        scenario=tuple(scenarios),
+        scenario=tuple(map(place, scenarios)),
         demand=tuple((demand,) for demand in demands) or ((),),
         behavior=tuple(behaviors) or (None,),
         policy=tuple(read(policy).text for policy in policies),

@@ -33,7 +33,7 @@ _GLOB = re.compile(r"[*?\[]")
 class Spec:
     """The axes of the matrix; every combination of one value each is a cell, driven once per seed."""
 
-    scenario: tuple[str, ...]  # names of worlds, absolute paths of .sumocfg
+    scenario: tuple[str, ...]  # names of worlds, absolute paths of their folders or of .sumocfg
     seeds: tuple[int, int] = (FIRST_TEST_SEED, FIRST_TEST_SEED + 1)  # first, and one past the last
     demand: tuple[tuple[str, ...], ...] = ((),)  # each: names or files driven together; (): the scenario's
     policy: tuple[str, ...] = ("idm",)  # as `cosim.scenario.policy_name` has it, files absolute
@@ -87,7 +87,7 @@ def read(path: Path | None, flags: Mapping[str, Any]) -> Spec:
     source: object = "command line" if path is None else path
     if "scenario" not in values:
         known = ", ".join(sumo_scenarios.names())
-        raise BadInput(f"name at least one: {known}, or a .sumocfg", file=source, field="scenario")
+        raise BadInput(f"name at least one: {known}, a folder or a .sumocfg", file=source, field="scenario")
     return _checked(Spec(**values), source)
 
 

@@ -24,7 +24,7 @@ def add(verbs: arguments.Verbs) -> None:
         description="Measure every predictor on recorded episodes; records what it needs itself unless "
         "--recordings names a folder of `cosim record`.",
     )
-    predict.add_argument("--scenario", action="append", default=[], metavar="S", help="repeatable (all five)")
+    predict.add_argument("--scenario", action="append", default=[], metavar="S", help="repeatable (all)")
     predict.add_argument("--behavior", action="append", default=[], choices=BEHAVIORS, help="repeatable")
     predict.add_argument("--demand", action="append", default=[], metavar="NAME", help="repeatable")
     predict.add_argument("--policy", action="append", default=[], metavar="NAME", help="repeatable")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from cosim.cli import arguments
 from cosim.errors import BadInput
 from cosim.files.xml_input import is_there
-from cosim.scenario import BEHAVIORS
+from cosim.scenario import BEHAVIORS, place
 from cosim.scenario.behaviors import DRIVER_MODELS
 from cosim.scenario.episode_id import Case
 from cosim.scenario.policy_name import label, read
@@ -34,7 +34,9 @@ def add(verbs: arguments.Verbs) -> None:
         help="drive one episode of a scenario",
         description="Drive one episode. Everything after -- goes to SUMO as it stands.",
     )
-    run.add_argument("what", metavar="WHAT", help="a scenario's name (cosim scenarios) or any .sumocfg")
+    run.add_argument(
+        "what", metavar="WHAT", help="a scenario's name (cosim scenarios), a world's folder or any .sumocfg"
+    )
     run.add_argument(
         "--demand",
         action="append",
@@ -184,8 +186,8 @@ def _drive(args: argparse.Namespace, case: Case, worker: Worker) -> int:
 def case_of(args: argparse.Namespace) -> Case:
     """The episode that the flags describe; files by absolute path, so that it can be found again."""
     return Case(
-        what=_place(args.what),
-        demand=tuple(map(_place, args.demand)),
+        what=place(args.what),
+        demand=tuple(map(_demand, args.demand)),
         policy=read(args.policy).text,
         behavior=args.behavior,
         driver_model=args.driver_model,
@@ -200,7 +202,7 @@ def case_of(args: argparse.Namespace) -> Case:
     )
 
 
-def _place(name: str) -> str:
-    """A file's absolute path; a name of ours, and whatever is wrong, as it is."""
+def _demand(name: str) -> str:
+    """A file's absolute path; a demand's name, and whatever is wrong, as it is."""
     is_file = ("." in name or "/" in name) and is_there(Path(name))
     return str(Path(name).absolute()) if is_file else name

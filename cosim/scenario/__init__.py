@@ -1,8 +1,9 @@
-"""What to simulate: one of our worlds by name, or any user's .sumocfg, read into one `Scenario`."""
+"""What to simulate: a world by name or by its folder, or any user's .sumocfg, read into one `Scenario`."""
 
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from cosim.scenario.behaviors import AS_IS, DRIVER_MODELS, LC2013, MIXED, load_b
 from cosim.types import Preset, Timing
 
 BEHAVIORS = load_behaviors().names
+DEFINITION = "scenario.yaml"  # what makes a folder a world
 FOREIGN_DURATION = 60.0  # s, for a .sumocfg that names no end
 MISSIONS = ("merge", "exit", "roundabout", "intersection", "none", "auto")
 
@@ -76,14 +78,19 @@ class Scenario:
     demand_name: str = "as-is"
     behavior: str = AS_IS
     driver_model: str = LC2013
-    demands: Mapping[str, Path] | None = None  # name -> file, of a built-in world
+    demands: Mapping[str, Path] | None = None  # name -> file, of a world
     title: str = ""
-    definition: Path | None = None  # the scenario.yaml of a built-in world
+    definition: Path | None = None  # the scenario.yaml of a world
     warnings: tuple[str, ...] = ()  # what `cosim.scenario.vet` found odd: reasons not to compare the result
 
     @property
     def built_in(self) -> bool:
+        """A world, ours or a user's, whose scenario.yaml says everything; not a bare .sumocfg."""
         return self.demands is not None
+
+    @property
+    def ships(self) -> bool:
+        return self.definition is not None and self.definition.parent.parent == sumo_scenarios.ROOT
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -105,7 +112,7 @@ def load(
     duration: float | None = None,
     options: Sequence[str] = (),
 ) -> Scenario:
-    """The scenario `what` (a world's name or a .sumocfg), with what the command line says otherwise.
+    """The scenario `what` (a world's name or folder, a .sumocfg), with what the command line says otherwise.
 
     `demand`: names of the world's demands or files; `options`: SUMO options as typed after `--`, which win
     over the file's. `duration` in s. Only this file's own syntax is checked: `cosim.scenario.vet` reads the
@@ -115,7 +122,12 @@ def load(
         BadInput: names file (or option), field and value, with the nearest name where one is near.
     """
     chosen = sumocfg.command_line(options)
-    scenario = _world(what) if what in sumo_scenarios.names() else _foreign(what)
+    if what in sumo_scenarios.names():
+        scenario = _world(sumo_scenarios.folder(what))
+    elif is_there(Path(what) / DEFINITION):
+        scenario = _world(Path(os.path.abspath(what)))
+    else:
+        scenario = _foreign(what)
     if demand:
         scenario = _with_demand(scenario, demand)
     scenario = _with_sumo_options(scenario, chosen)
@@ -150,13 +162,26 @@ class _WorldFile:
     conflict_zones: tuple[Zone, ...] = ()
 
 
-def _world(name: str) -> Scenario:
-    """One of our worlds: its scenario.yaml over its .sumocfg."""
-    folder = sumo_scenarios.folder(name)
-    file = folder / "scenario.yaml"
+def place(what: str) -> str:
+    """`what` as it is found from anywhere: a folder or file by its absolute path, a world's name as it is."""
+    is_path = what not in sumo_scenarios.names() and is_there(Path(what))
+    return os.path.abspath(what) if is_path else what
+
+
+def _world(folder: Path) -> Scenario:
+    """A world, ours or a user's: its scenario.yaml over its NAME.sumocfg.
+
+    A user's may be in a folder of another name than its own, but may not be called as one that ships.
+    """
+    file = folder / DEFINITION
     top = yaml_input.read(file, _WorldFile)
-    if top.name not in ("", name):
-        raise BadInput("differs from its folder's name", file=file, field="name", value=top.name)
+    name, ships = top.name or folder.name, folder.parent == sumo_scenarios.ROOT
+    if ships and name != folder.name:
+        raise BadInput("differs from its folder's name", file=file, field="name", value=name)
+    if not ships and name in sumo_scenarios.names():
+        raise BadInput(
+            "is the name of a world that ships: name yours otherwise", file=file, field="name", value=name
+        )
     config = sumocfg.read(folder / f"{name}.sumocfg")
     demands = {_demand_name(path): path for path in sorted((folder / "demand").glob("*.rou.xml"))}
     if not demands:
@@ -191,10 +216,10 @@ def _world(name: str) -> Scenario:
 def _foreign(what: str) -> Scenario:
     """Somebody's .sumocfg: its own duration, types and options; our clocks."""
     path = Path(what)
-    names = sumo_scenarios.names()
     if not is_there(path) and path.suffix != ".sumocfg":
-        problem = f"no such scenario{hint(what, names)}"
-        raise BadInput(problem, field="scenario", value=what)
+        sumo_scenarios.folder(what)  # raises, with the nearest name
+    if path.is_dir():
+        raise BadInput(f"a world's folder holds {DEFINITION}", field="scenario", value=what)
     config = sumocfg.read(regular_file(path, file=None, field="scenario"))
     if config.end is not None and config.end <= config.begin:
         raise BadInput("ends before it begins", file=path, field="end", value=f"{config.end:g}")

@@ -12,8 +12,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from policy.training.loop import Line, LoopConfig, Progress, train
-from policy.training.networks import adam_tensors, restore_adam
+from policy.training.loop import Line, LoopConfig, Progress, Task, train
 
 Batch = Mapping[str, torch.Tensor]  # name -> [S,...], S the same for all
 Loss = Callable[[Batch], torch.Tensor]
@@ -30,44 +29,32 @@ class FitConfig:
     seed: int = 0
 
 
-class FitTask:
-    """`policy.training.loop.Task` of one network and one loss."""
+class FitTask(Task):
+    """Training of one network by one loss; arguments as in `fit`."""
 
     def __init__(
         self, network: nn.Module, loss: Loss, config: FitConfig, examples: Batch, validation: Batch
     ) -> None:
-        self._network, self._loss, self._config = network, loss, config
-        self._examples = examples
+        self._loss, self._config, self._examples = loss, config, examples
         stride = max(len(next(iter(validation.values()))) // CHECKED, 1)
-        self._validation = {name: tensor[::stride] for name, tensor in validation.items()}
-        self._count = len(next(iter(examples.values())))
-        self._optimizer = torch.optim.Adam(network.parameters(), config.learning_rate)
+        checked = {name: tensor[::stride] for name, tensor in validation.items()}
+        adam = torch.optim.Adam(network.parameters(), config.learning_rate)
+        super().__init__(network, adam, self._rate, [(checked, 1)])
 
-    def update(self, number: int) -> Line:
-        """See `Task.update`."""
+    def _rate(self, number: int) -> float:
         c = self._config
-        rng = np.random.default_rng((c.seed, number))  # of this step alone: going on changes nothing
-        rows = torch.from_numpy(rng.integers(0, self._count, c.batch))
-        value = self._loss({name: tensor[rows] for name, tensor in self._examples.items()})
-        self._optimizer.zero_grad(set_to_none=True)
-        value.backward()  # type: ignore[no-untyped-call]
-        for group in self._optimizer.param_groups:
-            group["lr"] = 0.5 * c.learning_rate * (1.0 + math.cos(math.pi * number / c.steps))
-        self._optimizer.step()
-        return {"loss": float(value.detach())}
+        return 0.5 * c.learning_rate * (1.0 + math.cos(math.pi * number / c.steps))
 
-    def validate(self) -> Line:
-        """See `Task.validate`."""
-        with torch.no_grad():
-            return {"loss": float(self._loss(self._validation))}
+    def batch(self, number: int) -> Batch:
+        """See `Task.batch`."""
+        rng = np.random.default_rng((self._config.seed, number))
+        count = len(next(iter(self._examples.values())))
+        rows = torch.from_numpy(rng.integers(0, count, self._config.batch))
+        return {name: tensor[rows] for name, tensor in self._examples.items()}
 
-    def tensors(self) -> dict[str, torch.Tensor]:
-        """See `Task.tensors`."""
-        return adam_tensors({"network": self._network}, self._optimizer)
-
-    def restore(self, tensors: Mapping[str, torch.Tensor]) -> None:
-        """See `Task.restore`."""
-        restore_adam(tensors, {"network": self._network}, self._optimizer)
+    def losses(self, batch: Batch) -> dict[str, torch.Tensor]:
+        """See `Task.losses`."""
+        return {"loss": self._loss(batch)}
 
 
 def fit(

@@ -10,7 +10,7 @@ import numpy as np
 from cosim.road import LanePath, RoadMap
 from cosim.types import HEADING, LENGTH, SPEED, WIDTH, Bools, Floats, X, Y
 from policy.forecast import KinematicForecast
-from policy.motion import Rollout, fronts, pack, project_many, roll_out
+from policy.motion import Rollout, fronts, pack, project_many, roll
 from policy.predictors.protocol import Predictor
 from policy.scene import Scene
 
@@ -86,8 +86,8 @@ def predict_traffic(
     end = np.array([p.length if p.dead_end else np.inf for p in paths])
     limit = np.array([road.lanes[k].speed_limit for k in lanes]) * c.speed_factor
     top = np.maximum(limit, now[on_lane, SPEED])[:, None] if len(lanes) else np.zeros((0, 1))
-    along = roll_out(
-        packed,
+    along = roll(
+        *packed,
         arc,
         offset,
         aim,

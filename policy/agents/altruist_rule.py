@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from cosim.types import Decision, History, MetaAction, PolicyContext
-from policy.agents.idm import NO_MAPS, wished_gap
+from policy.agents.idm import Idm, desired_gap
 from policy.meeting import CAR, LANE, Meeting, Seen, along, meet, missions
 
 
@@ -39,20 +39,17 @@ class Need(NamedTuple):
     meeting: Meeting
 
 
-class AltruistRule:
+class AltruistRule(Idm):
     """Left if the left lane is free, else slower; at junctions slower, far upstream."""
 
     name = "altruist-rule"
-    label = ""
-    observation = NO_MAPS
-    av_parameters: Mapping[str, str] = {}
 
     def __init__(self, config: AltruistConfig = AltruistConfig()) -> None:
         self._config = config
 
     def reset(self, context: PolicyContext) -> None:
         """A new episode: nobody has been served yet."""
-        self._road = context.road
+        super().reset(context)
         self._served: set[str] = set()
         self._guide: dict[str, Need] = {}  # mission vehicle -> its guide
 
@@ -78,7 +75,7 @@ class AltruistRule:
 
     def _need(self, av: str, history: History, mission: str, seen: Seen) -> Need | None:
         """Whether this AV's way meets the mission vehicle's, and where; None when it does not."""
-        guide, meeting = self._guide.get(mission), meet(self._road, history, seen)
+        guide, meeting = self._guide.get(mission), meet(self.context.road, history, seen)
         if guide is not None and self._is_served(guide, av, history, seen, meeting):
             self._served.add(mission)
             return None
@@ -90,7 +87,7 @@ class AltruistRule:
         if own is None or seen.lane < 0:
             return False
         if guide.meeting.crossing:
-            return self._road.lanes[seen.lane].internal or seen.lane in own.lanes
+            return self.context.road.lanes[seen.lane].internal or seen.lane in own.lanes
         return meeting is not None and guide.av == av and seen.lane in own.lanes[:3]
 
     def _choose(self, mission: str, candidates: list[Need]) -> Need | None:
@@ -149,6 +146,6 @@ class AltruistRule:
         if own is None:
             return False
         for ahead, other in along(history, own):
-            if ahead > 0.0 and ahead - CAR < 1.1 * wished_gap(speed, min(other, speed)):
+            if ahead > 0.0 and ahead - CAR < 1.1 * desired_gap(speed, min(other, speed)):
                 return True
         return False

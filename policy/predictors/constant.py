@@ -54,5 +54,4 @@ def newest(kinematics: Floats, valid: Bools) -> tuple[Floats, Bools]:
 def _straight(now: Floats, speed: Floats, known: Bools, dt: float) -> KinematicForecast:
     heading = np.repeat(now[:, HEADING, None], speed.shape[1], 1)
     x, y = integrate_position(now, speed, heading, dt)
-    zero = np.zeros_like(speed)
-    return KinematicForecast(x, y, speed, heading, zero, zero, zero, zero, known)
+    return KinematicForecast.without_spread(x, y, speed, heading, known)

@@ -9,7 +9,7 @@ import numpy as np
 from cosim.control import MAX_DECEL, TIME_CONSTANT, next_target, tracked_speeds
 from cosim.types import Floats, Floats32, History, MetaAction, PolicyContext
 from policy.agents.altruist_rule import AltruistRule
-from policy.agents.idm import ACCEL, wished_gap
+from policy.agents.idm import ACCEL, desired_gap
 from policy.meeting import CAR, along
 
 YIELD = 2.0  # preference for what the scripted altruist commands: all others are below 0
@@ -61,7 +61,7 @@ class Demonstrator:
         leaders = [] if own is None else [(x, v) for x, v in along(history, own) if x > 0.0]
         if leaders:
             ahead, other = min(leaders)
-            press = (wished_gap(speed, other, TIME_GAP) / max(ahead - CAR, 0.5)) ** 2
+            press = (desired_gap(speed, other, TIME_GAP) / max(ahead - CAR, 0.5)) ** 2
         free = 1.0 - (speed / (limit + EAGER)) ** 4
         fits = np.full(len(MetaAction), NEVER, np.float32)
         fits[list(LONGITUDINAL)] = self._fits(ACCEL * (free - press), speed, target, limit)

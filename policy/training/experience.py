@@ -77,14 +77,18 @@ def states(chosen: list[tuple[Trajectory, int]], phi: Floats32, device: str = "c
 
 def states_without_maps(
     chosen: list[tuple[Trajectory, int]], phi: Floats32, device: str
-) -> tuple[torch.Tensor, ...]:
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Kinematics [B,T,R,F+1], situation [B,.] and phi [B,2] of `States`; arguments as in `states`."""
-    found = (
+    kinematics, situation, direction = (
         np.stack([trajectory.kinematics[t] for trajectory, t in chosen]).astype(np.float32),
         np.stack([trajectory.situation[t] for trajectory, t in chosen]),
         np.stack([np.cos(phi), np.sin(phi)], 1).astype(np.float32),
     )
-    return tuple(torch.from_numpy(array).to(device) for array in found)
+    return (
+        torch.from_numpy(kinematics).to(device),
+        torch.from_numpy(situation).to(device),
+        torch.from_numpy(direction).to(device),
+    )
 
 
 def save(path: Path, trajectories: list[Trajectory]) -> None:

@@ -36,7 +36,8 @@ class Explorer(PredictionAware):
     """`PredictionAware` whose first few AVs explore with the learner's weights.
 
     The others act greedily with `frozen` ones, so that one AV's transitions do not depend on what its
-    neighbours explore (semi-sequential training, P algorithm 4; T, section IV). `episode` must be called after `reset`.
+    neighbours explore (semi-sequential training, P algorithm 4; T, section IV). `episode` must be called
+    after `reset`.
     """
 
     def __init__(self, name: str, config: AgentConfig, explore: ExploreConfig) -> None:
@@ -188,6 +189,17 @@ class Explorer(PredictionAware):
             for name in STATE:
                 recorded[name].append(recorded[name][-1])
         frames = np.concatenate(recorded.pop("frames"))[: self.observation.frames + count * self._stride]
-        arrays = {name: np.stack(values[: count + (name in STATE)]) for name, values in recorded.items()}
-        where = {"episode": self._label, "av": av, "stride": self._stride, "phi": self._context.svo}
-        self.done.append(Trajectory(frames=frames, ending=ending, **where, **arrays))
+        arrays: dict[str, Any] = {
+            name: np.stack(values[: count + (name in STATE)]) for name, values in recorded.items()
+        }
+        self.done.append(
+            Trajectory(
+                episode=self._label,
+                av=av,
+                stride=self._stride,
+                frames=frames,
+                phi=self._context.svo,
+                ending=ending,
+                **arrays,
+            )
+        )

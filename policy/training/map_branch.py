@@ -76,7 +76,7 @@ class MapTask(Task):
             np.stack([s.next_valid[: c.block] for s in batch]),
             self._device,
         )
-        guess, rows = self.network([past], moved)
+        guess, rows = self.network(past, moved)
         square = (guess - wanted) ** 2
         weight = 1.0 + (t.weight - 1.0) * (wanted > 0.05)
         known = after[..., -1:]

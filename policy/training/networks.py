@@ -18,7 +18,7 @@ class Optimized:
     """
 
     def __init__(
-        self, networks: Mapping[str, nn.Module], optimizer: torch.optim.Optimizer, clip: float | None
+        self, networks: dict[str, nn.Module], optimizer: torch.optim.Optimizer, clip: float | None
     ) -> None:
         self._networks, self._optimizer, self._clip = networks, optimizer, clip
 

@@ -14,7 +14,7 @@ import torch
 from torch import nn
 
 from cosim.types import Bools, Floats
-from policy.gaussian_process import GaussianProcessBank, Operators
+from policy.gaussian_process import GaussianProcessBank, Operators, trapezoid
 from policy.kernel_prior import PriorNetwork, describe
 from policy.predictors.gp import GaussianProcessDirect, GaussianProcessIndirect
 from policy.predictors.learned import KinematicNet, NetConfig, features, integrate
@@ -92,10 +92,9 @@ class BankMath(nn.Module):
         self.unit, self.kernels, self.steps = bank.config.unit, len(bank.kernels), bank.horizon
         each = np.concatenate([op.predict, op.drift[None]]).reshape(frames + 1, self.kernels, self.steps)
         self.register_buffer("table", _tensor(each.swapaxes(0, 1).reshape(-1, self.steps)), persistent=False)
-        trapezoid = np.tril(np.full((bank.horizon, bank.horizon), bank.dt))
-        trapezoid[np.diag_indices(bank.horizon)] = 0.5 * bank.dt
-        both = np.concatenate([each, each @ trapezoid.T], 2).reshape(frames + 1, -1)
-        for name, values in (("both", both), ("variance", op.variance), ("integral", trapezoid.T)):
+        integral = trapezoid(bank.horizon, bank.dt).T
+        both = np.concatenate([each, each @ integral], 2).reshape(frames + 1, -1)
+        for name, values in (("both", both), ("variance", op.variance), ("integral", integral)):
             self.register_buffer(name, _tensor(values), persistent=False)
 
     def forward(

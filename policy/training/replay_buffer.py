@@ -60,7 +60,7 @@ class Batch(NamedTuple):
 class Advised(NamedTuple):
     """B states with what was demonstrated there."""
 
-    now: tuple[torch.Tensor | None, *tuple[torch.Tensor, ...]]  # `States`; no maps where they cost too much
+    now: tuple[torch.Tensor | None, torch.Tensor, torch.Tensor, torch.Tensor]  # `States`, maps or none
     possible: torch.Tensor  # [B,A] bool, actions that were safe
     wrong: torch.Tensor  # [B,A] bool, those of them that the demonstrator would not have taken
 

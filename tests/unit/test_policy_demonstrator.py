@@ -9,7 +9,7 @@ import pytest
 from policy_scenes import LIMIT, Car, histories, straight_road
 
 from cosim.types import COMPACT, MetaAction, PolicyContext, Timing
-from policy.agents.idm import ACCEL, wished_gap
+from policy.agents.idm import ACCEL, desired_gap
 from policy.meeting import CAR
 from policy.training.demonstrator import EAGER, TIME_GAP, Demonstrator
 
@@ -23,7 +23,7 @@ def test_a_learner_that_sees_maps_alone_is_shown_what_can_be_seen(wished: float,
     speed = 20.0
     # IDM's wish by the gap alone, behind somebody as fast: free road less (wished gap / gap)^2
     free = ACCEL * (1.0 - (speed / (LIMIT + EAGER)) ** 4)
-    gap = wished_gap(speed, speed, TIME_GAP) / math.sqrt((free - wished) / ACCEL)
+    gap = desired_gap(speed, speed, TIME_GAP) / math.sqrt((free - wished) / ACCEL)
     shown = []
     for target in (5.0, 20.0, 25.0):
         cars = [Car("a", 100.0, 0, speed, is_av=True, target=target), Car("b", 100.0 + gap + CAR, 0, speed)]

@@ -28,7 +28,8 @@ class KinematicForecast(NamedTuple):
         cls, x: Floats, y: Floats, speed: Floats, heading: Floats, valid: Bools
     ) -> KinematicForecast:
         """States [V,M] of a predictor that does not know its error; valid [V]."""
-        return cls(x, y, speed, heading, *[np.zeros_like(x)] * 4, valid)
+        zero = np.zeros_like(x)
+        return cls(x, y, speed, heading, zero, zero, zero, zero, valid)
 
 
 @compiled

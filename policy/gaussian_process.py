@@ -87,7 +87,7 @@ class GaussianProcessBank:
         Args:
             values: [S,n] oldest first.
             log_prior: [K] or [S,K] log weight of each kernel, uniform when None.
-            temperature: divides the log marginal likelihood, which is too sure where no kernel is quite right.
+            temperature: divides the log marginal likelihood, too sure where no kernel is right.
 
         Returns:
             moments [S,M] in the series' own unit, and of the integral, unit * s.

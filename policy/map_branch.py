@@ -55,9 +55,7 @@ class MapBranch(nn.Module):
         super().__init__()
         self.config = c = config
         size = (c.height, c.width)
-        self._stages: list[
-            tuple[Size, Size, Size]
-        ] = []  # convolution: what it sees, yields; pooling after it
+        self._stages: list[tuple[Size, Size, Size]] = []  # size a convolution sees, size it yields, pooling
         widths = [c.inputs, *c.features]
         self.encoder = nn.ModuleList()
         for k in range(3):

@@ -165,9 +165,9 @@ class VFN(nn.Module):
         situation: torch.Tensor,
         phi: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Log-preferences [B,5] (not normalised) and state values [B] (T, figure 4); arguments as in `forward`.
+        """Log-preferences [B,5] (not normalised) and state values [B] (T, figure 4).
 
-        Raises ValueError when the network has no critic (`VfnConfig.critic`).
+        Arguments as in `forward`. Raises ValueError when the network has no critic (`VfnConfig.critic`).
         """
         if self.state is None or not self.config.critic:
             raise ValueError("this network has no critic")

@@ -7,6 +7,7 @@ import hashlib
 import json
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +60,7 @@ def train(args: argparse.Namespace) -> int:
     else:
         task = KinematicTask(variant.kinematic, training.kinematics, loop.updates, *sets, args.device)
     progress = Progress(f"train {name}", "updates")
-    layout = hpn.layout(name, training, data)
+    layout = {"hpn": asdict(variant), "training": asdict(training), "data": data}
     log = supervised.train(task, loop, folder, layout=layout, resume=args.resume, progress=progress)
     progress.done()
     file_name = folder / f"{name}.safetensors"

@@ -1,4 +1,4 @@
-"""What stands in the way of the ego's futures: first contacts, and the gaps around it."""
+"""First contacts of the ego's futures with other vehicles, and the gaps around it."""
 
 from __future__ import annotations
 
@@ -49,9 +49,18 @@ def others_near(
 
 
 def first_contact(ego: Rollout, length: float, width: float, others: Others, c: SafetyConfig) -> Floats:
-    """When the ego's box (m) first touches each other's: [A,O] s, inf for never.
+    """When the ego's box first touches each other's (P, algorithm 2).
 
     Between two frames both boxes keep their velocity, so nothing is jumped over.
+
+    Args:
+        ego: [A,T+1] its futures.
+        length, width: m, of its box.
+        others: the O vehicles near it.
+        c: margins and time step.
+
+    Returns:
+        [A,O] s, inf for never.
     """
     mine = Boxes(ego.x, ego.y, ego.heading, length + c.margin_length, width + c.margin_width, ego.speed)
     touch = first_contacts(mine, others.boxes, c.dt)
@@ -96,12 +105,19 @@ def gap_margin(
 ) -> tuple[Floats, Ints]:
     """The score [A] s that the gaps around the ego leave, and which of the others limits it [A].
 
-    stopping [A] m: the ego's way to standstill; speed: now, m/s; changes [A]: to another lane.
     Leader: if it brakes with `leader_brake` from now on, and the ego as hard as it can from its next decision
     on, they must not touch; one that shares its intentions brakes no earlier than they say. A lane change
     further needs the place beside the ego, and a new follower that need not brake harder than
     `follower_brake`. At the limit the score is safe_th, below it falls with the gap. Decelerating never makes
     a gap smaller.
+
+    Args:
+        stopping: [A] m, the ego's way to standstill.
+        speed: its speed now, m/s.
+        changes: [A] leads to another lane.
+        near: how the others stand to the path of every action.
+        others: the O vehicles near it.
+        c: limits.
     """
     speeds = np.asarray(others.boxes.speed)
     soon = speeds[:, min(round(c.reaction / c.dt), speeds.shape[1] - 1)]

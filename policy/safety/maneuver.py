@@ -101,7 +101,7 @@ class Futures(NamedTuple):
     stopping: Floats  # [A] m until standstill, when Decelerate follows from the next decision on
 
     def shared(self, action: int) -> list[Floats]:
-        """The intention that is shared [6][T+1]: of one step of Decelerate, not of braking to a standstill."""
+        """The intention that is shared [6][T+1]: of one step of Decelerate alone."""
         row = len(ACTIONS) if action == SLOWER else action
         return [array[row] for array in self.under]
 

@@ -68,18 +68,10 @@ def collate(moments: Sequence[Moment], device: str = "cpu") -> Batch:
         seen.append(place[all_[other]])
         first += int(m.known.sum())
 
-    def joined(name: str) -> torch.Tensor:
-        return torch.from_numpy(np.concatenate([getattr(m, name)[m.known] for m in moments])).to(device)
-
-    return Batch(
-        joined("own"),
-        joined("near"),
-        joined("lane"),
-        joined("gp"),
-        joined("truth"),
-        torch.from_numpy(np.concatenate(looking)).to(device),
-        torch.from_numpy(np.concatenate(seen)).to(device),
-    )
+    names = ("own", "near", "lane", "gp", "truth")
+    vehicles = [np.concatenate([getattr(m, name)[m.known] for m in moments]) for name in names]
+    pairs = [np.concatenate(looking), np.concatenate(seen)]
+    return Batch(*(torch.from_numpy(array).to(device) for array in vehicles + pairs))
 
 
 def _near(egos: Floats32, others: Floats32) -> Bools:

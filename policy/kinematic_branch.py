@@ -125,7 +125,7 @@ class Corrected(NamedTuple):
         """[B,V,M] `sureness` of every vehicle in the picture of each AV; ego [B] are their places."""
         logit = self.seen[None] + self.looking[ego][:, None] + 4.0
         out: Floats = 1.0 / (1.0 + np.exp(-logit.astype(np.float64)))
-        out[np.arange(len(ego)), ego] = 1.0  # everybody is in the middle of his own picture
+        out[np.arange(len(ego)), ego] = 1.0  # every AV is in the middle of its own picture
         return out
 
 

@@ -173,9 +173,9 @@ def roll(
         for t in range(frames):
             if t > 0:
                 v_next = speed[k, t]
-                room = stop[k] - s
-                if room < 200.0:
-                    v_next = min(v_next, np.sqrt(max(2.0 * brake * room, 0.0)))
+                distance = stop[k] - s
+                if distance < 200.0:
+                    v_next = min(v_next, np.sqrt(max(2.0 * brake * distance, 0.0)))
                 s = min(s + 0.5 * dt * (v + v_next), max(stop[k], s))
                 v = v_next
                 drift = min(rate[k], left / dt)

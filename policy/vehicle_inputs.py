@@ -188,14 +188,14 @@ def _next_on_path(
             for j in range(count):
                 if place[j] != lanes[k] or j == i or owner[j] != owner[i]:
                     continue
-                room = begins[k] + position[j] * scale[i] - length[j] - front[i]
-                if room < -3.0 or room > 150.0 or room >= gap[i, 1]:
+                ahead = begins[k] + position[j] * scale[i] - length[j] - front[i]
+                if ahead < -3.0 or ahead > 150.0 or ahead >= gap[i, 1]:
                     continue
-                if room < gap[i, 0]:
+                if ahead < gap[i, 0]:
                     gap[i, 1], who[i, 1] = gap[i, 0], who[i, 0]
-                    gap[i, 0], who[i, 0] = room, j
+                    gap[i, 0], who[i, 0] = ahead, j
                 else:
-                    gap[i, 1], who[i, 1] = room, j
+                    gap[i, 1], who[i, 1] = ahead, j
     return who, gap
 
 

@@ -18,7 +18,7 @@ from cosim.recording import Folder, read
 from cosim.road import RoadMap
 from cosim.types import COMPACT, Bytes, Floats32
 from policy.inner_features import painted
-from policy.map_error import MapPredictors, frame_of, vehicle_channels
+from policy.map_error import MapPredictors, frame_of, unit_maps, vehicle_channels
 from policy.predictors import make_predictor
 
 SHOWN = (0.2, 1.0, 2.0, 3.0, 4.0)  # s, columns of a chain's picture
@@ -106,8 +106,7 @@ def _interest(now: Followed, av: str) -> float:
 
 def picture(maps: Floats32 | Bytes) -> Floats32:
     """One map [C,H,W] in colours [H,W,3]: road grey, AVs blue, HVs orange, ego and mission green."""
-    scale = 255.0 if maps.dtype == np.uint8 else 1.0
-    m = np.clip(np.asarray(maps, np.float32) / scale, 0.0, 1.0)
+    m = np.clip(unit_maps(maps), 0.0, 1.0)
     out = np.repeat(0.25 * m[2][..., None], 3, -1)
     for channel, colour in ((0, (0.35, 0.65, 1.0)), (1, (1.0, 0.6, 0.2)), (3, (0.4, 1.0, 0.4))):
         value = np.sqrt(m[channel])[..., None]

@@ -1,4 +1,4 @@
-"""Training of the value networks from a configuration file: the roof over trainer and rollouts."""
+"""Training of the value networks from a configuration file: joins trainer and rollouts."""
 
 from __future__ import annotations
 
@@ -97,8 +97,6 @@ def _scheduled(training: VfnTraining, args: argparse.Namespace, name: str) -> Vf
         )
     if name.endswith("-egoistic"):  # the twin never weighs anybody's interest but its own
         training = replace(training, svo=(0.0,), replay=replace(training.replay, phi=(0.0, 0.0)))
-    if args.iterations is not None:
-        training = replace(training, iterations=args.iterations)
-    if args.seed is not None:
-        training = replace(training, seed=args.seed)
-    return replace(training, learning=APPROACHES[name].learning)
+    given = {field: getattr(args, field) for field in ("iterations", "seed")}
+    changes = {field: value for field, value in given.items() if value is not None}
+    return replace(training, learning=APPROACHES[name].learning, **changes)

@@ -26,7 +26,7 @@ class AltruistConfig:
     crawl: float = 2.0  # the guide waits upstream of a junction (on the grid: it stops)
     pace_below: float = 5.0  # beside an ending lane the guide drives this much slower than the other
     pace_min: float = 5.0  # and never slower than this
-    clear: float = 10.0  # a free left lane: this much room ahead and behind,
+    clear: float = 10.0  # a free left lane: this much space ahead and behind,
     clear_time: float = 0.8  # s of a follower's way on top,
     max_closing: float = 3.0  # m/s that a follower there may be faster,
     closing_time: float = 3.0  # s of what the two close in on each other

@@ -19,7 +19,7 @@ class Predictor(Protocol):
         """Forecast V vehicles M frames ahead.
 
         Args:
-            kinematics: [V,N,>=4] x m, y m, speed m/s, heading rad (unwrapped), oldest first; nan where unknown.
+            kinematics: [V,N,>=4] x m, y m, speed m/s, heading rad (unwrapped), oldest first; nan: unknown.
             valid: [V,N] perceived in that frame.
 
         Returns:

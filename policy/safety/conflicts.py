@@ -64,7 +64,7 @@ def first_contact(ego: Rollout, length: float, width: float, others: Others, c: 
     """
     mine = Boxes(ego.x, ego.y, ego.heading, length + c.margin_length, width + c.margin_width, ego.speed)
     touch = first_contacts(mine, others.boxes, c.dt)
-    close = (touch == 0.0).any(0)  # within the margin already: only the cars themselves tell actions apart
+    close = (touch == 0.0).any(0)  # within the margin already: only without the margins do actions differ
     if close.any():
         exact = mine._replace(length=length, width=width)
         touch[:, close] = first_contacts(exact, _only(others.boxes, close), c.dt)
@@ -176,8 +176,8 @@ def _tightest(
             if changes[a]:
                 if behind[a, k]:
                     closing = max(speed[k] - own_speed, 0.0)
-                    room = speed[k] * follower_reaction + closing * closing / (2 * follower_brake)
-                    ratio = gap[a, k] / (follower_gap + room)
+                    needed = speed[k] * follower_reaction + closing * closing / (2 * follower_brake)
+                    ratio = gap[a, k] / (follower_gap + needed)
                 if in_lane[a, k] and gap[a, k] < standstill_gap:
                     ratio = 0.0
             if ratio < best[a]:

@@ -6,7 +6,7 @@ import zipfile
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -38,7 +38,9 @@ class Trajectory:
     unsafe: Bools  # [D+1, A] what the prioritizer masked
     action: npt.NDArray[np.int8]  # [D] carried out
     vetoed: npt.NDArray[np.int8]  # [D] the preferred action that was masked, or -1
-    wrong: Bools  # [D,A] what the demonstrator would not have done, though safe; none: it had no opinion
+    wrong: (
+        Bools  # [D,A] what the demonstrator would not have done, though safe; none: nothing was demonstrated
+    )
     terms: Floats32  # [D,3] reward terms: ego, AVs, HVs (equation 6)
     interacting: Bools  # [D] near a mission vehicle, or vetoed: drawn more often
     yielding: Bools  # [D] the demonstrator would have yielded to a mission vehicle here
@@ -93,14 +95,11 @@ def states_without_maps(
 
 def save(path: Path, trajectories: list[Trajectory]) -> None:
     """Write trajectories to one compressed .npz, whole or not at all: nothing in it is ever unpickled."""
-    arrays: dict[str, Any] = {"count": np.array(len(trajectories))}
-    for k, trajectory in enumerate(trajectories):
-        for name, value in vars(trajectory).items():
-            arrays[f"{k}.{name}"] = np.asarray(value)
+    arrays = {f"{k}.{name}": value for k, one in enumerate(trajectories) for name, value in vars(one).items()}
     # mostly zeros: level 1 will do
     deflated = partial(zipfile.ZipFile, compression=zipfile.ZIP_DEFLATED, compresslevel=1)
     with whole(path) as draft, deflated(draft, "w") as file:
-        for name, value in arrays.items():
+        for name, value in {"count": len(trajectories), **arrays}.items():
             with file.open(f"{name}.npy", "w", force_zip64=True) as part:
                 np.lib.format.write_array(part, np.asarray(value), allow_pickle=False)
 

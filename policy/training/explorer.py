@@ -75,7 +75,7 @@ class Explorer(PredictionAware):
         if self._learners:
             self._choose_learners(inputs)
         scene = inputs.scene
-        advice = np.zeros((len(scene.agents), len(MetaAction)), np.float32)  # no opinion
+        advice = np.zeros((len(scene.agents), len(MetaAction)), np.float32)  # nothing demonstrated
         if self._advised:
             advice = self._demonstrator.preferences(dict(zip(scene.agents, scene.histories, strict=True)))
         q = advice if self._guided else self._explored(self.values(inputs), inputs)

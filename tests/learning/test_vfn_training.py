@@ -50,7 +50,7 @@ def trajectory(
     vetoed: list[int] | None = None,
     near: bool = True,
 ) -> Trajectory:
-    """A drive whose states are told apart by one number of the situation: `situation` [D+1]."""
+    """A drive whose states differ in one number of the situation: `situation` [D+1]."""
     d = len(actions)
     states = np.zeros((d + 1, SITUATION_INPUTS), np.float32)
     for t, place in enumerate(situation or range(d + 1)):

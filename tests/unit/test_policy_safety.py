@@ -260,7 +260,7 @@ def test_a_follower_knows_that_its_leader_is_about_to_brake() -> None:
         Car("front", 112.0, 0, 20.0, is_av=True),
         Car("wall", 150.0, 0, 0.0),
     ]
-    assert decide(cars[:2], road)["rear"].action == IDLE, "close, but it would be told"
+    assert decide(cars[:2], road)["rear"].action == IDLE, "close, but the intention would be shared"
     shared = decide(cars, road)
     assert shared["front"].action == SLOWER
     assert shared["rear"].action == SLOWER

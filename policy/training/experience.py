@@ -38,9 +38,7 @@ class Trajectory:
     unsafe: Bools  # [D+1, A] what the prioritizer masked
     action: npt.NDArray[np.int8]  # [D] carried out
     vetoed: npt.NDArray[np.int8]  # [D] the preferred action that was masked, or -1
-    wrong: (
-        Bools  # [D,A] what the demonstrator would not have done, though safe; none: nothing was demonstrated
-    )
+    wrong: Bools  # [D,A] what the demonstrator would not have done, though safe; none: no demonstration
     terms: Floats32  # [D,3] reward terms: ego, AVs, HVs (equation 6)
     interacting: Bools  # [D] near a mission vehicle, or vetoed: drawn more often
     yielding: Bools  # [D] the demonstrator would have yielded to a mission vehicle here

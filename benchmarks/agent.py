@@ -40,8 +40,8 @@ from policy.agents.approaches import AgentConfig, compact, paper
 from policy.agents.prediction_aware import PredictionAware
 from policy.training.config import agent_config
 from policy.training.curriculum import Drive, Drove, Lesson
-from policy.training.ddqn import Learner
-from policy.training.replay import Replay
+from policy.training.ddqn import DdqnLearner
+from policy.training.replay_buffer import ReplayBuffer
 
 SIZES: Mapping[str, Callable[[str], AgentConfig]] = {"compact": compact, "paper": paper}
 POLICY = "vfn-p"
@@ -117,8 +117,8 @@ def training(config: str, lesson: Lesson, episodes: int) -> dict[str, float]:
     """
     file = configuration(config).file
     agent = agent_config(POLICY, file)
-    learner = Learner(agent.vfn, file.training.ddqn, seed=0)
-    replay = Replay(file.training.replay)
+    learner = DdqnLearner(agent.vfn, file.training.ddqn, seed=0)
+    replay = ReplayBuffer(file.training.replay)
     with Rollouts(1, POLICY, agent, file.explore, file.reward) as actors:
 
         def drive(seed: int) -> Any:

@@ -144,7 +144,7 @@ def map_branch(config: MapBranchConfig, horizon: int, rounds: int) -> dict[str, 
         window = past
         with torch.inference_mode():
             for _ in range(steps):
-                guess = step([window], rows)[0]
+                guess = step(window, rows)[0]
                 window = torch.cat([window, guess.to(window.dtype)], 1)[:, -seen:]
 
     note("eager", median_ms(lambda: chain(branch), rounds))

@@ -18,7 +18,7 @@ CAR = 5.0  # m, between the centres of two cars that touch
 
 
 class Seen(NamedTuple):
-    """The mission vehicle as one AV perceives it and tells the others."""
+    """The mission vehicle as one AV perceives it and shares it with the others."""
 
     lane: int  # index into RoadMap.lanes
     lane_position: float  # m, front bumper
@@ -57,7 +57,7 @@ def meet(road: RoadMap, history: History, seen: Seen) -> Meeting | None:
         mine, other, right = beside
         return Meeting((mine - history.route.arc) - (other - place), False, right, seen.speed)
     if not (np.isfinite(own.conflict) and _crosses_junction(road, theirs)):
-        return None  # not our affair: we drive beside the lane they want
+        return None  # no conflict: the own lane lies beside the one they want
     if _same_approach(road, own, theirs):
         return None
     behind = history.route.conflict_distance - max(theirs.conflict - place, 0.0)

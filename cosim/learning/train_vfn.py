@@ -1,4 +1,4 @@
-"""Training of the value networks from a configuration file: the roof over trainer and rollouts."""
+"""Training of the value networks from a configuration file: joins trainer and rollouts."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from policy.agents.approaches import APPROACHES
 from policy.checkpoint import sha256
 from policy.training.config import agent_config
 from policy.training.curriculum import Lesson, VfnTraining
-from policy.training.log import tensorboard
+from policy.training.loop import tensorboard
 from policy.training.networks import usable, use_threads
-from policy.training.vfn import Trainer
+from policy.training.vfn import TrainingRun
 from sumo_scenarios import names
 
 ABOUT = ("observation", "hpn", "reward", "explore", "chain", "safety", "traffic")  # sections in the card
@@ -63,17 +63,17 @@ def train(args: argparse.Namespace) -> int:
     progress = Progress(f"train {name}", "iterations")
     try:
         with Rollouts(args.workers, name, agent, explore, file.reward) as actors:
-            trainer = Trainer(
+            run = TrainingRun(
                 training, agent.vfn, actors, folder, device=args.device, log=writer, about=about
             )
-            if args.resume and not trainer.resume():
+            if args.resume and not run.resume():
                 print("nothing to resume: starting anew", file=sys.stderr)
-            trainer.run(progress)
+            run.run(progress)
     finally:
         progress.done()
         writer.close()
-    best = f", best validation reward {trainer.best:.3f}" if math.isfinite(trainer.best) else ""
-    print(f"{name}: {trainer.iteration} iterations, {trainer.school.learner.updates} updates{best}")
+    best = f", best validation reward {run.best:.3f}" if math.isfinite(run.best) else ""
+    print(f"{name}: {run.iteration} iterations, {run.trainer.learner.updates} updates{best}")
     print(f"  {folder / BEST}" + (f" (cosim run merge --policy {_typed(args.out)})" if best else ""))
     return 0
 
@@ -97,8 +97,6 @@ def _scheduled(training: VfnTraining, args: argparse.Namespace, name: str) -> Vf
         )
     if name.endswith("-egoistic"):  # the twin never weighs anybody's interest but its own
         training = replace(training, svo=(0.0,), replay=replace(training.replay, phi=(0.0, 0.0)))
-    if args.iterations is not None:
-        training = replace(training, iterations=args.iterations)
-    if args.seed is not None:
-        training = replace(training, seed=args.seed)
-    return replace(training, learning=APPROACHES[name].learning)
+    given = {field: getattr(args, field) for field in ("iterations", "seed")}
+    changes = {field: value for field, value in given.items() if value is not None}
+    return replace(training, learning=APPROACHES[name].learning, **changes)

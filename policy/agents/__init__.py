@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable
+from functools import partial
 
 from cosim.errors import BadInput, hint
 from cosim.types import Policy
@@ -12,23 +13,19 @@ from cosim.types import Policy
 LEARNING = ("vfn-p", "vfn", "vfn-p-egoistic", "safe-dqn", "conv3d-dqn", "conv3d-a2c", "conv2d-dqn")
 
 
-def _lazily(module: str, kind: str, *arguments: str) -> Callable[[], Policy]:
+def _made(module: str, kind: str, *arguments: str) -> Policy:
     """A policy's class by name: its module (torch, compiled kernels) is imported when one is made."""
-
-    def build() -> Policy:
-        made: Policy = getattr(importlib.import_module(f"policy.agents.{module}"), kind)(*arguments)
-        return made
-
-    return build
+    made: Policy = getattr(importlib.import_module(f"policy.agents.{module}"), kind)(*arguments)
+    return made
 
 
 POLICIES: dict[str, Callable[[], Policy]] = {
-    "idm": _lazily("idm", "Idm"),
-    "idm-courteous": _lazily("idm", "IdmCourteous"),
-    "keep-lane": _lazily("keep_lane", "KeepLane"),
-    "random": _lazily("random", "Random"),
-    "altruist-rule": _lazily("altruist_rule", "AltruistRule"),
-    **{name: _lazily("prediction_aware", "PredictionAware", name) for name in LEARNING},
+    "idm": partial(_made, "idm", "Idm"),
+    "idm-courteous": partial(_made, "idm", "IdmCourteous"),
+    "keep-lane": partial(_made, "keep_lane", "KeepLane"),
+    "random": partial(_made, "random", "Random"),
+    "altruist-rule": partial(_made, "altruist_rule", "AltruistRule"),
+    **{name: partial(_made, "prediction_aware", "PredictionAware", name) for name in LEARNING},
 }
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from cosim.types import Decision, History, MetaAction, PolicyContext
-from policy.agents.idm import NO_MAPS, wished_gap
+from policy.agents.idm import Idm, desired_gap
 from policy.meeting import CAR, LANE, Meeting, Seen, along, meet, missions
 
 
@@ -26,7 +26,7 @@ class AltruistConfig:
     crawl: float = 2.0  # the guide waits upstream of a junction (on the grid: it stops)
     pace_below: float = 5.0  # beside an ending lane the guide drives this much slower than the other
     pace_min: float = 5.0  # and never slower than this
-    clear: float = 10.0  # a free left lane: this much room ahead and behind,
+    clear: float = 10.0  # a free left lane: this much space ahead and behind,
     clear_time: float = 0.8  # s of a follower's way on top,
     max_closing: float = 3.0  # m/s that a follower there may be faster,
     closing_time: float = 3.0  # s of what the two close in on each other
@@ -39,20 +39,17 @@ class Need(NamedTuple):
     meeting: Meeting
 
 
-class AltruistRule:
+class AltruistRule(Idm):
     """Left if the left lane is free, else slower; at junctions slower, far upstream."""
 
     name = "altruist-rule"
-    label = ""
-    observation = NO_MAPS
-    av_parameters: Mapping[str, str] = {}
 
     def __init__(self, config: AltruistConfig = AltruistConfig()) -> None:
         self._config = config
 
     def reset(self, context: PolicyContext) -> None:
         """A new episode: nobody has been served yet."""
-        self._road = context.road
+        super().reset(context)
         self._served: set[str] = set()
         self._guide: dict[str, Need] = {}  # mission vehicle -> its guide
 
@@ -78,7 +75,7 @@ class AltruistRule:
 
     def _need(self, av: str, history: History, mission: str, seen: Seen) -> Need | None:
         """Whether this AV's way meets the mission vehicle's, and where; None when it does not."""
-        guide, meeting = self._guide.get(mission), meet(self._road, history, seen)
+        guide, meeting = self._guide.get(mission), meet(self.context.road, history, seen)
         if guide is not None and self._is_served(guide, av, history, seen, meeting):
             self._served.add(mission)
             return None
@@ -90,7 +87,7 @@ class AltruistRule:
         if own is None or seen.lane < 0:
             return False
         if guide.meeting.crossing:
-            return self._road.lanes[seen.lane].internal or seen.lane in own.lanes
+            return self.context.road.lanes[seen.lane].internal or seen.lane in own.lanes
         return meeting is not None and guide.av == av and seen.lane in own.lanes[:3]
 
     def _choose(self, mission: str, candidates: list[Need]) -> Need | None:
@@ -149,6 +146,6 @@ class AltruistRule:
         if own is None:
             return False
         for ahead, other in along(history, own):
-            if ahead > 0.0 and ahead - CAR < 1.1 * wished_gap(speed, min(other, speed)):
+            if ahead > 0.0 and ahead - CAR < 1.1 * desired_gap(speed, min(other, speed)):
                 return True
         return False

@@ -92,14 +92,28 @@ class PredictionAware:
         )
 
     def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
-        """One decision for every AV, each explained (`cosim.types.Decision`)."""
+        """One decision for every AV, each explained (P, figure 2; `cosim.types.Decision`).
+
+        Args:
+            histories: AV -> what it has observed (`cosim.types.History`), all of the same instant.
+
+        Raises:
+            FloatingPointError: the value network returned values that are not finite.
+        """
         if not histories:
             return {}
         inputs = self.perceive(histories)
         return self.choose(self.values(inputs), inputs)
 
     def perceive(self, histories: Mapping[str, History]) -> Inputs:
-        """Predict the next seconds: what the value network and the prioritizer work on."""
+        """Predict the next seconds: what the value network and the prioritizer work on (P, algorithm 1).
+
+        Args:
+            histories: AV -> what it has observed.
+
+        Returns:
+            scene of B AVs and V vehicles, the networks' states of the B AVs, the traffic of the V vehicles.
+        """
         c, context = self.config, self._context
         scene, traffic, forecast = self.foresee(histories)
         with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=c.bf16):
@@ -129,8 +143,16 @@ class PredictionAware:
         return self.valued(self.vfn, inputs.scene.agents, inputs.states)
 
     def valued(self, network: VFN, agents: Sequence[str], states: States) -> Floats32:
-        """What `network` gives for the states of these AVs: [B,A]. Raises FloatingPointError when not
-        finite."""
+        """Action values [B,A] of `network`.
+
+        Args:
+            network: the value network.
+            agents: names of the B AVs.
+            states: their inputs.
+
+        Raises:
+            FloatingPointError: a value is not finite.
+        """
         timing = self._context.timing
         with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=self.config.bf16):
             if network not in self._memories:
@@ -144,8 +166,12 @@ class PredictionAware:
         return q
 
     def choose(self, q: Floats32, inputs: Inputs) -> dict[str, Decision]:
-        """The safety prioritizer's choice by the action values q [B,A] (P, algorithm 3); without a mask the
-        best valued action."""
+        """The safety prioritizer's choice (P, algorithm 3); without a mask the best valued action.
+
+        Args:
+            q: [B,A] action values, in the order of `inputs.scene.agents`.
+            inputs: what `perceive` gave.
+        """
         c, context, scene = self.config, self._context, inputs.scene
         if not c.mask:
             best = q.argmax(1)
@@ -196,7 +222,7 @@ class PredictionAware:
 
 
 def _networks(c: AgentConfig) -> tuple[VFN, HPN | None]:
-    """As they are born."""
+    """Untrained networks."""
     vfn = VFN(c.vfn).eval()
     return vfn, HPN(c.hpn).eval() if c.predicted_maps and c.chain.source == "hpn" else None
 

@@ -146,5 +146,4 @@ class Learned:
         x, y = now[:, :1] + c * u - s * w, now[:, 1:2] + s * u + c * w
         speed, heading = (rest[0], now[:, 3:4] + rest[1]) if rest else motion_of(now, x, y, self.dt)
         x, y, speed, heading = (np.where(known[:, None], a, 0.0) for a in (x, y, speed, heading))
-        zero = np.zeros_like(x)
-        return KinematicForecast(x, y, speed, heading, zero, zero, zero, zero, known)
+        return KinematicForecast.without_spread(x, y, speed, heading, known)

@@ -20,12 +20,13 @@ from policy.predictors import PREDICTORS, make_predictor
 from policy.predictors.gp import GaussianProcessIndirect
 from policy.predictors.lane import along_lanes
 from policy.predictors.learned import KinematicNet, Learned, NetConfig
-from policy.training.fitting import FitConfig, fit
 from policy.training.loop import LoopConfig
 from policy.training.predictors import (
+    FitConfig,
     PriorFit,
     examples_for_net,
     factors_for,
+    fit,
     fresh_net,
     in_own_frame,
     net_loss,
@@ -277,7 +278,7 @@ def test_a_killed_fit_goes_on_to_the_same_weights(
     whole, fit_whole = fresh()
     untrained = float(net_loss(whole, examples).detach())
     assert fit_whole()[-1]["validation_loss"] < untrained
-    monkeypatch.setattr("policy.training.fitting.LoopConfig", partial(LoopConfig, save_every=0.0))
+    monkeypatch.setattr("policy.training.predictors.LoopConfig", partial(LoopConfig, save_every=0.0))
 
     def killed(done: float, _: float) -> None:
         if done == 15:

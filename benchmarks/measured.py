@@ -91,6 +91,14 @@ def reward_balance(place: Place) -> list[list[str]]:
     return [["benchmarks.reward_balance", *flags, "--out", str(place.out / "reward_balance.md")]]
 
 
+def attribution(place: Place) -> list[list[str]]:
+    """Which inputs the shipped value networks use."""
+    flags = ["--scenario", "merge", "--demand", "contested", "--workers", "2"]
+    flags += ["--policy", "vfn-p", "--seeds", "150000:150001" if place.small else "150000:150006"]
+    flags += ["--duration", "2"] if place.small else ["--policy", "vfn", "--policy", "vfn-p-egoistic"]
+    return [["cosim.cli.main", "bench", "attribution", *flags, "--out", str(place.work / "attribution")]]
+
+
 def behaviors(place: Place) -> list[list[str]]:
     """How faithfully LC2013 drives Table II."""
     flags = ["--report", "--scale", "0.002" if place.small else "1"]
@@ -108,6 +116,12 @@ PAGES = (
     Page("prediction_speed", prediction_speed, ("prediction_speed.md",)),
     Page("performance", performance, ("performance.md",)),
     Page("reward_balance", reward_balance, ("reward_balance.md",)),
+    Page(
+        "attribution",
+        attribution,
+        ("attribution.md", "attribution.png", "data/attribution.csv"),
+        drop=("*.md", "*.png", "*.csv"),
+    ),
     Page("real_nets", real_nets, ("real_nets.md",)),
     Page("behaviors", behaviors, ("behaviors.md",)),
     Page(

@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cosim.batch.case_runner import CaseRunner
-from cosim.batch.record import cases
+from cosim.batch.record import planned
 from cosim.errors import BadInput
 from cosim.files import write_csv
 from cosim.learning.prediction_data import spread
@@ -21,7 +21,7 @@ from cosim.policies import make
 from cosim.report.statistics import share
 from cosim.scenario.episode_id import Case
 from cosim.workers.engines import LocalEngine
-from cosim.workers.tasks import Progress, Task
+from cosim.workers.tasks import Progress
 from policy.agents.prediction_aware import PredictionAware
 from policy.attribution import SUMS, Questioned
 
@@ -77,12 +77,12 @@ def attribution(
 ) -> None:
     """Drive and ask; writes TABLE, PICTURE and PAGE into `out`.
 
-    Raises BadInput as `cosim.batch.record.cases`, and for a policy without a value network.
+    Raises BadInput as `cosim.batch.record.planned`, and for a policy without a value network.
     """
     for policy in policies:
         questioned(policy)
-    wanted = cases([scenario], [demand], [], policies, seeds, svo_deg, duration)
-    tasks = [Task(case.key, case.cell, (case, (), None)) for case in wanted]
+    plan = planned([scenario], [demand], [], policies, seeds, svo_deg, duration)
+    tasks = [cell.task(case) for cell, case in plan.cases()]
     driven = spread(LocalEngine(Asking, workers=workers), tasks, "attribution")
     names = dict.fromkeys(episode["policy"] for episode in driven)
     tables = {name: table([e for e in driven if e["policy"] == name]) for name in names}

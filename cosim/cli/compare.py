@@ -57,7 +57,7 @@ def add(verbs: arguments.Verbs) -> None:
 
 def work(args: argparse.Namespace) -> int:
     """Compare, show, and say by the exit code whether B passed."""
-    from cosim.report import junit, verdict
+    from cosim.report import verdict
     from cosim.report.compare import compare
     from cosim.report.pairing import chosen, side
 
@@ -71,7 +71,7 @@ def work(args: argparse.Namespace) -> int:
     found = compare(a, b, args.fail_on, across=args.across)
     if args.junit is not None:
         with writing(field="--junit", value=args.junit):
-            junit.write(found, Path(args.junit))
+            verdict.junit(found, Path(args.junit))
     if args.markdown is not None:
         with writing(field="--markdown", value=args.markdown):
             Path(args.markdown).write_text(verdict.markdown(found), "utf-8")

@@ -37,20 +37,19 @@ def add(verbs: arguments.Verbs) -> None:
     )
     compare.add_argument("a", metavar="A", help="run folder, or DIR:POLICY")
     compare.add_argument("b", metavar="B", nargs="?", help="the same; default: A's folder")
-    compare.add_argument("--baseline", metavar="POLICY", help="the policy of A")
-    compare.add_argument("--candidate", metavar="POLICY", help="the policy of B")
-    compare.add_argument(
-        "--fail-on", action="append", default=[], metavar="THRESHOLD", help="see below; repeatable"
-    )
-    compare.add_argument(
-        "--across",
-        action="append",
-        default=[],
-        metavar="FIELD",
-        help="A and B may differ in this: behavior, penetration, preset, svo_deg, driver_model; repeatable",
-    )
-    compare.add_argument("--junit", metavar="FILE", help="write a JUnit file")
-    compare.add_argument("--markdown", metavar="FILE", help="write a table for a pull request comment")
+    names = "behavior, penetration, preset, svo_deg, driver_model"
+    repeatable = {
+        "--fail-on": ("THRESHOLD", "see below; repeatable"),
+        "--across": ("FIELD", f"A and B may differ in this: {names}; repeatable"),
+    }
+    once = {
+        "--baseline": ("POLICY", "the policy of A"),
+        "--candidate": ("POLICY", "the policy of B"),
+        "--junit": ("FILE", "write a JUnit file"),
+        "--markdown": ("FILE", "write a table for a pull request comment"),
+    }
+    arguments.texts(compare, once)
+    arguments.texts(compare, repeatable, action="append", default=[])
     arguments.add(compare, "--json")
     compare.set_defaults(work=work)
 

@@ -75,10 +75,9 @@ def read(path: str | Path) -> Run:
         raise BadInput("no such run folder", value=str(path))
     file = folder / "episodes.parquet"
     if not file.is_file():
-        problem = "holds no episodes.parquet: is it a run of `cosim evaluate`?"
         if (folder / FILE).is_file():
-            problem = f"is not finished: `cosim evaluate --resume --out {folder}` goes on"
-        raise BadInput(problem, file=folder)
+            raise BadInput(f"is not finished: `cosim evaluate --resume --out {folder}` goes on", file=folder)
+        raise BadInput("holds no episodes.parquet: is it a run of `cosim evaluate`?", file=folder)
     try:
         rows: list[dict[str, Any]] = pa.parquet.read_table(file).to_pylist()
     except (pa.ArrowException, OSError) as error:
@@ -86,20 +85,24 @@ def read(path: str | Path) -> Run:
     for name in NEEDED:
         if rows and name not in rows[0]:
             raise BadInput("has no such column: is it a run of `cosim evaluate`?", file=file, field=name)
-    return Run(folder, _named_alike(rows), _manifest(folder / "manifest.json"))
+    file = folder / "manifest.json"
+    return Run(folder, _named_alike(rows), read_json(file) if file.is_file() else {})
 
 
-def _manifest(file: Path) -> Mapping[str, Any]:
-    """The manifest; {} when there is none."""
-    if not file.is_file():
-        return {}
+def read_json(file: Path) -> dict[str, Any]:
+    """A JSON object. Raises BadInput when the file is not there, cannot be read or holds none."""
     try:
-        found = json.loads(file.read_text(encoding="utf-8"))
-    except (ValueError, OSError) as error:
-        raise BadInput(f"cannot be read: {error}", file=file) from None
-    if not isinstance(found, dict):
-        raise BadInput("is not a manifest of ours", file=file)
-    return found
+        document = json.loads(file.read_text("utf-8"))
+    except FileNotFoundError:
+        problem = "no such file: a folder of cosim run --out or cosim evaluate is needed"
+        raise BadInput(problem, file=file) from None
+    except OSError as error:
+        raise BadInput(f"cannot be read: {error.strerror}", file=file) from None
+    except ValueError as error:
+        raise BadInput(f"not JSON: {error}", file=file) from None
+    if not isinstance(document, dict):
+        raise BadInput("not a JSON object", file=file)
+    return document
 
 
 def _named_alike(rows: list[dict[str, Any]]) -> list[Row]:

@@ -20,8 +20,7 @@ from PIL import Image
 from cosim.episode import Episode, run_episode
 from cosim.recording import watcher
 from cosim.recording.watcher import Watched, Watcher
-from cosim.report.replay import packing
-from cosim.report.replay.page import page
+from cosim.report.replay.page import document, page
 from cosim.report.replay.strip import Strip, poses_at
 from cosim.report.replay.video import CAPTION, HEIGHT, LOW, SMALL, WIDTH, animation, film
 from cosim.types import Decision, Forecast, History, MetaAction, ObservationConfig, PolicyContext
@@ -287,6 +286,6 @@ def test_an_empty_world_can_be_drawn() -> None:
     nobody = {name: getattr(first, name)[:0] for name in COLUMNS}
     empty = replace(first, ids=(), **nobody)
     watch.start(empty)
-    data = packing.document(watch.watched({}))
+    data = document(watch.watched({}))
     assert data["tracks"] == []
     assert math.isclose(data["begin"], 0.0)

@@ -7,7 +7,7 @@ camera of its own, at equal times since they began.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import av
@@ -50,7 +50,7 @@ def film(
         stream = container.add_stream("libx264", rate=RATE)
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT * len(episodes), "yuv420p"
         stream.options = {"crf": "23", "preset": "veryfast"}
-        for picture in _pictures(episodes, follow, picture_at, RATE, progress):
+        for picture in _pictures(episodes, follow, RATE, progress):
             container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
         container.mux(stream.encode())
 
@@ -64,7 +64,7 @@ def animation(
     """
     first, *rest = (
         Image.fromarray(picture).quantize(COLOURS, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
-        for picture in _pictures(episodes, follow, caption_at, 1.0 / STEP, progress)
+        for picture in _pictures(episodes, follow, 1.0 / STEP, progress, small=True)
     )
     times = round(1000 * SHOWN)  # ms
     with whole(path) as draft:
@@ -74,9 +74,10 @@ def animation(
 def _pictures(
     episodes: Sequence[Watched],
     follow: str | None,
-    draw: Callable[[Watched, float, _Camera], Image.Image],
     rate: float,
     progress: Progress | None,
+    *,
+    small: bool = False,
 ) -> Iterator[npt.NDArray[np.uint8]]:
     """`rate` pictures [height,width,3] a second, all episodes one above the other; those that ended earlier
     stand still."""
@@ -84,8 +85,8 @@ def _pictures(
     count = round(rate * max(float(r.times[-1] - r.times[0]) for r in episodes)) + 1
     for k in range(count):
         times = [min(float(r.times[0]) + k / rate, float(r.times[-1])) for r in episodes]
-        parts = [draw(*shot) for shot in zip(episodes, times, cameras, strict=True)]
-        yield np.vstack([np.asarray(part) for part in parts])
+        shots = zip(episodes, times, cameras, strict=True)
+        yield np.vstack([np.asarray(picture_at(*shot, small=small)) for shot in shots])
         if progress is not None:
             progress(k + 1, count)
 
@@ -114,50 +115,34 @@ class _Camera:
         return min(avs, key=lambda p: math.hypot(p.x - self.x, p.y - self.y), default=None)
 
 
-def picture_at(r: Watched, time: float, camera: _Camera) -> Image.Image:
-    """One picture of the film, WIDTH x HEIGHT."""
+def picture_at(r: Watched, time: float, camera: _Camera, *, small: bool = False) -> Image.Image:
+    """One picture: of the film, WIDTH x HEIGHT, or the `small` one of the GIF, SMALL x (LOW + CAPTION)."""
     poses = poses_at(r, time)
     shown = camera.look(poses)
-    strip = Strip(camera.x, camera.y, WIDTH, HEIGHT - PANEL)
+    strip = Strip(camera.x, camera.y, *((SMALL, LOW) if small else (WIDTH, HEIGHT - PANEL)))
+    strip.road(r)
     k = int(np.searchsorted(r.decided, time + 1e-6, side="right")) - 1
     choices: Mapping[str, Choice] = r.choices[k] if 0 <= k < len(r.choices) else {}
-    strip.road(r)
-    strip.forecast(r, k)
+    by_name = {p.track.id: p for p in poses}
+    if not small:
+        strip.forecast(r, k)
     for pose in poses:
         strip.vehicle(pose)
-    by_name = {p.track.id: p for p in poses}
-    for pose in poses:
+    for pose in () if small else poses:
         if pose.track.id in choices:
             strip.choice(pose, choices[pose.track.id], by_name)
         if pose.track.mission or pose is shown:
             strip.name(pose)
-    _crashes(strip, r, time)
-    board = _Board(strip.finished(), PANEL)
-    board.legend(r)
-    board.panel(r, time, camera, by_name, shown, choices)
-    return board.picture
-
-
-def caption_at(r: Watched, time: float, camera: _Camera) -> Image.Image:
-    """One picture of the GIF, SMALL x (LOW + CAPTION)."""
-    poses = poses_at(r, time)
-    camera.look(poses)
-    strip = Strip(camera.x, camera.y, SMALL, LOW)
-    strip.road(r)
-    for pose in poses:
-        strip.vehicle(pose)
-    _crashes(strip, r, time)
-    board = _Board(strip.finished(), CAPTION)
-    board.legend(r)
-    board.caption(r, time)
-    return board.picture
-
-
-def _crashes(strip: Strip, r: Watched, time: float) -> None:
-    """Marks the collisions of the last seconds."""
     for crash in r.collisions:
         if math.isfinite(crash.x) and 0.0 <= time - crash.time + 0.05 < SHOWN_CRASH:
             strip.crash(crash.x, crash.y)
+    board = _Board(strip.finished(), CAPTION if small else PANEL)
+    board.legend(r)
+    if small:
+        board.caption(r, time)
+    else:
+        board.panel(r, time, camera, by_name, shown, choices)
+    return board.picture
 
 
 class _Board:

@@ -48,10 +48,9 @@ class Roles:
             return Kind.AV, False
         if self.mission is not None and self.mission.fullmatch(vehicle):
             return Kind.HV, True
+        is_av = vehicle_type.partition("@")[0] == self.av_type
         if self.av_ids is not None:
             is_av = self.av_ids.fullmatch(vehicle) is not None
-        else:
-            is_av = self.av_type is not None and vehicle_type.partition("@")[0] == self.av_type
         return (Kind.AV if is_av else Kind.HV), False
 
 

@@ -105,8 +105,7 @@ class _Camera:
 
     def look(self, poses: list[Pose]) -> Pose | None:
         """Move to the followed vehicle; the AV whose decision is explained: itself, else the nearest one."""
-        name = None if self.follow is None else self.follow.id
-        here = next((p for p in poses if p.track.id == name), None)
+        here = next((p for p in poses if self.follow and p.track.id == self.follow.id), None)
         if here is not None:
             self.x, self.y = here.x, here.y
             if here.track.kind == Kind.AV:
@@ -126,9 +125,10 @@ def picture_at(r: Watched, time: float, camera: _Camera, *, small: bool = False)
     by_name = {p.track.id: p for p in poses}
     if not small:
         strip.forecast(r, k)
-    for pose in poses:
+    near = [p for p in poses if strip.sees(np.array([[p.x, p.y]]))]
+    for pose in near:
         strip.vehicle(pose)
-    for pose in () if small else poses:
+    for pose in () if small else near:
         if pose.track.id in choices:
             strip.choice(pose, choices[pose.track.id], by_name)
         if pose.track.mission or pose is shown:
@@ -193,11 +193,9 @@ class _Board:
         self._line(14, line + 50, f"{time - r.begin:.1f} s of {r.times[-1] - r.begin:.0f} s", TEXT, 14)
         outcome, colour = _outcome(r, time)
         self._line(14, line + 72, outcome, colour, 14)
-        followed = None if camera.follow is None else here.get(camera.follow.id)
-        if camera.follow is not None:
-            t = camera.follow
+        if t := camera.follow:
             what = _kind(t) + ", mission vehicle" * t.mission
-            where = f"{followed.speed:.1f} m/s" if followed is not None else "not on the road"
+            where = f"{here[t.id].speed:.1f} m/s" if t.id in here else "not on the road"
             self._line(14, line + 96, f"{t.id} ({what}): {where}", colour_of(t), 13)
         if shown is not None:
             self._decision(470, line, shown, choices.get(shown.track.id))

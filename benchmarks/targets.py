@@ -156,7 +156,7 @@ def contested(runs: Mapping[str, Run], worlds: Sequence[str], arms: Arms) -> Ite
 
 def farther(pairs: Compared) -> Figure:
     """How many times as far the mission vehicle travels: ratio of the means, over pairs."""
-    measure = pairs.known["dt_mission_m"]
+    measure = pairs.figures["dt_mission_m"].measure
     before, after = (measure.values([pair[k] for pair in pairs.group.pairs]) for k in (0, 1))
     change = paired_change(before, after, pairs.seed)
     return Figure(1.0 + change.value, 1.0 + change.low, 1.0 + change.high)

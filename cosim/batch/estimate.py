@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from statistics import fmean
 
 from cosim.batch.matrix import Cell, Plan
@@ -73,8 +73,7 @@ def _chosen(cells: Sequence[Cell]) -> list[Cell]:
 
 def _like(cell: Cell, costs: dict[tuple[str, str], Cost]) -> Cost:
     """The cost of the same world and policy, else the mean of the policy, else of all."""
-    known = costs.get((cell.case.what, cell.case.policy))
-    if known is not None:
+    if known := costs.get((cell.case.what, cell.case.policy)):
         return known
     alike = [cost for (_, policy), cost in costs.items() if policy == cell.case.policy] or [*costs.values()]
-    return Cost(fmean(c.start for c in alike), fmean(c.reset for c in alike), fmean(c.second for c in alike))
+    return Cost(*map(fmean, zip(*map(astuple, alike), strict=True)))

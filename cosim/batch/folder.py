@@ -17,7 +17,7 @@ ROOM_AT_LEAST = 4_000_000  # bytes
 RESULTS = (FILE, "episodes.parquet", "episodes.csv", "summary.json", "manifest.json")
 
 
-class RunFolder:
+class RunFolder(contextlib.AbstractContextManager["RunFolder"]):
     """Holds the lock on a run folder until `close`.
 
     Raises:
@@ -51,9 +51,6 @@ class RunFolder:
         if self._lock is not None:
             os.close(self._lock)
             self._lock = None
-
-    def __enter__(self) -> RunFolder:
-        return self
 
     def __exit__(self, *error: object) -> None:
         self.close()

@@ -50,7 +50,7 @@ _episodes = sa.Table(
 )
 
 
-class Store:
+class Store(contextlib.AbstractContextManager["Store"]):
     """The rows of one run. One process writes (`cosim.batch.folder` sees to that).
 
     Raises:
@@ -161,9 +161,6 @@ class Store:
     def close(self) -> None:
         """Let go of the database."""
         self._engine.dispose()
-
-    def __enter__(self) -> Store:
-        return self
 
     def __exit__(self, *error: object) -> None:
         self.close()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import functools
 import math
+from collections.abc import Mapping
 from typing import Any
 
 Verbs = Any  # what ArgumentParser.add_subparsers returns: argparse keeps its type private
@@ -22,6 +23,12 @@ def add(parser: Any, *flags: str, **changed: Any) -> None:
     """
     for flag in flags:
         parser.add_argument(flag, **(_shared()[flag] | changed))
+
+
+def texts(parser: Any, flags: Mapping[str, tuple[str, str]], **settings: Any) -> None:
+    """Add flags that take a text: flag -> its metavar and help. `settings`: further ones for all of them."""
+    for flag, (metavar, meaning) in flags.items():
+        parser.add_argument(flag, metavar=metavar, help=meaning, **settings)
 
 
 @functools.cache

@@ -37,27 +37,26 @@ def add(verbs: arguments.Verbs) -> None:
     )
     compare.add_argument("a", metavar="A", help="run folder, or DIR:POLICY")
     compare.add_argument("b", metavar="B", nargs="?", help="the same; default: A's folder")
-    compare.add_argument("--baseline", metavar="POLICY", help="the policy of A")
-    compare.add_argument("--candidate", metavar="POLICY", help="the policy of B")
-    compare.add_argument(
-        "--fail-on", action="append", default=[], metavar="THRESHOLD", help="see below; repeatable"
-    )
-    compare.add_argument(
-        "--across",
-        action="append",
-        default=[],
-        metavar="FIELD",
-        help="A and B may differ in this: behavior, penetration, preset, svo_deg, driver_model; repeatable",
-    )
-    compare.add_argument("--junit", metavar="FILE", help="write a JUnit file")
-    compare.add_argument("--markdown", metavar="FILE", help="write a table for a pull request comment")
+    names = "behavior, penetration, preset, svo_deg, driver_model"
+    repeatable = {
+        "--fail-on": ("THRESHOLD", "see below; repeatable"),
+        "--across": ("FIELD", f"A and B may differ in this: {names}; repeatable"),
+    }
+    once = {
+        "--baseline": ("POLICY", "the policy of A"),
+        "--candidate": ("POLICY", "the policy of B"),
+        "--junit": ("FILE", "write a JUnit file"),
+        "--markdown": ("FILE", "write a table for a pull request comment"),
+    }
+    arguments.texts(compare, once)
+    arguments.texts(compare, repeatable, action="append", default=[])
     arguments.add(compare, "--json")
     compare.set_defaults(work=work)
 
 
 def work(args: argparse.Namespace) -> int:
     """Compare, show, and say by the exit code whether B passed."""
-    from cosim.report import junit, verdict
+    from cosim.report import verdict
     from cosim.report.compare import compare
     from cosim.report.pairing import chosen, side
 
@@ -71,7 +70,7 @@ def work(args: argparse.Namespace) -> int:
     found = compare(a, b, args.fail_on, across=args.across)
     if args.junit is not None:
         with cannot("write", field="--junit", value=args.junit):
-            junit.write(found, Path(args.junit))
+            verdict.junit(found, Path(args.junit))
     if args.markdown is not None:
         with cannot("write", field="--markdown", value=args.markdown):
             Path(args.markdown).write_text(verdict.markdown(found), "utf-8")

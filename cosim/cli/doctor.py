@@ -171,8 +171,7 @@ def libsumo_library() -> Check:
 
 def explain_import(code: int, stderr: str) -> tuple[str, str]:
     """What went wrong when libsumo was imported, and how to mend it."""
-    missing = re.search(r"(lib[\w.+-]+\.so[\w.]*): cannot open shared object", stderr)
-    if missing:
+    if missing := re.search(r"(lib[\w.+-]+\.so[\w.]*): cannot open shared object", stderr):
         return f"the system has no {missing[1]}", APT_LINE
     return _last_line(code, stderr.strip()), REINSTALL
 

@@ -23,7 +23,6 @@ def add(verbs: arguments.Verbs) -> None:
         description="Read SUMO's fcd-output (.xml or .xml.gz, any size) and count what `cosim run` counts.",
     )
     metrics.add_argument("fcd", metavar="FCD", help="the file that SUMO's --fcd-output wrote")
-    metrics.add_argument("--net", metavar="NET", help="the .net.xml: tells bridges and lane successions")
     metrics.add_argument(
         "--types",
         action="append",
@@ -33,7 +32,6 @@ def add(verbs: arguments.Verbs) -> None:
     )
     arguments.add(metrics, "--av-type", help="watch the vehicles of this vType (default: everybody)")
     arguments.add(metrics, "--av-ids", help="watch the vehicles whose id matches")
-    metrics.add_argument("--mission", metavar="REGEX", help="watch these too, as mission vehicles")
     metrics.add_argument(
         "--begin", type=float, default=-math.inf, metavar="S", help="leave out what is earlier"
     )
@@ -41,9 +39,12 @@ def add(verbs: arguments.Verbs) -> None:
     metrics.add_argument(
         "--frame", type=arguments.positive, metavar="S", help="s between frames (default: 0.2, or the file's)"
     )
-    metrics.add_argument(
-        "--conflicts", metavar="CSV", help="write every single conflict there: who, when, where, how close"
-    )
+    more = {
+        "--net": ("NET", "the .net.xml: bridges and lane successions"),
+        "--mission": ("REGEX", "watch these too, as mission vehicles"),
+        "--conflicts": ("CSV", "write every single conflict there: who, when, where, how close"),
+    }
+    arguments.texts(metrics, more)
     metrics.add_argument(
         "--ttc",
         type=arguments.positive,

@@ -22,7 +22,7 @@ def add(verbs: arguments.Verbs) -> None:
     train.add_argument(
         "--config", default="compact", metavar="FILE", help="compact, maps, paper, smoke, or a YAML file"
     )
-    train.add_argument("--policy", metavar="NAME", help="the approach (default: vfn-p; a2c: conv3d-a2c)")
+    arguments.add(train, "--policy", metavar="NAME", help="the approach (default: vfn-p; a2c: conv3d-a2c)")
     train.add_argument(
         "--scenario", action="append", default=[], metavar="NAME", help="a world, or all (default: merge)"
     )

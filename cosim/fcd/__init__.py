@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections import Counter
@@ -47,10 +48,9 @@ class Roles:
             return Kind.AV, False
         if self.mission is not None and self.mission.fullmatch(vehicle):
             return Kind.HV, True
+        is_av = vehicle_type.partition("@")[0] == self.av_type
         if self.av_ids is not None:
             is_av = self.av_ids.fullmatch(vehicle) is not None
-        else:
-            is_av = self.av_type is not None and vehicle_type.partition("@")[0] == self.av_type
         return (Kind.AV if is_av else Kind.HV), False
 
 
@@ -84,7 +84,7 @@ def analyse(
     """Read the file once, as a stream. `begin`, `end` in s; `frame`: s between the frames that are counted.
     `critical`: list the encounters with a time to collision (s) below this.
 
-    Without a `road` vehicles on and below a bridge cannot be told apart, and a headway ends with the lane.
+    Without a `road` vehicles on and below a bridge cannot be distinguished, and a headway ends with the lane.
 
     Raises:
         BadInput: malformed or truncated, not FCD, a number missing or not finite, a vehicle twice in a step,
@@ -128,11 +128,9 @@ class _Counter:
         self._time = 0.0  # s, of the step last seen
         self._newest: Snapshot | None = None
         self._frames = 0
-        self._span = (math.nan, math.nan)
+        self._began = math.nan  # s, of the first frame
         self._known: dict[str, tuple[str, Kind, bool, Size]] = {}  # id -> type, kind, mission, size
         self._unknown_types: set[str] = set()
-        self._ever: set[str] = set()
-        self._watched: set[str] = set()
         self._laneless = self._rows = 0  # vehicle frames
         self._strange: Counter[str] = Counter()  # lanes that the road lacks
         self._driven = self._moved = 0.0  # m, by the speeds and by the positions
@@ -231,16 +229,12 @@ class _Counter:
                 metric.reset(snapshot, self._context)
         if self._encounters is not None:
             self._encounters.add(snapshot)
-        self._frames += 1
-        self._span = (self._span[0] if self._frames > 1 else snapshot.time, snapshot.time)
-        if self._driven < DRIVEN and self._newest is not None:
+        if self._newest is None:
+            self._began = snapshot.time
+        elif self._driven < DRIVEN:
             self._doubt(self._newest, snapshot)
+        self._frames += 1
         self._newest = snapshot
-        fresh = [i for i, name in enumerate(snapshot.ids) if name not in self._ever]
-        self._ever.update(snapshot.ids[i] for i in fresh)
-        self._watched.update(
-            snapshot.ids[i] for i in fresh if snapshot.kind[i] == Kind.AV or snapshot.mission[i]
-        )
 
     def _doubt(self, before: Snapshot, after: Snapshot) -> None:
         """Longitudes and latitudes hardly change while the speeds are those of cars."""
@@ -259,61 +253,48 @@ class _Counter:
         if self._first is not None:  # a file of one step
             self._set_clock(self._wanted or FRAME, self._first.time)
             self._count(self._snapshot(self._first))
-        if not self._ever:
-            window = (
-                "" if math.isinf(self._begin) and math.isinf(self._end) else " in the time that was asked for"
-            )
-            raise self._wrong(f"holds no vehicle{window}")
+        if not self._known or self._newest is None:
+            whole = math.isinf(self._begin) and math.isinf(self._end)
+            raise self._wrong("holds no vehicle" + ("" if whole else " in the time that was asked for"))
         if self._strange.total() > 0.5 * self._rows:
             problem = "no such lane in --net, which is not the net of this file"
             raise self._wrong(problem, "vehicle.lane", self._strange.most_common(1)[0][0])
-        figures: dict[str, Metric] = {}
-        for metric in self._metrics:
-            figures |= metric.result()
+        figures = dict(itertools.chain.from_iterable(m.result().items() for m in self._metrics))
         return Analysis(
             figures,
-            *self._span,
+            self._began,
+            self._newest.time,
             interval=round(self._stride * self._interval, 9),
             frames=self._frames,
-            vehicles=len(self._ever),
-            watched=len(self._watched),
+            vehicles=len(self._known),
+            watched=self._watched,
             notes=tuple(self._notes(has_road, has_sizes)),
             encounters=() if self._encounters is None else tuple(self._encounters.found()),
         )
 
+    @property
+    def _watched(self) -> int:
+        """How many vehicles were AVs or mission vehicles."""
+        return sum(kind == Kind.AV or mission for _, kind, mission, _ in self._known.values())
+
     def _notes(self, has_road: bool, has_sizes: bool) -> list[str]:
-        found = []
-        if self._roles.everybody:
-            found.append("every vehicle is watched (--av-type, --av-ids and --mission say otherwise)")
-        elif not self._watched:
-            found.append("no vehicle is an AV or a mission vehicle: nothing to count")
-        if not has_sizes:
-            found.append(f"every vehicle is taken as {_size(DEFAULT)} (--types FILE says otherwise)")
-        elif self._unknown_types:
-            names = ", ".join(sorted(self._unknown_types)[:5])
-            found.append(f"not in --types, taken as {_size(DEFAULT)}: {names}")
-        if not has_road:
-            found.append(
-                "without --net: vehicles on and below a bridge count as meeting, headways end with the lane"
-            )
-        if self._laneless:
-            found.append(f"{self._laneless} vehicle frames have no lane position: no headway there")
-        if self._strange:
-            lanes = ", ".join(sorted(self._strange)[:5])
-            found.append(f"{self._strange.total()} vehicle frames on lanes that --net lacks: {lanes}")
-        if self._stride > 1:
-            found.append(
-                f"steps of {self._interval:g} s are thinned to frames of {self._stride * self._interval:g} s"
-            )
-        if self._stride * self._interval > FRAME + 1e-9:
-            found.append(
-                f"frames every {self._stride * self._interval:g} s: brief events are missed, jerk is damped"
-            )
-        return found
+        apart = self._stride * self._interval  # s between frames
+        everybody, size = self._roles.everybody, f"{DEFAULT.length:g} x {DEFAULT.width:g} m"
+        types, lanes = (", ".join(sorted(names)[:5]) for names in (self._unknown_types, self._strange))
+        notes = {
+            "every vehicle is watched (--av-type, --av-ids and --mission say otherwise)": everybody,
+            "no vehicle is an AV or a mission vehicle: nothing to count": not (everybody or self._watched),
+            f"every vehicle is taken as {size} (--types FILE says otherwise)": not has_sizes,
+            f"not in --types, taken as {size}: {types}": has_sizes and bool(types),
+            "without --net: vehicles on and below a bridge count as meeting, headways end with the lane": (
+                not has_road
+            ),
+            f"{self._laneless} vehicle frames have no lane position: no headway there": bool(self._laneless),
+            f"{self._strange.total()} vehicle frames on lanes that --net lacks: {lanes}": bool(lanes),
+            f"steps of {self._interval:g} s are thinned to frames of {apart:g} s": self._stride > 1,
+            f"frames every {apart:g} s: brief events are missed, jerk is damped": apart > FRAME + 1e-9,
+        }
+        return [note for note, holds in notes.items() if holds]
 
     def _wrong(self, problem: str, place: str | None = None, value: object = None) -> BadInput:
         return BadInput(problem, file=self._path, field=place, value=value)
-
-
-def _size(size: Size) -> str:
-    return f"{size.length:g} x {size.width:g} m"

@@ -48,9 +48,9 @@ class Encounters:
         s = snapshot
         rows = np.flatnonzero(watched(s))
         if len(rows) and s.n > 1:
-            mine, all_boxes = boxes(s, rows), boxes(s)
+            mine = boxes(s, rows)
             columns = type(mine)(*(np.asarray(value)[:, None] for value in mine))
-            ttc = time_to_collision(columns, all_boxes, self._critical)  # [k,n] s
+            ttc = time_to_collision(columns, boxes(s), self._critical)  # [k,n] s
             for k, j in np.argwhere(ttc < self._critical).tolist():
                 self._meet(s, int(rows[k]), j, float(ttc[k, j]))
         late = [pair for pair, e in self._open.items() if s.time - e.end_s > APART + 1e-9]
@@ -65,11 +65,10 @@ class Encounters:
         if i == j or not self._road.connected(int(s.lane[i]), int(s.lane[j])):
             return
         ego, foe = s.ids[i], s.ids[j]
-        if (foe, ego) in self._open:  # both are watched: it is told once
+        if (foe, ego) in self._open:  # both are watched: it is listed once
             return
-        pair = boxes(s, np.array([i, j]))
-        a, b = (type(pair)(*(np.asarray(value)[k] for value in pair)) for k in (0, 1))
-        drac = float(deceleration_to_avoid_crash(a, b)) if ttc > 0.0 else 0.0
+        a, b = boxes(s, np.array([i])), boxes(s, np.array([j]))
+        drac = float(np.squeeze(deceleration_to_avoid_crash(a, b))) if ttc > 0.0 else 0.0
         known = self._open.get((ego, foe))
         hardest = max(drac if np.isfinite(drac) else 0.0, known.max_drac_mps2 if known else 0.0)
         if known is not None and known.min_ttc_s <= ttc:

@@ -76,10 +76,9 @@ def read(path: str | Path) -> Run:
         raise BadInput("no such run folder", value=str(path))
     file = folder / "episodes.parquet"
     if not file.is_file():
-        problem = "holds no episodes.parquet: is it a run of `cosim evaluate`?"
         if (folder / FILE).is_file():
-            problem = f"is not finished: `cosim evaluate --resume --out {folder}` goes on"
-        raise BadInput(problem, file=folder)
+            raise BadInput(f"is not finished: `cosim evaluate --resume --out {folder}` goes on", file=folder)
+        raise BadInput("holds no episodes.parquet: is it a run of `cosim evaluate`?", file=folder)
     try:
         rows: list[dict[str, Any]] = pa.parquet.read_table(file).to_pylist()
     except (pa.ArrowException, OSError) as error:

@@ -21,8 +21,7 @@ from cosim.episode import Episode, run_episode
 from cosim.recording import Recorder
 from cosim.recording.watched import Watched
 from cosim.recording.watched import watched as watched_episode
-from cosim.report.replay import packing
-from cosim.report.replay.page import page
+from cosim.report.replay.page import document, page
 from cosim.report.replay.strip import Strip, poses_at
 from cosim.report.replay.video import CAPTION, HEIGHT, LOW, SMALL, WIDTH, animation, film
 from cosim.types import Decision, Forecast, History, MetaAction, ObservationConfig, PolicyContext
@@ -292,6 +291,6 @@ def test_an_empty_world_can_be_drawn() -> None:
     nobody = {name: getattr(first, name)[:0] for name in COLUMNS}
     empty = replace(first, ids=(), **nobody)
     recorder.begin([empty])
-    data = packing.document(watched_episode(recorder, world, {}))
+    data = document(watched_episode(recorder, world, {}))
     assert data["tracks"] == []
     assert math.isclose(data["begin"], 0.0)

@@ -131,8 +131,7 @@ def _spread(series: list[Series], name: str, title: str, unit: str) -> Plot | No
         axes.plot([middle], [place], "o", markersize=6, color=colour, markeredgecolor=INK)
         return f"n {len(values)}"
 
-    svg = _rows(series, title, unit, draw)
-    return Plot(title, svg, "Dots: episodes; bar: middle half; point: median.")
+    return Plot(title, _rows(series, title, unit, draw), "Dots: episodes; bar: middle half; point: median.")
 
 
 def _times(series: list[Series]) -> Plot | None:
@@ -153,20 +152,14 @@ def _times(series: list[Series]) -> Plot | None:
         missing = sum(math.isnan(v) for v in one.values(name))
         return f"n {len(one.ok) - missing}" + (f", {missing} none" if missing else "")
 
-    svg = _rows(series, title, "s", draw, limits=(0.0, HORIZON), mark=CRITICAL)
-    return Plot(
-        title,
-        svg,
-        f"Share of episodes; line: {CRITICAL:g} s, critical; none: nobody came within {HORIZON:g} s.",
-    )
+    note = f"Share of episodes; line: {CRITICAL:g} s, critical; none: nobody came within {HORIZON:g} s."
+    return Plot(title, _rows(series, title, "s", draw, limits=(0.0, HORIZON), mark=CRITICAL), note)
 
 
 def _pareto(series: list[Series]) -> Plot | None:
     """What the AVs give and what the others get; an SVO sweep is a line."""
     others = {"dt_mission_m": "mission vehicle", "dt_hv_m": "human drivers"}
-    name = next((n for n in others if any(not math.isnan(v) for s in series for v in s.values(n))), None)
-    if name is None:
-        return None
+    name = next((n for n in others if any(s.counts(n).get("n") for s in series)), "dt_hv_m")
     who = others[name]
     points = [(s, statistics.mean(s.values("dt_av_m")), statistics.mean(s.values(name))) for s in series]
     points = [(s, x, y) for s, x, y in points if x.known and y.known]
@@ -180,8 +173,8 @@ def _pareto(series: list[Series]) -> Plot | None:
         colour = _colour(mine[0][0])
         axes.plot([x.value for _, x, _ in mine], [y.value for _, _, y in mine], color=colour, linewidth=1.0)
         for _, x, y in mine:
-            for xs, ys in (((x.low, x.high), (y.value,) * 2), ((x.value,) * 2, (y.low, y.high))):
-                axes.plot(xs, ys, color=colour, linewidth=1.6, alpha=0.5)
+            axes.plot((x.low, x.high), (y.value, y.value), color=colour, linewidth=1.6, alpha=0.5)
+            axes.plot((x.value, x.value), (y.low, y.high), color=colour, linewidth=1.6, alpha=0.5)
             axes.plot([x.value], [y.value], "o", markersize=6, color=colour)
     axes.set_xlabel("mean distance of the AVs, m")
     axes.set_ylabel(f"mean distance of the {who}, m")

@@ -75,9 +75,8 @@ def differences(found: Sequence[Difference]) -> Table | None:
     """Every series of a block against its baseline, pair by pair; None where there is no pair."""
     if not found:
         return None
-    names = dict.fromkeys(n for d in found for n in d.figures)
-    shown = [n for n in names if any(d.figures[n].n for d in found)]
     measures = found[0].figures
+    shown = [n for n in measures if any(d.figures[n].n for d in found)]
     rows = [
         [
             Cell(d.series.label, d.series.label, (f"against {d.baseline.label}",)),
@@ -114,9 +113,8 @@ def tone(figure: PairedFigure) -> str:
     crashes Tango's interval can leave 0 out where the exact test does not agree.
     """
     d = figure.difference
-    if math.isnan(d.low) or d.low <= 0.0 <= d.high or not figure.measure.better:
-        return ""
-    if figure.p is not None and figure.p >= 1.0 - CONFIDENCE:
+    chance = math.isnan(d.low) or d.low <= 0.0 <= d.high
+    if chance or (figure.p is not None and figure.p >= 1.0 - CONFIDENCE) or not figure.measure.better:
         return ""
     return "good" if (d.value > 0.0) == (figure.measure.better == "higher") else "bad"
 

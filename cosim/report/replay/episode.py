@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -92,26 +91,23 @@ def check_inputs(recorded: Recorded) -> tuple[Scenario, list[str]]:
     scenario = vetted(recorded.case.scenario(recorded.options))
     then, now = recorded.manifest, manifest(scenario, recorded.case.seed)
     paths = named(scenario.files)
+    driven = then.get("files", {})
     for name, digest in now["files"].items():
-        before = then.get("files", {}).get(name)
-        if before != digest:
-            problem = "was not among the files of the recorded run"
-            if before is not None:
-                problem = _changed("it was driven", before, digest)
-            raise BadInput(problem, file=paths[name])
-    for name in sorted(then.get("files", {}).keys() - now["files"].keys()):
-        raise BadInput("belonged to the recorded run, and to this one no more", file=name)
+        if name not in driven:
+            raise BadInput("was not among the files of the recorded run", file=paths[name])
+        if driven[name] != digest:
+            raise BadInput(_changed("it was driven", driven[name], digest), file=paths[name])
+    if gone := driven.keys() - now["files"].keys():
+        raise BadInput("belonged to the recorded run, and to this one no more", file=min(gone))
     for name in sorted(now.keys() - {"files", "versions", "seed", "options_not_passed_on"}):
         if name in then and (before := _lasting(name, then)) != (here := _lasting(name, now)):
             problem = f"is {here!r} now, it was {before!r} when it was driven"
             raise BadInput(problem, file=recorded.folder / MANIFEST, field=name)
-    versions = then.get("versions", {})
-    warnings = [
+    return scenario, [
         f"driven with {name} {before}, here is {now['versions'].get(name)}: the replay may differ"
-        for name, before in versions.items()
+        for name, before in then.get("versions", {}).items()
         if name in now["versions"] and now["versions"][name] != before
     ]
-    return scenario, warnings
 
 
 def drive(recorded: Recorded, scenario: Scenario, *, check: bool = True) -> tuple[EpisodeResult, Watched]:
@@ -168,38 +164,38 @@ def draw(
     names = list(dict.fromkeys(track.id for r in episodes for track in r.tracks))
     if follow is not None and follow not in names:
         raise BadInput(f"no such vehicle{hint(follow, names)}", field="--follow", value=follow)
+    for file in filter(None, (html, mp4, gif)):
+        with cannot("write", file=file):
+            file.parent.mkdir(parents=True, exist_ok=True)
     if html is not None:
         from cosim.report.replay.page import page
 
-        with _writing(html), whole(html) as draft:
+        with cannot("write", file=html), whole(html) as draft:
             draft.write_text(page(episodes[0]), "utf-8")
     if mp4 is not None or gif is not None:
         from cosim.report.replay import video
 
         for path, make in ((mp4, video.film), (gif, video.animation)):
             if path is not None:
-                with _progress(path.name, "pictures") as progress, _writing(path):
+                with _progress(path.name, "pictures") as progress, cannot("write", file=path):
                     make(episodes, path, follow=follow, progress=progress)
-
-
-def warn(lines: Sequence[str]) -> None:
-    """Warnings on stderr."""
-    for line in lines:
-        print(f"cosim: warning: {line}", file=sys.stderr)
 
 
 def _of_batch(folder: Path, episode: str | None) -> Recorded:
     run = run_folder.read(folder)
     if episode is None:
         raise BadInput(f"holds {len(run.rows)} episodes: name one by its key or seed", file=folder)
-    keys = [row["key"] for row in run.rows]
     found = [r for r in run.rows if r["key"] == episode] or [r for r in run.rows if str(r["seed"]) == episode]
     if not found:
-        raise BadInput(f"no such episode{hint(episode, keys)}", field="EPISODE", value=episode)
+        raise BadInput(
+            f"no such episode{hint(episode, [row['key'] for row in run.rows])}",
+            field="EPISODE",
+            value=episode,
+        )
     if len(found) > 1:
         some = [f"{r['key']} ({r['scenario']} / {r['demand']} / {r['policy']})" for r in found[:MOST_NAMED]]
-        more = ["..."] if len(found) > MOST_NAMED else []
-        problem = f"{len(found)} episodes have this seed: {', '.join([*some, *more])}"
+        some += ["..."] * (len(found) > MOST_NAMED)
+        problem = f"{len(found)} episodes have this seed: {', '.join(some)}"
         raise BadInput(problem, field="EPISODE", value=episode)
     row = found[0]
     if row["status"] != OK:
@@ -238,14 +234,6 @@ def _lasting(name: str, document: Mapping[str, Any]) -> Any:
     """A setting of a manifest; of SUMO's options only those that a replay uses again."""
     value = document[name]
     return {k: v for k, v in value.items() if keeps(k)} if name == "sumo_options" else value
-
-
-@contextlib.contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    """The folder is made where it is not there. Raises BadInput when `path` cannot be written."""
-    with cannot("write", file=path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield
 
 
 @contextlib.contextmanager

@@ -96,7 +96,8 @@ class Strip:
     def _pixel(self, x: float, y: float) -> tuple[float, float]:
         return self._pixels(np.array([[x, y]]))[0]
 
-    def _sees(self, points: Floats) -> bool:
+    def sees(self, points: Floats) -> bool:
+        """Whether points [p,2] m reach into the picture."""
         low, high = points.min(0), points.max(0)
         here = np.array([self._x, self._y])
         return bool((high > here - self._half).all() and (low < here + self._half).all())
@@ -108,9 +109,9 @@ class Strip:
     def road(self, r: Watched) -> None:
         """Junctions, then lanes with their edges."""
         for outline in r.road.junctions:
-            if self._sees(outline):
+            if self.sees(outline):
                 self._pen.polygon(self._pixels(outline), fill=JUNCTION)
-        lanes = [lane for lane in r.road.lanes if self._sees(lane.shape)]
+        lanes = [lane for lane in r.road.lanes if self.sees(lane.shape)]
         for internal, colour, less in ((True, ROAD, 0.2), (False, EDGE, -0.2), (False, ROAD, 0.2)):
             for lane in lanes:
                 if lane.internal == internal:
@@ -126,7 +127,7 @@ class Strip:
         every = max(round(1.0 / forecast.interval), 1)
         for v, name in enumerate(forecast.ids):
             points = np.stack([forecast.x[v], forecast.y[v]], axis=1)
-            if name not in colours or not self._sees(points):
+            if name not in colours or not self.sees(points):
                 continue
             colour = colours[name]
             self._pen.line(self._pixels(points), fill=(*colour, 190), width=FINE + 1)
@@ -138,15 +139,12 @@ class Strip:
 
     def vehicle(self, p: Pose) -> None:
         """The box, its windscreen, brake lights, and the sensor on an AV's roof."""
-        t = p.track
-        length, w = t.length, t.width
+        t, length, w = p.track, p.track.length, p.track.width
 
         def box(back: float, front: float, side: float) -> list[tuple[float, float]]:
             corners = np.array([[back, -side], [front, -side], [front, side], [back, side]])
             return self._pixels(_placed(corners, p.x, p.y, p.heading))
 
-        if not self._sees(np.array([[p.x, p.y]])):
-            return
         self._pen.polygon(
             box(-length / 2, length / 2, w / 2), fill=colour_of(t), outline=(255, 255, 255), width=FINE
         )
@@ -159,8 +157,6 @@ class Strip:
 
     def choice(self, p: Pose, c: Choice, others: Mapping[str, Pose]) -> None:
         """The command beside the car; a ring where it was vetoed, a line to who was blamed."""
-        if not self._sees(np.array([[p.x, p.y]])):
-            return
         d = c.decision
         if d.vetoed or d.fallback:
             colour = BAD if d.fallback else WARN

@@ -7,7 +7,7 @@ camera of its own, at equal times since they began.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import av
@@ -51,7 +51,7 @@ def film(
         stream = container.add_stream("libx264", rate=RATE)
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT * len(episodes), "yuv420p"
         stream.options = {"crf": "23", "preset": "veryfast"}
-        for picture in _pictures(episodes, follow, picture_at, RATE, progress):
+        for picture in _pictures(episodes, follow, RATE, progress):
             container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
         container.mux(stream.encode())
 
@@ -65,7 +65,7 @@ def animation(
     """
     first, *rest = (
         Image.fromarray(picture).quantize(COLOURS, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
-        for picture in _pictures(episodes, follow, caption_at, 1.0 / STEP, progress)
+        for picture in _pictures(episodes, follow, 1.0 / STEP, progress, small=True)
     )
     times = round(1000 * SHOWN)  # ms
     with whole(path) as draft:
@@ -75,9 +75,10 @@ def animation(
 def _pictures(
     episodes: Sequence[Watched],
     follow: str | None,
-    draw: Callable[[Watched, float, _Camera], Image.Image],
     rate: float,
     progress: Progress | None,
+    *,
+    small: bool = False,
 ) -> Iterator[npt.NDArray[np.uint8]]:
     """`rate` pictures [height,width,3] a second, all episodes one above the other; those that ended earlier
     stand still."""
@@ -85,8 +86,8 @@ def _pictures(
     count = round(rate * max(float(r.times[-1] - r.times[0]) for r in episodes)) + 1
     for k in range(count):
         times = [min(float(r.times[0]) + k / rate, float(r.times[-1])) for r in episodes]
-        parts = [draw(*shot) for shot in zip(episodes, times, cameras, strict=True)]
-        yield np.vstack([np.asarray(part) for part in parts])
+        shots = zip(episodes, times, cameras, strict=True)
+        yield np.vstack([np.asarray(picture_at(*shot, small=small)) for shot in shots])
         if progress is not None:
             progress(k + 1, count)
 
@@ -105,8 +106,7 @@ class _Camera:
 
     def look(self, poses: list[Pose]) -> Pose | None:
         """Move to the followed vehicle; the AV whose decision is explained: itself, else the nearest one."""
-        name = None if self.follow is None else self.follow.id
-        here = next((p for p in poses if p.track.id == name), None)
+        here = next((p for p in poses if self.follow and p.track.id == self.follow.id), None)
         if here is not None:
             self.x, self.y = here.x, here.y
             if here.track.kind == Kind.AV:
@@ -115,50 +115,35 @@ class _Camera:
         return min(avs, key=lambda p: math.hypot(p.x - self.x, p.y - self.y), default=None)
 
 
-def picture_at(r: Watched, time: float, camera: _Camera) -> Image.Image:
-    """One picture of the film, WIDTH x HEIGHT."""
+def picture_at(r: Watched, time: float, camera: _Camera, *, small: bool = False) -> Image.Image:
+    """One picture: of the film, WIDTH x HEIGHT, or the `small` one of the GIF, SMALL x (LOW + CAPTION)."""
     poses = poses_at(r, time)
     shown = camera.look(poses)
-    strip = Strip(camera.x, camera.y, WIDTH, HEIGHT - PANEL)
+    strip = Strip(camera.x, camera.y, *((SMALL, LOW) if small else (WIDTH, HEIGHT - PANEL)))
+    strip.road(r)
     k = int(np.searchsorted(r.decided, time + 1e-6, side="right")) - 1
     choices: Mapping[str, Choice] = r.choices[k] if 0 <= k < len(r.choices) else {}
-    strip.road(r)
-    strip.forecast(r, k)
-    for pose in poses:
-        strip.vehicle(pose)
     by_name = {p.track.id: p for p in poses}
-    for pose in poses:
+    if not small:
+        strip.forecast(r, k)
+    near = [p for p in poses if strip.sees(np.array([[p.x, p.y]]))]
+    for pose in near:
+        strip.vehicle(pose)
+    for pose in () if small else near:
         if pose.track.id in choices:
             strip.choice(pose, choices[pose.track.id], by_name)
         if pose.track.mission or pose is shown:
             strip.name(pose)
-    _crashes(strip, r, time)
-    board = _Board(strip.finished(), PANEL)
-    board.legend(r)
-    board.panel(r, time, camera, by_name, shown, choices)
-    return board.picture
-
-
-def caption_at(r: Watched, time: float, camera: _Camera) -> Image.Image:
-    """One picture of the GIF, SMALL x (LOW + CAPTION)."""
-    poses = poses_at(r, time)
-    camera.look(poses)
-    strip = Strip(camera.x, camera.y, SMALL, LOW)
-    strip.road(r)
-    for pose in poses:
-        strip.vehicle(pose)
-    _crashes(strip, r, time)
-    board = _Board(strip.finished(), CAPTION)
-    board.legend(r)
-    board.caption(r, time)
-    return board.picture
-
-
-def _crashes(strip: Strip, r: Watched, time: float) -> None:
-    """Marks the collisions of the last seconds."""
     for crash in r.collisions:
         if math.isfinite(crash.x) and 0.0 <= time - crash.time + 0.05 < SHOWN_CRASH:
             strip.crash(crash.x, crash.y)
+    board = _Board(strip.finished(), CAPTION if small else PANEL)
+    board.legend(r)
+    if small:
+        board.caption(r, time)
+    else:
+        board.panel(r, time, camera, by_name, shown, choices)
+    return board.picture
 
 
 class _Board:
@@ -209,11 +194,9 @@ class _Board:
         self._line(14, line + 50, f"{time - r.begin:.1f} s of {r.times[-1] - r.begin:.0f} s", TEXT, 14)
         outcome, colour = _outcome(r, time)
         self._line(14, line + 72, outcome, colour, 14)
-        followed = None if camera.follow is None else here.get(camera.follow.id)
-        if camera.follow is not None:
-            t = camera.follow
+        if t := camera.follow:
             what = _kind(t) + ", mission vehicle" * t.mission
-            where = f"{followed.speed:.1f} m/s" if followed is not None else "not on the road"
+            where = f"{here[t.id].speed:.1f} m/s" if t.id in here else "not on the road"
             self._line(14, line + 96, f"{t.id} ({what}): {where}", colour_of(t), 13)
         if shown is not None:
             self._decision(470, line, shown, choices.get(shown.track.id))

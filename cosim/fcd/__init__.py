@@ -7,24 +7,27 @@ import math
 import re
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from cosim.errors import BadInput
-from cosim.fcd.encounters import Encounters
+from cosim.fcd.encounters import Encounters, edge_of
 from cosim.fcd.file import Row, Step, lanes_named, read_steps
 from cosim.fcd.vehicle_types import DEFAULT, Size, size_of
 from cosim.files.xml_input import Progress
 from cosim.metrics import METRICS, MetricContext
+from cosim.metrics.context import rows_in_both
 from cosim.metrics.post_encroachment import LONGEST
 from cosim.road import Lane, RoadMap
 from cosim.simulation.conventions import centres
 from cosim.types import Kind, Metric, Snapshot, Timing
 
 FIGURES = ("time_to_collision", "post_encroachment", "drac", "hard_braking", "jerk", "headway")
+CONFLICTS = ("time_to_collision", "drac")  # figures of single frames, which a jump would make up
+SIDEWAYS = 5.0  # m/s: nobody moves faster to the side, but for SUMO's lane changes that take no time
 FRAME = Timing().frame  # s: finer data are thinned to it, so that figures compare with an episode's
 DRIVEN = 200.0  # m that all vehicles have driven before the positions are doubted
 WHOLE_LANE = 1e6  # m, of a lane whose length is not known
@@ -119,7 +122,7 @@ class _Counter:
         self._path, self._road, self._sizes, self._roles = path, road, sizes, roles
         self._begin, self._end = window
         self._wanted = frame
-        self._metrics = [METRICS[name]() for name in FIGURES]
+        self._metrics = {name: METRICS[name]() for name in FIGURES}
         self._encounters = encounters
         self._first: Step | None = None  # kept until the second one says how far apart they are
         self._interval = 0.0  # s between the file's steps
@@ -133,6 +136,7 @@ class _Counter:
         self._unknown_types: set[str] = set()
         self._laneless = self._rows = 0  # vehicle frames
         self._strange: Counter[str] = Counter()  # lanes that the road lacks
+        self._jumps = 0  # lane changes from one frame to the next
         self._driven = self._moved = 0.0  # m, by the speeds and by the positions
 
     def see(self, step: Step) -> None:
@@ -222,19 +226,44 @@ class _Counter:
         return known
 
     def _count(self, snapshot: Snapshot) -> None:
-        for metric in self._metrics:
+        seen = self._without_jumps(snapshot)
+        for name, metric in self._metrics.items():
+            frame = seen if name in CONFLICTS else snapshot
             if self._frames:
-                metric.add(snapshot)
+                metric.add(frame)
             else:
-                metric.reset(snapshot, self._context)
+                metric.reset(frame, self._context)
         if self._encounters is not None:
-            self._encounters.add(snapshot)
+            self._encounters.add(snapshot, seen)
         if self._newest is None:
             self._began = snapshot.time
         elif self._driven < DRIVEN:
             self._doubt(self._newest, snapshot)
         self._frames += 1
         self._newest = snapshot
+
+    def _without_jumps(self, snapshot: Snapshot) -> Snapshot:
+        """The frame without the vehicles that have just been put on a neighbouring lane (`SIDEWAYS`)."""
+        s, before = snapshot, self._newest
+        if before is None or s.n == 0:
+            return s
+        then, now = rows_in_both(before, s)
+        x, y = s.x[now] - before.x[then], s.y[now] - before.y[then]
+        aside = np.abs(np.cos(s.heading[now]) * y - np.sin(s.heading[now]) * x)  # [c] m
+        fast = np.flatnonzero(aside > SIDEWAYS * (s.time - before.time))
+        ways = [(int(before.lane[then[k]]), int(s.lane[now[k]]), int(now[k])) for k in fast]
+        jumped = [
+            row
+            for a, b, row in ways
+            if a != b and min(a, b) >= 0 and edge_of(self._road, a) == edge_of(self._road, b)
+        ]
+        self._jumps += len(jumped)
+        if not jumped:
+            return s
+        kept = np.delete(np.arange(s.n), jumped)
+        every: dict[str, Any] = {f.name: getattr(s, f.name) for f in fields(s)}
+        rest: dict[str, Any] = {k: v[kept] for k, v in every.items() if isinstance(v, np.ndarray)}
+        return replace(s, ids=tuple(s.ids[k] for k in kept), **rest)
 
     def _doubt(self, before: Snapshot, after: Snapshot) -> None:
         """Longitudes and latitudes hardly change while the speeds are those of cars."""
@@ -259,7 +288,7 @@ class _Counter:
         if self._strange.total() > 0.5 * self._rows:
             problem = "no such lane in --net, which is not the net of this file"
             raise self._wrong(problem, "vehicle.lane", self._strange.most_common(1)[0][0])
-        figures = dict(itertools.chain.from_iterable(m.result().items() for m in self._metrics))
+        figures = dict(itertools.chain.from_iterable(m.result().items() for m in self._metrics.values()))
         return Analysis(
             figures,
             self._began,
@@ -291,6 +320,8 @@ class _Counter:
             ),
             f"{self._laneless} vehicle frames have no lane position: no headway there": bool(self._laneless),
             f"{self._strange.total()} vehicle frames on lanes that --net lacks: {lanes}": bool(lanes),
+            f"{self._jumps} lane changes that took no time (lanechange.duration 0): no time to collision and "
+            "no DRAC of that vehicle in that frame": bool(self._jumps),
             f"steps of {self._interval:g} s are thinned to frames of {apart:g} s": self._stride > 1,
             f"frames every {apart:g} s: brief events are missed, jerk is damped": apart > FRAME + 1e-9,
         }

@@ -8,6 +8,7 @@ caps on depth, token length and unpacked size; memory does not grow with the fil
 
 from __future__ import annotations
 
+import codecs
 import gzip
 import stat
 import zlib
@@ -81,22 +82,18 @@ def scan(
     parser.buffer_text = True
     _refuse_entities(parser, path)
     stack: list[str] = []
-    root: list[str] = []
+    root = ""
 
     def opened(tag: str, attributes: dict[str, str]) -> None:
-        if not stack:
-            if roots and tag not in roots:
-                wanted = " or ".join(f"<{name}>" for name in roots)
-                raise BadInput(f"wrong root element, {wanted} is needed", file=path, field="root", value=tag)
-            root.append(tag)
+        nonlocal root
+        root = root or tag
+        if not stack and roots and tag not in roots:
+            wanted = " or ".join(f"<{name}>" for name in roots)
+            raise BadInput(f"wrong root element, {wanted} is needed", file=path, field="root", value=tag)
         stack.append(tag)
         if len(stack) > MAX_DEPTH:
-            raise BadInput(
-                f"elements nest deeper than {MAX_DEPTH} (line {parser.CurrentLineNumber})",
-                file=path,
-                field="element",
-                value=tag,
-            )
+            problem = f"elements nest deeper than {MAX_DEPTH} (line {parser.CurrentLineNumber})"
+            raise BadInput(problem, file=path, field="element", value=tag)
         start(tag, attributes, parser.CurrentLineNumber)
 
     def closed(tag: str) -> None:
@@ -117,7 +114,7 @@ def scan(
         parser.Parse(b"", True)
     except expat.ExpatError as error:
         raise _malformed(error, path, fed, stack) from None
-    return root[0]
+    return root
 
 
 def content(path: Path) -> bytes:
@@ -208,14 +205,11 @@ def _malformed(error: expat.ExpatError, path: Path, fed: int, stack: list[str]) 
 
 def _first_undecodable(path: Path) -> str | None:
     """The first byte that is not UTF-8, in hexadecimal; None when all are."""
-    tail = b""
-    for chunk in chunks(path):
-        data = tail + chunk
-        try:
-            data.decode("utf-8")
-            tail = b""
-        except UnicodeDecodeError as error:
-            if error.end < len(data) or len(data) - error.start > 3:
-                return f"0x{data[error.start]:02x}"
-            tail = data[error.start :]  # a character cut by the chunk's end
-    return f"0x{tail[0]:02x}" if tail else None
+    decoder = codecs.getincrementaldecoder("utf-8")()
+    try:
+        for chunk in chunks(path):
+            decoder.decode(chunk)
+        decoder.decode(b"", final=True)
+    except UnicodeDecodeError as error:
+        return f"0x{error.object[error.start]:02x}"
+    return None

@@ -31,7 +31,7 @@ _DRIVERS = frozenset({"vehicle", "trip", "flow"})
 _MOVING = _DRIVERS | {"person", "personFlow", "container", "containerFlow"}
 _TRAVEL = _DRIVERS | {"route", "walk", "ride", "personTrip", "transport", "tranship", "stop"}
 _EDGE_LISTS = ("edges", "via")
-_EDGE_NAMES = ("from", "to", "edge")
+_PLACES = {"from": "edge", "to": "edge", "edge": "edge", "fromJunction": "junction", "toJunction": "junction"}
 _ON_A_LANE = words(
     "stop busStop trainStop containerStop chargingStation parkingArea inductionLoop e1Detector "
     "instantInductionLoop laneAreaDetector e2Detector detEntry detExit"
@@ -106,13 +106,12 @@ class _DemandReader(Reader):
             self._type(attributes, owner)
         elif tag in _MOVING:
             self._driver(tag, attributes, owner, line)
-        elif tag in ("route", "routeDistribution"):
-            if "id" in attributes:
-                self.found.routes.add(attributes["id"])
-        elif tag == "vTypeDistribution" and "id" in attributes:
-            self.found.types.add(attributes["id"])
         elif tag == "include":
             self._include(attributes, line)
+        if "id" in attributes and (is_type or tag == "vTypeDistribution"):
+            self.found.types.add(attributes["id"])
+        elif "id" in attributes and tag in ("route", "routeDistribution"):
+            self.found.routes.add(attributes["id"])
         if tag in _TRAVEL:
             self._edges(tag, attributes, owner, line)
         if tag in _ON_A_LANE and "lane" in attributes:
@@ -135,8 +134,6 @@ class _DemandReader(Reader):
         return self.found
 
     def _type(self, attributes: dict[str, str], owner: str) -> None:
-        if "id" in attributes:
-            self.found.types.add(attributes["id"])
         idle = sorted(SL2015_ONLY & attributes.keys())
         if idle:
             self._warn(f"vType {owner!r}: {', '.join(idle)} only work with SL2015, LC2013 drives here")
@@ -179,12 +176,9 @@ class _DemandReader(Reader):
             self._last_depart = when
 
     def _edges(self, tag: str, attributes: dict[str, str], owner: str, line: int) -> None:
-        for name in _EDGE_NAMES:
-            if name in attributes and (name == "edge" or tag != "stop"):
-                self._use("edge", attributes[name], tag, name, owner, line)
-        for name in ("fromJunction", "toJunction"):
-            if name in attributes:
-                self._use("junction", attributes[name], tag, name, owner, line)
+        for name, kind in _PLACES.items():
+            if name in attributes and (tag != "stop" or name not in ("from", "to")):
+                self._use(kind, attributes[name], tag, name, owner, line)
         for name in _EDGE_LISTS:
             value = attributes.get(name)
             if value is None or value in self._seen_lists:

@@ -145,7 +145,6 @@ class _NetReader(Reader):
             self._need("lane", name, attributes, line)
         if self._edge is None:
             self._refuse("lane", "id", lane, "is outside every edge", "", line)
-            return
         expected = self._lanes[self._edge]
         internal = self._edge.startswith(":")  # netconvert itself repeats an index inside junctions
         if attributes["index"] != str(expected) and not (internal and int(attributes["index"]) < expected):

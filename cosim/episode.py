@@ -5,12 +5,12 @@ from __future__ import annotations
 import hashlib
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
 from cosim.control import to_commands
-from cosim.metrics import MetricContext, Metrics
+from cosim.metrics import MetricContext, MetricFactory, Metrics, joined
 from cosim.observation import Observer
 from cosim.scenario import Scenario
 from cosim.scenario.manifest import manifest
@@ -41,15 +41,22 @@ class Episode:
 
     `start` and `advance` return what every AV on the road observes; decisions given to `advance` are
     commanded, AVs without one are driven by SUMO. `terminated` after a collision of an AV or the mission
-    vehicle, `truncated` when the scenario's duration is over (definitions.md, Episode).
+    vehicle, `truncated` when the scenario's duration is over (definitions.md, Episode). `metrics` are
+    measured besides those of `cosim.metrics.METRICS`.
     """
 
-    def __init__(self, scenario: Scenario, simulator: Simulator, observation: ObservationConfig) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        simulator: Simulator,
+        observation: ObservationConfig,
+        metrics: Sequence[MetricFactory] = (),
+    ) -> None:
         self.scenario = scenario
         self.simulator = simulator
         self.observation = observation
         self._observer = Observer(simulator.road, observation)
-        self._metrics = Metrics()
+        self._metrics = Metrics(metrics)
 
     def start(self, seed: int) -> dict[str, History]:
         """Begin the episode `seed`: warm-up driven, clock at 0."""
@@ -134,9 +141,8 @@ class Episode:
     def result(self, policy: str, label: str = "", svo: float = 0.0) -> EpisodeResult:
         """The figures of the episode so far; `svo` in rad."""
         counts = self.simulator.counts()
-        metrics = self._metrics.result()
         decided = self._tally["decisions"]
-        metrics |= {
+        own = {
             "vehicles_inserted": Metric(counts["inserted"], "vehicles", ""),
             "vehicles_never_inserted": Metric(counts["waiting"], "vehicles", "lower"),
             "veto_rate": Metric(self._tally["vetoes"] / decided if decided else None, "share", "lower"),
@@ -146,6 +152,7 @@ class Episode:
             "lane_changes_commanded": Metric(self._tally["lane_changes"], "changes", ""),
             "commands_blocked": Metric(self._tally["blocked"], "commands", "lower"),
         }
+        metrics = joined(self._metrics.result(), own)
         s = self.scenario
         return EpisodeResult(
             scenario=s.name,

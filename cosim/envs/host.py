@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -10,8 +10,9 @@ import numpy as np
 
 from cosim.episode import Episode
 from cosim.errors import BadInput
+from cosim.metrics import MetricFactory
 from cosim.observation.view import Packed, Packer
-from cosim.rewards import RewardConfig, RewardTerms, rewards
+from cosim.rewards import Reward, RewardTerms, rewards
 from cosim.road import RoadMap
 from cosim.scenario import Scenario
 from cosim.types import (
@@ -60,9 +61,10 @@ class Host:
         scenario: Scenario,
         observation: ObservationConfig,
         svo: float,
-        reward: RewardConfig,
+        reward: Reward,
         others: PolicyFactory | None,
         simulator: SimulatorFactory | None,
+        metrics: Sequence[MetricFactory] = (),
     ) -> None:
         self._others = None if others is None else others()
         self._svo = svo  # rad
@@ -70,7 +72,7 @@ class Host:
         wanted = observation if self._others is None else _common(observation, self._others)
         parameters = {} if self._others is None else self._others.av_parameters
         self._simulator = (simulator or _sumo)(scenario, parameters, wanted.frames)
-        self._episode = Episode(scenario, self._simulator, wanted)
+        self._episode = Episode(scenario, self._simulator, wanted, metrics)
         self._packer = Packer()
         self._painter: Callable[[Snapshot, str | None], Bytes] | None = None
         self._started = False

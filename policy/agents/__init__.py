@@ -1,14 +1,35 @@
-"""Every policy by name: the explicit table that `--policy` reads."""
+"""Every policy by name: the explicit tables that `--policy` reads; they need no torch."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
 
 from cosim.errors import BadInput, hint
 from cosim.types import Policy
 
-# policy.agents.approaches has the table; its names alone are needed before torch is
-LEARNING = ("vfn-p", "vfn", "vfn-p-egoistic", "safe-dqn", "conv3d-dqn", "conv3d-a2c", "conv2d-dqn")
+
+@dataclass(frozen=True, slots=True)
+class Approach:
+    """One row of definitions.md's table of approaches."""
+
+    extractor: Literal["conv3d", "conv2d"] = "conv3d"
+    kinematics: bool = True  # K and the route join the maps
+    predicted_maps: bool = True
+    mask: Literal["gp-indirect", "cs", "none"] = "gp-indirect"
+    learning: Literal["ddqn", "a2c"] = "ddqn"
+
+
+APPROACHES = {
+    "vfn-p": Approach(),
+    "vfn-p-egoistic": Approach(),  # the twin: the same agent, trained with phi = 0
+    "vfn": Approach(predicted_maps=False, mask="cs"),
+    "safe-dqn": Approach(kinematics=False, predicted_maps=False, mask="cs"),
+    "conv3d-dqn": Approach(kinematics=False, predicted_maps=False, mask="none"),
+    "conv3d-a2c": Approach(kinematics=False, predicted_maps=False, mask="none", learning="a2c"),
+    "conv2d-dqn": Approach("conv2d", kinematics=False, predicted_maps=False, mask="none"),
+}
 
 
 def _prediction_aware(name: str) -> Callable[[], Policy]:
@@ -31,7 +52,7 @@ def _rules() -> dict[str, Callable[[], Policy]]:
 
 POLICIES: dict[str, Callable[[], Policy]] = {
     **_rules(),
-    **{name: _prediction_aware(name) for name in LEARNING},
+    **{name: _prediction_aware(name) for name in APPROACHES},
 }
 
 

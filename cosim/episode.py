@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cosim.control import to_commands
-from cosim.metrics import MetricContext, Metrics
+from cosim.metrics import MetricContext, MetricFactory, Metrics, joined
 from cosim.observation.observer import Observer
 from cosim.scenario import Scenario
 from cosim.scenario.manifest import manifest
@@ -72,15 +72,22 @@ class Episode:
 
     `start` and `advance` return what every AV on the road observes; decisions given to `advance` are
     commanded, AVs without one are driven by SUMO. `terminated` after a collision of an AV or the mission
-    vehicle, `truncated` when the scenario's duration is over (definitions.md, Episode).
+    vehicle, `truncated` when the scenario's duration is over (definitions.md, Episode). `metrics` are
+    measured besides those of `cosim.metrics.METRICS`.
     """
 
-    def __init__(self, scenario: Scenario, simulator: Simulator, observation: ObservationConfig) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        simulator: Simulator,
+        observation: ObservationConfig,
+        metrics: Sequence[MetricFactory] = (),
+    ) -> None:
         self.scenario = scenario
         self.simulator = simulator
         self.observation = observation
         self._observer = Observer(simulator.road, observation)
-        self._metrics = Metrics()
+        self._metrics = Metrics(metrics)
 
     def start(self, seed: int, hooks: Sequence[Hook] = ()) -> dict[str, History]:
         """Begin the episode `seed`: warm-up driven, clock at 0; `hooks` see it until the next start."""
@@ -168,9 +175,8 @@ class Episode:
     def result(self, policy: str, label: str = "", svo: float = 0.0) -> EpisodeResult:
         """The figures of the episode so far; `svo` in rad."""
         counts = self.simulator.counts()
-        metrics = self._metrics.result()
         decided = self._tally["decisions"]
-        metrics |= {
+        own = {
             "vehicles_inserted": Metric(counts["inserted"], "vehicles", ""),
             "vehicles_never_inserted": Metric(counts["waiting"], "vehicles", "lower"),
             "veto_rate": Metric(self._tally["vetoes"] / decided if decided else None, "share", "lower"),
@@ -180,6 +186,7 @@ class Episode:
             "lane_changes_commanded": Metric(self._tally["lane_changes"], "changes", ""),
             "commands_blocked": Metric(self._tally["blocked"], "commands", "lower"),
         }
+        metrics = joined(self._metrics.result(), own)
         s = self.scenario
         return EpisodeResult(
             scenario=s.name,

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from cosim.episode import Episode, Hook, Progress, run_episode
+from cosim.metrics import MetricFactory
 from cosim.policies import make
 from cosim.recording import DRAWN, Recorder
 from cosim.recording.watched import Watched, watched
@@ -29,6 +30,7 @@ class Host:
         svo: phi in rad, told to the policy.
         observation: what the AVs observe; by default what the policy wants to see.
         simulator: builds another simulator than SUMO's.
+        metrics: measured besides those of `cosim.metrics.METRICS`.
 
     Raises BadInput for an unknown policy and for input that SUMO refuses.
     """
@@ -41,6 +43,7 @@ class Host:
         *,
         observation: ObservationConfig | None = None,
         simulator: SimulatorFactory | None = None,
+        metrics: Sequence[MetricFactory] = (),
     ) -> None:
         self.policy = make(policy) if isinstance(policy, str) else policy
         self.svo = svo
@@ -48,7 +51,7 @@ class Host:
         self._policy_files = digests(getattr(self.policy, "files", ()))
         make_torch_deterministic()
         self.simulator = (simulator or sumo)(scenario, self.policy.av_parameters, wanted.frames)
-        self.episode = Episode(scenario, self.simulator, wanted)
+        self.episode = Episode(scenario, self.simulator, wanted, metrics)
 
     def policy_files(self) -> dict[str, str]:
         """SHA-256 of what decides how the policy drives, by file name: its weights, its own code."""

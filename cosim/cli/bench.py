@@ -31,6 +31,13 @@ def add(verbs: arguments.Verbs) -> None:
     predict.add_argument("--behavior", action="append", default=[], choices=BEHAVIORS, help="repeatable")
     predict.add_argument("--demand", action="append", default=[], metavar="NAME", help="repeatable")
     predict.add_argument("--policy", action="append", default=[], metavar="NAME", help="repeatable")
+    predict.add_argument(
+        "--predictor",
+        action="append",
+        default=[],
+        metavar="NAME|FILE:NAME",
+        help="repeatable (all of ours); your own: a class called with horizon, dt",
+    )
     predict.add_argument("--seeds", type=seeds, required=True, metavar="A:B", help="test seeds, B left out")
     predict.add_argument("--recordings", metavar="DIR", help="use these (seeds outside A:B are left out)")
     predict.add_argument("--no-maps", action="store_true", help="kinematics only (the maps take longer)")
@@ -77,6 +84,7 @@ def work(args: argparse.Namespace) -> int:
         scenarios=args.scenario,
         behaviors=args.behavior,
         seeds=args.seeds,
+        predictors=args.predictor,
         command=command,
     )
     print((out / PAGE).read_text())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -10,9 +10,10 @@ import numpy as np
 
 from cosim.errors import BadInput
 from cosim.host import Host, SimulatorFactory
+from cosim.metrics import MetricFactory
 from cosim.observation.view import Packed, Packer
 from cosim.policies import make
-from cosim.rewards import RewardConfig, RewardTerms, rewards
+from cosim.rewards import Reward, RewardTerms, rewards
 from cosim.road import RoadMap
 from cosim.scenario import Scenario
 from cosim.types import (
@@ -56,12 +57,20 @@ class SessionHost(Host):
         scenario: Scenario,
         observation: ObservationConfig,
         svo: float,
-        reward: RewardConfig,
+        reward: Reward,
         others: PolicyFactory | None,
         simulator: SimulatorFactory | None,
+        metrics: Sequence[MetricFactory] = (),
     ) -> None:
         policy = make("idm") if others is None else others()
-        super().__init__(scenario, policy, svo, observation=_common(observation, policy), simulator=simulator)
+        super().__init__(
+            scenario,
+            policy,
+            svo,
+            observation=_common(observation, policy),
+            simulator=simulator,
+            metrics=metrics,
+        )
         self._reward = reward
         self._packer = Packer()
         self._painter: Callable[[Snapshot, str | None], Bytes] | None = None

@@ -56,6 +56,17 @@ class Fleet:
         return f"penetration {self.penetration:g}" if self.penetration is not None else "none"
 
 
+def chosen_fleet(
+    av_type: str | None, av_ids: str | None, penetration: float | None, fleet: Fleet | None = None
+) -> Fleet | None:
+    """The fleet that one of these asks for; None: the scenario's own. Raises BadInput where two are given."""
+    words = {"fleet": fleet, "av_type": av_type, "av_ids": av_ids, "penetration": penetration}
+    given = [name for name, value in words.items() if value is not None]
+    if len(given) > 1:
+        raise BadInput(f"excludes {given[1]}: give one of them", field=given[0], value=words[given[0]])
+    return fleet if fleet is not None or not given else Fleet(av_type, av_ids, penetration)
+
+
 @dataclass(frozen=True, slots=True)
 class Scenario:
     """Everything the simulator needs; paths are absolute."""

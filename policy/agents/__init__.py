@@ -1,16 +1,37 @@
-"""Every policy by name: the explicit table that `--policy` reads."""
+"""Every policy by name: the explicit tables that `--policy` reads; they need no torch."""
 
 from __future__ import annotations
 
 import importlib
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
+from typing import Literal
 
 from cosim.errors import BadInput, hint
 from cosim.types import Policy
 
-# policy.agents.approaches has the table; its names alone are needed before torch is
-LEARNING = ("vfn-p", "vfn", "vfn-p-egoistic", "safe-dqn", "conv3d-dqn", "conv3d-a2c", "conv2d-dqn")
+
+@dataclass(frozen=True, slots=True)
+class Approach:
+    """One row of definitions.md's table of approaches."""
+
+    extractor: Literal["conv3d", "conv2d"] = "conv3d"
+    kinematics: bool = True  # K and the route join the maps
+    predicted_maps: bool = True
+    mask: Literal["gp-indirect", "cs", "none"] = "gp-indirect"
+    learning: Literal["ddqn", "a2c"] = "ddqn"
+
+
+APPROACHES = {
+    "vfn-p": Approach(),
+    "vfn-p-egoistic": Approach(),  # the twin: the same agent, trained with phi = 0
+    "vfn": Approach(predicted_maps=False, mask="cs"),
+    "safe-dqn": Approach(kinematics=False, predicted_maps=False, mask="cs"),
+    "conv3d-dqn": Approach(kinematics=False, predicted_maps=False, mask="none"),
+    "conv3d-a2c": Approach(kinematics=False, predicted_maps=False, mask="none", learning="a2c"),
+    "conv2d-dqn": Approach("conv2d", kinematics=False, predicted_maps=False, mask="none"),
+}
 
 
 def _made(module: str, kind: str, *arguments: str) -> Policy:
@@ -25,7 +46,7 @@ POLICIES: dict[str, Callable[[], Policy]] = {
     "keep-lane": partial(_made, "keep_lane", "KeepLane"),
     "random": partial(_made, "random", "Random"),
     "altruist-rule": partial(_made, "altruist_rule", "AltruistRule"),
-    **{name: partial(_made, "prediction_aware", "PredictionAware", name) for name in LEARNING},
+    **{name: partial(_made, "prediction_aware", "PredictionAware", name) for name in APPROACHES},
 }
 
 

@@ -16,7 +16,6 @@ from cosim.errors import BadInput
 from cosim.policies import make
 from cosim.scenario import load, place
 from cosim.simulation.fake import FakeSimulator, FakeVehicle
-from cosim.types import EpisodeResult
 from policy.predictors import make_predictor
 
 CODE = """
@@ -70,26 +69,12 @@ def one_av(*_: object) -> FakeSimulator:
     return FakeSimulator([FakeVehicle("av", 50.0, 0, 20.0, is_av=True)], length=520.0)
 
 
-def drive(what: str, code: str, steps: int = 2) -> EpisodeResult:
-    """The first steps of a contested episode that the user's policy drives."""
-    others = partial(make, f"{code}:Brakes")
-    with cosim.open(what, demand="contested", seed=100_007, others=others) as session:
-        session.reset()
-        for _ in range(steps):
-            session.act({})
-        return session.result()
-
-
 def test_a_world_is_a_folder_wherever_it_lies(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    theirs, code = own / "mine", f"{own}/code.py"
-    scenario = load(str(theirs), demand=["contested"])
-    assert (scenario.name, scenario.behavior) == ("mine", load("merge", demand=["contested"]).behavior)
-    found, ours = drive(str(theirs), code), drive("merge", code)
-    assert found.scenario == "mine"
-    assert found.trace_hash == ours.trace_hash
-    assert found.manifest["files"]["mine.sumocfg"] == ours.manifest["files"]["merge.sumocfg"]
+    theirs, ours = load(str(own / "mine"), demand=["contested"]), load("merge", demand=["contested"])
+    assert (theirs.name, theirs.behavior) == ("mine", ours.behavior)
+    assert theirs.demand[0] == own / "mine" / "demand" / "contested.rou.xml"
     monkeypatch.chdir(own)
-    assert place("mine") == str(theirs)
+    assert place("mine") == str(own / "mine")
     assert place("merge") == "merge"
 
 
@@ -103,20 +88,23 @@ def test_a_world_may_not_be_called_as_one_that_ships(own: Path, tmp_path: Path) 
 
 def test_reward_metric_and_policy_of_ones_own_drive_in_a_world_of_ones_own(own: Path) -> None:
     code = f"{own}/code.py"
-    words = {
-        "reward": f"{code}:by_speed",
-        "metrics": [f"{code}:Frames"],
-        "others": partial(make, f"{code}:Brakes"),
-    }
-    with cosim.open(str(own / "mine"), demand="contested", seed=100_007, **words) as session:
+    words = {"demand": "contested", "seed": 100_007, "others": partial(make, f"{code}:Brakes")}
+    with cosim.open("merge", **words) as session:
+        session.reset()
+        session.act({})
+        ours = session.result()
+    words |= {"reward": f"{code}:by_speed", "metrics": [f"{code}:Frames"]}
+    with cosim.open(str(own / "mine"), **words) as session:
         before = session.reset()
         step = session.act({})
         now = session.snapshot()
-        assert step.rewards == {av: now.speed[now.row[av]] for av in before}
-        assert step.terms[next(iter(before))].ego == step.rewards[next(iter(before))]
-        assert set(step.receipts) == set(before), "the policy commanded them all"
+        theirs = session.result()
         timing = session.scenario.timing
-        assert session.result().metrics["frames"].value == round(timing.decision / timing.frame)
+    assert (theirs.scenario, theirs.trace_hash) == ("mine", ours.trace_hash)
+    assert step.rewards == {av: now.speed[now.row[av]] for av in before}
+    assert {av: terms.ego for av, terms in step.terms.items()} == step.rewards
+    assert set(step.receipts) == set(before), "the policy commands them all"
+    assert theirs.metrics["frames"].value == round(timing.decision / timing.frame)
 
 
 def test_a_share_of_all_vehicles_may_be_avs(own: Path) -> None:

@@ -107,12 +107,9 @@ def _store(folder: RunFolder, plan: matrix.Plan, args: argparse.Namespace) -> St
 def _drive(plan: matrix.Plan, engine: Engine, store: Store, folder: Path, args: argparse.Namespace) -> int:
     done = len(store.keys())
     title = f"evaluate ({done} of {plan.episodes} done before)" if done else "evaluate"
-    progress = Progress(title, "episodes")
     began = time.monotonic()
-    try:
+    with Progress(title, "episodes") as progress:
         faults = batch.drive(plan, store, engine, folder / "outputs", progress)
-    finally:
-        progress.done()
     seconds = time.monotonic() - began
     rows = store.rows()
     manifest = _manifest(plan, store)

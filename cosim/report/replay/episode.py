@@ -120,7 +120,7 @@ def drive(recorded: Recorded, scenario: Scenario, *, check: bool = True) -> tupl
         ReplayDiffers: the trace hash is another one.
     """
     case = recorded.case
-    with _progress(f"replay {scenario.name} {label(case.policy)}", "s") as progress:
+    with Progress(f"replay {scenario.name} {label(case.policy)}", "s") as progress:
         worker = Worker(Runner, scenario, case.policy, math.radians(case.svo_deg), name="cosim-replay")
         with worker:
             if check:
@@ -176,7 +176,7 @@ def draw(
 
         for path, make in ((mp4, video.film), (gif, video.animation)):
             if path is not None:
-                with _progress(path.name, "pictures") as progress, _writing(path):
+                with Progress(path.name, "pictures") as progress, _writing(path):
                     make(episodes, path, follow=follow, progress=progress)
 
 
@@ -248,12 +248,3 @@ def _writing(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise BadInput(f"cannot write: {error.strerror or error}", file=path) from None
-
-
-@contextlib.contextmanager
-def _progress(title: str, unit: str) -> Iterator[Progress]:
-    progress = Progress(title, unit)
-    try:
-        yield progress
-    finally:
-        progress.done()

@@ -84,6 +84,12 @@ def performance(place: Place) -> list[list[str]]:
     return [record, ["benchmarks.performance", *flags, *(["--small"] if place.small else [])]]
 
 
+def startup(place: Place) -> list[list[str]]:
+    """How long a short command takes to start."""
+    flags = ["--rounds", "1" if place.small else "7"]
+    return [["benchmarks.startup", *flags, "--out", str(place.out / "startup.md")]]
+
+
 def reward_balance(place: Place) -> list[list[str]]:
     """Whether yielding pays."""
     flags = ["--seeds", "150100:150101" if place.small else "150100:150106"]
@@ -115,6 +121,7 @@ PAGES = (
     Page("agent", agent, ("agent.md",)),
     Page("prediction_speed", prediction_speed, ("prediction_speed.md",)),
     Page("performance", performance, ("performance.md",)),
+    Page("startup", startup, ("startup.md",)),
     Page("reward_balance", reward_balance, ("reward_balance.md",)),
     Page(
         "attribution",

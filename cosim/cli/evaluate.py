@@ -118,12 +118,9 @@ def _drive(plan: Plan, engine: Engine, store: Store, folder: Path, args: argpars
 
     done = len(store.keys())
     title = f"evaluate ({done} of {plan.episodes} done before)" if done else "evaluate"
-    progress = Progress(title, "episodes")
     began = time.monotonic()
-    try:
+    with Progress(title, "episodes") as progress:
         faults = execution.drive(plan, store, engine, folder / "outputs", progress)
-    finally:
-        progress.done()
     seconds = time.monotonic() - began
     rows = store.rows()
     summary = export(folder, rows, execution.manifest(plan, store), plan.episodes)

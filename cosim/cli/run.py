@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import math
 import shlex
@@ -14,17 +15,17 @@ from typing import TYPE_CHECKING, Any
 from cosim.cli import arguments
 from cosim.errors import BadInput
 from cosim.files.xml_input import is_there
-from cosim.scenario import BEHAVIORS, place
+from cosim.scenario import BEHAVIORS, Scenario, place
 from cosim.scenario.behaviors import DRIVER_MODELS
 from cosim.scenario.episode_id import Case
 from cosim.scenario.policy_name import label, read
 from cosim.seeding import FIRST_TEST_SEED
-from cosim.types import Preset
+from cosim.types import EpisodeResult, Preset
+from cosim.workers.worker import Worker
 
 if TYPE_CHECKING:
-    from cosim.episode import Progress
-    from cosim.scenario import Scenario
-    from cosim.workers.worker import Worker
+    from cosim.episode import Progress as Reported
+    from cosim.host import Host
 
 
 def add(verbs: arguments.Verbs) -> None:
@@ -85,47 +86,41 @@ class Driver:
     the scenario. Raises BadInput for an unknown policy."""
 
     def __init__(self, policy: str) -> None:
+        import cosim.simulation.sumo  # noqa: F401
         from cosim.host import Host
         from cosim.policies import make
-        from cosim.simulation import sumo
 
-        self._host_type, self._simulation = Host, sumo
-        self._policy = make(policy)
-        self._driven: Host | None = None
+        self._make = functools.partial(Host, policy=make(policy))
+        self._host: Host | None = None
 
     def drive(
-        self, verb: str, scenario: Scenario, svo: float, seed: int, progress: Progress, **options: Any
-    ) -> Any:
-        """`Host.run` or `Host.watch`; progress of 0 s in all: a kernel is being compiled.
+        self, scenario: Scenario, case: Case, watch: bool, folder: Path | None, progress: Reported
+    ) -> tuple[EpisodeResult, Any]:
+        """The episode, watched or not; progress of 0 s in all: kernels are being compiled.
 
         Raises as `Host`.
         """
         from cosim.geometry.compiled import on_compilation
 
-        on_compilation(lambda: progress(0.0, 0.0))
-        self._driven = self._host_type(scenario, self._policy, svo)
-        return getattr(self._driven, verb)(seed, progress, **options)
+        on_compilation(functools.cache(lambda: progress(0.0, 0.0)))
+        self._host = self._make(scenario, svo=math.radians(case.svo_deg))
+        if watch:
+            return self._host.watch(case.seed, progress, outputs=case.outputs, folder=folder)
+        return self._host.run(case.seed, progress, outputs=case.outputs, folder=folder), None
 
     def close(self) -> None:
         """End the simulation."""
-        if self._driven is not None:
-            self._driven.close()
+        if self._host is not None:
+            self._host.close()
 
 
 def work(args: argparse.Namespace) -> int:
     """Drive it in a worker process, show the result."""
-    from cosim.workers.worker import Worker
-
     for flag, wanted in (("--output", args.output), ("--replay", args.replay)):
         if wanted and not args.out:
             raise BadInput("needs a run folder to write into: --out DIR", field=flag)
     case = case_of(args)
-    with Worker(Driver, case.policy, name="cosim-run", wait=False) as worker:
-        return _drive(args, case, worker)
-
-
-def _drive(args: argparse.Namespace, case: Case, worker: Worker) -> int:
-    """The worker is loading meanwhile, and is not waited for when something is wrong."""
+    worker = Worker(Driver, case.policy, name="cosim-run", wait=False)
     from cosim.files import prepare_folder
     from cosim.policies import check
     from cosim.report import result as output
@@ -142,23 +137,15 @@ def _drive(args: argparse.Namespace, case: Case, worker: Worker) -> int:
         new = bool(args.out) and not Path(args.out).exists()
         folder = prepare_folder(args.out) if args.out else None
     except BaseException:
-        worker.kill()
+        worker.kill()  # it is still loading, and has nothing to put away
+        worker.close()
         raise
     files = folder / "outputs" if folder is not None and case.outputs else None
     progress = Progress(f"{scenario.name} {label(case.policy)}", "s")
     progress.starting()
-
-    def shown(done: float, total: float) -> None:
-        if total:
-            progress(done, total)
-        else:
-            progress.compiling()
-
     try:
-        verb, svo = "watch" if args.replay else "run", math.radians(case.svo_deg)
-        options = {"progress": shown, "outputs": case.outputs, "folder": files}
-        answer = worker.call("drive", verb, scenario, svo, case.seed, **options)
-        result, watched = answer if args.replay else (answer, None)
+        with worker:
+            result, watched = worker.call("drive", scenario, case, args.replay, files, progress=progress)
     except BaseException:
         if new and folder is not None:
             shutil.rmtree(folder, ignore_errors=True)

@@ -15,7 +15,7 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from cosim.geometry.compiled import compiled
+from cosim.geometry.compiled import cached, compiled
 from cosim.types import Bools, Floats, Ints
 
 FOLLOWING_COSINE = float(np.cos(np.radians(15.0)))  # headings closer than 15 degrees: following, not crossing
@@ -34,13 +34,8 @@ def _ufunc(inputs: int, result: str) -> Callable[[Callable[..., Any]], Callable[
     signature = f"{result}({', '.join(['float64'] * inputs)})"
 
     def compile_later(function: Callable[..., Any]) -> Callable[..., Any]:
-        @functools.cache
-        def made() -> Callable[..., Any]:
-            try:
-                return cast(Callable[..., Any], _numba.vectorize([signature], cache=True)(function))
-            except RuntimeError:  # no cache folder, see `compiled`
-                return cast(Callable[..., Any], _numba.vectorize([signature])(function))
-
+        vectorize = cached(functools.partial(_numba.vectorize, [signature]))
+        made = functools.cache(lambda: vectorize(function))
         return lambda *arguments: made()(*arguments)
 
     return compile_later

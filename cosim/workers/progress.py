@@ -12,12 +12,12 @@ from tqdm import tqdm
 
 REDRAW = 0.1  # s between redraws on a terminal
 LINE_EVERY = 10.0  # s between lines in a log; shorter work needs none
-COUNTED = "{n:.0f}/{total:.0f} {unit}, {rate_noinv_fmt}, {remaining} left"
+COUNTED = "{n:.0f}/{total:.0f}{unit}, {rate_noinv_fmt}, {remaining} left"
 STARTING = "starting SUMO ..."
 COMPILING = "compiling kernels (first use only: up to half a minute) ..."
 
 
-class _Lines(tqdm):
+class _Lines(tqdm):  # type: ignore[misc]  # tqdm is not typed
     """A line instead of each redraw."""
 
     @staticmethod
@@ -33,6 +33,8 @@ class _Lines(tqdm):
 class Progress:
     """Call it with (done, total); `unit` names what is counted. Silent when `quiet`.
 
+    A total of 0: there is nothing to count yet, kernels are being compiled.
+
     Rate and time left are a moving average over the last reports; what came before the first one, the start
     of processes and the like, does not count.
     """
@@ -42,25 +44,22 @@ class Progress:
         self._stream = stream or sys.stderr
         self._terminal = self._stream.isatty()
         self._bar: tqdm[Any] | None = None
-        self._note: threading.Timer | None = None
+        self._note = threading.Timer(3.0, self._say, [STARTING])
+        self._note.daemon = True
 
     def starting(self, after: float = 3.0) -> None:
         """Say what takes so long if nothing has been done `after` s from now."""
         if not self._quiet:
-            self._note = threading.Timer(after, self._say, [STARTING])
-            self._note.daemon = True
+            self._note.interval = after
             self._note.start()
-
-    def compiling(self) -> None:
-        """Say it, where nothing has been done yet."""
-        if not self._quiet and self._bar is None:
-            self._begun()
-            self._say(COMPILING)
 
     def __call__(self, done: float, total: float) -> None:
         if self._quiet:
             return
-        self._begun()
+        self._note.cancel()
+        if not total:
+            self._say(COMPILING)
+            return
         if self._bar is None:
             every = REDRAW if self._terminal else LINE_EVERY
             self._bar = (tqdm if self._terminal else _Lines)(
@@ -81,17 +80,18 @@ class Progress:
         self._bar.total = total
         self._bar.update(min(done, total) - self._bar.n)
 
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.done()
+
     def done(self) -> None:
         """Clear the bar."""
-        self._begun()
+        self._note.cancel()
         if self._bar is not None:
             self._bar.close()
 
     def _say(self, line: str) -> None:
         with contextlib.suppress(ValueError):  # the stream is closed: nobody listens any more
             print(f"{self._title}: {line}", file=self._stream, flush=True)
-
-    def _begun(self) -> None:
-        if self._note is not None:
-            self._note.cancel()
-            self._note = None

@@ -199,7 +199,14 @@ def _serve(pipe: Connection, factory: Callable[..., Any], arguments: tuple[Any, 
     os.dup2(file, 2)
     os.close(file)
     target, done = None, False
-    atexit.register(lambda: done and _leave())  # after every other exit function: they run in reverse order
+
+    def leave() -> None:
+        """Without taking numba and torch apart, which takes longer than a short episode."""
+        sys.stdout.flush()
+        if done:
+            os._exit(0)
+
+    atexit.register(leave)  # comes after every other exit function: they run in reverse order
 
     def attempt(work: Callable[[], Any]) -> bool:
         try:
@@ -227,9 +234,3 @@ def _serve(pipe: Connection, factory: Callable[..., Any], arguments: tuple[Any, 
         with contextlib.suppress(Exception):
             target.close()
     done = True
-
-
-def _leave() -> None:
-    """End the process without taking numba and torch apart, which takes longer than a short episode."""
-    sys.stdout.flush()
-    os._exit(0)

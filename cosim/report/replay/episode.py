@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -118,7 +117,7 @@ def drive(recorded: Recorded, scenario: Scenario, *, check: bool = True) -> tupl
         ReplayDiffers: the trace hash is another one.
     """
     case = recorded.case
-    with _progress(f"replay {scenario.name} {label(case.policy)}", "s") as progress:
+    with Progress(f"replay {scenario.name} {label(case.policy)}", "s") as progress:
         worker = Worker(Host, scenario, case.policy, math.radians(case.svo_deg), name="cosim-replay")
         with worker:
             if check:
@@ -177,7 +176,7 @@ def draw(
 
         for path, make in ((mp4, video.film), (gif, video.animation)):
             if path is not None:
-                with _progress(path.name, "pictures") as progress, cannot("write", file=path):
+                with Progress(path.name, "pictures") as progress, cannot("write", file=path):
                     make(episodes, path, follow=follow, progress=progress)
 
 
@@ -234,12 +233,3 @@ def _lasting(name: str, document: Mapping[str, Any]) -> Any:
     """A setting of a manifest; of SUMO's options only those that a replay uses again."""
     value = document[name]
     return {k: v for k, v in value.items() if keeps(k)} if name == "sumo_options" else value
-
-
-@contextlib.contextmanager
-def _progress(title: str, unit: str) -> Iterator[Progress]:
-    progress = Progress(title, unit)
-    try:
-        yield progress
-    finally:
-        progress.done()

@@ -28,9 +28,9 @@ import torch
 
 from benchmarks.prediction_maps import AGENTS, DECISION, PENETRATION, Gatherer
 from benchmarks.tables import markdown_row, write_page
+from cosim.host import Host
 from cosim.learning.configuration import configuration
 from cosim.learning.rollouts import Rollouts
-from cosim.runner import Runner
 from cosim.scenario import Fleet, Scenario, load
 from cosim.seeding import TUNING_SEEDS
 from cosim.types import EpisodeResult, History, PolicyContext
@@ -102,7 +102,7 @@ def decisions(
 
 def closed_loop(scenario: Scenario, episodes: int) -> dict[str, float]:
     """ms a decision of whole episodes driven by the compact agent in one process: who spends the time."""
-    with Worker(Runner, scenario, POLICY, SVO) as worker:
+    with Worker(Host, scenario, POLICY, SVO) as worker:
         worker.call("run", TUNING_SEEDS.start)  # compilation
         done: list[EpisodeResult] = [worker.call("run", TUNING_SEEDS.start + 1 + k) for k in range(episodes)]
     steps = sum(result.steps for result in done)

@@ -70,7 +70,7 @@ class Ours:
     """The loop up to the agent: advance, read, draw, keep the history."""
 
     def __init__(self, scenario: Scenario, observation: ObservationConfig) -> None:
-        from cosim.observation import Observer
+        from cosim.observation.observer import Observer
         from cosim.simulation.sumo import SumoSimulator
 
         self._simulator = SumoSimulator(scenario)

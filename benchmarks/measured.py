@@ -19,6 +19,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from sumo_scenarios import names
+
 RESULTS = Path("docs/results")
 PREDICTED = (  # what `cosim bench predict` leaves of figures
     *("position_error.png", "map_error.png", "hpn_training.png"),
@@ -77,8 +79,7 @@ def performance(place: Place) -> list[list[str]]:
     if place.small:
         record += ["--scenario", "merge", "--seeds", "100000:100001", "--duration", "8"]
     else:
-        worlds = ("exit", "merge", "roundabout", "intersection", "highway")
-        record += [word for world in worlds for word in ("--scenario", world)] + ["--seeds", "100000:100004"]
+        record += [word for world in names() for word in ("--scenario", world)] + ["--seeds", "100000:100004"]
     flags = ["--recordings", where, "--out", str(place.out / "performance.md")]
     return [record, ["benchmarks.performance", *flags, *(["--small"] if place.small else [])]]
 
@@ -88,6 +89,14 @@ def reward_balance(place: Place) -> list[list[str]]:
     flags = ["--seeds", "150100:150101" if place.small else "150100:150106"]
     flags += ["--scenario", "merge"] if place.small else []
     return [["benchmarks.reward_balance", *flags, "--out", str(place.out / "reward_balance.md")]]
+
+
+def attribution(place: Place) -> list[list[str]]:
+    """Which inputs the shipped value networks use."""
+    flags = ["--scenario", "merge", "--demand", "contested", "--workers", "2"]
+    flags += ["--policy", "vfn-p", "--seeds", "150000:150001" if place.small else "150000:150006"]
+    flags += ["--duration", "2"] if place.small else ["--policy", "vfn", "--policy", "vfn-p-egoistic"]
+    return [["cosim.cli.main", "bench", "attribution", *flags, "--out", str(place.work / "attribution")]]
 
 
 def behaviors(place: Place) -> list[list[str]]:
@@ -107,6 +116,12 @@ PAGES = (
     Page("prediction_speed", prediction_speed, ("prediction_speed.md",)),
     Page("performance", performance, ("performance.md",)),
     Page("reward_balance", reward_balance, ("reward_balance.md",)),
+    Page(
+        "attribution",
+        attribution,
+        ("attribution.md", "attribution.png", "data/attribution.csv"),
+        drop=("*.md", "*.png", "*.csv"),
+    ),
     Page("real_nets", real_nets, ("real_nets.md",)),
     Page("behaviors", behaviors, ("behaviors.md",)),
     Page(

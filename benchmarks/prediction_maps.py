@@ -27,7 +27,9 @@ import numpy as np
 import torch
 
 from benchmarks.tables import markdown_row, write_page
+from cosim.episode import Episode, Hook, Step
 from cosim.geometry.raster import rasterize_road
+from cosim.host import Host
 from cosim.scenario import Fleet, Scenario, load
 from cosim.types import COMPACT, PAPER, History, ObservationConfig
 from cosim.workers.memory import keep_freed_memory
@@ -49,28 +51,37 @@ class Gatherer:
     """Lives in a worker: drives an episode and keeps what 8 AVs saw."""
 
     def __init__(self, scenario: Scenario, observation: ObservationConfig) -> None:
-        from cosim.episode import Episode
-        from cosim.simulation.sumo import SumoSimulator
-
-        self._simulator = SumoSimulator(scenario, history=observation.frames)
-        self._episode = Episode(scenario, self._simulator, observation)
+        self._host = Host(scenario, "idm", 0.0, observation=observation)
 
     def gather(self, seed: int, decisions: int) -> tuple[Any, list[Any]]:
         """The road, and histories of the first AGENTS AVs (copies)."""
-        kept: list[dict[str, History]] = []
-        histories = self._episode.start(seed)
-        while not self._episode.over and len(kept) < decisions:
-            chosen = sorted(histories)[:AGENTS]
-            if len(chosen) == AGENTS:
-                kept.append(
-                    {a: histories[a]._replace(velocity_map=histories[a].velocity_map.copy()) for a in chosen}
-                )
-            histories = self._episode.advance({})
-        return self._simulator.road, kept
+        kept = Kept()
+        self._host.run(seed, hooks=[kept])
+        return self._host.simulator.road, kept.histories[:decisions]
 
     def close(self) -> None:
         """End SUMO."""
-        self._simulator.close()
+        self._host.close()
+
+
+class Kept(Hook):
+    """Copies of what the first AGENTS AVs observe at every decision."""
+
+    def __init__(self) -> None:
+        self.histories: list[dict[str, History]] = []
+
+    def on_start(self, episode: Episode) -> None:
+        """The first one."""
+        chosen = sorted(episode.histories)[:AGENTS]
+        if len(chosen) == AGENTS:
+            seen = {a: episode.histories[a] for a in chosen}
+            self.histories.append(
+                {a: h._replace(velocity_map=h.velocity_map.copy()) for a, h in seen.items()}
+            )
+
+    def on_step(self, episode: Episode, step: Step) -> None:
+        """The next one."""
+        self.on_start(episode)
 
 
 def median_ms(work: Callable[[], object], rounds: int) -> float:

@@ -16,6 +16,8 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.worlds import WITH_MISSION
+from cosim.episode import Episode, Hook, Step, run_episode
 from cosim.learning.configuration import configuration
 from cosim.learning.rollouts import Rollout
 from cosim.report import statistics
@@ -25,8 +27,8 @@ from cosim.workers.progress import Progress
 from cosim.workers.worker import Worker
 from policy.training.config import agent_config
 from policy.training.curriculum import Lesson
+from policy.training.explorer import Explorer
 
-WORLDS = ("merge", "exit", "roundabout", "intersection")
 PHI = math.radians(60.0)
 TRIED = {
     "P: 1/d, a mission vehicle counts 1": RewardConfig(mission=1.0),
@@ -43,22 +45,30 @@ class Paid(Rollout):
 
     def earn(self, world: str, seed: int, yields: bool) -> dict[str, Any]:
         """Sums by setting, and what became of the mission vehicle."""
-        episode, agent = self.episode(Lesson(world, "contested")), self.agent
-        histories = episode.start(seed)
-        agent.reset(episode.context(PHI if yields else 0.0))
-        agent.episode("balance", 0.0, generator(seed, "explore"), True)
-        earned = dict.fromkeys(TRIED, 0.0)
-        while not episode.over:
-            decisions = agent.decide(histories)
-            before = episode.snapshot
-            histories = episode.advance(decisions)
-            actions = {av: d.action for av, d in decisions.items()}
-            collisions = episode.events.collisions
-            for name, config in TRIED.items():
-                terms = rewards(before, episode.snapshot, tuple(decisions), actions, PHI, config, collisions)
-                earned[name] += sum(t.total for t in terms.values())
-        result = episode.result(agent.name)
-        return {"earned": earned, "success": bool(result.value("mission_success"))}
+        episode, paid = self.episode(Lesson(world, "contested")), Payments(self.agent)
+        result = run_episode(episode, self.agent, seed, svo=PHI if yields else 0.0, hooks=[paid])
+        return {"earned": paid.earned, "success": bool(result.value("mission_success"))}
+
+
+class Payments(Hook):
+    """What each setting pays all AVs together."""
+
+    def __init__(self, agent: Explorer) -> None:
+        self._agent = agent
+        self.earned = dict.fromkeys(TRIED, 0.0)
+
+    def on_start(self, episode: Episode) -> None:
+        """The demonstrator drives."""
+        self._agent.episode("balance", 0.0, generator(episode.seed, "explore"), True)
+
+    def on_step(self, episode: Episode, step: Step) -> None:
+        """One decision."""
+        actions = {av: d.action for av, d in step.decisions.items()}
+        for name, config in TRIED.items():
+            terms = rewards(
+                step.before, step.after, tuple(actions), actions, PHI, config, step.events.collisions
+            )
+            self.earned[name] += sum(t.total for t in terms.values())
 
 
 def page(drives: dict[str, dict[bool, list[dict[str, Any]]]], command: str) -> str:
@@ -99,7 +109,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     first, last = map(int, args.seeds.split(":"))
-    worlds = args.scenario or list(WORLDS)
+    worlds = args.scenario or WITH_MISSION
     file = configuration("compact").file
     agent = agent_config("vfn-p", file)
     progress, done = Progress("reward balance", "episodes"), 0

@@ -12,6 +12,7 @@ from typing import Literal, NamedTuple
 
 from benchmarks.arms import differences, of_world
 from benchmarks.tables import found
+from benchmarks.worlds import WITH_MISSION
 from cosim.report import wording
 from cosim.report.compare import Compared, PairedFigure
 from cosim.report.figures import RATES
@@ -114,7 +115,7 @@ def contested(runs: Mapping[str, Run], worlds: Sequence[str], arms: Arms) -> Ite
         differences(runs[other], runs[arms.agent]) for other in (arms.idm, arms.twin, arms.rule)
     )
     for world in worlds:
-        if world == "highway":  # nobody has a mission there
+        if world not in WITH_MISSION:
             continue
 
         def line(target: str, text: str, verdict: str, world: str = world) -> Finding:

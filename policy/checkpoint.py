@@ -19,7 +19,7 @@ from safetensors.torch import save_file
 from torch import nn
 
 from cosim.errors import BadInput, WeightsMismatch
-from cosim.files import whole
+from cosim.files import read_json, whole
 
 FORMAT = "cosim-weights-1"
 SHIPPED = Path(__file__).parent / "weights"
@@ -60,11 +60,8 @@ def read_card(path: Path) -> dict[str, Any]:
     for needed in (path, card_file):
         if not needed.is_file():
             raise BadInput("missing weights file", file=needed)
-    try:
-        card = json.loads(card_file.read_text())
-    except ValueError as error:
-        raise BadInput(f"not a JSON card: {error}", file=card_file) from None
-    if not isinstance(card, dict) or card.get("format") != FORMAT:
+    card = read_json(card_file)
+    if card.get("format") != FORMAT:
         raise WeightsMismatch(f"not a card of format {FORMAT}", file=card_file)
     if card.get("sha256") != sha256(path):
         raise WeightsMismatch("its SHA-256 is not the one on its card", file=path, field="sha256")

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from benchmarks.papers import shipped
 from benchmarks.papers.agents import Agent, build, fingerprint, missing, short
+from benchmarks.papers.claims import TABLE_3
 from cosim.batch import execution as batch
 from cosim.batch import matrix
 from cosim.batch.case_runner import CaseRunner
@@ -28,8 +29,9 @@ from cosim.seeding import FIRST_TEST_SEED
 from cosim.types import Policy
 from cosim.workers.engines import LocalEngine
 from cosim.workers.progress import Progress
+from sumo_scenarios import names
 
-WORLDS = ("exit", "merge", "roundabout", "intersection", "highway")  # P's order
+WORLDS = tuple(TABLE_3)  # in P's order
 SVO = 45.0  # deg, weighs oneself and the others alike
 LEAST = 2  # episodes, however small the scale
 TRAININGS = Path("docs/results/trainings")  # logs of the trainings that made the shipped weights
@@ -300,7 +302,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     default = Settings()
     add = parser.add_argument
     add("--scale", type=float, default=1.0, metavar="X", help="of the numbers of episodes")
-    add("--scenario", action="append", default=[], choices=WORLDS, help="default: all that a table has")
+    add("--scenario", action="append", default=[], choices=names(), help="default: all that a table has")
     add("--duration", type=float, metavar="S", help="of an episode; default: the scenario's own")
     add("--workers", type=int, default=default.workers, metavar="N")
     add("--untrained", action="store_true", help="value networks as they are born, labelled so")

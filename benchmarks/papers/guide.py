@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.papers.driving import AgentRunner
-from cosim.recording.watcher import Track, Watched
+from cosim.recording.watched import Track, Watched
 from cosim.report.replay.strip import Strip, poses_at
 from cosim.road import Lane
 from cosim.scenario.episode_id import Case

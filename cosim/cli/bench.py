@@ -1,11 +1,14 @@
-"""`cosim bench`: measurements a reader can repeat. `predict`: the predictors against recorded episodes."""
+"""`cosim bench`: measurements a reader can repeat.
+
+`predict`: the predictors against recorded episodes. `attribution`: which inputs a value network uses.
+"""
 
 from __future__ import annotations
 
 import argparse
 
 from cosim.cli import arguments
-from cosim.cli.record import seeds
+from cosim.cli.arguments import seeds
 from cosim.scenario import BEHAVIORS
 from cosim.scenario.behaviors import AS_IS
 
@@ -24,7 +27,7 @@ def add(verbs: arguments.Verbs) -> None:
         description="Measure every predictor on recorded episodes; records what it needs itself unless "
         "--recordings names a folder of `cosim record`.",
     )
-    predict.add_argument("--scenario", action="append", default=[], metavar="S", help="repeatable (all five)")
+    predict.add_argument("--scenario", action="append", default=[], metavar="S", help="repeatable (all)")
     predict.add_argument("--behavior", action="append", default=[], choices=BEHAVIORS, help="repeatable")
     predict.add_argument("--demand", action="append", default=[], metavar="NAME", help="repeatable")
     predict.add_argument("--policy", action="append", default=[], metavar="NAME", help="repeatable")
@@ -34,6 +37,7 @@ def add(verbs: arguments.Verbs) -> None:
     predict.add_argument("--workers", type=arguments.count, default=1, metavar="N", help="processes (1)")
     predict.add_argument("--out", required=True, metavar="DIR")
     predict.set_defaults(work=work)
+    _add_attribution(kinds)
 
 
 def work(args: argparse.Namespace) -> int:
@@ -43,7 +47,7 @@ def work(args: argparse.Namespace) -> int:
     from pathlib import Path
 
     import sumo_scenarios
-    from cosim.batch.record import cases, record
+    from cosim.batch.record import planned, record
     from cosim.errors import BadInput
     from cosim.files import prepare_folder
     from cosim.learning.bench_predict import MAPS_PAGE, PAGE, bench_maps, bench_predict
@@ -53,7 +57,7 @@ def work(args: argparse.Namespace) -> int:
     out = prepare_folder(args.out)
     where = Path(args.recordings) if args.recordings else out / "recordings"
     if not args.recordings:
-        wanted = cases(
+        wanted = planned(
             args.scenario or sumo_scenarios.names(),
             args.demand or DEMANDS,
             args.behavior or [b for b in BEHAVIORS if b != AS_IS],
@@ -87,4 +91,38 @@ def work(args: argparse.Namespace) -> int:
             command=command,
         )
         print((out / MAPS_PAGE).read_text())
+    return 0
+
+
+def _add_attribution(kinds: arguments.Verbs) -> None:
+    verb = kinds.add_parser(
+        "attribution",
+        help="which inputs of a value network change its choices",
+        description="Drive episodes as `cosim run` does; at every decision ask the same network again with "
+        "one input replaced. Writes attribution.csv, .md and .png.",
+    )
+    add = verb.add_argument
+    add("--policy", action="append", required=True, metavar="POLICY", help="a learned one; repeatable")
+    add("--scenario", required=True, metavar="S")
+    add("--demand", default="", metavar="NAME", help="default: the scenario's")
+    add("--seeds", type=seeds, required=True, metavar="A:B", help="B left out")
+    add("--svo", type=arguments.degrees, default=45.0, metavar="DEG", help="SVO angle, 0..90 (default 45)")
+    add("--duration", type=arguments.positive, metavar="S", help="counted s (default: the scenario's)")
+    add("--workers", type=arguments.count, default=1, metavar="N", help="processes (1)")
+    add("--out", required=True, metavar="DIR")
+    verb.set_defaults(work=work_attribution)
+
+
+def work_attribution(args: argparse.Namespace) -> int:
+    """Drive, ask, print the page."""
+    import shlex
+    import sys
+
+    from cosim.files import prepare_folder
+    from cosim.learning.attribution import PAGE, attribution
+
+    out = prepare_folder(args.out)
+    what = (args.policy, args.scenario, args.demand, args.seeds, args.svo, args.duration)
+    attribution(out, *what, workers=args.workers, command="cosim " + shlex.join(sys.argv[1:]))
+    print((out / PAGE).read_text(encoding="utf-8"))
     return 0

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from cosim.cli import arguments
 from cosim.errors import BadInput
+from cosim.files import cannot
 
 EPILOG = """\
 A and B are run folders of `cosim evaluate`, or DIR:POLICY for one policy of it. With one folder, name both
@@ -50,7 +51,7 @@ def add(verbs: arguments.Verbs) -> None:
     )
     compare.add_argument("--junit", metavar="FILE", help="write a JUnit file")
     compare.add_argument("--markdown", metavar="FILE", help="write a table for a pull request comment")
-    compare.add_argument("--json", action="store_true", help="print exactly one JSON document on stdout")
+    arguments.add(compare, "--json")
     compare.set_defaults(work=work)
 
 
@@ -65,19 +66,14 @@ def work(args: argparse.Namespace) -> int:
         problem = "with one run name both policies: --baseline and --candidate"
         raise BadInput(problem, field="B")
     b = side(args.b) if args.b is not None else a
-    if args.baseline is not None:
-        a = chosen(a.run, args.baseline)
-    if args.candidate is not None:
-        b = chosen(b.run, args.candidate)
+    a = a if args.baseline is None else chosen(a.run, args.baseline)
+    b = b if args.candidate is None else chosen(b.run, args.candidate)
     found = compare(a, b, args.fail_on, across=args.across)
-    for field, path, write in (
-        ("--junit", args.junit, lambda file: junit.write(found, file)),
-        ("--markdown", args.markdown, lambda file: file.write_text(verdict.markdown(found), "utf-8")),
-    ):
-        if path is not None:
-            try:
-                write(Path(path))
-            except OSError as error:
-                raise BadInput(f"cannot write: {error.strerror}", field=field, value=path) from None
+    if args.junit is not None:
+        with cannot("write", field="--junit", value=args.junit):
+            junit.write(found, Path(args.junit))
+    if args.markdown is not None:
+        with cannot("write", field="--markdown", value=args.markdown):
+            Path(args.markdown).write_text(verdict.markdown(found), "utf-8")
     print(json.dumps(verdict.document(found)) if args.json else verdict.text(found))
     return found.exit_code

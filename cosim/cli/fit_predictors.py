@@ -19,7 +19,7 @@ def add(verbs: arguments.Verbs) -> None:
     verb.add_argument("--validation", required=True, metavar="DIR", help="recordings, seeds 100000..199999")
     verb.add_argument("--only", action="append", default=[], metavar="NAME", help="repeatable (default all)")
     verb.add_argument("--steps", type=arguments.count, metavar="N", help="gradient steps (6000)")
-    verb.add_argument("--out", required=True, metavar="DIR", help="for the weights and their cards")
+    arguments.add(verb, "--out", required=True, help="for the weights and their cards")
     verb.add_argument("--state", metavar="DIR", help="logs, and what a killed fit needs to go on")
     verb.set_defaults(work=work)
 

@@ -26,7 +26,8 @@ from cosim.types import (
 from cosim.workers.worker import Worker
 
 if TYPE_CHECKING:
-    from cosim.envs.host import Host, PolicyFactory, Reply, SimulatorFactory
+    from cosim.envs.host import PolicyFactory, Reply, SessionHost
+    from cosim.host import SimulatorFactory
     from cosim.road import RoadMap
 
 TIMEOUT = 120.0  # s without an answer; the first step of a machine compiles the kernels
@@ -279,7 +280,7 @@ class Session:
 class _InProcess:
     """A `Caller` without a process of its own."""
 
-    def __init__(self, host: Host) -> None:
+    def __init__(self, host: SessionHost) -> None:
         self._host = host
 
     def call(self, method: str, *arguments: Any) -> Any:
@@ -289,8 +290,8 @@ class _InProcess:
         self._host.close()
 
 
-def build_host(*arguments: Any) -> Host:
+def build_host(*arguments: Any) -> SessionHost:
     """Runs in the worker: the loop, numba and libsumo are imported there, not here."""
-    from cosim.envs.host import Host
+    from cosim.envs.host import SessionHost
 
-    return Host(*arguments)
+    return SessionHost(*arguments)

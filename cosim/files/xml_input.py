@@ -2,7 +2,7 @@
 
 SUMO itself answers a bad file with "Process Error", with gigabytes of memory or with SIGSEGV
 (docs/sumo.md); everything SUMO is handed therefore passes through `scan` first. The
-parser is expat with defusedxml's three refusals (entities, external references, foreign encodings) and
+parser is expat with three refusals (entities, external references, foreign encodings) and
 caps on depth, token length and unpacked size; memory does not grow with the file.
 """
 
@@ -43,15 +43,12 @@ def regular_file(path: Path, *, file: object, field: str) -> Path:
         if stat.S_ISREG(mode):
             with path.open("rb"):
                 return path
+        problem = f"is {'a folder' if stat.S_ISDIR(mode) else 'not a regular file'}, a file is needed"
     except FileNotFoundError:
-        raise BadInput("no such file", file=file, field=field, value=str(path)) from None
-    except OSError as error:
-        problem = (error.strerror or "cannot be read").lower()
-        raise BadInput(problem, file=file, field=field, value=str(path)) from None
-    except ValueError as error:  # a NUL byte in the name
-        raise BadInput(str(error), file=file, field=field, value=str(path)) from None
-    kind = "a folder" if stat.S_ISDIR(mode) else "not a regular file"
-    raise BadInput(f"is {kind}, a file is needed", file=file, field=field, value=str(path))
+        problem = "no such file"
+    except (OSError, ValueError) as error:  # ValueError: a NUL byte in the name
+        problem = (getattr(error, "strerror", None) or str(error)).lower()
+    raise BadInput(problem, file=file, field=field, value=str(path))
 
 
 def is_there(path: Path) -> bool:

@@ -21,7 +21,7 @@ class Case:
     All cases that differ in nothing but the seed are one `cell`.
     """
 
-    what: str  # a world's name, or a .sumocfg
+    what: str  # a world's name or folder, or a .sumocfg
     demand: tuple[str, ...]  # one demand: names or files that are driven together; () is the scenario's own
     policy: str
     behavior: str | None  # None: the scenario's default

@@ -2,7 +2,7 @@
 
 `[LABEL=]RUN` or `[LABEL=]FILE.safetensors` are weights of `cosim train`, `[LABEL=]FILE.py:NAME` and
 `[LABEL=]MODULE:NAME` code; anything else is the name of a policy that ships. The label stands in rows and
-tables. Text only: whether there is such a policy, the roof knows (`cosim.policies`).
+tables. Text only: `cosim.policies` knows whether there is such a policy.
 """
 
 from __future__ import annotations

@@ -71,7 +71,7 @@ class SumoSimulator:
             )
         self._scratch = tempfile.TemporaryDirectory(prefix="cosim-")
         # a user's detectors would write beside his scenario, and workers over one another
-        self._scenario = scenario if scenario.built_in else quiet(scenario, Path(self._scratch.name))
+        self._scenario = scenario if scenario.ships else quiet(scenario, Path(self._scratch.name))
         self._av_parameters = dict(av_parameters or {})
         self._history = history
         self._stderr = SumoStderr()

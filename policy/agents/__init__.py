@@ -2,29 +2,30 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
 from functools import partial
 
 from cosim.errors import BadInput, hint
 from cosim.types import Policy
-from policy.agents.altruist_rule import AltruistRule
-from policy.agents.idm import Idm, IdmCourteous
-from policy.agents.keep_lane import KeepLane
-from policy.agents.random import Random
 
 # policy.agents.approaches has the table; its names alone are needed before torch is
 LEARNING = ("vfn-p", "vfn", "vfn-p-egoistic", "safe-dqn", "conv3d-dqn", "conv3d-a2c", "conv2d-dqn")
 
 
-def _prediction_aware(name: str) -> Policy:
-    from policy.agents.prediction_aware import PredictionAware  # torch: only when it is asked for
-
-    return PredictionAware(name)
+def _made(module: str, kind: str, *arguments: str) -> Policy:
+    """A policy's class by name: its module (torch, compiled kernels) is imported when one is made."""
+    made: Policy = getattr(importlib.import_module(f"policy.agents.{module}"), kind)(*arguments)
+    return made
 
 
 POLICIES: dict[str, Callable[[], Policy]] = {
-    **{policy.name: policy for policy in (Idm, IdmCourteous, KeepLane, Random, AltruistRule)},
-    **{name: partial(_prediction_aware, name) for name in LEARNING},
+    "idm": partial(_made, "idm", "Idm"),
+    "idm-courteous": partial(_made, "idm", "IdmCourteous"),
+    "keep-lane": partial(_made, "keep_lane", "KeepLane"),
+    "random": partial(_made, "random", "Random"),
+    "altruist-rule": partial(_made, "altruist_rule", "AltruistRule"),
+    **{name: partial(_made, "prediction_aware", "PredictionAware", name) for name in LEARNING},
 }
 
 

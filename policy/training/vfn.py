@@ -21,7 +21,7 @@ import numpy as np
 from safetensors.torch import load_file, save_file
 
 from cosim.errors import BadInput
-from cosim.files import whole
+from cosim.files import read_json, whole
 from cosim.seeding import TUNING_SEEDS
 from policy import checkpoint
 from policy.training import curriculum, experience
@@ -182,7 +182,7 @@ class TrainingRun:
         file = self.folder / "state.json"
         if not file.is_file():
             return False
-        state = json.loads(file.read_text())
+        state = read_json(file)
         mine = json.loads(json.dumps(asdict(self.config)))
         differs = [name for name in mine if mine[name] != state["config"].get(name) and name != "iterations"]
         if differs:

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from cosim.control import to_commands
-from cosim.observation import Observer
+from cosim.observation.observer import Observer
 from cosim.seeding import generator
 from cosim.simulation.fake import FakeSimulator, FakeVehicle
 from cosim.types import Decision, History, MetaAction, ObservationConfig, Policy, PolicyContext, Timing

@@ -173,7 +173,7 @@ def test_a_store_that_cannot_be_is_one_sentence_without_the_password() -> None:
     try:
         import psycopg  # noqa: F401
     except ModuleNotFoundError:
-        with pytest.raises(BadInput, match=r"pip install 'cosim\[postgresql\]'") as caught:
+        with pytest.raises(BadInput, match=r"pip install 'cosim-sumo\[postgresql\]'") as caught:
             Store("postgresql+psycopg://me:secret@host/db")
         assert "secret" not in str(caught.value)
 

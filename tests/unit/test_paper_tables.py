@@ -14,7 +14,7 @@ from benchmarks.papers.driving import Settings
 from benchmarks.papers.guide import NONE, OTHER, OVERTAKES, SLOWS, YIELDS, guided
 from benchmarks.tables import Line, write_csv
 from cosim.learning.bench_predict import EIGHT
-from cosim.recording.watcher import Track, Watched
+from cosim.recording.watched import Track, Watched
 from cosim.report.run_folder import Run
 from cosim.road import Lane, RoadMap
 from cosim.types import Floats, Kind

@@ -41,6 +41,11 @@ class Series:
         """Counts, rates and means (`summary.group_figures`)."""
         return group_figures(self.rows, self.known)
 
+    def counts(self, name: str) -> dict[str, Any]:
+        """Value, interval and counts of one measure; {} where the run does not have it."""
+        found = self.figures
+        return found["rates"].get(name) or found["means"].get(name) or found["timings"].get(name) or {}
+
     def values(self, name: str) -> list[float]:
         """One measure of every ok episode, nan for NA."""
         return self.known[name].values(self.ok) if name in self.known else []

@@ -60,7 +60,7 @@ def figures(blocks: Sequence[Block], known: dict[str, Measure]) -> Table:
     varying = [n for n in GROUP if len({s.identity[n] for s in series}) > 1]
     names = [n for n in HEADLINE if n in known]
     rows = [
-        [_named(s, varying), _episodes(s), *(_figure(_counts(s, n), known[n]) for n in names)] for s in series
+        [_named(s, varying), _episodes(s), *(_figure(s.counts(n), known[n]) for n in names)] for s in series
     ]
     heads = ["policy", "episodes", *(head(known[n]) for n in names)]
     common = [
@@ -91,16 +91,13 @@ def differences(found: Sequence[Difference]) -> Table | None:
 
 def everything(block: Block) -> Table:
     """Every figure of every series of a block: measures down, series across."""
-    known = block.series[0].known
-    rows = []
-    for name, measure in known.items():
-        counts = [_counts(s, name) for s in block.series]
-        rows.append(
-            [
-                Cell(name, name, (measure.unit,) if measure.unit else ()),
-                *(_figure(c, measure) for c in counts),
-            ]
-        )
+    rows = [
+        [
+            Cell(name, name, (measure.unit,) if measure.unit else ()),
+            *(_figure(s.counts(name), measure) for s in block.series),
+        ]
+        for name, measure in block.series[0].known.items()
+    ]
     return Table(["figure", *(s.label for s in block.series)], rows, [])
 
 
@@ -125,11 +122,6 @@ def tone(figure: PairedFigure) -> str:
 
 
 # ---- inside ----
-
-
-def _counts(series: Series, name: str) -> dict[str, Any]:
-    found = series.figures
-    return found["rates"].get(name) or found["means"].get(name) or found["timings"].get(name) or {}
 
 
 def _named(series: Series, varying: Sequence[str]) -> Cell:

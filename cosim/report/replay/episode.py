@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -11,17 +10,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from cosim.errors import BadInput, CosimError, hint
-from cosim.files import whole
+from cosim.errors import BadInput, CosimError, hint, inside
+from cosim.files import cannot, read_json, whole
+from cosim.files.yaml_input import dataclass_from, mapping
+from cosim.host import Host
 from cosim.policies import check
-from cosim.recording.watcher import Watched
+from cosim.recording.watched import Watched
 from cosim.report import run_folder
-from cosim.runner import Runner
 from cosim.scenario import Scenario
 from cosim.scenario.episode_id import Case
-from cosim.scenario.manifest import POLICY_FILES, manifest, named
+from cosim.scenario.manifest import CASE, OPTIONS, POLICY_FILES, checked, manifest, named
 from cosim.scenario.policy_name import label, read
-from cosim.scenario.sumocfg import CLOCK, INPUTS, command_line, keeps
+from cosim.scenario.sumocfg import keeps
 from cosim.scenario.vet import vetted
 from cosim.types import EpisodeResult
 from cosim.workers.progress import Progress
@@ -29,8 +29,8 @@ from cosim.workers.tasks import OK
 from cosim.workers.worker import Worker
 
 MANIFEST = "manifest.json"
+ABSENT = "no such file: a folder of cosim run --out or cosim evaluate is needed"
 MOST_NAMED = 8  # episodes of one seed
-CASE, OPTIONS = "case", "sumo_arguments"  # what `cosim run --out` adds to the manifest
 
 
 class ReplayDiffers(CosimError):
@@ -55,20 +55,6 @@ class Recorded:
         return f"replay-{self.case.key}" if (self.folder / "episodes.parquet").exists() else "replay"
 
 
-def remembered(case: Case, options: Sequence[str]) -> dict[str, Any]:
-    """What a manifest has to hold beside the usual so that `find` finds the episode again.
-
-    Outputs are left out: a replay does not write them again.
-    """
-    kept: list[str] = []
-    for name, value in command_line(options).items():
-        if name in INPUTS:
-            value = ",".join(str(Path(part.strip()).absolute()) for part in value.split(","))
-        if name in (*INPUTS, *CLOCK) or keeps(name):
-            kept += [f"--{name}={value}"]
-    return {CASE: case.document(), OPTIONS: kept}
-
-
 def find(folder: Path, episode: str | None) -> Recorded:
     """The episode in a folder of `cosim run --out` (`episode` may be None) or of `cosim evaluate`.
 
@@ -78,16 +64,17 @@ def find(folder: Path, episode: str | None) -> Recorded:
         BadInput: no such folder, not a run folder, no such episode (with the nearest key), one that was not
             driven to its end.
     """
-    document = _json(folder / MANIFEST)
+    file, result = folder / MANIFEST, folder / "result.json"
+    document = checked(read_json(file, ABSENT), file)
     if "cells" in document:
         return _of_batch(folder, episode)
     if CASE not in document:
-        raise BadInput("was not written by this version of cosim run or evaluate", file=folder / MANIFEST)
+        raise BadInput("was not written by this version of cosim run or evaluate", file=file)
     recorded = Recorded(
-        Case.read(document[CASE]),
+        _case(document[CASE], file, CASE),
         tuple(document.get(OPTIONS, ())),
         document,
-        _json(folder / "result.json").get("trace_hash", ""),
+        checked(read_json(result, ABSENT), result).get("trace_hash", ""),
         folder,
     )
     if episode is not None and episode not in (recorded.case.key, str(recorded.case.seed)):
@@ -136,7 +123,7 @@ def drive(recorded: Recorded, scenario: Scenario, *, check: bool = True) -> tupl
     """
     case = recorded.case
     with _progress(f"replay {scenario.name} {label(case.policy)}", "s") as progress:
-        worker = Worker(Runner, scenario, case.policy, math.radians(case.svo_deg), name="cosim-replay")
+        worker = Worker(Host, scenario, case.policy, math.radians(case.svo_deg), name="cosim-replay")
         with worker:
             if check:
                 _same_policy(recorded.manifest.get(POLICY_FILES, {}), worker.call("policy_files"))
@@ -218,9 +205,22 @@ def _of_batch(folder: Path, episode: str | None) -> Recorded:
     if row["status"] != OK:
         problem = f"was not driven to its end (status {row['status']}): nothing to compare with"
         raise BadInput(problem, field="EPISODE", value=row["key"])
-    cell = run.manifest["cells"][row["cell"]]
-    case = Case.read({**cell[CASE], "seed": row["seed"]})
+    file, where = folder / MANIFEST, f"cells.{row['cell']}"
+    cell = run.manifest["cells"].get(row["cell"], {})
+    for part in (CASE, "manifest"):
+        if part not in cell:
+            raise BadInput("is missing", file=file, field=f"{where}.{part}")
+    case = _case({**cell[CASE], "seed": row["seed"]}, file, f"{where}.{CASE}")
     return Recorded(case, (), cell["manifest"], row["trace_hash"], folder)
+
+
+def _case(document: Mapping[str, Any], file: Path, where: str) -> Case:
+    """The case that `file` holds under the name `where`. Raises BadInput for a field of another type."""
+    with inside(where, file):
+        given = mapping(document)
+    known = {name: given[name] for name in Case.__dataclass_fields__ if name in given}
+    dataclass_from(Case, known, file, where)
+    return Case.read(known)
 
 
 def _same_policy(then: Mapping[str, str], now: Mapping[str, str]) -> None:
@@ -240,29 +240,12 @@ def _lasting(name: str, document: Mapping[str, Any]) -> Any:
     return {k: v for k, v in value.items() if keeps(k)} if name == "sumo_options" else value
 
 
-def _json(path: Path) -> dict[str, Any]:
-    try:
-        document = json.loads(path.read_text("utf-8"))
-    except FileNotFoundError:
-        problem = "no such file: a folder of cosim run --out or cosim evaluate is needed"
-        raise BadInput(problem, file=path) from None
-    except OSError as error:
-        raise BadInput(f"cannot be read: {error.strerror}", file=path) from None
-    except ValueError as error:
-        raise BadInput(f"not JSON: {error}", file=path) from None
-    if not isinstance(document, dict):
-        raise BadInput("not a JSON object", file=path)
-    return document
-
-
 @contextlib.contextmanager
 def _writing(path: Path) -> Iterator[None]:
     """The folder is made where it is not there. Raises BadInput when `path` cannot be written."""
-    try:
+    with cannot("write", file=path):
         path.parent.mkdir(parents=True, exist_ok=True)
         yield
-    except OSError as error:
-        raise BadInput(f"cannot write: {error.strerror or error}", file=path) from None
 
 
 @contextlib.contextmanager

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cosim.recording.watcher import Choice, Track, Watched
+from cosim.recording import Choice
+from cosim.recording.watched import Track, Watched
 from cosim.types import Floats, Forecast
 
 MARGIN = 500.0  # m around the traffic: roads further away are left out
@@ -32,7 +33,7 @@ def document(watched: Watched) -> dict[str, Any]:
     """The watched episode as plain JSON; lengths in cm, times in ms, headings in mrad (see each line)."""
     r = watched
     number = {name: k for k, name in enumerate(dict.fromkeys(t.id for t in r.tracks))}
-    words = _Words()
+    words: dict[str | None, int] = {None: 0}  # names and reasons, each written once; number 0 is nobody
     window = _window(r)
     lanes = [k for k, lane in enumerate(r.road.lanes) if _meets(lane.shape, window)]
     place = {lane: k for k, lane in enumerate(lanes)}
@@ -60,7 +61,7 @@ def document(watched: Watched) -> dict[str, Any]:
             }
             for c in r.collisions
         ],
-        "words": words.all,
+        "words": [*words],
     }  # fmt: skip
 
 
@@ -80,12 +81,11 @@ def _facts(r: Watched) -> dict[str, Any]:
 
 def _vehicles(r: Watched, number: dict[str, int]) -> list[list[Any]]:
     """[id, is AV, is mission, class, length cm, width cm] by number."""
-    found: dict[str, list[Any]] = {}
-    for t in r.tracks:
-        found[t.id] = [
-            t.id, int(t.kind), int(t.mission), t.driver, round(t.length * 100), round(t.width * 100),
-        ]  # fmt: skip
-    return [found[name] for name in number]
+    last = {t.id: t for t in r.tracks}
+    return [
+        [t.id, int(t.kind), int(t.mission), t.driver, round(t.length * 100), round(t.width * 100)]
+        for t in (last[name] for name in number)
+    ]
 
 
 def _track(t: Track, number: dict[str, int], place: dict[int, int]) -> list[Any]:
@@ -103,7 +103,7 @@ def _track(t: Track, number: dict[str, int], place: dict[int, int]) -> list[Any]
     ]
 
 
-def _choice(vehicle: int, c: Choice, words: _Words) -> list[Any]:
+def _choice(vehicle: int, c: Choice, words: dict[str | None, int]) -> list[Any]:
     """[vehicle, action, target cm/s, flags, blamed, blocked, q, score, ttc, unsafe]; see data.js."""
     d = c.decision
     flags = int(d.vetoed) + 2 * int(d.fallback)
@@ -112,8 +112,8 @@ def _choice(vehicle: int, c: Choice, words: _Words) -> list[Any]:
         int(d.action),
         round(c.target * 100),
         flags,
-        words.number(d.blamed),
-        words.number(c.blocked),
+        words.setdefault(d.blamed, len(words)),
+        words.setdefault(c.blocked, len(words)),
     ]
     if d.q is None and d.safety_score is None and d.ttc is None and d.unsafe is None:
         return row
@@ -142,9 +142,8 @@ def _window(r: Watched) -> tuple[Floats, Floats]:
     """The traffic's bounding box with a margin: lower left and upper right corner, [2] m each."""
     if not r.tracks:
         return np.full(2, -np.inf), np.full(2, np.inf)
-    low = [min(t.x.min() for t in r.tracks), min(t.y.min() for t in r.tracks)]
-    high = [max(t.x.max() for t in r.tracks), max(t.y.max() for t in r.tracks)]
-    return np.array(low) - MARGIN, np.array(high) + MARGIN
+    points = np.hstack([(t.x, t.y) for t in r.tracks])  # [2,p]
+    return points.min(1) - MARGIN, points.max(1) + MARGIN
 
 
 def _meets(shape: Floats, window: tuple[Floats, Floats]) -> bool:
@@ -183,17 +182,3 @@ def _finite(value: float) -> float | None:
 
 def _ms(seconds: float) -> int:
     return round(seconds * 1000)
-
-
-class _Words:
-    """Names and reasons, each written once; number 0 is nobody."""
-
-    def __init__(self) -> None:
-        self.all: list[str | None] = [None]
-        self._place: dict[str | None, int] = {None: 0}
-
-    def number(self, word: str | None) -> int:
-        if word not in self._place:
-            self._place[word] = len(self.all)
-            self.all.append(word)
-        return self._place[word]

@@ -6,7 +6,7 @@ import html
 from importlib import resources
 from string import Template
 
-from cosim.recording.watcher import Watched
+from cosim.recording.watched import Watched
 from cosim.report.replay.packing import packed
 
 SCRIPTS = ("data.js", "view.js", "draw.js", "panel.js", "main.js")

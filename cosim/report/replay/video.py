@@ -7,17 +7,20 @@ camera of its own, at equal times since they began.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import av
 import numpy as np
+import numpy.typing as npt
 from PIL import Image, ImageDraw
 
 from cosim.files import whole
-from cosim.recording.watcher import Choice, Watched
+from cosim.recording import Choice
+from cosim.recording.watched import Track, Watched
 from cosim.report.replay.strip import AV, BAD, TEXT, WARN, Colour, Pose, Strip, colour_of, font, poses_at
 from cosim.types import Kind, MetaAction
+from cosim.workers.tasks import Progress
 
 WIDTH, HEIGHT = 1280, 400  # pixels
 PANEL = 124  # pixels of text beneath the road
@@ -37,95 +40,65 @@ ACTIONS = {
 
 
 def film(
-    episodes: Sequence[Watched],
-    path: Path,
-    *,
-    follow: str | None = None,
-    progress: Callable[[float, float], None] | None = None,
+    episodes: Sequence[Watched], path: Path, *, follow: str | None = None, progress: Progress | None = None
 ) -> None:
     """Write the MP4. `follow`: a vehicle's id (default: the mission vehicle, else the first AV).
 
     The file appears whole or not at all. Raises OSError when it cannot be written.
     """
-    reel = _Reel(episodes, follow, picture_at)
-    count = max(round(reel.seconds * RATE) + 1, 1)
     fast = {"movflags": "faststart"}
     with whole(path) as draft, av.open(str(draft), "w", format="mp4", options=fast) as container:
         stream = container.add_stream("libx264", rate=RATE)
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT * len(episodes), "yuv420p"
         stream.options = {"crf": "23", "preset": "veryfast"}
-        for k in range(count):
-            frame = av.VideoFrame.from_ndarray(np.asarray(reel.picture(k / RATE)), format="rgb24")
-            for packet in stream.encode(frame):
-                container.mux(packet)
-            if progress is not None:
-                progress(k + 1, count)
-        for packet in stream.encode():
-            container.mux(packet)
+        for picture in _pictures(episodes, follow, picture_at, RATE, progress):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        container.mux(stream.encode())
 
 
 def animation(
-    episodes: Sequence[Watched],
-    path: Path,
-    *,
-    follow: str | None = None,
-    progress: Callable[[float, float], None] | None = None,
+    episodes: Sequence[Watched], path: Path, *, follow: str | None = None, progress: Progress | None = None
 ) -> None:
     """Write a small GIF for a page or a slide: roads and outcomes without explanations, twice as fast.
 
     `follow`, the file and errors as in `film`.
     """
-    reel = _Reel(episodes, follow, caption_at)
-    count = max(round(reel.seconds / STEP) + 1, 1)
-    pictures = []
-    for k in range(count):
-        picture = reel.picture(k * STEP)
-        pictures.append(picture.quantize(COLOURS, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE))
-        if progress is not None:
-            progress(k + 1, count)
-    first, *rest = pictures
+    first, *rest = (
+        Image.fromarray(picture).quantize(COLOURS, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+        for picture in _pictures(episodes, follow, caption_at, 1.0 / STEP, progress)
+    )
     times = round(1000 * SHOWN)  # ms
     with whole(path) as draft:
         first.save(draft, "GIF", save_all=True, append_images=rest, duration=times, loop=0)
 
 
-class _Reel:
-    """Pictures of all episodes, one above the other."""
-
-    def __init__(
-        self,
-        episodes: Sequence[Watched],
-        follow: str | None,
-        draw: Callable[[Watched, float, _Camera], Image.Image],
-    ) -> None:
-        self._shots = [(r, _Camera(r, follow)) for r in episodes]
-        self._draw = draw
-        self.seconds = max(float(r.times[-1] - r.times[0]) for r in episodes)
-
-    def picture(self, since: float) -> Image.Image:
-        """At `since` s after the beginning of each; who ended earlier stands still."""
-        parts = [
-            self._draw(r, min(float(r.times[0]) + since, float(r.times[-1])), camera)
-            for r, camera in self._shots
-        ]
-        if len(parts) == 1:
-            return parts[0]
-        whole = Image.new("RGB", (parts[0].width, sum(part.height for part in parts)))
-        top = 0
-        for part in parts:
-            whole.paste(part, (0, top))
-            top += part.height
-        return whole
+def _pictures(
+    episodes: Sequence[Watched],
+    follow: str | None,
+    draw: Callable[[Watched, float, _Camera], Image.Image],
+    rate: float,
+    progress: Progress | None,
+) -> Iterator[npt.NDArray[np.uint8]]:
+    """`rate` pictures [height,width,3] a second, all episodes one above the other; those that ended earlier
+    stand still."""
+    cameras = [_Camera(r, follow) for r in episodes]
+    count = round(rate * max(float(r.times[-1] - r.times[0]) for r in episodes)) + 1
+    for k in range(count):
+        times = [min(float(r.times[0]) + k / rate, float(r.times[-1])) for r in episodes]
+        parts = [draw(*shot) for shot in zip(episodes, times, cameras, strict=True)]
+        yield np.vstack([np.asarray(part) for part in parts])
+        if progress is not None:
+            progress(k + 1, count)
 
 
 class _Camera:
     """Whom the film follows, and where it looks while that vehicle is not on the road."""
 
     def __init__(self, watched: Watched, follow: str | None) -> None:
-        tracks = watched.tracks
-        wanted = [t for t in tracks if t.id == follow] if follow is not None else []
-        wanted = wanted or [t for t in tracks if t.mission] or [t for t in tracks if t.kind == Kind.AV]
-        self.follow = next(iter(wanted or tracks), None)
+        def rank(t: Track) -> tuple[bool, bool, bool]:
+            return t.id != follow, not t.mission, t.kind != Kind.AV
+
+        self.follow = min(watched.tracks, key=rank, default=None)
         self.x = self.y = 0.0  # m, the middle of the picture
         if self.follow is not None:
             self.x, self.y = float(self.follow.x[0]), float(self.follow.y[0])
@@ -199,18 +172,10 @@ class _Board:
 
     def legend(self, r: Watched) -> None:
         """Which colour is who, at the top."""
-        kinds = {
-            "mission vehicle"
-            if t.mission
-            else "AV"
-            if t.kind == Kind.AV
-            else f"human, {t.driver}": colour_of(t)
-            for t in r.tracks
-        }
+        kinds = {"mission vehicle" if t.mission else _kind(t): colour_of(t) for t in r.tracks}
         x = 14.0
         for name, colour in sorted(kinds.items()):
-            box = (x, 12, (x + 18), 20)
-            self._pen.rounded_rectangle(box, 2, fill=colour)
+            self._pen.rounded_rectangle((x, 12, x + 18, 20), 2, fill=colour)
             self._line(x + 23, 8, name, TEXT, 12)
             x += 40 + self._pen.textlength(name, font(12))
 
@@ -247,8 +212,7 @@ class _Board:
         followed = None if camera.follow is None else here.get(camera.follow.id)
         if camera.follow is not None:
             t = camera.follow
-            what = "AV" if t.kind == Kind.AV else f"human, {t.driver}"
-            what += ", mission vehicle" if t.mission else ""
+            what = _kind(t) + ", mission vehicle" * t.mission
             where = f"{followed.speed:.1f} m/s" if followed is not None else "not on the road"
             self._line(14, line + 96, f"{t.id} ({what}): {where}", colour_of(t), 13)
         if shown is not None:
@@ -261,20 +225,16 @@ class _Board:
             return
         d = c.decision
         self._line(left, top + 8, f"{name}{ACTIONS[d.action]}, target {c.target:.0f} m/s", AV, 14, bold=True)
-        words, colour = [], QUIET
-        if d.vetoed:
-            words, colour = [f"preferred action vetoed, blamed {d.blamed}"], WARN
-        if d.fallback:
-            words, colour = [*words, "no action safe"], BAD
-        if c.blocked:
-            words, colour = [*words, f"command blocked: {c.blocked}"], BAD
-        self._line(left, top + 28, "; ".join(words) or "command executed", colour, 13)
-        rows = [
-            (n, a) for n, a in (("Q", d.q), ("score s", d.safety_score), ("TTC s", d.ttc)) if a is not None
-        ]
-        if not rows:
-            return
-        for a in MetaAction:
+        said = {
+            f"preferred action vetoed, blamed {d.blamed}": WARN if d.vetoed else None,
+            "no action safe": BAD if d.fallback else None,
+            f"command blocked: {c.blocked}": BAD if c.blocked else None,
+        }
+        words = {text: shade for text, shade in said.items() if shade} or {"command executed": QUIET}
+        self._line(left, top + 28, "; ".join(words), [*words.values()][-1], 13)
+        named = (("Q", d.q), ("score s", d.safety_score), ("TTC s", d.ttc))
+        rows = [(name, values) for name, values in named if values is not None]
+        for a in MetaAction if rows else ():
             x = left + 90 + 132 * int(a)
             unsafe = d.unsafe is not None and bool(d.unsafe[a])
             colour = AV if a == d.action else BAD if unsafe else TEXT
@@ -288,6 +248,10 @@ class _Board:
         self, x: float, y: float, text: str, colour: Colour, size: int = 13, *, bold: bool = False
     ) -> None:
         self._pen.text((x, y), text, fill=colour, font=font(size, bold))
+
+
+def _kind(t: Track) -> str:
+    return "AV" if t.kind == Kind.AV else f"human, {t.driver}"
 
 
 def _outcome(r: Watched, time: float) -> tuple[str, Colour]:

@@ -1,0 +1,164 @@
+"""`cosim bench attribution`: drives episodes and counts which inputs of the value network change a choice."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import astuple
+from itertools import groupby
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from cosim.batch.case_runner import CaseRunner
+from cosim.batch.record import planned
+from cosim.errors import BadInput
+from cosim.files import write_csv
+from cosim.learning.prediction_data import spread
+from cosim.policies import make
+from cosim.report.statistics import share
+from cosim.scenario.episode_id import Case
+from cosim.workers.engines import LocalEngine
+from cosim.workers.tasks import Progress
+from policy.agents.prediction_aware import PredictionAware
+from policy.attribution import SUMS, Questioned
+
+PAGE, TABLE, PICTURE = "attribution.md", "attribution.csv", "attribution.png"
+SHARES = ("choices_changed", "unmasked_changed")
+HEAD = (
+    "| input | replacement | decisions | choices changed | best valued changed | mean abs dq | spread |",
+    "|---|---|---:|---:|---:|---:|---:|",
+)
+METHOD = """\
+The agent drives as in `cosim run`; at every decision the same network is asked again with one input replaced:
+zeroed; as at present (the newest perceived frame in place of the others); another AV's of the same instant,
+where two or more decide. Choices changed: of the action that is carried out, after the prioritizer; best
+valued changed: before it. Counts and shares of the decisions of single AVs with Wilson's 95 % intervals
+(decisions of one episode are not independent). Mean abs dq: of the five action values; spread: what the best
+value is above the second best."""
+
+
+def questioned(policy: str) -> Questioned:
+    """The policy, asking itself. Raises BadInput where it has no value network."""
+    made = make(policy)
+    if not isinstance(made, PredictionAware):
+        raise BadInput("has no value network whose inputs could be replaced", field="--policy", value=policy)
+    return Questioned(made.name, made.config)
+
+
+class Asking(CaseRunner):
+    """Hosted by an engine's worker: drives as `cosim run` does, and asks at every decision."""
+
+    def policy(self, case: Case) -> Questioned:
+        """The policy of `case`, asking itself."""
+        self._agent = questioned(case.policy)
+        return self._agent
+
+    def run(
+        self, case: Case, warnings: tuple[str, ...], outputs: str | None, progress: Progress
+    ) -> dict[str, Any]:
+        """One episode: the document of `cosim run --json`, and the `answers`."""
+        return super().run(case, warnings, outputs, progress) | {"answers": self._agent.answers}
+
+
+def attribution(
+    out: Path,
+    policies: Sequence[str],
+    scenario: str,
+    demand: str,
+    seeds: range,
+    svo_deg: float = 45.0,
+    duration: float | None = None,
+    *,
+    workers: int = 1,
+    command: str = "",
+) -> None:
+    """Drive and ask; writes TABLE, PICTURE and PAGE into `out`.
+
+    Raises BadInput as `cosim.batch.record.planned`, and for a policy without a value network.
+    """
+    for policy in policies:
+        questioned(policy)
+    plan = planned([scenario], [demand], [], policies, seeds, svo_deg, duration)
+    tasks = [cell.task(case) for cell, case in plan.cases()]
+    driven = spread(LocalEngine(Asking, workers=workers), tasks, "attribution")
+    names = dict.fromkeys(episode["policy"] for episode in driven)
+    tables = {name: table([e for e in driven if e["policy"] == name]) for name in names}
+    write_csv(out / TABLE, [{"policy": policy} | row for policy, rows in tables.items() for row in rows])
+    draw(out / PICTURE, tables)
+    (out / PAGE).write_text(markdown(driven, tables, command), encoding="utf-8")
+
+
+def table(driven: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """A row per input and replacement: shares of the decisions with Wilson's intervals, and means.
+
+    Args:
+        driven: what `Asking.run` returned for the episodes of one policy.
+    """
+    rows = []
+    for key in driven[0]["answers"]:
+        found = np.sum([e["answers"][key] for e in driven if key in e["answers"]], 0)
+        sums = dict(zip(SUMS, found.tolist(), strict=True))
+        n = int(sums["decisions"])
+        row: dict[str, Any] = {"input": key[0], "replacement": key[1], "decisions": n}
+        for column in SHARES:
+            count = int(sums[column])
+            value, low, high = astuple(share(count, n))
+            row |= {column: value, f"{column}_low": low, f"{column}_high": high, f"{column}_count": count}
+        rows.append(row | {column: sums[column] / n for column in ("mean_abs_dq", "spread")})
+    return rows
+
+
+def markdown(
+    driven: Sequence[Mapping[str, Any]], tables: Mapping[str, Sequence[Mapping[str, Any]]], command: str
+) -> str:
+    """The tables as a document; what changes nothing is said first."""
+    page = ["# Which inputs the value networks use", ""]
+    for policy, rows in tables.items():
+        largest = {
+            name: max(row["choices_changed"] for row in mine)
+            for name, mine in groupby(rows, itemgetter("input"))
+        }
+        never = ", ".join(name for name, x in largest.items() if x == 0.0) or "none"
+        some = [f"{name} {100 * x:.1f} %" for name, x in sorted(largest.items(), key=itemgetter(1)) if x]
+        page += [f"- `{policy}`: inputs that change no choice, whatever replaces them: {never}."]
+        page += [f"  Largest share of the choices that a replacement changes: {', '.join(some) or '0 %'}."]
+    e = driven[0]
+    about = (
+        f"World `{e['scenario']}`, demand `{e['demand']}`, HVs {e['behavior']} ({e['driver_model']}), preset"
+    )
+    about += (
+        f" `{e['preset']}`, phi {e['svo_deg']:g} degrees; {len(driven) // len(tables)} episodes a policy."
+    )
+    page += ["", f"`{command}`", "", about, METHOD, "", f"![choices changed]({PICTURE})", ""]
+    for policy, rows in tables.items():
+        page += [f"## {policy}", "", *HEAD]
+        for row in rows:
+            cells = [row["input"], row["replacement"], str(row["decisions"])]
+            cells += [
+                f"{row[f'{c}_count']}: {100 * row[c]:.1f} %"
+                f" ({100 * row[f'{c}_low']:.1f} to {100 * row[f'{c}_high']:.1f})"
+                for c in SHARES
+            ]
+            page.append(f"| {' | '.join(cells)} | {row['mean_abs_dq']:.3f} | {row['spread']:.3f} |")
+        page.append("")
+    return "\n".join(page).rstrip() + "\n"
+
+
+def draw(path: Path, tables: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
+    """Bars: the share of the choices that change, by input and replacement, a panel per policy."""
+    longest = max(map(len, tables.values()))
+    figure = Figure(figsize=(1.0 + 3.6 * len(tables), 1.0 + 0.22 * longest), layout="constrained")
+    panels = figure.subplots(1, len(tables), squeeze=False, sharex=True)[0]
+    for axis, (policy, rows) in zip(panels, tables.items(), strict=True):
+        names = [f"{row['input']}: {row['replacement']}" for row in rows]
+        value, low, high = (
+            100.0 * np.array([row[f"choices_changed{end}"] for row in rows]) for end in ("", "_low", "_high")
+        )
+        axis.barh(names, value, xerr=np.clip([value - low, high - value], 0.0, None), error_kw={"lw": 0.8})
+        axis.tick_params(axis="y", labelsize="x-small")
+        axis.invert_yaxis()
+        axis.set(title=policy, xlabel="choices changed, %")
+    figure.savefig(path, dpi=110)

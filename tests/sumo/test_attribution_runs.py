@@ -1,0 +1,63 @@
+"""`cosim bench attribution` as a user meets it: it writes what it promises and drives as `cosim run` does."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import pytest
+
+from cosim.batch.case_runner import CaseRunner
+from cosim.batch.record import cases
+from cosim.cli.main import main
+from cosim.learning.attribution import Asking
+from cosim.workers.worker import Worker
+
+
+def test_who_is_asked_drives_the_same_episode() -> None:
+    (case,) = cases(["merge"], ["contested"], [], ["vfn-p"], [150000], duration=3.2)
+    hashes = []
+    for host in (CaseRunner, Asking):
+        with Worker(host) as worker:
+            found = worker.call("run", case, (), None, progress=lambda *_: None)
+            hashes.append(found["trace_hash"])
+    assert hashes[0] == hashes[1]
+    asked = {sums[0] for (_, how), sums in found["answers"].items() if how == "zeroed"}
+    assert asked == {found["answers"]["phi", "0 degrees"][0]}
+    assert asked.pop() > found["steps"], "several AVs a decision"
+
+
+def test_the_command_writes_table_page_and_picture(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [
+        "--policy",
+        "vfn",
+        "--scenario",
+        "merge",
+        "--demand",
+        "contested",
+        "--seeds",
+        "150000:150002",
+        "--duration",
+        "1.2",
+    ]
+    assert main(["bench", "attribution", *words, "--out", str(tmp_path)]) == 0
+    with (tmp_path / "attribution.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert {row["policy"] for row in rows} == {"vfn"}
+    assert len({(row["input"], row["replacement"]) for row in rows}) == len(rows) == 11
+    text = (tmp_path / "attribution.md").read_text()
+    assert text in capsys.readouterr().out
+    assert text.startswith("# Which inputs the value networks use\n\n- `vfn`: inputs that change no choice")
+    assert "preset `unguarded`" in text
+    assert "2 episodes a policy" in text
+    assert (tmp_path / "attribution.png").stat().st_size > 1000
+
+
+def test_a_policy_that_has_no_network_is_bad_input(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--policy", "altruist-rule", "--scenario", "merge", "--seeds", "150000:150001"]
+    assert main(["bench", "attribution", *words, "--out", str(tmp_path)]) == 2
+    assert "policy='altruist-rule'" in capsys.readouterr().err

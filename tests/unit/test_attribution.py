@@ -1,0 +1,153 @@
+"""Counterfactuals of a value network: what it does not read changes nothing, what it reads does."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from policy_scenes import Car, histories, straight_road
+
+from cosim.errors import BadInput
+from cosim.learning.attribution import markdown, questioned, table
+from cosim.types import MetaAction, PolicyContext, Timing
+from policy.agents.approaches import compact
+from policy.attribution import SUMS, Questioned, answer, questions
+from policy.tensors import States
+
+ROAD = straight_road(3)
+FREE = [Car("a", 300.0, 1, 20.0, is_av=True), Car("b", 100.0, 1, 20.0, is_av=True)]  # 200 m apart, alike
+
+
+def untrained(name: str = "vfn-p") -> Questioned:
+    return Questioned(name, dataclasses.replace(compact(name), vfn_weights=None, hpn_weights=None))
+
+
+def driven(
+    agent: Questioned, svo: float = math.pi / 4, cars: list[Car] = FREE
+) -> dict[str, dict[str, float]]:
+    """`input: replacement` -> its sums after one joint decision."""
+    agent.reset(PolicyContext(ROAD, Timing(), agent.observation, svo, np.random.default_rng(0)))
+    agent.decide(histories(ROAD, cars, agent.observation))
+    return {": ".join(k): dict(zip(SUMS, v.tolist(), strict=True)) for k, v in agent.answers.items()}
+
+
+def led_by(agent: Questioned, column: int) -> Questioned:
+    """Its values hang on one column of the joined layer's input alone: Accelerate is worth what that says."""
+    with torch.no_grad():
+        for layer in (agent.vfn.joined, agent.vfn.value):
+            layer.weight.zero_()
+            layer.bias.zero_()
+        agent.vfn.joined.weight[0, column] = 1.0
+        agent.vfn.value.weight[MetaAction.ACCELERATE, 0] = 1.0
+        agent.vfn.value.bias[MetaAction.IDLE] = 0.5
+    return agent
+
+
+def test_a_network_that_reads_phi_alone_uses_nothing_else() -> None:
+    found = driven(led_by(untrained(), -2))  # cos(phi): 0.71 at 45 degrees, more than Idle's 0.5
+    for key, sums in found.items():
+        assert sums["decisions"] == 2
+        assert sums["spread"] == pytest.approx(2 * (math.cos(math.pi / 4) - 0.5), abs=1e-6)
+        if key != "phi: 90 degrees":
+            assert sums["choices_changed"] == sums["unmasked_changed"] == 0, key
+        if not key.startswith("phi"):
+            assert sums["mean_abs_dq"] == 0.0, key
+    assert found["phi: 90 degrees"]["unmasked_changed"] == 2
+    assert found["phi: 90 degrees"]["choices_changed"] == 2
+    assert found["phi: 0 degrees"]["mean_abs_dq"] > 0.0
+
+
+def test_every_input_is_replaced_where_the_approach_has_it() -> None:
+    whole = {": ".join(key).split(":")[0] for key in _keys("vfn-p")}
+    framed = {f"{span} {what}" for span in ("past", "predicted", "all") for what in ("maps", "kinematics")}
+    assert whole == framed | {"situation", "map branch", "phi"}
+    assert {name for name, _ in _keys("vfn")} == {"maps", "kinematics", "situation", "map branch", "phi"}
+    assert {name for name, _ in _keys("safe-dqn")} == {"maps", "map branch", "phi"}
+
+
+def _keys(name: str) -> list[tuple[str, str]]:
+    agent = untrained(name)
+    driven(agent)
+    return list(agent.answers)
+
+
+def test_an_av_that_decides_alone_has_no_other_to_swap_with() -> None:
+    assert not [key for key in driven(untrained("vfn"), cars=FREE[:1]) if "another" in key]
+
+
+def test_swapping_avs_that_see_the_same_changes_nothing() -> None:
+    torch.manual_seed(0)
+    twins = States(
+        torch.randint(0, 255, (1, 14, 4, 32, 128), dtype=torch.uint8).expand(2, -1, -1, -1, -1),
+        *(torch.rand(1, *size).expand(2, *size) for size in ((14, 16, 9), (58,), (2,))),
+    )
+    swapped = [states for _, how, states in questions(twins, 10, True) if how == "another AV's"]
+    assert len(swapped) == 7
+    for states in swapped:
+        assert all(torch.equal(mine, theirs) for mine, theirs in zip(states, twins, strict=True))
+
+
+def test_replacements_touch_their_own_frames_and_nothing_else() -> None:
+    torch.manual_seed(0)
+    states = States(
+        torch.randint(1, 255, (3, 14, 4, 8, 8), dtype=torch.uint8),
+        *(torch.rand(3, *size) for size in ((14, 16, 9), (58,), (2,))),
+    )
+    asked = {(name, how): found for name, how, found in questions(states, 10, True)}
+    zeroed, present = asked["predicted maps", "zeroed"][0], asked["predicted maps", "as at present"][0]
+    assert torch.equal(zeroed[:, :10], states.maps[:, :10])
+    assert not zeroed[:, 10:].any()
+    assert torch.equal(present[:, 10:], states.maps[:, 9:10].expand(-1, 4, -1, -1, -1))
+    still = asked["past kinematics", "as at present"][1]
+    assert torch.equal(still[:, :10], states.kinematics[:, 9:10].expand(-1, 10, -1, -1))
+    assert torch.equal(still[:, 10:], states.kinematics[:, 10:])
+    other = asked["situation", "another AV's"][2]
+    assert torch.equal(other[1], states.situation[0])
+    assert torch.equal(asked["phi", "90 degrees"][3][0], torch.tensor([math.cos(math.pi / 2), 1.0]))
+
+
+def test_no_maps_is_the_last_layer_of_their_branch_at_zero() -> None:
+    agent = Questioned("vfn-p")
+    agent.reset(PolicyContext(ROAD, Timing(), agent.observation, 0.0, np.random.default_rng(0)))
+    states = agent.perceive(histories(ROAD, FREE, agent.observation)).states
+    without = answer(agent, (None, *states[1:]))
+    with torch.no_grad():
+        agent.vfn.hidden.weight.zero_()
+        agent.vfn.hidden.bias.zero_()
+    assert np.array_equal(without, answer(agent, states))
+
+
+def test_the_questions_do_not_disturb_the_memory_of_commanded_lane_changes() -> None:
+    agent = untrained()
+    with torch.no_grad():
+        agent.vfn.value.bias[MetaAction.LANE_LEFT] = 1.0
+    agent.reset(PolicyContext(ROAD, Timing(), agent.observation, 0.0, np.random.default_rng(0)))
+    seen = histories(ROAD, FREE, agent.observation)
+    assert agent.decide(seen)["a"].action == MetaAction.LANE_LEFT
+    assert agent.decide(seen)["a"].blamed == "(lane change was refused)"
+
+
+def test_shares_are_those_of_the_decisions_of_all_episodes_and_the_page_says_what_is_unused() -> None:
+    about = {"scenario": "w", "demand": "d", "behavior": "mixed", "driver_model": "m", "preset": "p"}
+    keys = [("maps", "zeroed"), ("maps", "another AV's"), ("phi", "0 degrees")]
+    sums = [[10, 0, 0, 0.0, 5.0], [8, 0, 0, 0.0, 4.0], [10, 3, 4, 2.0, 5.0]]
+    answers = [dict(zip(keys, map(np.array, sums), strict=True)) for _ in range(2)]
+    del answers[1]["maps", "another AV's"]  # an episode in which one AV decided at a time
+    episodes = [{**about, "svo_deg": 45.0, "policy": "x", "answers": found} for found in answers]
+    rows = table(episodes)
+    assert [row["decisions"] for row in rows] == [20, 8, 20]
+    assert rows[2]["choices_changed"] == 0.3
+    assert rows[2]["choices_changed_low"] < 0.3 < rows[2]["choices_changed_high"]
+    assert (rows[2]["unmasked_changed_count"], rows[2]["mean_abs_dq"], rows[2]["spread"]) == (8, 0.2, 0.5)
+    page = markdown(episodes, {"x": rows}, "cosim bench attribution ...")
+    assert "`x`: inputs that change no choice, whatever replaces them: maps." in page
+    assert "phi 30.0 %" in page
+    assert "2 episodes a policy" in page
+
+
+def test_a_policy_without_a_network_is_refused() -> None:
+    with pytest.raises(BadInput, match="policy='idm'"):
+        questioned("idm")

@@ -40,7 +40,7 @@ class Traffic(NamedTuple):
 
 
 def foresee(
-    scene: Scene, predictor: Predictor, road: RoadMap, config: TrafficConfig
+    scene: Scene, predictor: Predictor, road: RoadMap, config: TrafficConfig, frames: int | None = None
 ) -> tuple[KinematicForecast, Traffic]:
     """The predictor's forecast of every vehicle of a scene, and the same carried along the lanes.
 
@@ -49,9 +49,10 @@ def foresee(
         predictor: forecasts `predictor.horizon` frames.
         road: the road map.
         config: how vehicles are carried along their lanes.
+        frames: how far they are carried (default: the predictor's horizon).
     """
     forecast = predictor.predict(scene.state, scene.valid)
-    return forecast, predict_traffic(scene, forecast, road, config, predictor.horizon)
+    return forecast, predict_traffic(scene, forecast, road, config, frames or predictor.horizon)
 
 
 def predict_traffic(

@@ -32,7 +32,7 @@ from policy.safety import prioritize
 from policy.scene import Scene, join
 from policy.seeded import seeded
 from policy.tensors import States, pixels, situation_tensor, svo_tensor, to_batch, to_numpy
-from policy.traffic import Traffic, predict_traffic
+from policy.traffic import Traffic, foresee
 from policy.vfn import VFN, Frames
 
 UNTRAINED = "untrained"
@@ -133,8 +133,7 @@ class PredictionAware:
         """What all AVs see together, and where everybody in it will be."""
         c, context = self.config, self._context
         scene = join(histories, context.observation.share_perception)
-        forecast = self._predictor.predict(scene.state, scene.valid)
-        traffic = predict_traffic(scene, forecast, context.road, c.traffic, c.safety.frames)
+        forecast, traffic = foresee(scene, self._predictor, context.road, c.traffic, c.safety.frames)
         self._expected = scene.vehicles, traffic, forecast
         return scene, traffic, forecast
 

@@ -69,15 +69,13 @@ class KernelPrior(NamedTuple):
 
     @staticmethod
     def of(network: PriorNetwork) -> KernelPrior:
-        def array(value: torch.Tensor) -> Floats:
-            return value.detach().to(torch.float64).numpy()
-
+        values = {k: v.detach().to(torch.float64).numpy() for k, v in network.state_dict().items()}
         return KernelPrior(
-            (array(network.hidden.weight).T, array(network.hidden.bias)),
-            (array(network.out.weight).T, array(network.out.bias)),
+            (values["hidden.weight"].T, values["hidden.bias"]),
+            (values["out.weight"].T, values["out.bias"]),
             tuple(np.cumsum(network.config.kernels).tolist()),
-            np.exp(array(network.log_temperature)),
-            array(network.calibration),
+            np.exp(values["log_temperature"]),
+            values["calibration"],
             network.config.dt,
         )
 

@@ -208,16 +208,11 @@ class PredictionAware:
 
     def _refused(self, histories: Mapping[str, History]) -> dict[str, MetaAction]:
         """Lane changes that were commanded within RETRY s and did not begin (a closed lane, a solid line)."""
-        refused = {}
         for name, history in histories.items():
-            action, when = self._asked.get(name, (None, 0.0))
-            if action is None:
-                continue
+            _, when = self._asked.get(name, (None, np.inf))
             if history.lane_changing or history.time - when > RETRY:
-                del self._asked[name]
-            else:
-                refused[name] = action
-        return refused
+                self._asked.pop(name, None)
+        return {name: action for name, (action, _) in self._asked.items() if name in histories}
 
 
 def _networks(c: AgentConfig) -> tuple[VFN, HPN | None]:
@@ -229,6 +224,5 @@ def _networks(c: AgentConfig) -> tuple[VFN, HPN | None]:
 def _label(parts: Mapping[str, Path | None]) -> str:
     """What to warn of: nothing, `untrained`, or which part is."""
     missing = [part for part, weights in parts.items() if weights is None]
-    if len(missing) == len(parts):
-        return UNTRAINED
-    return f"{UNTRAINED} {', '.join(missing)}" if missing else ""
+    which = "" if len(missing) == len(parts) else f" {', '.join(missing)}"
+    return UNTRAINED + which if missing else ""

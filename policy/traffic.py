@@ -63,6 +63,16 @@ def predict_traffic(
     A vehicle keeps its lane and takes the straightest way (its route is unknown); one that drifts sideways
     goes where it drifts, so a merging car sits in the neighbour lane only once it really moves there; where
     the lane ends it stops. Vehicles off every lane go where the forecast says.
+
+    Args:
+        scene: what the AVs know.
+        forecast: [V,M] of its vehicles, in the world.
+        road: the road map.
+        config: how vehicles are carried along their lanes.
+        frames: of `config.dt` s.
+
+    Returns:
+        the rollout [V,frames+1] of every vehicle, frame 0 is now.
     """
     c = config
     count = len(scene.vehicles)

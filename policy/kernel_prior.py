@@ -49,7 +49,7 @@ class PriorNetwork(nn.Module):
         nn.init.zeros_(self.out.bias)
         self.log_temperature = nn.Parameter(torch.full((len(config.kernels),), 2.5))
         # factors that make a 90 % interval cover 90 % at each step, found on episodes not trained on; a row
-        # for each number of frames that are known, 1 to N: a completed past (policy.past) is less sure
+        # for each number of frames that are known, 1 to N: a completed past is less sure
         self.register_buffer("calibration", torch.ones(config.frames, config.spreads, config.horizon))
 
     def forward(self, features: torch.Tensor) -> torch.Tensor:

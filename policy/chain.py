@@ -49,7 +49,18 @@ class Prediction(NamedTuple):
 
 
 def render(rows: Floats, valid: Bools, pose: Floats, config: ObservationConfig, raster: RoadRaster) -> Bytes:
-    """Maps of predicted kinematics: rows [B,M,k,8], valid [B,k], pose [B,3] -> uint8 [B,M,C,H,W]."""
+    """Maps of predicted kinematics.
+
+    Args:
+        rows: [B,M,k,8] KINEMATIC_FEATURES in each ego's frame (m, m/s, rad), row 0 the ego.
+        valid: [B,k] which rows are vehicles.
+        pose: [B,3] x m, y m, heading rad of each ego now.
+        config: size and channels of the maps.
+        raster: the road.
+
+    Returns:
+        uint8 [B,M,C,H,W].
+    """
     b, m, r, f = rows.shape
     out = np.empty((b * m, len(config.channels), config.height, config.width), np.uint8)
     flat = np.ascontiguousarray(rows.reshape(b * m, r, f))

@@ -113,7 +113,14 @@ class GaussianProcessBank:
         )
 
     def evidence(self, past: Floats) -> Floats:
-        """Log marginal likelihood [S,K] of series [S,n] relative to their newest value, in the unit."""
+        """Log marginal likelihood of every kernel (P's reference [14]).
+
+        Args:
+            past: [S,n] series relative to their newest value, in units of `config.unit`.
+
+        Returns:
+            [S,K].
+        """
         op = self.operators(past.shape[1])
         white = past @ op.whiten
         white -= op.drift_white

@@ -28,7 +28,7 @@ class HpnConfig:
 
 
 class HPN(nn.Module):
-    """The branches that the configuration asks for; `policy.chain.predict` runs them (P, figure 3).
+    """The branches that the configuration asks for; `policy.chain.predict` runs them (P, fig. 3).
 
     Untrained, `rendered` and `corrected` return the maps rendered from the forecast along the lanes.
 

@@ -49,7 +49,7 @@ class PriorNetwork(nn.Module):
         nn.init.zeros_(self.out.bias)
         self.log_temperature = nn.Parameter(torch.full((len(config.kernels),), 2.5))
         # factors that make a 90 % interval cover 90 % at each step, found on episodes not trained on; a row
-        # for each number of frames that are known, 1 to N: a completed past (policy.past) is less sure
+        # for each number of frames that are known, 1 to N: a completed past is less sure
         self.register_buffer("calibration", torch.ones(config.frames, config.spreads, config.horizon))
 
     def forward(self, features: torch.Tensor) -> torch.Tensor:
@@ -69,15 +69,13 @@ class KernelPrior(NamedTuple):
 
     @staticmethod
     def of(network: PriorNetwork) -> KernelPrior:
-        def array(value: torch.Tensor) -> Floats:
-            return value.detach().to(torch.float64).numpy()
-
+        values = {k: v.detach().to(torch.float64).numpy() for k, v in network.state_dict().items()}
         return KernelPrior(
-            (array(network.hidden.weight).T, array(network.hidden.bias)),
-            (array(network.out.weight).T, array(network.out.bias)),
+            (values["hidden.weight"].T, values["hidden.bias"]),
+            (values["out.weight"].T, values["out.bias"]),
             tuple(np.cumsum(network.config.kernels).tolist()),
-            np.exp(array(network.log_temperature)),
-            array(network.calibration),
+            np.exp(values["log_temperature"]),
+            values["calibration"],
             network.config.dt,
         )
 

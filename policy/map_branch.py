@@ -38,11 +38,6 @@ class MapBranchConfig:
         """Past frames that enter the network."""
         return self.frames if self.history else 1
 
-    @property
-    def inputs(self) -> int:
-        """Map channels that enter the network."""
-        return (self.seen + (self.block if self.correct else 0)) * self.channels
-
 
 class MapBranch(nn.Module):
     """Predictive autoencoder with a map branch and a kinematic branch, added elementwise.
@@ -56,7 +51,7 @@ class MapBranch(nn.Module):
         self.config = c = config
         size = (c.height, c.width)
         self._stages: list[tuple[Size, Size, Size]] = []  # size a convolution sees, size it yields, pooling
-        widths = [c.inputs, *c.features]
+        widths = [(c.seen + (c.block if c.correct else 0)) * c.channels, *c.features]
         self.encoder = nn.ModuleList()
         for k in range(3):
             self.encoder.append(nn.Conv2d(widths[k], widths[k + 1], 3, stride=2, padding=1))

@@ -74,11 +74,6 @@ class MapPredictors:
         self._raster: RoadRaster = rasterize_road(road)
         self._traffic = TrafficConfig()
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Every predictor, the two references first."""
-        return ("last-frame", "gp-raster", *self._hpns)
-
     def predict(self, histories: Mapping[str, History]) -> Guess:
         """Maps of the whole horizon, frame by frame."""
         config = ChainConfig(horizon=self._predictor.horizon, every=1)
@@ -87,7 +82,7 @@ class MapPredictors:
         maps = {"last-frame": np.repeat(unit_maps(last)[:, None], config.horizon, 1)}
         with torch.inference_mode():
             batch = to_batch(scene.histories)
-            for name in self.names[1:]:
+            for name in ("gp-raster", *self._hpns):
                 hpn = self._hpns.get(name)
                 history = hpn is None or hpn.kinematic is None or hpn.kinematic.config.history
                 known = scene if history else scene.without_history()

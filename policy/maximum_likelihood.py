@@ -31,7 +31,14 @@ class Fitted(NamedTuple):
 
 
 def fit_series(values: Floats, unit: float, horizon: int = 20, dt: float = 0.2) -> Fitted:
-    """Fit and forecast one series [n] (n >= 2), oldest first, in its own unit; kernel in `unit`s and s."""
+    """Fit and forecast one series (P, eq. 7 and 8).
+
+    Args:
+        values: [n] oldest first, n >= 2, in the series' own unit.
+        unit: in which the kernel is given.
+        horizon: M, frames ahead.
+        dt: s between frames.
+    """
     past = dt * np.arange(1.0 - len(values), 1.0)
     ahead = dt * np.arange(1.0, horizon + 1.0)
     y = (values - values.mean()) / unit

@@ -37,12 +37,11 @@ class Meeting:
 
 def missions(histories: Iterable[History]) -> dict[str, Seen]:
     """Every mission vehicle that any of these AVs perceives (V2V: not everybody is near enough to)."""
-    found: dict[str, Seen] = {}
-    for history in histories:
-        for r in np.flatnonzero(history.valid[-1] & (history.kinematics[-1, :, IS_MISSION] > 0.5)):
-            speed = float(history.kinematics[-1, r, 2])
-            found[history.ids[r]] = Seen(int(history.lane[r]), float(history.lane_position[r]), speed)
-    return found
+    return {
+        h.ids[r]: Seen(int(h.lane[r]), float(h.lane_position[r]), float(h.kinematics[-1, r, 2]))
+        for h in histories
+        for r in np.flatnonzero(h.valid[-1] & (h.kinematics[-1, :, IS_MISSION] > 0.5))
+    }
 
 
 def meet(road: RoadMap, history: History, seen: Seen) -> Meeting | None:

@@ -87,7 +87,16 @@ def project(
 def project_many(
     points: Floats, arc: Floats, start: Ints, x: Floats, y: Floats, around: Floats
 ) -> tuple[Floats, Floats]:
-    """`project` of point k onto path k: [k] -> arc [k] m, offset [k] m."""
+    """`project` of one point onto each path.
+
+    Args:
+        points, arc, start: k packed paths (`Paths`).
+        x, y: [k] m, the point of each path.
+        around: [k] m, arc length near which is looked; nan: anywhere.
+
+    Returns:
+        arc [k] m, offset [k] m (left positive).
+    """
     n = x.shape[0]
     out_arc, out_offset = np.empty(n), np.empty(n)
     for k in range(n):
@@ -99,9 +108,15 @@ def project_many(
 def project_each(
     points: Floats, arc: Floats, start: Ints, same: Ints, x: Floats, y: Floats
 ) -> tuple[Floats, Floats]:
-    """`project` of every point [n] onto each of the first k paths: arc [k,n] m, offset [k,n] m.
+    """`project` of every point onto each of the first k paths.
 
-    same [k]: the first path that is the same, whose answer is taken over.
+    Args:
+        points, arc, start: packed paths (`Paths`).
+        same: [k] the first path that is the same, whose answer is copied.
+        x, y: [n] m.
+
+    Returns:
+        arc [k,n] m, offset [k,n] m (left positive).
     """
     count, n = same.shape[0], x.shape[0]
     out_arc, out_offset = np.empty((count, n)), np.empty((count, n))

@@ -40,7 +40,7 @@ class Traffic(NamedTuple):
 
 
 def foresee(
-    scene: Scene, predictor: Predictor, road: RoadMap, config: TrafficConfig
+    scene: Scene, predictor: Predictor, road: RoadMap, config: TrafficConfig, frames: int | None = None
 ) -> tuple[KinematicForecast, Traffic]:
     """The predictor's forecast of every vehicle of a scene, and the same carried along the lanes.
 
@@ -49,9 +49,10 @@ def foresee(
         predictor: forecasts `predictor.horizon` frames.
         road: the road map.
         config: how vehicles are carried along their lanes.
+        frames: how far they are carried (default: the predictor's horizon).
     """
     forecast = predictor.predict(scene.state, scene.valid)
-    return forecast, predict_traffic(scene, forecast, road, config, predictor.horizon)
+    return forecast, predict_traffic(scene, forecast, road, config, frames or predictor.horizon)
 
 
 def predict_traffic(
@@ -62,6 +63,16 @@ def predict_traffic(
     A vehicle keeps its lane and takes the straightest way (its route is unknown); one that drifts sideways
     goes where it drifts, so a merging car sits in the neighbour lane only once it really moves there; where
     the lane ends it stops. Vehicles off every lane go where the forecast says.
+
+    Args:
+        scene: what the AVs know.
+        forecast: [V,M] of its vehicles, in the world.
+        road: the road map.
+        config: how vehicles are carried along their lanes.
+        frames: of `config.dt` s.
+
+    Returns:
+        the rollout [V,frames+1] of every vehicle, frame 0 is now.
     """
     c = config
     count = len(scene.vehicles)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -136,7 +136,7 @@ def _grid(rows: int, columns: int) -> tuple[Figure, Any]:
     return figure, axes
 
 
-def _show(row: Any, name: str, images: Sequence[Floats32]) -> None:
+def _show(row: Any, name: str, images: Iterable[Floats32]) -> None:
     """Images side by side, named at the left."""
     row[0].set_ylabel(name, fontsize="small", rotation=0, ha="right", va="center")
     for axis, image in zip(row, images, strict=False):

@@ -93,8 +93,8 @@ class Scores:
         scenario counts the same. `n`: forecasts.
         """
         rows = []
-        steps = {horizon: slice(k, k + 1) for horizon, k in self.horizons().items()}
-        spans: dict[float | str, slice] = {**steps, "mean": slice(None)}
+        spans: dict[float | str, slice] = {h: slice(k, k + 1) for h, k in self.horizons().items()}
+        spans["mean"] = slice(None)
         for predictor, errors in self.errors.items():
             each = np.stack(errors)  # [E,M]
             for scenario, behavior, members in self.groups():

@@ -32,7 +32,7 @@ from policy.safety import prioritize
 from policy.scene import Scene, join
 from policy.seeded import seeded
 from policy.tensors import States, pixels, situation_tensor, svo_tensor, to_batch, to_numpy
-from policy.traffic import Traffic, predict_traffic
+from policy.traffic import Traffic, foresee
 from policy.vfn import VFN, Frames
 
 UNTRAINED = "untrained"
@@ -133,8 +133,7 @@ class PredictionAware:
         """What all AVs see together, and where everybody in it will be."""
         c, context = self.config, self._context
         scene = join(histories, context.observation.share_perception)
-        forecast = self._predictor.predict(scene.state, scene.valid)
-        traffic = predict_traffic(scene, forecast, context.road, c.traffic, c.safety.frames)
+        forecast, traffic = foresee(scene, self._predictor, context.road, c.traffic, c.safety.frames)
         self._expected = scene.vehicles, traffic, forecast
         return scene, traffic, forecast
 
@@ -209,16 +208,11 @@ class PredictionAware:
 
     def _refused(self, histories: Mapping[str, History]) -> dict[str, MetaAction]:
         """Lane changes that were commanded within RETRY s and did not begin (a closed lane, a solid line)."""
-        refused = {}
         for name, history in histories.items():
-            action, when = self._asked.get(name, (None, 0.0))
-            if action is None:
-                continue
+            _, when = self._asked.get(name, (None, np.inf))
             if history.lane_changing or history.time - when > RETRY:
-                del self._asked[name]
-            else:
-                refused[name] = action
-        return refused
+                self._asked.pop(name, None)
+        return {name: action for name, (action, _) in self._asked.items() if name in histories}
 
 
 def _networks(c: AgentConfig) -> tuple[VFN, HPN | None]:
@@ -230,6 +224,5 @@ def _networks(c: AgentConfig) -> tuple[VFN, HPN | None]:
 def _label(parts: Mapping[str, Path | None]) -> str:
     """What to warn of: nothing, `untrained`, or which part is."""
     missing = [part for part, weights in parts.items() if weights is None]
-    if len(missing) == len(parts):
-        return UNTRAINED
-    return f"{UNTRAINED} {', '.join(missing)}" if missing else ""
+    which = "" if len(missing) == len(parts) else f" {', '.join(missing)}"
+    return UNTRAINED + which if missing else ""

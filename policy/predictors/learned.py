@@ -61,7 +61,15 @@ class KinematicNet(nn.Module):
             )
 
     def forward(self, past: torch.Tensor, speed: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """past [V,N,INPUTS], speed [V] m/s now -> x, y [V,M] m; indirect also speed m/s, heading rad."""
+        """The next M frames of V vehicles.
+
+        Args:
+            past: [V,N,INPUTS] (`features`).
+            speed: [V] m/s, now.
+
+        Returns:
+            x, y [V,M] m in the own frame; an indirect network also speed [V,M] m/s, heading [V,M] rad.
+        """
         c = self.config
         if c.kind == "lstm":
             past = self.lstm(past)[0][:, -1]

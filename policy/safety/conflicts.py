@@ -28,10 +28,14 @@ class Others(NamedTuple):
 def others_near(
     b: int, me: int, scene: Scene, traffic: Traffic, road: RoadMap, reach: float, intended: Bools
 ) -> Others:
-    """Those within `reach` m.
+    """The vehicles that an AV can touch: its own rows; with shared perception also its allies' rows.
 
-    Its own rows; with shared perception also those of its allies, for rows are few in a queue. `intended`
-    [V]: whose rollout is a shared intention.
+    Args:
+        b: place of the AV among `scene.agents`.
+        me: its place among `scene.vehicles`.
+        scene, traffic, road: as in `policy.safety.prioritize`.
+        reach: m, with shared perception.
+        intended: [V] whose rollout is a shared intention.
     """
     r = traffic.rollout
     if scene.shared:
@@ -87,7 +91,16 @@ class Neighbours(NamedTuple):
 def neighbours(
     course: Ways, arc: Floats, heading: float, length: float, others: Others, c: SafetyConfig
 ) -> Neighbours:
-    """The ego: its centre's place on the path of every action, arc [A] m, its heading, rad, and length, m."""
+    """How the others stand to the path of every action.
+
+    Args:
+        course: the paths.
+        arc: [A] m, place of the ego's centre on each of them.
+        heading: rad, of the ego.
+        length: m, of the ego.
+        others: the O vehicles near it.
+        c: limits.
+    """
     paths, same = course.paths, course.same
     x, y, headings, lengths = (np.asarray(array) for array in others.boxes[:4])
     soon = min(5, x.shape[1] - 1)  # 1 s ahead: who drifts in is in

@@ -111,7 +111,7 @@ def test_gradients_reach_every_layer_of_both_networks() -> None:
         torch.nn.init.normal_(head.weight)  # type: ignore[union-attr]
     torch.nn.init.normal_(hpn.decoder[2].weight)  # type: ignore[arg-type]
     maps, moved = hpn(
-        [torch.rand(2, 40, 16, 128)], torch.rand(2, 10, 16, KINEMATIC_INPUTS), torch.rand(2, 20, 16, 128)
+        torch.rand(2, 40, 16, 128), torch.rand(2, 10, 16, KINEMATIC_INPUTS), torch.rand(2, 20, 16, 128)
     )
     q = vfn(
         torch.rand(2, 14, 4, 16, 128),

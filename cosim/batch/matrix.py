@@ -61,9 +61,8 @@ class Plan:
 
     def cases(self) -> Iterator[tuple[Cell, Case]]:
         """Every episode with its cell."""
-        for cell in self.cells:
-            for seed in self.seeds:
-                yield cell, cell.case.with_seed(seed)
+        for cell, seed in itertools.product(self.cells, self.seeds):
+            yield cell, cell.case.with_seed(seed)
 
 
 def cells(spec: Spec) -> Iterator[Case]:

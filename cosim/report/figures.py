@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from cosim.batch.records import IDENTITY, LAST
+from cosim.report.result import FIRST
 
 Row = Mapping[str, Any]  # one episode: a line of episodes.parquet, NA as None
 
@@ -47,26 +48,7 @@ RATES: dict[str, Measure] = {
     )
 }
 
-# Columns that stand first -> the measure that reports and comparisons show of them; "" where none.
-_FIRST = {
-    "crashed": "collision_rate",
-    "collisions": "",
-    "av_caused_collisions": "av_caused_collision_rate",
-    "teleports": "",
-    "emergency_stops": "",
-    "mission_success": "mission_success_rate",
-    "mission_time_s": "",
-    "dt_mission_m": "dt_mission_m",
-    "dt_av_m": "dt_av_m",
-    "dt_mean_m": "dt_mean_m",
-    "min_ttc_s": "min_ttc_s",
-    "hard_brakings_av": "hard_brakings_av",
-    "veto_rate": "veto_rate",
-    "vehicles_inserted": "",
-    "vehicles_never_inserted": "",
-}
-EPISODE = tuple(_FIRST)  # what the table of one episode shows
-HEADLINE = tuple(filter(None, _FIRST.values()))  # what reports and comparisons show first
+HEADLINE = tuple(filter(None, FIRST.values()))  # what reports and comparisons show first
 
 TIMINGS = ("reset_s", "simulation_s", "observation_s", "decision_s", "total_s")  # wall time: never repeatable
 

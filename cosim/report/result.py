@@ -7,8 +7,26 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cosim.files import cannot, whole
-from cosim.report.figures import EPISODE
 from cosim.types import EpisodeResult, Metric
+
+# Columns that the table of an episode shows -> the measure of them that reports and comparisons show first.
+FIRST = {
+    "crashed": "collision_rate",
+    "collisions": "",
+    "av_caused_collisions": "av_caused_collision_rate",
+    "teleports": "",
+    "emergency_stops": "",
+    "mission_success": "mission_success_rate",
+    "mission_time_s": "",
+    "dt_mission_m": "dt_mission_m",
+    "dt_av_m": "dt_av_m",
+    "dt_mean_m": "dt_mean_m",
+    "min_ttc_s": "min_ttc_s",
+    "hard_brakings_av": "hard_brakings_av",
+    "veto_rate": "veto_rate",
+    "vehicles_inserted": "",
+    "vehicles_never_inserted": "",
+}
 
 
 def table(result: EpisodeResult) -> str:
@@ -19,7 +37,7 @@ def table(result: EpisodeResult) -> str:
         f"  behaviour {result.behavior}, drivers {result.driver_model}, preset {result.preset}, "
         f"svo {result.svo_deg:g} deg, seed {result.seed}, {result.steps} decisions",
     ]
-    shown = [name for name in EPISODE if name in result.metrics]
+    shown = [name for name in FIRST if name in result.metrics]
     lines += [f"  {name:<24} {figure(result.metrics[name])}" for name in shown]
     for c in result.collisions:
         who = f"{c.kind}, {'AV-caused' if c.av_caused else 'not AV-caused'}"

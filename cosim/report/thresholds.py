@@ -90,10 +90,8 @@ def _unit(measure: Measure, sign: str, number: float, unit: str | None, text: st
     if unit == "%":
         if measure.is_share and sign:
             raise _wrong("a difference of shares is given in pp (percentage points)", text)
-        if measure.is_share:
-            return ABSOLUTE, 0.01
-        if sign:
-            return CHANGE, 0.01
+        if measure.is_share or sign:
+            return (CHANGE if sign else ABSOLUTE), 0.01
         raise _wrong(f"{measure.name} is in {_unit_of(measure)}; with + or - it may be a change in %", text)
     raise _wrong(f"unknown unit {unit!r}: {measure.name} is in {_unit_of(measure)}", text)
 

@@ -170,14 +170,13 @@ def _notes(compared: Compared) -> list[str]:
     """What a reader must know before the figures."""
     group = compared.group
     notes = [f"{len(group.pairs)} pairs, A {who(group.a)}, B {who(group.b)}"]
-    if group.identical:
-        notes.append(f"{group.identical} pairs drove exactly alike (same trace hash)")
-    if group.not_comparable:
-        notes.append(f"{group.not_comparable} pairs hold an episode that says it is not comparable")
-    unpaired = zip(group.unpaired, "AB", strict=True)
-    notes += [
-        f"{count} episodes of {side} have no partner and do not count" for count, side in unpaired if count
-    ]
+    counted = {
+        f"{group.identical} pairs drove exactly alike (same trace hash)": group.identical,
+        f"{group.not_comparable} pairs hold an episode that says it is not comparable": group.not_comparable,
+        f"{group.unpaired[0]} episodes of A have no partner and do not count": group.unpaired[0],
+        f"{group.unpaired[1]} episodes of B have no partner and do not count": group.unpaired[1],
+    }
+    notes += [note for note, count in counted.items() if count]
     for row in [*group.failed, *group.refused][:_SHOWN]:
         notes.append(f"{row['status']} {row['key']} ({row['policy']}, seed {row['seed']}): {_reason(row)}")
     hidden = len(group.failed) + len(group.refused) - _SHOWN

@@ -185,13 +185,11 @@ def _differences(values: npt.NDArray[Any], order: int = 1) -> list[int]:
 
 
 def _short(values: npt.NDArray[Any] | None, digits: int) -> list[float | None] | None:
-    if values is None:
-        return None
-    return [round(float(v), digits) if math.isfinite(v) else None for v in values]
+    return None if values is None else [_finite(float(v), digits) for v in values]
 
 
-def _finite(value: float) -> float | None:
-    return round(value, 2) if math.isfinite(value) else None
+def _finite(value: float, digits: int = 2) -> float | None:
+    return round(value, digits) if math.isfinite(value) else None
 
 
 def _ms(seconds: float) -> int:

@@ -59,6 +59,7 @@ def prediction_speed(place: Place) -> list[list[str]]:
     """What predicting four seconds costs."""
     size = ["--size", "compact", "--threads", "1"] if place.small else ["--threads", "2"]
     flags = ["--rounds", "1", "--decisions", "2" if place.small else "12"]
+    flags += ["--backend", "eager"] if place.small else []  # inductor compiles C++ for a minute
     return [["benchmarks.prediction_maps", *size, *flags, "--out", str(place.out / "prediction_speed.md")]]
 
 

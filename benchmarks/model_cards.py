@@ -32,7 +32,7 @@ MAPS_UNUSED = (
 MAPS_ONLY = "It sees nothing but maps, brakes for whatever is near, and has been trained for minutes only."
 DRIVING_LIMITS = (
     "It learned from a scripted demonstrator (`altruist-rule` and a cruise rule, docs/training.md) as well "
-    "as from rewards, and chooses as that does in most states: what rewards added has not been measured apart.",
+    "as from rewards, and chooses as that does in most states: what rewards added is not measured apart.",
     "The human drivers of its training never err. It knows no traffic light, no speed limit of a junction's "
     "lane, no pedestrian and no bicycle; in `unguarded` it drives through red lights.",
 )
@@ -86,8 +86,8 @@ def driving(name: str, card: Card) -> Iterator[str]:
     )
     hours = sum(row["iteration_s"] for row in log) / 3600
     yield (
-        f"- Shipped: iteration {last['iteration']}, after {last['updates']:,} updates and {hours:.1f} hours "
-        f"by its log; the best mean reward in {training['validation']} validation drives a case on tuning seeds."
+        f"- Shipped: iteration {last['iteration']}, after {last['updates']:,} updates and {hours:.1f} h "
+        f"by its log; highest mean reward in {training['validation']} validation drives a case, tuning seeds."
     )
     yield from ("- Measured (test seeds, preset `unguarded`):", "", *measured(name), "")
     yield from (

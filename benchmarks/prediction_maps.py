@@ -126,7 +126,7 @@ def parts(road: Any, kept: list[Any], size: ObservationConfig, chain: ChainConfi
     return out
 
 
-def map_branch(config: MapBranchConfig, horizon: int, rounds: int) -> dict[str, float | str]:
+def map_branch(config: MapBranchConfig, horizon: int, rounds: int, backend: str) -> dict[str, float | str]:
     """ms of the map branch's whole chain for 8 AVs, by the way it is computed."""
     torch.manual_seed(0)
     branch = MapBranch(config).eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -155,7 +155,7 @@ def map_branch(config: MapBranchConfig, horizon: int, rounds: int) -> dict[str, 
 
     note("ONNX Runtime", onnx(branch, past, rows, steps, rounds))
     try:
-        compiled = torch.compile(branch)
+        compiled = torch.compile(branch, backend=backend)
         note("compiled", median_ms(lambda: chain(compiled), rounds))
     except Exception as error:  # needs a C++ compiler on the machine
         note("compiled", f"not possible here: {type(error).__name__}")
@@ -235,6 +235,7 @@ def main() -> None:
     parser.add_argument("--decisions", type=int, default=40)
     parser.add_argument("--rounds", type=int, default=5, help="of the map branch's chain")
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--backend", default="inductor", help="of torch.compile; eager needs no C++ compiler")
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--out", type=Path, metavar="FILE.md")
     args = parser.parse_args()
@@ -256,7 +257,7 @@ def main() -> None:
             spent = parts(road, kept, size, chain)
             say(f"  whole prediction: {_ratio(spent['whole prediction'])}")
             vehicles = round(float(np.mean([len(join(h).vehicles) for h in kept])), 1)
-            ways = map_branch(branch, chain.horizon, args.rounds)
+            ways = map_branch(branch, chain.horizon, args.rounds, args.backend)
             result[label] = {"parts": spent, "map branch": ways, "vehicles": vehicles}
     if args.json:
         print(json.dumps(result))

@@ -20,8 +20,6 @@ PACKAGES = ("cosim", "policy", "sumo_scenarios")
 SOURCES = (*PACKAGES, "pyproject.toml", "README.md", "LICENSE", "MANIFEST.in")
 Command = Callable[..., str]
 
-pytestmark = pytest.mark.xdist_group("wheel")
-
 
 class Installed(NamedTuple):
     wheel: Path

@@ -77,15 +77,6 @@ def first_contacts(a: Boxes, b: Boxes, dt: float) -> Floats:
     return kernels.first_contacts(*mine, *theirs, dt)
 
 
-def pairs_time_to_collision(all_boxes: Boxes, rows: npt.NDArray[Any], cap: float = INF) -> Floats:
-    """Time to collision of vehicles `rows` [k] with all n vehicles of `all_boxes` ([n] each): [k,n] s.
-
-    A vehicle has `cap` with itself. See `time_to_collision`.
-    """
-    rows = np.asarray(rows, dtype=np.int64)
-    return kernels.pairs_ttc(_table(all_boxes), rows, float(cap))
-
-
 def deceleration_to_avoid_crash(a: Boxes, b: Boxes) -> Floats:
     """DRAC (deceleration rate to avoid a crash), in m/s2; broadcast shape.
 

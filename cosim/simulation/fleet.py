@@ -1,4 +1,4 @@
-"""Says who is an AV and who is the mission vehicle, and hands each newcomer its driver."""
+"""Says which vehicles are AVs and mission vehicles, and gives each departed vehicle its driver."""
 
 from __future__ import annotations
 
@@ -21,6 +21,8 @@ AV_LANE_CHANGE = {
     "laneChangeModel.lcCooperativeSpeed": "0",
     "laneChangeModel.lcKeepRight": "0",
 }
+# What a vehicle of a user's file keeps: getters and setters of libsumo.vehicle, in this order.
+KEPT = ("Length", "Width", "MaxSpeed", "SpeedFactor", "VehicleClass")
 
 
 class Fleet:
@@ -35,8 +37,8 @@ class Fleet:
         self._foreign = not scenario.built_in
         self._rewrite_humans = scenario.behavior != AS_IS
 
-    def welcome(self, vehicle: str, seed: int) -> Body:
-        """A vehicle departed: give it its driver, say what it is."""
+    def depart(self, vehicle: str, seed: int) -> Body:
+        """A vehicle departed: give it its driver; what it is."""
         get = libsumo.vehicle
         mission = self._mission is not None and self._mission.fullmatch(vehicle) is not None
         is_av = not mission and self._is_av(vehicle, seed)
@@ -70,15 +72,7 @@ def adopt(vehicle: str) -> None:
     `setType` replaces the car-following model (Krauss in most files); nothing else can.
     """
     get = libsumo.vehicle
-    length, width = get.getLength(vehicle), get.getWidth(vehicle)
-    fastest, factor, kind = (
-        get.getMaxSpeed(vehicle),
-        get.getSpeedFactor(vehicle),
-        get.getVehicleClass(vehicle),
-    )
+    kept = {name: getattr(get, f"get{name}")(vehicle) for name in KEPT}
     get.setType(vehicle, IDM_TYPE)
-    get.setLength(vehicle, length)
-    get.setWidth(vehicle, width)
-    get.setMaxSpeed(vehicle, fastest)
-    get.setSpeedFactor(vehicle, factor)
-    get.setVehicleClass(vehicle, kind)
+    for name, value in kept.items():
+        getattr(get, f"set{name}")(vehicle, value)

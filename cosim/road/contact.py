@@ -53,9 +53,7 @@ class Contact:
         new = self._number[edge] = len(self._members)
         self._members.append(lane)
         if new == len(self.table):
-            larger = np.zeros((2 * new, 2 * new), np.bool_)
-            larger[:new, :new] = self.table
-            self.table = larger
+            self.table = np.pad(self.table, (0, new))
         for k, other in enumerate(self._members):
             touch = near is None or other == OFF or self._lanes[other].edge in near
             self.table[new, k] = self.table[k, new] = touch

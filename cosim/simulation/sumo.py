@@ -201,9 +201,7 @@ class SumoSimulator:
 
     def _arguments(self, seed: int) -> list[str]:
         s = self._scenario
-        additional = [*s.additional]
-        if not s.built_in:
-            additional.append(sumo_scenarios.TYPES)
+        additional = s.additional if s.built_in else (*s.additional, sumo_scenarios.TYPES)
         settings, files = sumo_options(self._outputs, s)
         options = {
             "net-file": str(s.net),
@@ -265,8 +263,8 @@ class SumoSimulator:
         self._watch.lane_changes(snapshot, self.road, self._commander)
         extra = self._watch.from_boxes(snapshot, self.road, self._bodies, self._commander.lane_changes)
         if extra:
-            collisions = events.collisions + tuple(extra)
-            snapshot = replace(snapshot, events=replace(events, collisions=collisions))
+            events = replace(events, collisions=(*events.collisions, *extra))
+            snapshot = replace(snapshot, events=events)
         return snapshot
 
     def _goal(self) -> tuple[frozenset[int], frozenset[int]]:

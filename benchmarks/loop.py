@@ -57,7 +57,7 @@ class Bare:
             for _ in range(self._steps):
                 step()
                 for name in departed():
-                    self._simulator._bodies[name] = self._simulator._fleet.welcome(name, self._seed)
+                    self._simulator._bodies[name] = self._simulator._fleet.depart(name, self._seed)
             times.append(time.perf_counter() - began)
         return {"total": times}
 

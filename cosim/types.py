@@ -344,18 +344,13 @@ class EpisodeResult:
             "timings": {name: round(value, 6) for name, value in self.timings.items()},
             "comparable": not self.validity,
             "not_comparable_because": list(self.validity),
-            "collision_list": [_collision(asdict(c)) for c in self.collisions],
+            "collision_list": [{k: _plain(v) for k, v in asdict(c).items()} for c in self.collisions],
             "units": {name: metric.unit for name, metric in self.metrics.items()},
             "better": {name: metric.better for name, metric in self.metrics.items()},
             "manifest": self.manifest,
         }
 
 
-def _plain(value: float | int | bool | None) -> float | int | bool | None:
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
-
-
-def _collision(fields: dict[str, Any]) -> dict[str, Any]:
-    return {k: _plain(v) if isinstance(v, float) else v for k, v in fields.items()}
+def _plain(value: Any) -> Any:
+    """The value itself, None for a number that JSON cannot hold."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -18,6 +18,7 @@ MAX_DECEL = 8.0  # m/s2
 MAX_ACCEL = 3.0  # m/s2
 LANE_CHANGE_TIME = 2.0  # s, the same as SUMO's --lanechange.duration
 _ACTIONS, _ACCELERATE, _DECELERATE = len(MetaAction), int(MetaAction.ACCELERATE), int(MetaAction.DECELERATE)
+_NEVER = 1e9  # s: longer than any rollout
 STEP = 0.1  # s, with which a rollout tracks the target speed (SUMO's step, definitions.md)
 
 
@@ -55,36 +56,30 @@ def tracked_speed(speed: float, target: float, step: float) -> float:
 
 
 @compiled
-def tracked_speeds(speed: float, targets: Floats, frames: int, dt: float) -> Floats:
-    """Speeds while tracking target speeds [k] m/s from `speed`: [k,frames+1] m/s, every `dt` s."""
-    steps = max(round(dt / STEP), 1)
-    out = np.empty((targets.shape[0], frames + 1))
-    for k in range(targets.shape[0]):
-        v = speed
-        out[k, 0] = v
-        for t in range(1, frames + 1):
-            for _ in range(steps):
-                v = tracked_speed(v, targets[k], dt / steps)
-            out[k, t] = v
-    return out
-
-
-@compiled
 def braking_speeds(speed: float, target: float, frames: int, dt: float, period: float) -> Floats:
     """Speeds [frames+1] m/s when the target (m/s, already lowered once) falls one level every `period` s."""
     out = np.empty(frames + 1)
     v = speed
     out[0] = v
     steps = max(round(dt / STEP), 1)
-    per_level = max(round(period / STEP), 1)
-    k = 0
+    left = per_level = max(round(period / STEP), 1)
     for t in range(1, frames + 1):
         for _ in range(steps):
-            if k > 0 and k % per_level == 0:
+            if left == 0:
                 target = max(target - SPEED_STEP, 0.0)
-            k += 1
+                left = per_level
+            left -= 1
             v = tracked_speed(v, target, dt / steps)
         out[t] = v
+    return out
+
+
+@compiled
+def tracked_speeds(speed: float, targets: Floats, frames: int, dt: float) -> Floats:
+    """Speeds while tracking target speeds [k] m/s from `speed`: [k,frames+1] m/s, every `dt` s."""
+    out = np.empty((targets.shape[0], frames + 1))
+    for k in range(targets.shape[0]):
+        out[k] = braking_speeds(speed, targets[k], frames, dt, _NEVER)
     return out
 
 

@@ -22,7 +22,6 @@ from cosim.types import Bools, Floats, Ints, Snapshot
 
 Number = float | npt.NDArray[Any]
 INF = np.inf
-_Course = tuple[Any, Any, Any, Any, Any, Any, Any]  # x, y, cos and sin of the heading, speed, sizes
 EVERYWHERE: Bools = np.ones((1, 1), np.bool_)  # one road, on which all can touch
 
 
@@ -72,18 +71,10 @@ def first_contacts(a: Boxes, b: Boxes, dt: float) -> Floats:
     a: x, y, heading, speed [k,t], one length and width; b: [n,t], sizes [n]. Frames are `dt` s apart;
     between two of them, and one after the last, both boxes keep their velocity: nothing is jumped over.
     """
-    mine: _Course = (a.x, a.y, np.cos(a.heading), np.sin(a.heading), a.speed, a.length, a.width)
-    theirs: _Course = (b.x, b.y, np.cos(b.heading), np.sin(b.heading), b.speed, b.length, b.width)
-    return kernels.first_contacts(*mine, *theirs, dt)
-
-
-def pairs_time_to_collision(all_boxes: Boxes, rows: npt.NDArray[Any], cap: float = INF) -> Floats:
-    """Time to collision of vehicles `rows` [k] with all n vehicles of `all_boxes` ([n] each): [k,n] s.
-
-    A vehicle has `cap` with itself. See `time_to_collision`.
-    """
-    rows = np.asarray(rows, dtype=np.int64)
-    return kernels.pairs_ttc(_table(all_boxes), rows, float(cap))
+    courses: list[Any] = []
+    for c in (a, b):
+        courses += c.x, c.y, np.cos(c.heading), np.sin(c.heading), c.speed, c.length, c.width
+    return kernels.first_contacts(*courses, dt)
 
 
 def deceleration_to_avoid_crash(a: Boxes, b: Boxes) -> Floats:
@@ -116,12 +107,9 @@ def conflicts(
     The same as `time_to_collision` and `deceleration_to_avoid_crash` over all pairs, in one pass. `roads`:
     each vehicle's road [n] and which roads can touch [S,S] (`cosim.road.contact`); without them all can.
     """
-    x, y, heading, length, width, speed = (np.asarray(v, dtype=np.float64) for v in all_boxes)
-    number, touch = (np.zeros(len(x), np.int64), EVERYWHERE) if roads is None else roads
-    found = kernels.watched_conflicts(
-        x, y, heading, length, width, speed, watched, float(horizon), number, touch
-    )
-    return Conflicts(*found)
+    columns: list[Any] = [np.asarray(v, dtype=np.float64) for v in all_boxes]
+    number, touch = (np.zeros(len(watched), np.int64), EVERYWHERE) if roads is None else roads
+    return Conflicts(*kernels.watched_conflicts(*columns, watched, float(horizon), number, touch))
 
 
 def gap_ahead(
@@ -132,10 +120,8 @@ def gap_ahead(
     The corridor is the vehicle's lane and the lanes that follow it. rows [k] -> gap [k] m (inf when nobody
     is within `reach` m, negative when bumpers overlap), leader's row [k] (-1 for nobody).
     """
-    s = snapshot
-    return kernels.lane_gaps(
-        s.lane, s.lane_position, s.length, np.asarray(rows, np.int64), *graph, float(reach)
-    )
+    vehicles = snapshot.lane, snapshot.lane_position, snapshot.length
+    return kernels.lane_gaps(*vehicles, np.asarray(rows, np.int64), *graph, float(reach))
 
 
 def headway(gap: Floats, speed: Floats, slowest: float = 0.5) -> Floats:

@@ -232,18 +232,6 @@ def _box(table: Floats, i: int) -> Box:
     return table[i, 0], table[i, 1], table[i, 2], table[i, 3], table[i, 4], table[i, 5], table[i, 6]
 
 
-@compiled
-def pairs_ttc(table: Floats, rows: Ints, cap: float) -> Floats:
-    """See `cosim.geometry.pairs_time_to_collision`."""
-    n = len(table)
-    out = np.empty((len(rows), n))
-    for k in range(len(rows)):
-        a = _box(table, rows[k])
-        for j in range(n):
-            out[k, j] = cap if j == rows[k] else _ttc(a, _box(table, j), cap)
-    return out
-
-
 # fmt: off
 @compiled
 def first_contacts(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol, TypeVar, cast
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +14,6 @@ from cosim.geometry import Conflicts, boxes, conflicts
 from cosim.road import RoadMap
 from cosim.types import Bools, Ints, Kind, Metric, Snapshot, Timing
 
-Table = TypeVar("Table", bound=npt.NDArray[Any])
 AV = int(Kind.AV)  # comparing arrays with an IntEnum member costs five times as much
 HORIZON = 10.0  # s, further ahead straight-line extrapolation says nothing (docs/paper_map.md)
 
@@ -73,17 +72,6 @@ def watched(snapshot: Snapshot) -> Bools:
     return np.asarray((snapshot.kind == AV) | snapshot.mission)
 
 
-def rows_in_both(before: Snapshot, after: Snapshot) -> tuple[Ints, Ints]:
-    """Rows of the vehicles present in both frames: [c] in `before`, [c] in `after`."""
-    if before.ids == after.ids:
-        every = np.arange(after.n)
-        return every, every
-    then = before.row
-    pairs = [(then[name], row) for row, name in enumerate(after.ids) if name in then]
-    both = np.array(pairs, dtype=np.int64).reshape(-1, 2)
-    return both[:, 0], both[:, 1]
-
-
 class Slots:
     """Gives every vehicle of an episode a lasting number, in order of appearance (until `keep`)."""
 
@@ -110,12 +98,10 @@ class Slots:
         self._ids, self._rows = (), np.zeros(0, dtype=np.int64)
 
 
-def grown(table: Table, needed: int, fill: float, axis: int = 0) -> Table:
-    """The table itself while `needed` entries fit along `axis`, else a copy with room for twice as many."""
+def grown(table: npt.NDArray[Any], needed: int, fill: float, axis: int = 0) -> npt.NDArray[Any]:
+    """The table itself while `needed` entries fit along `axis`, else a copy for twice as many."""
     if table.shape[axis] >= needed:
         return table
-    shape = list(table.shape)
-    shape[axis] = 2 * needed
-    larger = np.full(shape, fill, dtype=table.dtype)
-    larger[(slice(None),) * axis + (slice(table.shape[axis]),)] = table
-    return cast(Table, larger)
+    added = [(0, 0)] * table.ndim
+    added[axis] = (0, 2 * needed - table.shape[axis])
+    return np.pad(table, added, constant_values=fill)

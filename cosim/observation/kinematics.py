@@ -105,8 +105,8 @@ def fill_rows(
     slots: npt.NDArray[np.int64],  # [n] slot of each present vehicle
     rows: npt.NDArray[np.int64],  # [B,R]
     fixed: Floats,  # [n,4] length m, width m, is_av, is_mission
-    kinematics: Floats32,  # [B,N,R,8] out, KINEMATIC_FEATURES
-    valid: Bools,  # [B,N,R] out
+    kinematics: Floats32,  # [B,N,R,8] out, KINEMATIC_FEATURES; given as zeros
+    valid: Bools,  # [B,N,R] out; given as False
 ) -> None:
     """Every past frame of every row, in the ego's frame at the newest frame."""
     frames = past.shape[0]
@@ -117,21 +117,14 @@ def fill_rows(
         for r in range(rows.shape[1]):
             j = rows[b, r]
             if j < 0:
-                for k in range(frames):
-                    valid[b, k, r] = False
-                    for f in range(8):
-                        kinematics[b, k, r, f] = 0.0
                 continue
             slot = slots[j]
             turn = past[frames - 1, slot, HEADING] - h0
             base = (turn + np.pi) % (2 * np.pi) - np.pi - turn - h0  # newest heading in (-pi, pi]
             for k in range(frames):
-                here = not np.isnan(past[k, slot, X])
-                valid[b, k, r] = here
-                if not here:
-                    for f in range(8):
-                        kinematics[b, k, r, f] = 0.0
+                if np.isnan(past[k, slot, X]):
                     continue
+                valid[b, k, r] = True
                 dx, dy = past[k, slot, X] - x0, past[k, slot, Y] - y0
                 kinematics[b, k, r, X] = c * dx + s * dy
                 kinematics[b, k, r, Y] = c * dy - s * dx

@@ -61,10 +61,10 @@ class Observer:
         if choose_rows(s.x, s.y, self._egos, self._seen, c.row_range, nobody, rows):
             first = never_left_out(s, self._road.straight_on, self._egos, c.row_range)
             choose_rows(s.x, s.y, self._egos, self._seen, c.row_range, first, rows)
-        kinematics = np.empty((count, c.frames, c.rows, len(KINEMATIC_FEATURES)), np.float32)
-        valid = np.empty((count, c.frames, c.rows), np.bool_)
+        kinematics = np.zeros((count, c.frames, c.rows, len(KINEMATIC_FEATURES)), np.float32)
+        valid = np.zeros((count, c.frames, c.rows), np.bool_)
         fixed = np.stack([s.length, s.width, s.kind == int(Kind.AV), s.mission], axis=1).astype(np.float64)
-        fill_rows(self._past.view, self._past.slots, rows, fixed, kinematics, valid)
+        fill_rows(self._past.window, self._past.slots, rows, fixed, kinematics, valid)
         lanes = np.where(rows >= 0, s.lane[rows], -1).astype(np.int32)  # [B,R]
         positions = np.where(rows >= 0, s.lane_position[rows], 0.0)  # [B,R] m
         pose = np.stack([s.x, s.y, s.heading], axis=1)[self._egos]  # [B,3]

@@ -75,6 +75,14 @@ class Packer:
         everyone = list(histories.values())
         empty = np.zeros((0, 0, 0, 0, 0), np.uint8)
         lines, exists = _lines(everyone)
+        numbers = [
+            (
+                *(*h.pose, h.target_speed, h.lane_changing, h.route.speed_limit),
+                *map(h.route.to_end, range(len(SIDES))),
+                *(h.route.conflict_distance, h.time),
+            )
+            for h in everyone
+        ]
         keep = fresh or 0
         return Packed(
             avs=avs,
@@ -84,7 +92,7 @@ class Packer:
             kinematics=np.stack([h.kinematics for h in everyone]) if everyone else empty.astype(np.float32),
             valid=np.stack([h.valid for h in everyone]) if everyone else empty.astype(np.bool_),
             ids=tuple(h.ids for h in everyone),
-            numbers=np.array([_numbers(h) for h in everyone], np.float64).reshape(-1, 11),
+            numbers=np.array(numbers, np.float64).reshape(-1, 11),
             lanes=exists,
             lines=lines,
         )
@@ -132,20 +140,6 @@ class Unpacker:
 def views(histories: Mapping[str, History]) -> dict[str, View]:
     """What an agent in the simulation's own process sees: AV id -> View."""
     return Unpacker().unpack(Packer().pack(histories, None))
-
-
-def _numbers(h: History) -> tuple[float, ...]:
-    route = h.route
-    ends = (route.to_end(0), route.to_end(1), route.to_end(2))
-    return (
-        *h.pose,
-        h.target_speed,
-        h.lane_changing,
-        route.speed_limit,
-        *ends,
-        route.conflict_distance,
-        h.time,
-    )
 
 
 def _lines(histories: list[History]) -> tuple[Floats32, Bools]:

@@ -218,15 +218,9 @@ class RoadMap:
         return self.lanes[lane].edge == edge
 
     def _join(self, indices: tuple[int, ...], dead_end: bool, leaves: bool) -> LanePath:
-        pieces: list[Floats] = []
-        starts = []  # m
-        total = 0.0
-        for i in indices:
-            shape = self.lanes[i].shape
-            starts.append(total)
-            pieces.append(shape if not pieces else shape[1:])
-            total += self._lengths[i]
-        points = np.concatenate(pieces)
+        starts = np.cumsum([0.0, *(self._lengths[i] for i in indices[:-1])])  # m
+        shapes = [self.lanes[i].shape for i in indices]
+        points = np.concatenate([shapes[0], *(shape[1:] for shape in shapes[1:])])
         step = np.sqrt((np.diff(points, axis=0) ** 2).sum(1))
         keep = np.concatenate([[True], step > 1e-6])
         if keep.sum() < 2:
@@ -234,14 +228,16 @@ class RoadMap:
         points = points[keep]
         arc = np.concatenate([[0.0], np.cumsum(np.sqrt((np.diff(points, axis=0) ** 2).sum(1)))])
         conflict = [
-            start for start, i in zip(starts, indices, strict=True) if any(i in z.lanes for z in self.zones)
+            start
+            for start, i in zip(starts.tolist(), indices, strict=True)
+            if any(i in z.lanes for z in self.zones)
         ]
         first = self.lanes[indices[0]]
         return LanePath(
             points,
             arc,
             indices,
-            np.array(starts),
+            starts,
             dead_end,
             leaves,
             scale=self._lengths[indices[0]] / max(first.length, 1e-6),

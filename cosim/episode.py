@@ -6,6 +6,7 @@ import hashlib
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from typing import NamedTuple
 
 import numpy as np
@@ -187,24 +188,16 @@ class Episode:
             "commands_blocked": Metric(self._tally["blocked"], "commands", "lower"),
         }
         metrics = joined(self._metrics.result(), own)
-        s = self.scenario
+        named = self.scenario.identity(policy, label, round(math.degrees(svo), 6), self.seed)
         return EpisodeResult(
-            scenario=s.name,
-            demand=s.demand_name,
-            policy=policy,
-            label=label,
-            behavior=s.behavior,
-            driver_model=s.driver_model,
-            preset=s.preset,
-            svo_deg=round(math.degrees(svo), 6),
-            seed=self.seed,
+            **asdict(named),
             steps=self.steps,
             trace_hash=self.trace_hash(),
             metrics=metrics,
             collisions=tuple(self._collisions),
             timings=dict(self.timings),
             validity=self._validity(metrics),
-            manifest=manifest(s, self.seed),
+            manifest=manifest(self.scenario, self.seed),
         )
 
     # ---- inside ----

@@ -127,6 +127,11 @@ class Snapshot:
     def n(self) -> int:
         return len(self.ids)
 
+    @property
+    def avs(self) -> tuple[str, ...]:
+        """Ids of the AVs."""
+        return tuple(self.ids[row] for row in np.flatnonzero(self.kind == Kind.AV))
+
 
 # Columns of the kinematic matrix, in the ego's frame at the newest frame of the history
 # (x ahead, y to the left), so that one history lives in one fixed frame and series are smooth.
@@ -302,18 +307,28 @@ class Metric:
 
 
 @dataclass(frozen=True)
-class EpisodeResult:
-    """Everything one episode yields; `document()` is what `cosim run --json` prints."""
+class Identity:
+    """What an episode is called in documents, rows, tables, recordings (`EpisodeId`: as it was asked for)."""
 
     scenario: str
     demand: str
     policy: str
-    label: str
+    policy_label: str | None  # e.g. "untrained"; None where it was never made
     behavior: str
     driver_model: str
+    penetration: float | None  # share of AVs, where that chooses them
     preset: str
     svo_deg: float
     seed: int
+
+
+IDENTITY = tuple(field.name for field in fields(Identity))
+
+
+@dataclass(frozen=True)
+class EpisodeResult(Identity):
+    """Everything one episode yields; `document()` is what `cosim run --json` prints."""
+
     steps: int  # decisions taken
     trace_hash: str
     metrics: dict[str, Metric]
@@ -329,15 +344,7 @@ class EpisodeResult:
     def document(self) -> dict[str, Any]:
         """The JSON document of `cosim run --json`: metrics by name, their units beside them, NA null."""
         return {
-            "scenario": self.scenario,
-            "demand": self.demand,
-            "policy": self.policy,
-            "policy_label": self.label,
-            "behavior": self.behavior,
-            "driver_model": self.driver_model,
-            "preset": self.preset,
-            "svo_deg": self.svo_deg,
-            "seed": self.seed,
+            **{name: getattr(self, name) for name in IDENTITY},
             "steps": self.steps,
             **{name: _plain(metric.value) for name, metric in self.metrics.items()},
             "trace_hash": self.trace_hash,

@@ -19,12 +19,12 @@ from benchmarks.papers.agents import Agent, build, fingerprint, missing, short
 from benchmarks.papers.claims import TABLE_3
 from cosim.batch import execution as batch
 from cosim.batch import matrix
-from cosim.batch.case_runner import CaseRunner
+from cosim.batch.episode_runner import EpisodeRunner
 from cosim.batch.folder import RunFolder
 from cosim.batch.store import Store
 from cosim.report.figures import Row
 from cosim.report.run_folder import Run
-from cosim.scenario.episode_id import Case
+from cosim.scenario.episode_id import EpisodeId
 from cosim.seeding import FIRST_TEST_SEED
 from cosim.types import Policy
 from cosim.workers.engines import LocalEngine
@@ -55,21 +55,15 @@ class Order:
         return self.arm or self.agent.name
 
     @property
-    def case(self) -> Case:
+    def case(self) -> EpisodeId:
         """Of the first seed; the policy is the agent's name."""
-        return Case(
+        return EpisodeId(
             what=self.scenario,
             demand=(self.demand,),
             policy=self.agent.name,
             behavior=self.behavior,
-            driver_model="lc2013",
-            penetration=None,
-            av_type=None,
-            av_ids=None,
             svo_deg=self.svo_deg,
             preset="unguarded",
-            duration=None,
-            seed=FIRST_TEST_SEED,
         )
 
 
@@ -233,7 +227,7 @@ class Planned(matrix.Plan):
         """Cell -> its seeds."""
         return {cell.name: self.seeds[:n] for cell, n in zip(self.cells, self.counts, strict=True)}
 
-    def cases(self) -> Iterator[tuple[matrix.Cell, Case]]:
+    def cases(self) -> Iterator[tuple[matrix.Cell, EpisodeId]]:
         wanted = self.wanted
         for cell in self.cells:
             for seed in wanted[cell.name]:
@@ -271,14 +265,14 @@ def agent_of(policy: str) -> str:
     return policy.split(MARK)[0]
 
 
-class AgentRunner(CaseRunner):
+class AgentRunner(EpisodeRunner):
     """Hosted by the engine: like `cosim evaluate`, for agents that `--policy` does not know."""
 
     def __init__(self, agents: Mapping[str, Agent], untrained: bool) -> None:
         super().__init__()
         self._agents, self._untrained = agents, untrained
 
-    def policy(self, case: Case) -> Policy:
+    def policy(self, case: EpisodeId) -> Policy:
         """The agent whose name the case bears."""
         return build(self._agents[agent_of(case.policy)], self._untrained)
 

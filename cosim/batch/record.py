@@ -9,21 +9,19 @@ from pathlib import Path
 from typing import Any
 
 from cosim.batch import matrix
-from cosim.batch.case_runner import CaseRunner
+from cosim.batch.episode_runner import EpisodeRunner
 from cosim.batch.matrix import Plan
 from cosim.batch.spec import Spec
 from cosim.errors import BadInput
 from cosim.policies import check
 from cosim.recording import Folder, Recorder, write
 from cosim.scenario import place
-from cosim.scenario.episode_id import Case
+from cosim.scenario.episode_id import EpisodeId
 from cosim.scenario.policy_name import read
+from cosim.types import IDENTITY
 from cosim.workers.engines import LocalEngine
 from cosim.workers.progress import Progress
 from cosim.workers.tasks import Progress as Heartbeat
-
-# of the result's document, in the recording's file
-ABOUT = ("scenario", "demand", "behavior", "policy", "policy_label", "svo_deg", "driver_model", "preset")
 
 
 def planned(
@@ -52,7 +50,7 @@ def planned(
     return plan
 
 
-class RecordingRunner(CaseRunner):
+class RecordingRunner(EpisodeRunner):
     """Drives episodes of any cell, one after another, and writes each to the folder."""
 
     def __init__(self, folder: str) -> None:
@@ -60,12 +58,12 @@ class RecordingRunner(CaseRunner):
         self._folder = Folder(Path(folder))
 
     def run(
-        self, case: Case, warnings: tuple[str, ...], outputs: str | None, progress: Heartbeat
+        self, case: EpisodeId, warnings: tuple[str, ...], outputs: str | None, progress: Heartbeat
     ) -> dict[str, Any]:
         """One episode and its file; the document of `cosim run --json`."""
         host, recorder = self.open(case, warnings), Recorder()
         document = host.run(case.seed, progress, hooks=[recorder]).document()
-        about = {name: document[name] for name in (*ABOUT, "seed", "trace_hash")}
+        about = {name: document[name] for name in (*IDENTITY, "trace_hash")}
         about |= {"cell": case.cell, "road": self._folder.add_road(host.simulator.road)}
         write(self._folder.episode_file(case.key), recorder, about)
         return document

@@ -15,6 +15,7 @@ from typing import Annotated, Any
 
 import sumo_scenarios
 from cosim.errors import BadInput, Range, check_pattern, hint, inside, one_of
+from cosim.files import code
 from cosim.files.xml_input import is_there
 from cosim.files.yaml_input import Positive, check_known, document, value_of
 from cosim.scenario import BEHAVIORS, policy_name
@@ -25,7 +26,17 @@ from cosim.types import Preset
 MAX_SEED = 2**62
 MAX_EPISODES = 1_000_000  # more is a slip of the keyboard: 3 GB of rows
 FLEET = ("av_type", "av_ids", "penetration")  # ways to choose the AVs: one excludes the others
-_AXES = ("scenario", "demand", "policy", "behavior", "driver_model", "penetration", "svo", "preset")
+# Axes of the matrix, in the order of its cells -> the field of `EpisodeId` that each value fills.
+AXES = {
+    "scenario": "what",
+    "demand": "demand",
+    "behavior": "behavior",
+    "driver_model": "driver_model",
+    "penetration": "penetration",
+    "preset": "preset",
+    "policy": "policy",
+    "svo": "svo_deg",
+}
 _GLOB = re.compile(r"[*?\[]")
 
 
@@ -50,12 +61,14 @@ class Spec:
     av_ids: str | None = None
     duration: Positive | None = None  # s
     output: tuple[str, ...] = ()  # SUMO's outputs to keep, by SUMO's names
+    metric: tuple[str, ...] = ()  # measured besides, FILE.py:NAME or MODULE:NAME, files absolute
+    reward: str | None = None  # paid and reported: a name of `cosim.rewards.REWARDS`, or code likewise
 
     @property
     def episodes(self) -> int:
         """How many episodes the matrix has."""
         first, end = self.seeds
-        return math.prod(len(getattr(self, axis)) for axis in _AXES) * (end - first)
+        return math.prod(len(getattr(self, axis)) for axis in AXES) * (end - first)
 
 
 _KINDS = typing.get_type_hints(Spec, include_extras=True)
@@ -123,6 +136,10 @@ def _axis(name: str, value: object, folder: Path, file: object, field: str) -> A
             raise BadInput("the list is empty")
     if name == "policy":
         found = [policy_name.read(item, folder, field, file).text for item in found]
+    elif name == "metric":
+        found = [code.read(item, field, folder=folder, file=file).text for item in found]
+    elif name == "reward" and code.is_code(found):
+        found = code.read(found, field, folder=folder, file=file).text
     elif name in ("scenario", "demand"):
         found = [point for item in found for point in _expand(item, folder, file, field, name)]
         found = [point[0] for point in found] if name == "scenario" else found

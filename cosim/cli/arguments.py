@@ -42,7 +42,10 @@ def _shared() -> dict[str, dict[str, Any]]:
         "--scenario": {"metavar": "NAME|FILE", "help": "a world, or a .sumocfg"},
         "--demand": {"metavar": "NAME|FILE", "help": "a name, or a route file"},
         "--policy": {"metavar": "POLICY", "help": POLICY},
-        "--behavior": {"choices": BEHAVIORS, "help": "Table II class of the human drivers"},
+        "--behavior": {
+            "choices": BEHAVIORS,
+            "help": "Table II class of the human drivers (ours: mixed; contested: moderate)",
+        },
         "--driver-model": {"choices": DRIVER_MODELS, "help": "of the human drivers"},
         "--penetration": {"type": share, "metavar": "P", "help": "this share of vehicles are AVs, 0..1"},
         "--av-type": {"metavar": "T", "help": "AVs are the vehicles of this vType"},
@@ -55,6 +58,15 @@ def _shared() -> dict[str, dict[str, Any]]:
             "type": positive,
             "metavar": "S",
             "help": "counted s per episode (default: the scenario's)",
+        },
+        "--output": {
+            "metavar": "NAME",
+            "help": "have SUMO write its NAME output (tripinfo, fcd, ...)",
+        },
+        "--metric": {"metavar": "FILE:NAME", "help": "measure this besides; FILE.py:NAME or MODULE:NAME"},
+        "--reward": {
+            "metavar": "NAME|FILE:NAME",
+            "help": "report what AVs earn by it: p, t, or your own",
         },
         "--workers": {"type": count, "metavar": "N", "help": "processes"},
         "--out": {"metavar": "DIR", "help": "folder to write into"},

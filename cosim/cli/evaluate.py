@@ -41,9 +41,9 @@ def add(verbs: arguments.Verbs) -> None:
     )
     arguments.add(axes, "--policy", "--behavior", "--driver-model", action="append")
     arguments.add(axes, "--penetration", "--svo", "--preset", action="append")
-    axes.add_argument("--output", action="append", metavar="NAME", help="keep SUMO's own output of this name")
+    arguments.add(axes, "--output", "--metric", action="append")
     arguments.add(evaluate, "--seeds", help="seeds A, A+1, ... B-1 (default 200000:200001)")
-    arguments.add(evaluate, "--av-type", "--av-ids", "--duration")
+    arguments.add(evaluate, "--av-type", "--av-ids", "--duration", "--reward")
     running = evaluate.add_argument_group("the work")
     arguments.add(running, "--out", "--resume")
     arguments.add(running, "--workers", help="processes (default: all cores)")
@@ -96,7 +96,7 @@ def work(args: argparse.Namespace) -> int:
 
 
 def _engine(args: argparse.Namespace) -> Engine:
-    from cosim.batch.case_runner import CaseRunner
+    from cosim.batch.episode_runner import EpisodeRunner
     from cosim.workers.engines import LocalEngine
     from cosim.workers.supervisor import Limits
 
@@ -105,10 +105,10 @@ def _engine(args: argparse.Namespace) -> Engine:
     if args.engine == "local":
         if args.ray_address is not None:
             raise BadInput("goes with --engine ray", field="--ray-address", value=args.ray_address)
-        return LocalEngine(CaseRunner, workers=args.workers, limits=limits)
+        return LocalEngine(EpisodeRunner, workers=args.workers, limits=limits)
     from cosim.workers.ray_engine import RayEngine
 
-    return RayEngine(CaseRunner, workers=args.workers, limits=limits, address=args.ray_address)
+    return RayEngine(EpisodeRunner, workers=args.workers, limits=limits, address=args.ray_address)
 
 
 def _drive(plan: Plan, engine: Engine, store: Store, folder: Path, args: argparse.Namespace) -> int:

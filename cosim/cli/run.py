@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 from cosim.cli import arguments
 from cosim.errors import BadInput
+from cosim.files import code
 from cosim.files.xml_input import is_there
-from cosim.scenario import BEHAVIORS, Scenario, place
-from cosim.scenario.behaviors import DRIVER_MODELS
-from cosim.scenario.episode_id import Case
+from cosim.scenario import Scenario, place
+from cosim.scenario.episode_id import EpisodeId
 from cosim.scenario.policy_name import label, read
 from cosim.seeding import FIRST_TEST_SEED
-from cosim.types import EpisodeResult, Preset
+from cosim.types import EpisodeResult
 from cosim.workers.worker import Worker
 
 if TYPE_CHECKING:
@@ -38,46 +38,16 @@ def add(verbs: arguments.Verbs) -> None:
     run.add_argument(
         "what", metavar="WHAT", help="a scenario's name (cosim scenarios), a world's folder or any .sumocfg"
     )
-    run.add_argument(
-        "--demand",
-        action="append",
-        default=[],
-        metavar="NAME|FILE",
-        help="demand by name (default of our worlds: dense), or route files",
-    )
-    run.add_argument("--policy", default="idm", metavar="POLICY", help=arguments.POLICY)
-    run.add_argument(
-        "--svo", type=arguments.degrees, default=45.0, metavar="DEG", help="SVO angle, 0..90 (default 45)"
-    )
-    run.add_argument(
-        "--behavior",
-        choices=BEHAVIORS,
-        help="Table II class of the human drivers (default: mixed; contested: moderate; your files: as-is)",
-    )
-    run.add_argument("--driver-model", choices=DRIVER_MODELS, default="lc2013", help="default lc2013")
-    run.add_argument("--preset", choices=Preset.ALL, help="who guards the AVs (default: the scenario's)")
-    fleet = run.add_mutually_exclusive_group()
-    fleet.add_argument("--av-type", metavar="T", help="AVs are the vehicles of this vType")
-    fleet.add_argument("--av-ids", metavar="REGEX", help="AVs are the vehicles whose id matches")
-    fleet.add_argument(
-        "--penetration", type=arguments.share, metavar="P", help="this share of vehicles are AVs, 0..1"
-    )
-    run.add_argument(
-        "--seed", type=arguments.seed, default=FIRST_TEST_SEED, metavar="N", help=f"default {FIRST_TEST_SEED}"
-    )
-    run.add_argument(
-        "--duration", type=arguments.positive, metavar="S", help="counted s (default: the scenario's)"
-    )
-    run.add_argument("--out", metavar="DIR", help="write the run folder here")
-    run.add_argument(
-        "--output",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="have SUMO write its NAME output (tripinfo, fcd, ssm, ...) to DIR/outputs; repeatable",
-    )
+    arguments.add(run, "--demand", action="append", default=[])
+    arguments.add(run, "--policy", default="idm")
+    arguments.add(run, "--svo", default=45.0)
+    arguments.add(run, "--behavior", "--preset", "--duration", "--reward", "--out")
+    arguments.add(run, "--driver-model", default="lc2013", help="of the human drivers (default lc2013)")
+    arguments.add(run.add_mutually_exclusive_group(), "--av-type", "--av-ids", "--penetration")
+    arguments.add(run, "--seed", default=FIRST_TEST_SEED, help=f"default {FIRST_TEST_SEED}")
+    arguments.add(run, "--output", "--metric", action="append", default=[])
     run.add_argument("--replay", action="store_true", help="draw DIR/replay.html and DIR/replay.mp4 too")
-    run.add_argument("--json", action="store_true", help="print exactly one JSON document on stdout")
+    arguments.add(run, "--json")
     run.set_defaults(work=work, passes_on=True)
 
 
@@ -94,7 +64,7 @@ class Driver:
         self._host: Host | None = None
 
     def drive(
-        self, scenario: Scenario, case: Case, watch: bool, folder: Path | None, progress: Reported
+        self, scenario: Scenario, case: EpisodeId, watch: bool, folder: Path | None, progress: Reported
     ) -> tuple[EpisodeResult, Any]:
         """The episode, watched or not; progress of 0 s in all: kernels are being compiled.
 
@@ -103,7 +73,9 @@ class Driver:
         from cosim.geometry.compiled import on_compilation
 
         on_compilation(functools.cache(lambda: progress(0.0, 0.0)))
-        self._host = self._make(scenario, svo=math.radians(case.svo_deg))
+        self._host = self._make(
+            scenario, svo=math.radians(case.svo_deg), metrics=case.metrics, reward=case.reward
+        )
         if watch:
             return self._host.watch(case.seed, progress, outputs=case.outputs, folder=folder)
         return self._host.run(case.seed, progress, outputs=case.outputs, folder=folder), None
@@ -170,22 +142,19 @@ def work(args: argparse.Namespace) -> int:
     return 0
 
 
-def case_of(args: argparse.Namespace) -> Case:
+def case_of(args: argparse.Namespace) -> EpisodeId:
     """The episode that the flags describe; files by absolute path, so that it can be found again."""
-    return Case(
+    same = ("behavior", "driver_model", "penetration", "av_type", "av_ids", "preset", "duration", "seed")
+    reward = args.reward
+    return EpisodeId(
         what=place(args.what),
         demand=tuple(map(_demand, args.demand)),
         policy=read(args.policy).text,
-        behavior=args.behavior,
-        driver_model=args.driver_model,
-        penetration=args.penetration,
-        av_type=args.av_type,
-        av_ids=args.av_ids,
         svo_deg=args.svo,
-        preset=args.preset,
-        duration=args.duration,
-        seed=args.seed,
         outputs=tuple(dict.fromkeys(args.output)),
+        metrics=tuple(code.read(metric, "--metric").text for metric in args.metric),
+        reward=code.read(reward, "--reward").text if reward and code.is_code(reward) else reward,
+        **{name: getattr(args, name) for name in same},
     )
 
 

@@ -24,8 +24,14 @@ def add(verbs: arguments.Verbs) -> None:
     )
     arguments.add(train, "--policy", metavar="NAME", help="the approach (default: vfn-p; a2c: conv3d-a2c)")
     train.add_argument(
-        "--scenario", action="append", default=[], metavar="NAME", help="a world, or all (default: merge)"
+        "--scenario",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="a world, its folder, or all",
     )
+    arguments.add(train, "--reward", metavar="FILE:NAME", help="your own, instead of the file's weights")
+    arguments.add(train, "--metric", action="append", default=[])
     train.add_argument("--iterations", type=arguments.count, metavar="N", help="instead of the file's")
     arguments.add(train, "--seed", help="of everything; instead of the file's")
     arguments.add(train, "--resume")

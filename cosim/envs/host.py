@@ -9,11 +9,11 @@ from typing import NamedTuple
 import numpy as np
 
 from cosim.errors import BadInput
-from cosim.host import Host, SimulatorFactory
+from cosim.host import Earnings, Host, SimulatorFactory
 from cosim.metrics import MetricFactory
 from cosim.observation.view import Packed, Packer
 from cosim.policies import make
-from cosim.rewards import Reward, RewardTerms, rewards
+from cosim.rewards import Reward, RewardTerms
 from cosim.road import RoadMap
 from cosim.scenario import Scenario
 from cosim.types import (
@@ -60,7 +60,7 @@ class SessionHost(Host):
         reward: Reward,
         others: PolicyFactory | None,
         simulator: SimulatorFactory | None,
-        metrics: Sequence[MetricFactory] = (),
+        metrics: Sequence[str | MetricFactory] = (),
     ) -> None:
         policy = make("idm") if others is None else others()
         super().__init__(
@@ -71,7 +71,7 @@ class SessionHost(Host):
             simulator=simulator,
             metrics=metrics,
         )
-        self._reward = reward
+        self._earnings = Earnings(reward, svo)
         self._packer = Packer()
         self._painter: Callable[[Snapshot, str | None], Bytes] | None = None
         self._started = False
@@ -93,13 +93,11 @@ class SessionHost(Host):
         seen = episode.advance({name: decisions[name] for name in episode.histories if name in decisions})
         assert episode.step is not None
         before, after, events = episode.step.before, episode.step.after, episode.step.events
-        executed = {name: d.action for name, d in decisions.items()}
-        avs = _avs(before)
-        earned = rewards(before, after, avs, executed, self.svo, self._reward, events.collisions)
+        earned = self._earnings.pay(episode.step, before.avs)
         if see is not None:
             seen = {name: h for name, h in seen.items() if name in see}
         packed = self._packer.pack(seen, len(episode.frames))
-        return self._reply(packed, earned, self._ended(avs, after, events))
+        return self._reply(packed, earned, self._ended(before.avs, after, events))
 
     def result(self, policy: str) -> EpisodeResult:
         """The figures of the episode so far."""
@@ -164,7 +162,7 @@ class SessionHost(Host):
             ended or {},
             e.step.receipts if e.step else (),
             Events.of(e.frames),
-            _avs(e.snapshot),
+            e.snapshot.avs,
             e.snapshot.time,
             e.elapsed,
             e.steps,
@@ -190,10 +188,6 @@ class SessionHost(Host):
             elif self.episode.truncated:
                 ended[name] = "duration"
         return ended
-
-
-def _avs(snapshot: Snapshot) -> tuple[str, ...]:
-    return tuple(snapshot.ids[row] for row in np.flatnonzero(snapshot.kind == Kind.AV))
 
 
 def _common(observation: ObservationConfig, others: Policy) -> ObservationConfig:

@@ -313,8 +313,6 @@ def build_host(
     more: Sequence[str | MetricFactory],
 ) -> SessionHost:
     """Runs in the worker: the loop, numba, libsumo and a user's code are imported there, not here."""
-    from cosim import metrics
     from cosim.envs.host import SessionHost
 
-    measured = [metrics.read(metric, "metrics") for metric in more]
-    return SessionHost(scenario, observation, svo, read(reward, "reward"), others, simulator, measured)
+    return SessionHost(scenario, observation, svo, read(reward, "reward"), others, simulator, more)

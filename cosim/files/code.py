@@ -26,6 +26,11 @@ class Code(NamedTuple):
     place: str  # a file's absolute path, or a module's name
     member: str
 
+    @property
+    def text(self) -> str:
+        """Reads back as the same, wherever one stands."""
+        return f"{self.place}:{self.member}"
+
     def load(self, field: str) -> Any:
         """The class, factory or function; calling it raises what `guarded` does.
 

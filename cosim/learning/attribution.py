@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from cosim.batch.case_runner import CaseRunner
+from cosim.batch.episode_runner import EpisodeRunner
 from cosim.batch.record import planned
 from cosim.errors import BadInput
 from cosim.files import write_csv
 from cosim.learning.prediction_data import spread
 from cosim.policies import make
 from cosim.report.statistics import share
-from cosim.scenario.episode_id import Case
+from cosim.scenario.episode_id import EpisodeId
 from cosim.workers.engines import LocalEngine
 from cosim.workers.tasks import Progress
 from policy.agents.prediction_aware import PredictionAware
@@ -48,16 +48,16 @@ def questioned(policy: str) -> Questioned:
     return Questioned(made.name, made.config)
 
 
-class Asking(CaseRunner):
+class Asking(EpisodeRunner):
     """Hosted by an engine's worker: drives as `cosim run` does, and asks at every decision."""
 
-    def policy(self, case: Case) -> Questioned:
+    def policy(self, case: EpisodeId) -> Questioned:
         """The policy of `case`, asking itself."""
         self._agent = questioned(case.policy)
         return self._agent
 
     def run(
-        self, case: Case, warnings: tuple[str, ...], outputs: str | None, progress: Progress
+        self, case: EpisodeId, warnings: tuple[str, ...], outputs: str | None, progress: Progress
     ) -> dict[str, Any]:
         """One episode: the document of `cosim run --json`, and the `answers`."""
         return super().run(case, warnings, outputs, progress) | {"answers": self._agent.answers}

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cosim.episode import Episode, Hook, Step, run_episode
-from cosim.host import Host, Hosts
-from cosim.rewards import RewardConfig, rewards
+from cosim.episode import Episode, Step, run_episode
+from cosim.host import Earnings, Host, Hosts
+from cosim.metrics import MetricFactory
+from cosim.rewards import Reward, read
 from cosim.scenario import load
 from cosim.seeding import generator
 from cosim.workers.supervisor import Limits, Supervisor
@@ -35,27 +37,37 @@ LIMITS = Limits(step=300.0, crashes=3)  # a drive is its iteration's: it is trie
 
 
 class Rollout(Hosts):
-    """Drives one episode after another; lives in a worker process."""
+    """Drives one episode after another; lives in a worker process.
 
-    def __init__(self, name: str, agent: AgentConfig, explore: ExploreConfig, reward: RewardConfig) -> None:
+    `reward` and `metrics` are objects, or texts as `cosim.rewards.read` and `cosim.metrics.read` know them.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        agent: AgentConfig,
+        explore: ExploreConfig,
+        reward: str | Reward,
+        metrics: Sequence[str | MetricFactory] = (),
+    ) -> None:
         super().__init__()
         self.agent = Explorer(name, agent, explore)
-        self._reward = reward
+        self._reward, self._metrics = read(reward), metrics
         self._loaded: dict[str, str] = {}
 
     def run(self, drive: Drive, progress: Any = None) -> Drove:
-        """One whole episode."""
+        """One whole episode; with metrics of a user's every figure of it is logged."""
         episode, agent = self.episode(drive.lesson), self.agent
         self._weights("vfn", agent.vfn, drive.weights)
         self._weights("frozen", agent.frozen, drive.frozen)
-        return drive_episode(episode, agent, drive, self._reward, progress)
+        return drive_episode(episode, agent, drive, self._reward, progress, every=bool(self._metrics))
 
     def episode(self, lesson: Lesson) -> Episode:
         """Where this lesson is driven: that of the last one, where it is the same."""
 
         def build() -> Host:
             scenario = load(lesson.scenario, demand=[lesson.demand], behavior=lesson.behavior)
-            return Host(scenario, self.agent, 0.0)
+            return Host(scenario, self.agent, 0.0, metrics=self._metrics)
 
         return self.host(lesson, build).episode
 
@@ -65,12 +77,12 @@ class Rollout(Hosts):
             self._loaded[slot] = file
 
 
-class Earnings(Hook):
-    """What every AV earns, decision by decision; the learning agent is paid."""
+class Payments(Earnings):
+    """What every commanded AV earns; the learning agent is paid."""
 
-    def __init__(self, agent: Explorer, drive: Drive, reward: RewardConfig) -> None:
-        self._agent, self._drive, self._reward = agent, drive, reward
-        self.totals: list[float] = []
+    def __init__(self, agent: Explorer, drive: Drive, reward: Reward) -> None:
+        super().__init__(reward, drive.svo)
+        self._agent, self._drive = agent, drive
 
     def on_start(self, episode: Episode) -> None:
         """The agent begins to explore and to remember."""
@@ -79,25 +91,30 @@ class Earnings(Hook):
         self._agent.episode(label, d.epsilon, generator(seed, "explore"), d.guided, d.record)
 
     def on_step(self, episode: Episode, step: Step) -> None:
-        """One decision of every commanded AV."""
-        avs, collisions = tuple(step.decisions), step.events.collisions
-        actions = {av: decision.action for av, decision in step.decisions.items()}
-        terms = rewards(step.before, step.after, avs, actions, self._drive.svo, self._reward, collisions)
+        """One decision."""
+        terms = self.pay(step, tuple(step.decisions))
         self.totals += [t.total for t in terms.values()]
-        crashed = frozenset(v for c in collisions for v in (c.collider, c.victim))
+        crashed = frozenset(v for c in step.events.collisions for v in (c.collider, c.victim))
         self._agent.pay(terms, crashed, frozenset(episode.histories))
 
 
 def drive_episode(
-    episode: Episode, agent: Explorer, drive: Drive, reward: RewardConfig, progress: Any = None
+    episode: Episode,
+    agent: Explorer,
+    drive: Drive,
+    reward: Reward,
+    progress: Any = None,
+    *,
+    every: bool = False,
 ) -> Drove:
-    """One whole episode with the learning agent; its networks are as they are."""
-    earned = Earnings(agent, drive, reward)
+    """One whole episode with the learning agent; its networks are as they are. `every`: all its figures."""
+    earned = Payments(agent, drive, reward)
     result = run_episode(episode, agent, drive.seed, svo=drive.svo, progress=progress, hooks=[earned])
     agent.decide(episode.histories)  # the last state is decided upon too: its mask is needed
     trajectories = agent.finish()
     figures: dict[str, float | None] = {
-        name: None if (v := result.value(name)) is None else float(v) for name in FIGURES
+        name: None if (v := result.value(name)) is None else float(v)
+        for name in (result.metrics if every else FIGURES)
     }
     # a crash ends the episode: the decisions that were not driven count as nothing earned
     planned = round(episode.scenario.duration / episode.scenario.timing.decision)

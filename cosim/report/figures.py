@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from cosim.batch.records import IDENTITY, LAST
+from cosim.batch import records
 from cosim.report.result import FIRST
 
 Row = Mapping[str, Any]  # one episode: a line of episodes.parquet, NA as None
@@ -55,8 +55,8 @@ TIMINGS = ("reset_s", "simulation_s", "observation_s", "decision_s", "total_s") 
 # What identifies, explains or times an episode, but measures nothing of the traffic.
 _NOT_FIGURES = frozenset(
     (
-        *IDENTITY,
-        *LAST,
+        *records.FIRST,
+        *records.LAST,
         "steps",
         "trace_hash",
         "timings",

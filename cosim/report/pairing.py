@@ -21,7 +21,7 @@ from cosim.report.summary import GROUP, not_comparable
 from cosim.workers.tasks import BAD_INPUT, OK
 
 PAIR = tuple(name for name in GROUP if name != "policy")
-ACROSS = ("behavior", "penetration", "preset", "svo_deg", "driver_model")  # what A and B may differ in
+ACROSS = tuple(name for name in PAIR if name not in ("scenario", "demand"))  # what A and B may differ in
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,7 +31,7 @@ FIRST = {
 
 def table(result: EpisodeResult) -> str:
     """A short table with units."""
-    label = f" ({result.label})" if result.label else ""
+    label = f" ({result.policy_label})" if result.policy_label else ""
     lines = [
         f"{result.scenario} / {result.demand} / {result.policy}{label}",
         f"  behaviour {result.behavior}, drivers {result.driver_model}, preset {result.preset}, "

@@ -15,7 +15,7 @@ from cosim.files.xml_input import is_there, regular_file
 from cosim.files.yaml_input import NonNegative, Positive
 from cosim.scenario import sumocfg
 from cosim.scenario.behaviors import AS_IS, DRIVER_MODELS, LC2013, MIXED, load_behaviors
-from cosim.types import Preset, Timing
+from cosim.types import Identity, Preset, Timing
 
 BEHAVIORS = load_behaviors().names
 DEFINITION = "scenario.yaml"  # what makes a folder a world
@@ -102,6 +102,21 @@ class Scenario:
     @property
     def ships(self) -> bool:
         return self.definition is not None and self.definition.parent.parent == sumo_scenarios.ROOT
+
+    def identity(self, policy: str, label: str | None, svo_deg: float, seed: int) -> Identity:
+        """What an episode of it is called, driven by this policy."""
+        return Identity(
+            scenario=self.name,
+            demand=self.demand_name,
+            policy=policy,
+            policy_label=label,
+            behavior=self.behavior,
+            driver_model=self.driver_model,
+            penetration=self.fleet.penetration,
+            preset=self.preset,
+            svo_deg=svo_deg,
+            seed=seed,
+        )
 
     @property
     def files(self) -> tuple[Path, ...]:

@@ -13,7 +13,7 @@ from typing import Any
 from cosim.errors import inside
 from cosim.files.yaml_input import mapping, value_of
 from cosim.scenario import Scenario
-from cosim.scenario.episode_id import Case
+from cosim.scenario.episode_id import EpisodeId
 from cosim.scenario.sumocfg import CLOCK, INPUTS, command_line, keeps
 
 POLICY_FILES = "policy_files"  # what decides how the policy drives: weights, or its own code
@@ -75,7 +75,7 @@ def checked(document: object, file: Path, where: str = "") -> dict[str, Any]:
     return found
 
 
-def remembered(case: Case, options: Sequence[str]) -> dict[str, Any]:
+def remembered(case: EpisodeId, options: Sequence[str]) -> dict[str, Any]:
     """What a manifest has to hold beside the usual so that `cosim replay` finds the episode again.
 
     Outputs are left out: a replay does not write them again.

@@ -122,7 +122,7 @@ class TrainingRun:
         """Validation of the weights that iteration `k` began with; the best are kept."""
         means, count = _means("valid", figures), self.config.validation
         for at, lesson in enumerate(self.config.lessons):
-            name = f"valid/{lesson.scenario}-{lesson.demand}"
+            name = f"valid/{Path(lesson.scenario).name}-{lesson.demand}"
             means |= _means(name, figures[at * count : (at + 1) * count])
         if means["valid/reward"] > self.best:
             self.best = means["valid/reward"]

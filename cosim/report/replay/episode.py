@@ -8,15 +8,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from cosim.errors import BadInput, CosimError, hint, inside
+from cosim.errors import BadInput, CosimError, hint
 from cosim.files import cannot, read_json, whole
-from cosim.files.yaml_input import dataclass_from, mapping
 from cosim.host import Host
 from cosim.policies import check
 from cosim.recording.watched import Watched
 from cosim.report import run_folder
 from cosim.scenario import Scenario
-from cosim.scenario.episode_id import Case
+from cosim.scenario.episode_id import EpisodeId
 from cosim.scenario.manifest import CASE, OPTIONS, POLICY_FILES, checked, manifest, named
 from cosim.scenario.policy_name import label, read
 from cosim.scenario.sumocfg import keeps
@@ -41,7 +40,7 @@ class ReplayDiffers(CosimError):
 class Recorded:
     """One episode as a run folder remembers it."""
 
-    case: Case
+    case: EpisodeId
     options: tuple[str, ...]  # SUMO's own, as typed after `--`
     manifest: Mapping[str, Any]
     trace_hash: str
@@ -69,7 +68,7 @@ def find(folder: Path, episode: str | None) -> Recorded:
     if CASE not in document:
         raise BadInput("was not written by this version of cosim run or evaluate", file=file)
     recorded = Recorded(
-        _case(document[CASE], file, CASE),
+        EpisodeId.read(document[CASE], file, CASE),
         tuple(document.get(OPTIONS, ())),
         document,
         checked(read_json(result, ABSENT), result).get("trace_hash", ""),
@@ -205,17 +204,8 @@ def _of_batch(folder: Path, episode: str | None) -> Recorded:
     for part in (CASE, "manifest"):
         if part not in cell:
             raise BadInput("is missing", file=file, field=f"{where}.{part}")
-    case = _case({**cell[CASE], "seed": row["seed"]}, file, f"{where}.{CASE}")
+    case = EpisodeId.read({**cell[CASE], "seed": row["seed"]}, file, f"{where}.{CASE}")
     return Recorded(case, (), cell["manifest"], row["trace_hash"], folder)
-
-
-def _case(document: Mapping[str, Any], file: Path, where: str) -> Case:
-    """The case that `file` holds under the name `where`. Raises BadInput for a field of another type."""
-    with inside(where, file):
-        given = mapping(document)
-    known = {name: given[name] for name in Case.__dataclass_fields__ if name in given}
-    dataclass_from(Case, known, file, where)
-    return Case.read(known)
 
 
 def _same_policy(then: Mapping[str, str], now: Mapping[str, str]) -> None:

@@ -8,16 +8,16 @@ from pathlib import Path
 from typing import Any
 
 from cosim.host import Host, Hosts
-from cosim.scenario.episode_id import Case
+from cosim.scenario.episode_id import EpisodeId
 from cosim.types import Policy
 from cosim.workers.tasks import Progress
 
 
-class CaseRunner(Hosts):
-    """Keeps the host of the last case's cell."""
+class EpisodeRunner(Hosts):
+    """Keeps the host of the last episode's cell."""
 
     def run(
-        self, case: Case, warnings: tuple[str, ...], outputs: str | None, progress: Progress
+        self, case: EpisodeId, warnings: tuple[str, ...], outputs: str | None, progress: Progress
     ) -> dict[str, Any]:
         """One episode; the document of `cosim run --json`.
 
@@ -27,15 +27,16 @@ class CaseRunner(Hosts):
         host = self.open(case, warnings)
         return host.run(case.seed, progress, outputs=case.outputs, folder=folder).document()
 
-    def policy(self, case: Case) -> str | Policy:
+    def policy(self, case: EpisodeId) -> str | Policy:
         """Who commands the AVs of `case`: a name that `--policy` knows, unless a subclass says otherwise."""
         return case.policy
 
-    def open(self, case: Case, warnings: tuple[str, ...]) -> Host:
+    def open(self, case: EpisodeId, warnings: tuple[str, ...]) -> Host:
         """The host of the case's cell."""
 
         def build() -> Host:
             scenario = replace(case.scenario(), warnings=warnings)
-            return Host(scenario, self.policy(case), math.radians(case.svo_deg))
+            policy, svo = self.policy(case), math.radians(case.svo_deg)
+            return Host(scenario, policy, svo, metrics=case.metrics, reward=case.reward)
 
         return self.host(case.cell, build)

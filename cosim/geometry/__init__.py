@@ -39,9 +39,8 @@ class Boxes(NamedTuple):
 def boxes(snapshot: Snapshot, rows: npt.NDArray[Any] | None = None) -> Boxes:
     """The vehicles of a snapshot ([n], or [k] with `rows`) as boxes; m, rad, m/s."""
     s = snapshot
-    if rows is None:
-        return Boxes(s.x, s.y, s.heading, s.length, s.width, s.speed)
-    return Boxes(s.x[rows], s.y[rows], s.heading[rows], s.length[rows], s.width[rows], s.speed[rows])
+    columns = s.x, s.y, s.heading, s.length, s.width, s.speed
+    return Boxes(*(columns if rows is None else (column[rows] for column in columns)))
 
 
 def overlap(a: Boxes, b: Boxes) -> Bools:

@@ -31,8 +31,7 @@ class ConflictView:
     def of(self, snapshot: Snapshot) -> Conflicts:
         """Conflicts of AVs and mission vehicles with anybody, up to `HORIZON` ahead."""
         if snapshot is not self._snapshot:
-            number = self._contact.numbers(snapshot.lane)
-            roads = number, self._contact.table
+            roads = self._contact.numbers(snapshot.lane), self._contact.table
             self._conflicts = conflicts(boxes(snapshot), watched(snapshot), HORIZON, roads)
             self._snapshot = snapshot
         return self._conflicts

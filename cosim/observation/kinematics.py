@@ -11,29 +11,18 @@ from cosim.road import LaneGraph
 from cosim.types import HEADING, SPEED, Bools, Floats, Floats32, Ints, Snapshot, X, Y
 
 
-@compiled
-def perceived(
-    x: Floats,  # [n] m
-    y: Floats,  # [n] m
-    egos: npt.NDArray[np.int64],  # [B] rows of the AVs
-    reach: float,  # m, of one AV's own sensors
-    share: bool,  # V2V: allies pass on what they perceive
-    seen: Bools,  # [B,n] out
-) -> None:
-    """Who is perceived by whom."""
-    n = x.shape[0]
-    for b in range(egos.shape[0]):
-        for j in range(n):
-            dx, dy = x[j] - x[egos[b]], y[j] - y[egos[b]]
-            seen[b, j] = dx * dx + dy * dy <= reach * reach
-    if share:
-        for j in range(n):
-            anyone = False
-            for b in range(egos.shape[0]):
-                anyone = anyone or seen[b, j]
-            if anyone:
-                for b in range(egos.shape[0]):
-                    seen[b, j] = True
+def perceived(snapshot: Snapshot, egos: Ints, reach: float, share: bool) -> Bools:
+    """Which vehicles each AV perceives: [B,n].
+
+    Args:
+        snapshot: the n vehicles on the road.
+        egos: [B] rows of the AVs.
+        reach: m, of one AV's own sensors, measured between centres.
+        share: whether AVs pass on what they perceive (V2V): then all perceive the same.
+    """
+    x, y = snapshot.x, snapshot.y
+    near = (x - x[egos, None]) ** 2 + (y - y[egos, None]) ** 2 <= reach * reach
+    return near | near.any(0) if share else near
 
 
 @compiled

@@ -1,4 +1,4 @@
-"""Turns snapshots into one History per AV: the first station of every decision."""
+"""Turns snapshots into one History per AV: the first step of every decision."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from cosim.geometry.raster import RoadRaster, draw_snapshot, rasterize_road
 from cosim.observation.kinematics import choose_rows, fill_rows, never_left_out, perceived
 from cosim.observation.past import KinematicPast, MapPast
 from cosim.road import RoadMap
-from cosim.types import KINEMATIC_FEATURES, Bools, History, Ints, Kind, ObservationConfig, Snapshot
+from cosim.types import KINEMATIC_FEATURES, History, Ints, Kind, ObservationConfig, Snapshot
 
 RouteOf = Callable[[str], tuple[str, ...]]  # AV id -> edges ahead, the present one first
 CommandOf = Callable[[str], tuple[float | None, int]]  # AV id -> target speed m/s, lane change under way
@@ -42,11 +42,10 @@ class Observer:
         self._newest = snapshot
         self._egos: Ints = np.flatnonzero(snapshot.kind == int(Kind.AV))
         c = self._config
-        self._seen: Bools = np.zeros((len(self._egos), snapshot.n), np.bool_)
-        perceived(snapshot.x, snapshot.y, self._egos, c.perception_range, c.share_perception, self._seen)
+        self._seen = perceived(snapshot, self._egos, c.perception_range, c.share_perception)
         if self._maps is None or self._raster is None:
             return
-        avs = [snapshot.ids[i] for i in self._egos]
+        avs = tuple(snapshot.ids[i] for i in self._egos)
         block, slots = self._maps.next_frame(avs)
         draw_snapshot(block, slots, snapshot, self._egos, self._seen, self._raster, c)
 
@@ -57,8 +56,8 @@ class Observer:
             return {}
         count = len(self._egos)
         rows = np.empty((count, c.rows), np.int64)
-        nobody = np.zeros((count, s.n), np.bool_)
-        if choose_rows(s.x, s.y, self._egos, self._seen, c.row_range, nobody, rows):
+        none = np.zeros((count, s.n), np.bool_)
+        if choose_rows(s.x, s.y, self._egos, self._seen, c.row_range, none, rows):
             first = never_left_out(s, self._road.straight_on, self._egos, c.row_range)
             choose_rows(s.x, s.y, self._egos, self._seen, c.row_range, first, rows)
         kinematics = np.zeros((count, c.frames, c.rows, len(KINEMATIC_FEATURES)), np.float32)

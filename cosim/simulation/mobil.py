@@ -227,14 +227,13 @@ class MobilDriving:
         self._drivers[vehicle] = (idm, mobil)
         self._due[int(phase * len(self._due))].append(vehicle)
 
-    def step(self) -> list[tuple[str, int]]:
-        """Decide for the drivers whose turn it is; returns the commanded (vehicle, direction)."""
+    def step(self) -> None:
+        """Decide for the drivers whose turn it is."""
         if not self._due:
-            return []
+            return
         turn = self._steps % len(self._due)
         self._steps += 1
         on_road: list[str] = []
-        commanded: list[tuple[str, int]] = []
         requested: list[tuple[str, int, float]] = []  # edge, target lane's index, m along it, of this step
         for vehicle in self._due[turn]:
             try:
@@ -245,9 +244,7 @@ class MobilDriving:
             on_road.append(vehicle)
             if direction and _gap_is_free(vehicle, direction, requested):
                 libsumo.vehicle.changeLaneRelative(vehicle, direction, 0.0)
-                commanded.append((vehicle, direction))
         self._due[turn] = on_road
-        return commanded
 
     def _decide(self, vehicle: str) -> int:
         if changing(vehicle):

@@ -117,9 +117,7 @@ class SumoSimulator:
                 self._step()
                 if k >= first_kept and (steps - k) % self._steps_per_frame == 0:
                     frames.append(self._snapshot())
-        if not frames:
-            frames.append(self._snapshot())
-        return tuple(frames)
+        return tuple(frames) or (self._snapshot(),)
 
     def advance(self, commands: Sequence[Command]) -> tuple[tuple[Receipt, ...], tuple[Snapshot, ...]]:
         """Hold the commands for one decision; one snapshot per frame. Raises SimulationError."""
@@ -149,8 +147,7 @@ class SumoSimulator:
         state = self._commander.controlled.get(vehicle)
         if state is None:
             return None, 0
-        under_way = libsumo.simulation.getTime() < state.change_until - 1e-9
-        return state.target, state.change if under_way else 0
+        return state.target, state.changing(libsumo.simulation.getTime())
 
     def counts(self) -> dict[str, int]:
         """Vehicles since the start: `inserted`, and `waiting`: due and not inserted, whether SUMO has dropped

@@ -1,4 +1,4 @@
-"""Post-encroachment time: the shortest time between two vehicles on one spot of crossing paths."""
+"""Post-encroachment time: the shortest time between an AV's (or mission vehicle's) and another's passage."""
 
 from __future__ import annotations
 

@@ -32,10 +32,10 @@ def choose_rows(
     egos: npt.NDArray[np.int64],  # [B]
     seen: Bools,  # [B,n]
     row_range: float,  # m
-    first: Bools,  # [B,n] who gets a row before all others
+    first: Bools,  # [B,n] which vehicles get a row before all others
     rows: npt.NDArray[np.int64],  # [B,R] out: vehicle of each row, -1 for none; row 0 the ego
 ) -> bool:
-    """The ego and the perceived vehicles within `row_range`, by distance; whether somebody found no row."""
+    """The ego and the perceived vehicles within `row_range`, by distance; whether a vehicle found no row."""
     n, wanted = x.shape[0], rows.shape[1]
     rank = np.empty(wanted, np.float64)  # squared distance, less a lot for those who come first
     full = False
@@ -76,7 +76,17 @@ def choose_rows(
 
 
 def never_left_out(snapshot: Snapshot, graph: LaneGraph, egos: Ints, reach: float) -> Bools:
-    """[B,n] the mission vehicles, and each ego's leader and follower along the lanes within `reach` m."""
+    """The vehicles that always get a row: mission vehicles, and each ego's leader and follower.
+
+    Args:
+        snapshot: the n vehicles.
+        graph: which lane follows which (`RoadMap.straight_on`).
+        egos: [B] rows of the AVs.
+        reach: m, how far ahead and behind along the lanes.
+
+    Returns:
+        [B,n] whether vehicle n is one of ego B's.
+    """
     first = np.repeat(snapshot.mission[None], len(egos), 0)
     gap, leader = gap_ahead(snapshot, graph, np.arange(snapshot.n), reach)
     for b, ego in enumerate(egos):

@@ -19,6 +19,10 @@ CommandOf = Callable[[str], tuple[float | None, int]]  # AV id -> target speed m
 class Observer:
     """Holds the past of one episode. `add` once per frame, `histories` once per decision.
 
+    Args:
+        road: the net, for the road channel and the routes ahead.
+        config: sizes and ranges; a History has N = `config.frames` frames and R = `config.rows` rows.
+
     Arrays inside a History are views or fresh copies that stay valid for at least N further frames.
     """
 
@@ -30,14 +34,14 @@ class Observer:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything: a new episode begins."""
+        """Clear the past: a new episode begins."""
         self._past = KinematicPast(self._config.frames)
         if self._maps is not None:
             self._maps.clear()
         self._newest: Snapshot | None = None
 
     def add(self, snapshot: Snapshot) -> None:
-        """Append one frame: the kinematics of all, the maps of every AV on the road."""
+        """Append one frame: the kinematics of all vehicles, the maps of every AV on the road."""
         self._past.add(snapshot)
         self._newest = snapshot
         self._egos: Ints = np.flatnonzero(snapshot.kind == int(Kind.AV))
@@ -45,12 +49,16 @@ class Observer:
         self._seen = perceived(snapshot, self._egos, c.perception_range, c.share_perception)
         if self._maps is None or self._raster is None:
             return
-        avs = tuple(snapshot.ids[i] for i in self._egos)
-        block, slots = self._maps.next_frame(avs)
+        block, slots = self._maps.next_frame(tuple(snapshot.ids[i] for i in self._egos))
         draw_snapshot(block, slots, snapshot, self._egos, self._seen, self._raster, c)
 
     def histories(self, route: RouteOf, commanded: CommandOf) -> dict[str, History]:
-        """One History per AV on the road, at the newest frame."""
+        """One History per AV on the road, at the newest frame (AVs off every lane are left out).
+
+        Args:
+            route: AV id -> the edges ahead of it (`Simulator.route`).
+            commanded: AV id -> its target speed and lane change under way (`Simulator.commanded`).
+        """
         s, c = self._newest, self._config
         if s is None or not len(self._egos):
             return {}

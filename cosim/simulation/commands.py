@@ -89,7 +89,7 @@ class Commander:
             if not command.lane_offset or not receipt.executed:
                 continue
             name, state = command.vehicle, self.controlled.get(command.vehicle)
-            if state is None or name not in libsumo.vehicle.getIDList():
+            if not state or name not in libsumo.vehicle.getIDList():
                 continue
             if abs(libsumo.vehicle.getLateralLanePosition(name)) < 0.05:
                 state.change, state.change_until = 0, -1.0
@@ -107,7 +107,7 @@ class Commander:
                 vehicle.setSpeed(name, wanted)
                 state.requested = wanted
 
-    def forget(self, name: str) -> None:
+    def drop(self, name: str) -> None:
         """The vehicle left the road."""
         self.controlled.pop(name, None)
         self.lane_changes.pop(name, None)

@@ -34,7 +34,7 @@ CONFLICT_RANGE = 60.0  # m: two requests of one step into one lane this close: t
 
 
 class Car(NamedTuple):
-    """One vehicle as MOBIL sees it."""
+    """The state of one vehicle that MOBIL needs."""
 
     speed: float  # m/s
     desired_speed: float  # m/s, v0
@@ -73,7 +73,13 @@ class Accelerations(NamedTuple):
 def idm_acceleration(
     idm: IdmParameters, speed: float, desired_speed: float, gap: float = FAR, leader_speed: float = 0.0
 ) -> float:
-    """IDM acceleration in m/s2 at a bumper gap in m behind a leader (FAR: a free road).
+    """IDM acceleration in m/s2 (P, section V-A.2).
+
+    Args:
+        idm: the driver's parameters.
+        speed, desired_speed: v and v0, m/s.
+        gap: m, bumper to bumper, to the leader (FAR: a free road).
+        leader_speed: m/s.
 
     The desired gap never falls below d0 (Treiber's max(0, .)): opening gaps do not repel.
     """
@@ -81,8 +87,8 @@ def idm_acceleration(
     if gap >= FAR:
         return idm.max_acceleration * free
     root = 2.0 * math.sqrt(idm.max_acceleration * idm.comfortable_deceleration)
-    wished = idm.minimum_gap + max(0.0, speed * idm.time_headway + speed * (speed - leader_speed) / root)
-    return idm.max_acceleration * (free - (wished / max(gap, TOUCHING)) ** 2)
+    desired_gap = idm.minimum_gap + max(0.0, speed * idm.time_headway + speed * (speed - leader_speed) / root)
+    return idm.max_acceleration * (free - (desired_gap / max(gap, TOUCHING)) ** 2)
 
 
 def _follow(car: Car, ahead: Beside | None) -> float:
@@ -216,7 +222,7 @@ class MobilDriving:
         self._steps = 0
 
     def known(self, vehicle: str) -> IdmParameters | None:
-        """Parameters of a driver of ours, None for anybody else."""
+        """Parameters of a driver of ours, None for another vehicle."""
         return self._drivers.get(vehicle, (None,))[0]
 
     def add(self, vehicle: str, idm: IdmParameters, mobil: MobilParameters, phase: float) -> None:

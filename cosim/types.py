@@ -1,4 +1,4 @@
-"""The data that crosses rooms: pure numpy, SI units, radians counter-clockwise from east, vehicle centres.
+"""Data exchanged by packages: pure numpy, SI units, radians counter-clockwise from east, vehicle centres.
 
 Letters in shapes: `n` vehicles, `N` past frames, `M` predicted frames, `C, H, W` map channels, rows
 (across the road) and columns (along it), `R, F` kinematic rows and features, `A` = 5 meta-actions.
@@ -89,8 +89,7 @@ class Events:
     def of(cls, frames: Sequence[Snapshot]) -> Events:
         """What happened in all of `frames`, in their order."""
         every = [frame.events for frame in frames]
-        names = [field.name for field in fields(cls)]
-        return cls(**{name: tuple(x for e in every for x in getattr(e, name)) for name in names})
+        return cls(**{f.name: tuple(x for e in every for x in getattr(e, f.name)) for f in fields(cls)})
 
 
 NO_EVENTS = Events()
@@ -172,7 +171,7 @@ class Decision(NamedTuple):
     safety_score: Floats32 | None = None  # [A] s, weighted time to collision (P, algorithm 2)
     unsafe: Bools | None = None  # [A]
     ttc: Floats32 | None = None  # [A] s until first contact under the action, capped
-    blamed: str | None = None  # who made the preferred action unsafe: a vehicle, or why, in brackets
+    blamed: str | None = None  # which vehicle made the preferred action unsafe, or another reason in brackets
     vetoed: bool = False  # the preferred action was masked
     fallback: bool = False  # every action was unsafe: the highest score was taken
 
@@ -222,7 +221,7 @@ class ObservationConfig:
     rows: int = 16  # R, the ego and up to 15 others
     row_range: float = 125.0  # m, vehicles further away get no row
     perception_range: float = 125.0  # m, what one AV's own sensors reach
-    share_perception: bool = True  # V2V: an AV also knows what its allies perceive
+    share_perception: bool = True  # V2V: an AV also gets what the other AVs perceive
     maps: bool = True  # False: no VelocityMaps are drawn (for policies that use none)
 
     def __post_init__(self) -> None:
@@ -247,7 +246,7 @@ class Timing:
 
 @dataclass(frozen=True, slots=True)
 class PolicyContext:
-    """What a policy is told when an episode starts."""
+    """The circumstances of an episode, given to a policy when it starts."""
 
     road: RoadMap
     timing: Timing

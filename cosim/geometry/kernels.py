@@ -23,7 +23,7 @@ _STRAIGHT_COSINE = float(np.cos(np.radians(5.0)))  # a trail that stays within 5
 _SAME_COURSE_COSINE = float(np.cos(np.radians(10.0)))  # 10 + 5 degrees: every spot of it is following
 _ONCOMING_COSINE = -float(np.cos(np.radians(45.0)))  # headings more than 135 degrees apart: head-on
 _PARALLEL = 1e-12  # m/s or cosine below which a projection counts as standing still
-_HORIZON = 120.0  # s, how far ahead the deceleration to avoid a crash looks
+_HORIZON = 120.0  # s, how far ahead the deceleration to avoid a crash is sought
 
 Box = tuple[float, float, float, float, float, float, float]
 _numba = cast(Any, numba)  # its decorators are not typed
@@ -396,9 +396,8 @@ def encroachment(
                 continue
             if course[a, 0] * c + course[a, 1] * s > _SAME_COURSE_COSINE:
                 continue
-            if x < bounds[a, 0] - reach or x > bounds[a, 1] + reach:
-                continue
-            if y < bounds[a, 2] - reach or y > bounds[a, 3] + reach:
+            beside = x < bounds[a, 0] - reach or x > bounds[a, 1] + reach
+            if beside or y < bounds[a, 2] - reach or y > bounds[a, 3] + reach:
                 continue
             for age in range(1, frames):
                 k = (newest - age) % frames

@@ -1,4 +1,4 @@
-"""What every metric is told when an episode starts, what a metric is, and how vehicles are followed."""
+"""The context of an episode's metrics, the protocol of a metric, and tables of vehicles over time."""
 
 from __future__ import annotations
 
@@ -29,10 +29,9 @@ class ConflictView:
         self._snapshot: Snapshot | None = None
 
     def of(self, snapshot: Snapshot) -> Conflicts:
-        """Conflicts of AVs and mission vehicles with anybody, up to `HORIZON` ahead."""
+        """Conflicts of AVs and mission vehicles with any vehicle, up to `HORIZON` ahead."""
         if snapshot is not self._snapshot:
-            number = self._contact.numbers(snapshot.lane)
-            roads = number, self._contact.table
+            roads = self._contact.numbers(snapshot.lane), self._contact.table
             self._conflicts = conflicts(boxes(snapshot), watched(snapshot), HORIZON, roads)
             self._snapshot = snapshot
         return self._conflicts
@@ -55,7 +54,7 @@ class MetricContext:
 
 
 class EpisodeMetric(Protocol):
-    """One file, one idea: sees every frame of an episode and yields its figures."""
+    """One figure or a few of an episode, computed from its frames."""
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         """A new episode; `first` is its first frame (time 0 of the counted time)."""
@@ -92,7 +91,7 @@ class Slots:
         return self._rows
 
     def keep(self, numbers: Ints) -> None:
-        """Forget all but these numbers, which become 0, 1, 2, ... in this order."""
+        """Keep only these numbers, which become 0, 1, 2, ... in this order."""
         new = {int(old): k for k, old in enumerate(numbers)}
         self.of = {name: new[old] for name, old in self.of.items() if old in new}
         self._ids, self._rows = (), np.zeros(0, dtype=np.int64)

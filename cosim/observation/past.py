@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -30,33 +29,40 @@ class FrameBuffer:
         self._end = frames
         self._slot: dict[str, int] = {}
         self._free = list(range(slots))
+        self.clear()
 
     def clear(self) -> None:
         """A new episode: no vehicle is known. The buffer stays, so that its memory is touched only once."""
-        self._free.extend(self._slot.values())
-        self._slot.clear()
+        self._assign(())
 
-    def next_frame(self, vehicles: Sequence[str]) -> tuple[npt.NDArray[Any], Ints]:
+    def next_frame(self, vehicles: tuple[str, ...]) -> tuple[npt.NDArray[Any], Ints]:
         """The new frame [S,...], to be written into, and the slot [n] of each of the present vehicles."""
-        for name in self._slot.keys() - set(vehicles):
-            self._free.append(self._slot.pop(name))
         if self._end == len(self._buffer):
             used = list(self._slot.values())
             self._buffer[: self._frames, used] = self._buffer[-self._frames :, used]
             self._end = self._frames
-        for name in vehicles:
-            if name not in self._slot:
-                if not self._free:
-                    self._grow()
-                slot = self._slot[name] = self._free.pop()
-                self._buffer[self._end - self._frames : self._end, slot] = self._absent
+        if vehicles != self._vehicles:
+            self._assign(vehicles)
         self._end += 1
-        return self._buffer[self._end - 1], np.array([self._slot[name] for name in vehicles], np.int64)
+        return self._buffer[self._end - 1], self.slots
 
     @property
     def window(self) -> npt.NDArray[Any]:
         """[N,S,...] the newest N frames, oldest first."""
         return self._buffer[self._end - self._frames : self._end]
+
+    def _assign(self, vehicles: tuple[str, ...]) -> None:
+        """Give a slot to every vehicle that came, and free those of the vehicles that left."""
+        for name in self._slot.keys() - set(vehicles):
+            self._free.append(self._slot.pop(name))
+        for name in vehicles:
+            if name not in self._slot:
+                if not self._free:
+                    self._grow()
+                slot = self._slot[name] = self._free.pop()
+                self.window[:, slot] = self._absent
+        self.slots = np.array([self._slot[name] for name in vehicles], np.int64)
+        self._vehicles = vehicles
 
     def _grow(self) -> None:
         """Twice as many slots; the lowest of the new ones is taken first."""
@@ -71,17 +77,14 @@ class KinematicPast(FrameBuffer):
 
     def __init__(self, frames: int) -> None:
         super().__init__(frames, 64, np.nan, (4,), np.float64)
-        self.slots: Ints = np.zeros(0, np.int64)  # [n] of the vehicles of the newest snapshot
 
     def add(self, snapshot: Snapshot) -> None:
         """Append one frame."""
-        new, self.slots = self.next_frame(snapshot.ids)
-        before: Floats = self._buffer[self._end - 2, self.slots, 3]
+        new, slots = self.next_frame(snapshot.ids)
+        before: Floats = self._buffer[self._end - 2, slots, 3]
         turn = snapshot.heading - np.where(np.isnan(before), snapshot.heading, before)
-        new[self.slots, 0] = snapshot.x
-        new[self.slots, 1] = snapshot.y
-        new[self.slots, 2] = snapshot.speed
-        new[self.slots, 3] = snapshot.heading - 2 * np.pi * np.round(turn / (2 * np.pi))
+        heading = snapshot.heading - 2 * np.pi * np.round(turn / (2 * np.pi))
+        new[slots] = np.array((snapshot.x, snapshot.y, snapshot.speed, heading)).T
 
 
 class MapPast(FrameBuffer):

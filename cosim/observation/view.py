@@ -1,4 +1,4 @@
-"""What an agent outside the simulation's process sees of one AV, and how it crosses the pipe cheaply.
+"""What an agent outside the simulation's process sees of one AV, and how it is sent there in few bytes.
 
 A `History` carries the lane paths of its route: too much to pickle at every decision. A `View` holds what
 an agent needs of them as plain arrays, and of the N maps only the new ones cross (`Unpacker` keeps the rest).
@@ -67,7 +67,12 @@ class Packer:
         self._sent: frozenset[str] = frozenset()
 
     def pack(self, histories: Mapping[str, History], fresh: int | None) -> Packed:
-        """`fresh`: frames since the last packing; None sends whole histories (a new episode)."""
+        """The views of all AVs, to be sent to the other side.
+
+        Args:
+            histories: AV id -> its history at this decision.
+            fresh: frames since the last packing; None sends whole histories (a new episode).
+        """
         avs = tuple(histories)
         known = [name for name in avs if fresh is not None and name in self._sent]
         newcomers = tuple(name for name in avs if name not in known)
@@ -83,10 +88,9 @@ class Packer:
             )
             for h in everyone
         ]
-        keep = fresh or 0
         return Packed(
             avs=avs,
-            maps=np.stack([histories[n].velocity_map[-keep:] for n in known]) if known else empty,
+            maps=np.stack([histories[n].velocity_map[-(fresh or 0) :] for n in known]) if known else empty,
             new_maps=np.stack([histories[n].velocity_map for n in newcomers]) if newcomers else empty,
             newcomers=newcomers,
             kinematics=np.stack([h.kinematics for h in everyone]) if everyone else empty.astype(np.float32),

@@ -125,9 +125,8 @@ class RoadMap:
     def straight_on(self) -> LaneGraph:
         """The straightest successor of every lane (another vehicle's route is unknown)."""
         steps = [self._successor(k, None, 0) for k in range(len(self.lanes))]
-        following = [-1 if step is None else step[0] for step in steps]
-        lengths = [lane.length for lane in self.lanes]
-        return LaneGraph(np.array(following, np.int64), np.array(lengths, np.float64))
+        following = np.array([-1 if step is None else step[0] for step in steps], np.int64)
+        return LaneGraph(following, np.array([lane.length for lane in self.lanes], np.float64))
 
     def ahead(self, lane: int, lane_position: float, length: float, route: tuple[str, ...]) -> RouteAhead:
         """Route knowledge of a vehicle of `length` m whose front bumper is at `lane_position` m of `lane`."""
@@ -162,11 +161,9 @@ class RoadMap:
                 break
             step = self._successor(lanes[-1], route, place)
             if step is None:
-                dead_end = True
-                if route is None and not lane.successors:
-                    beside = [self.lanes[o] for o in (lane.left, lane.right) if o >= 0]
-                    dead_end = any(other.successors for other in beside)
-                    leaves = not dead_end
+                beside = [self.lanes[o] for o in (lane.left, lane.right) if o >= 0]
+                dead_end = route is not None or any(other.successors for other in (lane, *beside))
+                leaves = not dead_end
                 break
             following, place = step
             if following in lanes:  # a ring: once round is far enough

@@ -43,12 +43,17 @@ class SnapshotReader:
         self._ids: tuple[str, ...] | None = None
         self._static: tuple[np.ndarray, ...] = ()  # kind, mission, length m, width m [n] of `_ids`
 
-    def forget(self) -> None:
-        """The bodies changed (a new episode, a new mission vehicle)."""
+    def bodies_changed(self) -> None:
+        """Build the constant columns anew at the next read (a new episode, a new mission vehicle)."""
         self._ids = None
 
     def read(self, bodies: dict[str, Body], events: Events) -> Snapshot:
-        """One snapshot of every vehicle on the road, sorted by id."""
+        """One snapshot of every vehicle on the road, sorted by id.
+
+        Args:
+            bodies: what is constant of each vehicle that has departed, by id.
+            events: what happened since the last snapshot.
+        """
         ids = tuple(sorted(libsumo.vehicle.getIDList()))
         if ids != self._ids:
             present = [bodies[i] for i in ids]
@@ -83,9 +88,14 @@ class SnapshotReader:
 
 
 def read_road(zones: Sequence[Zone], scenario_file: object) -> RoadMap:
-    """The loaded net as a RoadMap: every lane a motor vehicle may use.
+    """The loaded net as a RoadMap (m, m/s): every lane that a motor vehicle may use.
 
-    Raises BadInput when a conflict zone names an edge that the net does not have.
+    Args:
+        zones: the conflict zones by their edges; without any, minor approaches and ending lanes make one.
+        scenario_file: named in errors.
+
+    Raises:
+        BadInput: a conflict zone names an edge that the net does not have.
     """
     get = libsumo.lane
     ids = [i for i in get.getIDList() if not (a := get.getAllowed(i)) or MOTOR_CLASSES.intersection(a)]

@@ -22,7 +22,7 @@ LARGEST_DRAW = 1.0 - 1e-12  # in (0, 1): the division rounds up to 1 for the lar
 
 
 def derive_idm_type(original: str, name: str) -> None:
-    """Make vehicle type `name`: IDM with the size, class, maximum speed and looks of type `original`.
+    """Make vehicle type `name`: IDM with the size, class, maximum speed, shape and color of type `original`.
 
     Raises BadInput if `original` does not use IDM and the base type has not been loaded.
     """
@@ -31,7 +31,7 @@ def derive_idm_type(original: str, name: str) -> None:
         get.copy(IDM_TYPE, name)
         for parameter in BODY:
             getattr(get, f"set{parameter}")(name, getattr(get, f"get{parameter}")(original))
-    elif get.getImperfection(original) == -1.0:  # SUMO's IDM has no driver imperfection and says -1
+    elif get.getImperfection(original) == -1.0:  # SUMO's IDM has no driver imperfection: the value is -1
         get.copy(original, name)
     else:
         raise BadInput(
@@ -62,7 +62,7 @@ class Drivers:
                 value=driver_model,
             )
         self.behavior, self.driver_model, self.seed = behavior, driver_model, seed
-        self.classes: dict[str, str] = {}  # vehicle -> class, of everybody applied so far
+        self.classes: dict[str, str] = {}  # vehicle -> class, of all HVs so far
         self.mobil = MobilDriving(self.behaviors.mobil_period) if driver_model == MOBIL else None
         self._types: dict[tuple[str, str], str] = {}
 

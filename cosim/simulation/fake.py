@@ -18,7 +18,7 @@ LATERAL_SPEED = LANE_WIDTH / 2.0  # m/s: a lane change takes 2 s (definitions.md
 
 @dataclass(slots=True)
 class FakeVehicle:
-    """One vehicle of the fake world; `x` is the front bumper's place along the road in m."""
+    """One vehicle of the fake simulator; `x` is the front bumper's place along the road in m."""
 
     id: str
     x: float
@@ -26,7 +26,7 @@ class FakeVehicle:
     speed: float  # m/s
     is_av: bool = False
     mission: bool = False
-    desired: float = 25.0  # m/s, of an HV (and of an AV nobody commands)
+    desired: float = 25.0  # m/s, of an HV (and of an AV without a command)
     target: float | None = None  # m/s, once commanded
     goal_lane: int = -1  # while a lane change is under way
     offset: float = 0.0  # m, lateral, from the centre of `lane`
@@ -58,7 +58,7 @@ class FakeSimulator:
         self._length = length
 
     def reset(self, seed: int) -> tuple[Snapshot, ...]:
-        """One frame: everyone at the start."""
+        """One frame: all vehicles at the start."""
         rng = np.random.default_rng(seed)
         self._time = 0.0
         self._hit: set[frozenset[str]] = set()
@@ -90,7 +90,7 @@ class FakeSimulator:
         return v.target, 0 if v.goal_lane < 0 else int(np.sign(v.goal_lane - v.lane))
 
     def counts(self) -> dict[str, int]:
-        """Everybody is inserted at once."""
+        """All vehicles are inserted at the start."""
         return {"inserted": len(self._template), "waiting": 0}
 
     def close(self) -> None:

@@ -14,7 +14,7 @@ from cosim.simulation.convert import Body
 from cosim.simulation.drivers import IDM_TYPE, Drivers
 from cosim.types import Kind
 
-# definitions.md, Vehicles: what an AV drives with while nobody commands it (egoistic IDM).
+# definitions.md, Vehicles: what an AV drives with while it has no command (egoistic IDM).
 AV_IDM = {"Tau": 0.8, "MinGap": 2.0, "Accel": 3.0, "Decel": 7.0}
 AV_LANE_CHANGE = {
     "laneChangeModel.lcCooperative": "0",

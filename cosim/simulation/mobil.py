@@ -34,7 +34,7 @@ CONFLICT_RANGE = 60.0  # m: two requests of one step into one lane this close: t
 
 
 class Car(NamedTuple):
-    """One vehicle as MOBIL sees it."""
+    """The state of one vehicle that MOBIL needs."""
 
     speed: float  # m/s
     desired_speed: float  # m/s, v0
@@ -73,7 +73,13 @@ class Accelerations(NamedTuple):
 def idm_acceleration(
     idm: IdmParameters, speed: float, desired_speed: float, gap: float = FAR, leader_speed: float = 0.0
 ) -> float:
-    """IDM acceleration in m/s2 at a bumper gap in m behind a leader (FAR: a free road).
+    """IDM acceleration in m/s2 (P, section V-A.2).
+
+    Args:
+        idm: the driver's parameters.
+        speed, desired_speed: v and v0, m/s.
+        gap: m, bumper to bumper, to the leader (FAR: a free road).
+        leader_speed: m/s.
 
     The desired gap never falls below d0 (Treiber's max(0, .)): opening gaps do not repel.
     """
@@ -81,8 +87,8 @@ def idm_acceleration(
     if gap >= FAR:
         return idm.max_acceleration * free
     root = 2.0 * math.sqrt(idm.max_acceleration * idm.comfortable_deceleration)
-    wished = idm.minimum_gap + max(0.0, speed * idm.time_headway + speed * (speed - leader_speed) / root)
-    return idm.max_acceleration * (free - (wished / max(gap, TOUCHING)) ** 2)
+    desired_gap = idm.minimum_gap + max(0.0, speed * idm.time_headway + speed * (speed - leader_speed) / root)
+    return idm.max_acceleration * (free - (desired_gap / max(gap, TOUCHING)) ** 2)
 
 
 def _follow(car: Car, ahead: Beside | None) -> float:
@@ -216,7 +222,7 @@ class MobilDriving:
         self._steps = 0
 
     def known(self, vehicle: str) -> IdmParameters | None:
-        """Parameters of a driver of ours, None for anybody else."""
+        """Parameters of a driver of ours, None for another vehicle."""
         return self._drivers.get(vehicle, (None,))[0]
 
     def add(self, vehicle: str, idm: IdmParameters, mobil: MobilParameters, phase: float) -> None:
@@ -227,14 +233,13 @@ class MobilDriving:
         self._drivers[vehicle] = (idm, mobil)
         self._due[int(phase * len(self._due))].append(vehicle)
 
-    def step(self) -> list[tuple[str, int]]:
-        """Decide for the drivers whose turn it is; returns the commanded (vehicle, direction)."""
+    def step(self) -> None:
+        """Decide for the drivers whose turn it is."""
         if not self._due:
-            return []
+            return
         turn = self._steps % len(self._due)
         self._steps += 1
         on_road: list[str] = []
-        commanded: list[tuple[str, int]] = []
         requested: list[tuple[str, int, float]] = []  # edge, target lane's index, m along it, of this step
         for vehicle in self._due[turn]:
             try:
@@ -245,9 +250,7 @@ class MobilDriving:
             on_road.append(vehicle)
             if direction and _gap_is_free(vehicle, direction, requested):
                 libsumo.vehicle.changeLaneRelative(vehicle, direction, 0.0)
-                commanded.append((vehicle, direction))
         self._due[turn] = on_road
-        return commanded
 
     def _decide(self, vehicle: str) -> int:
         if changing(vehicle):

@@ -26,8 +26,8 @@ from cosim.simulation.convert import Body, SnapshotReader, read_road, struggling
 from cosim.simulation.drivers import Drivers
 from cosim.simulation.fleet import Fleet
 from cosim.simulation.stderr import SumoStderr
-from cosim.simulation.xerces import keep_awake
-from cosim.types import Collision, Command, Events, Kind, Receipt, Snapshot
+from cosim.simulation.xerces import keep_initialized
+from cosim.types import Command, Events, Kind, Receipt, Snapshot
 
 SUMO_ERRORS = (libsumo.TraCIException, libsumo.FatalTraCIError)
 
@@ -37,7 +37,7 @@ DEFAULTS = {
     "time-to-teleport": "-1",
     "default.speeddev": "0",
 }
-# Ours whatever the file says: collisions must be seen (docs/sumo.md: never `collision.action none`).
+# Ours whatever the file says: collisions must be reported (docs/sumo.md: never `collision.action none`).
 FORCED = {
     "collision.action": "warn",
     "collision.check-junctions": "true",
@@ -47,7 +47,7 @@ FORCED = {
     "duration-log.disable": "true",
     "xml-validation": "never",  # cosim.scenario.vet has read the files already
 }
-# What SUMO says in the middle of a run, where it loads routes, of a vehicle that cannot depart as written.
+# SUMO's message in the middle of a run, where it loads routes, about a vehicle that cannot depart as written.
 WRONG_DEMAND = re.compile(
     r"[Ii]nvalid depart|Departure \w+ .*for vehicle|has no valid route|No connection between edge"
 )
@@ -104,7 +104,7 @@ class SumoSimulator:
         self._bodies: dict[str, Body] = {}
         self._routes: dict[str, tuple[str, ...]] = {}
         self._watch = CollisionWatch()
-        self._reader.forget()
+        self._reader.bodies_changed()
         self._mission_found = bool(self._scenario.mission.vehicles) or self._scenario.mission.kind == "none"
         self._inserted = 0
         self._waited: set[str] = set()  # only where SUMO gives up: seen waiting, not inserted since
@@ -117,9 +117,7 @@ class SumoSimulator:
                 self._step()
                 if k >= first_kept and (steps - k) % self._steps_per_frame == 0:
                     frames.append(self._snapshot())
-        if not frames:
-            frames.append(self._snapshot())
-        return tuple(frames)
+        return tuple(frames) or (self._snapshot(),)
 
     def advance(self, commands: Sequence[Command]) -> tuple[tuple[Receipt, ...], tuple[Snapshot, ...]]:
         """Hold the commands for one decision; one snapshot per frame. Raises SimulationError."""
@@ -149,8 +147,7 @@ class SumoSimulator:
         state = self._commander.controlled.get(vehicle)
         if state is None:
             return None, 0
-        under_way = libsumo.simulation.getTime() < state.change_until - 1e-9
-        return state.target, state.change if under_way else 0
+        return state.target, state.changing(libsumo.simulation.getTime())
 
     def counts(self) -> dict[str, int]:
         """Vehicles since the start: `inserted`, and `waiting`: due and not inserted, whether SUMO has dropped
@@ -194,7 +191,7 @@ class SumoSimulator:
                 else:
                     libsumo.start(["sumo", *arguments])
                     self._started = True
-                    keep_awake()
+                    keep_initialized()
         except SUMO_ERRORS as error:
             self._started = libsumo.isLoaded()
             raise self._explain(error, starting=True) from None
@@ -234,7 +231,6 @@ class SumoSimulator:
             libsumo.simulationStep()
         except SUMO_ERRORS as error:
             raise self._explain(error) from None
-        now = simulation.getTime()
         departed = simulation.getDepartedIDList()
         self._inserted += len(departed)
         self._waited.difference_update(departed)
@@ -242,14 +238,18 @@ class SumoSimulator:
             self._bodies[name] = self._fleet.depart(name, self._seed)
         arrived = simulation.getArrivedIDList()
         for name in arrived:
-            self._commander.forget(name)
+            self._commander.drop(name)
             self._routes.pop(name, None)
-        collisions: Sequence[Collision] = ()
-        if simulation.getCollidingVehiclesNumber():
-            collisions = self._watch.from_sumo(self._bodies, self._commander.lane_changes, now)
-        teleported = simulation.getStartingTeleportIDList()
-        stopped = simulation.getEmergencyStoppingVehiclesIDList()
-        self._happened.append((collisions, departed, arrived, teleported, stopped))
+        now = simulation.getTime()
+        self._happened.append(
+            (
+                self._watch.from_sumo(self._bodies, self._commander.lane_changes, now),
+                departed,
+                arrived,
+                simulation.getStartingTeleportIDList(),
+                simulation.getEmergencyStoppingVehiclesIDList(),
+            )
+        )
         if self._gives_up:
             self._waited.update(simulation.getPendingVehicles())
         self._drivers.step(now)
@@ -292,5 +292,5 @@ class SumoSimulator:
         name = snapshot.ids[row]
         self._bodies[name] = replace(self._bodies[name], mission=True)
         self._mission_found = True
-        self._reader.forget()
+        self._reader.bodies_changed()
         return self._reader.read(self._bodies, snapshot.events)

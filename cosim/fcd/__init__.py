@@ -19,7 +19,6 @@ from cosim.fcd.file import Row, Step, lanes_named, read_steps
 from cosim.fcd.vehicle_types import DEFAULT, Size, size_of
 from cosim.files.xml_input import Progress
 from cosim.metrics import METRICS, MetricContext
-from cosim.metrics.context import rows_in_both
 from cosim.metrics.post_encroachment import LONGEST
 from cosim.road import Lane, RoadMap
 from cosim.simulation.conventions import centres
@@ -247,7 +246,8 @@ class _Counter:
         s, before = snapshot, self._newest
         if before is None or s.n == 0:
             return s
-        then, now = rows_in_both(before, s)
+        both = [(before.row[name], row) for row, name in enumerate(s.ids) if name in before.row]
+        then, now = np.array(both, np.int64).reshape(-1, 2).T  # [c] rows of who is in both frames
         x, y = s.x[now] - before.x[then], s.y[now] - before.y[then]
         aside = np.abs(np.cos(s.heading[now]) * y - np.sin(s.heading[now]) * x)  # [c] m
         fast = np.flatnonzero(aside > SIDEWAYS * (s.time - before.time))

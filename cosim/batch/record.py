@@ -20,7 +20,7 @@ from cosim.scenario.episode_id import EpisodeId
 from cosim.scenario.policy_name import read
 from cosim.types import IDENTITY
 from cosim.workers.engines import LocalEngine
-from cosim.workers.progress import Progress
+from cosim.workers.progress import shown
 from cosim.workers.tasks import Progress as Heartbeat
 
 
@@ -90,13 +90,10 @@ def record(
     folder.write_manifest(document)
     todo = [cell.task(case) for cell, case in plan.cases() if not folder.has(case.key)]
     failed: dict[str, str | None] = {}
-    progress = Progress("record", "episodes", quiet=quiet)
     outcomes = LocalEngine(RecordingRunner, (str(out),), workers=workers).run(todo)
-    for done, outcome in enumerate(outcomes, 1):
+    for outcome in shown(outcomes, len(todo), "record", "episodes", quiet=quiet):
         if not outcome.ok:
             failed[outcome.key] = outcome.error
-        progress(done, len(todo))
-    progress.done()
     document["failed"] = failed
     document["episodes"] = {key: _digest(folder.episode_file(key)) for key in folder.episodes()}
     folder.write_manifest(document)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 
 from cosim.cli import arguments
-from cosim.cli.arguments import seeds
 from cosim.scenario import BEHAVIORS
 from cosim.scenario.behaviors import AS_IS
 
@@ -27,10 +26,7 @@ def add(verbs: arguments.Verbs) -> None:
         description="Measure every predictor on recorded episodes; records what it needs itself unless "
         "--recordings names a folder of `cosim record`.",
     )
-    predict.add_argument("--scenario", action="append", default=[], metavar="S", help="repeatable (all)")
-    predict.add_argument("--behavior", action="append", default=[], choices=BEHAVIORS, help="repeatable")
-    predict.add_argument("--demand", action="append", default=[], metavar="NAME", help="repeatable")
-    predict.add_argument("--policy", action="append", default=[], metavar="NAME", help="repeatable")
+    arguments.add(predict, "--scenario", "--demand", "--behavior", "--policy", action="append", default=[])
     predict.add_argument(
         "--predictor",
         action="append",
@@ -38,11 +34,11 @@ def add(verbs: arguments.Verbs) -> None:
         metavar="NAME|FILE:NAME",
         help="repeatable (all of ours); your own: a class called with horizon, dt",
     )
-    predict.add_argument("--seeds", type=seeds, required=True, metavar="A:B", help="test seeds, B left out")
+    arguments.add(predict, "--seeds", type=arguments.seeds, required=True, help="test seeds, B left out")
     predict.add_argument("--recordings", metavar="DIR", help="use these (seeds outside A:B are left out)")
     predict.add_argument("--no-maps", action="store_true", help="kinematics only (the maps take longer)")
-    predict.add_argument("--workers", type=arguments.count, default=1, metavar="N", help="processes (1)")
-    predict.add_argument("--out", required=True, metavar="DIR")
+    arguments.add(predict, "--workers", default=1)
+    arguments.add(predict, "--out", required=True)
     predict.set_defaults(work=work)
     _add_attribution(kinds)
 
@@ -64,40 +60,25 @@ def work(args: argparse.Namespace) -> int:
     out = prepare_folder(args.out)
     where = Path(args.recordings) if args.recordings else out / "recordings"
     if not args.recordings:
-        wanted = planned(
+        plan = planned(
             args.scenario or sumo_scenarios.names(),
             args.demand or DEMANDS,
             args.behavior or [b for b in BEHAVIORS if b != AS_IS],
             args.policy or POLICIES,
             args.seeds,
         )
-        if failed := record(where, wanted, workers=args.workers, resume=True):
+        if failed := record(where, plan, workers=args.workers, resume=True):
             print(f"cosim: {len(failed)} episodes were not recorded: {failed[0]}", file=sys.stderr)
     elif args.demand or args.policy:
         raise BadInput("recordings are there already", field="--demand, --policy")
     folder = Folder(where)
     folder.manifest()
     command = "\n".join([*recorded_by(folder.manifest()), "cosim " + shlex.join(sys.argv[1:])])
-    bench_predict(
-        folder,
-        out,
-        scenarios=args.scenario,
-        behaviors=args.behavior,
-        seeds=args.seeds,
-        predictors=args.predictor,
-        command=command,
-    )
+    wanted = {"scenarios": args.scenario, "behaviors": args.behavior, "seeds": args.seeds}
+    bench_predict(folder, out, predictors=args.predictor, command=command, **wanted)
     print((out / PAGE).read_text())
     if not args.no_maps:
-        bench_maps(
-            folder,
-            out,
-            scenarios=args.scenario,
-            behaviors=args.behavior,
-            seeds=args.seeds,
-            workers=args.workers,
-            command=command,
-        )
+        bench_maps(folder, out, workers=args.workers, command=command, **wanted)
         print((out / MAPS_PAGE).read_text())
     return 0
 
@@ -109,15 +90,13 @@ def _add_attribution(kinds: arguments.Verbs) -> None:
         description="Drive episodes as `cosim run` does; at every decision ask the same network again with "
         "one input replaced. Writes attribution.csv, .md and .png.",
     )
-    add = verb.add_argument
-    add("--policy", action="append", required=True, metavar="POLICY", help="a learned one; repeatable")
-    add("--scenario", required=True, metavar="S")
-    add("--demand", default="", metavar="NAME", help="default: the scenario's")
-    add("--seeds", type=seeds, required=True, metavar="A:B", help="B left out")
-    add("--svo", type=arguments.degrees, default=45.0, metavar="DEG", help="SVO angle, 0..90 (default 45)")
-    add("--duration", type=arguments.positive, metavar="S", help="counted s (default: the scenario's)")
-    add("--workers", type=arguments.count, default=1, metavar="N", help="processes (1)")
-    add("--out", required=True, metavar="DIR")
+    arguments.add(verb, "--policy", action="append", required=True)
+    arguments.add(verb, "--scenario", "--out", required=True)
+    arguments.add(verb, "--demand", default="")
+    arguments.add(verb, "--seeds", type=arguments.seeds, required=True)
+    arguments.add(verb, "--svo", default=45.0)
+    arguments.add(verb, "--duration")
+    arguments.add(verb, "--workers", default=1)
     verb.set_defaults(work=work_attribution)
 
 

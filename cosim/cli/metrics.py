@@ -70,19 +70,18 @@ def work(args: argparse.Namespace) -> int:
     types = [regular_file(Path(name), file=None, field="--types") for name in args.types]
     roles = Roles(args.av_type, _pattern(args.av_ids, "--av-ids"), _pattern(args.mission, "--mission"))
     road = None if args.net is None else _road(regular_file(Path(args.net), file=None, field="--net"))
-    progress = Progress(path.name, "bytes")
-    found = analyse(
-        path,
-        road=road,
-        sizes=read_sizes(types) if types else None,
-        roles=roles,
-        frame=args.frame,
-        critical=(args.ttc or CRITICAL) if args.conflicts else None,
-        progress=progress,
-        begin=args.begin,
-        end=args.end,
-    )
-    progress.done()
+    with Progress(path.name, "bytes") as progress:
+        found = analyse(
+            path,
+            road=road,
+            sizes=read_sizes(types) if types else None,
+            roles=roles,
+            frame=args.frame,
+            critical=(args.ttc or CRITICAL) if args.conflicts else None,
+            progress=progress,
+            begin=args.begin,
+            end=args.end,
+        )
     if args.conflicts:
         file = Path(args.conflicts)
         with cannot("write", field="--conflicts", value=args.conflicts):

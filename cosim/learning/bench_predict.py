@@ -18,7 +18,7 @@ from cosim.recording import Folder, Recording, Windows, read, windows
 from cosim.report import statistics
 from cosim.road import RoadMap
 from cosim.types import Floats
-from cosim.workers.progress import Progress
+from cosim.workers.progress import shown
 from policy.forecast import KinematicForecast
 from policy.predictors import PREDICTORS, Predictor, make_predictor
 from policy.predictors.lane import along_lanes
@@ -51,13 +51,11 @@ def bench_predict(
     if twice := next((name for name in called if called.count(name) > 1), None):
         raise BadInput("two predictors are called so", field="predictor", value=twice)
     keys = [key for key in folder.episodes() if seeds is None or int(key.rsplit("-", 1)[1]) in seeds]
-    scores, progress = Scores(HORIZON, DT), Progress("bench predict", "episodes")
-    for done, key in enumerate(keys, 1):
+    scores = Scores(HORIZON, DT)
+    for key in shown(keys, len(keys), "bench predict", "episodes"):
         recording = read(folder.episode_file(key))
         if _wanted(recording, scenarios, behaviors):
             measure(scores, recording, made, folder.road(recording))
-        progress(done, len(keys))
-    progress.done()
     if not scores.cases:
         raise BadInput("holds no recording of these scenarios, behaviours and seeds", file=folder.path)
     positions, coverage = scores.position_table(), scores.coverage_table()

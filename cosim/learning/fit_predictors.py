@@ -81,9 +81,9 @@ def fit_predictors(
     measured = {}
     for name in names:
         kept = None if state is None else state / name
-        predictor, parts, config = (_fit_net if name in NETS else _fit_prior)(
-            name, learned, checked, steps, kept, Progress(f"fit {name}", "steps")
-        )
+        fitted = _fit_net if name in NETS else _fit_prior
+        with Progress(f"fit {name}", "steps") as progress:
+            predictor, parts, config = fitted(name, learned, checked, steps, kept, progress)
         measured[name] = score(predictor, Folder(validation))
         about = {**data, "fit": asdict(config)}
         save(out / f"{name}.safetensors", *parts, measured=measured[name], data=about)
@@ -97,7 +97,6 @@ def _fit_net(
     network = fresh_net(NETS[name], config.seed)
     examples, checks = examples_for_net(learned), examples_for_net(checked)
     fit(network, partial(net_loss, network), config, examples, checks, folder=kept, progress=progress)
-    progress.done()
     predictor = Learned(NETS[name], weights=network)
     return predictor, ({"network": network}, {"network": NETS[name]}), config
 
@@ -109,7 +108,6 @@ def _fit_prior(
     prior = PriorFit(PRIORS[name], config.seed)
     examples, checks = prior.examples(learned), prior.examples(checked)
     fit(prior.network, prior.loss, config, examples, checks, folder=kept, progress=progress)
-    progress.done()
     _calibrate(prior, checked)
     return prior.fitted(), ({"prior": prior.network}, {"prior": prior.network.config}), config
 

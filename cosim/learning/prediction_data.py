@@ -15,7 +15,7 @@ from cosim.recording import Folder, Recording, histories, read
 from cosim.road import RoadMap
 from cosim.types import COMPACT, Bytes, History, ObservationConfig, Snapshot
 from cosim.workers.engines import Engine
-from cosim.workers.progress import Progress
+from cosim.workers.progress import shown
 from cosim.workers.tasks import Task
 
 HORIZON = 20  # frames, 4 s
@@ -95,12 +95,8 @@ class EpisodeReader:
 def spread(engine: Engine, tasks: Sequence[Task], title: str) -> list[Any]:
     """What each task returned, in the order of the tasks. Raises CosimError for the first that failed."""
     found: dict[str, Any] = {}
-    progress = Progress(title, "episodes")
-    for outcome in engine.run(tasks):
+    for outcome in shown(engine.run(tasks), len(tasks), title, "episodes"):
         if not outcome.ok:
-            progress.done()
             raise CosimError(f"{outcome.key}: {outcome.error}")
         found[outcome.key] = outcome.value
-        progress(len(found), len(tasks))
-    progress.done()
     return [found[task.key] for task in tasks]

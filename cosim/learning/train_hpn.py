@@ -59,10 +59,9 @@ def train(args: argparse.Namespace) -> int:
         task = MapTask(variant.map_branch, training.maps, loop.updates, *sets, args.device)
     else:
         task = KinematicTask(variant.kinematic, training.kinematics, loop.updates, *sets, args.device)
-    progress = Progress(f"train {name}", "updates")
     layout = {"hpn": asdict(variant), "training": asdict(training), "data": data}
-    log = supervised.train(task, loop, folder, layout=layout, resume=args.resume, progress=progress)
-    progress.done()
+    with Progress(f"train {name}", "updates") as progress:
+        log = supervised.train(task, loop, folder, layout=layout, resume=args.resume, progress=progress)
     file_name = folder / f"{name}.safetensors"
     supervised.write_log(file_name.with_suffix(".csv"), log)
     hpn.save(file_name, name, hpn.assemble(name, task), log[-1], {**data, "commands": _commands(args, found)})

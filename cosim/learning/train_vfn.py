@@ -6,6 +6,7 @@ import argparse
 import math
 import shlex
 import sys
+from contextlib import closing
 from dataclasses import asdict, replace
 
 import yaml
@@ -65,18 +66,12 @@ def train(args: argparse.Namespace) -> int:
     keep_freed_memory()
     use_threads(args.threads)  # more threads than cores stall each other (docs/training.md)
     writer = tensorboard(folder)
-    progress = Progress(f"train {name}", "iterations")
-    try:
-        with Rollouts(args.workers, name, agent, explore, reward, metrics) as actors:
-            run = TrainingRun(
-                training, agent.vfn, actors, folder, device=args.device, log=writer, about=about
-            )
-            if args.resume and not run.resume():
-                print("nothing to resume: starting anew", file=sys.stderr)
-            run.run(progress)
-    finally:
-        progress.done()
-        writer.close()
+    rollouts = Rollouts(args.workers, name, agent, explore, reward, metrics)
+    with closing(writer), Progress(f"train {name}", "iterations") as progress, rollouts as actors:
+        run = TrainingRun(training, agent.vfn, actors, folder, device=args.device, log=writer, about=about)
+        if args.resume and not run.resume():
+            print("nothing to resume: starting anew", file=sys.stderr)
+        run.run(progress)
     best = f", best validation reward {run.best:.3f}" if math.isfinite(run.best) else ""
     print(f"{name}: {run.iteration} iterations, {run.trainer.learner.updates} updates{best}")
     print(f"  {folder / BEST}" + (f" (cosim run merge --policy {_typed(args.out)})" if best else ""))

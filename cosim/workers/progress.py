@@ -5,11 +5,12 @@ from __future__ import annotations
 import contextlib
 import sys
 import threading
-from collections.abc import Callable
-from typing import Any, TextIO
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, TextIO, TypeVar
 
 from tqdm import tqdm
 
+Item = TypeVar("Item")
 REDRAW = 0.1  # s between redraws on a terminal
 LINE_EVERY = 10.0  # s between lines in a log; shorter work needs none
 COUNTED = "{n:.0f}/{total:.0f}{unit}, {rate_noinv_fmt}, {remaining} left"
@@ -95,3 +96,11 @@ class Progress:
     def _say(self, line: str) -> None:
         with contextlib.suppress(ValueError):  # the stream is closed: nobody listens any more
             print(f"{self._title}: {line}", file=self._stream, flush=True)
+
+
+def shown(items: Iterable[Item], total: int, title: str, unit: str, *, quiet: bool = False) -> Iterator[Item]:
+    """The items one by one, with the progress of what is done with them; `total`: how many there are."""
+    with Progress(title, unit, quiet=quiet) as progress:
+        for done, item in enumerate(items, 1):
+            yield item
+            progress(done, total)

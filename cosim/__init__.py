@@ -3,8 +3,6 @@
 Importing cosim costs next to nothing: SUMO, numba and torch are loaded by what needs them, when it does.
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:

@@ -12,8 +12,6 @@
 The number is `exit_code`, which the command line returns; success is 0, and a gate that fails is 1.
 """
 
-from __future__ import annotations
-
 import contextlib
 import difflib
 import math

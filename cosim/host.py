@@ -1,7 +1,5 @@
 """The one place that assembles simulator, episode and policy in a process."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """One root seed, named sub-seeds: every random draw can be traced to (root seed, purpose)."""
 
-from __future__ import annotations
-
 import hashlib
 
 import numpy as np

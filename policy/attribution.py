@@ -3,8 +3,6 @@
 Nothing here changes how the agent drives: the plain network is asked on whole maps, without its memory.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 

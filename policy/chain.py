@@ -1,7 +1,5 @@
 """The multi-step prediction chain (P, algorithm 1): all AVs' next seconds as maps and kinematics."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 

@@ -4,8 +4,6 @@
 SHA-256 of the tensor file, what they were trained on and the result measured with them.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """What turns a stack of maps into features: T's Conv3D (Table 1), and the Conv2D of the simplest baseline."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Literal
 

@@ -6,8 +6,6 @@ prediction is a matrix product with operators computed once. Per series the kern
 likelihood times a prior over kernels; picking the best one is worse (measured, docs/prediction.md).
 """
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass
 from functools import cache

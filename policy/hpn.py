@@ -7,8 +7,6 @@ Three ways to a map (measured, docs/results/prediction_maps.md):
 - `plain`: P's map branch alone, as written. Trained with the mean squared error it predicts empty maps.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """What goes on inside a trained HPN, as pictures (P, figure 7)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

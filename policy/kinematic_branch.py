@@ -7,8 +7,6 @@ believe, how far ahead or aside of it the vehicle will really be. The weights ar
 which see one another through pooled features of the nearest. Untrained it corrects nothing.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

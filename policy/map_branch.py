@@ -1,7 +1,5 @@
 """The HPN's map branch, P's figure 3 as written: past observations in, the next map and kinematics out."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """How far predicted maps are from what followed: PRE and occupancy IoU (definitions.md, Observation)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import NamedTuple
 

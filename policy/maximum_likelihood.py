@@ -4,8 +4,6 @@ P's method as it reads: linear + RBF + white noise, hyperparameters by maximum m
 of each series. Three orders of magnitude slower than the bank, and no better (docs/prediction.md).
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

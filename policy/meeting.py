@@ -1,7 +1,5 @@
 """Who drives along an AV's lanes, and how its way meets a mission vehicle's: geometry on the road map."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple

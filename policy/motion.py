@@ -6,8 +6,6 @@ front changes lanes in 2 s at any speed, the box straightens only over the dista
 1.28: after a change at 1 m/s a car stands 29 degrees askew, at 15 m/s never more than 6).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -6,8 +6,6 @@ prior erred by three times constant speed. So what is not known is taken to have
 frames show; with a single one, constant speed (measured on tuning seeds, docs/prediction.md).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from cosim.geometry.compiled import compiled

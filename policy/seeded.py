@@ -1,7 +1,5 @@
 """Networks made from a seed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import TypeVar
 

@@ -4,8 +4,6 @@ The maps and kinematic rows hold nearly all of it too, but from the few drives t
 a network does not find it there (docs/training.md, What it took to learn from few drives).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The only crossing between numpy and torch: histories in, network inputs out, action values back."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Where the others go: every vehicle's predicted speed carried along its real lane."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

@@ -6,8 +6,6 @@ process's (P, eq. 7-9), which knows no road, and the same speeds carried along t
 here is known to the driver alone: no class, route or desired speed.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

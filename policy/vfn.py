@@ -5,8 +5,6 @@ and what the ego knows besides join after FC 512 through MLPs. The baselines of 
 network with parts left out.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 

@@ -1,7 +1,5 @@
 """The worlds that ship, as data: find a world's folder by its name (no simulator is touched here)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from cosim.errors import BadInput, hint

@@ -3,8 +3,6 @@
 netconvert comes with the `eclipse-sumo` package (extra `tools`); the committed nets run without it.
 """
 
-from __future__ import annotations
-
 import argparse
 import re
 import shutil

@@ -1,7 +1,5 @@
 """What a batch hosts in its worker processes: any episode, one after another, in one process."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """How long a matrix will take: a few short episodes of it are driven, and the rest is computed from them."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from contextlib import closing

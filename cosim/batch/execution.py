@@ -1,7 +1,5 @@
 """The straight path of a batch: what is left to do -> engine -> row -> store, one episode at a time."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a run leaves for others to read: episodes as Parquet and CSV, the manifest, the summary."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

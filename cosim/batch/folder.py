@@ -1,7 +1,5 @@
 """The folder of a run: made, locked and measured before anything is run, left as it was if that fails."""
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import os

@@ -1,7 +1,5 @@
 """The matrix of a spec: every cell loaded and vetted before anything is run."""
 
-from __future__ import annotations
-
 import hashlib
 import itertools
 import json

@@ -1,7 +1,5 @@
 """`cosim record`: drives episodes on worker processes and keeps what every vehicle did."""
 
-from __future__ import annotations
-
 import hashlib
 import sys
 from collections.abc import Sequence

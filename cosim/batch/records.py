@@ -1,7 +1,5 @@
 """One flat row per episode: the columns of `cosim run --json`, and what became of the episode. NA is None."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict

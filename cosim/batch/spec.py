@@ -1,7 +1,5 @@
 """What to evaluate, as a user writes it: SPEC.yaml and the flags of `cosim evaluate`, read into a `Spec`."""
 
-from __future__ import annotations
-
 import glob
 import itertools
 import math

@@ -1,7 +1,5 @@
 """Flags and types of values that several verbs share: argparse says what is wrong and exits with 2."""
 
-from __future__ import annotations
-
 import argparse
 import functools
 import math

@@ -3,8 +3,6 @@
 `predict`: the predictors against recorded episodes. `attribution`: which inputs a value network uses.
 """
 
-from __future__ import annotations
-
 import argparse
 
 from cosim.cli import arguments

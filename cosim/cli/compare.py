@@ -1,7 +1,5 @@
 """`cosim compare`: two policies or two runs on equal seeds, and whether B may replace A."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from pathlib import Path

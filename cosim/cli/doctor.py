@@ -1,7 +1,5 @@
 """`cosim doctor`: what this installation consists of, what is wrong with it, and how to mend that."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -1,7 +1,5 @@
 """`cosim fit-predictors`: fit the kinematic predictors on recorded episodes."""
 
-from __future__ import annotations
-
 import argparse
 
 from cosim.cli import arguments

@@ -1,7 +1,5 @@
 """The command line: one sub-command per module of `cosim.cli`, and what every exit code means."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import importlib

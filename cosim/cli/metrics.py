@@ -1,7 +1,5 @@
 """`cosim metrics`: our figures for floating-car data that SUMO wrote, whoever drove."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

@@ -1,7 +1,5 @@
 """`cosim record`: drive episodes and keep what every vehicle did, for learning and measuring prediction."""
 
-from __future__ import annotations
-
 import argparse
 
 from cosim.cli import arguments

@@ -1,7 +1,5 @@
 """`cosim replay`: drive a recorded episode again, check that it is the same, draw it as a page and a film."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from pathlib import Path

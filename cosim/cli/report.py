@@ -1,7 +1,5 @@
 """`cosim report`: a run as one HTML file to read and to pass on."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

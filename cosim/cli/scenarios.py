@@ -1,7 +1,5 @@
 """`cosim scenarios`: the worlds and their demands, for people and for machines."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from typing import Any

@@ -1,7 +1,5 @@
 """`cosim train`: train one of the networks; killed at any moment, `--resume` goes on exactly."""
 
-from __future__ import annotations
-
 import argparse
 
 from cosim.cli import arguments

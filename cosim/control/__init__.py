@@ -1,7 +1,5 @@
 """Meta-actions become commands: a target speed on a grid, and a lane (definitions.md, Vehicles)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

@@ -1,7 +1,5 @@
 """Environments on the one loop: `cosim.open`, Gymnasium ids `cosim/...-v0`, PettingZoo's `parallel_env`."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 import gymnasium

@@ -1,7 +1,5 @@
 """The simulation's side of a session: lives in the worker process, one decision at a time."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """A picture of the traffic around one vehicle, drawn from a snapshot: no display, no window system."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from cosim.geometry.raster import CHANNELS, ROAD_LINE, draw_snapshot, rasterize_road

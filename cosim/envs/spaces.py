@@ -1,7 +1,5 @@
 """Views as Gymnasium observations: the spaces and the numbers in them, scaled and bounded."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any, cast
 

@@ -1,7 +1,5 @@
 """A user's floating-car data (SUMO's fcd-output) through the very metrics that an episode goes through."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import re

@@ -1,7 +1,5 @@
 """Single conflicts behind the figures: who met whom, when, where, and how close it came."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import asdict, dataclass, field
 from typing import Any

@@ -1,7 +1,5 @@
 """Reads SUMO's fcd-output as a stream of steps: every number checked, whatever the file's size."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """Vehicle sizes out of SUMO's route and additional files, since floating-car data do not hold any."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Files that appear whole or not at all, and one clear error for those that cannot be read or written."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import json

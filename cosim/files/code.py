@@ -1,7 +1,5 @@
 """A user's own code, named FILE.py:NAME or MODULE:NAME: loaded, called, its mistakes named as its own."""
 
-from __future__ import annotations
-
 import hashlib
 import importlib
 import importlib.util

@@ -6,8 +6,6 @@ parser is expat with three refusals (entities, external references, foreign enco
 caps on depth, token length and unpacked size; memory does not grow with the file.
 """
 
-from __future__ import annotations
-
 import codecs
 import gzip
 import stat

@@ -1,7 +1,5 @@
 """YAML into frozen dataclasses: every field checked by its type, errors name file, field and value."""
 
-from __future__ import annotations
-
 import dataclasses
 import enum
 import types

@@ -8,8 +8,6 @@ times. Cars that pass in the next lane therefore have no time to collision at al
 (distance over closing speed) would warn. All inputs broadcast: [k,1] boxes against [1,n] boxes give [k,n].
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple, cast
 
 import numpy as np

@@ -1,7 +1,5 @@
 """One way to compile a kernel: numba, cached on disk wherever a cache folder can be written."""
 
-from __future__ import annotations
-
 import functools
 import importlib
 from collections.abc import Callable

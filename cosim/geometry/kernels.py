@@ -5,8 +5,6 @@ All in one file on purpose: numba's cache on disk notices a change of the file a
 the files it calls into.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from typing import Any, cast

@@ -4,8 +4,6 @@ Rows run across the road (row 0 furthest to the left), columns along it (column 
 the ego's centre lies in the middle, looking towards rising columns. Pixels are stored as uint8 (255 = 1).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any

@@ -1,7 +1,5 @@
 """`cosim bench attribution`: drives episodes and counts which inputs of the value network change a choice."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple
 from itertools import groupby

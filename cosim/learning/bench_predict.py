@@ -1,7 +1,5 @@
 """`cosim bench predict`: how far off the kinematic predictors are, and what their intervals are worth."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """The configuration file of a training: one that ships, one's own, or what one's own changes of another."""
 
-from __future__ import annotations
-
 import importlib.resources
 from pathlib import Path
 from typing import NamedTuple

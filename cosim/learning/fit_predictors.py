@@ -1,7 +1,5 @@
 """Fits everything the kinematic predictors learn from recordings, and writes it with its card."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """The map half of `cosim bench predict`: PRE and IoU of every map predictor on recorded episodes."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Figures of the map predictors: training curves, error over the horizon, chains and inner features."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Recordings as the predictor's data: decisions with the maps and states that really followed."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """How good forecasts of vehicles are: position error and interval coverage, episode by episode."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple

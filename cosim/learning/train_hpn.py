@@ -1,7 +1,5 @@
 """Training of the hybrid predictive network from recordings: `cosim train hpn`."""
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """Training of the value networks from a configuration file: joins trainer and rollouts."""
 
-from __future__ import annotations
-
 import argparse
 import math
 import shlex

@@ -1,7 +1,5 @@
 """Every figure of an episode, in SI units: one file per metric, one line each in the table below."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Collisions: C% of the papers (`crashed`), pairs that touched, and who was to blame."""
 
-from __future__ import annotations
-
 from cosim.metrics.context import MetricContext
 from cosim.types import Collision, Metric, Snapshot
 

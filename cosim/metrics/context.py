@@ -1,7 +1,5 @@
 """The context of an episode's metrics, the protocol of a metric, and tables of vehicles over time."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Distance driven (DT of both papers): of all vehicles, of AVs, of HVs and of the mission vehicle."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 

@@ -1,7 +1,5 @@
 """DRAC: the hardest constant braking that an AV or mission vehicle, or its opponent, would have needed."""
 
-from __future__ import annotations
-
 from cosim.metrics.context import MetricContext
 from cosim.types import Metric, Snapshot
 

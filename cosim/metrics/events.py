@@ -1,7 +1,5 @@
 """Teleports and emergency stops: three different things with collisions, so three figures (docs/sumo.md)."""
 
-from __future__ import annotations
-
 from cosim.metrics.context import MetricContext
 from cosim.types import Metric, Snapshot
 

@@ -1,7 +1,5 @@
 """Hard braking: how often vehicles began to brake harder than 3 m/s2, AVs and all."""
 
-from __future__ import annotations
-
 from cosim.metrics.context import MetricContext
 from cosim.types import Kind, Metric, Snapshot
 

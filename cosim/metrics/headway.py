@@ -1,7 +1,5 @@
 """Headway: the time gap that AVs keep to the vehicle ahead in their corridor, mean and smallest."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from cosim.geometry import gap_ahead, headway

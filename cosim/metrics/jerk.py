@@ -1,7 +1,5 @@
 """Jerk: the mean absolute rate of change of the AVs' acceleration, a measure of comfort."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 

@@ -1,7 +1,5 @@
 """Mission: did the vehicle that needs the help of others get where it wanted, and when."""
 
-from __future__ import annotations
-
 from cosim.metrics.context import MetricContext
 from cosim.types import Metric, Snapshot
 

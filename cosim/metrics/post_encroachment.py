@@ -1,7 +1,5 @@
 """Post-encroachment time: the shortest time between an AV's (or mission vehicle's) and another's passage."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from cosim.geometry.kernels import encroachment, record

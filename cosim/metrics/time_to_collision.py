@@ -1,7 +1,5 @@
 """Time to collision of AVs and mission vehicles with others: the smallest, and how long it was critical."""
 
-from __future__ import annotations
-
 from cosim.metrics.context import HORIZON, MetricContext
 from cosim.types import Metric, Snapshot
 

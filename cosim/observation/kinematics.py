@@ -1,7 +1,5 @@
 """The kinematic matrix: who gets a row, and the rows of every past frame in one fixed ego frame."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 

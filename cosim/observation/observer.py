@@ -1,7 +1,5 @@
 """Turns snapshots into one History per AV: the first step of every decision."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The last N frames of every vehicle and of every AV's maps: written once, read as views."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -4,8 +4,6 @@ A `History` carries the lane paths of its route: too much to pickle at every dec
 an agent needs of them as plain arrays, and of the N maps only the new ones cross (`Unpacker` keeps the rest).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import NamedTuple
 

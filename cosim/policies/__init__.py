@@ -1,7 +1,5 @@
 """Every policy that `--policy` can name: those that ship, weights of a training, somebody's own code."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from cosim.errors import BadInput

@@ -1,7 +1,5 @@
 """Somebody's own policy behind our protocol: class, factory or function, its mistakes named as its own."""
 
-from __future__ import annotations
-
 import inspect
 import operator
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """The agent of a training, built again from its weights and what their card says of them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar

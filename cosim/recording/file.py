@@ -1,7 +1,5 @@
 """One episode as one Parquet file: a row per vehicle and frame, written whole or not at all."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass

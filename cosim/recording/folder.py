@@ -1,7 +1,5 @@
 """A folder of recordings: which episodes there are, which are still missing, and on which road."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence

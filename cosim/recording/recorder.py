@@ -1,7 +1,5 @@
 """The one recorder of an episode: a hook that keeps what was driven, decided and predicted."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """The road as a JSON document beside the recordings, so that maps can be drawn without SUMO."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Recordings as learners need them: tracks of all vehicles, and each AV's histories built anew."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """A recorded episode as it is drawn: every vehicle's track, every decision and what became of it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """A against B on equal traffic: their figures, the differences of pairs, and the verdict on thresholds."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Which columns of the rows are figures, what they are called, their units, and which direction is better."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ A pair is one episode of each side that agree in all of `PAIR` and in the seed; 
 agree in `PAIR`. Nothing is pooled over groups.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 from collections.abc import Iterable, Mapping, Sequence

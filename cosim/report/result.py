@@ -1,7 +1,5 @@
 """One episode's result: a short table to read, a run folder to keep."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What `cosim evaluate` leaves in a run folder, written and read back: rows, manifest, summary."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property

@@ -3,8 +3,6 @@
 What is used where, and how it was checked: docs/evaluation_statistics.md. NA is nan in here, never 0.
 """
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Callable, Sequence

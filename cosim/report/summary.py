@@ -1,7 +1,5 @@
 """The figures of a run, cell by cell, with intervals and counts: what summary.json holds."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -8,8 +8,6 @@ A's), or the metric's own unit, which may be left out. `.upper` and `.lower` tak
 interval instead of the value. A share needs its unit, unless it is 0: 0.5 might be a half or half a per cent.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass

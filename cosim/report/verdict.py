@@ -1,7 +1,5 @@
 """A comparison for people and machines: text for a terminal, Markdown for a pull request, JSON, JUnit."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """How figures are spelled for people: per cent and percentage points, units, intervals, NA."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any

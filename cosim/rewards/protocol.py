@@ -1,7 +1,5 @@
 """What a reward is: it sees one decision of the traffic and says what each AV earned by it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple, Protocol
 

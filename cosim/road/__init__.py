@@ -1,7 +1,5 @@
 """The road as pure data: lanes with centre lines, how they connect, and the paths ahead of a vehicle."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple

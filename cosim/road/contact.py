@@ -1,7 +1,5 @@
 """Which roads can touch: vehicles on a bridge and below it are on top of one another only on the map."""
 
-from __future__ import annotations
-
 from functools import cached_property
 
 import numpy as np

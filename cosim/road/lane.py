@@ -1,7 +1,5 @@
 """One lane of the road."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from cosim.arrays import Floats

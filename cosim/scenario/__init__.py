@@ -1,7 +1,5 @@
 """What to simulate: a world by name or by its folder, or any user's .sumocfg, read into one `Scenario`."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Mapping, Sequence

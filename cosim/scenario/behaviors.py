@@ -1,7 +1,5 @@
 """Human drivers as data: P's Table II and its LC2013 mapping, read from sumo_scenarios/behaviors.yaml."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache

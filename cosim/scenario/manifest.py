@@ -1,7 +1,5 @@
 """What was run, with which versions, on which files: lies beside every result."""
 
-from __future__ import annotations
-
 import hashlib
 import platform
 from collections.abc import Iterable, Mapping, Sequence

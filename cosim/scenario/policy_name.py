@@ -5,8 +5,6 @@
 tables. Text only: `cosim.policies` knows whether there is such a policy.
 """
 
-from __future__ import annotations
-
 import os
 import re
 from pathlib import Path

@@ -6,8 +6,6 @@ races between workers, and `host:port` opens a connection. The elements stay, so
 detector still finds it; only the name of the file becomes SUMO's own word for no file.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

@@ -4,8 +4,6 @@ SUMO writes them itself; where to and with which settings is ours to say, so tha
 folder only. What a setting does is written beside it; all of them yield to options typed after `--`.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import shutil

@@ -4,8 +4,6 @@ A foreign configuration is never handed to SUMO as it is: its outputs could writ
 `remote-port` would wait for ever (docs/sumo.md). What changes the traffic is kept.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Sequence

@@ -5,8 +5,6 @@ file is read once as a stream (memory does not grow with the demand's size, exce
 numbers are checked, and every name it refers to must exist. Files that have not changed are not read again.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache

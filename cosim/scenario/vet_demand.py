@@ -1,7 +1,5 @@
 """Read a route or additional file as a stream: check its numbers and names, note what it refers to."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field

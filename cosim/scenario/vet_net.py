@@ -1,7 +1,5 @@
 """Read a SUMO net as a stream: refuse what would kill or fool SUMO, keep what routes are checked against."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Mapping

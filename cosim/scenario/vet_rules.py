@@ -5,8 +5,6 @@ accepts NaN, infinities and negative speeds silently (docs/sumo.md). Words such 
 `departPos="random"` are legal where the schema has them; SUMO itself refuses a word it does not know.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass

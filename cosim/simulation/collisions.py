@@ -1,7 +1,5 @@
 """Finds collisions: SUMO's own list and our oriented-box check for AVs, once per pair, attributed."""
 
-from __future__ import annotations
-
 import libsumo
 import numpy as np
 

@@ -1,7 +1,5 @@
 """Commands become libsumo calls, each with a receipt that says whether it was carried out, and why not."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Converts SUMO's positions and angles of vehicles to ours; needs no SUMO: file readers use it too."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 

@@ -1,7 +1,5 @@
 """SUMO's conventions end here: front bumper and degrees clockwise from north become centre and radians."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Makes each HV in SUMO drive like its class of Table II (`cosim.scenario.behaviors`)."""
 
-from __future__ import annotations
-
 import hashlib
 
 import libsumo

@@ -1,7 +1,5 @@
 """An in-memory Simulator without SUMO: a straight road, IDM followers, commanded AVs. For your tests."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations

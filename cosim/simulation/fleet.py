@@ -1,7 +1,5 @@
 """Says which vehicles are AVs and mission vehicles, and gives each departed vehicle its driver."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 

@@ -5,8 +5,6 @@ change lanes if a_n' > -b_safe and (a_ego' - a_ego) + p [(a_n' - a_n) + (a_o' - 
 Kesting, Treiber and Helbing 2007). n: the new follower, o: the old one; ': after the change.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """A net alone, read by SUMO into a RoadMap: for files of traffic that was driven elsewhere."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import libsumo

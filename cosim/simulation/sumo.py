@@ -1,7 +1,5 @@
 """Starts SUMO through libsumo and advances it one decision at a time: the only simulation of its process."""
 
-from __future__ import annotations
-
 import re
 import tempfile
 from collections.abc import Mapping, Sequence

@@ -5,8 +5,6 @@ anew (1.5 of 7 ms, perf). Xerces counts its starts (XMLPlatformUtils::Initialize
 never ended, makes all others free.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 from pathlib import Path

@@ -1,7 +1,5 @@
 """One thread, deterministic kernels for whatever torch a policy brought (definitions.md, Reproducibility)."""
 
-from __future__ import annotations
-
 import sys
 
 

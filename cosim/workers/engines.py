@@ -1,7 +1,5 @@
 """Who drives the tasks: one small protocol, and the engine that uses processes of this machine."""
 
-from __future__ import annotations
-
 import os
 import queue
 import threading

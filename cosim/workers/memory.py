@@ -1,7 +1,5 @@
 """Freed memory stays with the process: every step's arrays reuse warm pages, none are faulted anew."""
 
-from __future__ import annotations
-
 import ctypes
 
 # glibc's malloc.h

@@ -5,8 +5,6 @@ are treated alike and SUMO never runs inside a Ray process. What Ray adds is the
 node or without: its task goes back and another actor takes it.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from collections import Counter

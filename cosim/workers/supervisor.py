@@ -3,8 +3,6 @@
 The hosted object (`cosim.workers.tasks.Hosted`) is built in the process; nothing here knows what it does.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import signal

@@ -1,7 +1,5 @@
 """Tasks and their outcomes, and who gets which task next: all that an engine knows of the work it spreads."""
 
-from __future__ import annotations
-
 import threading
 from collections import Counter, deque
 from collections.abc import Callable, Iterable

@@ -1,7 +1,5 @@
 """Every policy by name: the explicit tables that `--policy` reads; they need no torch."""
 
-from __future__ import annotations
-
 import importlib
 from collections.abc import Callable
 from dataclasses import dataclass

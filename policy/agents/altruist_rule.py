@@ -4,8 +4,6 @@ It shows what altruism can gain without learning anything (docs/results/altruism
 for the learned policies. AVs share what they know (V2V), so one guide is chosen for all of them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """The approaches of Table III as configurations of one agent: what each network sees, and what masks it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 

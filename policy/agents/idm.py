@@ -1,7 +1,5 @@
 """AVs that nobody commands: SUMO drives them, egoistic or with its default courtesy."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

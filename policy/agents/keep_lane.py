@@ -1,7 +1,5 @@
 """AVs that hold their lane and speed: with nobody guarding them, how hard is the traffic?"""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from cosim.types import Decision, History, MetaAction

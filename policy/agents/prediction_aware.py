@@ -1,7 +1,5 @@
 """The prediction-aware agent: chain of predictions, value network, safety prioritizer (P, figure 2)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path

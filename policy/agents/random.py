@@ -1,7 +1,5 @@
 """AVs that draw their meta-action at random: the least that every policy must beat."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from cosim.types import Decision, History, MetaAction

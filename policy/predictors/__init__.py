@@ -1,7 +1,5 @@
 """Kinematic predictors: P's eight in one table, and a user's own."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 

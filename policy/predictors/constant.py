@@ -1,7 +1,5 @@
 """The two simplest predictors (P's CS and CA): constant speed, and constant acceleration until standstill."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from cosim.types import HEADING, SPEED, Bools, Floats

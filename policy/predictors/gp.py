@@ -1,7 +1,5 @@
 """Gaussian-process predictors (P, section IV-C): "indirect" by speed and heading, "direct" by positions."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

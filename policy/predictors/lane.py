@@ -3,8 +3,6 @@
 Not one of P's eight: it knows the road and where on it a vehicle is, which they do not.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from cosim.road import RoadMap

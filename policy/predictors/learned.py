@@ -1,7 +1,5 @@
 """P's learned baselines: LSTM and autoencoder, each direct (positions) and indirect (speed and heading)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal

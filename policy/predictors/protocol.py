@@ -1,7 +1,5 @@
 """What every kinematic predictor promises: a history of states in, the next frames of states out."""
 
-from __future__ import annotations
-
 from typing import Protocol
 
 from cosim.types import Bools, Floats

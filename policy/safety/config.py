@@ -1,7 +1,5 @@
 """Thresholds of the safety prioritizer and the driving limits behind them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

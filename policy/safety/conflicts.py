@@ -1,7 +1,5 @@
 """First contacts of the ego's futures with other vehicles, and the gaps around it."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

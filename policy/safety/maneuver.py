@@ -1,7 +1,5 @@
 """The ego's possible futures: where each meta-action leads it, along its real lane centre lines."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import NamedTuple
 

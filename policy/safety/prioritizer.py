@@ -10,8 +10,6 @@ the new follower that a lane change asks to brake. Algorithm 3 takes the best ac
 AVs decide front to back, each knowing the rollouts chosen before it (V2V intentions, switchable).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import NamedTuple

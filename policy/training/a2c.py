@@ -1,7 +1,5 @@
 """Multi-agent advantage actor-critic after T: shared weights, n-step returns, one pass over fresh drives."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 

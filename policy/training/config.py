@@ -1,7 +1,5 @@
 """One training run as one document: sizes, reward, exploration and schedule (policy/configs/*.yaml)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 from cosim.rewards import RewardConfig

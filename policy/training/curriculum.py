@@ -1,7 +1,5 @@
 """What is driven when: lessons, seeds, exploration and who drives, all drawn from one seed."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field

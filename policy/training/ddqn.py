@@ -1,7 +1,5 @@
 """Safe double Q-learning after P's algorithm 4: one update."""
 
-from __future__ import annotations
-
 from copy import deepcopy
 from dataclasses import dataclass
 

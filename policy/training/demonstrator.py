@@ -1,7 +1,5 @@
 """The scripted driver whose actions a learner imitates: the demonstrator of guided episodes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

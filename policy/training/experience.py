@@ -1,7 +1,5 @@
 """One AV's trajectory of one episode, as learners store it: every frame once, no stack twice."""
 
-from __future__ import annotations
-
 import zipfile
 from dataclasses import dataclass
 from functools import partial

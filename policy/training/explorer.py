@@ -1,7 +1,5 @@
 """The agent while it learns: explores, and records the trajectories of its learning AVs."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The three HPNs that are trained and compared, and how: the shipped one, and two ablations of it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path

@@ -6,8 +6,6 @@ all frames of the horizon at once. It saturates when a box misses altogether: ha
 than nothing, ten metres off are as wrong as twenty.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial

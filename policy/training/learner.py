@@ -1,7 +1,5 @@
 """What both ways of learning have: a value network, its optimiser, and steps towards demonstrations."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

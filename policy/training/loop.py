@@ -6,8 +6,6 @@ and learning rates follow from (seed, update), never from a generator that would
 that goes on after `kill -9` sees the very batches that the uninterrupted one sees.
 """
 
-from __future__ import annotations
-
 import csv
 import json
 import math

@@ -1,7 +1,5 @@
 """Trains the HPN's map branch as P does: from true histories, the next block of maps and kinematics."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial

@@ -1,7 +1,5 @@
 """What a supervised learner learns from: one decision of a recorded episode, and what came of it."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple

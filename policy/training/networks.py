@@ -1,7 +1,5 @@
 """Networks with their optimiser: steps, and a state of named tensors (nothing is ever pickled)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import torch

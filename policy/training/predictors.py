@@ -4,8 +4,6 @@ All of them see the same windows of recorded episodes and minimise the same figu
 over the horizon (PE), so that their table compares methods and not objectives.
 """
 
-from __future__ import annotations
-
 import math
 import tempfile
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """Replay buffer of whole trajectories: n-step samples, in fixed parts from rare and common moments."""
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass
 from typing import NamedTuple

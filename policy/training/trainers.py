@@ -3,8 +3,6 @@
 Both learn from demonstrations first, where their configuration wants it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

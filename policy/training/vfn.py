@@ -6,8 +6,6 @@ latest trajectories only: it waits for them. So every number depends on the conf
 not on which process was faster, and a killed run goes on exactly.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import time

@@ -3,8 +3,6 @@
 Only figures of one block stand side by side: its series met the same traffic on the same seeds.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable
 from dataclasses import dataclass

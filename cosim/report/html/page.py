@@ -1,7 +1,5 @@
 """Puts the report together: verdict, tables, plots, worst episodes, failures, manifest -> one HTML text."""
 
-from __future__ import annotations
-
 import json
 import math
 import shlex

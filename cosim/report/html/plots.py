@@ -3,8 +3,6 @@
 matplotlib's SVG made fit for a page: colours of the page's theme, its fonts, ids that do not clash.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import math

@@ -1,7 +1,5 @@
 """The tables of the report, as plain cells: what is written, what it is sorted by, what is said beside it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

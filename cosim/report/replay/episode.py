@@ -1,7 +1,5 @@
 """`cosim replay`: find an episode in a run folder, drive it once more, prove that it is the same, draw it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

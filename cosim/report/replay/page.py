@@ -5,8 +5,6 @@ are centimetres; their second difference is an acceleration of a few units, whic
 `assets/data.js` is the way back.
 """
 
-from __future__ import annotations
-
 import base64
 import gzip
 import html

@@ -1,7 +1,5 @@
 """The road of one moment from above, drawn by Pillow twice as fine as it is shown."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from functools import lru_cache

@@ -4,8 +4,6 @@ Several episodes (the same seed with other policies, say) are drawn one above th
 camera of its own, at equal times since they began.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path

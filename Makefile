@@ -1,4 +1,4 @@
-# `make demo` and `make test` are all the set-up there is (README).
+# `make demo` and `make test` are all the set-up there is (README); `make quick` after every change.
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
@@ -6,14 +6,29 @@ RUN ?= runs/demo
 SCALE ?= 1
 WORKERS ?= 2
 SAMPLE ?= 20
+PROCESSES ?= 2
+# A file's tests stay in one process, in the order of the folders: the longest files come first. A core each: no threads.
+PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(PROCESSES) --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test check nets results pages results-small audit image smoke clean
+.PHONY: demo test quick unit check kernels nets results pages results-small audit image smoke clean
 
 demo: $(VENV)/.installed
 	$(BIN)/cosim run merge --demand contested --policy vfn-p --out $(RUN)
 
-test: $(VENV)/.installed-dev check
-	$(BIN)/python -m pytest
+# Lint and kernels side by side, so that the tests' processes do not compile the same ones at once.
+test: $(VENV)/.installed-dev
+	$(MAKE) --no-print-directory -j 2 check kernels
+	$(PYTEST)
+
+# What a developer wants to know after every change: lint, and the tests that neither train nor need SUMO.
+quick: $(VENV)/.installed-dev
+	$(MAKE) --no-print-directory -j 2 check unit
+
+unit: kernels
+	$(PYTEST) tests/unit
+
+kernels: $(VENV)/.installed-dev
+	$(BIN)/cosim run merge --policy vfn-p --duration 1 --json >/dev/null
 
 check: $(VENV)/.installed-dev
 	$(BIN)/ruff check .

@@ -28,9 +28,9 @@ import torch
 
 from benchmarks.prediction_maps import AGENTS, DECISION, PENETRATION, Gatherer
 from benchmarks.tables import markdown_row, write_page
+from cosim.host import Host
 from cosim.learning.configuration import configuration
 from cosim.learning.rollouts import Rollouts
-from cosim.runner import Runner
 from cosim.scenario import Fleet, Scenario, load
 from cosim.seeding import TUNING_SEEDS
 from cosim.types import EpisodeResult, History, PolicyContext
@@ -40,8 +40,8 @@ from policy.agents.approaches import AgentConfig, compact, paper
 from policy.agents.prediction_aware import PredictionAware
 from policy.training.config import agent_config
 from policy.training.curriculum import Drive, Drove, Lesson
-from policy.training.ddqn import Learner
-from policy.training.replay import Replay
+from policy.training.ddqn import DdqnLearner
+from policy.training.replay_buffer import ReplayBuffer
 
 SIZES: Mapping[str, Callable[[str], AgentConfig]] = {"compact": compact, "paper": paper}
 POLICY = "vfn-p"
@@ -102,7 +102,7 @@ def decisions(
 
 def closed_loop(scenario: Scenario, episodes: int) -> dict[str, float]:
     """ms a decision of whole episodes driven by the compact agent in one process: who spends the time."""
-    with Worker(Runner, scenario, POLICY, SVO) as worker:
+    with Worker(Host, scenario, POLICY, SVO) as worker:
         worker.call("run", TUNING_SEEDS.start)  # compilation
         done: list[EpisodeResult] = [worker.call("run", TUNING_SEEDS.start + 1 + k) for k in range(episodes)]
     steps = sum(result.steps for result in done)
@@ -117,8 +117,8 @@ def training(config: str, lesson: Lesson, episodes: int) -> dict[str, float]:
     """
     file = configuration(config).file
     agent = agent_config(POLICY, file)
-    learner = Learner(agent.vfn, file.training.ddqn, seed=0)
-    replay = Replay(file.training.replay)
+    learner = DdqnLearner(agent.vfn, file.training.ddqn, seed=0)
+    replay = ReplayBuffer(file.training.replay)
     with Rollouts(1, POLICY, agent, file.explore, file.reward) as actors:
 
         def drive(seed: int) -> Any:

@@ -14,8 +14,8 @@ from benchmarks.papers.driving import Order, Results, Settings
 from benchmarks.papers.pages import Job, heading, save
 from benchmarks.tables import lines_of, table
 from benchmarks.targets import farther
+from benchmarks.worlds import WORLDS
 
-WORLDS = ("merge", "exit", "roundabout", "intersection", "highway")
 POLICIES = ("idm", "idm-courteous", "altruist-rule", "keep-lane")
 EPISODES = 40  # a world
 COLUMNS = (

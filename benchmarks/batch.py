@@ -23,7 +23,7 @@ from pathlib import Path
 
 from cosim.batch import execution as batch
 from cosim.batch import matrix
-from cosim.batch.case_runner import CaseRunner
+from cosim.batch.episode_runner import EpisodeRunner
 from cosim.batch.spec import Spec
 from cosim.batch.store import Store
 from cosim.workers.engines import LocalEngine
@@ -56,7 +56,7 @@ def measured(plan: matrix.Plan, workers: int, progress: Progress) -> Run:
     with tempfile.TemporaryDirectory() as folder, Store.in_folder(Path(folder)) as store:
         batch.begin(plan, store, {})
         began = time.perf_counter()
-        batch.drive(plan, store, LocalEngine(CaseRunner, workers=workers), Path(folder), arrived)
+        batch.drive(plan, store, LocalEngine(EpisodeRunner, workers=workers), Path(folder), arrived)
         wall = time.perf_counter() - began
         rows = store.rows()
     if any(row["status"] != "ok" for row in rows):

@@ -57,7 +57,7 @@ class Bare:
             for _ in range(self._steps):
                 step()
                 for name in departed():
-                    self._simulator._bodies[name] = self._simulator._fleet.welcome(name, self._seed)
+                    self._simulator._bodies[name] = self._simulator._fleet.depart(name, self._seed)
             times.append(time.perf_counter() - began)
         return {"total": times}
 
@@ -70,7 +70,7 @@ class Ours:
     """The loop up to the agent: advance, read, draw, keep the history."""
 
     def __init__(self, scenario: Scenario, observation: ObservationConfig) -> None:
-        from cosim.observation import Observer
+        from cosim.observation.observer import Observer
         from cosim.simulation.sumo import SumoSimulator
 
         self._simulator = SumoSimulator(scenario)

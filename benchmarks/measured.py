@@ -19,6 +19,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from sumo_scenarios import names
+
 RESULTS = Path("docs/results")
 PREDICTED = (  # what `cosim bench predict` leaves of figures
     *("position_error.png", "map_error.png", "hpn_training.png"),
@@ -57,6 +59,7 @@ def prediction_speed(place: Place) -> list[list[str]]:
     """What predicting four seconds costs."""
     size = ["--size", "compact", "--threads", "1"] if place.small else ["--threads", "2"]
     flags = ["--rounds", "1", "--decisions", "2" if place.small else "12"]
+    flags += ["--backend", "eager"] if place.small else []  # inductor compiles C++ for a minute
     return [["benchmarks.prediction_maps", *size, *flags, "--out", str(place.out / "prediction_speed.md")]]
 
 
@@ -77,10 +80,15 @@ def performance(place: Place) -> list[list[str]]:
     if place.small:
         record += ["--scenario", "merge", "--seeds", "100000:100001", "--duration", "8"]
     else:
-        worlds = ("exit", "merge", "roundabout", "intersection", "highway")
-        record += [word for world in worlds for word in ("--scenario", world)] + ["--seeds", "100000:100004"]
+        record += [word for world in names() for word in ("--scenario", world)] + ["--seeds", "100000:100004"]
     flags = ["--recordings", where, "--out", str(place.out / "performance.md")]
     return [record, ["benchmarks.performance", *flags, *(["--small"] if place.small else [])]]
+
+
+def startup(place: Place) -> list[list[str]]:
+    """How long a short command takes to start."""
+    flags = ["--rounds", "1" if place.small else "7"]
+    return [["benchmarks.startup", *flags, "--out", str(place.out / "startup.md")]]
 
 
 def reward_balance(place: Place) -> list[list[str]]:
@@ -121,6 +129,7 @@ PAGES = (
     Page("agent", agent, ("agent.md",)),
     Page("prediction_speed", prediction_speed, ("prediction_speed.md",)),
     Page("performance", performance, ("performance.md",)),
+    Page("startup", startup, ("startup.md",)),
     Page("reward_balance", reward_balance, ("reward_balance.md",)),
     Page("reward_by_driving", reward_by_driving, ("reward_by_driving.md",)),
     Page(

@@ -27,7 +27,9 @@ import numpy as np
 import torch
 
 from benchmarks.tables import markdown_row, write_page
+from cosim.episode import Episode, Hook, Step
 from cosim.geometry.raster import rasterize_road
+from cosim.host import Host
 from cosim.scenario import Fleet, Scenario, load
 from cosim.types import COMPACT, PAPER, History, ObservationConfig
 from cosim.workers.memory import keep_freed_memory
@@ -49,28 +51,37 @@ class Gatherer:
     """Lives in a worker: drives an episode and keeps what 8 AVs saw."""
 
     def __init__(self, scenario: Scenario, observation: ObservationConfig) -> None:
-        from cosim.episode import Episode
-        from cosim.simulation.sumo import SumoSimulator
-
-        self._simulator = SumoSimulator(scenario, history=observation.frames)
-        self._episode = Episode(scenario, self._simulator, observation)
+        self._host = Host(scenario, "idm", 0.0, observation=observation)
 
     def gather(self, seed: int, decisions: int) -> tuple[Any, list[Any]]:
         """The road, and histories of the first AGENTS AVs (copies)."""
-        kept: list[dict[str, History]] = []
-        histories = self._episode.start(seed)
-        while not self._episode.over and len(kept) < decisions:
-            chosen = sorted(histories)[:AGENTS]
-            if len(chosen) == AGENTS:
-                kept.append(
-                    {a: histories[a]._replace(velocity_map=histories[a].velocity_map.copy()) for a in chosen}
-                )
-            histories = self._episode.advance({})
-        return self._simulator.road, kept
+        kept = Kept()
+        self._host.run(seed, hooks=[kept])
+        return self._host.simulator.road, kept.histories[:decisions]
 
     def close(self) -> None:
         """End SUMO."""
-        self._simulator.close()
+        self._host.close()
+
+
+class Kept(Hook):
+    """Copies of what the first AGENTS AVs observe at every decision."""
+
+    def __init__(self) -> None:
+        self.histories: list[dict[str, History]] = []
+
+    def on_start(self, episode: Episode) -> None:
+        """The first one."""
+        chosen = sorted(episode.histories)[:AGENTS]
+        if len(chosen) == AGENTS:
+            seen = {a: episode.histories[a] for a in chosen}
+            self.histories.append(
+                {a: h._replace(velocity_map=h.velocity_map.copy()) for a, h in seen.items()}
+            )
+
+    def on_step(self, episode: Episode, step: Step) -> None:
+        """The next one."""
+        self.on_start(episode)
 
 
 def median_ms(work: Callable[[], object], rounds: int) -> float:
@@ -115,7 +126,7 @@ def parts(road: Any, kept: list[Any], size: ObservationConfig, chain: ChainConfi
     return out
 
 
-def map_branch(config: MapBranchConfig, horizon: int, rounds: int) -> dict[str, float | str]:
+def map_branch(config: MapBranchConfig, horizon: int, rounds: int, backend: str) -> dict[str, float | str]:
     """ms of the map branch's whole chain for 8 AVs, by the way it is computed."""
     torch.manual_seed(0)
     branch = MapBranch(config).eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -133,7 +144,7 @@ def map_branch(config: MapBranchConfig, horizon: int, rounds: int) -> dict[str, 
         window = past
         with torch.inference_mode():
             for _ in range(steps):
-                guess = step([window], rows)[0]
+                guess = step(window, rows)[0]
                 window = torch.cat([window, guess.to(window.dtype)], 1)[:, -seen:]
 
     note("eager", median_ms(lambda: chain(branch), rounds))
@@ -144,7 +155,7 @@ def map_branch(config: MapBranchConfig, horizon: int, rounds: int) -> dict[str, 
 
     note("ONNX Runtime", onnx(branch, past, rows, steps, rounds))
     try:
-        compiled = torch.compile(branch)
+        compiled = torch.compile(branch, backend=backend)
         note("compiled", median_ms(lambda: chain(compiled), rounds))
     except Exception as error:  # needs a C++ compiler on the machine
         note("compiled", f"not possible here: {type(error).__name__}")
@@ -224,6 +235,7 @@ def main() -> None:
     parser.add_argument("--decisions", type=int, default=40)
     parser.add_argument("--rounds", type=int, default=5, help="of the map branch's chain")
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--backend", default="inductor", help="of torch.compile; eager needs no C++ compiler")
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--out", type=Path, metavar="FILE.md")
     args = parser.parse_args()
@@ -245,7 +257,7 @@ def main() -> None:
             spent = parts(road, kept, size, chain)
             say(f"  whole prediction: {_ratio(spent['whole prediction'])}")
             vehicles = round(float(np.mean([len(join(h).vehicles) for h in kept])), 1)
-            ways = map_branch(branch, chain.horizon, args.rounds)
+            ways = map_branch(branch, chain.horizon, args.rounds, args.backend)
             result[label] = {"parts": spent, "map branch": ways, "vehicles": vehicles}
     if args.json:
         print(json.dumps(result))

@@ -2,7 +2,7 @@
 
     python -m benchmarks.real_nets [--duration S] [--out docs/results/real_nets.md]
 
-Runs `cosim run` on A10KW.sumocfg to its end. Needs `pip install cosim[tools]`.
+Runs `cosim run` on A10KW.sumocfg to its end. Needs `pip install cosim-sumo[tools]`.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def page(found: dict[str, Any], command: str) -> list[str]:
         "# A net that none of us wrote",
         "",
         f"Made by `{command}`: A10KW is a motorway interchange with bridges that the `eclipse-sumo` package",
-        "ships (`pip install cosim[tools]`), driven as it stands:",
+        "ships (`pip install cosim-sumo[tools]`), driven as it stands:",
         "",
         "```",
         f"cosim run A10KW.sumocfg {' '.join(FLAGS)} --json",

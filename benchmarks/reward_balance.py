@@ -3,11 +3,11 @@
     python -m benchmarks.reward_balance [--seeds 150100:150106] [--scenario merge] [--out FILE]
     python -m benchmarks.reward_balance --ways [--seeds 150100:150106] [--scenario merge] [--out FILE]
 
-The first page: the mentor drives every AV of `contested` as an altruist and as an egoist, and the sum of all
-AVs' rewards of a whole episode at phi = 60 degrees is compared under several settings of equation (6). The
-second: mean reward per AV and decision at phi = 45 degrees of crawling, holding lane and speed, IDM, the
-scripted altruist and the learned agent. Same drives for all rewards, equal tuning seeds. A reward under which
-the altruist earns less cannot teach altruism, however well it is learned. `--out` writes the page.
+The first page: the demonstrator drives every AV of `contested` as an altruist and as an egoist, and the sum
+of all AVs' rewards of a whole episode at phi = 60 degrees is compared under several settings of equation
+(6). The second: mean reward per AV and decision at phi = 45 degrees of crawling, holding lane and speed, IDM,
+the scripted altruist and the learned agent. Same drives for all rewards, equal tuning seeds. A reward under
+which the altruist earns less cannot teach altruism, however well it is learned. `--out` writes the page.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from benchmarks.papers.agents import Agent
 from benchmarks.papers.driving import Order
 from benchmarks.tables import markdown_row
 from benchmarks.unled import Unled
-from cosim.batch.case_runner import CaseRunner
-from cosim.episode import Episode
+from benchmarks.worlds import WITH_MISSION, WORLDS
+from cosim.batch.episode_runner import EpisodeRunner
+from cosim.host import Earnings
 from cosim.learning.configuration import configuration
 from cosim.learning.prediction_data import spread
 from cosim.report import statistics
-from cosim.rewards import RewardConfig, rewards
-from cosim.runner import Runner
-from cosim.scenario.episode_id import Case
-from cosim.types import Decision, Floats32, History, Kind, MetaAction, Policy, PolicyContext
+from cosim.rewards import RewardConfig
+from cosim.scenario.episode_id import EpisodeId
+from cosim.types import Floats32, MetaAction, Policy, PolicyContext
 from cosim.workers.engines import LocalEngine
 from cosim.workers.tasks import Progress, Task
 from policy.agents import make
@@ -43,8 +43,6 @@ from policy.agents.prediction_aware import Inputs
 from policy.training.config import agent_config
 from policy.training.explorer import Explorer
 
-WORLDS = ("merge", "exit", "roundabout", "intersection")  # those with a mission vehicle
-EVERY_WORLD = (*WORLDS, "highway")
 DEMANDS = {"contested": "moderate", "dense": "mixed"}  # demand -> drivers
 COMPACT = configuration("compact").file
 TRIED = {
@@ -60,15 +58,15 @@ LEARNED = {
     "T's equation (2), defaults: no decay, mission 20, own maneuvers cost": RewardConfig(variant="t"),
     "compact.yaml: no decay, 250 m, social 0.02, mission 150": COMPACT.reward,
 }
-MENTORED_PHI, PHI = 60.0, 45.0  # degrees at which drives are paid
+DEMONSTRATED_PHI, PHI = 60.0, 45.0  # degrees at which drives are paid
 WANTED, AGENT = "altruist-rule", "vfn-p"
 
 
-class Mentored(Explorer):
-    """The mentor drives every AV, guarded by the mask, as in a guided episode of the training."""
+class Demonstrated(Explorer):
+    """The demonstrator drives every AV, guarded by the mask, as in a guided episode of the training."""
 
     def __init__(self) -> None:
-        super().__init__("mentor", agent_config("vfn-p", COMPACT), COMPACT.explore)
+        super().__init__("demonstrator", agent_config("vfn-p", COMPACT), COMPACT.explore)
 
     def reset(self, context: PolicyContext) -> None:
         """A new episode."""
@@ -102,76 +100,51 @@ WAYS: dict[str, Callable[[], Policy]] = {
 }
 
 
-class PaidEpisode(Episode):
-    """An episode that adds up what several rewards pay all AVs."""
+class Paid(EpisodeRunner):
+    """Drives the AVs of a case in one of WAYS, or as the demonstrator does, and adds up what rewards pay."""
 
-    def pay_by(self, settings: Mapping[str, RewardConfig], phi: float) -> None:
-        """From the next start on; phi in rad."""
-        self._settings, self._phi = settings, phi
+    def policy(self, case: EpisodeId) -> Policy:
+        """One of WAYS, or the demonstrator."""
+        return WAYS[case.policy]() if case.policy in WAYS else Demonstrated()
 
-    def start(self, seed: int) -> dict[str, History]:
-        """As `Episode.start`."""
-        self.earned, self.paid = dict.fromkeys(self._settings, 0.0), 0
-        return super().start(seed)
-
-    def advance(self, decisions: Mapping[str, Decision]) -> dict[str, History]:
-        """As `Episode.advance`."""
-        before = self.snapshot
-        histories = super().advance(decisions)
-        avs = [name for name, kind in zip(before.ids, before.kind, strict=True) if kind == Kind.AV]
-        actions = {av: decision.action for av, decision in decisions.items()}
-        for name, config in self._settings.items():
-            terms = rewards(before, self.snapshot, avs, actions, self._phi, config, self.events.collisions)
-            self.earned[name] += sum(t.total for t in terms.values())
-        self.paid += len(avs)
-        return histories
-
-
-class Paid(CaseRunner):
-    """Drives the AVs of a case in one of WAYS, or as the mentor does, and adds up what each reward pays."""
-
-    def policy(self, case: Case) -> Policy:
-        """One of WAYS, or the mentor."""
-        return WAYS[case.policy]() if case.policy in WAYS else Mentored()
-
-    def open(self, case: Case, warnings: tuple[str, ...]) -> Runner:
-        """The case's runner with an episode that pays."""
-        runner = super().open(case, warnings)
-        if not isinstance(runner._episode, PaidEpisode):
-            plain = runner._episode
-            runner._episode = PaidEpisode(plain.scenario, plain.simulator, plain.observation)
-        return runner
-
-    def run(self, case: Case, settings: Any, phi_deg: Any, progress: Progress) -> dict[str, Any]:
-        """`earned`: sums over all AVs and decisions; `each`: the same per AV and decision that was planned,
-        those after a crash having earned nothing."""
-        episode = self.open(case, ())._episode
-        assert isinstance(episode, PaidEpisode)
-        episode.pay_by(settings, math.radians(phi_deg))
-        document = super().run(case, (), None, progress)
-        planned = round(episode.scenario.duration / episode.scenario.timing.decision)
-        share = planned * episode.paid / max(document["steps"], 1)
-        each = {name: earned / max(share, 1.0) for name, earned in episode.earned.items()}
-        return document | {"earned": episode.earned, "each": each}
+    def run(  # type: ignore[override]
+        self, case: EpisodeId, settings: Mapping[str, RewardConfig], phi: float, progress: Progress
+    ) -> dict[str, Any]:
+        """`earned`: sums over all AVs and decisions, paid at `phi` degrees; `each`: the same per AV and
+        decision that was planned, those after a crash having earned nothing."""
+        host = self.open(case, ())
+        hooks = {name: Earnings(config, math.radians(phi)) for name, config in settings.items()}
+        result = host.run(case.seed, progress, hooks=list(hooks.values()))
+        scenario = host.episode.scenario
+        planned = round(scenario.duration / scenario.timing.decision)
+        paid = len(next(iter(hooks.values())).totals)  # decisions of single AVs
+        share = max(planned * paid / max(result.steps, 1), 1.0)
+        earned = {name: sum(hook.totals) for name, hook in hooks.items()}
+        each = {name: total / share for name, total in earned.items()}
+        return result.document() | {"earned": earned, "each": each}
 
 
 def driven(
-    cases: Sequence[Case], settings: Mapping[str, RewardConfig], phi: float, workers: int
+    cases: Sequence[EpisodeId], settings: Mapping[str, RewardConfig], phi: float, workers: int
 ) -> list[dict[str, Any]]:
     """What `Paid.run` returned for each case."""
     tasks = [Task(case.key, case.cell, (case, settings, phi)) for case in cases]
     return spread(LocalEngine(Paid, workers=workers), tasks, "rewards")
 
 
-def case_of(policy: str, world: str, demand: str, svo_deg: float) -> Case:
+def case_of(policy: str, world: str, demand: str, svo_deg: float) -> EpisodeId:
     """Any seed of it."""
     return Order(Agent(policy), world, demand, DEMANDS[demand], 1, svo_deg).case
 
 
 def balance(worlds: Sequence[str], seeds: range, command: str, workers: int) -> list[str]:
     """The altruist's gain, paired, as a share of what the egoist earns."""
-    cells = [case_of("mentor", world, "contested", phi) for world in worlds for phi in (0.0, MENTORED_PHI)]
-    found = driven([c.with_seed(s) for c in cells for s in seeds], TRIED, MENTORED_PHI, workers)
+    cells = [
+        case_of("demonstrator", world, "contested", phi)
+        for world in worlds
+        for phi in (0.0, DEMONSTRATED_PHI)
+    ]
+    found = driven([c.with_seed(s) for c in cells for s in seeds], TRIED, DEMONSTRATED_PHI, workers)
     drives: dict[str, dict[bool, list[dict[str, Any]]]] = {w: {False: [], True: []} for w in worlds}
     for drive in found:
         drives[drive["scenario"]][drive["svo_deg"] > 0.0].append(drive)
@@ -211,16 +184,15 @@ def by_way(worlds: Sequence[str], seeds: range, command: str, workers: int) -> l
     lines = [
         "# What each way of driving earns under each reward",
         "",
-        f"`{command}`: all AVs drive one way, on the same {len(seeds)} tuning seeds a world and",
-        "demand, `contested` among moderate and `dense` among mixed drivers (`lc2013`, preset `unguarded`).",
-        "Mean reward per AV and decision at phi 45 degrees with bootstrap 95 % interval over episodes; the",
-        "decisions that a crash leaves undriven have earned nothing. Crawling is guarded by the safety",
-        "prioritizer, `keep-lane` by nobody; `idm`, and `altruist-rule` where it commands nothing, are "
-        "driven",
-        "by SUMO, so that their maneuvers cost nothing under T's reward. The way that is wanted in "
-        "`contested`",
-        f"is `{WANTED}`: the last line of each table says whether it earns more than the best of the other",
-        "scripted ways (by mean), and how much, paired.",
+        f"`{command}`:",
+        f"all AVs drive one way, on the same {len(seeds)} tuning seeds a world and demand, `contested` among",
+        "moderate and `dense` among mixed drivers (`lc2013`, preset `unguarded`). Mean reward per AV and",
+        "decision at phi 45 degrees with bootstrap 95 % interval over episodes; the decisions that a crash",
+        "leaves undriven have earned nothing. Crawling is guarded by the safety prioritizer, `keep-lane` by",
+        "nobody; `idm`, and `altruist-rule` where it commands nothing, are driven by SUMO, so that their",
+        "maneuvers cost nothing under T's reward.",
+        f"The way that is wanted in `contested` is `{WANTED}`: the last line of each table says whether it",
+        "earns more than the best of the other scripted ways (by mean), and how much, paired.",
         "",
     ]
     for demand, (reward, title) in itertools.product(DEMANDS, enumerate(LEARNED)):
@@ -266,7 +238,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     seeds = args.seeds or ("150100:150106" if args.ways else "150100:150120")
-    worlds = args.scenario or list(EVERY_WORLD if args.ways else WORLDS)
+    worlds = args.scenario or list(WORLDS if args.ways else WITH_MISSION)
     flags = "".join(f" --scenario {w}" for w in args.scenario)
     command = f"python -m benchmarks.reward_balance{' --ways' if args.ways else ''} --seeds {seeds}{flags}"
     make_page = by_way if args.ways else balance

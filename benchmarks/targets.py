@@ -12,6 +12,7 @@ from typing import Literal, NamedTuple
 
 from benchmarks.arms import differences, of_world
 from benchmarks.tables import found
+from benchmarks.worlds import WITH_MISSION
 from cosim.report import wording
 from cosim.report.compare import Compared, PairedFigure
 from cosim.report.figures import RATES
@@ -114,7 +115,7 @@ def contested(runs: Mapping[str, Run], worlds: Sequence[str], arms: Arms) -> Ite
         differences(runs[other], runs[arms.agent]) for other in (arms.idm, arms.twin, arms.rule)
     )
     for world in worlds:
-        if world == "highway":  # nobody has a mission there
+        if world not in WITH_MISSION:
             continue
 
         def line(target: str, text: str, verdict: str, world: str = world) -> Finding:
@@ -155,7 +156,7 @@ def contested(runs: Mapping[str, Run], worlds: Sequence[str], arms: Arms) -> Ite
 
 def farther(pairs: Compared) -> Figure:
     """How many times as far the mission vehicle travels: ratio of the means, over pairs."""
-    measure = pairs.known["dt_mission_m"]
+    measure = pairs.figures["dt_mission_m"].measure
     before, after = (measure.values([pair[k] for pair in pairs.group.pairs]) for k in (0, 1))
     change = paired_change(before, after, pairs.seed)
     return Figure(1.0 + change.value, 1.0 + change.low, 1.0 + change.high)

@@ -12,13 +12,10 @@ if TYPE_CHECKING:
     from cosim.observation.view import View
 
 __all__ = ["Session", "StepResult", "View", "__version__", "open"]
+__version__ = "0.1.0"
 
 
 def __getattr__(name: str) -> object:
-    if name == "__version__":
-        from importlib.metadata import version
-
-        return version("cosim")
     if name in __all__:
         from cosim.envs import session
 

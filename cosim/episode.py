@@ -1,22 +1,25 @@
-"""The straight loop: observe, decide, command, advance. Everything else in cosim walks this one path."""
+"""The one loop: observe, decide, command, advance; hooks see every step of it."""
 
 from __future__ import annotations
 
 import hashlib
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from typing import NamedTuple
 
 import numpy as np
 
 from cosim.control import to_commands
-from cosim.metrics import MetricContext, Metrics
-from cosim.observation import Observer
+from cosim.metrics import MetricContext, MetricFactory, Metrics, joined
+from cosim.observation.observer import Observer
 from cosim.scenario import Scenario
 from cosim.scenario.manifest import manifest
 from cosim.seeding import generator
 from cosim.types import (
     Collision,
+    Command,
     Decision,
     EpisodeResult,
     Events,
@@ -36,23 +39,59 @@ NO_ROOM = 0.05
 Progress = Callable[[float, float], None]  # simulated s so far, of s in all
 
 
+class Step(NamedTuple):
+    """One decision period, carried out."""
+
+    before: Snapshot
+    decisions: Mapping[str, Decision]  # of the AVs that were commanded
+    commands: tuple[Command, ...]
+    receipts: tuple[Receipt, ...]  # of each command
+    frames: tuple[Snapshot, ...]  # since `before`, newest last
+
+    @property
+    def after(self) -> Snapshot:
+        return self.frames[-1]
+
+    @property
+    def events(self) -> Events:
+        """What happened in all of its frames."""
+        return Events.of(self.frames)
+
+
+class Hook:
+    """Sees an episode while it is driven, and changes nothing; override what is needed."""
+
+    def on_start(self, episode: Episode) -> None:
+        """The warm-up is driven (`episode.frames`: its last frames), the clock is at 0."""
+
+    def on_step(self, episode: Episode, step: Step) -> None:
+        """A decision was carried out; `episode.histories` are what the AVs observe now."""
+
+
 class Episode:
     """Many episodes, one after another, of one scenario on one simulator.
 
     `start` and `advance` return what every AV on the road observes; decisions given to `advance` are
     commanded, AVs without one are driven by SUMO. `terminated` after a collision of an AV or the mission
-    vehicle, `truncated` when the scenario's duration is over (definitions.md, Episode).
+    vehicle, `truncated` when the scenario's duration is over (definitions.md, Episode). `metrics` are
+    measured besides those of `cosim.metrics.METRICS`.
     """
 
-    def __init__(self, scenario: Scenario, simulator: Simulator, observation: ObservationConfig) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        simulator: Simulator,
+        observation: ObservationConfig,
+        metrics: Sequence[MetricFactory] = (),
+    ) -> None:
         self.scenario = scenario
         self.simulator = simulator
         self.observation = observation
         self._observer = Observer(simulator.road, observation)
-        self._metrics = Metrics()
+        self._metrics = Metrics(metrics)
 
-    def start(self, seed: int) -> dict[str, History]:
-        """Begin the episode `seed`: warm-up driven, clock at 0."""
+    def start(self, seed: int, hooks: Sequence[Hook] = ()) -> dict[str, History]:
+        """Begin the episode `seed`: warm-up driven, clock at 0; `hooks` see it until the next start."""
         began = time.perf_counter()
         frames = self.simulator.reset(seed)
         self.timings = dict.fromkeys(("reset_s", "simulation_s", "observation_s", "decision_s"), 0.0)
@@ -60,8 +99,8 @@ class Episode:
         self.seed = seed
         self.steps = 0
         self.snapshot: Snapshot = frames[-1]
-        self.receipts: tuple[Receipt, ...] = ()
         self.frames: tuple[Snapshot, ...] = frames
+        self.step: Step | None = None  # the last one
         self.terminated = self.truncated = False
         self._begin = self.snapshot.time
         self._collisions: list[Collision] = []
@@ -79,19 +118,24 @@ class Episode:
         )
         self._metrics.reset(self.snapshot, context)
         self._observer.reset()
-        return self._observe(frames)
+        self._hooks = hooks
+        self._observe(frames)
+        for hook in hooks:
+            hook.on_start(self)
+        return self.histories
 
     def advance(self, decisions: Mapping[str, Decision]) -> dict[str, History]:
         """Carry the decisions out for one decision period."""
         self._trace(decisions)
         self._count(decisions)
-        commands = to_commands(decisions, self._histories, self.scenario.timing.decision)
+        commands = to_commands(decisions, self.histories, self.scenario.timing.decision)
         began = time.perf_counter()
-        self.receipts, self.frames = self.simulator.advance(commands)
+        receipts, self.frames = self.simulator.advance(commands)
         self.timings["simulation_s"] += time.perf_counter() - began
-        self.snapshot = self.frames[-1]
+        self.step = step = Step(self.snapshot, decisions, tuple(commands), receipts, self.frames)
+        self.snapshot = step.after
         self.steps += 1
-        for command, receipt in zip(commands, self.receipts, strict=True):
+        for command, receipt in zip(commands, receipts, strict=True):
             self._tally["lane_changes"] += bool(command.lane_offset and receipt.executed)
             self._tally["blocked"] += not receipt.executed  # of any command
         for frame in self.frames:
@@ -101,22 +145,20 @@ class Episode:
                 c.collider_is_av or c.victim_is_av or c.involves_mission for c in frame.events.collisions
             )
         self.truncated = not self.terminated and self.elapsed >= self.scenario.duration - 1e-6
-        return self._observe(self.frames)
+        self._observe(self.frames)
+        for hook in self._hooks:
+            hook.on_step(self, step)
+        return self.histories
 
-    def context(self, svo: float) -> PolicyContext:
-        """What a policy is told when this episode starts; `svo` (phi) in rad."""
+    def context(self, seed: int, svo: float) -> PolicyContext:
+        """What a policy knows of the episode `seed` before it starts; `svo` (phi) in rad."""
         return PolicyContext(
             road=self.simulator.road,
             timing=self.scenario.timing,
             observation=self.observation,
             svo=svo,
-            rng=generator(self.seed, "policy"),
+            rng=generator(seed, "policy"),
         )
-
-    @property
-    def events(self) -> Events:
-        """What happened since the last decision, in every frame."""
-        return Events.of(self.frames)
 
     @property
     def over(self) -> bool:
@@ -134,9 +176,8 @@ class Episode:
     def result(self, policy: str, label: str = "", svo: float = 0.0) -> EpisodeResult:
         """The figures of the episode so far; `svo` in rad."""
         counts = self.simulator.counts()
-        metrics = self._metrics.result()
         decided = self._tally["decisions"]
-        metrics |= {
+        own = {
             "vehicles_inserted": Metric(counts["inserted"], "vehicles", ""),
             "vehicles_never_inserted": Metric(counts["waiting"], "vehicles", "lower"),
             "veto_rate": Metric(self._tally["vetoes"] / decided if decided else None, "share", "lower"),
@@ -146,35 +187,29 @@ class Episode:
             "lane_changes_commanded": Metric(self._tally["lane_changes"], "changes", ""),
             "commands_blocked": Metric(self._tally["blocked"], "commands", "lower"),
         }
-        s = self.scenario
+        metrics = joined(self._metrics.result(), own)
+        named = self.scenario.identity(policy, label, round(math.degrees(svo), 6), self.seed)
         return EpisodeResult(
-            scenario=s.name,
-            demand=s.demand_name,
-            policy=policy,
-            label=label,
-            behavior=s.behavior,
-            driver_model=s.driver_model,
-            preset=s.preset,
-            svo_deg=round(math.degrees(svo), 6),
-            seed=self.seed,
+            **asdict(named),
             steps=self.steps,
             trace_hash=self.trace_hash(),
             metrics=metrics,
             collisions=tuple(self._collisions),
             timings=dict(self.timings),
             validity=self._validity(metrics),
-            manifest=manifest(s, self.seed),
+            manifest=manifest(self.scenario, self.seed),
         )
 
     # ---- inside ----
 
-    def _observe(self, frames: tuple[Snapshot, ...]) -> dict[str, History]:
+    def _observe(self, frames: tuple[Snapshot, ...]) -> None:
         began = time.perf_counter()
         for frame in frames:
             self._observer.add(frame)
-        self._histories = self._observer.histories(self.simulator.route, self.simulator.commanded)
+        self.histories: dict[str, History] = self._observer.histories(
+            self.simulator.route, self.simulator.commanded
+        )
         self.timings["observation_s"] += time.perf_counter() - began
-        return self._histories
 
     def _trace(self, decisions: Mapping[str, Decision]) -> None:
         s, update = self.snapshot, self._hash.update
@@ -211,12 +246,18 @@ class Episode:
 
 
 def run_episode(
-    episode: Episode, policy: Policy, seed: int, *, svo: float, progress: Progress | None = None
+    episode: Episode,
+    policy: Policy,
+    seed: int,
+    *,
+    svo: float,
+    progress: Progress | None = None,
+    hooks: Sequence[Hook] = (),
 ) -> EpisodeResult:
     """Drive one whole episode with one policy; `svo` (phi) in rad."""
     began = time.perf_counter()
-    histories = episode.start(seed)
-    policy.reset(episode.context(svo))
+    policy.reset(episode.context(seed, svo))
+    histories = episode.start(seed, hooks)
     while not episode.over:
         before = time.perf_counter()
         decisions = policy.decide(histories)

@@ -1,9 +1,25 @@
-"""The whole error tree: every failure a user can meet is one of these, with one clear sentence."""
+"""The whole error tree: every failure a user can meet is one of these, with one clear sentence.
+
+    CosimError                      4   what cosim cannot go on with (results that cannot be written, ...)
+    |-- BadInput                    2   the user's input: file, field and value are named
+    |   `-- WeightsMismatch         2   a checkpoint that does not fit its network
+    |-- SimulationError             3   SUMO failed
+    |   |-- SimulationInUse         3   a second simulation in one process
+    |   `-- SimulationCrashed       3   the process that held SUMO died
+    |       `-- SimulationTimeout   3   ... or did not answer and was killed
+    `-- ReplayDiffers               1   `cosim replay`: not the recorded episode (cosim.report.replay.episode)
+
+The number is `exit_code`, which the command line returns; success is 0, and a gate that fails is 1.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import difflib
-from collections.abc import Iterable
+import math
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 
 LISTED = 16  # known names at most that an error lists
 
@@ -81,6 +97,36 @@ class WeightsMismatch(BadInput):
     """A checkpoint's layout (names, shapes, hash) is not the one that the network needs."""
 
 
+@contextlib.contextmanager
+def inside(place: str, file: object = None) -> Iterator[None]:
+    """Name in a BadInput of the block the field `place` that its own field is part of, and the `file`."""
+    try:
+        yield
+    except BadInput as error:
+        parts = [part for part in (place, error.field) if part]
+        field = ".".join(parts).replace(".[", "[")
+        raise BadInput(
+            error.problem, file=file or error.file, field=field or None, value=error.value
+        ) from None
+
+
+@dataclass(frozen=True, slots=True)
+class Range:
+    """The bounds of a finite number."""
+
+    low: float = -math.inf
+    above: bool = False  # strictly more than `low`
+    high: float = math.inf
+
+    def problem(self, number: float) -> str | None:
+        """What is wrong with `number`; None when nothing is."""
+        if not math.isfinite(number):
+            return "must be finite"
+        if number < self.low or (self.above and number == self.low):
+            return f"must be {'more than' if self.above else 'at least'} {self.low:g}"
+        return f"must be at most {self.high:g}" if number > self.high else None
+
+
 def in_range(config: object, *, positive: str = "", not_negative: str = "") -> None:
     """Refuse a configuration whose fields of these names (with spaces between) are out of range.
 
@@ -108,3 +154,11 @@ def one_of(value: str, allowed: Iterable[str], field: str, file: object = None) 
     if value not in words:
         raise BadInput(f"unknown{hint(value, words)}", file=file, field=field, value=value)
     return value
+
+
+def check_pattern(pattern: str, field: str, file: object = None) -> None:
+    """Raises BadInput unless `pattern` is a regular expression."""
+    try:
+        re.compile(pattern)
+    except re.error as error:
+        raise BadInput(f"not a regular expression: {error}", file=file, field=field, value=pattern) from None

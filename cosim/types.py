@@ -1,4 +1,4 @@
-"""The data that crosses rooms: pure numpy, SI units, radians counter-clockwise from east, vehicle centres.
+"""Data exchanged by packages: pure numpy, SI units, radians counter-clockwise from east, vehicle centres.
 
 Letters in shapes: `n` vehicles, `N` past frames, `M` predicted frames, `C, H, W` map channels, rows
 (across the road) and columns (along it), `R, F` kinematic rows and features, `A` = 5 meta-actions.
@@ -89,8 +89,7 @@ class Events:
     def of(cls, frames: Sequence[Snapshot]) -> Events:
         """What happened in all of `frames`, in their order."""
         every = [frame.events for frame in frames]
-        names = [field.name for field in fields(cls)]
-        return cls(**{name: tuple(x for e in every for x in getattr(e, name)) for name in names})
+        return cls(**{f.name: tuple(x for e in every for x in getattr(e, f.name)) for f in fields(cls)})
 
 
 NO_EVENTS = Events()
@@ -126,6 +125,11 @@ class Snapshot:
     @property
     def n(self) -> int:
         return len(self.ids)
+
+    @property
+    def avs(self) -> tuple[str, ...]:
+        """Ids of the AVs."""
+        return tuple(self.ids[row] for row in np.flatnonzero(self.kind == Kind.AV))
 
 
 # Columns of the kinematic matrix, in the ego's frame at the newest frame of the history
@@ -167,7 +171,7 @@ class Decision(NamedTuple):
     safety_score: Floats32 | None = None  # [A] s, weighted time to collision (P, algorithm 2)
     unsafe: Bools | None = None  # [A]
     ttc: Floats32 | None = None  # [A] s until first contact under the action, capped
-    blamed: str | None = None  # who made the preferred action unsafe: a vehicle, or why, in brackets
+    blamed: str | None = None  # which vehicle made the preferred action unsafe, or another reason in brackets
     vetoed: bool = False  # the preferred action was masked
     fallback: bool = False  # every action was unsafe: the highest score was taken
 
@@ -217,7 +221,7 @@ class ObservationConfig:
     rows: int = 16  # R, the ego and up to 15 others
     row_range: float = 125.0  # m, vehicles further away get no row
     perception_range: float = 125.0  # m, what one AV's own sensors reach
-    share_perception: bool = True  # V2V: an AV also knows what its allies perceive
+    share_perception: bool = True  # V2V: an AV also gets what the other AVs perceive
     maps: bool = True  # False: no VelocityMaps are drawn (for policies that use none)
 
     def __post_init__(self) -> None:
@@ -242,7 +246,7 @@ class Timing:
 
 @dataclass(frozen=True, slots=True)
 class PolicyContext:
-    """What a policy is told when an episode starts."""
+    """The circumstances of an episode, given to a policy when it starts."""
 
     road: RoadMap
     timing: Timing
@@ -302,18 +306,28 @@ class Metric:
 
 
 @dataclass(frozen=True)
-class EpisodeResult:
-    """Everything one episode yields; `document()` is what `cosim run --json` prints."""
+class Identity:
+    """What an episode is called in documents, rows, tables, recordings (`EpisodeId`: as it was asked for)."""
 
     scenario: str
     demand: str
     policy: str
-    label: str
+    policy_label: str | None  # e.g. "untrained"; None where it was never made
     behavior: str
     driver_model: str
+    penetration: float | None  # share of AVs, where that chooses them
     preset: str
     svo_deg: float
     seed: int
+
+
+IDENTITY = tuple(field.name for field in fields(Identity))
+
+
+@dataclass(frozen=True)
+class EpisodeResult(Identity):
+    """Everything one episode yields; `document()` is what `cosim run --json` prints."""
+
     steps: int  # decisions taken
     trace_hash: str
     metrics: dict[str, Metric]
@@ -329,33 +343,20 @@ class EpisodeResult:
     def document(self) -> dict[str, Any]:
         """The JSON document of `cosim run --json`: metrics by name, their units beside them, NA null."""
         return {
-            "scenario": self.scenario,
-            "demand": self.demand,
-            "policy": self.policy,
-            "policy_label": self.label,
-            "behavior": self.behavior,
-            "driver_model": self.driver_model,
-            "preset": self.preset,
-            "svo_deg": self.svo_deg,
-            "seed": self.seed,
+            **{name: getattr(self, name) for name in IDENTITY},
             "steps": self.steps,
             **{name: _plain(metric.value) for name, metric in self.metrics.items()},
             "trace_hash": self.trace_hash,
             "timings": {name: round(value, 6) for name, value in self.timings.items()},
             "comparable": not self.validity,
             "not_comparable_because": list(self.validity),
-            "collision_list": [_collision(asdict(c)) for c in self.collisions],
+            "collision_list": [{k: _plain(v) for k, v in asdict(c).items()} for c in self.collisions],
             "units": {name: metric.unit for name, metric in self.metrics.items()},
             "better": {name: metric.better for name, metric in self.metrics.items()},
             "manifest": self.manifest,
         }
 
 
-def _plain(value: float | int | bool | None) -> float | int | bool | None:
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
-
-
-def _collision(fields: dict[str, Any]) -> dict[str, Any]:
-    return {k: _plain(v) if isinstance(v, float) else v for k, v in fields.items()}
+def _plain(value: Any) -> Any:
+    """The value itself, None for a number that JSON cannot hold."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value

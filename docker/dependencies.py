@@ -12,7 +12,7 @@ from pathlib import Path
 
 
 def dependencies(project: dict, extras: list[str]) -> list[str]:
-    """The requirements of `project` and its `extras`; an extra that names others (`cosim[a,b]`) is unfolded.
+    """The requirements of `project` and its `extras`; an extra that names others (`NAME[a,b]`) is unfolded.
 
     Raises KeyError for an extra that the project does not have.
     """

@@ -49,7 +49,18 @@ class Prediction(NamedTuple):
 
 
 def render(rows: Floats, valid: Bools, pose: Floats, config: ObservationConfig, raster: RoadRaster) -> Bytes:
-    """Maps of predicted kinematics: rows [B,M,k,8], valid [B,k], pose [B,3] -> uint8 [B,M,C,H,W]."""
+    """Maps of predicted kinematics.
+
+    Args:
+        rows: [B,M,k,8] KINEMATIC_FEATURES in each ego's frame (m, m/s, rad), row 0 the ego.
+        valid: [B,k] which rows are vehicles.
+        pose: [B,3] x m, y m, heading rad of each ego now.
+        config: size and channels of the maps.
+        raster: the road.
+
+    Returns:
+        uint8 [B,M,C,H,W].
+    """
     b, m, r, f = rows.shape
     out = np.empty((b * m, len(config.channels), config.height, config.width), np.uint8)
     flat = np.ascontiguousarray(rows.reshape(b * m, r, f))
@@ -82,11 +93,23 @@ def predict(
     forecast: KinematicForecast,
     traffic: Traffic | None = None,
 ) -> Prediction:
-    """Algorithm 1, batched over all AVs.
+    """The next seconds of all AVs in one batch (P, algorithm 1).
 
-    `forecast`: the predicted states of all vehicles of `scene` in the world, at least `horizon` frames;
-    `traffic`: the same speeds along the lanes, for an `hpn` with a kinematic branch (ValueError without).
-    Without an `hpn` the maps rendered from the forecast are returned.
+    Args:
+        config: horizon and which of its frames are returned.
+        observation: size and channels of the maps.
+        raster: the road as `cosim.geometry.raster.rasterize_road` gives it.
+        hpn: the network; None: the maps are rendered from the forecast as it is.
+        scene: what the AVs know (`policy.scene.join`).
+        batch: what they saw (`policy.tensors.to_batch`), on the device of the network.
+        forecast: states of all vehicles of `scene` in the world (m, m/s, rad), `horizon` frames at least.
+        traffic: the same speeds along the lanes, needed by a kinematic branch.
+
+    Returns:
+        maps, kinematics and rows of B AVs, M = horizon / every frames.
+
+    Raises:
+        ValueError: the `hpn` has a kinematic branch and there is no `traffic`.
     """
     device = str(batch.maps.device)
     corrected: Corrected | None = None
@@ -134,8 +157,8 @@ def _chain(
     m, device = config.horizon, batch.maps.device
     n, block, channels = branch.config.seen, branch.config.block, batch.maps.shape[2]
     b, _, _, h, w = batch.maps.shape
-    # channels_last from here on: every frame is a group of channels, the window a few such groups
-    past = [_grouped(batch.maps[:, -n:])]
+    # channels_last from here on: every frame is a group of channels
+    past = _grouped(batch.maps[:, -n:])
     moved = batch.kinematics[:, -n:]
     guesses = []
     for start in range(0, m, block):
@@ -150,7 +173,7 @@ def _chain(
         frames = guess.view(b, block, channels, h, w)
         guesses += [frames[:, k] for k in range(block) if (start + k + 1) % config.every == 0]
         if start + block < m:
-            past = _newest([*past, guess], n * channels)
+            past = torch.cat([past, guess], 1)[:, -n * channels :]
             moved = torch.cat([moved, kinematics[:, start : start + block]], 1)[:, -n:]
     return torch.stack(guesses[: config.hypotheses], 1)
 
@@ -158,14 +181,3 @@ def _chain(
 def _grouped(maps: torch.Tensor) -> torch.Tensor:
     """[B,T,C,H,W] pixels -> [B,T*C,H,W] in [0,1], in channels_last."""
     return unit(maps).flatten(1, 2).contiguous(memory_format=torch.channels_last)
-
-
-def _newest(groups: list[torch.Tensor], wanted: int) -> list[torch.Tensor]:
-    """The last `wanted` channels of channel groups [B,.,H,W], oldest first."""
-    kept: list[torch.Tensor] = []
-    for group in reversed(groups):
-        kept.insert(0, group[:, -wanted:])
-        wanted -= kept[0].shape[1]
-        if wanted <= 0:
-            break
-    return kept

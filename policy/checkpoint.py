@@ -19,7 +19,7 @@ from safetensors.torch import save_file
 from torch import nn
 
 from cosim.errors import BadInput, WeightsMismatch
-from cosim.files import whole
+from cosim.files import read_json, whole
 
 FORMAT = "cosim-weights-1"
 SHIPPED = Path(__file__).parent / "weights"
@@ -60,11 +60,8 @@ def read_card(path: Path) -> dict[str, Any]:
     for needed in (path, card_file):
         if not needed.is_file():
             raise BadInput("missing weights file", file=needed)
-    try:
-        card = json.loads(card_file.read_text())
-    except ValueError as error:
-        raise BadInput(f"not a JSON card: {error}", file=card_file) from None
-    if not isinstance(card, dict) or card.get("format") != FORMAT:
+    card = read_json(card_file)
+    if card.get("format") != FORMAT:
         raise WeightsMismatch(f"not a card of format {FORMAT}", file=card_file)
     if card.get("sha256") != sha256(path):
         raise WeightsMismatch("its SHA-256 is not the one on its card", file=path, field="sha256")
@@ -79,11 +76,11 @@ def load(path: Path, networks: Mapping[str, nn.Module], configs: Mapping[str, An
     """
     card = read_card(path)
     for name, config in configs.items():
-        wanted, found = _plain(config), card.get("configs", {}).get(name)
-        if isinstance(found, dict):
-            found = _filled(found, _defaults(config))
-        if found != wanted:
-            differs = [k for k in wanted if not isinstance(found, dict) or found.get(k) != wanted[k]]
+        wanted, stated = _plain(config), card.get("configs", {}).get(name)
+        if isinstance(stated, dict):
+            stated = _filled(stated, _defaults(config))
+        if stated != wanted:
+            differs = [k for k in wanted if not isinstance(stated, dict) or stated.get(k) != wanted[k]]
             raise WeightsMismatch(
                 f"made for another layout (differs in {', '.join(differs) or 'its fields'})",
                 file=path,
@@ -93,7 +90,10 @@ def load(path: Path, networks: Mapping[str, nn.Module], configs: Mapping[str, An
     expected = {f"{name}.{key}": value for name, state in states.items() for key, value in state.items()}
     try:
         with safe_open(path, framework="pt", device="cpu") as file:
-            _compare_names(path, set(file.keys()), set(expected))
+            found = set(file.keys())
+            for problem, names in (("missing", set(expected) - found), ("unknown", found - set(expected))):
+                if names:
+                    raise WeightsMismatch(f"{len(names)} tensors are {problem}", file=path, field=min(names))
             for key, value in expected.items():
                 shape = tuple(file.get_slice(key).get_shape())
                 if shape != tuple(value.shape):
@@ -140,10 +140,3 @@ def _filled(found: dict[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any
     option must be what was done without it)."""
     both = [k for k, v in found.items() if isinstance(v, dict) and isinstance(defaults.get(k), dict)]
     return {**defaults, **found, **{k: _filled(found[k], defaults[k]) for k in both}}
-
-
-def _compare_names(path: Path, found: set[str], wanted: set[str]) -> None:
-    if missing := sorted(wanted - found):
-        raise WeightsMismatch(f"{len(missing)} tensors are missing", file=path, field=missing[0])
-    if unknown := sorted(found - wanted):
-        raise WeightsMismatch(f"{len(unknown)} tensors are unknown", file=path, field=unknown[0])

@@ -43,13 +43,9 @@ class Conv3dMaps(nn.Module):
         widths = (channels, *features)
         layers: list[nn.Conv3d] = []
         for k, (stride, wanted) in enumerate(zip(STRIDES[strides], KERNELS, strict=True)):
-            if strides == "temporal":
-                padding = tuple((n - 1) // 2 for n in wanted)
-                # a kernel never reaches beyond its (padded) input at the smaller sizes
-                kernel = tuple(min(n, s + 2 * p) for n, s, p in zip(wanted, shape, padding, strict=True))
-            else:
-                padding = (0, 0, 0)
-                kernel = tuple(min(n, s) for n, s in zip(wanted, shape, strict=True))
+            padding = tuple((n - 1) // 2 if strides == "temporal" else 0 for n in wanted)
+            # a kernel never reaches beyond its (padded) input at the smaller sizes
+            kernel = tuple(min(n, s + 2 * p) for n, s, p in zip(wanted, shape, padding, strict=True))
             layers.append(nn.Conv3d(widths[k], widths[k + 1], kernel, stride, padding))  # type: ignore[arg-type]
             shape = tuple(
                 (s + 2 * p - n) // d + 1 for s, p, n, d in zip(shape, padding, kernel, stride, strict=True)

@@ -23,16 +23,29 @@ class KinematicForecast(NamedTuple):
     across_std: Floats  # [V,M] m
     valid: Bools  # [V] was perceived in the newest frame
 
-
-def integrate_position(now: Floats, speed: Floats, heading: Floats, dt: float) -> tuple[Floats, Floats]:
-    """P, eq. (9), trapezoid rule: now [V,>=4] x y speed heading; speed, heading [V,M] -> x, y [V,M] m."""
-    x, y = np.empty(speed.shape), np.empty(speed.shape)
-    _integrate(now, speed, heading, dt, x, y)
-    return x, y
+    @classmethod
+    def without_spread(
+        cls, x: Floats, y: Floats, speed: Floats, heading: Floats, valid: Bools
+    ) -> KinematicForecast:
+        """States [V,M] of a predictor that does not know its error; valid [V]."""
+        zero = np.zeros_like(x)
+        return cls(x, y, speed, heading, zero, zero, zero, zero, valid)
 
 
 @compiled
-def _integrate(now: Floats, speed: Floats, heading: Floats, dt: float, x: Floats, y: Floats) -> None:
+def integrate_position(now: Floats, speed: Floats, heading: Floats, dt: float) -> tuple[Floats, Floats]:
+    """Positions from predicted speeds and headings by the trapezoid rule (P, eq. 9).
+
+    Args:
+        now: [V,>=4] x m, y m, speed m/s, heading rad.
+        speed: [V,M] m/s.
+        heading: [V,M] rad.
+        dt: s between frames.
+
+    Returns:
+        x, y: [V,M] m.
+    """
+    x, y = np.empty(speed.shape), np.empty(speed.shape)
     for v in range(speed.shape[0]):
         px, py = now[v, X], now[v, Y]
         vx, vy = now[v, SPEED] * np.cos(now[v, HEADING]), now[v, SPEED] * np.sin(now[v, HEADING])
@@ -42,12 +55,19 @@ def _integrate(now: Floats, speed: Floats, heading: Floats, dt: float, x: Floats
             py += 0.5 * dt * (vy + wy)
             x[v, k], y[v, k] = px, py
             vx, vy = wx, wy
+    return x, y
 
 
 def motion_of(now: Floats, x: Floats, y: Floats, dt: float) -> tuple[Floats, Floats]:
-    """Speed and heading along predicted positions: now [V,>=4], x, y [V,M] m -> m/s, rad (unwrapped) [V,M].
+    """Speed and heading along predicted positions; a vehicle that hardly moves keeps its heading.
 
-    Who hardly moves keeps its heading.
+    Args:
+        now: [V,>=4] x m, y m, speed m/s, heading rad.
+        x, y: [V,M] m.
+        dt: s between frames.
+
+    Returns:
+        speed [V,M] m/s, heading [V,M] rad (unwrapped).
     """
     dx = np.diff(np.concatenate([now[:, X, None], x], 1), axis=1)
     dy = np.diff(np.concatenate([now[:, Y, None], y], 1), axis=1)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -77,22 +78,19 @@ class GaussianProcessBank:
     def __init__(self, config: BankConfig, horizon: int = 20, dt: float = 0.2) -> None:
         self.config, self.horizon, self.dt = config, horizon, dt
         self.kernels = config.kernels()  # [K,5]
-        self._operators: dict[int, Operators] = {}
-
-    def covariance(self, kernel: Floats, a: Floats, b: Floats) -> Floats:
-        """Noise-free covariance k(a, b) of one kernel (a row of `kernels`); times in s -> [len(a),len(b)]."""
-        slope, amplitude, length = kernel[:3]
-        lag = a[:, None] - b[None, :]
-        linear = self.config.bias**2 + slope**2 * a[:, None] * b[None, :]
-        return np.asarray(linear + amplitude**2 * np.exp(-0.5 * (lag / length) ** 2))
 
     def forecast(
         self, values: Floats, log_prior: Floats | None = None, temperature: float = 1.0
     ) -> SeriesForecast:
-        """Forecast series of equal length: [S,n], oldest first -> moments [S,M] in the series' own unit.
+        """Forecast series of equal length (P, eq. 8, averaged over the kernels).
 
-        log_prior: [K] or [S,K] log weight of each kernel, uniform when None; `temperature` divides the log
-        marginal likelihood, which trusts itself too much where no kernel is quite right.
+        Args:
+            values: [S,n] oldest first.
+            log_prior: [K] or [S,K] log weight of each kernel, uniform when None.
+            temperature: divides the log marginal likelihood, too sure where no kernel is right.
+
+        Returns:
+            moments [S,M] in the series' own unit, and of the integral, unit * s.
         """
         op = self.operators(values.shape[1])
         k, m, s = len(self.kernels), self.horizon, len(values)
@@ -115,7 +113,14 @@ class GaussianProcessBank:
         )
 
     def evidence(self, past: Floats) -> Floats:
-        """Log marginal likelihood [S,K] of series [S,n] relative to their newest value, in the unit."""
+        """Log marginal likelihood of every kernel (P's reference [14]).
+
+        Args:
+            past: [S,n] series relative to their newest value, in units of `config.unit`.
+
+        Returns:
+            [S,K].
+        """
         op = self.operators(past.shape[1])
         white = past @ op.whiten
         white -= op.drift_white
@@ -125,40 +130,63 @@ class GaussianProcessBank:
 
     def operators(self, count: int) -> Operators:
         """For histories of `count` frames; computed once."""
-        found = self._operators.get(count)
-        if found is None:
-            found = self._operators[count] = self._build(count)
-        return found
+        return _operators(self.config, self.horizon, self.dt, count)
 
-    def _build(self, count: int) -> Operators:
-        m = self.horizon
-        past: Floats = self.dt * np.arange(1.0 - count, 1.0)  # s, 0 is now
-        ahead: Floats = self.dt * np.arange(1.0, m + 1.0)
-        # trapezoid from the newest value on: linear in the prediction, so its moments are exact
-        integral = np.tril(np.full((m, m), self.dt))  # [M,M]
-        integral[np.diag_indices(m)] = 0.5 * self.dt
-        predict, drift, whiten, drift_white, log_norm, variance = [], [], [], [], [], []
-        for kernel in self.kernels:
-            gram = self.covariance(kernel, past, past) + (kernel[3] ** 2 + 1e-9) * np.eye(count)
-            lower = np.linalg.cholesky(gram)
-            inverse = np.linalg.inv(lower)
-            half = inverse @ self.covariance(kernel, past, ahead)  # [n,M]
-            posterior = self.covariance(kernel, ahead, ahead) - half.T @ half
-            operator = inverse.T @ half  # [n,M]
-            predict.append(operator)
-            drift.append(kernel[4] * (ahead - past @ operator))  # m(ahead) less what m(past) would predict
-            whiten.append(inverse.T)
-            drift_white.append(inverse @ (kernel[4] * past))
-            log_norm.append(-np.log(np.diag(lower)).sum() - 0.5 * count * np.log(2 * np.pi))
-            variance.append(np.concatenate([np.diag(posterior), np.diag(integral @ posterior @ integral.T)]))
-        return Operators(
-            np.concatenate(predict, 1),
-            np.concatenate(drift),
-            np.concatenate(whiten, 1),
-            np.concatenate(drift_white),
-            np.array(log_norm),
-            np.maximum(np.array(variance), 0.0),
+
+def covariance(kernel: Floats, a: Floats, b: Floats, bias: float) -> Floats:
+    """Noise-free covariance of linear + RBF (P, eq. 7).
+
+    Args:
+        kernel: [>=3] slope, amplitude, length s, in the series' unit.
+        a, b: times in s.
+        bias: of the constant part.
+
+    Returns:
+        [len(a),len(b)].
+    """
+    slope, amplitude, length = kernel[:3]
+    lag = a[:, None] - b[None, :]
+    linear = bias**2 + slope**2 * a[:, None] * b[None, :]
+    return np.asarray(linear + amplitude**2 * np.exp(-0.5 * (lag / length) ** 2))
+
+
+def trapezoid(steps: int, dt: float) -> Floats:
+    """[M,M] the integral of a series up to each of its steps, from a 0 one step before the first."""
+    return np.asarray(dt * (np.tri(steps) - 0.5 * np.eye(steps)))
+
+
+@cache
+def _operators(config: BankConfig, m: int, dt: float, count: int) -> Operators:
+    past: Floats = dt * np.arange(1.0 - count, 1.0)  # s, 0 is now
+    ahead: Floats = dt * np.arange(1.0, m + 1.0)
+    integral = trapezoid(m, dt)  # linear in the prediction, so its moments are exact
+    parts = []
+    for kernel in config.kernels():
+        gram = covariance(kernel, past, past, config.bias) + (kernel[3] ** 2 + 1e-9) * np.eye(count)
+        lower = np.linalg.cholesky(gram)
+        inverse = np.linalg.inv(lower)
+        half = inverse @ covariance(kernel, past, ahead, config.bias)  # [n,M]
+        posterior = covariance(kernel, ahead, ahead, config.bias) - half.T @ half
+        operator = inverse.T @ half  # [n,M]
+        parts.append(
+            (
+                operator,
+                kernel[4] * (ahead - past @ operator),  # m(ahead) less what m(past) would predict
+                inverse.T,
+                inverse @ (kernel[4] * past),
+                -np.log(np.diag(lower)).sum() - 0.5 * count * np.log(2 * np.pi),
+                np.concatenate([np.diag(posterior), np.diag(integral @ posterior @ integral.T)]),
+            )
         )
+    predict, drift, whiten, drift_white, log_norm, variance = zip(*parts, strict=True)
+    return Operators(
+        np.concatenate(predict, 1),
+        np.concatenate(drift),
+        np.concatenate(whiten, 1),
+        np.concatenate(drift_white),
+        np.array(log_norm),
+        np.maximum(np.array(variance), 0.0),
+    )
 
 
 @compiled

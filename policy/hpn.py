@@ -28,10 +28,15 @@ class HpnConfig:
 
 
 class HPN(nn.Module):
-    """The branches that the configuration asks for; `policy.chain.predict` puts them to work.
+    """The branches that the configuration asks for; `policy.chain.predict` runs them (P, fig. 3).
 
     Untrained, `rendered` and `corrected` return the maps rendered from the forecast along the lanes.
-    Raises ValueError when the map branch is not of the kind that `maps` needs.
+
+    Args:
+        config: which branches there are, and their layouts.
+
+    Raises:
+        ValueError: the map branch is not of the kind that `maps` needs.
     """
 
     kinematic: KinematicBranch | None

@@ -12,10 +12,9 @@ from cosim.road import RoadMap
 from cosim.types import Floats, Floats32, History, ObservationConfig
 from policy.chain import render
 from policy.hpn import HPN
-from policy.map_branch import MapBranch
 from policy.predictors import Predictor
 from policy.scene import Scene, join, pictured
-from policy.tensors import Batch, to_batch, to_numpy, unit
+from policy.tensors import to_batch, to_numpy, unit
 from policy.traffic import TrafficConfig, foresee
 from policy.vehicle_inputs import vehicle_inputs
 
@@ -47,16 +46,10 @@ def painted(
                 values = to_numpy(features) * inputs.known[:, None]
                 out[f"{name}, vehicles"] = _on_the_road(values, scene, b, observation, road)
             if hpn.map_branch is not None and not hpn.map_branch.config.correct:
-                batch = to_batch(scene.histories)
-                for layer, maps in enumerate(_encoded(hpn.map_branch, batch, b)):
-                    out[f"{name}, layer {layer + 1}"] = _scaled(_liveliest(maps))
+                seen = to_batch(scene.histories).maps[b : b + 1, -hpn.map_branch.config.seen :]
+                for layer, maps in enumerate(hpn.map_branch.encode(unit(seen).flatten(1, 2))[1]):
+                    out[f"{name}, layer {layer + 1}"] = _scaled(to_numpy(maps[0]))
     return out
-
-
-def _encoded(branch: MapBranch, batch: Batch, b: int) -> list[Floats32]:
-    """[k,h,w] of every encoder layer."""
-    _, layers = branch.encode(unit(batch.maps[b : b + 1, -branch.config.seen :]).flatten(1, 2))
-    return [to_numpy(layer[0]) for layer in layers]
 
 
 def _on_the_road(
@@ -81,11 +74,8 @@ def _on_the_road(
     return np.stack(out).astype(np.float32)
 
 
-def _liveliest(maps: Floats32) -> Floats32:
-    """The PAINTED features [k,h,w] that vary most over the picture."""
-    return maps[np.argsort(-maps.std((1, 2)))[:PAINTED]]
-
-
 def _scaled(maps: Floats32) -> Floats32:
-    low, high = maps.min((1, 2), keepdims=True), maps.max((1, 2), keepdims=True)
-    return np.asarray((maps - low) / np.maximum(high - low, 1e-9), np.float32)
+    """The PAINTED features [k,h,w] that vary most over the picture, each from 0 to 1."""
+    most = maps[np.argsort(-maps.std((1, 2)))[:PAINTED]]
+    low, high = most.min((1, 2), keepdims=True), most.max((1, 2), keepdims=True)
+    return np.asarray((most - low) / np.maximum(high - low, 1e-9), np.float32)

@@ -15,7 +15,7 @@ import torch
 from torch import nn
 
 from cosim.geometry.compiled import compiled
-from cosim.types import Bools, Floats, Ints
+from cosim.types import Bools, Floats
 
 LAGS = np.array([1, 2, 4, 9])  # frames back over which speed and heading are compared with now
 FEATURES = 4 + 2 * len(LAGS) + 3
@@ -49,7 +49,7 @@ class PriorNetwork(nn.Module):
         nn.init.zeros_(self.out.bias)
         self.log_temperature = nn.Parameter(torch.full((len(config.kernels),), 2.5))
         # factors that make a 90 % interval cover 90 % at each step, found on episodes not trained on; a row
-        # for each number of frames that are known, 1 to N: a completed past (policy.past) is less sure
+        # for each number of frames that are known, 1 to N: a completed past is less sure
         self.register_buffer("calibration", torch.ones(config.frames, config.spreads, config.horizon))
 
     def forward(self, features: torch.Tensor) -> torch.Tensor:
@@ -69,15 +69,13 @@ class KernelPrior(NamedTuple):
 
     @staticmethod
     def of(network: PriorNetwork) -> KernelPrior:
-        def array(value: torch.Tensor) -> Floats:
-            return value.detach().to(torch.float64).numpy()
-
+        values = {k: v.detach().to(torch.float64).numpy() for k, v in network.state_dict().items()}
         return KernelPrior(
-            (array(network.hidden.weight).T, array(network.hidden.bias)),
-            (array(network.out.weight).T, array(network.out.bias)),
+            (values["hidden.weight"].T, values["hidden.bias"]),
+            (values["out.weight"].T, values["out.bias"]),
             tuple(np.cumsum(network.config.kernels).tolist()),
-            np.exp(array(network.log_temperature)),
-            array(network.calibration),
+            np.exp(values["log_temperature"]),
+            values["calibration"],
             network.config.dt,
         )
 
@@ -96,18 +94,19 @@ class KernelPrior(NamedTuple):
         return np.stack(rows).reshape(*found.shape[:2], horizon)
 
 
+@compiled
 def describe(past: Floats, known: Bools, dt: float) -> Floats:
-    """The present motion as [V,FEATURES], each of order one; past [V,N,>=4] whole, known [V].
+    """The present motion: speed, standing, mean acceleration and turning rate since LAGS, each of order one.
 
-    Speed, standing, mean acceleration and turning rate since LAGS; zeros for a vehicle that is not known now.
+    Args:
+        past: [V,N,>=4] whole histories: x m, y m, speed m/s, heading rad.
+        known: [V] perceived in the newest frame; the others' features are zeros.
+        dt: s between frames.
+
+    Returns:
+        [V,FEATURES].
     """
     out = np.zeros((len(past), FEATURES))
-    _describe(past, known, dt, np.minimum(LAGS, past.shape[1] - 1), out)
-    return out
-
-
-@compiled
-def _describe(past: Floats, known: Bools, dt: float, lags: Ints, out: Floats) -> None:
     now = past.shape[1] - 1
     for v in range(past.shape[0]):
         if not known[v]:
@@ -118,7 +117,8 @@ def _describe(past: Floats, known: Bools, dt: float, lags: Ints, out: Floats) ->
         out[v, 2] = speed < STANDING
         out[v, 3] = np.exp(-speed / 2.0)
         at = 4
-        for lag in lags:
+        for frames in LAGS:
+            lag = min(frames, now)
             elapsed = dt * max(lag, 1)
             out[v, at] = np.tanh((speed - past[v, now - lag, 2]) / elapsed / 2.0)
             out[v, at + 1] = np.tanh((heading - past[v, now - lag, 3]) / elapsed / 0.2)
@@ -126,3 +126,4 @@ def _describe(past: Floats, known: Bools, dt: float, lags: Ints, out: Floats) ->
         out[v, at] = abs(out[v, 4])
         out[v, at + 1] = abs(out[v, 5])
         out[v, at + 2] = abs(out[v, at - 1])
+    return out

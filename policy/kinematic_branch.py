@@ -4,7 +4,7 @@ P's branch K is two fully connected layers of 128 whose output the Gaussian proc
 eq. 10). Here it works the other way round, and for one vehicle at a time: the forecasts (Gaussian process,
 and the same speeds along the lane) come in, a small correction goes out: how much of each forecast to
 believe, how far ahead or aside of it the vehicle will really be. The weights are shared by all vehicles,
-who hear of one another through pooled features of the nearest. Untrained it corrects nothing.
+which see one another through pooled features of the nearest. Untrained it corrects nothing.
 """
 
 from __future__ import annotations
@@ -74,7 +74,16 @@ class KinematicBranch(nn.Module):
         return joined
 
     def forward(self, own: torch.Tensor, near: torch.Tensor) -> torch.Tensor:
-        """own [V,.], near [V,K,.] as in `VehicleInputs` -> [V,M,OUTPUTS] m, m/s, rad; logits."""
+        """What to correct of every vehicle's forecast (P, figure 3 and eq. 10).
+
+        Args:
+            own: [V,own_inputs(N)] scaled (`policy.vehicle_inputs.VehicleInputs`).
+            near: [V,NEIGHBOURS,NEIGHBOUR_INPUTS] scaled.
+
+        Returns:
+            [V,M,OUTPUTS] belief in the Gaussian process (logit); ahead m, left m, speed m/s, heading rad; two
+            logits of `sureness`.
+        """
         raw: torch.Tensor = self.out(self.features(own, near)).contiguous()
         return raw.view(*raw.shape[:-1], self.config.horizon, OUTPUTS) * self.unit
 
@@ -116,7 +125,7 @@ class Corrected(NamedTuple):
         """[B,V,M] `sureness` of every vehicle in the picture of each AV; ego [B] are their places."""
         logit = self.seen[None] + self.looking[ego][:, None] + 4.0
         out: Floats = 1.0 / (1.0 + np.exp(-logit.astype(np.float64)))
-        out[np.arange(len(ego)), ego] = 1.0  # everybody is in the middle of his own picture
+        out[np.arange(len(ego)), ego] = 1.0  # every AV is in the middle of its own picture
         return out
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,6 +11,7 @@ from torch.nn import functional
 
 from policy.tensors import KINEMATIC_INPUTS
 
+Size = tuple[int, int]
 PREDICTED = 4  # x, y, speed, heading of each row: P's K
 
 
@@ -38,11 +38,6 @@ class MapBranchConfig:
         """Past frames that enter the network."""
         return self.frames if self.history else 1
 
-    @property
-    def inputs(self) -> int:
-        """Map channels that enter the network."""
-        return (self.seen + (self.block if self.correct else 0)) * self.channels
-
 
 class MapBranch(nn.Module):
     """Predictive autoencoder with a map branch and a kinematic branch, added elementwise.
@@ -55,20 +50,15 @@ class MapBranch(nn.Module):
         super().__init__()
         self.config = c = config
         size = (c.height, c.width)
-        before: list[tuple[int, int]] = []  # what each convolution sees
-        convolved: list[tuple[int, int]] = []  # what it yields, before pooling
-        pools: list[tuple[int, int]] = []
-        widths = [c.inputs, *c.features]
+        self._stages: list[tuple[Size, Size, Size]] = []  # size a convolution sees, size it yields, pooling
+        widths = [(c.seen + (c.block if c.correct else 0)) * c.channels, *c.features]
         self.encoder = nn.ModuleList()
         for k in range(3):
             self.encoder.append(nn.Conv2d(widths[k], widths[k + 1], 3, stride=2, padding=1))
             h, w = ((n + 1) // 2 for n in size)
             pool = (2 if h > 1 else 1, 2 if w > 1 else 1) if c.reading == "pool" else (1, 1)
-            before.append(size)
-            convolved.append((h, w))
-            pools.append(pool)
+            self._stages.append((size, (h, w), pool))
             size = (h // pool[0], w // pool[1])
-        self._before, self._convolved, self._pools = before, convolved, pools
         self._core = (c.features[2], *size)  # shape of the convolution output
         flat = self._core[0] * self._core[1] * self._core[2]
         self.kinematics_in = nn.Sequential(
@@ -85,16 +75,13 @@ class MapBranch(nn.Module):
             nn.Linear(c.latent, c.hidden), nn.ReLU(), nn.Linear(c.hidden, c.block * c.rows * PREDICTED)
         )
         if c.correct:
-            last = self.decoder[2]
-            assert isinstance(last, nn.ConvTranspose2d)
-            assert last.bias is not None
-            nn.init.zeros_(last.weight)
-            nn.init.zeros_(last.bias)
+            for parameter in self.decoder[2].parameters():
+                nn.init.zeros_(parameter)
 
     def encode(self, z: torch.Tensor) -> tuple[torch.Tensor, list[torch.Tensor]]:
         """Frames [B,k*C,H,W] through the encoder: its output, and what every layer gave before pooling."""
         layers: list[torch.Tensor] = []
-        for convolution, pool in zip(self.encoder, self._pools, strict=True):
+        for convolution, (_, _, pool) in zip(self.encoder, self._stages, strict=True):
             z = functional.relu_(convolution(z))
             layers.append(z)
             if pool != (1, 1):
@@ -102,31 +89,39 @@ class MapBranch(nn.Module):
         return z, layers
 
     def forward(
-        self, past: Sequence[torch.Tensor], kinematics: torch.Tensor, rendered: torch.Tensor | None = None
+        self, past: torch.Tensor, kinematics: torch.Tensor, rendered: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """One prediction step.
+        """One prediction step (P, figure 3). Fastest in channels_last.
 
-        past: maps of the `seen` frames, oldest first, as one or more groups [B,k*C,H,W] of whole frames;
-        kinematics [B,seen,R,F+1]; rendered [B,block*C,H,W]: with `correct`, of the frames to predict.
-        Returns the next maps [B,block*C,H,W] (not clamped) and kinematics [B,block,R,4] x y speed heading
-        (scaled as the input is). Fastest in channels_last.
+        Args:
+            past: [B,seen*C,H,W] maps of the `seen` frames in [0,1], oldest first.
+            kinematics: [B,seen,R,F+1] scaled.
+            rendered: [B,block*C,H,W] with `correct`, of the frames to predict.
+
+        Returns:
+            the next maps [B,block*C,H,W] (not clamped) and kinematics [B,block,R,4] x, y, speed, heading
+            (scaled as the input is).
+
+        Raises:
+            ValueError: a rendered map is missing, or there is one that is not corrected.
         """
         c = self.config
         if c.correct != (rendered is not None):
             raise ValueError("a rendered map is needed exactly when the network corrects one")
         b = kinematics.shape[0]
-        z = torch.cat([*past, rendered] if rendered is not None else list(past), 1)
-        z, skips = self.encode(z)
+        z, skips = self.encode(past if rendered is None else torch.cat([past, rendered], 1))
         moved = self.kinematics_in(kinematics.flatten(1))
         latent = functional.relu(self.to_latent(z.flatten(1) + moved))  # P: elementwise addition
         z = functional.relu(self.from_latent(latent)).reshape(b, *self._core)
         z = z.contiguous(memory_format=torch.channels_last)
-        for k, convolution in enumerate(self.decoder):
-            if self._pools[2 - k] != (1, 1):  # undo the pooling
-                z = functional.interpolate(z, size=self._convolved[2 - k], mode="nearest")
+        for k, (convolution, (before, convolved, pool)) in enumerate(
+            zip(self.decoder, reversed(self._stages), strict=True)
+        ):
+            if pool != (1, 1):  # undo the pooling
+                z = functional.interpolate(z, size=convolved, mode="nearest")
             if c.skips:
                 z = z + skips[2 - k]
-            z = convolution(z, output_size=list(self._before[2 - k]))
+            z = convolution(z, output_size=list(before))
             if k < 2:
                 z = functional.relu_(z)
         if rendered is not None:

@@ -41,14 +41,15 @@ def picture_error(
     Two empty maps agree: their IoU is 1.
     """
     axes = (-3, -2, -1)
-    p, t = (_unit(a[..., channels, :, :]) for a in (predicted, true))
+    p, t = (unit_maps(a[..., channels, :, :]) for a in (predicted, true))
     pre = ((p - t) ** 2).mean(axes, dtype=np.float64)
     a, b = p > OCCUPIED, t > OCCUPIED
     union = (a | b).sum(axes)
     return pre, np.where(union > 0, (a & b).sum(axes) / np.maximum(union, 1), 1.0)
 
 
-def _unit(maps: Floats32 | Bytes) -> Floats32:
+def unit_maps(maps: Floats32 | Bytes) -> Floats32:
+    """Maps of any shape, uint8 pixels or float32 in [0,1] already -> float32 in [0,1]."""
     scale = 255.0 if maps.dtype == np.uint8 else 1.0
     return np.asarray(maps, np.float32) / np.float32(scale)
 
@@ -73,20 +74,15 @@ class MapPredictors:
         self._raster: RoadRaster = rasterize_road(road)
         self._traffic = TrafficConfig()
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Every predictor, the two references first."""
-        return ("last-frame", "gp-raster", *self._hpns)
-
     def predict(self, histories: Mapping[str, History]) -> Guess:
         """Maps of the whole horizon, frame by frame."""
         config = ChainConfig(horizon=self._predictor.horizon, every=1)
         scene = join(histories, self._observation.share_perception)
         last = np.stack([h.velocity_map[-1] for h in scene.histories])
-        maps = {"last-frame": np.repeat(_unit(last)[:, None], config.horizon, 1)}
+        maps = {"last-frame": np.repeat(unit_maps(last)[:, None], config.horizon, 1)}
         with torch.inference_mode():
             batch = to_batch(scene.histories)
-            for name in self.names[1:]:
+            for name in ("gp-raster", *self._hpns):
                 hpn = self._hpns.get(name)
                 history = hpn is None or hpn.kinematic is None or hpn.kinematic.config.history
                 known = scene if history else scene.without_history()

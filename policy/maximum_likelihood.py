@@ -13,6 +13,7 @@ from scipy.linalg import cho_solve, cholesky
 from scipy.optimize import minimize
 
 from cosim.types import Floats
+from policy.gaussian_process import covariance
 
 BIAS = 10.0  # in units of the series, as in the bank
 START = (1.0, 1.0, 1.5, 0.1)  # slope, amplitude, length s, noise
@@ -30,7 +31,14 @@ class Fitted(NamedTuple):
 
 
 def fit_series(values: Floats, unit: float, horizon: int = 20, dt: float = 0.2) -> Fitted:
-    """Fit and forecast one series [n] (n >= 2), oldest first, in its own unit; kernel in `unit`s and s."""
+    """Fit and forecast one series (P, eq. 7 and 8).
+
+    Args:
+        values: [n] oldest first, n >= 2, in the series' own unit.
+        unit: in which the kernel is given.
+        horizon: M, frames ahead.
+        dt: s between frames.
+    """
     past = dt * np.arange(1.0 - len(values), 1.0)
     ahead = dt * np.arange(1.0, horizon + 1.0)
     y = (values - values.mean()) / unit
@@ -44,24 +52,17 @@ def fit_series(values: Floats, unit: float, horizon: int = 20, dt: float = 0.2) 
     )
     kernel = np.exp(found.x)
     lower = cholesky(_gram(kernel, past), lower=True)
-    cross = _covariance(kernel, ahead, past)
+    cross = covariance(kernel, ahead, past, BIAS)
     mean = cross @ cho_solve((lower, True), y)
     half = np.linalg.solve(lower, cross.T)
-    variance = np.diag(_covariance(kernel, ahead, ahead)) - (half**2).sum(0)
+    variance = np.diag(covariance(kernel, ahead, ahead, BIAS)) - (half**2).sum(0)
     return Fitted(
         kernel, -float(found.fun), values.mean() + unit * mean, unit * np.sqrt(np.maximum(variance, 0.0))
     )
 
 
-def _covariance(kernel: Floats, a: Floats, b: Floats) -> Floats:
-    slope, amplitude, length = kernel[:3]
-    lag = a[:, None] - b[None, :]
-    linear = BIAS**2 + slope**2 * a[:, None] * b[None, :]
-    return np.asarray(linear + amplitude**2 * np.exp(-0.5 * (lag / length) ** 2))
-
-
 def _gram(kernel: Floats, past: Floats) -> Floats:
-    return np.asarray(_covariance(kernel, past, past) + (kernel[3] ** 2 + 1e-9) * np.eye(len(past)))
+    return np.asarray(covariance(kernel, past, past, BIAS) + (kernel[3] ** 2 + 1e-9) * np.eye(len(past)))
 
 
 def _loss(log_kernel: Floats, past: Floats, y: Floats) -> tuple[float, Floats]:

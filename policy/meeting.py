@@ -18,7 +18,7 @@ CAR = 5.0  # m, between the centres of two cars that touch
 
 
 class Seen(NamedTuple):
-    """The mission vehicle as one AV perceives it and tells the others."""
+    """The mission vehicle as one AV perceives it and shares it with the others."""
 
     lane: int  # index into RoadMap.lanes
     lane_position: float  # m, front bumper
@@ -37,12 +37,11 @@ class Meeting:
 
 def missions(histories: Iterable[History]) -> dict[str, Seen]:
     """Every mission vehicle that any of these AVs perceives (V2V: not everybody is near enough to)."""
-    found: dict[str, Seen] = {}
-    for history in histories:
-        for r in np.flatnonzero(history.valid[-1] & (history.kinematics[-1, :, IS_MISSION] > 0.5)):
-            speed = float(history.kinematics[-1, r, 2])
-            found[history.ids[r]] = Seen(int(history.lane[r]), float(history.lane_position[r]), speed)
-    return found
+    return {
+        h.ids[r]: Seen(int(h.lane[r]), float(h.lane_position[r]), float(h.kinematics[-1, r, 2]))
+        for h in histories
+        for r in np.flatnonzero(h.valid[-1] & (h.kinematics[-1, :, IS_MISSION] > 0.5))
+    }
 
 
 def meet(road: RoadMap, history: History, seen: Seen) -> Meeting | None:
@@ -57,7 +56,7 @@ def meet(road: RoadMap, history: History, seen: Seen) -> Meeting | None:
         mine, other, right = beside
         return Meeting((mine - history.route.arc) - (other - place), False, right, seen.speed)
     if not (np.isfinite(own.conflict) and _crosses_junction(road, theirs)):
-        return None  # not our affair: we drive beside the lane they want
+        return None  # no conflict: the own lane lies beside the one they want
     if _same_approach(road, own, theirs):
         return None
     behind = history.route.conflict_distance - max(theirs.conflict - place, 0.0)

@@ -50,8 +50,17 @@ def pack(paths: Sequence[LanePath]) -> Paths:
 def project(
     points: Floats, arc: Floats, first: int, last: int, x: float, y: float, around: float
 ) -> tuple[float, float]:
-    """Nearest arc length and signed offset (left positive) of (x, y) on points[first:last], within 60 m
-    of arc length `around` (nan: anywhere). The path goes on straight beyond its ends."""
+    """The nearest place on a polyline, which goes on straight beyond its ends.
+
+    Args:
+        points: [p,2] m; arc: [p] m.
+        first, last: the polyline is points[first:last].
+        x, y: m, the point.
+        around: m, arc length within 60 m of which is looked; nan: anywhere.
+
+    Returns:
+        arc length m, offset m (left positive).
+    """
     best, best_arc, best_offset = np.inf, 0.0, 0.0
     for i in range(first, last - 1):
         if arc[i + 1] < around - 60.0 or arc[i] > around + 60.0:
@@ -78,7 +87,16 @@ def project(
 def project_many(
     points: Floats, arc: Floats, start: Ints, x: Floats, y: Floats, around: Floats
 ) -> tuple[Floats, Floats]:
-    """`project` of point k onto path k: [k] -> arc [k] m, offset [k] m."""
+    """`project` of one point onto each path.
+
+    Args:
+        points, arc, start: k packed paths (`Paths`).
+        x, y: [k] m, the point of each path.
+        around: [k] m, arc length near which is looked; nan: anywhere.
+
+    Returns:
+        arc [k] m, offset [k] m (left positive).
+    """
     n = x.shape[0]
     out_arc, out_offset = np.empty(n), np.empty(n)
     for k in range(n):
@@ -90,9 +108,15 @@ def project_many(
 def project_each(
     points: Floats, arc: Floats, start: Ints, same: Ints, x: Floats, y: Floats
 ) -> tuple[Floats, Floats]:
-    """`project` of every point [n] onto each of the first k paths: arc [k,n] m, offset [k,n] m.
+    """`project` of every point onto each of the first k paths.
 
-    same [k]: the first path that is the same, whose answer is taken over.
+    Args:
+        points, arc, start: packed paths (`Paths`).
+        same: [k] the first path that is the same, whose answer is copied.
+        x, y: [n] m.
+
+    Returns:
+        arc [k,n] m, offset [k,n] m (left positive).
     """
     count, n = same.shape[0], x.shape[0]
     out_arc, out_offset = np.empty((count, n)), np.empty((count, n))
@@ -123,26 +147,38 @@ def roll(
     points: Floats,
     arc: Floats,
     start: Ints,
-    begin: Floats,  # [k] m, arc of the front now
-    offset: Floats,  # [k] m, front beside the path now
-    aim: Floats,  # [k] m, offset at which it ends up
-    heading: Floats,  # [k] rad, now
-    rate: Floats,  # [k] m/s >= 0, at which it gets there
-    length: Floats,  # [k] m
-    speed: Floats,  # [k,T+1] m/s
-    stop: Floats,  # [k] m, arc at which the front has to stand; inf for none
-    brake: float,  # m/s2 with which it gets there
+    begin: Floats,
+    offset: Floats,
+    aim: Floats,
+    heading: Floats,
+    rate: Floats,
+    length: Floats,
+    speed: Floats,
+    stop: Floats,
+    brake: float,
     dt: float,
-    x: Floats,  # [k,T+1] out
-    y: Floats,
-    out_heading: Floats,
-    out_speed: Floats,
-    out_arc: Floats,
-    out_rear: Floats,
-) -> None:
-    """Vehicle k along path k."""
-    frames = speed.shape[1]
-    for k in range(begin.shape[0]):
+) -> Floats:
+    """Vehicle k along path k.
+
+    Args:
+        points, arc, start: k packed paths (`Paths`).
+        begin: [k] m, arc of the front now.
+        offset: [k] m, front beside the path now, left positive.
+        aim: [k] m, offset at which it ends up.
+        heading: [k] rad, now.
+        rate: [k] m/s >= 0, at which it gets there.
+        length: [k] m.
+        speed: [k,T+1] m/s.
+        stop: [k] m, arc at which the front has to stand; inf for none.
+        brake: m/s2 with which it gets there.
+        dt: s between frames.
+
+    Returns:
+        [6,k,T+1] the arrays of a `Rollout`.
+    """
+    count, frames = speed.shape
+    out = np.empty((6, count, frames))
+    for k in range(count):
         first, last = start[k], start[k + 1]
         s, front, rear = begin[k], start[k], start[k]
         v = speed[k, 0]
@@ -152,9 +188,9 @@ def roll(
         for t in range(frames):
             if t > 0:
                 v_next = speed[k, t]
-                room = stop[k] - s
-                if room < 200.0:
-                    v_next = min(v_next, np.sqrt(max(2.0 * brake * room, 0.0)))
+                distance = stop[k] - s
+                if distance < 200.0:
+                    v_next = min(v_next, np.sqrt(max(2.0 * brake * distance, 0.0)))
                 s = min(s + 0.5 * dt * (v + v_next), max(stop[k], s))
                 v = v_next
                 drift = min(rate[k], left / dt)
@@ -177,30 +213,10 @@ def roll(
             beside = aim[k] + side * left
             fx -= np.sin(along) * beside
             fy += np.cos(along) * beside
-            x[k, t] = fx - 0.5 * length[k] * np.cos(h)
-            y[k, t] = fy - 0.5 * length[k] * np.sin(h)
-            out_heading[k, t] = h
-            out_speed[k, t] = v
-            out_arc[k, t] = s
-            out_rear[k, t] = beside - length[k] * np.sin(turn)
-
-
-def roll_out(
-    paths: Paths,
-    begin: Floats,
-    offset: Floats,
-    aim: Floats,
-    heading: Floats,
-    rate: Floats,
-    length: Floats,
-    speed: Floats,
-    stop: Floats,
-    brake: float,
-    dt: float,
-) -> Rollout:
-    """`roll` into fresh arrays; see there for the arguments."""
-    out = Rollout(*(np.empty_like(speed) for _ in range(6)))
-    roll(*paths, begin, offset, aim, heading, rate, length, speed, stop, brake, dt, *out)
+            out[0, k, t] = fx - 0.5 * length[k] * np.cos(h)
+            out[1, k, t] = fy - 0.5 * length[k] * np.sin(h)
+            out[2, k, t], out[3, k, t], out[4, k, t] = h, v, s
+            out[5, k, t] = beside - length[k] * np.sin(turn)
     return out
 
 
@@ -218,11 +234,23 @@ def roll_one(
     brake: float,
     dt: float,
 ) -> Floats:
-    """One vehicle on each of k paths, with the speeds [k,T+1] m/s of its row: a `Rollout`'s arrays [6,k,T+1].
+    """One vehicle on each of k paths.
 
-    now [8]: KINEMATIC_FEATURES in the world; its front lies about `around` m along every path. Where it
-    stands more than `beside` m off the path the gap closes with `change` m/s (a lane change, new or under
-    way), else with `settle`.
+    Where it stands more than `beside` m off the path the gap closes with `change` m/s (a lane change, new or
+    under way), else with `settle`.
+
+    Args:
+        points, arc, start: k packed paths (`Paths`).
+        now: [8] KINEMATIC_FEATURES in the world (m, m/s, rad).
+        around: m, arc of its front along every path, about.
+        speed: [k,T+1] m/s.
+        beside: m.
+        change, settle: m/s.
+        brake: m/s2 in front of a stop (there is none).
+        dt: s between frames.
+
+    Returns:
+        [6,k,T+1] the arrays of a `Rollout`.
     """
     count = speed.shape[0]
     begin, offset, rate = np.empty(count), np.empty(count), np.empty(count)
@@ -231,29 +259,9 @@ def roll_one(
     for k in range(count):
         begin[k], offset[k] = project(points, arc, start[k], start[k + 1], x, y, around)
         rate[k] = change if abs(offset[k]) > beside else settle
-    out = np.empty((6, count, speed.shape[1]))
-    roll(
-        points,
-        arc,
-        start,
-        begin,
-        offset,
-        np.zeros(count),
-        np.full(count, now[3]),
-        rate,
-        np.full(count, now[4]),
-        speed,
-        np.full(count, np.inf),
-        brake,
-        dt,
-        out[0],
-        out[1],
-        out[2],
-        out[3],
-        out[4],
-        out[5],
-    )
-    return out
+    still = np.zeros(count)
+    heading, length, stop = still + now[3], still + now[4], still + np.inf
+    return roll(points, arc, start, begin, offset, still, heading, rate, length, speed, stop, brake, dt)
 
 
 def fronts(state: Floats) -> tuple[Floats, Floats]:

@@ -1,7 +1,7 @@
 """The known past of every vehicle, completed to whole histories: predictors are fitted on nothing shorter.
 
-A vehicle that came into view two frames ago has a past too, only an unknown one. Told of whole histories
-alone, a learned predictor takes silence for calm, or for anything at all: with one known frame the fitted
+A vehicle that came into view two frames ago has a past too, only an unknown one. A predictor fitted on whole
+histories alone does not know what missing frames mean: with one known frame the fitted
 prior erred by three times constant speed. So what is not known is taken to have been as the two oldest known
 frames show; with a single one, constant speed (measured on tuning seeds, docs/prediction.md).
 """
@@ -16,29 +16,19 @@ from cosim.types import Bools, Floats, Ints
 ORDINARY = 3.0  # m/s2: who brakes harder than this now has hardly done so for two seconds
 
 
-def trailing_run(state: Floats, valid: Bools) -> Ints:
-    """[V] how many unbroken valid, finite frames lead up to now; state [V,N,>=4], valid [V,N]."""
-    run = np.empty(len(state), np.int64)
-    _trailing_run(state, valid, run)
-    return run
-
-
-def whole_past(state: Floats, run: Ints, frames: int, dt: float) -> Floats:
-    """[V,frames,4] x y speed heading, known or completed; `run` from `trailing_run` of state [V,N,>=4].
-
-    Speed (its slope within ORDINARY) and heading go back as the two oldest known frames show, nobody
-    reverses, and the places follow from both (P, eq. 9 backwards). A longer past is cut; zeros for a vehicle
-    that is not known now.
-    """
-    out = np.zeros((len(state), frames, 4))
-    _whole_past(state, run, dt, out)
-    return out
-
-
 @compiled
-def _trailing_run(state: Floats, valid: Bools, run: Ints) -> None:
+def trailing_run(state: Floats, valid: Bools) -> Ints:
+    """How many unbroken valid, finite frames lead up to now.
+
+    Args:
+        state: [V,N,>=4] oldest first.
+        valid: [V,N].
+
+    Returns:
+        [V] frames.
+    """
+    run = np.zeros(len(state), np.int64)
     for v in range(state.shape[0]):
-        run[v] = 0
         for k in range(state.shape[1] - 1, -1, -1):
             whole = valid[v, k]
             for f in range(4):
@@ -46,11 +36,27 @@ def _trailing_run(state: Floats, valid: Bools, run: Ints) -> None:
             if not whole:
                 break
             run[v] += 1
+    return run
 
 
 @compiled
-def _whole_past(state: Floats, run: Ints, dt: float, out: Floats) -> None:
-    frames = out.shape[1]
+def whole_past(state: Floats, run: Ints, frames: int, dt: float) -> Floats:
+    """The past of every vehicle as a whole history, known or completed.
+
+    Speed (its slope within ORDINARY) and heading go back as the two oldest known frames show, nobody
+    reverses, and the places follow from both (P, eq. 9 backwards). A longer past is cut; zeros for a vehicle
+    that is not known now.
+
+    Args:
+        state: [V,N,>=4] x m, y m, speed m/s, heading rad, oldest first.
+        run: [V] from `trailing_run`.
+        frames: of a whole history.
+        dt: s between frames.
+
+    Returns:
+        [V,frames,4] x m, y m, speed m/s, heading rad.
+    """
+    out = np.zeros((len(state), frames, 4))
     for v in range(state.shape[0]):
         known = min(run[v], frames)
         if known == 0:
@@ -70,3 +76,4 @@ def _whole_past(state: Floats, run: Ints, dt: float, out: Floats) -> None:
             out[v, k, 0] = x - 0.5 * dt * (speed * np.cos(heading) + before * np.cos(turned))
             out[v, k, 1] = y - 0.5 * dt * (speed * np.sin(heading) + before * np.sin(turned))
             out[v, k, 2], out[v, k, 3] = before, turned
+    return out

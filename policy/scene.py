@@ -40,7 +40,9 @@ class Scene(NamedTuple):
 def join(histories: Mapping[str, History], share: bool = True) -> Scene:
     """Join the histories of AVs that decide together.
 
-    `share`: V2V, the AVs' knowledge of a vehicle is pooled; otherwise each keeps its own copy of it.
+    Args:
+        histories: AV -> what it has observed.
+        share: V2V, the AVs' knowledge of a vehicle is pooled; otherwise each keeps its own copy of it.
     """
     agents = tuple(sorted(histories))
     each = tuple(histories[a] for a in agents)
@@ -49,29 +51,21 @@ def join(histories: Mapping[str, History], share: bool = True) -> Scene:
     pose = np.stack([h.pose for h in each])
     rows = np.full((len(each), kinematics.shape[2]), -1, np.int64)
     found: dict[tuple[str, str], int] = {}
-    names: list[str] = []
     source: list[tuple[int, int]] = []
     for b, history in enumerate(each):
-        for r, name in enumerate(history.ids):
-            if not name:
-                continue
-            key = (name, "" if share else agents[b])
-            k = found.get(key)
-            if k is None:
-                k = found[key] = len(names)
-                names.append(name)
+        for r, name in ((r, name) for r, name in enumerate(history.ids) if name):
+            k = rows[b, r] = found.setdefault((name, "" if share else agents[b]), len(found))
+            if k == len(source):
                 source.append((b, r))
-            rows[b, r] = k
-    at = np.array(source, np.int64)
-    state = to_world(kinematics, pose)[at[:, 0], :, at[:, 1]]  # [V,N,8]
+    of, row = np.array(source, np.int64).T  # [V] the AV that perceives each vehicle, and the row it has there
     return Scene(
         agents,
         each,
-        tuple(names),
-        state,
-        valid[at[:, 0], :, at[:, 1]],
-        np.stack([h.lane for h in each])[at[:, 0], at[:, 1]],
-        np.stack([h.lane_position for h in each])[at[:, 0], at[:, 1]],
+        tuple(name for name, _ in found),
+        to_world(kinematics, pose)[of, :, row],  # [V,N,8]
+        valid[of, :, row],
+        np.stack([h.lane for h in each])[of, row],
+        np.stack([h.lane_position for h in each])[of, row],
         rows,
         pose,
         share,

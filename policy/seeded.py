@@ -7,13 +7,18 @@ from typing import TypeVar
 
 import torch
 
+from cosim.seeding import subseed
+
 Made = TypeVar("Made")
 
 
 def seeded(build: Callable[[], Made], seed: int) -> Made:
     """What `build` makes, weights drawn from `seed`; torch's generator is left as it was."""
-    state = torch.random.get_rng_state()
-    torch.manual_seed(seed)  # module initialisers know no generator
-    made = build()
-    torch.random.set_rng_state(state)
-    return made
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)  # module initialisers know no generator
+        return build()
+
+
+def first_weights(build: Callable[[], Made], seed: int) -> Made:
+    """`seeded` for the network of a training whose seed of everything is `seed`."""
+    return seeded(build, subseed(seed, "network") % 2**31)

@@ -6,7 +6,7 @@ a network does not find it there (docs/training.md, What it took to learn from f
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from cosim.control import SPEED_STEP
 from cosim.geometry.compiled import compiled
 from cosim.road import RoadMap
 from cosim.types import Floats, Floats32, History
-from policy.meeting import LANE, Meeting, along, meet, missions
+from policy.meeting import LANE, along, meet, missions
 
 LOOK_AHEAD = np.array([20.0, 50.0, 100.0])  # m, where the candidate centre lines are sampled
 FAR = 200.0  # m: lane ends and conflict zones further away are all alike
@@ -108,18 +108,14 @@ def _met(histories: Sequence[History], road: RoadMap, shared: bool) -> list[list
 
 def _order(histories: Sequence[History], road: RoadMap) -> list[list[float]]:
     nobody = [0.0, 1.0, 1.0, 0.0, 0.0, 0.0]
-    meetings: list[Mapping[str, Meeting]] = []
-    seen = missions(histories)
-    for history in histories:
-        own = {name: meet(road, history, at) for name, at in seen.items()}
-        meetings.append({name: m for name, m in own.items() if m is not None})
+    seen = missions(histories).items()
+    meetings = [{name: m for name, at in seen if (m := meet(road, h, at)) is not None} for h in histories]
     out = []
     for mine in meetings:
         if not mine:
             out.append(nobody)
             continue
-        name = min(mine, key=lambda n: abs(mine[n].behind))
-        m = mine[name]
+        name, m = min(mine.items(), key=lambda item: abs(item[1].behind))
         before = [o[name].behind for o in meetings if name in o and o[name].behind < m.behind]
         next_before = max(before, default=-FAR)
         out.append(

@@ -10,7 +10,7 @@ import numpy as np
 from cosim.road import LanePath, RoadMap
 from cosim.types import HEADING, LENGTH, SPEED, WIDTH, Bools, Floats, X, Y
 from policy.forecast import KinematicForecast
-from policy.motion import Rollout, fronts, pack, project_many, roll_out
+from policy.motion import Rollout, fronts, pack, project_many, roll
 from policy.predictors.protocol import Predictor
 from policy.scene import Scene
 
@@ -40,11 +40,19 @@ class Traffic(NamedTuple):
 
 
 def foresee(
-    scene: Scene, predictor: Predictor, road: RoadMap, config: TrafficConfig
+    scene: Scene, predictor: Predictor, road: RoadMap, config: TrafficConfig, frames: int | None = None
 ) -> tuple[KinematicForecast, Traffic]:
-    """What the predictor says of every vehicle, and the same carried along the lanes."""
+    """The predictor's forecast of every vehicle of a scene, and the same carried along the lanes.
+
+    Args:
+        scene: what the AVs know.
+        predictor: forecasts `predictor.horizon` frames.
+        road: the road map.
+        config: how vehicles are carried along their lanes.
+        frames: how far they are carried (default: the predictor's horizon).
+    """
     forecast = predictor.predict(scene.state, scene.valid)
-    return forecast, predict_traffic(scene, forecast, road, config, predictor.horizon)
+    return forecast, predict_traffic(scene, forecast, road, config, frames or predictor.horizon)
 
 
 def predict_traffic(
@@ -55,6 +63,16 @@ def predict_traffic(
     A vehicle keeps its lane and takes the straightest way (its route is unknown); one that drifts sideways
     goes where it drifts, so a merging car sits in the neighbour lane only once it really moves there; where
     the lane ends it stops. Vehicles off every lane go where the forecast says.
+
+    Args:
+        scene: what the AVs know.
+        forecast: [V,M] of its vehicles, in the world.
+        road: the road map.
+        config: how vehicles are carried along their lanes.
+        frames: of `config.dt` s.
+
+    Returns:
+        the rollout [V,frames+1] of every vehicle, frame 0 is now.
     """
     c = config
     count = len(scene.vehicles)
@@ -86,8 +104,8 @@ def predict_traffic(
     end = np.array([p.length if p.dead_end else np.inf for p in paths])
     limit = np.array([road.lanes[k].speed_limit for k in lanes]) * c.speed_factor
     top = np.maximum(limit, now[on_lane, SPEED])[:, None] if len(lanes) else np.zeros((0, 1))
-    along = roll_out(
-        packed,
+    along = roll(
+        *packed,
         arc,
         offset,
         aim,
@@ -105,12 +123,10 @@ def predict_traffic(
     lost = np.flatnonzero(known & (scene.lane < 0))
     if len(lost):
         _straight(out, now, forecast, speed, lost, m, c.dt)
-    stream: list[LanePath | None] = [None] * count
+    stream = dict(zip(on_lane.tolist(), paths, strict=True))
     drifting = np.zeros(count, np.bool_)
-    for i, v in enumerate(on_lane):
-        stream[v] = paths[i]
     drifting[on_lane] = moving
-    return Traffic(out, now[:, LENGTH], now[:, WIDTH], tuple(stream), drifting, known)
+    return Traffic(out, now[:, LENGTH], now[:, WIDTH], tuple(map(stream.get, range(count))), drifting, known)
 
 
 def _sideways(
@@ -139,9 +155,9 @@ def _straight(
     dt: float,
 ) -> None:
     """Vehicles off every lane: the forecast's own positions, then straight on."""
-    out.x[rows, 0], out.y[rows, 0], out.heading[rows, 0] = now[rows, X], now[rows, Y], now[rows, HEADING]
-    out.x[rows, 1 : m + 1], out.y[rows, 1 : m + 1] = forecast.x[rows, :m], forecast.y[rows, :m]
-    out.heading[rows, 1 : m + 1] = forecast.heading[rows, :m]
+    for array, feature, ahead in ((out.x, X, forecast.x), (out.y, Y, forecast.y)):
+        array[rows, : m + 1] = np.concatenate([now[rows, feature, None], ahead[rows, :m]], 1)
+    out.heading[rows, : m + 1] = np.concatenate([now[rows, HEADING, None], forecast.heading[rows, :m]], 1)
     later = dt * np.arange(1, out.x.shape[1] - m)
     last = forecast.heading[rows, m - 1 : m]
     v = speed[rows, m : m + 1]

@@ -1,9 +1,9 @@
-"""What the HPN's kinematic branch is told of every vehicle: its past, two forecasts, whom it meets.
+"""The inputs of the HPN's kinematic branch, by vehicle: its past, two forecasts, its neighbours.
 
 Every vehicle is seen in its own frame (its centre at the newest frame, x ahead, y left), so what is learned
 holds wherever a road lies and whatever world it belongs to. Two forecasts stand side by side: the Gaussian
 process's (P, eq. 7-9), which knows no road, and the same speeds carried along the vehicle's lane. Nothing
-here is any driver's own secret: no class, route or desired speed.
+here is known to the driver alone: no class, route or desired speed.
 """
 
 from __future__ import annotations
@@ -83,10 +83,9 @@ def _to_own(x: Floats, y: Floats, now: Floats) -> tuple[Floats, Floats]:
 
 def _fixed(traffic: Traffic, now: Floats) -> Floats:
     """[V,FIXED] speed, size, kind, and the place on the road."""
-    out = np.zeros((len(now), FIXED))
-    out[:, :5] = now[:, [SPEED, LENGTH, WIDTH, IS_AV, IS_MISSION]] / (30.0, 10.0, 3.0, 1.0, 1.0)
-    out[:, 5] = np.clip(traffic.rollout.rear[:, 0] / 3.2, -2.0, 2.0)  # in lane widths beside its path
-    out[:, 6] = traffic.drifting
+    vehicle = now[:, [SPEED, LENGTH, WIDTH, IS_AV, IS_MISSION]] / (30.0, 10.0, 3.0, 1.0, 1.0)
+    beside = np.clip(traffic.rollout.rear[:, 0] / 3.2, -2.0, 2.0)  # in lane widths beside its path
+    place = np.zeros((len(now), 4))
     at = [
         (k, p.length if p.dead_end else np.inf, p.conflict, p.leaves)
         for k, p in enumerate(traffic.stream)
@@ -95,11 +94,9 @@ def _fixed(traffic: Traffic, now: Floats) -> Floats:
     if at:
         rows, end, conflict, leaves = (np.array(v) for v in zip(*at, strict=True))
         front = traffic.rollout.arc[rows, 0]  # m
-        out[rows, 7] = 1.0
-        out[rows, 8] = 1.0 - np.clip(end - front, 0.0, OPEN) / OPEN
-        out[rows, 9] = 1.0 - np.clip(conflict - front, 0.0, OPEN) / OPEN
-        out[rows, 10] = leaves
-    return out
+        near = [1.0 - np.clip(distance - front, 0.0, OPEN) / OPEN for distance in (end, conflict)]
+        place[rows] = np.stack([np.ones(len(rows)), *near, leaves], 1)
+    return np.concatenate([vehicle, beside[:, None], traffic.drifting[:, None], place], 1)
 
 
 def _past(past: Floats, seen: Bools, now: Floats) -> Floats:
@@ -107,25 +104,27 @@ def _past(past: Floats, seen: Bools, now: Floats) -> Floats:
     v, n = seen.shape
     ahead, left = _to_own(past[:, :-1, X], past[:, :-1, Y], now)
     elapsed = FRAME * np.arange(1 - n, 0)
-    parts = np.empty((v, n - 1, 4))
-    parts[..., 0] = (ahead - now[:, SPEED, None] * elapsed) / 5.0
-    parts[..., 1] = left / 3.0
-    parts[..., 2] = (past[:, :-1, SPEED] - now[:, SPEED, None]) / 5.0
-    parts[..., 3] = (past[:, :-1, HEADING] - now[:, HEADING, None]) / 0.3
-    parts *= seen[:, :-1, None]
-    return np.concatenate([parts.reshape(v, -1), seen], 1)
+    parts = (
+        (ahead - now[:, SPEED, None] * elapsed) / 5.0,
+        left / 3.0,
+        (past[:, :-1, SPEED] - now[:, SPEED, None]) / 5.0,
+        (past[:, :-1, HEADING] - now[:, HEADING, None]) / 0.3,
+    )
+    known = np.stack(parts, -1) * seen[:, :-1, None]
+    return np.concatenate([known.reshape(v, -1), seen], 1)
 
 
 def _ahead(states: Floats, now: Floats) -> Floats:
     """[V,AHEAD*marks] a forecast at the MARKS, against straight on at the present speed."""
     at = states[:, MARKS]
     ahead, left = _to_own(at[..., X], at[..., Y], now)
-    out = np.empty((*ahead.shape, AHEAD))
-    out[..., 0] = (ahead - now[:, SPEED, None] * FRAME * (1 + MARKS)) / 15.0
-    out[..., 1] = left / 8.0
-    out[..., 2] = (at[..., SPEED] - now[:, SPEED, None]) / 8.0
-    out[..., 3] = (at[..., HEADING] - now[:, HEADING, None]) / 0.8
-    return out.reshape(len(now), -1)
+    parts = (
+        (ahead - now[:, SPEED, None] * FRAME * (1 + MARKS)) / 15.0,
+        left / 8.0,
+        (at[..., SPEED] - now[:, SPEED, None]) / 8.0,
+        (at[..., HEADING] - now[:, HEADING, None]) / 0.8,
+    )
+    return np.stack(parts, -1).reshape(len(now), -1)
 
 
 def _accel(past: Floats, seen: Bools) -> Floats:
@@ -157,13 +156,14 @@ def _leaders(scene: Scene, traffic: Traffic, now: Floats, accel: Floats, known: 
     )
     there = who >= 0
     j = np.maximum(who, 0)
-    out = np.empty((*who.shape, LEADER))
-    out[..., 0] = 1.0
-    out[..., 1] = np.exp(-np.maximum(gap, 0.0) / 20.0)
-    out[..., 2] = now[j, SPEED] / 30.0
-    out[..., 3] = (now[:, None, SPEED] - now[j, SPEED]) / 8.0
-    out[..., 4] = accel[j] / 4.0
-    return np.asarray((out * there[..., None]).reshape(len(now), -1))
+    parts = (
+        np.ones(who.shape),
+        np.exp(-np.maximum(gap, 0.0) / 20.0),
+        now[j, SPEED] / 30.0,
+        (now[:, None, SPEED] - now[j, SPEED]) / 8.0,
+        accel[j] / 4.0,
+    )
+    return np.asarray((np.stack(parts, -1) * there[..., None]).reshape(len(now), -1))
 
 
 @compiled
@@ -188,14 +188,14 @@ def _next_on_path(
             for j in range(count):
                 if place[j] != lanes[k] or j == i or owner[j] != owner[i]:
                     continue
-                room = begins[k] + position[j] * scale[i] - length[j] - front[i]
-                if room < -3.0 or room > 150.0 or room >= gap[i, 1]:
+                ahead = begins[k] + position[j] * scale[i] - length[j] - front[i]
+                if ahead < -3.0 or ahead > 150.0 or ahead >= gap[i, 1]:
                     continue
-                if room < gap[i, 0]:
+                if ahead < gap[i, 0]:
                     gap[i, 1], who[i, 1] = gap[i, 0], who[i, 0]
-                    gap[i, 0], who[i, 0] = room, j
+                    gap[i, 0], who[i, 0] = ahead, j
                 else:
-                    gap[i, 1], who[i, 1] = room, j
+                    gap[i, 1], who[i, 1] = ahead, j
     return who, gap
 
 
@@ -214,20 +214,15 @@ def _near(scene: Scene, now: Floats, accel: Floats, lane: Floats, known: Bools) 
     there = np.isfinite(np.take_along_axis(square, j, 1)) & known[:, None]
     ahead, left = _to_own(now[j, X], now[j, Y], now)
     turn = now[j, HEADING] - now[:, HEADING, None]
-    f = out[:, :k]
-    f[..., 0] = 1.0
-    f[..., 1], f[..., 2] = ahead / 40.0, left / 8.0
-    f[..., 3], f[..., 4] = np.cos(turn), np.sin(turn)
-    f[..., 5], f[..., 6] = now[j, SPEED] / 30.0, (now[j, SPEED] - now[:, SPEED, None]) / 8.0
-    f[..., 7], f[..., 8], f[..., 9] = accel[j] / 4.0, now[j, LENGTH] / 10.0, now[j, IS_AV]
-    f[..., 10] = scene.lane[j] == scene.lane[:, None]
-    for place, mark in enumerate(MARKS[:3]):
+    parts = [np.ones(j.shape), ahead / 40.0, left / 8.0, np.cos(turn), np.sin(turn)]
+    parts += [now[j, SPEED] / 30.0, (now[j, SPEED] - now[:, SPEED, None]) / 8.0, accel[j] / 4.0]
+    parts += [now[j, LENGTH] / 10.0, now[j, IS_AV], scene.lane[j] == scene.lane[:, None]]
+    for mark in MARKS[:3]:
         mine = lane[:, mark]  # where each is then
         ahead, left = _to_own(mine[j, X], mine[j, Y], mine)
-        f[..., 11 + 2 * place], f[..., 12 + 2 * place] = ahead / 40.0, left / 8.0
-    np.nan_to_num(f, copy=False)
-    np.clip(f, -CLIP, CLIP, out=f)
-    f *= there[..., None]
+        parts += [ahead / 40.0, left / 8.0]
+    inputs = np.nan_to_num(np.stack(parts, -1).astype(np.float32))
+    out[:, :k] = np.clip(inputs, -CLIP, CLIP) * there[..., None]
     return out
 
 

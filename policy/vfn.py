@@ -8,7 +8,7 @@ network with parts left out.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import nn
@@ -81,11 +81,11 @@ class VFN(nn.Module):
     def __init__(self, config: VfnConfig) -> None:
         super().__init__()
         self.config = c = config
-        # without kinematics what they would tell must be found in pixels
+        # without kinematics the same must be found in pixels
         channels, read = (c.channels, unit) if c.kinematic else (APART, apart)
         shape = c.frames, channels, c.height, c.width
         if c.extractor == "conv2d":
-            self.maps: nn.Module = Conv2dMaps(*shape, c.features, read)
+            self.maps: Any = Conv2dMaps(*shape, c.features, read)
         else:
             self.maps = Conv3dMaps(*shape, c.features, c.strides, read)
         self.hidden = nn.Linear(int(self.maps.flat), c.hidden)
@@ -103,10 +103,9 @@ class VFN(nn.Module):
         self.joined = nn.Linear(c.hidden + 3 * c.kinematic + own + 2, c.joined)
         self.value = nn.Linear(c.joined, len(MetaAction))
         self.state = nn.Linear(c.joined, 1) if c.critic or c.dueling else None
-        for head in (self.value, self.state):
-            if head is not None:
-                nn.init.zeros_(head.weight)
-                nn.init.zeros_(head.bias)
+        for head in (self.value, self.state) if self.state is not None else (self.value,):
+            for parameter in head.parameters():
+                nn.init.zeros_(parameter)
 
     @property
     def layout(self) -> torch.memory_format:
@@ -128,11 +127,7 @@ class VFN(nn.Module):
         if maps is None:
             parts = [phi.new_zeros(len(phi), self.config.hidden)]
         else:
-            if isinstance(maps, Frames):
-                assert isinstance(self.maps, Conv3dMaps)
-                seen = self.maps.stacked(maps.features)
-            else:
-                seen = self.maps(maps)
+            seen = self.maps.stacked(maps.features) if isinstance(maps, Frames) else self.maps(maps)
             parts = [functional.relu(self.hidden(seen))]
         if self.kinematics is not None:
             parts += [self.kinematics(kinematics), self.situation(situation)]
@@ -145,10 +140,17 @@ class VFN(nn.Module):
         situation: torch.Tensor,
         phi: torch.Tensor,
     ) -> torch.Tensor:
-        """maps [B,T,C,H,W], kinematics [B,T,R,F+1], situation [B,.], phi [B,2] -> q [B,5].
+        """Action values (P, figure 4).
 
-        Maps are uint8 pixels; in [0,1] too where there are kinematics. Without maps that branch says nothing,
-        and learning costs no convolutions.
+        Args:
+            maps: [B,T,C,H,W] uint8 pixels (where there are kinematics, float32 in [0,1] too), the past frames
+                first; or their `Frames`; None: the map branch gives zeros, and there are no convolutions.
+            kinematics: [B,T,R,F+1] scaled, the mask last (`policy.tensors.kinematic_tensor`).
+            situation: [B,SITUATION_INPUTS] (`policy.situation.situation`).
+            phi: [B,2] cosine and sine of the SVO (`policy.tensors.svo_tensor`).
+
+        Returns:
+            q: [B,5] value of each `MetaAction`.
         """
         z = self.features(maps, kinematics, situation, phi)
         q: torch.Tensor = self.value(z)
@@ -157,9 +159,16 @@ class VFN(nn.Module):
         return q
 
     def actor_critic(
-        self, maps: torch.Tensor, kinematics: torch.Tensor, situation: torch.Tensor, phi: torch.Tensor
+        self,
+        maps: torch.Tensor | Frames | None,
+        kinematics: torch.Tensor,
+        situation: torch.Tensor,
+        phi: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Log-preferences [B,5] (not normalised) and state values [B]. Needs `critic`."""
+        """Log-preferences [B,5] (not normalised) and state values [B] (T, figure 4).
+
+        Arguments as in `forward`. Raises ValueError when the network has no critic (`VfnConfig.critic`).
+        """
         if self.state is None or not self.config.critic:
             raise ValueError("this network has no critic")
         z = self.features(maps, kinematics, situation, phi)

@@ -1,4 +1,4 @@
-"""The five worlds as data: find a world's folder by its name (no simulator is touched here)."""
+"""The worlds that ship, as data: find a world's folder by its name (no simulator is touched here)."""
 
 from __future__ import annotations
 

@@ -13,8 +13,8 @@ from benchmarks.unled import Unled
 from cosim.errors import BadInput
 from cosim.types import Policy, PolicyContext
 from policy import checkpoint
-from policy.agents import LEARNING, make
-from policy.agents.approaches import APPROACHES, AgentConfig, compact, shipped
+from policy.agents import APPROACHES, make
+from policy.agents.approaches import AgentConfig, compact, shipped
 from policy.agents.prediction_aware import PredictionAware
 from policy.checkpoint import sha256
 from policy.safety import SafetyConfig
@@ -46,7 +46,7 @@ class Agent:
     @property
     def learned(self) -> bool:
         """Whether it has networks."""
-        return self.base in LEARNING
+        return self.base in APPROACHES
 
     @property
     def command(self) -> str:

@@ -16,20 +16,22 @@ from pathlib import Path
 
 from benchmarks.papers import shipped
 from benchmarks.papers.agents import Agent, build, fingerprint, missing, short
+from benchmarks.papers.claims import TABLE_3
 from cosim.batch import execution as batch
 from cosim.batch import matrix
-from cosim.batch.case_runner import CaseRunner
+from cosim.batch.episode_runner import EpisodeRunner
 from cosim.batch.folder import RunFolder
 from cosim.batch.store import Store
 from cosim.report.figures import Row
 from cosim.report.run_folder import Run
-from cosim.scenario.episode_id import Case
+from cosim.scenario.episode_id import EpisodeId
 from cosim.seeding import FIRST_TEST_SEED
 from cosim.types import Policy
 from cosim.workers.engines import LocalEngine
 from cosim.workers.progress import Progress
+from sumo_scenarios import names
 
-WORLDS = ("exit", "merge", "roundabout", "intersection", "highway")  # P's order
+WORLDS = tuple(TABLE_3)  # in P's order
 SVO = 45.0  # deg, weighs oneself and the others alike
 LEAST = 2  # episodes, however small the scale
 TRAININGS = Path("docs/results/trainings")  # logs of the trainings that made the shipped weights
@@ -53,21 +55,15 @@ class Order:
         return self.arm or self.agent.name
 
     @property
-    def case(self) -> Case:
+    def case(self) -> EpisodeId:
         """Of the first seed; the policy is the agent's name."""
-        return Case(
+        return EpisodeId(
             what=self.scenario,
             demand=(self.demand,),
             policy=self.agent.name,
             behavior=self.behavior,
-            driver_model="lc2013",
-            penetration=None,
-            av_type=None,
-            av_ids=None,
             svo_deg=self.svo_deg,
             preset="unguarded",
-            duration=None,
-            seed=FIRST_TEST_SEED,
         )
 
 
@@ -231,7 +227,7 @@ class Planned(matrix.Plan):
         """Cell -> its seeds."""
         return {cell.name: self.seeds[:n] for cell, n in zip(self.cells, self.counts, strict=True)}
 
-    def cases(self) -> Iterator[tuple[matrix.Cell, Case]]:
+    def cases(self) -> Iterator[tuple[matrix.Cell, EpisodeId]]:
         wanted = self.wanted
         for cell in self.cells:
             for seed in wanted[cell.name]:
@@ -269,14 +265,14 @@ def agent_of(policy: str) -> str:
     return policy.split(MARK)[0]
 
 
-class AgentRunner(CaseRunner):
+class AgentRunner(EpisodeRunner):
     """Hosted by the engine: like `cosim evaluate`, for agents that `--policy` does not know."""
 
     def __init__(self, agents: Mapping[str, Agent], untrained: bool) -> None:
         super().__init__()
         self._agents, self._untrained = agents, untrained
 
-    def policy(self, case: Case) -> Policy:
+    def policy(self, case: EpisodeId) -> Policy:
         """The agent whose name the case bears."""
         return build(self._agents[agent_of(case.policy)], self._untrained)
 
@@ -300,7 +296,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     default = Settings()
     add = parser.add_argument
     add("--scale", type=float, default=1.0, metavar="X", help="of the numbers of episodes")
-    add("--scenario", action="append", default=[], choices=WORLDS, help="default: all that a table has")
+    add("--scenario", action="append", default=[], choices=names(), help="default: all that a table has")
     add("--duration", type=float, metavar="S", help="of an episode; default: the scenario's own")
     add("--workers", type=int, default=default.workers, metavar="N")
     add("--untrained", action="store_true", help="value networks as they are born, labelled so")

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from benchmarks.papers.driving import AgentRunner
-from cosim.recording.watcher import Track, Watched
+from cosim.recording.watched import Track, Watched
 from cosim.report.replay.strip import Strip, poses_at
 from cosim.road import Lane
-from cosim.scenario.episode_id import Case
+from cosim.scenario.episode_id import EpisodeId
 from cosim.types import Floats, Kind
 from cosim.workers.tasks import Progress
 
@@ -51,7 +51,7 @@ class GuideWatcher(AgentRunner):
     """Hosted by the engine: drives an episode, looks at its guide AV and takes three pictures."""
 
     def run(
-        self, case: Case, warnings: tuple[str, ...], outputs: str | None, progress: Progress
+        self, case: EpisodeId, warnings: tuple[str, ...], outputs: str | None, progress: Progress
     ) -> dict[str, Any]:
         """`seed`, `trace_hash`, `crashed`; `guided`: the fields of `Guided`; `pictures`: PNG files."""
         result, watched = self.open(case, warnings).watch(case.seed, progress)

@@ -13,14 +13,14 @@ import argparse
 from benchmarks import learning_curves
 from benchmarks.papers.driving import Settings, add_arguments, settings_of
 from benchmarks.tables import write_page
-from policy.agents import LEARNING
+from policy.agents import APPROACHES
 
 NAME = "learning"
 
 
 def write(settings: Settings) -> None:
     """learning.md, learning.png, data/learning.csv; nothing where no training is known of."""
-    runs = [learning_curves.read(f"{name}={run}") for name in LEARNING for run in settings.trained(name)]
+    runs = [learning_curves.read(f"{name}={run}") for name in APPROACHES for run in settings.trained(name)]
     if not runs:
         return
     data = settings.out / "data"

@@ -15,13 +15,13 @@ from benchmarks.papers.agents import Agent
 from benchmarks.papers.driving import Driven, Order, Results, Settings
 from benchmarks.papers.pages import Job, drawing, heading, save, save_picture
 from benchmarks.tables import Line, difference_lines, difference_table, found, lines_of, table
+from benchmarks.worlds import WITH_MISSION
 from cosim.report.figures import Measure
 from cosim.report.run_folder import Run
 
 PHIS = (0.0, 15.0, 30.0, 45.0, 60.0, 75.0, 90.0)  # degrees: from egoist to whoever lives for others
 AGENT = "vfn-p"
 YARDSTICKS = (("vfn-p-egoistic", 0.0), ("idm", 45.0), ("altruist-rule", 45.0))
-WORLDS = ("merge", "exit", "roundabout", "intersection")  # those with a mission vehicle
 DEMAND, BEHAVIOR = "contested", "moderate"
 EPISODES = 100
 FIGURES = ("collision_rate", "mission_success_rate", "dt_av_m", "dt_hv_m", "dt_mission_m", "dt_mean_m",
@@ -41,7 +41,7 @@ def orders() -> list[Order]:
     agents += [(Agent(name), phi, "") for name, phi in YARDSTICKS]
     return [
         Order(agent, world, DEMAND, BEHAVIOR, EPISODES, phi, name)
-        for world in WORLDS
+        for world in WITH_MISSION
         for agent, phi, name in agents
     ]
 
@@ -52,7 +52,7 @@ def write(results: Results, settings: Settings) -> None:
     lines: list[Line] = []
     runs = results.runs()
     driven = {one.order.arm or one.order.name: one for one in results.driven if one.rows}
-    worlds = [w for w in WORLDS if any(of_world(run, w) for run in runs.values())]
+    worlds = [w for w in WITH_MISSION if any(of_world(run, w) for run in runs.values())]
     if worlds:
         page += [_picture(runs, driven, worlds, settings), ""]
         page += [

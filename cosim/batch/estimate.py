@@ -1,10 +1,11 @@
-"""How long a matrix will take: a few short episodes of it are driven, and the rest reckoned from them."""
+"""How long a matrix will take: a few short episodes of it are driven, and the rest is computed from them."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from statistics import fmean
 
 from cosim.batch.matrix import Cell, Plan
@@ -23,31 +24,20 @@ class Cost:
     second: float  # per counted second
 
 
-@dataclass(frozen=True, slots=True)
-class Estimate:
-    """Wall time of a whole matrix in s (None: no probe came through), and what it rests on."""
+def estimate(plan: Plan, engine: Engine, workers: int) -> tuple[float | None, str]:
+    """Wall time of a whole matrix in s (None: no probe came through), and what it rests on.
 
-    seconds: float | None
-    basis: str
-
-
-def estimate(plan: Plan, engine: Engine, workers: int) -> Estimate:
-    """Drive the first seed of some cells for `PROBE` s each, and reckon the rest from them.
-
+    The first seed of some cells is driven for `PROBE` s each, and the rest is computed from them.
     A cell that was not probed is taken to cost what those of the same policy do. Traffic that grows during an
     episode makes the estimate too low, an early end by a crash makes it too high.
     """
     costs = probe(_chosen(plan.cells), engine)
     if not costs:
-        return Estimate(None, "no short episode came through: see the rows' errors in a real run")
-    total = 0.0
-    for cell in plan.cells:
-        if cell.refused is None:
-            cost = _like(cell, costs)
-            per_episode = cost.reset + cost.second * cell.scenario.duration
-            total += cost.start + per_episode * len(plan.seeds)
+        return None, "no short episode came through: see the rows' errors in a real run"
+    driven = [(cell.scenario.duration, _like(cell, costs)) for cell in plan.cells if cell.refused is None]
+    total = sum(cost.start + len(plan.seeds) * (cost.reset + cost.second * s) for s, cost in driven)
     basis = f"{len(costs)} of {len(plan.cells)} cells driven for {PROBE:g} s just now, {workers} workers"
-    return Estimate(total / workers, basis)
+    return total / workers, basis
 
 
 def probe(cells: Sequence[Cell], engine: Engine) -> dict[tuple[str, str], Cost]:
@@ -73,22 +63,17 @@ def probe(cells: Sequence[Cell], engine: Engine) -> dict[tuple[str, str], Cost]:
 
 def _chosen(cells: Sequence[Cell]) -> list[Cell]:
     """One cell of each world and policy, those of different policies first."""
-    found: dict[tuple[str, str], Cell] = {}
+    found: dict[str, dict[str, Cell]] = {}
     for cell in cells:
         if cell.refused is None:
-            found.setdefault((cell.case.what, cell.case.policy), cell)
-    seen: dict[str, int] = {}
-    ranked: list[tuple[int, int, Cell]] = []
-    for (_, policy), cell in found.items():
-        seen[policy] = seen.get(policy, 0) + 1
-        ranked.append((seen[policy], len(ranked), cell))
-    return [cell for _, _, cell in sorted(ranked, key=lambda item: item[:2])[:PROBES]]
+            found.setdefault(cell.case.policy, {}).setdefault(cell.case.what, cell)
+    rounds = itertools.zip_longest(*(worlds.values() for worlds in found.values()))
+    return [cell for mixed in rounds for cell in mixed if cell is not None][:PROBES]
 
 
 def _like(cell: Cell, costs: dict[tuple[str, str], Cost]) -> Cost:
     """The cost of the same world and policy, else the mean of the policy, else of all."""
-    known = costs.get((cell.case.what, cell.case.policy))
-    if known is not None:
+    if known := costs.get((cell.case.what, cell.case.policy)):
         return known
     alike = [cost for (_, policy), cost in costs.items() if policy == cell.case.policy] or [*costs.values()]
-    return Cost(fmean(c.start for c in alike), fmean(c.reset for c in alike), fmean(c.second for c in alike))
+    return Cost(*map(fmean, zip(*map(astuple, alike), strict=True)))

@@ -9,14 +9,42 @@ from typing import Any
 
 from cosim.batch.matrix import Cell, Plan
 from cosim.batch.records import row
-from cosim.batch.store import Store
+from cosim.batch.store import FILE, Store
 from cosim.errors import BadInput, CosimError
+from cosim.scenario.episode_id import EpisodeId
 from cosim.scenario.manifest import POLICY_FILES
 from cosim.scenario.policy_name import label
 from cosim.workers.engines import Engine
 from cosim.workers.tasks import BAD_INPUT, FAULT, Outcome, Progress
 
 FAULTS = 10  # of our own code, before a batch stops: it is broken, not unlucky
+
+
+def asked(folder: Path, url: str | None) -> tuple[list[EpisodeId], range]:
+    """The case of every cell and the seeds of the run in a folder, or in the database `url`.
+
+    Raises BadInput when there is none.
+    """
+    if url is not None or (folder / FILE).is_file():
+        with Store.in_folder(folder, url) as store:
+            if store.spec_hash() is not None:
+                cases = [EpisodeId.read(cell["case"]) for cell in store.cells().values()]
+                return cases, range(*store.document()["seeds"])
+    raise BadInput("holds no run to resume", field="--out", value=str(folder))
+
+
+def begin_or_resume(plan: Plan, store: Store, document: Mapping[str, Any], *, resume: bool) -> None:
+    """Begin a fresh store with this plan; check that one in use was begun with it.
+
+    Raises BadInput when it was begun with another plan, or was begun at all and `resume` is false.
+    """
+    if store.spec_hash() is None:
+        begin(plan, store, document)
+    elif resume:
+        check_same(plan, store)
+    else:
+        problem = f"holds a run named {store.run} already: --resume it, or name another --out"
+        raise BadInput(problem, field="--store")
 
 
 def begin(plan: Plan, store: Store, document: Mapping[str, Any]) -> None:
@@ -59,43 +87,46 @@ def drive(plan: Plan, store: Store, engine: Engine, outputs: Path, progress: Pro
         for cell, case in cases.values()
         if not cell.refused
     ]
-    witness = _Witness(store)
+    common = _Common(store)
     faults: list[Outcome] = []
-    finished = len(refused)
     with closing(engine.run(tasks)) as outcomes:
-        for outcome in outcomes:
-            cell, case = cases[outcome.key]
-            finished += 1
+        for finished, outcome in enumerate(outcomes, len(refused) + 1):
             progress(finished, len(cases))
-            if outcome.status == FAULT:
-                faults.append(outcome)
-                if len(faults) == FAULTS:
-                    raise CosimError(f"stopped at the {FAULTS}th fault of our own: {outcome.stderr}")
-                continue
+            cell, case = cases[outcome.key]
             if outcome.ok:
-                witness.see(cell, outcome.value)
-            store.add([row(cell, case, outcome)])
+                common.check(cell, outcome.value)
+            if outcome.status != FAULT:
+                store.add([row(cell, case, outcome)])
+                continue
+            faults.append(outcome)
+            if len(faults) == FAULTS:
+                raise CosimError(f"stopped at the {FAULTS}th fault of our own: {outcome.stderr}")
     return faults
 
 
-class _Witness:
-    """Keeps what all episodes of a cell have in common once, and sees to it that they do have it."""
+def manifest(plan: Plan, store: Store) -> dict[str, Any]:
+    """manifest.json: what was run, on what; per cell what `cosim.scenario.manifest` says of all."""
+    cells = store.cells()
+    versions: dict[str, Any] = next((cell["manifest"]["versions"] for cell in cells.values()), {})
+    return {**store.document(), "spec": plan.spec_hash, "versions": versions, "cells": cells}
+
+
+class _Common:
+    """What all episodes of a cell have in common: kept once, and compared with every episode."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
-        self._manifests: dict[str, Mapping[str, Any]] = {}
+        self._manifests = {name: cell["manifest"] for name, cell in store.cells().items()}
         self._notes = {name: dict(store.document().get(name, {})) for name in ("units", "better")}
 
-    def see(self, cell: Cell, document: Mapping[str, Any]) -> None:
+    def check(self, cell: Cell, document: Mapping[str, Any]) -> None:
         """One episode's document. Raises BadInput when its manifest is not that of the cell."""
         found = {k: v for k, v in document["manifest"].items() if k != "seed"}
-        known = self._manifests.get(cell.name)
-        if known is None:
-            known = self._manifests[cell.name] = self._store.cells()[cell.name]["manifest"]
+        known = self._manifests[cell.name]
         _compare(known, found, cell, "in a worker")
         if found.keys() - known.keys():
-            self._manifests[cell.name] = {**known, **found}
-            self._store.set_manifest(cell.name, self._manifests[cell.name])
+            self._manifests[cell.name] = known | found
+            self._store.set_manifest(cell.name, known | found)
         for name, notes in self._notes.items():
             if document[name].keys() - notes.keys():
                 notes.update(document[name])

@@ -48,12 +48,6 @@ def arrow(rows: Sequence[Row]) -> pa.Table:
 
 def _column(values: list[Any]) -> pa.Array:
     kinds = {type(value) for value in values if value is not None}
-    if not kinds:
-        return pa.array(values, pa.float64())  # NA throughout: figures have no other type to lose
-    if kinds == {bool}:
-        return pa.array(values, pa.bool_())
-    if kinds == {int}:
-        return pa.array(values, pa.int64())
-    if kinds == {str}:
-        return pa.array(values, pa.string())
-    return pa.array([None if value is None else float(value) for value in values], pa.float64())
+    if len(kinds) > 1:  # 1 and 2.5
+        values = [None if value is None else float(value) for value in values]
+    return pa.array(values, None if kinds else pa.float64())  # NA throughout: no type to infer

@@ -5,17 +5,19 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 from cosim.batch.store import FILE
 from cosim.errors import BadInput
+from cosim.files import cannot
 
 ROOM = 32_000  # bytes per episode: 6 kB in the store, 2 kB exported, and the store's log beside it
 ROOM_AT_LEAST = 4_000_000  # bytes
 RESULTS = (FILE, "episodes.parquet", "episodes.csv", "summary.json", "manifest.json")
 
 
-class RunFolder:
+class RunFolder(contextlib.AbstractContextManager["RunFolder"]):
     """Holds the lock on a run folder until `close`.
 
     Raises:
@@ -50,26 +52,21 @@ class RunFolder:
             os.close(self._lock)
             self._lock = None
 
-    def __enter__(self) -> RunFolder:
-        return self
-
     def __exit__(self, *error: object) -> None:
         self.close()
 
     def _make(self) -> list[Path]:
         """Make it; the folders that were not there before, innermost first."""
-        missing = []
-        folder = self.path
+        missing: list[Path] = []
         try:
-            while not folder.exists():
-                missing.append(folder)
-                folder = folder.parent
-            self.path.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
+            missing += [folder for folder in (self.path, *self.path.parents) if not folder.exists()]
+            with self._cannot("make this folder"):
+                self.path.mkdir(parents=True, exist_ok=True)
+        except BadInput:
             for made in missing:
                 if made.is_dir():
                     made.rmdir()
-            raise self._wrong(f"cannot make this folder: {_words(error)}") from None
+            raise
         return missing
 
     def _remove_made(self) -> None:
@@ -80,30 +77,25 @@ class RunFolder:
 
     def _take_lock(self) -> None:
         """flock on the folder itself: gone with the process, however that ends."""
-        try:
+        with self._cannot("lock this folder"):
             self._lock = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY)
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise self._wrong("another process is working in it") from None
-        except OSError as error:
-            raise self._wrong(f"cannot lock this folder: {_words(error)}") from None
+            try:
+                fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise self._wrong("another process is working in it") from None
 
     def _check_room(self, size: int) -> None:
         """Write and remove a file of the size that the results may reach."""
         probe = self.path / ".room.part"
-        try:
+        with self._cannot(f"hold the results ({size / 1e6:.0f} MB at most)"):
             try:
                 with probe.open("wb") as file:
                     os.posix_fallocate(file.fileno(), 0, size)
             finally:
                 probe.unlink(missing_ok=True)
-        except OSError as error:
-            problem = f"cannot hold the results ({size / 1e6:.0f} MB at most): {_words(error)}"
-            raise self._wrong(problem) from None
+
+    def _cannot(self, doing: str) -> AbstractContextManager[None]:
+        return cannot(doing, field="--out", value=self._shown)
 
     def _wrong(self, problem: str) -> BadInput:
         return BadInput(problem, field="--out", value=self._shown)
-
-
-def _words(error: OSError) -> str:
-    return (error.strerror or str(error)).lower()

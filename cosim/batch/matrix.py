@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from cosim.batch.spec import Spec
+from cosim.batch.spec import AXES, Spec
 from cosim.errors import BadInput
 from cosim.scenario import Scenario, sumo_outputs
-from cosim.scenario.episode_id import Case
+from cosim.scenario.episode_id import EpisodeId
 from cosim.scenario.manifest import manifest
 from cosim.scenario.vet import vetted
 from cosim.workers.tasks import Task
@@ -25,7 +25,7 @@ CheckPolicy = Callable[[str], None]  # raises BadInput for a name that is none
 class Cell:
     """Cases that differ in nothing but the seed."""
 
-    case: Case  # of the first seed
+    case: EpisodeId  # of the first seed
     scenario: Scenario  # vetted unless `refused`
     manifest: Mapping[str, Any]  # `cosim.scenario.manifest` without the seed
     refused: str | None = None  # why SUMO must not see this net: every episode of the cell is bad_input
@@ -34,7 +34,7 @@ class Cell:
     def name(self) -> str:
         return self.case.cell
 
-    def task(self, case: Case, outputs: Path | None = None) -> Task:
+    def task(self, case: EpisodeId, outputs: Path | None = None) -> Task:
         """One episode of this cell, for an engine that hosts a `run(case, warnings, outputs)`.
 
         `outputs`: folder for SUMO's own outputs; None where the case wants none.
@@ -59,44 +59,28 @@ class Plan:
         text = json.dumps([sorted(cell.case.text() for cell in self.cells), self.seeds[0], self.seeds[-1]])
         return hashlib.sha256(text.encode()).hexdigest()
 
-    def cases(self) -> Iterator[tuple[Cell, Case]]:
+    def cases(self) -> Iterator[tuple[Cell, EpisodeId]]:
         """Every episode with its cell."""
-        for cell in self.cells:
-            for seed in self.seeds:
-                yield cell, cell.case.with_seed(seed)
+        for cell, seed in itertools.product(self.cells, self.seeds):
+            yield cell, cell.case.with_seed(seed)
 
 
-def cells(spec: Spec) -> Iterator[Case]:
+def cells(spec: Spec) -> Iterator[EpisodeId]:
     """The case of every cell's first seed."""
-    axes = itertools.product(
-        spec.scenario,
-        spec.demand,
-        spec.behavior,
-        spec.driver_model,
-        spec.penetration,
-        spec.preset,
-        spec.policy,
-        spec.svo,
-    )
-    for what, demand, behavior, driver_model, penetration, preset, policy, svo in axes:
-        yield Case(
-            what=what,
-            demand=demand,
-            policy=policy,
-            behavior=behavior,
-            driver_model=driver_model,
-            penetration=penetration,
+    for values in itertools.product(*(getattr(spec, axis) for axis in AXES)):
+        yield EpisodeId(
+            **dict(zip(AXES.values(), values, strict=True)),
             av_type=spec.av_type,
             av_ids=spec.av_ids,
-            svo_deg=svo,
-            preset=preset,
             duration=spec.duration,
             seed=spec.seeds[0],
             outputs=spec.output,
+            metrics=spec.metric,
+            reward=spec.reward,
         )
 
 
-def plan(cases: Iterable[Case], seeds: range, check_policy: CheckPolicy) -> Plan:
+def plan(cases: Iterable[EpisodeId], seeds: range, check_policy: CheckPolicy) -> Plan:
     """Load and vet every cell.
 
     A net that would kill SUMO costs its own cells only: they become `refused`.
@@ -106,7 +90,7 @@ def plan(cases: Iterable[Case], seeds: range, check_policy: CheckPolicy) -> Plan
             that is malformed or whose edges are not in the net, a vehicle type that is not there.
     """
     found = []
-    worlds: dict[Case, tuple[Scenario, Mapping[str, Any], str | None]] = {}
+    worlds: dict[EpisodeId, tuple[Scenario, Mapping[str, Any], str | None]] = {}
     for case in cases:
         check_policy(case.policy)
         world = replace(case, policy="", svo_deg=0.0, seed=seeds[0])  # who drives changes nothing of it
@@ -116,7 +100,7 @@ def plan(cases: Iterable[Case], seeds: range, check_policy: CheckPolicy) -> Plan
     return Plan(tuple(found), seeds)
 
 
-def _read(case: Case) -> tuple[Scenario, Mapping[str, Any], str | None]:
+def _read(case: EpisodeId) -> tuple[Scenario, Mapping[str, Any], str | None]:
     """The scenario, vetted unless its net is refused; its manifest without the seed; why it is refused."""
     scenario = case.scenario()
     sumo_outputs.check(case.outputs, scenario.options)

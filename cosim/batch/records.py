@@ -4,52 +4,25 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
+from dataclasses import asdict
 from typing import Any
 
 from cosim.batch.matrix import Cell
-from cosim.scenario.episode_id import Case
+from cosim.scenario.episode_id import EpisodeId
 from cosim.scenario.policy_name import label
+from cosim.types import IDENTITY
 from cosim.workers.tasks import Outcome
 
-# First in every table; all others follow in the order of `cosim run --json`.
-IDENTITY = (
-    "key",
-    "cell",
-    "status",
-    "scenario",
-    "demand",
-    "policy",
-    "policy_label",
-    "behavior",
-    "driver_model",
-    "penetration",
-    "preset",
-    "svo_deg",
-    "seed",
-)
+FIRST = ("key", "cell", "status", *IDENTITY)  # in every table; then the order of `cosim run --json`
 LAST = ("error", "stderr", "attempts")
 _NESTED = ("units", "better", "manifest")  # the same for all episodes of a cell: kept once, in the manifest
 _AS_TEXT = ("timings", "collision_list", "not_comparable_because")
 
 
-def row(cell: Cell, case: Case, outcome: Outcome) -> dict[str, Any]:
+def row(cell: Cell, case: EpisodeId, outcome: Outcome) -> dict[str, Any]:
     """The row of one outcome, whose value is the document of `cosim run --json`."""
-    scenario = cell.scenario
-    found: dict[str, Any] = {
-        "key": case.key,
-        "cell": cell.name,
-        "status": outcome.status,
-        "scenario": scenario.name,
-        "demand": scenario.demand_name,
-        "policy": label(case.policy),
-        "policy_label": None,
-        "behavior": scenario.behavior,
-        "driver_model": scenario.driver_model,
-        "penetration": case.penetration,
-        "preset": scenario.preset,
-        "svo_deg": case.svo_deg,
-        "seed": case.seed,
-    }
+    named = cell.scenario.identity(label(case.policy), None, case.svo_deg, case.seed)
+    found = {"key": case.key, "cell": cell.name, "status": outcome.status, **asdict(named)}
     if outcome.ok:
         found |= flat(outcome.value)
     return found | {"error": outcome.error, "stderr": outcome.stderr, "attempts": outcome.attempts}
@@ -64,7 +37,7 @@ def flat(document: Mapping[str, Any]) -> dict[str, Any]:
 
 def columns(rows: Iterable[Mapping[str, Any]]) -> tuple[str, ...]:
     """Every column that any row has, in one order."""
-    seen: dict[str, None] = dict.fromkeys(IDENTITY)
+    seen: dict[str, None] = dict.fromkeys(FIRST)
     for found in rows:
         seen.update(dict.fromkeys(name for name in found if name not in LAST))
     return (*seen, *LAST)

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import glob
 import itertools
+import math
 import os
 import re
-from collections.abc import Mapping, Sequence
+import typing
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import sumo_scenarios
-from cosim.errors import BadInput, hint, one_of
-from cosim.files import yaml_input
+from cosim.errors import BadInput, Range, check_pattern, hint, inside, one_of
+from cosim.files import code
 from cosim.files.xml_input import is_there
+from cosim.files.yaml_input import Positive, check_known, document, value_of
 from cosim.scenario import BEHAVIORS, policy_name
 from cosim.scenario.behaviors import DRIVER_MODELS
 from cosim.seeding import FIRST_TEST_SEED
@@ -22,6 +25,18 @@ from cosim.types import Preset
 
 MAX_SEED = 2**62
 MAX_EPISODES = 1_000_000  # more is a slip of the keyboard: 3 GB of rows
+FLEET = ("av_type", "av_ids", "penetration")  # ways to choose the AVs: one excludes the others
+# Axes of the matrix, in the order of its cells -> the field of `EpisodeId` that each value fills.
+AXES = {
+    "scenario": "what",
+    "demand": "demand",
+    "behavior": "behavior",
+    "driver_model": "driver_model",
+    "penetration": "penetration",
+    "preset": "preset",
+    "policy": "policy",
+    "svo": "svo_deg",
+}
 _GLOB = re.compile(r"[*?\[]")
 
 
@@ -29,38 +44,35 @@ _GLOB = re.compile(r"[*?\[]")
 class Spec:
     """The axes of the matrix; every combination of one value each is a cell, driven once per seed."""
 
-    scenario: tuple[str, ...]  # names of worlds, absolute paths of .sumocfg
+    scenario: tuple[str, ...]  # names of worlds, absolute paths of their folders or of .sumocfg
     seeds: tuple[int, int] = (FIRST_TEST_SEED, FIRST_TEST_SEED + 1)  # first, and one past the last
     demand: tuple[tuple[str, ...], ...] = ((),)  # each: names or files driven together; (): the scenario's
     policy: tuple[str, ...] = ("idm",)  # as `cosim.scenario.policy_name` has it, files absolute
     behavior: tuple[str | None, ...] = (None,)  # None: the scenario's default
     driver_model: tuple[str, ...] = ("lc2013",)
-    penetration: tuple[float | None, ...] = (None,)  # None: the scenario's own fleet
-    svo: tuple[float, ...] = (45.0,)  # degrees; 45 weighs oneself and the others alike
+    penetration: tuple[Annotated[float, Range(0.0, high=1.0)] | None, ...] = (
+        None,
+    )  # None: the scenario's own fleet
+    svo: tuple[Annotated[float, Range(0.0, high=90.0)], ...] = (
+        45.0,
+    )  # degrees; 45 weighs oneself and the others alike
     preset: tuple[str | None, ...] = (None,)
     av_type: str | None = None
     av_ids: str | None = None
-    duration: float | None = None  # s
+    duration: Positive | None = None  # s
     output: tuple[str, ...] = ()  # SUMO's outputs to keep, by SUMO's names
+    metric: tuple[str, ...] = ()  # measured besides, FILE.py:NAME or MODULE:NAME, files absolute
+    reward: str | None = None  # paid and reported: a name of `cosim.rewards.REWARDS`, or code likewise
 
     @property
     def episodes(self) -> int:
         """How many episodes the matrix has."""
         first, end = self.seeds
-        return (
-            len(self.scenario)
-            * len(self.demand)
-            * len(self.policy)
-            * len(self.behavior)
-            * len(self.driver_model)
-            * len(self.penetration)
-            * len(self.svo)
-            * len(self.preset)
-            * (end - first)
-        )
+        return math.prod(len(getattr(self, axis)) for axis in AXES) * (end - first)
 
 
-FIELDS = tuple(Spec.__dataclass_fields__)
+_KINDS = typing.get_type_hints(Spec, include_extras=True)
+FIELDS = tuple(_KINDS)
 
 
 def read(path: Path | None, flags: Mapping[str, Any]) -> Spec:
@@ -73,34 +85,22 @@ def read(path: Path | None, flags: Mapping[str, Any]) -> Spec:
         BadInput: unknown field (with the nearest name), wrong kind of value, a glob without a file, seeds
             that are none, values that exclude one another.
     """
-    values: dict[str, Any] = {} if path is None else _file(path)
-    place = "command line"
-    for name, given in flags.items():
-        if given is None or given == []:
-            continue
-        if name in ("scenario", "demand"):
-            values[name] = tuple(_expand(item, Path.cwd(), None, f"--{name}", name) for item in given)
-        elif name == "policy":
-            values[name] = tuple(policy_name.read(item).text for item in given)
-        elif name == "seeds":
-            values[name] = seeds(given, None, "--seeds")
-        else:
-            values[name] = (
-                tuple(given) if isinstance(given, Sequence) and not isinstance(given, str) else given
-            )
-        if name in ("av_type", "av_ids", "penetration"):  # one way to choose the fleet replaces the others
-            for other in {"av_type", "av_ids", "penetration"} - {name}:
-                if flags.get(other) in (None, []):
-                    values.pop(other, None)
-    for name in ("scenario", "demand"):
-        if name in values:
-            values[name] = tuple(itertools.chain.from_iterable(values[name]))
-    source: object = place if path is None else path
-    if not values.get("scenario"):
+    written = {} if path is None else document(path)
+    with inside("", path):
+        check_known(written, FIELDS)
+    given = {name: flags[name] for name in FIELDS if flags.get(name) not in (None, [])}
+    if given.keys() & set(FLEET):  # one way to choose the fleet replaces the others
+        written = {name: value for name, value in written.items() if name not in FLEET}
+    values = {}
+    for name in FIELDS:
+        if name in given:
+            values[name] = _axis(name, given[name], Path.cwd(), None, f"--{name}")
+        elif written.get(name) is not None:
+            values[name] = _axis(name, written[name], Path(str(path)).absolute().parent, path, name)
+    source: object = "command line" if path is None else path
+    if "scenario" not in values:
         known = ", ".join(sumo_scenarios.names())
-        raise BadInput(f"name at least one: {known}, or a .sumocfg", file=source, field="scenario")
-    values["scenario"] = tuple(item[0] for item in values["scenario"])
-    values |= {name: _unique(values[name]) for name in _AXES if name in values}
+        raise BadInput(f"name at least one: {known}, a folder or a .sumocfg", file=source, field="scenario")
     return _checked(Spec(**values), source)
 
 
@@ -125,49 +125,35 @@ def seeds(text: object, file: object, field: str) -> tuple[int, int]:
 
 # ---- inside ----
 
-_AXES = ("scenario", "demand", "policy", "behavior", "driver_model", "penetration", "svo", "preset", "output")
-_Demands = tuple[tuple[str, ...], ...]
+
+def _axis(name: str, value: object, folder: Path, file: object, field: str) -> Any:
+    """A field of the spec from what a file or a flag says; files are relative to `folder`."""
+    if name == "seeds":
+        return seeds(value, file, field)
+    with inside(field, file):
+        found = value_of(tuple[str, ...] if name == "demand" else _KINDS[name], value)
+        if found == ():
+            raise BadInput("the list is empty")
+    if name == "policy":
+        found = [policy_name.read(item, folder, field, file).text for item in found]
+    elif name == "metric":
+        found = [code.read(item, field, folder=folder, file=file).text for item in found]
+    elif name == "reward" and code.is_code(found):
+        found = code.read(found, field, folder=folder, file=file).text
+    elif name in ("scenario", "demand"):
+        found = [point for item in found for point in _expand(item, folder, file, field, name)]
+        found = [point[0] for point in found] if name == "scenario" else found
+    return tuple(dict.fromkeys(found)) if isinstance(found, list | tuple) else found  # no file twice
 
 
-def _file(path: Path) -> dict[str, Any]:
-    """The fields of SPEC.yaml that are there."""
-    top = yaml_input.read(path, FIELDS)
-    folder = path.absolute().parent
-    values: dict[str, Any] = {}
-    for name in FIELDS:
-        if not top.has(name):
-            continue
-        if name in ("scenario", "demand"):
-            values[name] = tuple(_expand(item, folder, path, name, name) for item in top.names(name))
-        elif name == "policy":
-            values[name] = tuple(policy_name.read(item, folder, name, path).text for item in top.names(name))
-        elif name == "seeds":
-            values[name] = seeds(top.raw(name), path, name)
-        elif name == "penetration":
-            values[name] = top.numbers(name, 0.0, 1.0)
-        elif name == "svo":
-            values[name] = top.numbers(name, 0.0, 90.0)
-        elif name == "duration":
-            values[name] = top.number(name, low=0.0, above=True)
-        elif name == "av_type":
-            values[name] = top.text(name)
-        elif name == "av_ids":
-            values[name] = top.pattern(name)
-        else:
-            values[name] = top.names(name)
-        if values[name] == ():
-            raise BadInput("the list is empty", file=path, field=name)
-    return values
-
-
-def _expand(item: str, folder: Path, file: object, field: str, kind: str) -> _Demands:
+def _expand(item: str, folder: Path, file: object, field: str, kind: str) -> Iterator[tuple[str, ...]]:
     """The points of one axis that one item stands for.
 
     A demand may be several files, joined by commas, and each of them a glob: every combination is a point.
     """
     whole = is_there(folder / item)
     parts = [part.strip() for part in ([item] if whole or kind == "scenario" else item.split(","))]
-    return tuple(itertools.product(*(_files(part, folder, file, field) for part in parts)))
+    return itertools.product(*(_files(part, folder, file, field) for part in parts))
 
 
 def _files(name: str, folder: Path, file: object, field: str) -> tuple[str, ...]:
@@ -192,35 +178,20 @@ def _checked(spec: Spec, file: object) -> Spec:
     for name in spec.scenario:
         if name not in known and not os.path.isabs(name):
             raise BadInput(f"no such scenario{hint(name, known)}", file=file, field="scenario", value=name)
-    for behavior in filter(None, spec.behavior):
-        one_of(behavior, BEHAVIORS, "behavior", file)
-    for model in spec.driver_model:
-        one_of(model, DRIVER_MODELS, "driver_model", file)
-    for preset in filter(None, spec.preset):
-        one_of(preset, Preset.ALL, "preset", file)
+    words = (("behavior", BEHAVIORS), ("driver_model", DRIVER_MODELS), ("preset", Preset.ALL))
+    for field, allowed in words:
+        for word in filter(None, getattr(spec, field)):
+            one_of(word, allowed, field, file)
     labels = [policy_name.label(text) for text in spec.policy]
     if twice := next((name for name in labels if labels.count(name) > 1), None):
         raise BadInput(f"two are called {twice}: label them, LABEL=...", file=file, field="policy")
-    chosen = [
-        name
-        for name, given in (
-            ("av_type", spec.av_type),
-            ("av_ids", spec.av_ids),
-            ("penetration", spec.penetration != (None,) or None),
-        )
-        if given is not None
-    ]
+    chosen = [name for name in FLEET if getattr(spec, name) not in (None, (None,))]
     if len(chosen) > 1:
         raise BadInput(f"excludes {chosen[1]}: give one of them", file=file, field=chosen[0])
     if spec.av_ids is not None:
-        yaml_input.check_pattern(spec.av_ids, file, "av_ids")
+        check_pattern(spec.av_ids, "av_ids", file)
     if spec.episodes > MAX_EPISODES:
         problem = f"{spec.episodes} episodes are more than {MAX_EPISODES}"
         first, end = spec.seeds
         raise BadInput(problem, file=file, field="seeds", value=f"{first}:{end}")
     return spec
-
-
-def _unique(values: Sequence[Any]) -> tuple[Any, ...]:
-    """Each value once, in the order first given: overlapping globs must not drive a file twice."""
-    return tuple(dict.fromkeys(values))

@@ -1,12 +1,14 @@
 """Where the rows of a run are kept as they come: one row per episode, exactly once, whatever is killed.
 
 SQLite in the run's folder by default (write-ahead log: a row is there whole or not at all, also after
-kill -9), or any database that SQLAlchemy reaches by URL. A database may hold many runs, told apart by name.
+kill -9), or any database that SQLAlchemy reaches by URL. A database may hold
+many runs, each under its name.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import contextlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +50,7 @@ _episodes = sa.Table(
 )
 
 
-class Store:
+class Store(contextlib.AbstractContextManager["Store"]):
     """The rows of one run. One process writes (`cosim.batch.folder` sees to that).
 
     Raises:
@@ -57,7 +59,7 @@ class Store:
     """
 
     def __init__(self, url: str, run: str = "") -> None:
-        self._run = run
+        self.run = run  # its name in the database
         self._url = url
         try:
             self._engine = sa.create_engine(url)
@@ -67,22 +69,24 @@ class Store:
         except ArgumentError:
             raise BadInput("is no database URL", field="--store", value=url) from None
         except ModuleNotFoundError as error:
-            problem = f"needs the package {error.name} (pip install 'cosim[postgresql]')"
+            problem = f"needs the package {error.name} (pip install 'cosim-sumo[postgresql]')"
             raise BadInput(problem, field="--store", value=self._shown) from None
         except SQLAlchemyError as error:
             raise BadInput(_first_line(error), field="--store", value=self._shown) from None
 
     @classmethod
-    def in_folder(cls, folder: Path) -> Store:
-        """The store of a run folder: one SQLite file."""
+    def in_folder(cls, folder: Path, url: str | None = None) -> Store:
+        """The store of a run folder: one SQLite file, or the database `url`, by the folder's name in it."""
+        if url is not None:
+            return cls(url, folder.absolute().name)
         return cls(f"sqlite:///{folder.absolute() / FILE}")
 
     def begin(self, spec_hash: str, document: Mapping[str, Any], cells: Sequence[Mapping[str, Any]]) -> None:
         """Write down what is to be run. `cells`: `cell`, `case` and `manifest`, in the matrix's order."""
-        rows = [{"run": self._run, "place": i, **cell} for i, cell in enumerate(cells)]
+        rows = [{"run": self.run, "place": i, **cell} for i, cell in enumerate(cells)]
         with self._writing() as connection:
             connection.execute(
-                _runs.insert().values(run=self._run, spec_hash=spec_hash, document=dict(document))
+                _runs.insert().values(run=self.run, spec_hash=spec_hash, document=dict(document))
             )
             if rows:
                 connection.execute(_cells.insert(), rows)
@@ -91,34 +95,28 @@ class Store:
         """Write down further cells, as in `begin`, behind those that are there; known ones stay."""
         known = self.cells()
         new = [cell for cell in cells if cell["cell"] not in known]
-        rows = [{"run": self._run, "place": len(known) + i, **cell} for i, cell in enumerate(new)]
+        rows = [{"run": self.run, "place": len(known) + i, **cell} for i, cell in enumerate(new)]
         if rows:
             with self._writing() as connection:
                 connection.execute(_cells.insert(), rows)
 
     def spec_hash(self) -> str | None:
         """The hash of what this run was begun with; None when it was not begun."""
-        with self._engine.connect() as connection:
-            found = connection.execute(sa.select(_runs.c.spec_hash).where(_runs.c.run == self._run))
-            return found.scalar_one_or_none()
+        found = self._read(sa.select(_runs.c.spec_hash).where(_runs.c.run == self.run))
+        return found[0].spec_hash if found else None
 
     def document(self) -> dict[str, Any]:
         """What `begin` wrote down."""
-        with self._engine.connect() as connection:
-            found = connection.execute(sa.select(_runs.c.document).where(_runs.c.run == self._run))
-            return dict(found.scalar_one())
+        return dict(self._read(sa.select(_runs.c.document).where(_runs.c.run == self.run))[0].document)
 
     def cells(self) -> dict[str, dict[str, Any]]:
         """Cell -> its `case` and `manifest`, in the matrix's order."""
-        query = sa.select(_cells).where(_cells.c.run == self._run).order_by(_cells.c.place)
-        with self._engine.connect() as connection:
-            return {
-                row.cell: {"case": row.case, "manifest": row.manifest} for row in connection.execute(query)
-            }
+        query = sa.select(_cells).where(_cells.c.run == self.run).order_by(_cells.c.place)
+        return {row.cell: {"case": row.case, "manifest": row.manifest} for row in self._read(query)}
 
     def set_manifest(self, cell: str, manifest: Mapping[str, Any]) -> None:
         """The manifest of a cell's episodes, as the workers saw it."""
-        here = (_cells.c.run == self._run) & (_cells.c.cell == cell)
+        here = (_cells.c.run == self.run) & (_cells.c.cell == cell)
         with self._writing() as connection:
             connection.execute(_cells.update().where(here).values(manifest=dict(manifest)))
 
@@ -126,19 +124,17 @@ class Store:
         """Set one field of what `begin` wrote down."""
         document = {**self.document(), name: value}
         with self._writing() as connection:
-            connection.execute(_runs.update().where(_runs.c.run == self._run).values(document=document))
+            connection.execute(_runs.update().where(_runs.c.run == self.run).values(document=document))
 
     def keys(self) -> set[str]:
         """The episodes that are done."""
-        with self._engine.connect() as connection:
-            query = sa.select(_episodes.c.key).where(_episodes.c.run == self._run)
-            return set(connection.execute(query).scalars())
+        return {row.key for row in self._read(sa.select(_episodes.c.key).where(_episodes.c.run == self.run))}
 
     def add(self, rows: Iterable[Mapping[str, Any]]) -> None:
         """Keep these rows, all of them or none. Raises CosimError when one is there already."""
         values = [
             {
-                "run": self._run,
+                "run": self.run,
                 "key": row["key"],
                 "cell": row["cell"],
                 "seed": row["seed"],
@@ -157,18 +153,14 @@ class Store:
         query = (
             sa.select(_episodes.c.row)
             .join(_cells, (_cells.c.run == _episodes.c.run) & (_cells.c.cell == _episodes.c.cell))
-            .where(_episodes.c.run == self._run)
+            .where(_episodes.c.run == self.run)
             .order_by(_cells.c.place, _episodes.c.seed)
         )
-        with self._engine.connect() as connection:
-            return [dict(row) for row in connection.execute(query).scalars()]
+        return [dict(found.row) for found in self._read(query)]
 
     def close(self) -> None:
         """Let go of the database."""
         self._engine.dispose()
-
-    def __enter__(self) -> Store:
-        return self
 
     def __exit__(self, *error: object) -> None:
         self.close()
@@ -180,35 +172,22 @@ class Store:
         """The URL without its password."""
         return sa.engine.make_url(self._url).render_as_string(hide_password=True)
 
-    def _writing(self) -> _Writing:
-        return _Writing(self._engine, self._shown)
-
-
-class _Writing:
-    """One transaction; what a database cannot do becomes one sentence."""
-
-    def __init__(self, engine: sa.Engine, shown: str) -> None:
-        self._begin = engine.begin()
-        self._shown = shown
-
-    def __enter__(self) -> sa.Connection:
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[sa.Connection]:
+        """One transaction; what a database cannot do becomes one sentence."""
         try:
-            return self._begin.__enter__()
+            with self._engine.begin() as connection:
+                yield connection
+        except IntegrityError as error:
+            problem = f"an episode was to be kept twice: {_first_line(error)}"
+            raise CosimError(f"{self._shown}: {problem}") from None
         except SQLAlchemyError as error:
-            raise self._explained(error) from None
+            problem = f"cannot write: {_first_line(error)} (--resume goes on from here)"
+            raise CosimError(f"{self._shown}: {problem}") from None
 
-    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
-        try:
-            self._begin.__exit__(kind, error, trace)
-        except SQLAlchemyError as problem:
-            raise self._explained(problem) from None
-        if isinstance(error, SQLAlchemyError):
-            raise self._explained(error) from None
-
-    def _explained(self, error: SQLAlchemyError) -> CosimError:
-        if isinstance(error, IntegrityError):
-            return CosimError(f"{self._shown}: an episode was to be kept twice: {_first_line(error)}")
-        return CosimError(f"{self._shown}: cannot write: {_first_line(error)} (--resume goes on from here)")
+    def _read(self, query: sa.Select[Any]) -> list[sa.Row[Any]]:
+        with self._engine.connect() as connection:
+            return [*connection.execute(query)]
 
 
 def _sqlite(connection: Any, _: object) -> None:

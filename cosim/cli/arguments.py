@@ -1,9 +1,11 @@
-"""Types of command-line values that several verbs share: argparse says what is wrong and exits with 2."""
+"""Flags and types of values that several verbs share: argparse says what is wrong and exits with 2."""
 
 from __future__ import annotations
 
 import argparse
+import functools
 import math
+from collections.abc import Mapping
 from typing import Any
 
 Verbs = Any  # what ArgumentParser.add_subparsers returns: argparse keeps its type private
@@ -12,6 +14,65 @@ POLICY = (
     "who commands the AVs (default idm): a name; RUN or FILE.safetensors of cosim train; FILE.py:NAME or "
     "MODULE:NAME, your own (docs/own_policy.md). LABEL= before a file says what tables call it"
 )
+
+
+def add(parser: Any, *flags: str, **changed: Any) -> None:
+    """Add these shared flags to a parser or a group of one.
+
+    `changed`: settings of `add_argument` that replace the shared ones, for all of `flags`.
+    """
+    for flag in flags:
+        parser.add_argument(flag, **(_shared()[flag] | changed))
+
+
+def texts(parser: Any, flags: Mapping[str, tuple[str, str]], **settings: Any) -> None:
+    """Add flags that take a text: flag -> its metavar and help. `settings`: further ones for all of them."""
+    for flag, (metavar, meaning) in flags.items():
+        parser.add_argument(flag, metavar=metavar, help=meaning, **settings)
+
+
+@functools.cache
+def _shared() -> dict[str, dict[str, Any]]:
+    """Flag -> its settings. Made on demand: the names of behaviours are read from a file."""
+    from cosim.scenario import BEHAVIORS
+    from cosim.scenario.behaviors import DRIVER_MODELS
+    from cosim.types import Preset
+
+    return {
+        "--scenario": {"metavar": "NAME|FILE", "help": "a world, or a .sumocfg"},
+        "--demand": {"metavar": "NAME|FILE", "help": "a name, or a route file"},
+        "--policy": {"metavar": "POLICY", "help": POLICY},
+        "--behavior": {
+            "choices": BEHAVIORS,
+            "help": "Table II class of the human drivers (ours: mixed; contested: moderate)",
+        },
+        "--driver-model": {"choices": DRIVER_MODELS, "help": "of the human drivers"},
+        "--penetration": {"type": share, "metavar": "P", "help": "this share of vehicles are AVs, 0..1"},
+        "--av-type": {"metavar": "T", "help": "AVs are the vehicles of this vType"},
+        "--av-ids": {"metavar": "REGEX", "help": "AVs are the vehicles whose id matches"},
+        "--svo": {"type": degrees, "metavar": "DEG", "help": "SVO angle, 0..90 (default 45)"},
+        "--preset": {"choices": Preset.ALL, "help": "who guards the AVs (default: the scenario's)"},
+        "--seed": {"type": seed, "metavar": "N"},
+        "--seeds": {"metavar": "A:B", "help": "seeds A, A+1, ... B-1"},
+        "--duration": {
+            "type": positive,
+            "metavar": "S",
+            "help": "counted s per episode (default: the scenario's)",
+        },
+        "--output": {
+            "metavar": "NAME",
+            "help": "have SUMO write its NAME output (tripinfo, fcd, ...)",
+        },
+        "--metric": {"metavar": "FILE:NAME", "help": "measure this besides; FILE.py:NAME or MODULE:NAME"},
+        "--reward": {
+            "metavar": "NAME|FILE:NAME",
+            "help": "report what AVs earn by it: p, t, or your own",
+        },
+        "--workers": {"type": count, "metavar": "N", "help": "processes"},
+        "--out": {"metavar": "DIR", "help": "folder to write into"},
+        "--resume": {"action": "store_true", "help": "go on with what the folder --out holds"},
+        "--json": {"action": "store_true", "help": "print exactly one JSON document on stdout"},
+    }
 
 
 def degrees(text: str) -> float:
@@ -37,6 +98,18 @@ def count(text: str) -> int:
 def seed(text: str) -> int:
     """A whole number of 0 or more."""
     return _whole(text, 0, "a whole number from 0 to 2^62")
+
+
+def seeds(text: str) -> range:
+    """`a:b`, b not included; a single number is that one seed."""
+    low, colon, high = text.partition(":")
+    try:
+        found = range(int(low), int(high) if colon else int(low) + 1)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no range of seeds A:B") from None
+    if found.start < 0 or not found:
+        raise argparse.ArgumentTypeError(f"{text!r} holds no seed (A:B with 0 <= A < B)")
+    return found
 
 
 def _whole(text: str, low: int, what: str) -> int:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 
 from cosim.cli import arguments
-from cosim.cli.record import seeds
+from cosim.cli.arguments import seeds
 from cosim.scenario import BEHAVIORS
 from cosim.scenario.behaviors import AS_IS
 
@@ -27,10 +27,17 @@ def add(verbs: arguments.Verbs) -> None:
         description="Measure every predictor on recorded episodes; records what it needs itself unless "
         "--recordings names a folder of `cosim record`.",
     )
-    predict.add_argument("--scenario", action="append", default=[], metavar="S", help="repeatable (all five)")
+    predict.add_argument("--scenario", action="append", default=[], metavar="S", help="repeatable (all)")
     predict.add_argument("--behavior", action="append", default=[], choices=BEHAVIORS, help="repeatable")
     predict.add_argument("--demand", action="append", default=[], metavar="NAME", help="repeatable")
     predict.add_argument("--policy", action="append", default=[], metavar="NAME", help="repeatable")
+    predict.add_argument(
+        "--predictor",
+        action="append",
+        default=[],
+        metavar="NAME|FILE:NAME",
+        help="repeatable (all of ours); your own: a class called with horizon, dt",
+    )
     predict.add_argument("--seeds", type=seeds, required=True, metavar="A:B", help="test seeds, B left out")
     predict.add_argument("--recordings", metavar="DIR", help="use these (seeds outside A:B are left out)")
     predict.add_argument("--no-maps", action="store_true", help="kinematics only (the maps take longer)")
@@ -47,7 +54,7 @@ def work(args: argparse.Namespace) -> int:
     from pathlib import Path
 
     import sumo_scenarios
-    from cosim.batch.record import cases, record
+    from cosim.batch.record import planned, record
     from cosim.errors import BadInput
     from cosim.files import prepare_folder
     from cosim.learning.bench_predict import MAPS_PAGE, PAGE, bench_maps, bench_predict
@@ -57,7 +64,7 @@ def work(args: argparse.Namespace) -> int:
     out = prepare_folder(args.out)
     where = Path(args.recordings) if args.recordings else out / "recordings"
     if not args.recordings:
-        wanted = cases(
+        wanted = planned(
             args.scenario or sumo_scenarios.names(),
             args.demand or DEMANDS,
             args.behavior or [b for b in BEHAVIORS if b != AS_IS],
@@ -77,6 +84,7 @@ def work(args: argparse.Namespace) -> int:
         scenarios=args.scenario,
         behaviors=args.behavior,
         seeds=args.seeds,
+        predictors=args.predictor,
         command=command,
     )
     print((out / PAGE).read_text())

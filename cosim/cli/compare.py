@@ -8,6 +8,7 @@ from pathlib import Path
 
 from cosim.cli import arguments
 from cosim.errors import BadInput
+from cosim.files import cannot
 
 EPILOG = """\
 A and B are run folders of `cosim evaluate`, or DIR:POLICY for one policy of it. With one folder, name both
@@ -36,27 +37,26 @@ def add(verbs: arguments.Verbs) -> None:
     )
     compare.add_argument("a", metavar="A", help="run folder, or DIR:POLICY")
     compare.add_argument("b", metavar="B", nargs="?", help="the same; default: A's folder")
-    compare.add_argument("--baseline", metavar="POLICY", help="the policy of A")
-    compare.add_argument("--candidate", metavar="POLICY", help="the policy of B")
-    compare.add_argument(
-        "--fail-on", action="append", default=[], metavar="THRESHOLD", help="see below; repeatable"
-    )
-    compare.add_argument(
-        "--across",
-        action="append",
-        default=[],
-        metavar="FIELD",
-        help="A and B may differ in this: behavior, penetration, preset, svo_deg, driver_model; repeatable",
-    )
-    compare.add_argument("--junit", metavar="FILE", help="write a JUnit file")
-    compare.add_argument("--markdown", metavar="FILE", help="write a table for a pull request comment")
-    compare.add_argument("--json", action="store_true", help="print exactly one JSON document on stdout")
+    names = "behavior, penetration, preset, svo_deg, driver_model"
+    repeatable = {
+        "--fail-on": ("THRESHOLD", "see below; repeatable"),
+        "--across": ("FIELD", f"A and B may differ in this: {names}; repeatable"),
+    }
+    once = {
+        "--baseline": ("POLICY", "the policy of A"),
+        "--candidate": ("POLICY", "the policy of B"),
+        "--junit": ("FILE", "write a JUnit file"),
+        "--markdown": ("FILE", "write a table for a pull request comment"),
+    }
+    arguments.texts(compare, once)
+    arguments.texts(compare, repeatable, action="append", default=[])
+    arguments.add(compare, "--json")
     compare.set_defaults(work=work)
 
 
 def work(args: argparse.Namespace) -> int:
     """Compare, show, and say by the exit code whether B passed."""
-    from cosim.report import junit, verdict
+    from cosim.report import verdict
     from cosim.report.compare import compare
     from cosim.report.pairing import chosen, side
 
@@ -65,19 +65,14 @@ def work(args: argparse.Namespace) -> int:
         problem = "with one run name both policies: --baseline and --candidate"
         raise BadInput(problem, field="B")
     b = side(args.b) if args.b is not None else a
-    if args.baseline is not None:
-        a = chosen(a.run, args.baseline)
-    if args.candidate is not None:
-        b = chosen(b.run, args.candidate)
+    a = a if args.baseline is None else chosen(a.run, args.baseline)
+    b = b if args.candidate is None else chosen(b.run, args.candidate)
     found = compare(a, b, args.fail_on, across=args.across)
-    for field, path, write in (
-        ("--junit", args.junit, lambda file: junit.write(found, file)),
-        ("--markdown", args.markdown, lambda file: file.write_text(verdict.markdown(found), "utf-8")),
-    ):
-        if path is not None:
-            try:
-                write(Path(path))
-            except OSError as error:
-                raise BadInput(f"cannot write: {error.strerror}", field=field, value=path) from None
+    if args.junit is not None:
+        with cannot("write", field="--junit", value=args.junit):
+            verdict.junit(found, Path(args.junit))
+    if args.markdown is not None:
+        with cannot("write", field="--markdown", value=args.markdown):
+            Path(args.markdown).write_text(verdict.markdown(found), "utf-8")
     print(json.dumps(verdict.document(found)) if args.json else verdict.text(found))
     return found.exit_code

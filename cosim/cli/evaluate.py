@@ -3,11 +3,23 @@
 from __future__ import annotations
 
 import argparse
+import json
+import shlex
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from cosim.cli import arguments
-from cosim.scenario import BEHAVIORS
-from cosim.scenario.behaviors import DRIVER_MODELS
-from cosim.types import Preset
+from cosim.errors import BadInput
+
+if TYPE_CHECKING:
+    from cosim.batch.matrix import Plan
+    from cosim.batch.store import Store
+    from cosim.workers.engines import Engine
+
+LISTED = 200  # cells that a dry run lists
 
 
 def add(verbs: arguments.Verbs) -> None:
@@ -20,32 +32,21 @@ def add(verbs: arguments.Verbs) -> None:
     )
     evaluate.add_argument("spec", nargs="?", metavar="SPEC.yaml", help="the matrix, by the flags' names")
     axes = evaluate.add_argument_group("the matrix (each flag may be repeated)")
-    axes.add_argument(
-        "--scenario", action="append", metavar="NAME|FILE", help="a world, or a .sumocfg, or a glob of them"
-    )
+    arguments.add(axes, "--scenario", action="append", help="a world, its folder, a .sumocfg, or a glob")
     axes.add_argument(
         "--demand",
         action="append",
         metavar="NAME|FILES",
         help="a name, or a file or glob (.rou.xml, .trips.xml, flows, .gz); A,B is one demand of two files",
     )
-    axes.add_argument("--policy", action="append", metavar="POLICY", help=arguments.POLICY)
-    axes.add_argument("--behavior", action="append", choices=BEHAVIORS)
-    axes.add_argument("--driver-model", action="append", choices=DRIVER_MODELS)
-    axes.add_argument("--penetration", action="append", type=arguments.share, metavar="X", help="0..1")
-    axes.add_argument("--svo", action="append", type=arguments.degrees, metavar="DEG", help="0..90")
-    axes.add_argument("--preset", action="append", choices=Preset.ALL)
-    axes.add_argument("--output", action="append", metavar="NAME", help="keep SUMO's own output of this name")
-    evaluate.add_argument("--seeds", metavar="A:B", help="seeds A, A+1, ... B-1 (default 200000:200001)")
-    evaluate.add_argument("--av-type", metavar="T", help="AVs are the vehicles of this vType")
-    evaluate.add_argument("--av-ids", metavar="REGEX", help="AVs are the vehicles whose id matches")
-    evaluate.add_argument("--duration", type=arguments.positive, metavar="S", help="counted s per episode")
+    arguments.add(axes, "--policy", "--behavior", "--driver-model", action="append")
+    arguments.add(axes, "--penetration", "--svo", "--preset", action="append")
+    arguments.add(axes, "--output", "--metric", action="append")
+    arguments.add(evaluate, "--seeds", help="seeds A, A+1, ... B-1 (default 200000:200001)")
+    arguments.add(evaluate, "--av-type", "--av-ids", "--duration", "--reward")
     running = evaluate.add_argument_group("the work")
-    running.add_argument("--out", metavar="DIR", help="the run's folder")
-    running.add_argument("--resume", action="store_true", help="go on with what DIR holds")
-    running.add_argument(
-        "--workers", type=arguments.count, metavar="N", help="processes (default: all cores)"
-    )
+    arguments.add(running, "--out", "--resume")
+    arguments.add(running, "--workers", help="processes (default: all cores)")
     running.add_argument("--engine", choices=("local", "ray"), default="local")
     running.add_argument("--ray-address", metavar="A", help="an existing cluster (default: a local one)")
     running.add_argument("--store", metavar="URL", help="a database instead of DIR/store.sqlite")
@@ -53,12 +54,144 @@ def add(verbs: arguments.Verbs) -> None:
     running.add_argument("--reset-timeout", type=arguments.positive, metavar="S", help="end a hung start")
     running.add_argument("--no-report", action="store_true", help="leave report.html out")
     running.add_argument("--dry-run", action="store_true", help="print the matrix and an estimated time")
-    running.add_argument("--json", action="store_true", help="print exactly one JSON document on stdout")
+    arguments.add(running, "--json")
     evaluate.set_defaults(work=work)
 
 
 def work(args: argparse.Namespace) -> int:
-    """0 when every episode has its row, whatever the rows say."""
-    from cosim.cli.evaluate_work import evaluate
+    """0 when every episode has its row, whatever the rows say.
 
-    return evaluate(args)
+    Raises BadInput before anything is run, or CosimError when it cannot go on.
+    """
+    from cosim.batch import execution, matrix, spec
+    from cosim.batch.folder import RunFolder
+    from cosim.batch.store import Store
+    from cosim.policies import check
+
+    flags = {name: getattr(args, name) for name in spec.FIELDS}
+    continued = args.resume and args.spec is None and all(value is None for value in flags.values())
+    if args.out is None and (continued or not args.dry_run):
+        raise BadInput("name the run's folder", field="--out")
+    if continued:  # neither a spec nor a flag of the matrix: what the folder holds
+        cases, seeds = execution.asked(Path(args.out), args.store)
+    else:
+        wanted = spec.read(None if args.spec is None else Path(args.spec), flags)
+        cases, seeds = [*matrix.cells(wanted)], range(*wanted.seeds)
+    plan = matrix.plan(cases, seeds, check)
+    engine = _engine(args)
+    if args.dry_run:
+        return _dry_run(plan, engine, args)
+    with RunFolder(args.out, resume=args.resume, episodes=plan.episodes) as folder:
+        try:
+            store = Store.in_folder(folder.path, args.store)
+            began = time.strftime("%Y-%m-%dT%H:%M:%S%z")
+            about = {"command": shlex.join(["cosim", *sys.argv[1:]]), "began": began}
+            execution.begin_or_resume(plan, store, about, resume=args.resume)
+        except BaseException:
+            if not args.resume:
+                folder.undo()
+            raise
+        with store:
+            return _drive(plan, engine, store, folder.path, args)
+
+
+def _engine(args: argparse.Namespace) -> Engine:
+    from cosim.batch.episode_runner import EpisodeRunner
+    from cosim.workers.engines import LocalEngine
+    from cosim.workers.supervisor import Limits
+
+    default = Limits()
+    limits = Limits(step=args.step_timeout or default.step, start=args.reset_timeout or default.start)
+    if args.engine == "local":
+        if args.ray_address is not None:
+            raise BadInput("goes with --engine ray", field="--ray-address", value=args.ray_address)
+        return LocalEngine(EpisodeRunner, workers=args.workers, limits=limits)
+    from cosim.workers.ray_engine import RayEngine
+
+    return RayEngine(EpisodeRunner, workers=args.workers, limits=limits, address=args.ray_address)
+
+
+def _drive(plan: Plan, engine: Engine, store: Store, folder: Path, args: argparse.Namespace) -> int:
+    from cosim.batch import execution
+    from cosim.report.run_folder import export
+    from cosim.workers.progress import Progress
+
+    done = len(store.keys())
+    title = f"evaluate ({done} of {plan.episodes} done before)" if done else "evaluate"
+    began = time.monotonic()
+    with Progress(title, "episodes") as progress:
+        faults = execution.drive(plan, store, engine, folder / "outputs", progress)
+    seconds = time.monotonic() - began
+    rows = store.rows()
+    summary = export(folder, rows, execution.manifest(plan, store), plan.episodes)
+    if not args.no_report:
+        from cosim.report import html, run_folder  # matplotlib: a second that only a report need pay
+
+        html.write(run_folder.read(folder), None, shown=args.out)
+    _warn(rows)
+    for fault in faults:
+        print(f"cosim: {fault.key}: no row, --resume tries it again: {fault.stderr}", file=sys.stderr)
+    if args.json:
+        print(json.dumps(summary))
+    else:
+        driven = plan.episodes - done
+        print(f"{plan.episodes} episodes of {len(plan.cells)} cells in {folder}")
+        print(f"  driven now {driven} in {seconds:.1f} s ({driven / max(seconds, 1e-9):.2f} episodes/s)")
+        status = {**summary["status"], "not driven": plan.episodes - len(rows)}
+        print("  status     " + ", ".join(f"{name} {n}" for name, n in status.items() if n))
+    return 4 if faults else 0
+
+
+def _warn(rows: Sequence[Mapping[str, Any]]) -> None:
+    """Say on stderr which episodes have no figures, and why."""
+    reasons: dict[tuple[str, str], list[str]] = {}
+    for row in rows:
+        if row["status"] != "ok":
+            reasons.setdefault((row["status"], row["error"] or ""), []).append(row["key"])
+    if reasons:
+        wrong = sum(map(len, reasons.values()))
+        print(f"cosim: {wrong} of {len(rows)} episodes have no figures:", file=sys.stderr)
+    for (status, error), keys in [*reasons.items()][:10]:
+        which = keys[0] if len(keys) == 1 else f"{keys[0]} and {len(keys) - 1} more"
+        print(f"  {status}: {which}: {error[:500]}", file=sys.stderr)
+    if len(reasons) > 10:
+        print(f"  and {len(reasons) - 10} further reasons: see the column `error`", file=sys.stderr)
+
+
+def _dry_run(plan: Plan, engine: Engine, args: argparse.Namespace) -> int:
+    from cosim.batch.estimate import estimate
+    from cosim.workers.engines import cores
+
+    seconds, basis = estimate(plan, engine, args.workers or cores())
+    if args.json:
+        document = {
+            "episodes": plan.episodes,
+            "seeds": [plan.seeds.start, plan.seeds.stop],
+            "cells": [
+                {"cell": cell.name, "case": cell.case.document(), "refused": cell.refused}
+                for cell in plan.cells
+            ],
+            "estimated_s": seconds,
+            "estimated_from": basis,
+        }
+        print(json.dumps(document))
+        return 0
+    for cell in plan.cells[:LISTED]:
+        s, case = cell.scenario, cell.case
+        print(
+            f"{cell.name}  {s.name} / {s.demand_name} / {case.policy}, {s.behavior}, "
+            f"AVs by {s.fleet.describe()}, svo {case.svo_deg:g}, {s.preset}, {s.driver_model}, "
+            f"{s.duration:g} s" + (f"  BAD INPUT: {cell.refused}" if cell.refused else "")
+        )
+    if len(plan.cells) > LISTED:
+        print(f"... and {len(plan.cells) - LISTED} more")
+    span = f"{plan.seeds.start}:{plan.seeds.stop}"
+    print(f"{len(plan.cells)} cells x {len(plan.seeds)} seeds ({span}) = {plan.episodes} episodes")
+    print(f"estimated time {'unknown' if seconds is None else _duration(seconds)} ({basis})")
+    return 0
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

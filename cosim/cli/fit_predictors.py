@@ -15,11 +15,14 @@ def add(verbs: arguments.Verbs) -> None:
         description="Fit P's learned baselines and the Gaussian processes' prior over kernels on recordings "
         "(cosim record) of training seeds; calibrate and measure on recordings of tuning seeds.",
     )
-    verb.add_argument("--training", required=True, metavar="DIR", help="recordings, seeds below 100000")
-    verb.add_argument("--validation", required=True, metavar="DIR", help="recordings, seeds 100000..199999")
+    needed = {
+        "--training": ("DIR", "recordings, seeds below 100000"),
+        "--validation": ("DIR", "recordings, seeds 100000..199999"),
+    }
+    arguments.texts(verb, needed, required=True)
     verb.add_argument("--only", action="append", default=[], metavar="NAME", help="repeatable (default all)")
     verb.add_argument("--steps", type=arguments.count, metavar="N", help="gradient steps (6000)")
-    verb.add_argument("--out", required=True, metavar="DIR", help="for the weights and their cards")
+    arguments.add(verb, "--out", required=True, help="for the weights and their cards")
     verb.add_argument("--state", metavar="DIR", help="logs, and what a killed fit needs to go on")
     verb.set_defaults(work=work)
 

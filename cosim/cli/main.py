@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import importlib
 import signal
 import sys
 import threading
 import traceback
 from collections.abc import Iterator, Sequence
 
+from cosim import __version__
 from cosim.cli import VERBS
 from cosim.errors import BadInput, CosimError
 
@@ -22,7 +24,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if "--" in arguments:
         cut = arguments.index("--")
         arguments, options = arguments[:cut], arguments[cut + 1 :]
-    args = parser().parse_args(arguments)
+    args = parser(*arguments[:1]).parse_args(arguments)
     args.sumo_options = options
     try:
         if options and not getattr(args, "passes_on", False):
@@ -62,24 +64,15 @@ def _terminable() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-class _Version(argparse.Action):
-    """Looked up when it is asked for: no other command has to wait for it, or needs cosim to be installed."""
-
-    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
-        from cosim.cli.doctor_work import version_of
-
-        parser.exit(message=f"cosim {version_of('cosim') or 'is not installed'}\n")
-
-
-def parser() -> argparse.ArgumentParser:
-    """Every verb and flag."""
+def parser(verb: str = "") -> argparse.ArgumentParser:
+    """Every flag of one verb, or of all."""
     top = argparse.ArgumentParser(
         prog="cosim", description="Altruistic cooperative driving in mixed traffic on SUMO."
     )
-    top.add_argument("--version", action=_Version, nargs=0, help="cosim's version")
+    top.add_argument("--version", action="version", version=f"cosim {__version__}", help="cosim's version")
     verbs = top.add_subparsers(required=True, metavar="VERB")
-    for verb in VERBS:
-        verb.add(verbs)
+    for name in (verb,) if verb in VERBS else VERBS:
+        importlib.import_module(f"cosim.cli.{name.replace('-', '_')}").add(verbs)
     return top
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import re
 import sys
-from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,6 @@ def add(verbs: arguments.Verbs) -> None:
         description="Read SUMO's fcd-output (.xml or .xml.gz, any size) and count what `cosim run` counts.",
     )
     metrics.add_argument("fcd", metavar="FCD", help="the file that SUMO's --fcd-output wrote")
-    metrics.add_argument("--net", metavar="NET", help="the .net.xml: tells bridges and lane successions")
     metrics.add_argument(
         "--types",
         action="append",
@@ -31,42 +30,46 @@ def add(verbs: arguments.Verbs) -> None:
         metavar="FILE",
         help="route or additional file with the vTypes: lengths and widths; repeatable",
     )
+    arguments.add(metrics, "--av-type", help="watch the vehicles of this vType (default: everybody)")
+    arguments.add(metrics, "--av-ids", help="watch the vehicles whose id matches")
     metrics.add_argument(
-        "--av-type", metavar="T", help="watch the vehicles of this vType (default: everybody)"
+        "--begin", type=float, default=-math.inf, metavar="S", help="leave out what is earlier"
     )
-    metrics.add_argument("--av-ids", metavar="REGEX", help="watch the vehicles whose id matches")
-    metrics.add_argument("--mission", metavar="REGEX", help="watch these too, as mission vehicles")
-    metrics.add_argument("--begin", type=float, metavar="S", help="leave out what is earlier")
-    metrics.add_argument("--end", type=float, metavar="S", help="leave out what is later")
+    metrics.add_argument("--end", type=float, default=math.inf, metavar="S", help="leave out what is later")
     metrics.add_argument(
         "--frame", type=arguments.positive, metavar="S", help="s between frames (default: 0.2, or the file's)"
     )
-    metrics.add_argument(
-        "--conflicts", metavar="CSV", help="write every single conflict there: who, when, where, how close"
-    )
+    more = {
+        "--net": ("NET", "the .net.xml: bridges and lane successions"),
+        "--mission": ("REGEX", "watch these too, as mission vehicles"),
+        "--conflicts": ("CSV", "write every single conflict there: who, when, where, how close"),
+    }
+    arguments.texts(metrics, more)
     metrics.add_argument(
         "--ttc",
         type=arguments.positive,
         metavar="S",
         help="a conflict is a time to collision below this (default 1.5)",
     )
-    metrics.add_argument("--json", action="store_true", help="print exactly one JSON document on stdout")
+    arguments.add(metrics, "--json")
     metrics.set_defaults(work=work)
 
 
 def work(args: argparse.Namespace) -> int:
     """Read it, count, print."""
     from cosim.fcd import Roles, analyse
+    from cosim.fcd.encounters import Encounter
     from cosim.fcd.vehicle_types import read_sizes
+    from cosim.files import cannot, write_csv
     from cosim.files.xml_input import regular_file
     from cosim.metrics.time_to_collision import CRITICAL
+    from cosim.report.result import figure
     from cosim.workers.progress import Progress
 
     path = regular_file(Path(args.fcd), file=None, field="FCD")
     types = [regular_file(Path(name), file=None, field="--types") for name in args.types]
     roles = Roles(args.av_type, _pattern(args.av_ids, "--av-ids"), _pattern(args.mission, "--mission"))
     road = None if args.net is None else _road(regular_file(Path(args.net), file=None, field="--net"))
-    window = {name: value for name, value in (("begin", args.begin), ("end", args.end)) if value is not None}
     progress = Progress(path.name, "bytes")
     found = analyse(
         path,
@@ -76,11 +79,15 @@ def work(args: argparse.Namespace) -> int:
         frame=args.frame,
         critical=(args.ttc or CRITICAL) if args.conflicts else None,
         progress=progress,
-        **window,
+        begin=args.begin,
+        end=args.end,
     )
     progress.done()
     if args.conflicts:
-        _write(Path(args.conflicts), found.encounters)
+        file = Path(args.conflicts)
+        with cannot("write", field="--conflicts", value=args.conflicts):
+            file.parent.mkdir(parents=True, exist_ok=True)
+            write_csv(file, found.encounters, [field.name for field in fields(Encounter)])
         print(f"{len(found.encounters)} conflicts in {args.conflicts}", file=sys.stderr)
     whole: dict[str, Any] = {
         "file": str(path),
@@ -98,8 +105,6 @@ def work(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps(whole))
         return 0
-    from cosim.cli.output import figure
-
     print(
         f"{path}: {found.vehicles} vehicles ({found.watched} watched), {found.begin:g} to {found.end:g} s, "
         f"{found.frames} frames of {found.interval:g} s"
@@ -109,17 +114,6 @@ def work(args: argparse.Namespace) -> int:
     for note in found.notes:
         print(f"  note: {note}")
     return 0
-
-
-def _write(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    from cosim.fcd.encounters import Encounter
-    from cosim.files import write_csv
-
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_csv(path, rows, [field.name for field in fields(Encounter)])
-    except OSError as error:
-        raise BadInput(f"cannot write: {error.strerror}", field="--conflicts", value=str(path)) from None
 
 
 def _road(net: Path) -> Any:

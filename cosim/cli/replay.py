@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 from cosim.cli import arguments
@@ -22,11 +23,16 @@ def add(verbs: arguments.Verbs) -> None:
     replay.add_argument(
         "episode", nargs="?", metavar="EPISODE", help="its key, or its seed where only one episode has it"
     )
-    replay.add_argument("--html", metavar="FILE", help="the page (default: replay*.html in RUN)")
-    replay.add_argument("--mp4", metavar="FILE", help="the film (default: replay*.mp4 in RUN)")
-    replay.add_argument("--gif", metavar="FILE", help="a small picture that moves, for a page or a slide")
-    replay.add_argument("--beside", metavar="POLICY", help="drive it with this policy too, film both")
-    replay.add_argument("--follow", metavar="ID", help="whom the film follows (default: the mission vehicle)")
+    arguments.texts(
+        replay,
+        {
+            "--html": ("FILE", "the page (default: replay*.html in RUN)"),
+            "--mp4": ("FILE", "the film (default: replay*.mp4 in RUN)"),
+            "--gif": ("FILE", "a small picture that moves, for a page or a slide"),
+            "--beside": ("POLICY", "drive it with this policy too, film both"),
+            "--follow": ("ID", "whom the film follows (default: the mission vehicle)"),
+        },
+    )
     replay.add_argument("--no-check", action="store_true", help="draw it even when it is another one")
     replay.set_defaults(work=work)
 
@@ -37,7 +43,8 @@ def work(args: argparse.Namespace) -> int:
 
     recorded = replay.find(Path(args.run), args.episode)
     scenario, warnings = replay.check_inputs(recorded)
-    replay.warn(warnings)
+    for warning in warnings:
+        print(f"cosim: warning: {warning}", file=sys.stderr)
     other = None if args.beside is None else replay.beside(recorded, args.beside)
     html, mp4, gif = (None if name is None else Path(name) for name in (args.html, args.mp4, args.gif))
     if html is None and mp4 is None and gif is None:
@@ -45,13 +52,10 @@ def work(args: argparse.Namespace) -> int:
         mp4 = recorded.folder / f"{name}.mp4"
         html = recorded.folder / f"{name}.html" if other is None else None
     result, recording = replay.drive(recorded, scenario, check=not args.no_check)
-    recordings = [recording]
-    if other is not None:
-        recordings += [replay.drive(other, scenario, check=False)[1]]
-    replay.draw(recordings, html, mp4, gif, args.follow)
+    others = [] if other is None else [replay.drive(other, scenario, check=False)[1]]
+    replay.draw([recording, *others], html, mp4, gif, args.follow)
     same = "the same episode" if result.trace_hash == recorded.trace_hash else "ANOTHER episode"
     print(f"{same}: trace hash {result.trace_hash}")
-    for path in (html, mp4, gif):
-        if path is not None:
-            print(f"{path} ({path.stat().st_size / 1e6:.2f} MB)")
+    for path in filter(None, (html, mp4, gif)):
+        print(f"{path} ({path.stat().st_size / 1e6:.2f} MB)")
     return 0

@@ -17,7 +17,7 @@ def add(verbs: arguments.Verbs) -> None:
         "needs no network.",
     )
     report.add_argument("run", metavar="DIR", help="run folder of `cosim evaluate`")
-    report.add_argument("--out", metavar="FILE", help="write it here (default: DIR/report.html)")
+    arguments.add(report, "--out", metavar="FILE", help="write it here (default: DIR/report.html)")
     report.set_defaults(work=work)
 
 

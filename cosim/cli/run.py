@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import math
 import shlex
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from cosim.cli import arguments
 from cosim.errors import BadInput
+from cosim.files import code
 from cosim.files.xml_input import is_there
-from cosim.scenario import BEHAVIORS
-from cosim.scenario.behaviors import DRIVER_MODELS
-from cosim.scenario.episode_id import Case
+from cosim.scenario import Scenario, place
+from cosim.scenario.episode_id import EpisodeId
 from cosim.scenario.policy_name import label, read
 from cosim.seeding import FIRST_TEST_SEED
-from cosim.types import Preset
+from cosim.types import EpisodeResult
+from cosim.workers.worker import Worker
+
+if TYPE_CHECKING:
+    from cosim.episode import Progress as Reported
+    from cosim.host import Host
 
 
 def add(verbs: arguments.Verbs) -> None:
@@ -28,80 +35,89 @@ def add(verbs: arguments.Verbs) -> None:
         help="drive one episode of a scenario",
         description="Drive one episode. Everything after -- goes to SUMO as it stands.",
     )
-    run.add_argument("what", metavar="WHAT", help="a scenario's name (cosim scenarios) or any .sumocfg")
     run.add_argument(
-        "--demand",
-        action="append",
-        default=[],
-        metavar="NAME|FILE",
-        help="demand by name (default of our worlds: dense), or route files",
+        "what", metavar="WHAT", help="a scenario's name (cosim scenarios), a world's folder or any .sumocfg"
     )
-    run.add_argument("--policy", default="idm", metavar="POLICY", help=arguments.POLICY)
-    run.add_argument(
-        "--svo", type=arguments.degrees, default=45.0, metavar="DEG", help="SVO angle, 0..90 (default 45)"
-    )
-    run.add_argument(
-        "--behavior",
-        choices=BEHAVIORS,
-        help="Table II class of the human drivers (default: mixed; contested: moderate; your files: as-is)",
-    )
-    run.add_argument("--driver-model", choices=DRIVER_MODELS, default="lc2013", help="default lc2013")
-    run.add_argument("--preset", choices=Preset.ALL, help="who guards the AVs (default: the scenario's)")
-    fleet = run.add_mutually_exclusive_group()
-    fleet.add_argument("--av-type", metavar="T", help="AVs are the vehicles of this vType")
-    fleet.add_argument("--av-ids", metavar="REGEX", help="AVs are the vehicles whose id matches")
-    fleet.add_argument(
-        "--penetration", type=arguments.share, metavar="P", help="this share of vehicles are AVs, 0..1"
-    )
-    run.add_argument(
-        "--seed", type=arguments.seed, default=FIRST_TEST_SEED, metavar="N", help=f"default {FIRST_TEST_SEED}"
-    )
-    run.add_argument(
-        "--duration", type=arguments.positive, metavar="S", help="counted s (default: the scenario's)"
-    )
-    run.add_argument("--out", metavar="DIR", help="write the run folder here")
-    run.add_argument(
-        "--output",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="have SUMO write its NAME output (tripinfo, fcd, ssm, ...) to DIR/outputs; repeatable",
-    )
+    arguments.add(run, "--demand", action="append", default=[])
+    arguments.add(run, "--policy", default="idm")
+    arguments.add(run, "--svo", default=45.0)
+    arguments.add(run, "--behavior", "--preset", "--duration", "--reward", "--out")
+    arguments.add(run, "--driver-model", default="lc2013", help="of the human drivers (default lc2013)")
+    arguments.add(run.add_mutually_exclusive_group(), "--av-type", "--av-ids", "--penetration")
+    arguments.add(run, "--seed", default=FIRST_TEST_SEED, help=f"default {FIRST_TEST_SEED}")
+    arguments.add(run, "--output", "--metric", action="append", default=[])
     run.add_argument("--replay", action="store_true", help="draw DIR/replay.html and DIR/replay.mp4 too")
-    run.add_argument("--json", action="store_true", help="print exactly one JSON document on stdout")
+    arguments.add(run, "--json")
     run.set_defaults(work=work, passes_on=True)
+
+
+class Driver:
+    """What `cosim run` hosts in its worker: loads SUMO and the policy at once, while the caller still checks
+    the scenario. Raises BadInput for an unknown policy."""
+
+    def __init__(self, policy: str) -> None:
+        import cosim.simulation.sumo  # noqa: F401
+        from cosim.host import Host
+        from cosim.policies import make
+
+        self._make = functools.partial(Host, policy=make(policy))
+        self._host: Host | None = None
+
+    def drive(
+        self, scenario: Scenario, case: EpisodeId, watch: bool, folder: Path | None, progress: Reported
+    ) -> tuple[EpisodeResult, Any]:
+        """The episode, watched or not; progress of 0 s in all: kernels are being compiled.
+
+        Raises as `Host`.
+        """
+        from cosim.geometry.compiled import on_compilation
+
+        on_compilation(functools.cache(lambda: progress(0.0, 0.0)))
+        self._host = self._make(
+            scenario, svo=math.radians(case.svo_deg), metrics=case.metrics, reward=case.reward
+        )
+        if watch:
+            return self._host.watch(case.seed, progress, outputs=case.outputs, folder=folder)
+        return self._host.run(case.seed, progress, outputs=case.outputs, folder=folder), None
+
+    def close(self) -> None:
+        """End the simulation."""
+        if self._host is not None:
+            self._host.close()
 
 
 def work(args: argparse.Namespace) -> int:
     """Drive it in a worker process, show the result."""
-    from cosim.cli import output
-    from cosim.files import prepare_folder
-    from cosim.policies import check
-    from cosim.report.replay.episode import draw, remembered
-    from cosim.runner import Runner
-    from cosim.scenario import sumo_outputs
-    from cosim.scenario.vet import vetted
-    from cosim.workers.progress import Progress
-    from cosim.workers.worker import Worker
-
     for flag, wanted in (("--output", args.output), ("--replay", args.replay)):
         if wanted and not args.out:
             raise BadInput("needs a run folder to write into: --out DIR", field=flag)
     case = case_of(args)
-    check(case.policy)
-    scenario = case.scenario(args.sumo_options)
-    sumo_outputs.check(case.outputs, scenario.options)
-    scenario = vetted(scenario)
-    new = bool(args.out) and not Path(args.out).exists()
-    folder = prepare_folder(args.out) if args.out else None
+    worker = Worker(Driver, case.policy, name="cosim-run", wait=False)
+    from cosim.files import prepare_folder
+    from cosim.policies import check
+    from cosim.report import result as output
+    from cosim.scenario import sumo_outputs
+    from cosim.scenario.manifest import remembered
+    from cosim.scenario.vet import vetted
+    from cosim.workers.progress import Progress
+
+    try:
+        check(case.policy)
+        scenario = case.scenario(args.sumo_options)
+        sumo_outputs.check(case.outputs, scenario.options)
+        scenario = vetted(scenario)
+        new = bool(args.out) and not Path(args.out).exists()
+        folder = prepare_folder(args.out) if args.out else None
+    except BaseException:
+        worker.kill()  # it is still loading, and has nothing to put away
+        worker.close()
+        raise
     files = folder / "outputs" if folder is not None and case.outputs else None
     progress = Progress(f"{scenario.name} {label(case.policy)}", "s")
     progress.starting()
     try:
-        with Worker(Runner, scenario, case.policy, math.radians(case.svo_deg), name="cosim-run") as worker:
-            verb = "watch" if args.replay else "run"
-            answer = worker.call(verb, case.seed, progress=progress, outputs=case.outputs, folder=files)
-            result, watched = answer if args.replay else (answer, None)
+        with worker:
+            result, watched = worker.call("drive", scenario, case, args.replay, files, progress=progress)
     except BaseException:
         if new and folder is not None:
             shutil.rmtree(folder, ignore_errors=True)
@@ -114,6 +130,8 @@ def work(args: argparse.Namespace) -> int:
     if folder is not None:
         output.write_folder(folder, result, case.outputs)
         if watched is not None:
+            from cosim.report.replay.episode import draw
+
             draw([watched], folder / "replay.html", folder / "replay.mp4")
     if args.json:
         print(json.dumps(result.document()))
@@ -124,26 +142,23 @@ def work(args: argparse.Namespace) -> int:
     return 0
 
 
-def case_of(args: argparse.Namespace) -> Case:
+def case_of(args: argparse.Namespace) -> EpisodeId:
     """The episode that the flags describe; files by absolute path, so that it can be found again."""
-    return Case(
-        what=_place(args.what),
-        demand=tuple(map(_place, args.demand)),
+    same = ("behavior", "driver_model", "penetration", "av_type", "av_ids", "preset", "duration", "seed")
+    reward = args.reward
+    return EpisodeId(
+        what=place(args.what),
+        demand=tuple(map(_demand, args.demand)),
         policy=read(args.policy).text,
-        behavior=args.behavior,
-        driver_model=args.driver_model,
-        penetration=args.penetration,
-        av_type=args.av_type,
-        av_ids=args.av_ids,
         svo_deg=args.svo,
-        preset=args.preset,
-        duration=args.duration,
-        seed=args.seed,
         outputs=tuple(dict.fromkeys(args.output)),
+        metrics=tuple(code.read(metric, "--metric").text for metric in args.metric),
+        reward=code.read(reward, "--reward").text if reward and code.is_code(reward) else reward,
+        **{name: getattr(args, name) for name in same},
     )
 
 
-def _place(name: str) -> str:
-    """A file's absolute path; a name of ours, and whatever is wrong, as it is."""
+def _demand(name: str) -> str:
+    """A file's absolute path; a demand's name, and whatever is wrong, as it is."""
     is_file = ("." in name or "/" in name) and is_there(Path(name))
     return str(Path(name).absolute()) if is_file else name

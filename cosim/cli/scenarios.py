@@ -12,7 +12,7 @@ from cosim.cli import arguments
 def add(verbs: arguments.Verbs) -> None:
     """Register the verb and its flags."""
     scenarios = verbs.add_parser("scenarios", help="list the worlds and their demands")
-    scenarios.add_argument("--json", action="store_true")
+    arguments.add(scenarios, "--json")
     scenarios.set_defaults(work=work)
 
 
@@ -21,21 +21,19 @@ def work(args: argparse.Namespace) -> int:
     from cosim.scenario import load
     from sumo_scenarios import names
 
-    rows: list[dict[str, Any]] = []
-    for name in names():
-        s = load(name)
-        rows.append(
-            {
-                "name": name,
-                "title": s.title,
-                "demands": sorted(s.demands or {}),
-                "default_demand": s.demand_name,
-                "mission": s.mission.kind,
-                "duration_s": s.duration,
-                "warmup_s": s.warmup,
-                "preset": s.preset,
-            }
-        )
+    rows: list[dict[str, Any]] = [
+        {
+            "name": name,
+            "title": s.title,
+            "demands": sorted(s.demands or {}),
+            "default_demand": s.demand_name,
+            "mission": s.mission.kind,
+            "duration_s": s.duration,
+            "warmup_s": s.warmup,
+            "preset": s.preset,
+        }
+        for name, s in ((name, load(name)) for name in names())
+    ]
     if args.json:
         print(json.dumps(rows))
         return 0

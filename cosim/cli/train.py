@@ -22,23 +22,27 @@ def add(verbs: arguments.Verbs) -> None:
     train.add_argument(
         "--config", default="compact", metavar="FILE", help="compact, maps, paper, smoke, or a YAML file"
     )
-    train.add_argument("--policy", metavar="NAME", help="the approach (default: vfn-p; a2c: conv3d-a2c)")
+    arguments.add(train, "--policy", metavar="NAME", help="the approach (default: vfn-p; a2c: conv3d-a2c)")
     train.add_argument(
-        "--scenario", action="append", default=[], metavar="NAME", help="a world, or all (default: merge)"
+        "--scenario",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="a world, its folder, or all",
     )
+    arguments.add(train, "--reward", metavar="FILE:NAME", help="your own, instead of the file's weights")
+    arguments.add(train, "--metric", action="append", default=[])
     train.add_argument("--iterations", type=arguments.count, metavar="N", help="instead of the file's")
-    train.add_argument(
-        "--seed", type=arguments.seed, metavar="N", help="of everything; instead of the file's"
-    )
-    train.add_argument("--resume", action="store_true", help="go on in --out")
+    arguments.add(train, "--seed", help="of everything; instead of the file's")
+    arguments.add(train, "--resume")
     train.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
-    train.add_argument("--workers", type=arguments.count, default=1, metavar="N", help="driving processes")
+    arguments.add(train, "--workers", default=1, help="driving processes")
     train.add_argument("--threads", type=arguments.count, default=1, metavar="N", help="of the learner")
     recorded = train.add_argument_group("hpn", "learns from recordings (cosim record)")
     recorded.add_argument("--recordings", action="append", default=[], metavar="DIR", help="training seeds")
     recorded.add_argument("--validation", action="append", default=[], metavar="DIR", help="tuning seeds")
     recorded.add_argument("--variant", choices=VARIANTS, default="hpn", help="hpn is the one that ships")
-    train.add_argument("--out", required=True, metavar="DIR")
+    arguments.add(train, "--out", required=True)
     train.set_defaults(work=work)
 
 

@@ -18,11 +18,17 @@ MAX_DECEL = 8.0  # m/s2
 MAX_ACCEL = 3.0  # m/s2
 LANE_CHANGE_TIME = 2.0  # s, the same as SUMO's --lanechange.duration
 _ACTIONS, _ACCELERATE, _DECELERATE = len(MetaAction), int(MetaAction.ACCELERATE), int(MetaAction.DECELERATE)
+_NEVER = 1e9  # s: longer than any rollout
 STEP = 0.1  # s, with which a rollout tracks the target speed (SUMO's step, definitions.md)
 
 
 def next_target(target: float, speed: float, action: int, speed_limit: float) -> float:
-    """The target speed after `action`, all in m/s; `speed` is the AV's present one.
+    """The target speed in m/s after a meta-action (definitions.md, Vehicles).
+
+    Args:
+        target, speed: m/s, the AV's present target and its own speed.
+        action: a `MetaAction`.
+        speed_limit: m/s, of its lane.
 
     The levels are 0, 5, 10, ... up to the limit, and the limit + 2 on top. Decelerate goes to the highest
     level at least `LEAST_STEP` below the lower of target and speed, Accelerate to the lowest one as much
@@ -49,42 +55,59 @@ def _next_target(target: float, speed: float, action: int, speed_limit: float) -
 
 @compiled
 def tracked_speed(speed: float, target: float, step: float) -> float:
-    """Speed in m/s one simulation step (s) later, tracking `target` within an AV's limits."""
+    """Speed in m/s one simulation step later, tracking a target speed within an AV's limits.
+
+    Args:
+        speed, target: m/s. The difference decays with `TIME_CONSTANT`, at -`MAX_DECEL` to `MAX_ACCEL`.
+        step: s.
+    """
     accel = (target - speed) / TIME_CONSTANT
     return max(speed + min(max(accel, -MAX_DECEL), MAX_ACCEL) * step, 0.0)
 
 
 @compiled
-def tracked_speeds(speed: float, targets: Floats, frames: int, dt: float) -> Floats:
-    """Speeds while tracking target speeds [k] m/s from `speed`: [k,frames+1] m/s, every `dt` s."""
-    steps = max(round(dt / STEP), 1)
-    out = np.empty((targets.shape[0], frames + 1))
-    for k in range(targets.shape[0]):
-        v = speed
-        out[k, 0] = v
-        for t in range(1, frames + 1):
-            for _ in range(steps):
-                v = tracked_speed(v, targets[k], dt / steps)
-            out[k, t] = v
-    return out
-
-
-@compiled
 def braking_speeds(speed: float, target: float, frames: int, dt: float, period: float) -> Floats:
-    """Speeds [frames+1] m/s when the target (m/s, already lowered once) falls one level every `period` s."""
+    """Speeds while Decelerate is repeated.
+
+    Args:
+        speed, target: m/s at the start; the target is lowered once already.
+        frames, dt: how many frames ahead, and s between them.
+        period: s between decisions: each lowers the target by one level.
+
+    Returns:
+        [frames+1] m/s, the first entry the present.
+    """
     out = np.empty(frames + 1)
     v = speed
     out[0] = v
     steps = max(round(dt / STEP), 1)
-    per_level = max(round(period / STEP), 1)
-    k = 0
+    left = per_level = max(round(period / STEP), 1)
     for t in range(1, frames + 1):
         for _ in range(steps):
-            if k > 0 and k % per_level == 0:
+            if left == 0:
                 target = max(target - SPEED_STEP, 0.0)
-            k += 1
+                left = per_level
+            left -= 1
             v = tracked_speed(v, target, dt / steps)
         out[t] = v
+    return out
+
+
+@compiled
+def tracked_speeds(speed: float, targets: Floats, frames: int, dt: float) -> Floats:
+    """Speeds while k constant target speeds are tracked.
+
+    Args:
+        speed: m/s at the start.
+        targets: [k] m/s.
+        frames, dt: how many frames ahead, and s between them.
+
+    Returns:
+        [k,frames+1] m/s, the first column the present.
+    """
+    out = np.empty((targets.shape[0], frames + 1))
+    for k in range(targets.shape[0]):
+        out[k] = braking_speeds(speed, targets[k], frames, dt, _NEVER)
     return out
 
 
@@ -92,11 +115,19 @@ def braking_speeds(speed: float, target: float, frames: int, dt: float, period: 
 def speeds_ahead(
     target: float, speed: float, limit: float, frames: int, stopping: int, dt: float, period: float
 ) -> tuple[Floats, Floats]:
-    """What every action means, every `dt` s, and how far it is to standstill.
+    """The speeds that every action leads to, and how far it is to standstill after it.
 
-    Speeds [A+1,frames+1] m/s of the actions held, which for Decelerate means again at every decision,
-    `period` s apart; the last row is Decelerate once. [A] m driven within `stopping` frames when Decelerate
-    follows from the next decision on.
+    Args:
+        target, speed, limit: m/s, the AV's present target, its speed and its lane's speed limit.
+        frames: how many frames of speeds are wanted.
+        stopping: how many frames the way to standstill is added up over.
+        dt: s between frames.
+        period: s between decisions.
+
+    Returns:
+        [A+1,frames+1] m/s of the actions held, which for Decelerate means again at every decision; the last
+        row is Decelerate once. [A] m driven within `stopping` frames when Decelerate follows every action
+        from the next decision on.
     """
     targets = np.empty(_ACTIONS + 1)
     for a in range(_ACTIONS):
@@ -116,19 +147,37 @@ def speeds_ahead(
 def braked_from(
     speeds: Floats, target: float, held: int, frames: int, limit: float, dt: float, period: float
 ) -> Floats:
-    """[frames+1] m/s: the first `held` frames of `speeds`, at `target`, then Decelerate every `period` s."""
+    """The first `held` frames of a course of speeds, then Decelerate at every decision.
+
+    Args:
+        speeds: [>held] m/s, every `dt` s.
+        target: m/s, tracked until then.
+        held, frames: frames until the first Decelerate, and in all.
+        limit: m/s, the lane's speed limit.
+        dt, period: s between frames, and between decisions.
+
+    Returns:
+        [frames+1] m/s.
+    """
     then = speeds[held]
     out = np.empty(frames + 1)
     out[:held] = speeds[:held]
-    lowered = _next_target(target, then, _DECELERATE, limit)
-    out[held:] = braking_speeds(then, lowered, frames - held, dt, period)
+    out[held:] = braking_speeds(
+        then, _next_target(target, then, _DECELERATE, limit), frames - held, dt, period
+    )
     return out
 
 
 def to_commands(
     decisions: Mapping[str, Decision], histories: Mapping[str, History], hold: float
 ) -> list[Command]:
-    """One command per decided AV, held for `hold` s."""
+    """One command per decided AV.
+
+    Args:
+        decisions: AV id -> what its policy chose.
+        histories: AV id -> its history, for its target speed, speed and speed limit (m/s).
+        hold: s until the next decision.
+    """
     commands = []
     for vehicle, decision in decisions.items():
         history = histories[vehicle]

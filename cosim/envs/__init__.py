@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 
 import gymnasium
 
+from sumo_scenarios import names
+
 if TYPE_CHECKING:
     from cosim.envs.gym import SumoEnv
     from cosim.envs.parallel import SumoParallelEnv, parallel_env
@@ -14,8 +16,12 @@ if TYPE_CHECKING:
 
 __all__ = ["Session", "StepResult", "SumoEnv", "SumoParallelEnv", "View", "open", "parallel_env"]
 
-_WORLDS = ("Merge", "Exit", "Roundabout", "Intersection", "Highway")
-_HOME = {"SumoEnv": "gym", "SumoParallelEnv": "parallel", "parallel_env": "parallel", "View": "view"}
+_HOME = {
+    "SumoEnv": "cosim.envs.gym",
+    "SumoParallelEnv": "cosim.envs.parallel",
+    "parallel_env": "cosim.envs.parallel",
+    "View": "cosim.observation.view",
+}
 
 
 def __getattr__(name: str) -> object:
@@ -23,9 +29,9 @@ def __getattr__(name: str) -> object:
         raise AttributeError(f"module 'cosim.envs' has no attribute {name!r}")
     from importlib import import_module
 
-    return getattr(import_module(f"cosim.envs.{_HOME.get(name, 'session')}"), name)
+    return getattr(import_module(_HOME.get(name, "cosim.envs.session")), name)
 
 
-for _world in _WORLDS:
-    gymnasium.register(f"cosim/{_world}-v0", "cosim.envs.gym:SumoEnv", kwargs={"config": _world.lower()})
-gymnasium.register("cosim/Sumo-v0", "cosim.envs.gym:SumoEnv")  # give it config="my.sumocfg"
+for _world in names():
+    gymnasium.register(f"cosim/{_world.capitalize()}-v0", "cosim.envs.gym:SumoEnv", kwargs={"config": _world})
+gymnasium.register("cosim/Sumo-v0", "cosim.envs.gym:SumoEnv")  # give it config="my.sumocfg" or a folder

@@ -1,17 +1,19 @@
-"""The simulation's side of a session: lives in the worker process, walks the one loop of `cosim.episode`."""
+"""The simulation's side of a session: lives in the worker process, one decision at a time."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from cosim.episode import Episode
 from cosim.errors import BadInput
+from cosim.host import Earnings, Host, SimulatorFactory
+from cosim.metrics import MetricFactory
 from cosim.observation.view import Packed, Packer
-from cosim.rewards import RewardConfig, RewardTerms, rewards
+from cosim.policies import make
+from cosim.rewards import Reward, RewardTerms
 from cosim.road import RoadMap
 from cosim.scenario import Scenario
 from cosim.types import (
@@ -24,12 +26,9 @@ from cosim.types import (
     ObservationConfig,
     Policy,
     Receipt,
-    Simulator,
     Snapshot,
 )
-from cosim.workers.determinism import make_torch_deterministic
 
-SimulatorFactory = Callable[[Scenario, Mapping[str, str], int], Simulator]  # ..., AV parameters, frames kept
 PolicyFactory = Callable[[], Policy]
 
 
@@ -49,92 +48,79 @@ class Reply(NamedTuple):
     truncated: bool
 
 
-class Host:
-    """One scenario, any number of episodes; the caller commands the AVs it names in `act`.
-
-    `others` commands those that are left (it sees only these); without it SUMO drives them.
-    """
+class SessionHost(Host):
+    """The caller commands the AVs it names in `act`; the policy commands those that are left (it sees only
+    these): `others`, or SUMO's IDM."""
 
     def __init__(
         self,
         scenario: Scenario,
         observation: ObservationConfig,
         svo: float,
-        reward: RewardConfig,
+        reward: Reward,
         others: PolicyFactory | None,
         simulator: SimulatorFactory | None,
+        metrics: Sequence[str | MetricFactory] = (),
     ) -> None:
-        self._others = None if others is None else others()
-        self._svo = svo  # rad
-        self._reward = reward
-        wanted = observation if self._others is None else _common(observation, self._others)
-        parameters = {} if self._others is None else self._others.av_parameters
-        self._simulator = (simulator or _sumo)(scenario, parameters, wanted.frames)
-        self._episode = Episode(scenario, self._simulator, wanted)
+        policy = make("idm") if others is None else others()
+        super().__init__(
+            scenario,
+            policy,
+            svo,
+            observation=_common(observation, policy),
+            simulator=simulator,
+            metrics=metrics,
+        )
+        self._earnings = Earnings(reward, svo)
         self._packer = Packer()
         self._painter: Callable[[Snapshot, str | None], Bytes] | None = None
         self._started = False
 
     def reset(self, seed: int) -> Reply:
         """Begin the episode `seed` and drive its warm-up."""
-        self._histories = self._episode.start(seed)
+        self.policy.reset(self.episode.context(seed, self.svo))
+        histories = self.episode.start(seed)
         self._started = True
-        if self._others is not None:
-            make_torch_deterministic()
-            self._others.reset(self._episode.context(self._svo))
-        return self._reply(self._packer.pack(self._histories, None), {}, {})
+        return self._reply(self._packer.pack(histories, None))
 
     def act(self, actions: Mapping[str, int], see: Collection[str] | None) -> Reply:
         """One decision. `see`: AVs whose views are wanted (None: all)."""
-        episode = self._episode
-        before = episode.snapshot
+        episode = self.episode
         decisions = {name: Decision(MetaAction(action)) for name, action in actions.items()}
-        if self._others is not None:
-            theirs = {name: h for name, h in self._histories.items() if name not in actions}
-            decisions |= self._others.decide(theirs)
+        left = {name: h for name, h in episode.histories.items() if name not in actions}
+        decisions |= self.policy.decide(left)
         # sorted: SUMO takes commands in the order given, which must not hang on a caller's dict order
-        decisions = {name: decisions[name] for name in self._histories if name in decisions}
-        self._histories = episode.advance(decisions)
-        after, events = episode.snapshot, episode.events
-        avs = _avs(before)
-        earned = rewards(
-            before,
-            after,
-            avs,
-            {name: d.action for name, d in decisions.items()},
-            self._svo,
-            self._reward,
-            events.collisions,
-        )
-        seen = self._histories
+        seen = episode.advance({name: decisions[name] for name in episode.histories if name in decisions})
+        assert episode.step is not None
+        before, after, events = episode.step.before, episode.step.after, episode.step.events
+        earned = self._earnings.pay(episode.step, before.avs)
         if see is not None:
             seen = {name: h for name, h in seen.items() if name in see}
         packed = self._packer.pack(seen, len(episode.frames))
-        return self._reply(packed, earned, self._ended(avs, after, events))
+        return self._reply(packed, earned, self._ended(before.avs, after, events))
 
     def result(self, policy: str) -> EpisodeResult:
         """The figures of the episode so far."""
         self._check_started()
-        label = "" if self._others is None else self._others.label
-        return self._episode.result(policy, label, self._svo)
+        return self.episode.result(policy, self.policy.label, self.svo)
 
     def snapshot(self) -> Snapshot:
         """Every vehicle as it is now."""
         self._check_started()
-        return self._episode.snapshot
+        return self.episode.snapshot
 
     def partner(self) -> str:
         """The AV that reaches the conflict zone next after the mission vehicle does, at present speeds: the
         one that would have to yield. "" without a mission vehicle or zone ahead, or without such an AV."""
         self._check_started()
-        s, road = self._episode.snapshot, self._simulator.road
+        s, road = self.episode.snapshot, self.simulator.road
 
         def arrival(row: np.intp) -> float:  # s
             if s.lane[row] < 0:
                 return float("inf")
             name = s.ids[row]
             place, length = float(s.lane_position[row]), float(s.length[row])
-            ahead = road.ahead(int(s.lane[row]), place, length, self._simulator.route(name))
+            ahead = road.ahead(int(s.lane[row]), place, length, self.simulator.route(name))
             return ahead.conflict_distance / max(float(s.speed[row]), 1.0)
 
         waiting = [t for row in np.flatnonzero(s.mission) if (t := arrival(row)) < float("inf")]
@@ -146,7 +132,7 @@ class Host:
 
     def road(self) -> RoadMap:
         """The net's lanes."""
-        return self._simulator.road
+        return self.simulator.road
 
     def picture(self, av: str | None) -> Bytes:
         """[rows, columns, 3] the road around one AV (or around the first vehicle) from above."""
@@ -154,12 +140,8 @@ class Host:
 
         self._check_started()
         if self._painter is None:
-            self._painter = Painter(self._simulator.road).paint
-        return self._painter(self._episode.snapshot, av)
-
-    def close(self) -> None:
-        """End the simulation."""
-        self._simulator.close()
+            self._painter = Painter(self.simulator.road).paint
+        return self._painter(self.episode.snapshot, av)
 
     # ---- inside ----
 
@@ -167,15 +149,20 @@ class Host:
         if not self._started:
             raise BadInput("no episode has begun: call reset first")
 
-    def _reply(self, packed: Packed, earned: dict[str, RewardTerms], ended: dict[str, str]) -> Reply:
-        e = self._episode
+    def _reply(
+        self,
+        packed: Packed,
+        earned: dict[str, RewardTerms] | None = None,
+        ended: dict[str, str] | None = None,
+    ) -> Reply:
+        e = self.episode
         return Reply(
             packed,
-            earned,
-            ended,
-            e.receipts,
-            e.events,
-            _avs(e.snapshot),
+            earned or {},
+            ended or {},
+            e.step.receipts if e.step else (),
+            Events.of(e.frames),
+            e.snapshot.avs,
             e.snapshot.time,
             e.elapsed,
             e.steps,
@@ -196,15 +183,11 @@ class Host:
                 ended[name] = "teleported"
             elif name not in after.row:
                 ended[name] = "arrived"
-            elif self._episode.terminated:
+            elif self.episode.terminated:
                 ended[name] = "collision of another AV"
-            elif self._episode.truncated:
+            elif self.episode.truncated:
                 ended[name] = "duration"
         return ended
-
-
-def _avs(snapshot: Snapshot) -> tuple[str, ...]:
-    return tuple(snapshot.ids[row] for row in np.flatnonzero(snapshot.kind == Kind.AV))
 
 
 def _common(observation: ObservationConfig, others: Policy) -> ObservationConfig:
@@ -220,9 +203,3 @@ def _common(observation: ObservationConfig, others: Policy) -> ObservationConfig
         f"{observation.frames}: give both the same observation",
         field="observation",
     )
-
-
-def _sumo(scenario: Scenario, av_parameters: Mapping[str, str], history: int) -> Simulator:
-    from cosim.simulation.sumo import SumoSimulator  # libsumo: only here, in the worker's process
-
-    return SumoSimulator(scenario, av_parameters=av_parameters, history=history)

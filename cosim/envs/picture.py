@@ -28,13 +28,12 @@ class Painter:
         if not s.n:
             return picture
         row = 0 if vehicle is None else s.row.get(vehicle, 0)
-        everybody = np.ones((1, s.n), np.bool_)
-        draw_snapshot(self._block, np.zeros(1, np.int64), s, np.array([row]), everybody, self._raster, VIEW)
+        all_seen = np.ones((1, s.n), np.bool_)
+        draw_snapshot(self._block, np.zeros(1, np.int64), s, np.array([row]), all_seen, self._raster, VIEW)
         layers = dict(zip(CHANNELS, self._block[0], strict=True))
         picture[layers["road"] > 0] = SURFACE
         picture[layers["road"] == ROAD_LINE] = LINE
         for name, colour in COLOURS.items():
-            if name == "ego" and vehicle not in s.row:
-                continue
-            picture[layers[name] > 0] = colour
+            if name != "ego" or vehicle in s.row:
+                picture[layers[name] > 0] = colour
         return picture

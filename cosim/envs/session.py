@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 import multiprocessing
 import operator
+import pickle
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from cosim.errors import BadInput, hint
 from cosim.observation.view import Unpacker, View
-from cosim.rewards import RewardConfig, RewardTerms
-from cosim.scenario import Fleet, Scenario, load
+from cosim.rewards import Reward, RewardTerms, read
+from cosim.scenario import Fleet, Scenario, chosen_fleet, load
 from cosim.seeding import TRAINING_SEEDS
 from cosim.types import (
     COMPACT,
@@ -26,7 +27,9 @@ from cosim.types import (
 from cosim.workers.worker import Worker
 
 if TYPE_CHECKING:
-    from cosim.envs.host import Host, PolicyFactory, Reply, SimulatorFactory
+    from cosim.envs.host import PolicyFactory, Reply, SessionHost
+    from cosim.host import SimulatorFactory
+    from cosim.metrics import MetricFactory
     from cosim.road import RoadMap
 
 TIMEOUT = 120.0  # s without an answer; the first step of a machine compiles the kernels
@@ -69,22 +72,29 @@ def open(
     svo: float = 45.0,
     preset: str | None = None,
     fleet: Fleet | None = None,
+    penetration: float | None = None,
+    av_type: str | None = None,
+    av_ids: str | None = None,
     duration: float | None = None,
     options: Sequence[str] = (),
     seed: int | None = None,
     observation: ObservationConfig = COMPACT,
-    reward: RewardConfig | None = None,
+    reward: str | Reward | None = None,
+    metrics: Sequence[str | MetricFactory] = (),
     others: PolicyFactory | None = None,
     simulator: SimulatorFactory | None = None,
     timeout: float = TIMEOUT,
     worker: bool = True,
 ) -> Session:
-    """Open the scenario `what`: a world's name, a path to any .sumocfg, or a `Scenario`.
+    """Open the scenario `what`: a world's name or folder, a path to any .sumocfg, or a `Scenario`.
 
     The same words mean the same as in `cosim run`; `svo` is in degrees (it weighs the reward). `seed` is the
-    first episode's. `others` builds a policy for the AVs you do not command (an importable function, run in
-    the simulation's process; without it SUMO's IDM drives them). `simulator` replaces SUMO, for tests
-    (`cosim.simulation.fake`). `timeout`: the longest silence in s before the process counts as hung.
+    first episode's. `reward`: a `cosim.rewards.Reward` (a `RewardConfig`, a function of your own), a name of
+    `REWARDS`, FILE.py:NAME or MODULE:NAME; without it P's. `metrics`: classes like those of `cosim.metrics`,
+    or FILE.py:NAME, measured besides. `others` builds a policy for the AVs you do not command (without it
+    SUMO's IDM drives them). What is no text must be importable: it runs in the simulation's process.
+    `simulator` replaces SUMO, for tests (`cosim.simulation.fake`). `timeout`: the longest silence in s before
+    the process counts as hung.
     `worker=False` runs the simulation in this process, for debugging: one at a time, and its death is yours.
 
     Raises:
@@ -101,7 +111,7 @@ def open(
             behavior=behavior,
             driver_model=driver_model,
             preset=preset,
-            fleet=fleet,
+            fleet=chosen_fleet(av_type, av_ids, penetration, fleet),
             duration=duration,
             options=options,
         )
@@ -109,7 +119,7 @@ def open(
         from cosim.scenario.vet import vetted
 
         scenario = vetted(scenario)
-    arguments = (scenario, observation, math.radians(svo), reward or RewardConfig(), others, simulator)
+    arguments = (scenario, observation, math.radians(svo), reward or "p", others, simulator, tuple(metrics))
     # a daemonic process (gymnasium's AsyncVectorEnv, SB3's SubprocVecEnv) may have no children, but is a
     # process of its own already
     in_process = not worker or multiprocessing.current_process().daemon
@@ -117,7 +127,11 @@ def open(
     def connect() -> Caller:
         if in_process:
             return _InProcess(build_host(*arguments))
-        return Worker(build_host, *arguments, timeout=timeout, name="cosim-session")
+        try:
+            return Worker(build_host, *arguments, timeout=timeout, name="cosim-session")
+        except (pickle.PicklingError, AttributeError) as error:
+            problem = f"must be importable, or worker=False: {error}"
+            raise BadInput(problem, field="reward, metrics, others, simulator") from None
 
     return Session(scenario, connect, seed)
 
@@ -279,7 +293,7 @@ class Session:
 class _InProcess:
     """A `Caller` without a process of its own."""
 
-    def __init__(self, host: Host) -> None:
+    def __init__(self, host: SessionHost) -> None:
         self._host = host
 
     def call(self, method: str, *arguments: Any) -> Any:
@@ -289,8 +303,16 @@ class _InProcess:
         self._host.close()
 
 
-def build_host(*arguments: Any) -> Host:
-    """Runs in the worker: the loop, numba and libsumo are imported there, not here."""
-    from cosim.envs.host import Host
+def build_host(
+    scenario: Scenario,
+    observation: ObservationConfig,
+    svo: float,
+    reward: str | Reward,
+    others: PolicyFactory | None,
+    simulator: SimulatorFactory | None,
+    more: Sequence[str | MetricFactory],
+) -> SessionHost:
+    """Runs in the worker: the loop, numba, libsumo and a user's code are imported there, not here."""
+    from cosim.envs.host import SessionHost
 
-    return Host(*arguments)
+    return SessionHost(scenario, observation, svo, read(reward, "reward"), others, simulator, more)

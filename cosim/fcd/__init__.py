@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from cosim.errors import BadInput
-from cosim.fcd.encounters import Encounters
+from cosim.fcd.encounters import Encounters, edge_of
 from cosim.fcd.file import Row, Step, lanes_named, read_steps
 from cosim.fcd.vehicle_types import DEFAULT, Size, size_of
 from cosim.files.xml_input import Progress
@@ -24,6 +25,8 @@ from cosim.simulation.conventions import centres
 from cosim.types import Kind, Metric, Snapshot, Timing
 
 FIGURES = ("time_to_collision", "post_encroachment", "drac", "hard_braking", "jerk", "headway")
+CONFLICTS = ("time_to_collision", "drac")  # figures of single frames, which a jump would make up
+SIDEWAYS = 5.0  # m/s: nobody moves faster to the side, but for SUMO's lane changes that take no time
 FRAME = Timing().frame  # s: finer data are thinned to it, so that figures compare with an episode's
 DRIVEN = 200.0  # m that all vehicles have driven before the positions are doubted
 WHOLE_LANE = 1e6  # m, of a lane whose length is not known
@@ -47,10 +50,9 @@ class Roles:
             return Kind.AV, False
         if self.mission is not None and self.mission.fullmatch(vehicle):
             return Kind.HV, True
+        is_av = vehicle_type.partition("@")[0] == self.av_type
         if self.av_ids is not None:
             is_av = self.av_ids.fullmatch(vehicle) is not None
-        else:
-            is_av = self.av_type is not None and vehicle_type.partition("@")[0] == self.av_type
         return (Kind.AV if is_av else Kind.HV), False
 
 
@@ -84,7 +86,7 @@ def analyse(
     """Read the file once, as a stream. `begin`, `end` in s; `frame`: s between the frames that are counted.
     `critical`: list the encounters with a time to collision (s) below this.
 
-    Without a `road` vehicles on and below a bridge cannot be told apart, and a headway ends with the lane.
+    Without a `road` vehicles on and below a bridge cannot be distinguished, and a headway ends with the lane.
 
     Raises:
         BadInput: malformed or truncated, not FCD, a number missing or not finite, a vehicle twice in a step,
@@ -119,7 +121,7 @@ class _Counter:
         self._path, self._road, self._sizes, self._roles = path, road, sizes, roles
         self._begin, self._end = window
         self._wanted = frame
-        self._metrics = [METRICS[name]() for name in FIGURES]
+        self._metrics = {name: METRICS[name]() for name in FIGURES}
         self._encounters = encounters
         self._first: Step | None = None  # kept until the second one says how far apart they are
         self._interval = 0.0  # s between the file's steps
@@ -128,13 +130,12 @@ class _Counter:
         self._time = 0.0  # s, of the step last seen
         self._newest: Snapshot | None = None
         self._frames = 0
-        self._span = (math.nan, math.nan)
+        self._began = math.nan  # s, of the first frame
         self._known: dict[str, tuple[str, Kind, bool, Size]] = {}  # id -> type, kind, mission, size
         self._unknown_types: set[str] = set()
-        self._ever: set[str] = set()
-        self._watched: set[str] = set()
         self._laneless = self._rows = 0  # vehicle frames
         self._strange: Counter[str] = Counter()  # lanes that the road lacks
+        self._jumps = 0  # lane changes from one frame to the next
         self._driven = self._moved = 0.0  # m, by the speeds and by the positions
 
     def see(self, step: Step) -> None:
@@ -224,23 +225,45 @@ class _Counter:
         return known
 
     def _count(self, snapshot: Snapshot) -> None:
-        for metric in self._metrics:
+        seen = self._without_jumps(snapshot)
+        for name, metric in self._metrics.items():
+            frame = seen if name in CONFLICTS else snapshot
             if self._frames:
-                metric.add(snapshot)
+                metric.add(frame)
             else:
-                metric.reset(snapshot, self._context)
+                metric.reset(frame, self._context)
         if self._encounters is not None:
-            self._encounters.add(snapshot)
-        self._frames += 1
-        self._span = (self._span[0] if self._frames > 1 else snapshot.time, snapshot.time)
-        if self._driven < DRIVEN and self._newest is not None:
+            self._encounters.add(snapshot, seen)
+        if self._newest is None:
+            self._began = snapshot.time
+        elif self._driven < DRIVEN:
             self._doubt(self._newest, snapshot)
+        self._frames += 1
         self._newest = snapshot
-        fresh = [i for i, name in enumerate(snapshot.ids) if name not in self._ever]
-        self._ever.update(snapshot.ids[i] for i in fresh)
-        self._watched.update(
-            snapshot.ids[i] for i in fresh if snapshot.kind[i] == Kind.AV or snapshot.mission[i]
-        )
+
+    def _without_jumps(self, snapshot: Snapshot) -> Snapshot:
+        """The frame without the vehicles that have just been put on a neighbouring lane (`SIDEWAYS`)."""
+        s, before = snapshot, self._newest
+        if before is None or s.n == 0:
+            return s
+        both = [(before.row[name], row) for row, name in enumerate(s.ids) if name in before.row]
+        then, now = np.array(both, np.int64).reshape(-1, 2).T  # [c] rows of who is in both frames
+        x, y = s.x[now] - before.x[then], s.y[now] - before.y[then]
+        aside = np.abs(np.cos(s.heading[now]) * y - np.sin(s.heading[now]) * x)  # [c] m
+        fast = np.flatnonzero(aside > SIDEWAYS * (s.time - before.time))
+        ways = [(int(before.lane[then[k]]), int(s.lane[now[k]]), int(now[k])) for k in fast]
+        jumped = [
+            row
+            for a, b, row in ways
+            if a != b and min(a, b) >= 0 and edge_of(self._road, a) == edge_of(self._road, b)
+        ]
+        self._jumps += len(jumped)
+        if not jumped:
+            return s
+        kept = np.delete(np.arange(s.n), jumped)
+        every: dict[str, Any] = {f.name: getattr(s, f.name) for f in fields(s)}
+        rest: dict[str, Any] = {k: v[kept] for k, v in every.items() if isinstance(v, np.ndarray)}
+        return replace(s, ids=tuple(s.ids[k] for k in kept), **rest)
 
     def _doubt(self, before: Snapshot, after: Snapshot) -> None:
         """Longitudes and latitudes hardly change while the speeds are those of cars."""
@@ -259,61 +282,50 @@ class _Counter:
         if self._first is not None:  # a file of one step
             self._set_clock(self._wanted or FRAME, self._first.time)
             self._count(self._snapshot(self._first))
-        if not self._ever:
-            window = (
-                "" if math.isinf(self._begin) and math.isinf(self._end) else " in the time that was asked for"
-            )
-            raise self._wrong(f"holds no vehicle{window}")
+        if not self._known or self._newest is None:
+            whole = math.isinf(self._begin) and math.isinf(self._end)
+            raise self._wrong("holds no vehicle" + ("" if whole else " in the time that was asked for"))
         if self._strange.total() > 0.5 * self._rows:
             problem = "no such lane in --net, which is not the net of this file"
             raise self._wrong(problem, "vehicle.lane", self._strange.most_common(1)[0][0])
-        figures: dict[str, Metric] = {}
-        for metric in self._metrics:
-            figures |= metric.result()
+        figures = dict(itertools.chain.from_iterable(m.result().items() for m in self._metrics.values()))
         return Analysis(
             figures,
-            *self._span,
+            self._began,
+            self._newest.time,
             interval=round(self._stride * self._interval, 9),
             frames=self._frames,
-            vehicles=len(self._ever),
-            watched=len(self._watched),
+            vehicles=len(self._known),
+            watched=self._watched,
             notes=tuple(self._notes(has_road, has_sizes)),
             encounters=() if self._encounters is None else tuple(self._encounters.found()),
         )
 
+    @property
+    def _watched(self) -> int:
+        """How many vehicles were AVs or mission vehicles."""
+        return sum(kind == Kind.AV or mission for _, kind, mission, _ in self._known.values())
+
     def _notes(self, has_road: bool, has_sizes: bool) -> list[str]:
-        found = []
-        if self._roles.everybody:
-            found.append("every vehicle is watched (--av-type, --av-ids and --mission say otherwise)")
-        elif not self._watched:
-            found.append("no vehicle is an AV or a mission vehicle: nothing to count")
-        if not has_sizes:
-            found.append(f"every vehicle is taken as {_size(DEFAULT)} (--types FILE says otherwise)")
-        elif self._unknown_types:
-            names = ", ".join(sorted(self._unknown_types)[:5])
-            found.append(f"not in --types, taken as {_size(DEFAULT)}: {names}")
-        if not has_road:
-            found.append(
-                "without --net: vehicles on and below a bridge count as meeting, headways end with the lane"
-            )
-        if self._laneless:
-            found.append(f"{self._laneless} vehicle frames have no lane position: no headway there")
-        if self._strange:
-            lanes = ", ".join(sorted(self._strange)[:5])
-            found.append(f"{self._strange.total()} vehicle frames on lanes that --net lacks: {lanes}")
-        if self._stride > 1:
-            found.append(
-                f"steps of {self._interval:g} s are thinned to frames of {self._stride * self._interval:g} s"
-            )
-        if self._stride * self._interval > FRAME + 1e-9:
-            found.append(
-                f"frames every {self._stride * self._interval:g} s: brief events are missed, jerk is damped"
-            )
-        return found
+        apart = self._stride * self._interval  # s between frames
+        everybody, size = self._roles.everybody, f"{DEFAULT.length:g} x {DEFAULT.width:g} m"
+        types, lanes = (", ".join(sorted(names)[:5]) for names in (self._unknown_types, self._strange))
+        notes = {
+            "every vehicle is watched (--av-type, --av-ids and --mission say otherwise)": everybody,
+            "no vehicle is an AV or a mission vehicle: nothing to count": not (everybody or self._watched),
+            f"every vehicle is taken as {size} (--types FILE says otherwise)": not has_sizes,
+            f"not in --types, taken as {size}: {types}": has_sizes and bool(types),
+            "without --net: vehicles on and below a bridge count as meeting, headways end with the lane": (
+                not has_road
+            ),
+            f"{self._laneless} vehicle frames have no lane position: no headway there": bool(self._laneless),
+            f"{self._strange.total()} vehicle frames on lanes that --net lacks: {lanes}": bool(lanes),
+            f"{self._jumps} lane changes that took no time (lanechange.duration 0): no time to collision and "
+            "no DRAC of that vehicle in that frame": bool(self._jumps),
+            f"steps of {self._interval:g} s are thinned to frames of {apart:g} s": self._stride > 1,
+            f"frames every {apart:g} s: brief events are missed, jerk is damped": apart > FRAME + 1e-9,
+        }
+        return [note for note, holds in notes.items() if holds]
 
     def _wrong(self, problem: str, place: str | None = None, value: object = None) -> BadInput:
         return BadInput(problem, file=self._path, field=place, value=value)
-
-
-def _size(size: Size) -> str:
-    return f"{size.length:g} x {size.width:g} m"

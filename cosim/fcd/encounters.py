@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+import math
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 
-from cosim.geometry import boxes, deceleration_to_avoid_crash, time_to_collision
+from cosim.geometry import (
+    Boxes,
+    boxes,
+    deceleration_to_avoid_crash,
+    post_encroachment_time,
+    time_to_collision,
+)
 from cosim.metrics.context import watched
+from cosim.metrics.post_encroachment import LONGEST
 from cosim.metrics.time_to_collision import CRITICAL
 from cosim.road import RoadMap
 from cosim.types import Snapshot
 
 APART = 1.0  # s without a critical frame: what follows is another encounter
+STEPS = 3  # lanes followed ahead to see whether two ways become one
+ALIGNED, ONCOMING = math.radians(15.0), math.radians(135.0)  # as in PET and DRAC
 
 
 @dataclass(slots=True)
@@ -32,6 +42,35 @@ class Encounter:
     ego_speed_mps: float
     foe_speed_mps: float
     max_drac_mps2: float  # largest of the encounter; 0 where they only overlapped
+    type: str = ""  # following, lane change, merging, crossing or oncoming, when it was closest
+    pet_s: float = math.nan  # post-encroachment time of crossing or merging paths; NaN: none up to 5 s
+
+
+@dataclass(slots=True)
+class _Followed:
+    """An encounter with both vehicles' trajectories from its begin on, for the PET."""
+
+    encounter: Encounter
+    sizes: tuple[tuple[float, float], ...]  # length and width of ego and foe, m
+    frames: list[tuple[tuple[float, ...], ...]] = field(default_factory=list)  # [t][2] x, y, heading, speed
+
+    def add(self, s: Snapshot) -> None:
+        rows = (s.row.get(self.encounter.ego), s.row.get(self.encounter.foe))
+        absent = (math.nan,) * 4
+        self.frames.append(
+            tuple(absent if i is None else (s.x[i], s.y[i], s.heading[i], s.speed[i]) for i in rows)
+        )
+
+    def finish(self, interval: float) -> Encounter:
+        """The encounter with its PET; `interval` s between frames."""
+        ways = np.array(self.frames, np.float64).transpose(1, 2, 0)  # [2,4,t]
+        ego, foe = (
+            Boxes(x, y, heading, length, width, speed)
+            for (x, y, heading, speed), (length, width) in zip(ways, self.sizes, strict=True)
+        )
+        pet = post_encroachment_time(ego, foe, interval, LONGEST)
+        self.encounter.pet_s = pet if math.isfinite(pet) else math.nan
+        return self.encounter
 
 
 class Encounters:
@@ -40,43 +79,51 @@ class Encounters:
 
     def __init__(self, road: RoadMap, critical: float = CRITICAL) -> None:
         self._road, self._critical = road, critical
-        self._open: dict[tuple[str, str], Encounter] = {}
+        self._open: dict[tuple[str, str], _Followed] = {}
+        self._late: list[_Followed] = []  # over, and followed on for their PET
         self._closed: list[Encounter] = []
+        self._interval, self._time = math.nan, math.nan  # s between frames, of the newest
 
-    def add(self, snapshot: Snapshot) -> None:
-        """The next frame."""
-        s = snapshot
+    def add(self, snapshot: Snapshot, seen: Snapshot | None = None) -> None:
+        """The next frame; `seen`: the frame without the vehicles that can meet nobody in it."""
+        s = snapshot if seen is None else seen
+        self._interval, self._time = snapshot.time - self._time, snapshot.time
         rows = np.flatnonzero(watched(s))
         if len(rows) and s.n > 1:
-            mine, all_boxes = boxes(s, rows), boxes(s)
+            mine = boxes(s, rows)
             columns = type(mine)(*(np.asarray(value)[:, None] for value in mine))
-            ttc = time_to_collision(columns, all_boxes, self._critical)  # [k,n] s
+            ttc = time_to_collision(columns, boxes(s), self._critical)  # [k,n] s
             for k, j in np.argwhere(ttc < self._critical).tolist():
                 self._meet(s, int(rows[k]), j, float(ttc[k, j]))
-        late = [pair for pair, e in self._open.items() if s.time - e.end_s > APART + 1e-9]
-        self._closed += [self._open.pop(pair) for pair in late]
+        over = [pair for pair, f in self._open.items() if s.time - f.encounter.end_s > APART + 1e-9]
+        self._late += [self._open.pop(pair) for pair in over]
+        for followed in (*self._open.values(), *self._late):
+            followed.add(snapshot)
+        gone = [f for f in self._late if s.time - f.encounter.end_s > LONGEST + 1e-9]
+        self._late = [f for f in self._late if f not in gone]
+        self._closed += [f.finish(self._interval) for f in gone]
 
     def found(self) -> list[dict[str, Any]]:
         """All so far, in the order they began, as rows of a table."""
-        every = [*self._closed, *self._open.values()]
-        return [asdict(e) for e in sorted(every, key=lambda e: (e.begin_s, e.ego, e.foe))]
+        rest = [f.finish(self._interval) for f in (*self._late, *self._open.values())]
+        return [asdict(e) for e in sorted([*self._closed, *rest], key=lambda e: (e.begin_s, e.ego, e.foe))]
 
     def _meet(self, s: Snapshot, i: int, j: int, ttc: float) -> None:
         if i == j or not self._road.connected(int(s.lane[i]), int(s.lane[j])):
             return
         ego, foe = s.ids[i], s.ids[j]
-        if (foe, ego) in self._open:  # both are watched: it is told once
+        if (foe, ego) in self._open:  # both are watched: the pair is listed once
             return
-        pair = boxes(s, np.array([i, j]))
-        a, b = (type(pair)(*(np.asarray(value)[k] for value in pair)) for k in (0, 1))
-        drac = float(deceleration_to_avoid_crash(a, b)) if ttc > 0.0 else 0.0
+        a, b = boxes(s, np.array([i])), boxes(s, np.array([j]))
+        drac = float(np.squeeze(deceleration_to_avoid_crash(a, b))) if ttc > 0.0 else 0.0
         known = self._open.get((ego, foe))
-        hardest = max(drac if np.isfinite(drac) else 0.0, known.max_drac_mps2 if known else 0.0)
-        if known is not None and known.min_ttc_s <= ttc:
-            known.end_s, known.max_drac_mps2 = s.time, hardest
+        before = known.encounter if known else None
+        hardest = max(drac if np.isfinite(drac) else 0.0, before.max_drac_mps2 if before else 0.0)
+        if before is not None and before.min_ttc_s <= ttc:
+            before.end_s, before.max_drac_mps2 = s.time, hardest
             return
-        self._open[ego, foe] = Encounter(
-            begin_s=known.begin_s if known else s.time,
+        closest = Encounter(
+            begin_s=before.begin_s if before else s.time,
             end_s=s.time,
             ego=ego,
             foe=foe,
@@ -88,4 +135,36 @@ class Encounters:
             ego_speed_mps=float(s.speed[i]),
             foe_speed_mps=float(s.speed[j]),
             max_drac_mps2=hardest,
+            type=self._type(int(s.lane[i]), int(s.lane[j]), float(s.heading[i] - s.heading[j])),
         )
+        if known is None:
+            sizes = tuple((float(s.length[k]), float(s.width[k])) for k in (i, j))
+            known = self._open[ego, foe] = _Followed(closest, sizes)
+        known.encounter = closest
+
+    def _type(self, a: int, b: int, turned: float) -> str:
+        """How vehicles on lanes `a` and `b` (-1: off every lane) meet, their headings `turned` rad apart."""
+        turned = abs(math.remainder(turned, math.tau))
+        if turned > ONCOMING:
+            return "oncoming"
+        if min(a, b) >= 0:
+            mine, theirs = self._ahead(a), self._ahead(b)
+            if a in theirs or b in mine:
+                return "following"
+            if edge_of(self._road, a) == edge_of(self._road, b) and turned <= ALIGNED:
+                return "lane change"
+            if mine & theirs:
+                return "merging"
+        return "following" if turned <= ALIGNED else "crossing"
+
+    def _ahead(self, lane: int) -> set[int]:
+        """The lane and those that whoever is on it drives on to, as long as there is no choice."""
+        found = [lane]
+        while len(found) <= STEPS and len(onward := self._road.lanes[found[-1]].successors) == 1:
+            found.append(onward[0])
+        return set(found)
+
+
+def edge_of(road: RoadMap, lane: int) -> str:
+    """The edge of a lane, by SUMO's way to name lanes (a road without a net has no other)."""
+    return road.lanes[lane].id.rpartition("_")[0]

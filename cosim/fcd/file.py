@@ -51,11 +51,10 @@ def read_steps(path: Path, each: Callable[[Step], None], progress: Progress | No
 def lanes_named(path: Path) -> list[str]:
     """The lanes that the file names, sorted. Raises BadInput when it cannot be read."""
     names: set[bytes] = set()
-    tail = b""
+    text = b""
     for chunk in chunks(path, math.inf):
-        text = tail + chunk
+        text = text[-LONGEST_NAME:] + chunk
         names.update(re.findall(rb'\blane="([^"]*)"', text))
-        tail = text[-LONGEST_NAME:]
     return sorted(name.decode("utf-8", "replace") for name in names if name)
 
 
@@ -74,10 +73,9 @@ class _Reader:
             if self._step is None:
                 raise self._wrong("a vehicle outside of a timestep", "line", line)
             row = self._row(attributes, line)
-            if row.id in self._step.rows:
+            if self._step.rows.setdefault(row.id, row) is not row:
                 problem = f"is twice in the step at {self._step.time:g} s (line {line})"
                 raise self._wrong(problem, "vehicle.id", row.id)
-            self._step.rows[row.id] = row
 
     def end(self, tag: str) -> None:
         if tag == "timestep" and self._step is not None:
@@ -85,8 +83,7 @@ class _Reader:
             self._each(step)
 
     def _row(self, attributes: dict[str, str], line: int) -> Row:
-        name = attributes.get("id")
-        if not name:
+        if not (name := attributes.get("id")):
             raise self._wrong("is missing", f"vehicle.id (line {line})")
         x, y, angle, speed = (self._number(attributes, n, name, line) for n in NUMBERS)
         lane = attributes.get("lane", "")

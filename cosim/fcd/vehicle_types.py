@@ -65,12 +65,9 @@ def read_sizes(files: Iterable[Path]) -> dict[str, Size]:
 
 def size_of(vehicle_type: str, sizes: Mapping[str, Size]) -> Size | None:
     """The size of a type as SUMO writes it: `type@vehicle` is one vehicle's own copy, `type/class` ours."""
-    name = vehicle_type
-    for cut in ("", "@", "/"):
-        name = name.partition(cut)[0] if cut else name
-        if name in sizes:
-            return sizes[name]
-    return None
+    type_of_copy = vehicle_type.partition("@")[0]
+    names = (vehicle_type, type_of_copy, type_of_copy.partition("/")[0])
+    return next((sizes[name] for name in names if name in sizes), None)
 
 
 def _metres(attributes: Mapping[str, str], name: str, default: float, path: Path, line: int) -> float:

@@ -1,9 +1,10 @@
-"""Files that appear whole or not at all."""
+"""Files that appear whole or not at all, and one clear error for those that cannot be read or written."""
 
 from __future__ import annotations
 
 import contextlib
 import csv
+import json
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -29,6 +30,36 @@ def whole(path: Path, *, contended: bool = False) -> Iterator[Path]:
         draft.unlink(missing_ok=True)
 
 
+@contextlib.contextmanager
+def cannot(
+    doing: str, *, file: object = None, field: str | None = None, value: object = None
+) -> Iterator[None]:
+    """An OSError of the block becomes `BadInput("cannot DOING: why")` that names file, field and value."""
+    try:
+        yield
+    except OSError as error:
+        problem = f"cannot {doing}: {(error.strerror or str(error)).lower()}"
+        raise BadInput(problem, file=file, field=field, value=value) from None
+
+
+def read_json(path: Path, absent: str = "no such file") -> dict[str, Any]:
+    """The JSON object that `path` holds.
+
+    Raises:
+        BadInput: it is not there (`absent` says what is needed), cannot be read, is not a JSON object.
+    """
+    try:
+        with cannot("read", file=path):
+            if not path.exists():
+                raise BadInput(absent, file=path)
+            found = json.loads(path.read_text("utf-8"))
+    except ValueError as error:
+        raise BadInput(f"not JSON: {error}", file=path) from None
+    if not isinstance(found, dict):
+        raise BadInput("not a JSON object", file=path)
+    return found
+
+
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None) -> None:
     """Rows with a header, whole or not at all; numbers with six digits, NA (nan, infinities) is empty.
 
@@ -50,10 +81,8 @@ def _plain(value: Any) -> Any:
 def prepare_folder(path: str) -> Path:
     """Make the run folder now, so that a bad path fails before the simulation. Raises BadInput."""
     folder = Path(path)
-    try:
+    with cannot("make this folder", field="--out", value=path):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise BadInput(f"cannot make this folder: {error.strerror}", field="--out", value=path) from None
     if not os.access(folder, os.W_OK):
         raise BadInput("cannot write into this folder", field="--out", value=path)
     return folder

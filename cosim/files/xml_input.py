@@ -2,12 +2,13 @@
 
 SUMO itself answers a bad file with "Process Error", with gigabytes of memory or with SIGSEGV
 (docs/sumo.md); everything SUMO is handed therefore passes through `scan` first. The
-parser is expat with defusedxml's three refusals (entities, external references, foreign encodings) and
+parser is expat with three refusals (entities, external references, foreign encodings) and
 caps on depth, token length and unpacked size; memory does not grow with the file.
 """
 
 from __future__ import annotations
 
+import codecs
 import gzip
 import stat
 import zlib
@@ -43,15 +44,12 @@ def regular_file(path: Path, *, file: object, field: str) -> Path:
         if stat.S_ISREG(mode):
             with path.open("rb"):
                 return path
+        problem = f"is {'a folder' if stat.S_ISDIR(mode) else 'not a regular file'}, a file is needed"
     except FileNotFoundError:
-        raise BadInput("no such file", file=file, field=field, value=str(path)) from None
-    except OSError as error:
-        problem = (error.strerror or "cannot be read").lower()
-        raise BadInput(problem, file=file, field=field, value=str(path)) from None
-    except ValueError as error:  # a NUL byte in the name
-        raise BadInput(str(error), file=file, field=field, value=str(path)) from None
-    kind = "a folder" if stat.S_ISDIR(mode) else "not a regular file"
-    raise BadInput(f"is {kind}, a file is needed", file=file, field=field, value=str(path))
+        problem = "no such file"
+    except (OSError, ValueError) as error:  # ValueError: a NUL byte in the name
+        problem = (getattr(error, "strerror", None) or str(error)).lower()
+    raise BadInput(problem, file=file, field=field, value=str(path))
 
 
 def is_there(path: Path) -> bool:
@@ -84,22 +82,18 @@ def scan(
     parser.buffer_text = True
     _refuse_entities(parser, path)
     stack: list[str] = []
-    root: list[str] = []
+    root = ""
 
     def opened(tag: str, attributes: dict[str, str]) -> None:
-        if not stack:
-            if roots and tag not in roots:
-                wanted = " or ".join(f"<{name}>" for name in roots)
-                raise BadInput(f"wrong root element, {wanted} is needed", file=path, field="root", value=tag)
-            root.append(tag)
+        nonlocal root
+        root = root or tag
+        if not stack and roots and tag not in roots:
+            wanted = " or ".join(f"<{name}>" for name in roots)
+            raise BadInput(f"wrong root element, {wanted} is needed", file=path, field="root", value=tag)
         stack.append(tag)
         if len(stack) > MAX_DEPTH:
-            raise BadInput(
-                f"elements nest deeper than {MAX_DEPTH} (line {parser.CurrentLineNumber})",
-                file=path,
-                field="element",
-                value=tag,
-            )
+            problem = f"elements nest deeper than {MAX_DEPTH} (line {parser.CurrentLineNumber})"
+            raise BadInput(problem, file=path, field="element", value=tag)
         start(tag, attributes, parser.CurrentLineNumber)
 
     def closed(tag: str) -> None:
@@ -120,7 +114,7 @@ def scan(
         parser.Parse(b"", True)
     except expat.ExpatError as error:
         raise _malformed(error, path, fed, stack) from None
-    return root[0]
+    return root
 
 
 def content(path: Path) -> bytes:
@@ -211,14 +205,11 @@ def _malformed(error: expat.ExpatError, path: Path, fed: int, stack: list[str]) 
 
 def _first_undecodable(path: Path) -> str | None:
     """The first byte that is not UTF-8, in hexadecimal; None when all are."""
-    tail = b""
-    for chunk in chunks(path):
-        data = tail + chunk
-        try:
-            data.decode("utf-8")
-            tail = b""
-        except UnicodeDecodeError as error:
-            if error.end < len(data) or len(data) - error.start > 3:
-                return f"0x{data[error.start]:02x}"
-            tail = data[error.start :]  # a character cut by the chunk's end
-    return f"0x{tail[0]:02x}" if tail else None
+    decoder = codecs.getincrementaldecoder("utf-8")()
+    try:
+        for chunk in chunks(path):
+            decoder.decode(chunk)
+        decoder.decode(b"", final=True)
+    except UnicodeDecodeError as error:
+        return f"0x{error.object[error.start]:02x}"
+    return None

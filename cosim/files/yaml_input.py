@@ -1,148 +1,34 @@
-"""Read a YAML file field by field: every field is checked, and an error names file, field and value."""
+"""YAML into frozen dataclasses: every field checked by its type, errors name file, field and value."""
 
 from __future__ import annotations
 
-import math
-import re
-from collections.abc import Iterable
+import dataclasses
+import enum
+import types
+import typing
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import yaml
 
-from cosim.errors import BadInput, hint, one_of
+from cosim.errors import BadInput, Range, hint, inside
 from cosim.files.xml_input import regular_file
 
+Config = TypeVar("Config")
+Positive = Annotated[float, Range(0.0, above=True)]
+NonNegative = Annotated[float, Range(0.0)]
+_WANTED = {int: "a whole number", bool: "true or false", str: "text"}
 
-class Section:
-    """One mapping of a YAML file; `where` is its dotted name ("" for the file itself).
 
-    Each getter returns its default when the field is absent, and raises BadInput when it is of the wrong
-    type or out of range. Fields that are not in `known` are refused with the nearest name.
+def document(path: Path) -> dict[Any, Any]:
+    """The mapping that the YAML file `path` holds; {} when it is empty.
+
+    Raises BadInput: missing, not UTF-8, not YAML (with the line), no mapping.
     """
-
-    def __init__(self, file: Path, values: object, known: Iterable[str], where: str = "") -> None:
-        self._file = file
-        self._where = where
-        if not isinstance(values, dict):
-            raise BadInput("a mapping is needed", file=file, field=where or "file", value=values)
-        self._values: dict[Any, Any] = values
-        allowed = tuple(known)
-        for name in values:
-            if name not in allowed:
-                problem = f"unknown field{hint(str(name), allowed)}"
-                raise BadInput(problem, file=file, field=self._name(str(name)), value=values[name])
-
-    def has(self, name: str) -> bool:
-        """Whether the field is there and not empty."""
-        return self._values.get(name) is not None
-
-    def raw(self, name: str) -> object:
-        """The value as YAML read it, for a field with a grammar of its own."""
-        return self._values.get(name)
-
-    def text(self, name: str, default: str | None = None) -> str | None:
-        """A string."""
-        value = self._values.get(name)
-        if value is None:
-            return default
-        if not isinstance(value, str):
-            raise self._wrong(name, value, "text is needed")
-        return value
-
-    def choice(self, name: str, allowed: Iterable[str], default: str) -> str:
-        """One of the words `allowed`."""
-        return one_of(self.text(name) or default, allowed, self._name(name), self._file)
-
-    def pattern(self, name: str, default: str | None = None) -> str | None:
-        """A regular expression."""
-        value = self.text(name, default)
-        if value is not None:
-            check_pattern(value, self._file, self._name(name))
-        return value
-
-    def number(
-        self, name: str, default: float | None = None, *, low: float = -math.inf, above: bool = False
-    ) -> float | None:
-        """A finite number, at least `low` (more than `low` if `above`)."""
-        value = self._values.get(name)
-        if value is None:
-            return default
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise self._wrong(name, value, "a finite number is needed")
-        if value < low or (above and value == low):
-            bound = f"more than {low:g}" if above else f"at least {low:g}"
-            raise self._wrong(name, value, f"must be {bound}")
-        return float(value)
-
-    def needed(self, name: str, *, low: float = -math.inf, above: bool = False) -> float:
-        """`number`, which must be there."""
-        value = self.number(name, low=low, above=above)
-        if value is None:
-            raise BadInput("missing", file=self._file, field=self._name(name))
-        return value
-
-    def keys(self, name: str) -> tuple[str, ...]:
-        """The names in the mapping below `name`, of which there must be one."""
-        value = self._values.get(name)
-        if not isinstance(value, dict) or not value:
-            raise self._wrong(name, value, "a mapping is needed")
-        return tuple(map(str, value))
-
-    def names(self, name: str) -> tuple[str, ...]:
-        """A list of strings; one string stands for a list of one."""
-        value = self._values.get(name, ())
-        if isinstance(value, str):
-            return (value,)
-        if not isinstance(value, list | tuple) or not all(isinstance(item, str) for item in value):
-            raise self._wrong(name, value, "a list of names is needed")
-        return tuple(value)
-
-    def numbers(self, name: str, low: float, high: float) -> tuple[float, ...]:
-        """A list of numbers from `low` to `high`; one number stands for a list of one."""
-        value = self._values.get(name, ())
-        found = value if isinstance(value, list | tuple) else (value,)
-        for item in found:
-            if isinstance(item, bool) or not isinstance(item, int | float) or not low <= item <= high:
-                raise self._wrong(name, item, f"a number from {low:g} to {high:g} is needed")
-        return tuple(float(item) for item in found)
-
-    def section(self, name: str, known: Iterable[str]) -> Section:
-        """The mapping below `name`; an empty one when it is absent."""
-        value = self._values.get(name)
-        return Section(self._file, {} if value is None else value, known, self._name(name))
-
-    def sections(self, name: str, known: Iterable[str]) -> tuple[Section, ...]:
-        """The list of mappings below `name`."""
-        value = self._values.get(name, [])
-        if not isinstance(value, list):
-            raise self._wrong(name, value, "a list is needed")
-        known = tuple(known)
-        return tuple(
-            Section(self._file, item, known, f"{self._name(name)}[{i}]") for i, item in enumerate(value)
-        )
-
-    def _name(self, field: str) -> str:
-        return f"{self._where}.{field}" if self._where else field
-
-    def _wrong(self, name: str, value: object, problem: str) -> BadInput:
-        return BadInput(problem, file=self._file, field=self._name(name), value=value)
-
-
-def read(path: Path, known: Iterable[str]) -> Section:
-    """The YAML file `path`, which must be one mapping with no fields but `known`.
-
-    Raises:
-        BadInput: missing, not UTF-8, not YAML (with the line), or not such a mapping.
-    """
-    return Section(path, document(path), known)
-
-
-def document(path: Path) -> object:
-    """What the YAML file `path` holds. Raises BadInput: missing, not UTF-8, not YAML (with the line)."""
     regular_file(path, file=path, field="file")
     try:
-        return yaml.load(path.read_text(encoding="utf-8"), Loader=_OnceOnly)
+        found = yaml.load(path.read_text(encoding="utf-8"), Loader=_OnceOnly)
     except UnicodeDecodeError as error:
         raise BadInput("is not UTF-8", file=path, field="byte", value=error.start) from None
     except yaml.YAMLError as error:
@@ -150,6 +36,120 @@ def document(path: Path) -> object:
         problem = f"not YAML: {getattr(error, 'problem', None) or 'malformed'}"
         line = None if mark is None else mark.line + 1
         raise BadInput(problem, file=path, field="line", value=line) from None
+    with inside("file", path):
+        return mapping({} if found is None else found)
+
+
+def check_known(values: Mapping[Any, object], known: Iterable[str]) -> None:
+    """Raises BadInput for a field of `values` that is not in `known`, with the nearest one that is."""
+    names = tuple(known)
+    for name in (name for name in values if name not in names):
+        raise BadInput(f"unknown field{hint(str(name), names)}", field=str(name), value=values[name])
+
+
+def read(path: Path, cls: type[Config]) -> Config:
+    """The YAML file `path` as an instance of `cls`. Raises BadInput like `document` and `dataclass_from`."""
+    return dataclass_from(cls, document(path), path)
+
+
+def dataclass_from(cls: type[Config], values: object, file: Path | None, where: str = "") -> Config:
+    """An instance of `cls` from a mapping as YAML gives it; absent and empty fields keep their defaults.
+
+    Fields may be int, float, bool, str, Literal, IntEnum, X | None, tuples (one value stands for a list of
+    one), mappings and further dataclasses of these; `Annotated[float, Range(...)]` has bounds. `where`: the
+    mapping's own name in the file.
+
+    Raises:
+        BadInput: an unknown field (with the nearest name), a value of the wrong type, or what the
+            dataclass itself refuses.
+    """
+    with inside(where, file):
+        return typing.cast(Config, _instance(cls, mapping(values)))
+
+
+def value_of(kind: Any, value: object) -> Any:
+    """`value`, as YAML gives it, as a `kind`: a type or what stands in its place in a dataclass.
+
+    Raises:
+        BadInput: of another type or out of bounds; the field is named only where it is below `value`.
+    """
+    origin, arguments = get_origin(kind), get_args(kind)
+    if origin in (Union, types.UnionType):
+        kind = next(a for a in arguments if a is not type(None))
+        return None if value is None else value_of(kind, value)
+    if origin is tuple:
+        return _tuple(arguments, value)
+    if origin is Mapping:
+        return {str(name): _part(str(name), arguments[1], v) for name, v in mapping(value).items()}
+    if dataclasses.is_dataclass(kind):
+        return _instance(kind, mapping(value))
+    if kind is float or origin is Annotated:
+        return _number(value, arguments[1] if arguments else Range())
+    problem = None
+    if origin is Literal:
+        if value not in arguments:
+            names = [*map(str, arguments)]
+            problem = f"must be one of {', '.join(names)}{hint(str(value), names)}"
+    elif isinstance(kind, type) and issubclass(kind, enum.IntEnum):
+        if type(value) is int and value in [*kind]:
+            return kind(value)
+        problem = f"must be one of {', '.join(f'{m:d} {m.name.lower()}' for m in kind)}"
+    elif type(value) is not kind:
+        problem = f"{_WANTED[kind]} is needed"
+    if problem is not None:
+        raise BadInput(problem, value=value)
+    return value
+
+
+def _instance(cls: Any, values: Mapping[Any, object]) -> Any:
+    kinds = typing.get_type_hints(cls, include_extras=True)
+    fields = {field.name: field for field in dataclasses.fields(cls)}
+    given = {}
+    check_known(values, fields)
+    for name, value in values.items():
+        if value is not None or type(None) in get_args(kinds[name]):
+            given[name] = _part(name, kinds[name], value)
+    for name, field in fields.items():
+        if name not in given and field.default is field.default_factory is dataclasses.MISSING:
+            raise BadInput("is missing", field=name)
+    return cls(**given)
+
+
+def _part(name: str, kind: Any, value: object) -> Any:
+    with inside(name):
+        return value_of(kind, value)
+
+
+def mapping(value: object) -> dict[Any, Any]:
+    """`value` if it is a mapping. Raises BadInput."""
+    if not isinstance(value, dict):
+        raise BadInput("a mapping is needed", value=value)
+    return value
+
+
+def _number(value: object, bounds: Range) -> float:
+    problem: str | None = "a finite number is needed"
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        problem = bounds.problem(value)
+        if problem is None:
+            return float(value)
+    if bounds.high < float("inf"):
+        problem = f"a number from {bounds.low:g} to {bounds.high:g} is needed"
+    raise BadInput(str(problem), value=value)
+
+
+def _tuple(kinds: tuple[Any, ...], value: object) -> tuple[Any, ...]:
+    if kinds[1:] == (Ellipsis,):
+        if not isinstance(value, list | tuple):
+            try:
+                return (value_of(kinds[0], value),)
+            except BadInput as error:
+                raise BadInput(f"{error.problem}, or a list", field=error.field, value=error.value) from None
+        kinds = kinds[:1] * len(value)
+    if not isinstance(value, list | tuple) or len(value) != len(kinds):
+        raise BadInput(f"a list of {len(kinds)} values is needed", value=value)
+    places = (f"[{i}]" if dataclasses.is_dataclass(kind) else "" for i, kind in enumerate(kinds))
+    return tuple(map(_part, places, kinds, value))
 
 
 class _OnceOnly(yaml.SafeLoader):
@@ -163,11 +163,3 @@ class _OnceOnly(yaml.SafeLoader):
                 raise yaml.constructor.ConstructorError(None, None, problem, key.start_mark)
             seen.add(str(key.value))
         return super().construct_mapping(node, deep)
-
-
-def check_pattern(pattern: str, file: object, field: str) -> None:
-    """Raises BadInput unless `pattern` is a regular expression."""
-    try:
-        re.compile(pattern)
-    except re.error as error:
-        raise BadInput(f"not a regular expression: {error}", file=file, field=field, value=pattern) from None

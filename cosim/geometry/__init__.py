@@ -22,7 +22,6 @@ from cosim.types import Bools, Floats, Ints, Snapshot
 
 Number = float | npt.NDArray[Any]
 INF = np.inf
-_Course = tuple[Any, Any, Any, Any, Any, Any, Any]  # x, y, cos and sin of the heading, speed, sizes
 EVERYWHERE: Bools = np.ones((1, 1), np.bool_)  # one road, on which all can touch
 
 
@@ -38,56 +37,71 @@ class Boxes(NamedTuple):
 
 
 def boxes(snapshot: Snapshot, rows: npt.NDArray[Any] | None = None) -> Boxes:
-    """The vehicles of a snapshot ([n], or [k] with `rows`) as boxes; m, rad, m/s."""
+    """The n vehicles of a snapshot as boxes (m, rad, m/s); with `rows` [k] only these, in this order."""
     s = snapshot
-    if rows is None:
-        return Boxes(s.x, s.y, s.heading, s.length, s.width, s.speed)
-    return Boxes(s.x[rows], s.y[rows], s.heading[rows], s.length[rows], s.width[rows], s.speed[rows])
+    columns = s.x, s.y, s.heading, s.length, s.width, s.speed
+    return Boxes(*(columns if rows is None else (column[rows] for column in columns)))
 
 
 def overlap(a: Boxes, b: Boxes) -> Bools:
-    """Whether the rectangles of `a` and `b` overlap (touching edges do not); broadcast shape, bool."""
-    with _quiet():
+    """Whether the rectangles of `a` and `b` overlap; touching edges do not.
+
+    Args:
+        a, b: boxes of shapes that broadcast, e.g. [k,1] and [n]; speeds do not matter.
+
+    Returns:
+        bool of the broadcast shape (separating axis theorem, Gottschalk et al. 1996).
+    """
+    with _no_float_warnings():
         return cast(Bools, kernels.overlap_ufunc(*_poses(a), *_poses(b)))
 
 
 def overlapping_pairs(all_boxes: Boxes) -> Ints:
-    """Rows of every pair of the n boxes ([n] each) that overlaps: [p,2], the lower row first."""
+    """Every pair of the n boxes that overlaps.
+
+    Args:
+        all_boxes: n boxes, each field [n] (a scalar holds for all).
+
+    Returns:
+        [p,2] rows of the p pairs, the lower row first, in ascending order.
+    """
     return kernels.pairs_overlap(_table(all_boxes))
 
 
 def time_to_collision(a: Boxes, b: Boxes, cap: float = INF) -> Floats:
-    """Time until the swept rectangles first touch, in s; broadcast shape.
+    """Time to collision: until the swept rectangles first touch while both keep their velocity.
 
-    Both keep their velocity. 0 where they overlap already; `cap` (default inf) where they never touch or
-    only later than `cap`.
+    Args:
+        a, b: boxes of shapes that broadcast.
+        cap: s, the result where they never touch, or only later.
+
+    Returns:
+        s, of the broadcast shape, float64; 0 where the boxes overlap already.
     """
-    with _quiet():
+    with _no_float_warnings():
         return cast(Floats, kernels.ttc_ufunc(*_motions(a), *_motions(b), cap))
 
 
 def first_contacts(a: Boxes, b: Boxes, dt: float) -> Floats:
-    """When a's box on each of its courses first touches each b's: [k,n] s, inf for never.
+    """When one vehicle, on each of k courses, first touches each of n others.
 
-    a: x, y, heading, speed [k,t], one length and width; b: [n,t], sizes [n]. Frames are `dt` s apart;
-    between two of them, and one after the last, both boxes keep their velocity: nothing is jumped over.
+    Args:
+        a: its courses: x, y, heading, speed [k,t] (m, rad, m/s); one length and one width, m.
+        b: the others: x, y, heading, speed [n,t]; length and width [n] m.
+        dt: s between frames. Between two of them, and for `dt` after the last one, boxes keep their
+            velocity, so that no contact between two frames is missed.
+
+    Returns:
+        [k,n] s from the first frame on, inf without a contact.
     """
-    mine: _Course = (a.x, a.y, np.cos(a.heading), np.sin(a.heading), a.speed, a.length, a.width)
-    theirs: _Course = (b.x, b.y, np.cos(b.heading), np.sin(b.heading), b.speed, b.length, b.width)
-    return kernels.first_contacts(*mine, *theirs, dt)
-
-
-def pairs_time_to_collision(all_boxes: Boxes, rows: npt.NDArray[Any], cap: float = INF) -> Floats:
-    """Time to collision of vehicles `rows` [k] with all n vehicles of `all_boxes` ([n] each): [k,n] s.
-
-    A vehicle has `cap` with itself. See `time_to_collision`.
-    """
-    rows = np.asarray(rows, dtype=np.int64)
-    return kernels.pairs_ttc(_table(all_boxes), rows, float(cap))
+    courses: list[Any] = []
+    for c in (a, b):
+        courses += c.x, c.y, np.cos(c.heading), np.sin(c.heading), c.speed, c.length, c.width
+    return kernels.first_contacts(*courses, dt)
 
 
 def deceleration_to_avoid_crash(a: Boxes, b: Boxes) -> Floats:
-    """DRAC (deceleration rate to avoid a crash), in m/s2; broadcast shape.
+    """DRAC (deceleration rate to avoid a crash) of boxes `a` and `b`, in m/s2, of their broadcast shape.
 
     The smallest constant deceleration with which one of the two, braking alone along its heading while the
     other keeps its velocity, avoids every overlap of the swept rectangles. When the follower of an aligned
@@ -96,12 +110,12 @@ def deceleration_to_avoid_crash(a: Boxes, b: Boxes) -> Floats:
     135 degrees apart), where one alone cannot help, may share the braking:
     (v_a^2 + v_b^2) / (2 closing distance). 0 without a time to collision below 120 s, inf where they overlap.
     """
-    with _quiet():
+    with _no_float_warnings():
         return cast(Floats, kernels.drac_ufunc(*_motions(a), *_motions(b)))
 
 
 class Conflicts(NamedTuple):
-    """The worst of each watched vehicle with anybody, at one moment; k watched vehicles."""
+    """The worst conflict of each watched vehicle with any other, at one moment; k watched vehicles."""
 
     rows: Ints  # [k]
     time_to_collision: Floats  # [k] s, the smallest; the horizon when there is none
@@ -111,43 +125,63 @@ class Conflicts(NamedTuple):
 def conflicts(
     all_boxes: Boxes, watched: Bools, horizon: float = 10.0, roads: tuple[Ints, Bools] | None = None
 ) -> Conflicts:
-    """Conflicts of the `watched` [n] vehicles with any of the n (arrays [n] each), up to `horizon` s ahead.
+    """Conflicts of the watched vehicles with any of the n.
 
-    The same as `time_to_collision` and `deceleration_to_avoid_crash` over all pairs, in one pass. `roads`:
-    each vehicle's road [n] and which roads can touch [S,S] (`cosim.road.contact`); without them all can.
+    The same as `time_to_collision` and `deceleration_to_avoid_crash` over all pairs, in one pass.
+
+    Args:
+        all_boxes: n boxes, each field [n].
+        watched: [n] which vehicles' conflicts are wanted.
+        horizon: s, how far ahead.
+        roads: each vehicle's road [n] and which roads can touch [S,S] (`cosim.road.contact`); None: all can.
     """
-    x, y, heading, length, width, speed = (np.asarray(v, dtype=np.float64) for v in all_boxes)
-    number, touch = (np.zeros(len(x), np.int64), EVERYWHERE) if roads is None else roads
-    found = kernels.watched_conflicts(
-        x, y, heading, length, width, speed, watched, float(horizon), number, touch
-    )
-    return Conflicts(*found)
+    columns: list[Any] = [np.asarray(v, dtype=np.float64) for v in all_boxes]
+    number, touch = (np.zeros(len(watched), np.int64), EVERYWHERE) if roads is None else roads
+    return Conflicts(*kernels.watched_conflicts(*columns, watched, float(horizon), number, touch))
 
 
 def gap_ahead(
     snapshot: Snapshot, graph: LaneGraph, rows: npt.NDArray[Any], reach: float = 125.0
 ) -> tuple[Floats, Ints]:
-    """Bumper-to-bumper gap to the next vehicle in the same corridor and that vehicle's row.
+    """Bumper-to-bumper gap to the next vehicle in the same corridor, and that vehicle's row.
 
-    The corridor is the vehicle's lane and the lanes that follow it. rows [k] -> gap [k] m (inf when nobody
-    is within `reach` m, negative when bumpers overlap), leader's row [k] (-1 for nobody).
+    The corridor is the vehicle's lane and the lanes that follow it straight on.
+
+    Args:
+        snapshot: the n vehicles.
+        graph: which lane follows which (`RoadMap.straight_on`).
+        rows: [k] the vehicles whose gap is wanted.
+        reach: m, how far ahead.
+
+    Returns:
+        gap [k] m: inf without a leader within `reach`, negative when bumpers overlap;
+        row of the leader [k], -1 without one.
     """
-    s = snapshot
-    return kernels.lane_gaps(
-        s.lane, s.lane_position, s.length, np.asarray(rows, np.int64), *graph, float(reach)
-    )
+    vehicles = snapshot.lane, snapshot.lane_position, snapshot.length
+    return kernels.lane_gaps(*vehicles, np.asarray(rows, np.int64), *graph, float(reach))
 
 
 def headway(gap: Floats, speed: Floats, slowest: float = 0.5) -> Floats:
-    """Time headway gap / speed in s (net, bumper to bumper); [k] m, [k] m/s -> [k] s.
+    """Net time headway gap / speed (bumper to bumper).
 
-    inf without a leader and below `slowest` m/s, where a quotient would only measure standing in a queue.
+    Args:
+        gap: [k] m, inf without a leader.
+        speed: [k] m/s.
+        slowest: m/s, at or below which the headway is inf: a quotient would only measure a queue.
+
+    Returns:
+        [k] s, inf without a leader.
     """
     return np.where(speed > slowest, np.maximum(gap, 0.0) / np.maximum(speed, slowest), INF)
 
 
 def post_encroachment_time(a: Boxes, b: Boxes, interval: float, longest: float = 5.0) -> float:
-    """PET in s of two trajectories ([T] each, NaN while absent) sampled every `interval` s.
+    """Post-encroachment time (PET) of two trajectories, in s.
+
+    Args:
+        a, b: trajectories, each field [T] (m, rad, m/s), NaN while absent; sizes may be scalars.
+        interval: s between samples.
+        longest: s, the longest PET that counts.
 
     The time from the moment the first vehicle leaves a spot to the moment the second reaches it (Allen et
     al. 1978), smallest over all spots; inf when there is none up to `longest` s. Only spots count where the
@@ -167,8 +201,8 @@ def post_encroachment_time(a: Boxes, b: Boxes, interval: float, longest: float =
     return best if best <= longest else INF
 
 
-def _quiet() -> np.errstate:
-    """The compiler evaluates branches that are not taken, which raises floating-point flags for nothing."""
+def _no_float_warnings() -> np.errstate:
+    """The compiler evaluates branches that are not taken, which raises floating-point flags without need."""
     return np.errstate(invalid="ignore", divide="ignore", over="ignore")
 
 

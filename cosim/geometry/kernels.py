@@ -15,7 +15,7 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from cosim.geometry.compiled import compiled
+from cosim.geometry.compiled import cached, compiled
 from cosim.types import Bools, Floats, Ints
 
 FOLLOWING_COSINE = float(np.cos(np.radians(15.0)))  # headings closer than 15 degrees: following, not crossing
@@ -23,7 +23,7 @@ _STRAIGHT_COSINE = float(np.cos(np.radians(5.0)))  # a trail that stays within 5
 _SAME_COURSE_COSINE = float(np.cos(np.radians(10.0)))  # 10 + 5 degrees: every spot of it is following
 _ONCOMING_COSINE = -float(np.cos(np.radians(45.0)))  # headings more than 135 degrees apart: head-on
 _PARALLEL = 1e-12  # m/s or cosine below which a projection counts as standing still
-_HORIZON = 120.0  # s, how far ahead the deceleration to avoid a crash looks
+_HORIZON = 120.0  # s, how far ahead the deceleration to avoid a crash is sought
 
 Box = tuple[float, float, float, float, float, float, float]
 _numba = cast(Any, numba)  # its decorators are not typed
@@ -34,13 +34,8 @@ def _ufunc(inputs: int, result: str) -> Callable[[Callable[..., Any]], Callable[
     signature = f"{result}({', '.join(['float64'] * inputs)})"
 
     def compile_later(function: Callable[..., Any]) -> Callable[..., Any]:
-        @functools.cache
-        def made() -> Callable[..., Any]:
-            try:
-                return cast(Callable[..., Any], _numba.vectorize([signature], cache=True)(function))
-            except RuntimeError:  # no cache folder, see `compiled`
-                return cast(Callable[..., Any], _numba.vectorize([signature])(function))
-
+        vectorize = cached(functools.partial(_numba.vectorize, [signature]))
+        made = functools.cache(lambda: vectorize(function))
         return lambda *arguments: made()(*arguments)
 
     return compile_later
@@ -237,18 +232,6 @@ def _box(table: Floats, i: int) -> Box:
     return table[i, 0], table[i, 1], table[i, 2], table[i, 3], table[i, 4], table[i, 5], table[i, 6]
 
 
-@compiled
-def pairs_ttc(table: Floats, rows: Ints, cap: float) -> Floats:
-    """See `cosim.geometry.pairs_time_to_collision`."""
-    n = len(table)
-    out = np.empty((len(rows), n))
-    for k in range(len(rows)):
-        a = _box(table, rows[k])
-        for j in range(n):
-            out[k, j] = cap if j == rows[k] else _ttc(a, _box(table, j), cap)
-    return out
-
-
 # fmt: off
 @compiled
 def first_contacts(
@@ -413,9 +396,8 @@ def encroachment(
                 continue
             if course[a, 0] * c + course[a, 1] * s > _SAME_COURSE_COSINE:
                 continue
-            if x < bounds[a, 0] - reach or x > bounds[a, 1] + reach:
-                continue
-            if y < bounds[a, 2] - reach or y > bounds[a, 3] + reach:
+            beside = x < bounds[a, 0] - reach or x > bounds[a, 1] + reach
+            if beside or y < bounds[a, 2] - reach or y > bounds[a, 3] + reach:
                 continue
             for age in range(1, frames):
                 k = (newest - age) % frames

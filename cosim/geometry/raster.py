@@ -36,7 +36,7 @@ CHANNELS = ("av", "hv", "road", "mission", "ego")
 # A vehicle's pixel, of 1: FLOOR + SPAN clip((dv + SPEED) / (2 SPEED), 0, 1), dv in m/s relative to the ego.
 PIXEL_FLOOR, PIXEL_SPAN, PIXEL_SPEED = 0.1, 0.9, 30.0
 ROAD_SURFACE = 128  # a lane's surface
-ROAD_LINE = 255  # within LINE_WIDTH of a lane's edge, so that lanes can be told apart
+ROAD_LINE = 255  # within LINE_WIDTH of a lane's edge, so that neighbouring lanes can be distinguished
 LINE_WIDTH = 0.5  # m
 RASTER_CELL = 0.5  # m, the finest cell of the world raster (paper size has 0.5 m pixels)
 RASTER_CELLS = 64_000_000  # bytes at most; larger nets get coarser cells
@@ -87,9 +87,16 @@ def draw_snapshot(
     raster: RoadRaster,
     config: ObservationConfig,
 ) -> None:
-    """The frame of every ego (rows `ego` [B] of the snapshot) into `out` [S,C,H,W] at `slots` [B].
+    """Draw the frame of every ego, centred on it and looking along its heading.
 
-    `seen` [B,n]: who is perceived by whom; the ego itself is always drawn.
+    Args:
+        out: [S,C,H,W] uint8, overwritten at `slots`.
+        slots: [B] where in `out` each ego's frame goes.
+        snapshot: the n vehicles.
+        ego: [B] the egos' rows in the snapshot.
+        seen: [B,n] which vehicles each ego perceives; the ego itself is always drawn.
+        raster: the road's surface (`rasterize_road`).
+        config: size, scale and channels of a frame.
     """
     s = snapshot
     vehicles = s.x, s.y, s.heading, s.speed, s.length, s.width, s.kind == int(Kind.AV), s.mission
@@ -99,13 +106,21 @@ def draw_snapshot(
 def draw_kinematics(
     out: Bytes, rows: Floats, valid: Bools, pose: Floats, raster: RoadRaster, config: ObservationConfig
 ) -> None:
-    """A frame per batch entry into `out` [B,C,H,W]: rows [B,R,8], valid [B,R], pose [B,3] as `draw_rows` has
-    them."""
+    """Draw one frame per batch entry from kinematic rows, seen from row 0.
+
+    Args:
+        out: [B,C,H,W] uint8, overwritten.
+        rows: [B,R,8] KINEMATIC_FEATURES (m, rad, m/s) in any one frame of reference per entry; row 0 the ego.
+        valid: [B,R] which rows hold a vehicle.
+        pose: [B,3] that frame of reference in the world: x m, y m, heading rad (for the road).
+        raster: the road's surface (`rasterize_road`).
+        config: size, scale and channels of a frame.
+    """
     draw_rows(out, rows, valid, pose, *_view(raster, config))
 
 
 def _view(r: RoadRaster, c: ObservationConfig) -> tuple[Any, ...]:
-    """What both kernels are told of the picture and the road, in their order."""
+    """The last arguments of both kernels: the picture's channels and scale, and the road's raster."""
     return channel_indices(c), c.metres_across, c.metres_along, r.cells, r.x, r.y, r.cell
 
 
@@ -240,8 +255,7 @@ def _draw_vehicle(
     # nan and far away fail these comparisons and draw nothing
     if not (abs(ahead) - reach_x < 0.5 * columns * along and abs(left) - reach_y < 0.5 * height * across):
         return
-    level = (dv + PIXEL_SPEED) / (2.0 * PIXEL_SPEED)
-    level = min(max(level, 0.0), 1.0)
+    level = min(max((dv + PIXEL_SPEED) / (2.0 * PIXEL_SPEED), 0.0), 1.0)
     value = np.uint8(255.0 * (PIXEL_FLOOR + PIXEL_SPAN * level) + 0.5)
     first = channels[4] if is_ego else (channels[0] if is_av else channels[1])
     second = channels[3] if mission and not is_ego else -1
@@ -330,8 +344,7 @@ def _draw_lane(cells: Bytes, shape: Floats, half: float, cell: float, value: int
             py = (r + 0.5) * cell - ay
             for k in range(x0, x1 + 1):
                 px = (k + 0.5) * cell - ax
-                t = (px * dx + py * dy) / span2
-                t = min(max(t, 0.0), 1.0)
+                t = min(max((px * dx + py * dy) / span2, 0.0), 1.0)
                 ex, ey = px - t * dx, py - t * dy
                 if ex * ex + ey * ey <= half * half:
                     cells[r, k] = value

@@ -12,16 +12,16 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from cosim.batch.case_runner import CaseRunner
-from cosim.batch.record import cases
+from cosim.batch.episode_runner import EpisodeRunner
+from cosim.batch.record import planned
 from cosim.errors import BadInput
 from cosim.files import write_csv
 from cosim.learning.prediction_data import spread
 from cosim.policies import make
 from cosim.report.statistics import share
-from cosim.scenario.episode_id import Case
+from cosim.scenario.episode_id import EpisodeId
 from cosim.workers.engines import LocalEngine
-from cosim.workers.tasks import Progress, Task
+from cosim.workers.tasks import Progress
 from policy.agents.prediction_aware import PredictionAware
 from policy.attribution import SUMS, Questioned
 
@@ -48,16 +48,16 @@ def questioned(policy: str) -> Questioned:
     return Questioned(made.name, made.config)
 
 
-class Asking(CaseRunner):
+class Asking(EpisodeRunner):
     """Hosted by an engine's worker: drives as `cosim run` does, and asks at every decision."""
 
-    def policy(self, case: Case) -> Questioned:
+    def policy(self, case: EpisodeId) -> Questioned:
         """The policy of `case`, asking itself."""
         self._agent = questioned(case.policy)
         return self._agent
 
     def run(
-        self, case: Case, warnings: tuple[str, ...], outputs: str | None, progress: Progress
+        self, case: EpisodeId, warnings: tuple[str, ...], outputs: str | None, progress: Progress
     ) -> dict[str, Any]:
         """One episode: the document of `cosim run --json`, and the `answers`."""
         return super().run(case, warnings, outputs, progress) | {"answers": self._agent.answers}
@@ -77,12 +77,12 @@ def attribution(
 ) -> None:
     """Drive and ask; writes TABLE, PICTURE and PAGE into `out`.
 
-    Raises BadInput as `cosim.batch.record.cases`, and for a policy without a value network.
+    Raises BadInput as `cosim.batch.record.planned`, and for a policy without a value network.
     """
     for policy in policies:
         questioned(policy)
-    wanted = cases([scenario], [demand], [], policies, seeds, svo_deg, duration)
-    tasks = [Task(case.key, case.cell, (case, (), None)) for case in wanted]
+    plan = planned([scenario], [demand], [], policies, seeds, svo_deg, duration)
+    tasks = [cell.task(case) for cell, case in plan.cases()]
     driven = spread(LocalEngine(Asking, workers=workers), tasks, "attribution")
     names = dict.fromkeys(episode["policy"] for episode in driven)
     tables = {name: table([e for e in driven if e["policy"] == name]) for name in names}

@@ -20,12 +20,11 @@ from cosim.road import RoadMap
 from cosim.types import Floats
 from cosim.workers.progress import Progress
 from policy.forecast import KinematicForecast
-from policy.predictors import Predictor, make_predictor
+from policy.predictors import PREDICTORS, Predictor, make_predictor
 from policy.predictors.lane import along_lanes
 
-EIGHT = ("cs", "ca", "lstm-direct", "lstm-indirect", "ae-direct", "ae-indirect", "gp-direct", "gp-indirect")
 EVERY = 5  # frames between two moments: 1 s
-LED = "gp-lane"  # knows the road, so it is not one of the eight
+LED = "gp-lane"  # knows the road, so it is not in the table of predictors
 HORIZON, DT = 20, 0.2  # frames, s
 PAGE, MAPS_PAGE = "prediction.md", "prediction_maps.md"
 TOLERATED = 0.03  # a 90 % interval shall cover 90 +- 3 %
@@ -39,12 +38,18 @@ def bench_predict(
     scenarios: Sequence[str] = (),
     behaviors: Sequence[str] = (),
     seeds: range | None = None,
-    predictors: Sequence[str] = EIGHT,
+    predictors: Sequence[str] = (),
     command: str = "",
 ) -> Scores:
-    """Measure on recorded episodes; writes position_error.csv, interval_coverage.csv, position_error.png and
-    PAGE into `out`. Raises BadInput when no recording fits."""
-    made = [make_predictor(name, HORIZON, DT) for name in predictors]
+    """Measure `predictors` (none: all of the table) on recorded episodes; writes position_error.csv,
+    interval_coverage.csv, position_error.png and PAGE into `out`.
+
+    Raises BadInput: no recording fits, no such predictor, two of one name.
+    """
+    made = [make_predictor(name, HORIZON, DT) for name in predictors or PREDICTORS]
+    called = [LED, *(predictor.name for predictor in made)]
+    if twice := next((name for name in called if called.count(name) > 1), None):
+        raise BadInput("two predictors are called so", field="predictor", value=twice)
     keys = [key for key in folder.episodes() if seeds is None or int(key.rsplit("-", 1)[1]) in seeds]
     scores, progress = Scores(HORIZON, DT), Progress("bench predict", "episodes")
     for done, key in enumerate(keys, 1):
@@ -109,7 +114,7 @@ def measure(
 ) -> None:
     """Add one episode to the scores: every vehicle an AV perceives, once a second.
 
-    With the `road`, `gp-indirect` is also led along the lanes (LED, beside the eight).
+    With the `road`, `gp-indirect` is also led along the lanes (LED).
     """
     w = windows(recording, every=EVERY, horizon=scores.steps)
     forecasts = {p.name: forecast(p, w.past) for p in predictors}

@@ -8,8 +8,7 @@ from typing import NamedTuple
 
 import policy
 from cosim.errors import BadInput, hint
-from cosim.files.dataclass_input import dataclass_from
-from cosim.files.yaml_input import document
+from cosim.files.yaml_input import dataclass_from, document
 from policy.training.config import TrainingFile
 
 
@@ -38,9 +37,9 @@ def configuration(name: str, beside: Path = Path(), above: tuple[Path, ...] = ()
         raise BadInput(problem, **where, value=name)
     if path in above:
         raise BadInput("is its own base", file=above[-1], field="base", value=name)
-    values = document(path) or {}
+    values: object = document(path)
     if isinstance(values, dict) and "base" in values:
-        base, values = values["base"], {key: value for key, value in values.items() if key != "base"}
+        base = values.pop("base")
         if not isinstance(base, str):
             raise BadInput("the name of a configuration is needed", file=path, field="base", value=base)
         values = _over(configuration(base, path.parent, (*above, path)).values, values)
@@ -48,7 +47,9 @@ def configuration(name: str, beside: Path = Path(), above: tuple[Path, ...] = ()
 
 
 def _over(base: object, values: object) -> object:
-    """`values`, and what `base` has besides, section by section."""
+    """`values`, and what `base` has besides, section by section; an empty section changes nothing."""
+    if values is None:
+        return base
     if not isinstance(base, dict) or not isinstance(values, dict):
         return values
     return {**base, **{name: _over(base.get(name), value) for name, value in values.items()}}

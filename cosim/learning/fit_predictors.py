@@ -24,14 +24,15 @@ from policy.checkpoint import save
 from policy.predictors import Predictor
 from policy.predictors.gp import GaussianProcessDirect, GaussianProcessIndirect
 from policy.predictors.learned import Learned, NetConfig
-from policy.training.fitting import FitConfig, fit
 from policy.training.networks import use_threads
 from policy.training.predictors import (
+    FitConfig,
     GaussianProcess,
     PriorFit,
     Windows,
     examples_for_net,
     factors_for,
+    fit,
     fresh_net,
     in_own_frame,
     net_loss,

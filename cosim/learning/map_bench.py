@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from cosim.errors import BadInput
-from cosim.learning.prediction_data import followed, spread
+from cosim.learning.prediction_data import EpisodeReader, followed, spread
 from cosim.recording import Folder, read
 from cosim.report import statistics
 from cosim.types import COMPACT, Floats
@@ -41,53 +42,44 @@ def hpn_weights() -> dict[str, Path]:
     return {name: path for name, path in found.items() if path.is_file()}
 
 
-class MapMeter:
+class MapMeter(EpisodeReader):
     """Lives in a worker: predicts maps on recorded episodes and compares them with what followed."""
 
     def __init__(self, weights: Mapping[str, str], stride: int) -> None:
+        super().__init__()
         use_threads(1)
         self._hpns = load_hpns({name: Path(path) for name, path in weights.items()})
         self._stride = stride
         self._predictor = make_predictor("gp-indirect", 20, 0.2)
-        self._folders: dict[str, Folder] = {}
         self._predictors: dict[str, MapPredictors] = {}  # by road
 
     def run(self, path: str, key: str, progress: Any = None) -> EpisodeErrors | None:
         """One episode; None when it is too short."""
-        folder = self._folders.setdefault(path, Folder(Path(path)))
-        recording = read(folder.episode_file(key))
+        recording, road = self.read(path, key)
         case, name = recording.case, str(recording.case["road"])
-        road = folder.road(recording)
         if name not in self._predictors:
             self._predictors[name] = MapPredictors(self._hpns, self._predictor, COMPACT, road)
         channels, at = vehicle_channels(COMPACT), [frame_of(h) for h in HORIZONS]
-        pre: dict[str, list[Floats]] = {}
-        iou: dict[str, list[Floats]] = {}
+        errors: dict[str, list[tuple[Floats, Floats]]] = defaultdict(list)
         for now in followed(recording, road, COMPACT, self._stride, int(case["seed"])):
             if not now.maps:
                 continue
             guess = self._predictors[name].predict(now.histories)
             if progress is not None:
                 progress(now.frame, len(recording.times))
-            for b, av in enumerate(guess.agents):
-                if av not in now.maps:
-                    continue
+            for b, av in ((b, av) for b, av in enumerate(guess.agents) if av in now.maps):
                 for predictor, maps in guess.maps.items():
-                    p, i = picture_error(maps[b, at], now.maps[av][at], channels)
-                    pre.setdefault(predictor, []).append(p)
-                    iou.setdefault(predictor, []).append(i)
-        if not pre:
+                    errors[predictor].append(picture_error(maps[b, at], now.maps[av][at], channels))
+        if not errors:
             return None
+        means = {predictor: np.mean(each, 0) for predictor, each in errors.items()}  # [2,H]
         return EpisodeErrors(
             str(case["scenario"]),
             str(case["behavior"]),
-            len(next(iter(pre.values()))),
-            {k: np.mean(v, 0) for k, v in pre.items()},
-            {k: np.mean(v, 0) for k, v in iou.items()},
+            len(next(iter(errors.values()))),
+            {predictor: pre for predictor, (pre, _) in means.items()},
+            {predictor: iou for predictor, (_, iou) in means.items()},
         )
-
-    def close(self) -> None:
-        """Nothing to end."""
 
 
 def load_hpns(weights: Mapping[str, Path]) -> dict[str, HPN]:
@@ -115,8 +107,8 @@ def measure(
     ]
     chosen = hpn_weights() if weights is None else weights
     engine = LocalEngine(MapMeter, ({k: str(p) for k, p in chosen.items()}, stride), workers=workers)
-    found = spread(engine, [Task(k, "", (str(folder), k)) for k in keys], "maps") if keys else []
-    measured = [episode for episode in found if episode is not None]
+    tasks = [Task(k, "", (str(folder), k)) for k in keys]
+    measured = [episode for episode in (spread(engine, tasks, "maps") if keys else []) if episode is not None]
     if not measured:
         raise BadInput("no recorded episode is long enough to measure maps on", file=folder)
     return measured
@@ -132,29 +124,34 @@ def rows(episodes: Sequence[EpisodeErrors]) -> list[dict[str, Any]]:
     """The table: a row per predictor, scenario (and `all`) and horizon; intervals over episodes."""
     pixels = len(vehicle_channels(COMPACT)) * COMPACT.height * COMPACT.width
     out = []
-    worlds = sorted({e.scenario for e in episodes})
-    for world in (*worlds, "all"):
-        here = [e for e in episodes if world in ("all", e.scenario)]
+    for world, here in _by_world(episodes):
         for predictor in here[0].pre:
             for k, horizon in enumerate(HORIZONS):
                 pre = statistics.mean([float(e.pre[predictor][k]) for e in here])
                 iou = statistics.mean([float(e.iou[predictor][k]) for e in here])
-                row = {
-                    "predictor": predictor,
-                    "scenario": world,
-                    "horizon_s": horizon,
-                    "pre": pre.value,
-                    "pre_low": pre.low,
-                    "pre_high": pre.high,
-                    "pre_sum": pre.value * pixels,
-                    "iou": iou.value,
-                    "iou_low": iou.low,
-                    "iou_high": iou.high,
-                    "n": sum(e.samples for e in here),
-                    "episodes": len(here),
-                }
-                out.append(row)
+                out.append(
+                    {
+                        "predictor": predictor,
+                        "scenario": world,
+                        "horizon_s": horizon,
+                        "pre": pre.value,
+                        "pre_low": pre.low,
+                        "pre_high": pre.high,
+                        "pre_sum": pre.value * pixels,
+                        "iou": iou.value,
+                        "iou_low": iou.low,
+                        "iou_high": iou.high,
+                        "n": sum(e.samples for e in here),
+                        "episodes": len(here),
+                    }
+                )
     return out
+
+
+def _by_world(episodes: Sequence[EpisodeErrors]) -> Iterator[tuple[str, list[EpisodeErrors]]]:
+    """The episodes of each world, then all."""
+    for world in (*sorted({e.scenario for e in episodes}), "all"):
+        yield world, [e for e in episodes if world in ("all", e.scenario)]
 
 
 def against(episodes: Sequence[EpisodeErrors], ours: str = "hpn") -> list[dict[str, Any]]:
@@ -163,9 +160,7 @@ def against(episodes: Sequence[EpisodeErrors], ours: str = "hpn") -> list[dict[s
     PRE below 0 and IoU above 0 say that ours is better; `everywhere`: at every horizon in the mean.
     """
     out: list[dict[str, Any]] = []
-    worlds = sorted({e.scenario for e in episodes})
-    for world in (*worlds, "all"):
-        here = [e for e in episodes if world in ("all", e.scenario)]
+    for world, here in _by_world(episodes):
         for other in (name for name in here[0].pre if name != ours and ours in here[0].pre):
             row: dict[str, Any] = {"scenario": world, "against": other, "everywhere": True}
             for name, sign in (("pre", -1.0), ("iou", 1.0)):
@@ -187,9 +182,7 @@ def markdown(
     table: Sequence[Mapping[str, Any]], compared: Sequence[Mapping[str, Any]] = (), command: str = ""
 ) -> str:
     """The tables for people: PRE and IoU with their intervals, and what the HPN gains on the others."""
-    lines = ["# Predicted maps", ""]
-    if command:
-        lines += ["```", command, "```", ""]
+    lines = ["# Predicted maps", "", *(["```", command, "```", ""] if command else [])]
     total = [r for r in table if r["scenario"] == "all"]
     lines += [
         f"{total[0]['episodes']} episodes, {total[0]['n']} samples (an AV at a decision, one in {STRIDE}). "
@@ -204,8 +197,8 @@ def markdown(
                 statistics.Figure(r[f"{n}_change"], r[f"{n}_low"], r[f"{n}_high"]).text(1, 100.0)
                 for n in ("pre", "iou")
             )
-            said = "yes" if r["everywhere"] else "no"
-            lines.append(f"| {r['scenario']} | {r['against']} | {pre} % | {iou} % | {said} |")
+            better = "yes" if r["everywhere"] else "no"
+            lines.append(f"| {r['scenario']} | {r['against']} | {pre} % | {iou} % | {better} |")
     keys = list(dict.fromkeys((row["scenario"], row["predictor"]) for row in table))
     head = " | ".join(f"{h:g} s" for h in HORIZONS)
     for name, title, scale, digits in (("pre", "PRE, 1e-5 per pixel", 1e5, 1), ("iou", "IoU", 1.0, 3)):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from cosim.recording import Folder, read
 from cosim.road import RoadMap
 from cosim.types import COMPACT, Bytes, Floats32
 from policy.inner_features import painted
-from policy.map_error import HORIZONS, MapPredictors, frame_of, vehicle_channels
+from policy.map_error import MapPredictors, frame_of, unit_maps, vehicle_channels
 from policy.predictors import make_predictor
 
 SHOWN = (0.2, 1.0, 2.0, 3.0, 4.0)  # s, columns of a chain's picture
@@ -106,8 +106,7 @@ def _interest(now: Followed, av: str) -> float:
 
 def picture(maps: Floats32 | Bytes) -> Floats32:
     """One map [C,H,W] in colours [H,W,3]: road grey, AVs blue, HVs orange, ego and mission green."""
-    scale = 255.0 if maps.dtype == np.uint8 else 1.0
-    m = np.clip(np.asarray(maps, np.float32) / scale, 0.0, 1.0)
+    m = np.clip(unit_maps(maps), 0.0, 1.0)
     out = np.repeat(0.25 * m[2][..., None], 3, -1)
     for channel, colour in ((0, (0.35, 0.65, 1.0)), (1, (1.0, 0.6, 0.2)), (3, (0.4, 1.0, 0.4))):
         value = np.sqrt(m[channel])[..., None]
@@ -120,39 +119,40 @@ def _chain(now: Followed, av: str, predictors: MapPredictors, world: str, out: P
     b = guess.agents.index(av)
     at = [frame_of(h) for h in SHOWN]
     lines = [("what followed", now.maps[av][at])] + [(n, m[b, at]) for n, m in guess.maps.items()]
-    figure = Figure(figsize=(3.1 * len(at), 0.95 * len(lines) + 0.3), layout="constrained")
-    axes = figure.subplots(len(lines), len(at), squeeze=False)
-    for line, (name, maps) in enumerate(lines):
-        for column, horizon in enumerate(SHOWN):
-            axis = axes[line, column]
-            axis.imshow(picture(maps[column]), aspect="auto", interpolation="nearest")
-            axis.set(xticks=[], yticks=[])
-            if line == 0:
-                axis.set_title(f"{world}, {horizon:g} s ahead", fontsize="small")
-            if column == 0:
-                axis.set_ylabel(name, fontsize="small", rotation=0, ha="right", va="center")
+    figure, axes = _grid(len(lines), len(at))
+    for axis, horizon in zip(axes[0], SHOWN, strict=True):
+        axis.set_title(f"{world}, {horizon:g} s ahead", fontsize="small")
+    for row, (name, maps) in zip(axes, lines, strict=True):
+        _show(row, name, [picture(one) for one in maps])
     figure.savefig(out, dpi=DPI)
+
+
+def _grid(rows: int, columns: int) -> tuple[Figure, Any]:
+    """A figure of wide pictures, its axes [rows,columns] without ticks."""
+    figure = Figure(figsize=(3.1 * columns, 0.95 * rows + 0.3), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False)
+    for axis in axes.flat:
+        axis.set(xticks=[], yticks=[])
+    return figure, axes
+
+
+def _show(row: Any, name: str, images: Iterable[Floats32]) -> None:
+    """Images side by side, named at the left."""
+    row[0].set_ylabel(name, fontsize="small", rotation=0, ha="right", va="center")
+    for axis, image in zip(row, images, strict=False):
+        axis.imshow(image, aspect="auto", interpolation="nearest", cmap=colormaps["magma"])
 
 
 def _features(now: Followed, av: str, hpns: Mapping[str, Any], road: RoadMap, world: str, out: Path) -> None:
     found = painted(hpns, now.histories, av, COMPACT, road, make_predictor("gp-indirect", 20, 0.2))
     columns = 4
-    per = {name: maps[: 2 * columns] for name, maps in found.items()}
-    count = sum(-(-len(m) // columns) for m in per.values())
-    figure = Figure(figsize=(3.1 * columns, 0.95 * count + 0.3), layout="constrained")
-    axes = figure.subplots(count, columns, squeeze=False)
-    line = 0
-    for name, maps in per.items():
-        for k, values in enumerate(maps):
-            axis = axes[line + k // columns, k % columns]
-            axis.imshow(values, aspect="auto", interpolation="nearest", cmap=colormaps["magma"])
-            if k % columns == 0:
-                axis.set_ylabel(name, fontsize="small", rotation=0, ha="right", va="center")
-        line += -(-len(maps) // columns)
-    for axis in axes.flat:
-        axis.set(xticks=[], yticks=[])
+    rows = [
+        (name, maps[at : at + columns])
+        for name, maps in found.items()
+        for at in range(0, min(len(maps), 2 * columns), columns)
+    ]
+    figure, axes = _grid(len(rows), columns)
+    for row, (name, maps) in zip(axes, rows, strict=True):
+        _show(row, name, maps)
     figure.suptitle(f"{world}: inner features", fontsize="small")
     figure.savefig(out, dpi=DPI)
-
-
-__all__ = ["HORIZONS", "errors", "picture", "pictures", "training"]

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from cosim.errors import CosimError
-from cosim.recording import Folder, Recording, histories
+from cosim.recording import Folder, Recording, histories, read
 from cosim.road import RoadMap
 from cosim.types import COMPACT, Bytes, History, ObservationConfig, Snapshot
 from cosim.workers.engines import Engine
@@ -18,6 +19,7 @@ from cosim.workers.progress import Progress
 from cosim.workers.tasks import Task
 
 HORIZON = 20  # frames, 4 s
+MAPLESS = replace(COMPACT, maps=False)
 
 
 class Followed(NamedTuple):
@@ -62,30 +64,32 @@ def followed(
 
 def episodes(folders: list[Path]) -> list[tuple[Path, str]]:
     """(folder, key) of every recorded episode. Raises BadInput for a folder that holds none."""
-    return [(path, key) for path in folders for key in _keys(Folder(path))]
+    return [(path, key) for path in folders if Folder(path).manifest() for key in Folder(path).episodes()]
 
 
 def recorded_by(manifest: Mapping[str, Any]) -> list[str]:
     """The commands that drove a folder's episodes, without where they wrote: that is no part of the data."""
-    told = set()
+    commands = set()
     for command in manifest["commands"]:
         words = [w for k, w in enumerate(command) if "--out" not in (w, *command[max(k - 1, 0) : k])]
-        told.add("cosim record " + shlex.join(w for w in words if w != "--resume"))
-    return sorted(told)
+        commands.add("cosim record " + shlex.join(w for w in words if w != "--resume"))
+    return sorted(commands)
 
 
-def _keys(folder: Folder) -> list[str]:
-    folder.manifest()
-    return folder.episodes()
+class EpisodeReader:
+    """What lives in a worker and reads recorded episodes."""
 
+    def __init__(self) -> None:
+        self._folders: dict[str, Folder] = {}
 
-MAPLESS = ObservationConfig(
-    frames=COMPACT.frames,
-    rows=COMPACT.rows,
-    row_range=COMPACT.row_range,
-    perception_range=COMPACT.perception_range,
-    maps=False,
-)
+    def read(self, path: str, key: str) -> tuple[Recording, RoadMap]:
+        """The episode `key` of the folder `path`, and its road."""
+        folder = self._folders.setdefault(path, Folder(Path(path)))
+        recording = read(folder.episode_file(key))
+        return recording, folder.road(recording)
+
+    def close(self) -> None:
+        """Nothing to end."""
 
 
 def spread(engine: Engine, tasks: Sequence[Task], title: str) -> list[Any]:

@@ -93,18 +93,15 @@ class Scores:
         scenario counts the same. `n`: forecasts.
         """
         rows = []
+        spans: dict[float | str, slice] = {h: slice(k, k + 1) for h, k in self.horizons().items()}
+        spans["mean"] = slice(None)
         for predictor, errors in self.errors.items():
             each = np.stack(errors)  # [E,M]
             for scenario, behavior, members in self.groups():
-                wanted: dict[float | str, Floats] = {
-                    h: each[members][:, k] for h, k in self.horizons().items()
-                }
-                wanted["mean"] = each[members].mean(1)
-                for horizon, values in wanted.items():
+                counts = np.stack([self.counts[i] for i in members])
+                for horizon, span in spans.items():
+                    values = each[members][:, span].mean(1)
                     figure = statistics.mean(self._balanced(values, members, scenario))
-                    counts = np.stack([self.counts[i] for i in members])
-                    if horizon != "mean":
-                        counts = counts[:, self.horizons()[float(horizon)]]
                     rows.append(
                         {
                             "predictor": predictor,
@@ -114,7 +111,7 @@ class Scores:
                             "mean_m": figure.value,
                             "ci_low": figure.low,
                             "ci_high": figure.high,
-                            "n": int(counts.sum()),
+                            "n": int(counts[:, span].sum()),
                         }
                     )
         return rows

@@ -7,14 +7,15 @@ import hashlib
 import json
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from cosim.errors import BadInput
 from cosim.files import prepare_folder
 from cosim.learning.configuration import configuration
-from cosim.learning.prediction_data import MAPLESS, episodes, followed, recorded_by, spread
-from cosim.recording import Folder, read
+from cosim.learning.prediction_data import MAPLESS, EpisodeReader, episodes, followed, recorded_by, spread
+from cosim.recording import Folder
 from cosim.seeding import TRAINING_SEEDS, TUNING_SEEDS
 from cosim.types import COMPACT
 from cosim.workers.engines import LocalEngine
@@ -24,9 +25,8 @@ from cosim.workers.tasks import Task
 from policy.predictors import make_predictor
 from policy.traffic import TrafficConfig
 from policy.training import hpn
+from policy.training import loop as supervised
 from policy.training.kinematics import KinematicTask
-from policy.training.loop import train as run_loop
-from policy.training.loop import write_log
 from policy.training.map_branch import MapTask
 from policy.training.moments import MapSample, Moment, map_sample, moment
 from policy.training.networks import use_threads
@@ -52,30 +52,19 @@ def train(args: argparse.Namespace) -> int:
     data = {part: _manifest(keys) for part, keys in found.items()}
     examples = {part: _gather(keys, name, training, args.workers, part) for part, keys in found.items()}
     task: KinematicTask | MapTask
-    variant = hpn.VARIANTS[name]
-    loop, device = training.loop, args.device
+    variant, loop = hpn.VARIANTS[name], training.loop
+    sets = examples["train"], examples["validation"]
     if variant.maps == "plain":
         loop = training.map_loop
-        samples = {part: [s for s in found if isinstance(s, MapSample)] for part, found in examples.items()}
-        task = MapTask(
-            variant.map_branch, training.maps, loop.updates, samples["train"], samples["validation"], device
-        )
+        task = MapTask(variant.map_branch, training.maps, loop.updates, *sets, args.device)
     else:
-        moments = {part: [m for m in found if isinstance(m, Moment)] for part, found in examples.items()}
-        task = KinematicTask(
-            variant.kinematic,
-            training.kinematics,
-            loop.updates,
-            moments["train"],
-            moments["validation"],
-            device,
-        )
+        task = KinematicTask(variant.kinematic, training.kinematics, loop.updates, *sets, args.device)
     progress = Progress(f"train {name}", "updates")
-    layout = hpn.layout(name, training, data)
-    log = run_loop(task, loop, folder, layout=layout, resume=args.resume, progress=progress)
+    layout = {"hpn": asdict(variant), "training": asdict(training), "data": data}
+    log = supervised.train(task, loop, folder, layout=layout, resume=args.resume, progress=progress)
     progress.done()
     file_name = folder / f"{name}.safetensors"
-    write_log(file_name.with_suffix(".csv"), log)
+    supervised.write_log(file_name.with_suffix(".csv"), log)
     hpn.save(file_name, name, hpn.assemble(name, task), log[-1], {**data, "commands": _commands(args, found)})
     print(f"{name}: {loop.updates} updates, validation loss {log[-1]['validation_loss']:.4f}")
     print(f"  {file_name}")
@@ -87,9 +76,9 @@ def _commands(args: argparse.Namespace, found: Mapping[str, Sequence[tuple[Path,
     seed = "" if args.seed is None else f" --seed {args.seed}"
     recorders = {
         f"{part} recordings": [
-            told
+            command
             for path in sorted({path for path, _ in keys})
-            for told in recorded_by(Folder(path).manifest())
+            for command in recorded_by(Folder(path).manifest())
         ]
         for part, keys in found.items()
     }
@@ -99,19 +88,18 @@ def _commands(args: argparse.Namespace, found: Mapping[str, Sequence[tuple[Path,
     }
 
 
-class Gatherer:
-    """Lives in a worker: turns recorded episodes into what is learned from."""
+class Gatherer(EpisodeReader):
+    """Lives in a worker: turns recorded episodes into examples."""
 
     def __init__(self, variant: str, training: hpn.HpnTraining) -> None:
+        super().__init__()
         self._variant, self._training = hpn.VARIANTS[variant], training
         self._predictor = make_predictor("gp-indirect", 20, 0.2)
-        self._folders: dict[str, Folder] = {}
 
     def run(self, path: str, key: str, progress: object = None) -> list[Moment] | list[MapSample]:
         """Everything that one episode gives."""
-        folder = self._folders.setdefault(path, Folder(Path(path)))
-        recording = read(folder.episode_file(key))
-        road, seed, t = folder.road(recording), int(recording.case["seed"]), self._training
+        recording, road = self.read(path, key)
+        seed, t = int(recording.case["seed"]), self._training
         if self._variant.maps == "plain":
             return [
                 map_sample(at.histories[name], at.maps[name], at.future)
@@ -124,13 +112,10 @@ class Gatherer:
             for at in followed(recording, road, MAPLESS, t.stride, seed)
         ]
 
-    def close(self) -> None:
-        """Nothing to end."""
-
 
 def _gather(
     keys: Sequence[tuple[Path, str]], variant: str, training: hpn.HpnTraining, workers: int, part: str
-) -> list[Moment] | list[MapSample]:
+) -> list[Any]:
     """Examples of every episode, in the order of the keys whichever worker was faster."""
     tasks = [Task(f"{path} {key}", str(path), (str(path), key)) for path, key in keys]
     found = spread(LocalEngine(Gatherer, (variant, training), workers=workers), tasks, f"read {part}")

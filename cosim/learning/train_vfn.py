@@ -1,4 +1,4 @@
-"""Training of the value networks from a configuration file: the roof over trainer and rollouts."""
+"""Training of the value networks from a configuration file: joins trainer and rollouts."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from dataclasses import asdict, replace
 import yaml
 
 from cosim.errors import BadInput
-from cosim.files import prepare_folder
+from cosim.files import code, prepare_folder
 from cosim.learning.configuration import configuration
 from cosim.learning.rollouts import Rollouts
-from cosim.scenario import load
+from cosim.rewards import RewardConfig
+from cosim.scenario import load, place
 from cosim.scenario.policy_name import BEST
 from cosim.workers.memory import keep_freed_memory
 from cosim.workers.progress import Progress
@@ -22,13 +23,13 @@ from policy.agents.approaches import APPROACHES
 from policy.checkpoint import sha256
 from policy.training.config import agent_config
 from policy.training.curriculum import Lesson, VfnTraining
-from policy.training.log import tensorboard
+from policy.training.loop import tensorboard
 from policy.training.networks import usable, use_threads
-from policy.training.vfn import Trainer
+from policy.training.vfn import TrainingRun
 from sumo_scenarios import names
 
 ABOUT = ("observation", "hpn", "reward", "explore", "chain", "safety", "traffic")  # sections in the card
-CONTESTED = 2.0  # contested episodes for every dense one: altruism is learned where somebody must yield
+WEIGHTS = {"contested": 2.0, "dense": 1.0}  # altruism is learned where somebody must yield
 
 
 def train(args: argparse.Namespace) -> int:
@@ -54,6 +55,10 @@ def train(args: argparse.Namespace) -> int:
         "scenarios": sorted({lesson.scenario for lesson in training.lessons}),
         **{part: asdict(getattr(file, part)) for part in ABOUT},
     }
+    reward: str | RewardConfig = file.reward
+    if args.reward is not None:
+        reward = about["reward"] = code.read(args.reward, "--reward").text
+    metrics = [code.read(metric, "--metric").text for metric in args.metric]
     if agent.predicted_maps and agent.chain.source == "hpn" and agent.hpn_weights is not None:
         about["hpn_sha256"] = sha256(agent.hpn_weights)
     explore = replace(file.explore, sample=learning == "a2c")
@@ -62,18 +67,18 @@ def train(args: argparse.Namespace) -> int:
     writer = tensorboard(folder)
     progress = Progress(f"train {name}", "iterations")
     try:
-        with Rollouts(args.workers, name, agent, explore, file.reward) as actors:
-            trainer = Trainer(
+        with Rollouts(args.workers, name, agent, explore, reward, metrics) as actors:
+            run = TrainingRun(
                 training, agent.vfn, actors, folder, device=args.device, log=writer, about=about
             )
-            if args.resume and not trainer.resume():
+            if args.resume and not run.resume():
                 print("nothing to resume: starting anew", file=sys.stderr)
-            trainer.run(progress)
+            run.run(progress)
     finally:
         progress.done()
         writer.close()
-    best = f", best validation reward {trainer.best:.3f}" if math.isfinite(trainer.best) else ""
-    print(f"{name}: {trainer.iteration} iterations, {trainer.school.learner.updates} updates{best}")
+    best = f", best validation reward {run.best:.3f}" if math.isfinite(run.best) else ""
+    print(f"{name}: {run.iteration} iterations, {run.trainer.learner.updates} updates{best}")
     print(f"  {folder / BEST}" + (f" (cosim run merge --policy {_typed(args.out)})" if best else ""))
     return 0
 
@@ -85,20 +90,22 @@ def _typed(folder: str) -> str:
 
 def _scheduled(training: VfnTraining, args: argparse.Namespace, name: str) -> VfnTraining:
     """The file's schedule with what the command line and the approach say otherwise."""
-    worlds = names() if "all" in args.scenario else tuple(args.scenario)
+    worlds = names() if "all" in args.scenario else tuple(map(place, args.scenario))
     if worlds:
-        training = replace(
-            training,
-            lessons=tuple(
-                Lesson(world, demand, weight=weight)
-                for world in worlds
-                for demand, weight in (("contested", CONTESTED), ("dense", 1.0))
-            ),
-        )
+        lessons = tuple(lesson for world in worlds for lesson in _lessons(world))
+        training = replace(training, lessons=lessons)
     if name.endswith("-egoistic"):  # the twin never weighs anybody's interest but its own
         training = replace(training, svo=(0.0,), replay=replace(training.replay, phi=(0.0, 0.0)))
-    if args.iterations is not None:
-        training = replace(training, iterations=args.iterations)
-    if args.seed is not None:
-        training = replace(training, seed=args.seed)
-    return replace(training, learning=APPROACHES[name].learning)
+    given = {field: getattr(args, field) for field in ("iterations", "seed")}
+    changes = {field: value for field, value in given.items() if value is not None}
+    return replace(training, learning=APPROACHES[name].learning, **changes)
+
+
+def _lessons(world: str) -> list[Lesson]:
+    """Its contested and dense demands, or all that it has. Raises BadInput where it has none by name."""
+    known = load(world).demands
+    if not known:
+        raise BadInput("has no demands by name to train on", field="--scenario", value=world)
+    return [Lesson(world, d, weight=WEIGHTS[d]) for d in WEIGHTS if d in known] or [
+        Lesson(world, d) for d in known
+    ]

@@ -1,11 +1,11 @@
-"""What every metric is told when an episode starts, what a metric is, and how vehicles are followed."""
+"""The context of an episode's metrics, the protocol of a metric, and tables of vehicles over time."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol, TypeVar, cast
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +14,6 @@ from cosim.geometry import Conflicts, boxes, conflicts
 from cosim.road import RoadMap
 from cosim.types import Bools, Ints, Kind, Metric, Snapshot, Timing
 
-Table = TypeVar("Table", bound=npt.NDArray[Any])
 AV = int(Kind.AV)  # comparing arrays with an IntEnum member costs five times as much
 HORIZON = 10.0  # s, further ahead straight-line extrapolation says nothing (docs/paper_map.md)
 
@@ -30,10 +29,9 @@ class ConflictView:
         self._snapshot: Snapshot | None = None
 
     def of(self, snapshot: Snapshot) -> Conflicts:
-        """Conflicts of AVs and mission vehicles with anybody, up to `HORIZON` ahead."""
+        """Conflicts of AVs and mission vehicles with any vehicle, up to `HORIZON` ahead."""
         if snapshot is not self._snapshot:
-            number = self._contact.numbers(snapshot.lane)
-            roads = number, self._contact.table
+            roads = self._contact.numbers(snapshot.lane), self._contact.table
             self._conflicts = conflicts(boxes(snapshot), watched(snapshot), HORIZON, roads)
             self._snapshot = snapshot
         return self._conflicts
@@ -56,7 +54,7 @@ class MetricContext:
 
 
 class EpisodeMetric(Protocol):
-    """One file, one idea: sees every frame of an episode and yields its figures."""
+    """One figure or a few of an episode, computed from its frames."""
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         """A new episode; `first` is its first frame (time 0 of the counted time)."""
@@ -71,17 +69,6 @@ class EpisodeMetric(Protocol):
 def watched(snapshot: Snapshot) -> Bools:
     """[n] the vehicles whose conflicts are counted: AVs and mission vehicles."""
     return np.asarray((snapshot.kind == AV) | snapshot.mission)
-
-
-def rows_in_both(before: Snapshot, after: Snapshot) -> tuple[Ints, Ints]:
-    """Rows of the vehicles present in both frames: [c] in `before`, [c] in `after`."""
-    if before.ids == after.ids:
-        every = np.arange(after.n)
-        return every, every
-    then = before.row
-    pairs = [(then[name], row) for row, name in enumerate(after.ids) if name in then]
-    both = np.array(pairs, dtype=np.int64).reshape(-1, 2)
-    return both[:, 0], both[:, 1]
 
 
 class Slots:
@@ -104,18 +91,16 @@ class Slots:
         return self._rows
 
     def keep(self, numbers: Ints) -> None:
-        """Forget all but these numbers, which become 0, 1, 2, ... in this order."""
+        """Keep only these numbers, which become 0, 1, 2, ... in this order."""
         new = {int(old): k for k, old in enumerate(numbers)}
         self.of = {name: new[old] for name, old in self.of.items() if old in new}
         self._ids, self._rows = (), np.zeros(0, dtype=np.int64)
 
 
-def grown(table: Table, needed: int, fill: float, axis: int = 0) -> Table:
-    """The table itself while `needed` entries fit along `axis`, else a copy with room for twice as many."""
+def grown(table: npt.NDArray[Any], needed: int, fill: float, axis: int = 0) -> npt.NDArray[Any]:
+    """The table itself while `needed` entries fit along `axis`, else a copy for twice as many."""
     if table.shape[axis] >= needed:
         return table
-    shape = list(table.shape)
-    shape[axis] = 2 * needed
-    larger = np.full(shape, fill, dtype=table.dtype)
-    larger[(slice(None),) * axis + (slice(table.shape[axis]),)] = table
-    return cast(Table, larger)
+    added = [(0, 0)] * table.ndim
+    added[axis] = (0, 2 * needed - table.shape[axis])
+    return np.pad(table, added, constant_values=fill)

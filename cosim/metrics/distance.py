@@ -13,8 +13,8 @@ from cosim.types import Bools, Floats, Ints, Metric, Snapshot
 class Distance:
     """Mean over vehicles of the metres driven in the counted time (definitions.md, Episode).
 
-    The vehicles are those on the road at the first frame, so that a policy cannot change whom it is judged
-    by; a vehicle that left keeps its distance. On a road that starts empty (a foreign scenario without
+    The vehicles are those on the road at the first frame, so that a policy cannot change which vehicles are
+    counted; a vehicle that left keeps its distance. On a road that starts empty (a foreign scenario without
     warm-up) they are all that ever appeared. The mission vehicle counts whenever it appears.
     """
 
@@ -28,13 +28,12 @@ class Distance:
         self.add(first)
 
     def add(self, snapshot: Snapshot) -> None:
-        s = snapshot
-        slot = self._slots.rows(s.ids)
+        slot = self._slots.rows(snapshot.ids)
         self._tally = grown(self._tally, len(self._slots), 0.0)
-        elapsed = s.time - self._time
-        self._time = s.time
+        elapsed, self._time = snapshot.time - self._time, snapshot.time
         self._frame += 1
-        _drive(s.kind, s.mission, s.speed, slot, self._tally, self._frame, elapsed)
+        vehicles = snapshot.kind, snapshot.mission, snapshot.speed
+        _drive(*vehicles, slot, self._tally, self._frame, elapsed)
 
     def result(self) -> dict[str, Metric]:
         seen = len(self._slots)
@@ -59,7 +58,7 @@ def _drive(
     frame: int,
     elapsed: float,
 ) -> None:
-    """Add the trapezoid of the speeds to everybody's distance; positions would count a teleport's jump."""
+    """Add the trapezoid of the speeds to each vehicle's distance; positions would count a teleport's jump."""
     for k in range(len(slot)):
         row = tally[slot[k]]
         if frame > 1 and row[0] == frame - 1:

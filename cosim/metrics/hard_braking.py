@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from cosim.metrics.context import MetricContext, rows_in_both
+from cosim.metrics.context import MetricContext
 from cosim.types import Kind, Metric, Snapshot
 
 THRESHOLD = 3.0  # m/s2, about 0.3 g: the usual bound of hard-braking events in naturalistic driving data
@@ -12,23 +12,21 @@ class HardBraking:
     """An event begins at a frame whose mean deceleration exceeds the threshold, unless one goes on."""
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
-        self._before = first
+        self._time = first.time
+        self._speeds = dict(zip(first.ids, first.speed.tolist(), strict=True))  # m/s in the frame before
         self._braking: frozenset[str] = frozenset()
         self._all = self._av = 0
-        self._any = first.n > 0
-        self._any_av = bool((first.kind == Kind.AV).any())
+        self._kinds = set(first.kind.tolist())  # of all vehicles seen so far
 
     def add(self, snapshot: Snapshot) -> None:
-        s, before = snapshot, self._before
-        elapsed = s.time - before.time
-        then, now = rows_in_both(before, s)
-        self._before = s
-        self._any = self._any or s.n > 0
-        self._any_av = self._any_av or bool((s.kind == Kind.AV).any())
-        if elapsed <= 0.0:
+        s, before = snapshot, self._speeds
+        change = THRESHOLD * (s.time - self._time)  # m/s
+        self._time = s.time
+        self._speeds = dict(zip(s.ids, s.speed.tolist(), strict=True))
+        self._kinds.update(s.kind.tolist())
+        if change <= 0.0:
             return
-        hard = now[(before.speed[then] - s.speed[now]) > THRESHOLD * elapsed]
-        braking = frozenset(s.ids[row] for row in hard)
+        braking = frozenset(i for i, speed in self._speeds.items() if before.get(i, speed) - speed > change)
         begun = braking - self._braking
         self._all += len(begun)
         self._av += sum(s.kind[s.row[name]] == Kind.AV for name in begun)
@@ -36,6 +34,6 @@ class HardBraking:
 
     def result(self) -> dict[str, Metric]:
         return {
-            "hard_brakings": Metric(self._all if self._any else None, "events", "lower"),
-            "hard_brakings_av": Metric(int(self._av) if self._any_av else None, "events", "lower"),
+            "hard_brakings": Metric(self._all if self._kinds else None, "events", "lower"),
+            "hard_brakings_av": Metric(int(self._av) if Kind.AV in self._kinds else None, "events", "lower"),
         }

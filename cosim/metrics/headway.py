@@ -10,7 +10,7 @@ from cosim.types import Metric, Snapshot
 
 
 class Headway:
-    """Net time headway (bumper to bumper) over all AV frames with somebody within 125 m ahead."""
+    """Net time headway (bumper to bumper) over all AV frames with a vehicle within 125 m ahead."""
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._graph = context.road.straight_on

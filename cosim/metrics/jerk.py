@@ -26,8 +26,7 @@ class Jerk:
     def add(self, snapshot: Snapshot) -> None:
         slot = self._slots.rows(snapshot.ids)
         self._last = grown(self._last, len(self._slots), np.nan)
-        elapsed = snapshot.time - self._time
-        self._time = snapshot.time
+        elapsed, self._time = snapshot.time - self._time, snapshot.time
         self._frame += 1
         total, counted = _jerks(snapshot.kind, snapshot.speed, slot, self._last, self._frame, elapsed)
         self._sum += total

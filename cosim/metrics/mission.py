@@ -1,4 +1,4 @@
-"""Mission: did the vehicle that needs somebody's help get where it wanted, and when."""
+"""Mission: did the vehicle that needs the help of others get where it wanted, and when."""
 
 from __future__ import annotations
 
@@ -29,8 +29,7 @@ class MissionSuccess:
             return
         for collision in snapshot.events.collisions:  # they came before this frame's positions
             self._crashed.update((collision.collider, collision.victim))
-        if snapshot.events.arrived:
-            self._standing.difference_update(snapshot.events.arrived)
+        self._standing.difference_update(snapshot.events.arrived)
         for row in snapshot.mission.nonzero()[0].tolist():
             name = snapshot.ids[row]
             if self._reached.setdefault(name, None) is not None:
@@ -48,7 +47,7 @@ class MissionSuccess:
             times = [time for time in self._reached.values() if time is not None]
             success = len(times) == len(self._reached)
             when = max(times) if success else None
-            # a failure that is final for the eye: it stands, typically at the end of its lane
+            # it stands without having succeeded, typically at the end of its lane
             failed = any(self._reached[name] is None for name in self._standing)
         return {
             "mission_success": Metric(success, "bool", "higher"),

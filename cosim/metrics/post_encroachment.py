@@ -1,4 +1,4 @@
-"""Post-encroachment time: how soon somebody crossed the path of an AV or mission vehicle, or the reverse."""
+"""Post-encroachment time: the shortest time between an AV's (or mission vehicle's) and another's passage."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class PostEncroachment:
     def add(self, snapshot: Snapshot) -> None:
         s = snapshot
         if len(self._slots) > 2 * s.n + 64:
-            self._forget_those_who_left()
+            self._drop_absent()
         slot = self._slots.rows(s.ids)  # [n]
         self._sizes = grown(self._sizes, len(self._slots), 0.0)
         self._watched = grown(self._watched, len(self._slots), False)
@@ -38,23 +38,16 @@ class PostEncroachment:
         self._newest = (self._newest + 1) % self._frames
         number = self._contact.numbers(s.lane)
         record(self._trail, self._newest, slot, s.x, s.y, s.heading, s.speed, number)
-        if slot is not self._known:  # somebody came or left
+        if slot is not self._known:  # a vehicle came or left
             self._sizes[slot, 0], self._sizes[slot, 1] = s.length, s.width
             self._known = slot
         self._watched[slot] |= watched(s)
-        found = encroachment(
-            self._trail,
-            self._newest,
-            len(self._slots),
-            self._sizes,
-            self._watched,
-            self._interval,
-            self._contact.table,
-        )
+        vehicles = len(self._slots), self._sizes, self._watched
+        found = encroachment(self._trail, self._newest, *vehicles, self._interval, self._contact.table)
         self._smallest = min(self._smallest, found)
 
-    def _forget_those_who_left(self) -> None:
-        """In an hour of traffic thousands come and go, and a frame's cost grows with all that are known."""
+    def _drop_absent(self) -> None:
+        """In an hour thousands of vehicles come and go, and a frame's cost grows with all that have slots."""
         kept = np.flatnonzero(~np.isnan(self._trail[:, : len(self._slots), 0]).all(0))
         self._slots.keep(kept)
         self._trail = self._trail[:, kept]

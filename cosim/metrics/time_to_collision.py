@@ -1,4 +1,4 @@
-"""Time to collision of AVs and mission vehicles with anybody: the smallest, and how long it was critical."""
+"""Time to collision of AVs and mission vehicles with others: the smallest, and how long it was critical."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ CRITICAL = 1.5  # s, the usual bound of a serious conflict (van der Horst 1990);
 
 
 class TimeToCollision:
-    """Swept oriented boxes at constant velocity; `min_ttc_s` is NA when nobody came within 10 s."""
+    """Swept oriented boxes at constant velocity; `min_ttc_s` is NA when no vehicle came within 10 s."""
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._conflicts = context.conflicts

@@ -1,5 +1,1 @@
-"""What each AV sees: VelocityMaps, kinematic matrices and their history."""
-
-from cosim.observation.observer import Observer
-
-__all__ = ["Observer"]
+"""What an AV observes: VelocityMaps, kinematic matrices, histories, and the view of an external agent."""

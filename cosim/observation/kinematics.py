@@ -11,29 +11,18 @@ from cosim.road import LaneGraph
 from cosim.types import HEADING, SPEED, Bools, Floats, Floats32, Ints, Snapshot, X, Y
 
 
-@compiled
-def perceived(
-    x: Floats,  # [n] m
-    y: Floats,  # [n] m
-    egos: npt.NDArray[np.int64],  # [B] rows of the AVs
-    reach: float,  # m, of one AV's own sensors
-    share: bool,  # V2V: allies pass on what they perceive
-    seen: Bools,  # [B,n] out
-) -> None:
-    """Who is perceived by whom."""
-    n = x.shape[0]
-    for b in range(egos.shape[0]):
-        for j in range(n):
-            dx, dy = x[j] - x[egos[b]], y[j] - y[egos[b]]
-            seen[b, j] = dx * dx + dy * dy <= reach * reach
-    if share:
-        for j in range(n):
-            anyone = False
-            for b in range(egos.shape[0]):
-                anyone = anyone or seen[b, j]
-            if anyone:
-                for b in range(egos.shape[0]):
-                    seen[b, j] = True
+def perceived(snapshot: Snapshot, egos: Ints, reach: float, share: bool) -> Bools:
+    """Which vehicles each AV perceives: [B,n].
+
+    Args:
+        snapshot: the n vehicles on the road.
+        egos: [B] rows of the AVs.
+        reach: m, of one AV's own sensors, measured between centres.
+        share: whether AVs pass on what they perceive (V2V): then all perceive the same.
+    """
+    x, y = snapshot.x, snapshot.y
+    near = (x - x[egos, None]) ** 2 + (y - y[egos, None]) ** 2 <= reach * reach
+    return near | near.any(0) if share else near
 
 
 @compiled
@@ -43,10 +32,10 @@ def choose_rows(
     egos: npt.NDArray[np.int64],  # [B]
     seen: Bools,  # [B,n]
     row_range: float,  # m
-    first: Bools,  # [B,n] who gets a row before all others
+    first: Bools,  # [B,n] which vehicles get a row before all others
     rows: npt.NDArray[np.int64],  # [B,R] out: vehicle of each row, -1 for none; row 0 the ego
 ) -> bool:
-    """The ego and the perceived vehicles within `row_range`, by distance; whether somebody found no row."""
+    """The ego and the perceived vehicles within `row_range`, by distance; whether a vehicle found no row."""
     n, wanted = x.shape[0], rows.shape[1]
     rank = np.empty(wanted, np.float64)  # squared distance, less a lot for those who come first
     full = False
@@ -87,7 +76,17 @@ def choose_rows(
 
 
 def never_left_out(snapshot: Snapshot, graph: LaneGraph, egos: Ints, reach: float) -> Bools:
-    """[B,n] the mission vehicles, and each ego's leader and follower along the lanes within `reach` m."""
+    """The vehicles that always get a row: mission vehicles, and each ego's leader and follower.
+
+    Args:
+        snapshot: the n vehicles.
+        graph: which lane follows which (`RoadMap.straight_on`).
+        egos: [B] rows of the AVs.
+        reach: m, how far ahead and behind along the lanes.
+
+    Returns:
+        [B,n] whether vehicle n is one of ego B's.
+    """
     first = np.repeat(snapshot.mission[None], len(egos), 0)
     gap, leader = gap_ahead(snapshot, graph, np.arange(snapshot.n), reach)
     for b, ego in enumerate(egos):
@@ -105,8 +104,8 @@ def fill_rows(
     slots: npt.NDArray[np.int64],  # [n] slot of each present vehicle
     rows: npt.NDArray[np.int64],  # [B,R]
     fixed: Floats,  # [n,4] length m, width m, is_av, is_mission
-    kinematics: Floats32,  # [B,N,R,8] out, KINEMATIC_FEATURES
-    valid: Bools,  # [B,N,R] out
+    kinematics: Floats32,  # [B,N,R,8] out, KINEMATIC_FEATURES; given as zeros
+    valid: Bools,  # [B,N,R] out; given as False
 ) -> None:
     """Every past frame of every row, in the ego's frame at the newest frame."""
     frames = past.shape[0]
@@ -117,21 +116,14 @@ def fill_rows(
         for r in range(rows.shape[1]):
             j = rows[b, r]
             if j < 0:
-                for k in range(frames):
-                    valid[b, k, r] = False
-                    for f in range(8):
-                        kinematics[b, k, r, f] = 0.0
                 continue
             slot = slots[j]
             turn = past[frames - 1, slot, HEADING] - h0
             base = (turn + np.pi) % (2 * np.pi) - np.pi - turn - h0  # newest heading in (-pi, pi]
             for k in range(frames):
-                here = not np.isnan(past[k, slot, X])
-                valid[b, k, r] = here
-                if not here:
-                    for f in range(8):
-                        kinematics[b, k, r, f] = 0.0
+                if np.isnan(past[k, slot, X]):
                     continue
+                valid[b, k, r] = True
                 dx, dy = past[k, slot, X] - x0, past[k, slot, Y] - y0
                 kinematics[b, k, r, X] = c * dx + s * dy
                 kinematics[b, k, r, Y] = c * dy - s * dx

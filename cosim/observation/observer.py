@@ -1,4 +1,4 @@
-"""Turns snapshots into one History per AV: the first station of every decision."""
+"""Turns snapshots into one History per AV: the first step of every decision."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from cosim.geometry.raster import RoadRaster, draw_snapshot, rasterize_road
 from cosim.observation.kinematics import choose_rows, fill_rows, never_left_out, perceived
 from cosim.observation.past import KinematicPast, MapPast
 from cosim.road import RoadMap
-from cosim.types import KINEMATIC_FEATURES, Bools, History, Ints, Kind, ObservationConfig, Snapshot
+from cosim.types import KINEMATIC_FEATURES, History, Ints, Kind, ObservationConfig, Snapshot
 
 RouteOf = Callable[[str], tuple[str, ...]]  # AV id -> edges ahead, the present one first
 CommandOf = Callable[[str], tuple[float | None, int]]  # AV id -> target speed m/s, lane change under way
@@ -18,6 +18,10 @@ CommandOf = Callable[[str], tuple[float | None, int]]  # AV id -> target speed m
 
 class Observer:
     """Holds the past of one episode. `add` once per frame, `histories` once per decision.
+
+    Args:
+        road: the net, for the road channel and the routes ahead.
+        config: sizes and ranges; a History has N = `config.frames` frames and R = `config.rows` rows.
 
     Arrays inside a History are views or fresh copies that stay valid for at least N further frames.
     """
@@ -30,41 +34,44 @@ class Observer:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything: a new episode begins."""
+        """Clear the past: a new episode begins."""
         self._past = KinematicPast(self._config.frames)
         if self._maps is not None:
             self._maps.clear()
         self._newest: Snapshot | None = None
 
     def add(self, snapshot: Snapshot) -> None:
-        """Append one frame: the kinematics of all, the maps of every AV on the road."""
+        """Append one frame: the kinematics of all vehicles, the maps of every AV on the road."""
         self._past.add(snapshot)
         self._newest = snapshot
         self._egos: Ints = np.flatnonzero(snapshot.kind == int(Kind.AV))
         c = self._config
-        self._seen: Bools = np.zeros((len(self._egos), snapshot.n), np.bool_)
-        perceived(snapshot.x, snapshot.y, self._egos, c.perception_range, c.share_perception, self._seen)
+        self._seen = perceived(snapshot, self._egos, c.perception_range, c.share_perception)
         if self._maps is None or self._raster is None:
             return
-        avs = [snapshot.ids[i] for i in self._egos]
-        block, slots = self._maps.next_frame(avs)
+        block, slots = self._maps.next_frame(tuple(snapshot.ids[i] for i in self._egos))
         draw_snapshot(block, slots, snapshot, self._egos, self._seen, self._raster, c)
 
     def histories(self, route: RouteOf, commanded: CommandOf) -> dict[str, History]:
-        """One History per AV on the road, at the newest frame."""
+        """One History per AV on the road, at the newest frame (AVs off every lane are left out).
+
+        Args:
+            route: AV id -> the edges ahead of it (`Simulator.route`).
+            commanded: AV id -> its target speed and lane change under way (`Simulator.commanded`).
+        """
         s, c = self._newest, self._config
         if s is None or not len(self._egos):
             return {}
         count = len(self._egos)
         rows = np.empty((count, c.rows), np.int64)
-        nobody = np.zeros((count, s.n), np.bool_)
-        if choose_rows(s.x, s.y, self._egos, self._seen, c.row_range, nobody, rows):
+        none = np.zeros((count, s.n), np.bool_)
+        if choose_rows(s.x, s.y, self._egos, self._seen, c.row_range, none, rows):
             first = never_left_out(s, self._road.straight_on, self._egos, c.row_range)
             choose_rows(s.x, s.y, self._egos, self._seen, c.row_range, first, rows)
-        kinematics = np.empty((count, c.frames, c.rows, len(KINEMATIC_FEATURES)), np.float32)
-        valid = np.empty((count, c.frames, c.rows), np.bool_)
+        kinematics = np.zeros((count, c.frames, c.rows, len(KINEMATIC_FEATURES)), np.float32)
+        valid = np.zeros((count, c.frames, c.rows), np.bool_)
         fixed = np.stack([s.length, s.width, s.kind == int(Kind.AV), s.mission], axis=1).astype(np.float64)
-        fill_rows(self._past.view, self._past.slots, rows, fixed, kinematics, valid)
+        fill_rows(self._past.window, self._past.slots, rows, fixed, kinematics, valid)
         lanes = np.where(rows >= 0, s.lane[rows], -1).astype(np.int32)  # [B,R]
         positions = np.where(rows >= 0, s.lane_position[rows], 0.0)  # [B,R] m
         pose = np.stack([s.x, s.y, s.heading], axis=1)[self._egos]  # [B,3]

@@ -1,4 +1,4 @@
-"""What an agent outside the simulation's process sees of one AV, and how it crosses the pipe cheaply.
+"""What an agent outside the simulation's process sees of one AV, and how it is sent there in few bytes.
 
 A `History` carries the lane paths of its route: too much to pickle at every decision. A `View` holds what
 an agent needs of them as plain arrays, and of the N maps only the new ones cross (`Unpacker` keeps the rest).
@@ -67,7 +67,12 @@ class Packer:
         self._sent: frozenset[str] = frozenset()
 
     def pack(self, histories: Mapping[str, History], fresh: int | None) -> Packed:
-        """`fresh`: frames since the last packing; None sends whole histories (a new episode)."""
+        """The views of all AVs, to be sent to the other side.
+
+        Args:
+            histories: AV id -> its history at this decision.
+            fresh: frames since the last packing; None sends whole histories (a new episode).
+        """
         avs = tuple(histories)
         known = [name for name in avs if fresh is not None and name in self._sent]
         newcomers = tuple(name for name in avs if name not in known)
@@ -75,16 +80,23 @@ class Packer:
         everyone = list(histories.values())
         empty = np.zeros((0, 0, 0, 0, 0), np.uint8)
         lines, exists = _lines(everyone)
-        keep = fresh or 0
+        numbers = [
+            (
+                *(*h.pose, h.target_speed, h.lane_changing, h.route.speed_limit),
+                *map(h.route.to_end, range(len(SIDES))),
+                *(h.route.conflict_distance, h.time),
+            )
+            for h in everyone
+        ]
         return Packed(
             avs=avs,
-            maps=np.stack([histories[n].velocity_map[-keep:] for n in known]) if known else empty,
+            maps=np.stack([histories[n].velocity_map[-(fresh or 0) :] for n in known]) if known else empty,
             new_maps=np.stack([histories[n].velocity_map for n in newcomers]) if newcomers else empty,
             newcomers=newcomers,
             kinematics=np.stack([h.kinematics for h in everyone]) if everyone else empty.astype(np.float32),
             valid=np.stack([h.valid for h in everyone]) if everyone else empty.astype(np.bool_),
             ids=tuple(h.ids for h in everyone),
-            numbers=np.array([_numbers(h) for h in everyone], np.float64).reshape(-1, 11),
+            numbers=np.array(numbers, np.float64).reshape(-1, 11),
             lanes=exists,
             lines=lines,
         )
@@ -132,20 +144,6 @@ class Unpacker:
 def views(histories: Mapping[str, History]) -> dict[str, View]:
     """What an agent in the simulation's own process sees: AV id -> View."""
     return Unpacker().unpack(Packer().pack(histories, None))
-
-
-def _numbers(h: History) -> tuple[float, ...]:
-    route = h.route
-    ends = (route.to_end(0), route.to_end(1), route.to_end(2))
-    return (
-        *h.pose,
-        h.target_speed,
-        h.lane_changing,
-        route.speed_limit,
-        *ends,
-        route.conflict_distance,
-        h.time,
-    )
 
 
 def _lines(histories: list[History]) -> tuple[Floats32, Bools]:

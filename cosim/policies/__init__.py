@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from cosim.errors import BadInput
-from cosim.policies.own import load, own
+from cosim.policies.own import own
 from cosim.scenario.policy_name import WEIGHTS, read
 from cosim.types import Policy
 from policy import agents
@@ -27,7 +27,7 @@ def check(text: str) -> None:
 
         config(Path(name.place))
     else:
-        load(name)
+        name.code.load("--policy")
 
 
 def make(text: str) -> Policy:

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import hashlib
-import importlib
-import importlib.util
 import inspect
 import operator
-import sys
-import traceback
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
-from cosim.errors import BadInput, CosimError, hint
+from cosim.errors import BadInput
+from cosim.files.code import guarded
 from cosim.observation.view import View, views
 from cosim.scenario.policy_name import PolicyName
 from cosim.types import COMPACT, Decision, History, MetaAction, ObservationConfig, PolicyContext
@@ -31,7 +26,8 @@ class OwnPolicy:
     Raises BadInput whenever his code raises or answers something else, naming the file and line.
     """
 
-    def __init__(self, inner: Any, name: PolicyName, file: Path | None) -> None:
+    def __init__(self, inner: Any, name: PolicyName) -> None:
+        file = name.code.file()
         self._inner, self._place = inner, file or name.place
         lacking = [field for field in NEEDED if not hasattr(inner, field)]
         if lacking:
@@ -47,7 +43,7 @@ class OwnPolicy:
                 raise self._wrong(
                     "must map SUMO's parameters to text", f"{name.member}.av_parameters", (key, value)
                 )
-        more = self._guard("files", lambda: [Path(f) for f in getattr(inner, "files", ())])
+        more = guarded(self._place, "files", lambda: [Path(f) for f in getattr(inner, "files", ())])
         for path in more:
             if not path.is_file():
                 raise self._wrong("no such file", f"{name.member}.files", str(path))
@@ -55,11 +51,11 @@ class OwnPolicy:
 
     def reset(self, context: PolicyContext) -> None:
         """A new episode begins."""
-        self._guard("reset", self._inner.reset, context)
+        guarded(self._place, "reset", self._inner.reset, context)
 
     def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
         """One decision per AV he wants to command."""
-        answer = self._guard("decide", self._inner.decide, histories)
+        answer = guarded(self._place, "decide", self._inner.decide, histories)
         if not isinstance(answer, Mapping):
             raise self._wrong("must return a mapping of AV to decision", "decide", type(answer).__name__)
         found = {}
@@ -77,14 +73,6 @@ class OwnPolicy:
         except (TypeError, ValueError):
             problem = f"must decide for a Decision, a MetaAction ({ACTIONS}) or None"
             raise self._wrong(problem, "decide", value) from None
-
-    def _guard(self, what: str, call: Callable[..., Any], *arguments: Any) -> Any:
-        try:
-            return call(*arguments)
-        except CosimError:
-            raise
-        except (Exception, SystemExit) as error:
-            raise raised(error, self._place, what) from error
 
     def _wrong(self, problem: str, field: str, value: object = None) -> BadInput:
         return BadInput(problem, file=self._place, field=field, value=value)
@@ -108,39 +96,15 @@ class PerVehicle:
         return {av: self._act(view) for av, view in views(histories).items()}
 
 
-def load(name: PolicyName) -> tuple[Any, Path | None]:
-    """The class, factory or function that `name` stands for, and the file it is in.
-
-    Raises BadInput: it cannot be imported, or has nothing of that name that can be called.
-    """
-    module = _module(name)
-    found = getattr(module, name.member, None)
-    if not callable(found):
-        known = [n for n, value in vars(module).items() if callable(value) and not n.startswith("_")]
-        problem = f"nothing to call of this name{hint(name.member, known)}"
-        raise BadInput(problem, file=name.place, field="--policy", value=name.member)
-    file = getattr(module, "__file__", None)
-    return found, Path(file) if file else None
-
-
 def own(name: PolicyName) -> OwnPolicy:
     """A fresh policy of the user's.
 
-    Raises BadInput as `load`, and when its class or factory cannot be called.
+    Raises BadInput: it cannot be imported, there is nothing of that name, it cannot be called.
     """
-    found, file = load(name)
-    try:
-        inner = PerVehicle(found) if _takes_one(found) else found()
-    except Exception as error:
-        raise raised(error, name.place, name.member) from error
-    return OwnPolicy(inner, name, file)
-
-
-def raised(error: BaseException, place: object, what: str) -> BadInput:
-    """What his code raised, in one line; of a file of his the deepest line that is in it."""
-    lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == str(place)]
-    where = f"{place}:{lines[-1]}" if lines else place
-    return BadInput(f"{type(error).__name__}: {error}", file=where, field=what)
+    found = name.code.load("--policy")
+    if _takes_one(found):
+        return OwnPolicy(PerVehicle(found), name)
+    return OwnPolicy(guarded(name.place, name.member, found), name)
 
 
 def _takes_one(found: Any) -> bool:
@@ -149,28 +113,3 @@ def _takes_one(found: Any) -> bool:
         return False
     needed = [p for p in inspect.signature(found).parameters.values() if p.default is p.empty]
     return bool([p for p in needed if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)])
-
-
-def _module(name: PolicyName) -> ModuleType:
-    """A file is imported once a process, with its folder on the path, as if it were run."""
-    try:
-        if not name.place.endswith(".py"):
-            return importlib.import_module(name.place)
-        path = Path(name.place)
-        known = f"cosim_own_{path.stem}_{hashlib.sha256(name.place.encode()).hexdigest()[:8]}"
-        if known in sys.modules:
-            return sys.modules[known]
-        spec = importlib.util.spec_from_file_location(known, path)
-        assert spec is not None and spec.loader is not None  # noqa: PT018
-        module = importlib.util.module_from_spec(spec)
-        if str(path.parent) not in sys.path:
-            sys.path.insert(0, str(path.parent))
-        sys.modules[known] = module  # dataclasses and pickle look there
-        try:
-            spec.loader.exec_module(module)
-        except BaseException:
-            del sys.modules[known]
-            raise
-        return module
-    except Exception as error:
-        raise raised(error, name.place, "import") from error

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from cosim.errors import BadInput
-from cosim.files.dataclass_input import dataclass_from
+from cosim.files.yaml_input import dataclass_from
 from cosim.scenario.policy_name import PolicyName
 from cosim.types import COMPACT, PAPER, ObservationConfig
 from policy.agents.approaches import APPROACHES, AgentConfig, configure, shipped

@@ -2,15 +2,16 @@
 
 from cosim.recording.file import Recording, read, write
 from cosim.recording.folder import Folder
-from cosim.recording.replay import Tracks, Windows, histories, tracks, windows
-from cosim.recording.tape import Knowledge, RecordingSimulator, Tape
+from cosim.recording.recorder import DRAWN, Choice, Knowledge, Recorder
+from cosim.recording.views import Tracks, Windows, histories, tracks, windows
 
 __all__ = [
+    "DRAWN",
+    "Choice",
     "Folder",
     "Knowledge",
+    "Recorder",
     "Recording",
-    "RecordingSimulator",
-    "Tape",
     "Tracks",
     "Windows",
     "histories",

@@ -15,8 +15,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from cosim.errors import BadInput
-from cosim.files import whole
-from cosim.recording.tape import Knowledge, Tape
+from cosim.files import cannot, whole
+from cosim.recording.recorder import Knowledge, Recorder
 from cosim.types import Collision, Events, Snapshot
 
 FORMAT = "cosim-recording-1"
@@ -94,70 +94,54 @@ class Recording:
         return np.lexsort((self.table["vehicle"], self.table["frame"]))
 
 
-def write(path: Path, tape: Tape, case: Mapping[str, Any]) -> None:
-    """Write one episode to `path`; until it is whole it has another name. Raises BadInput."""
-    ids = sorted({name for frame in tape.frames for name in frame.ids})
-    place = {name: i for i, name in enumerate(ids)}
-    routes: dict[tuple[str, ...], int] = {}
-    columns: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in SCHEMA.names}
-    for k, s in enumerate(tape.frames):
-        knowledge = [tape.known.get(k, {}).get(name) for name in s.ids]
-        columns["frame"].append(np.full(s.n, k, np.int32))
-        columns["vehicle"].append(np.array([place[name] for name in s.ids], np.int32))
-        columns["route"].append(
-            np.array([-1 if a is None else routes.setdefault(a.route, len(routes)) for a in knowledge])
-        )
-        columns["target_speed"].append(
-            np.array([np.nan if a is None or a.target_speed is None else a.target_speed for a in knowledge])
-        )
-        columns["lane_changing"].append(np.array([0 if a is None else a.lane_changing for a in knowledge]))
-        for name in (*WHOLE, *REAL):
-            columns[name].append(getattr(s, name))
-    joined = {name: np.concatenate(parts) for name, parts in columns.items()}
-    order = np.lexsort((joined["frame"], joined["vehicle"]))  # a vehicle's frames together compress best
-    arrays = []
-    for field in SCHEMA:
-        values = joined[field.name][order]
-        hidden = None
-        if field.name == "route":
-            hidden = values < 0
-        elif field.name == "target_speed":
-            hidden = np.isnan(values)
-        arrays.append(pa.array(values.astype(str(field.type)), field.type, mask=hidden))
-    events = {str(k): asdict(s.events) for k, s in enumerate(tape.frames) if any(asdict(s.events).values())}
+def write(path: Path, recorder: Recorder, case: Mapping[str, Any]) -> None:
+    """Write the recorded episode to `path`; until it is whole it has another name. Raises BadInput."""
+    columns: dict[str, npt.NDArray[Any]]
+    ids, frame, vehicle, columns = recorder.vehicles(*WHOLE, *REAL)
+    empty = Knowledge((), float("nan"))  # of whoever decides nothing
+    known = [recorder.known.get(k, {}).get(ids[i]) for k, i in zip(frame, vehicle, strict=True)]
+    routes = {r: k for k, r in enumerate(dict.fromkeys(a.route for a in known if a is not None))}
+    columns |= {"frame": frame, "vehicle": vehicle}
+    columns["route"] = np.array([-1 if a is None else routes[a.route] for a in known], np.int64)
+    each = [a or empty for a in known]
+    columns["target_speed"] = np.array([a.target_speed for a in each], np.float64)  # None is nan
+    columns["lane_changing"] = np.array([a.lane_changing for a in each], np.int64)
+    hidden = {"route": columns["route"] < 0, "target_speed": np.isnan(columns["target_speed"])}
+    arrays = [
+        pa.array(columns[field.name].astype(str(field.type)), field.type, mask=hidden.get(field.name))
+        for field in SCHEMA
+    ]
+    frames = recorder.frames
+    events = {str(k): asdict(s.events) for k, s in enumerate(frames) if any(asdict(s.events).values())}
     about = {
         "format": FORMAT,
         "case": dict(case),
-        "times": [s.time for s in tape.frames],
-        "first": tape.first,
+        "times": [s.time for s in frames],
+        "first": recorder.first,
         "ids": ids,
         "routes": list(routes),
         "events": events,
     }
     table = pa.Table.from_arrays(arrays, schema=SCHEMA.with_metadata({"cosim": json.dumps(about)}))
-    try:
-        with whole(path) as draft:
-            pq.write_table(
-                table,
-                draft,
-                compression="zstd",
-                use_dictionary=[n for n in SCHEMA.names if n not in REAL],
-                use_byte_stream_split=list(REAL),
-            )
-    except OSError as error:
-        raise BadInput(f"cannot write: {error.strerror}", file=path) from None
+    with cannot("write", file=path), whole(path) as draft:
+        pq.write_table(
+            table,
+            draft,
+            compression="zstd",
+            use_dictionary=[n for n in SCHEMA.names if n not in REAL],
+            use_byte_stream_split=list(REAL),
+        )
 
 
 def read(path: Path) -> Recording:
     """Read one episode. Raises BadInput when the file is not a recording."""
     try:
-        file = pq.ParquetFile(path)
-        about = json.loads((file.schema_arrow.metadata or {}).get(b"cosim", b"null"))
-        if not isinstance(about, dict) or about.get("format") != FORMAT:
-            raise BadInput(f"not a recording of format {FORMAT}", file=path)
-        table = file.read()
-    except OSError as error:
-        raise BadInput(f"cannot read: {error}", file=path) from None
+        with cannot("read", file=path):
+            file = pq.ParquetFile(path)
+            about = json.loads((file.schema_arrow.metadata or {}).get(b"cosim", b"null"))
+            if not isinstance(about, dict) or about.get("format") != FORMAT:
+                raise BadInput(f"not a recording of format {FORMAT}", file=path)
+            table = file.read()
     except (pa.ArrowException, ValueError) as error:
         raise BadInput(f"not a recording: {error}", file=path) from None
     fill = {"route": -1, "target_speed": float("nan")}

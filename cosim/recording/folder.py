@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cosim.errors import BadInput
-from cosim.files import whole
+from cosim.files import cannot, read_json, whole
 from cosim.recording import roads
 from cosim.recording.file import FORMAT, Recording, read
 from cosim.road import RoadMap
@@ -32,13 +32,9 @@ class Folder:
 
     def prepare(self) -> None:
         """Make the folder. Raises BadInput."""
-        try:
+        with cannot("make this folder", field="--out", value=str(self.path)):
             for part in ("episodes", "roads"):
                 (self.path / part).mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise BadInput(
-                f"cannot make this folder: {error.strerror}", field="--out", value=str(self.path)
-            ) from None
 
     def episode_file(self, key: str) -> Path:
         return self.path / "episodes" / f"{key}.parquet"
@@ -52,13 +48,8 @@ class Folder:
 
     def manifest(self) -> dict[str, Any]:
         """Raises BadInput when this is not a folder of recordings."""
-        try:
-            found = json.loads(self.manifest_file.read_text())
-        except OSError:
-            raise BadInput("not a folder of recordings (no manifest.json)", file=self.path) from None
-        except ValueError as error:
-            raise BadInput(f"not JSON: {error}", file=self.manifest_file) from None
-        if not isinstance(found, dict) or found.get("format") != FORMAT:
+        found = read_json(self.manifest_file, "not a folder of recordings (no manifest.json)")
+        if found.get("format") != FORMAT:
             raise BadInput(f"not a folder of recordings of format {FORMAT}", file=self.manifest_file)
         return found
 
@@ -94,8 +85,6 @@ class Folder:
 
 
 def _write_whole(file: Path, text: str) -> None:
-    try:
-        with whole(file, contended=True) as draft:  # two workers may store the same road
-            draft.write_text(text)
-    except OSError as error:
-        raise BadInput(f"cannot write: {error.strerror}", file=file) from None
+    # two workers may store the same road
+    with cannot("write", file=file), whole(file, contended=True) as draft:
+        draft.write_text(text)

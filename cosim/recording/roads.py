@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from cosim.errors import BadInput
+from cosim.files import read_json
 from cosim.road import ConflictZone, Lane, RoadMap
 
 FORMAT = "cosim-road-1"
@@ -48,8 +49,8 @@ def text(road: RoadMap) -> str:
 
 def read_road(file: Path) -> RoadMap:
     """Raises BadInput when the file is not such a document."""
+    found = read_json(file)
     try:
-        found = json.loads(file.read_text())
         if found["format"] != FORMAT:
             raise BadInput(f"not a road of format {FORMAT}", file=file, field="format")
         lanes = tuple(
@@ -58,7 +59,5 @@ def read_road(file: Path) -> RoadMap:
         )
         zones = tuple(ConflictZone(zone["name"], frozenset(zone["lanes"])) for zone in found["zones"])
         return RoadMap(lanes, zones, tuple(np.array(outline, float) for outline in found["junctions"]))
-    except OSError as error:
-        raise BadInput(f"cannot read the road: {error.strerror}", file=file) from None
     except (ValueError, KeyError, TypeError) as error:
         raise BadInput(f"not a recorded road: {error}", file=file) from None

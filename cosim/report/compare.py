@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache
 from typing import Any
+
+import numpy as np
 
 from cosim.errors import BadInput
 from cosim.report import wording
 from cosim.report.figures import Measure, Row
 from cosim.report.pairing import Group, Side, pair, title
 from cosim.report.statistics import (
-    NA,
     Figure,
     discordant,
     mcnemar,
@@ -73,13 +75,11 @@ class PairedFigures(Mapping[str, PairedFigure]):
     """Every measure of a group by name, each bootstrapped when it is first asked for."""
 
     def __init__(self, known: Mapping[str, Measure], pairs: Sequence[tuple[Row, Row]], seed: int) -> None:
-        self._known, self._pairs, self._seed = known, pairs, seed
-        self._found: dict[str, PairedFigure] = {}
+        self._known = known
+        self._figure = cache(lambda name: paired(known[name], pairs, seed))
 
     def __getitem__(self, name: str) -> PairedFigure:
-        if name not in self._found:
-            self._found[name] = paired(self._known[name], self._pairs, self._seed)
-        return self._found[name]
+        return self._figure(name)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._known)
@@ -93,17 +93,8 @@ class Compared:
     """One group of pairs with its figures."""
 
     group: Group
-    known: dict[str, Measure]
+    figures: PairedFigures
     seed: int  # of the bootstrap
-
-    @cached_property
-    def figures(self) -> PairedFigures:
-        """Every measure by name."""
-        return PairedFigures(self.known, self.group.pairs, self.seed)
-
-    def check(self, threshold: Threshold) -> Check:
-        """Hold one threshold against the group."""
-        return Check(threshold, self.group, *_judge(threshold, self))
 
 
 @dataclass(frozen=True)
@@ -119,29 +110,25 @@ class Comparison:
     @property
     def exit_code(self) -> int:
         """0 passed, 1 a threshold failed, 2 input refused, 3 simulations failed among the compared."""
-        if any(g.group.refused for g in self.groups):
-            return 2
-        if any(g.group.failed for g in self.groups):
-            return 3
-        return int(any(check.status == FAILED for check in self.checks))
+        return self._judged[0]
 
     @property
     def verdict(self) -> str:
         """The same in words."""
-        refused = sum(len(g.group.refused) for g in self.groups)
-        failed = sum(len(g.group.failed) for g in self.groups)
-        if refused:
-            return f"no verdict: {refused} compared episodes had bad input"
-        if failed:
-            return f"no verdict: {failed} of the compared simulations crashed or timed out"
-        if not self.checks:
-            return "compared, no threshold was given"
-        bad = sum(check.status == FAILED for check in self.checks)
-        if bad:
-            return f"failed: {bad} of {len(self.checks)} checks"
-        skipped = sum(check.status == SKIPPED for check in self.checks)
-        passed = f"passed: {len(self.checks) - skipped} of {len(self.checks)} checks"
-        return f"{passed}, {skipped} do not apply" if skipped else passed
+        return self._judged[1]
+
+    @property
+    def _judged(self) -> tuple[int, str]:
+        if refused := sum(len(g.group.refused) for g in self.groups):
+            return 2, f"no verdict: {refused} compared episodes had bad input"
+        if failed := sum(len(g.group.failed) for g in self.groups):
+            return 3, f"no verdict: {failed} of the compared simulations crashed or timed out"
+        count = Counter(check.status for check in self.checks)
+        if count[FAILED]:
+            return 1, f"failed: {count[FAILED]} of {len(self.checks)} checks"
+        passed = f"passed: {count[PASSED]} of {len(self.checks)} checks" if count else ""
+        skipped = f", {count[SKIPPED]} do not apply" if count[SKIPPED] else ""
+        return 0, passed + skipped or "compared, no threshold was given"
 
 
 def compare(
@@ -157,11 +144,10 @@ def compare(
     known = {**b.run.measures, **a.run.measures}
     thresholds = [parse(text, known) for text in fail_on]
     found, alone = pair(a, b, across)
-    groups = [Compared(group, known, seed) for group in found]
-    checks = [group.check(threshold) for group in groups for threshold in thresholds]
+    groups = [Compared(group, PairedFigures(known, group.pairs, seed), seed) for group in found]
+    checks = [Check(t, compared.group, *_judge(t, compared)) for compared in groups for t in thresholds]
     for threshold in thresholds:
-        mine = [check for check in checks if check.threshold is threshold]
-        if all(check.status == SKIPPED for check in mine):
+        if all(check.status == SKIPPED for check in checks if check.threshold is threshold):
             problem = f"{threshold.measure.name} is NA in every compared episode"
             raise BadInput(problem, field="--fail-on", value=threshold.text)
     return Comparison(title(a), title(b), groups, checks, alone)
@@ -169,17 +155,16 @@ def compare(
 
 def paired(measure: Measure, pairs: Sequence[tuple[Row, Row]], seed: int = 0) -> PairedFigure:
     """One measure over the pairs; those in which it is NA on either side are left out, and counted."""
-    before, after = (measure.values(rows) for rows in ([a for a, _ in pairs], [b for _, b in pairs]))
-    both = [(x, y) for x, y in zip(before, after, strict=True) if not math.isnan(x) and not math.isnan(y)]
-    neither = sum(math.isnan(x) and math.isnan(y) for x, y in zip(before, after, strict=True))
-    n, na = len(both), len(pairs) - len(both)
-    x, y = [x for x, _ in both], [y for _, y in both]
+    values = np.array([measure.values([pair[k] for pair in pairs]) for k in (0, 1)])  # [2,pairs]
+    missing = np.isnan(values)
+    x, y = values[:, ~missing.any(0)]
+    n, na, neither = len(x), len(pairs) - len(x), int(missing.all(0).sum())
     if not measure.is_rate:
         difference = paired_mean(x, y, seed)
         return PairedFigure(measure, mean(x, seed), mean(y, seed), difference, n, na, neither)
-    was, now = [v > 0 for v in x], [v > 0 for v in y]
-    hits = (sum(was), sum(now))
-    difference = paired_share(was, now) if n else NA
+    was, now = x > 0, y > 0
+    hits = (int(was.sum()), int(now.sum()))
+    difference = paired_share(was, now)
     p = mcnemar(*discordant(was, now)) if n else None
     return PairedFigure(measure, share(hits[0], n), share(hits[1], n), difference, n, na, neither, hits, p)
 

@@ -7,7 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from cosim.batch.records import IDENTITY, LAST
+from cosim.batch import records
+from cosim.report.result import FIRST
 
 Row = Mapping[str, Any]  # one episode: a line of episodes.parquet, NA as None
 
@@ -31,14 +32,8 @@ class Measure:
 
     def values(self, rows: Sequence[Row]) -> list[float]:
         """The figure in each row, nan for NA; of a rate 1.0 or 0.0."""
-        found = []
-        for row in rows:
-            value = row.get(self.column)
-            if value is None or (isinstance(value, float) and math.isnan(value)):
-                found.append(math.nan)
-            else:
-                found.append(float(value > 0) if self.is_rate else float(value))
-        return found
+        found = [math.nan if row.get(self.column) is None else float(row[self.column]) for row in rows]
+        return [float(x > 0) if self.is_rate and not math.isnan(x) else x for x in found]
 
 
 # Shares of episodes, by the name that thresholds and tables use.
@@ -53,25 +48,15 @@ RATES: dict[str, Measure] = {
     )
 }
 
-HEADLINE = (
-    "collision_rate",
-    "av_caused_collision_rate",
-    "mission_success_rate",
-    "dt_mission_m",
-    "dt_av_m",
-    "dt_mean_m",
-    "min_ttc_s",
-    "hard_brakings_av",
-    "veto_rate",
-)
+HEADLINE = tuple(filter(None, FIRST.values()))  # what reports and comparisons show first
 
 TIMINGS = ("reset_s", "simulation_s", "observation_s", "decision_s", "total_s")  # wall time: never repeatable
 
 # What identifies, explains or times an episode, but measures nothing of the traffic.
 _NOT_FIGURES = frozenset(
     (
-        *IDENTITY,
-        *LAST,
+        *records.FIRST,
+        *records.LAST,
         "steps",
         "trace_hash",
         "timings",
@@ -91,23 +76,18 @@ def measures(
     give rates, of numbers means; so a metric that is new has its figure without being listed here.
     """
     units, better = units or {}, better or {}
-    kinds: dict[str, type] = {}
-    columns: dict[str, None] = {}
+    kinds: dict[str, set[type]] = {}  # of the values that are not NA
     for row in rows:
         for column, value in row.items():
-            columns[column] = None
-            if value is not None and kinds.get(column, int) is int:
-                kinds[column] = type(value)  # a column of 1 and 2.5 is one of floats
-    found = {m.name: m for m in RATES.values() if m.column in columns}
-    rated = {m.column for m in found.values() if kinds.get(m.column, bool) is bool}
+            kinds.setdefault(column, set()).update(() if value is None else (type(value),))
+    rates = {m.name: m for m in RATES.values() if m.column in kinds}
+    rated = {m.column for m in rates.values() if kinds[m.column] <= {bool}}
     means = {}
-    for column in columns:
-        if column in _NOT_FIGURES or column in TIMINGS or column in rated:
-            continue
-        if kinds.get(column) is bool:
+    for column in [c for c in kinds if c not in _NOT_FIGURES | rated | {*TIMINGS}]:
+        if kinds[column] == {bool}:
             name = f"{column}_rate"
-            found[name] = Measure(name, column, SHARE, better.get(column, ""), True)
-        elif kinds.get(column) in (int, float) or column in units:
+            rates[name] = Measure(name, column, SHARE, better.get(column, ""), True)
+        elif column in units or (kinds[column] and kinds[column] <= {int, float}):
             means[column] = Measure(column, column, units.get(column, ""), better.get(column, ""))
-    timings = {column: Measure(column, column, "s", "lower") for column in TIMINGS if column in columns}
-    return found | means | timings
+    timings = {column: Measure(column, column, "s", "lower") for column in TIMINGS if column in kinds}
+    return rates | means | timings

@@ -21,7 +21,7 @@ from cosim.report.summary import GROUP, not_comparable
 from cosim.workers.tasks import BAD_INPUT, OK
 
 PAIR = tuple(name for name in GROUP if name != "policy")
-ACROSS = ("behavior", "penetration", "preset", "svo_deg", "driver_model")  # what A and B may differ in
+ACROSS = tuple(name for name in PAIR if name not in ("scenario", "demand"))  # what A and B may differ in
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,20 +105,16 @@ def pair(a: Side, b: Side, across: Sequence[str] = ()) -> tuple[list[Group], tup
         if name not in ACROSS:
             raise BadInput(f"cannot be compared across{hint(name, ACROSS)}", field="--across", value=name)
     by_policy = _clear_policies(a, b)
-    if by_policy:
-        common = set(a.run.policies) & set(b.run.policies)
-        if not common:
-            problem = f"no policy in common: A has {_words(a.run.policies)}, B has {_words(b.run.policies)}"
-            raise BadInput(problem + "; choose with DIR:POLICY")
-    fields = tuple(name for name in PAIR if name not in across) + (("policy",) if by_policy else ())
+    if by_policy and not set(a.run.policies) & set(b.run.policies):
+        problem = f"no policy in common: A has {_words(a.run.policies)}, B has {_words(b.run.policies)}"
+        raise BadInput(problem + "; choose with DIR:POLICY")
+    fields = tuple(name for name in PAIR if name not in across) + ("policy",) * by_policy
     same_folder = a.run.path.resolve() == b.run.path.resolve()
     all_a, all_b = (_cells(one, fields, across, same_folder) for one in (a, b))
     groups = []
     for key, cells_a in all_a.items():
         for rows_a, rows_b in itertools.product(cells_a.values(), all_b.get(key, {}).values()):
-            seeds = sorted(rows_a.keys() & rows_b.keys())
-            if seeds:
-                pairs = [(rows_a[s], rows_b[s]) for s in seeds]
+            if pairs := [(rows_a[s], rows_b[s]) for s in sorted(rows_a.keys() & rows_b.keys())]:
                 groups.append(_group(pairs, fields, (len(rows_a), len(rows_b))))
     if not groups:
         raise BadInput(_why_none(all_a, all_b, fields))
@@ -142,10 +138,8 @@ _Key = tuple[Any, ...]
 def _clear_policies(a: Side, b: Side) -> bool:
     """Whether each policy is paired with itself; otherwise each side is of one policy."""
     several = [one.policy is None and len(one.run.policies) > 1 for one in (a, b)]
-    if not any(several):
-        return False
-    if a.policy is None and b.policy is None and all(several):
-        return True
+    if all(several) or not any(several):
+        return all(several)
     name, one = ("A", a) if several[0] else ("B", b)
     problem = f"{name} holds several policies, choose one with DIR:POLICY: {_words(one.run.policies)}"
     raise BadInput(problem, value=str(one.run.path))
@@ -164,7 +158,7 @@ def _cells(one: Side, fields: tuple[str, ...], across: Sequence[str], same_folde
         if one.policy is not None and row["policy"] != one.policy:
             continue
         key: _Key = tuple(row.get(name) for name in fields)
-        if same_folder:  # then files can be told apart even where their names are equal
+        if same_folder:  # then files are distinguished even where their names are equal
             case = {k: v for k, v in one.run.case(row).items() if k not in (*across, "outputs")}
             key += (json.dumps(case, sort_keys=True),)
         rows = found.setdefault(key, {}).setdefault(tuple(row.get(name) for name in across), {})
@@ -176,19 +170,19 @@ def _cells(one: Side, fields: tuple[str, ...], across: Sequence[str], same_folde
 
 
 def _group(pairs: list[tuple[Row, Row]], fields: tuple[str, ...], episodes: tuple[int, int]) -> Group:
-    first_a, first_b = pairs[0]
-    differing = [n for n in PAIR if n not in fields and first_a.get(n) != first_b.get(n)]
+    first, second = pairs[0]
+    differing = [n for n in PAIR if n not in fields and first.get(n) != second.get(n)]
     drivers = [
         {
             "policy": row["policy"],
             "policy_label": next((p[k]["policy_label"] for p in pairs if p[k].get("policy_label")), ""),
             **{name: row.get(name) for name in differing},
         }
-        for k, row in enumerate((first_a, first_b))
+        for k, row in enumerate(pairs[0])
     ]
     wrong = [row for pair in pairs for row in pair if row["status"] != OK]
     return Group(
-        identity={n: first_a.get(n) for n in PAIR if n not in differing},
+        identity={n: first.get(n) for n in PAIR if n not in differing},
         a=drivers[0],
         b=drivers[1],
         pairs=[(x, y) for x, y in pairs if x["status"] == OK and y["status"] == OK],

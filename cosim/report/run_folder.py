@@ -1,9 +1,8 @@
-"""Reads back what `cosim evaluate` left in a run folder: its rows and its manifest."""
+"""What `cosim evaluate` leaves in a run folder, written and read back: rows, manifest, summary."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -12,9 +11,13 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet
 
+from cosim.batch import export as files
 from cosim.batch.store import FILE
 from cosim.errors import BadInput
+from cosim.files import read_json
 from cosim.report.figures import Measure, Row, measures
+from cosim.report.summary import summarize
+from cosim.scenario.manifest import checked
 from cosim.workers.tasks import OK
 
 NEEDED = ("key", "cell", "status", "scenario", "demand", "policy", "seed")
@@ -52,6 +55,16 @@ class Run:
         return {k: v for k, v in cell.get("case", {}).items() if k not in ("policy", "seed")}
 
 
+def export(folder: Path, rows: Sequence[Row], manifest: Mapping[str, Any], planned: int) -> dict[str, Any]:
+    """Write the rows, the manifest and their summary, which is returned; `planned`: episodes of the run.
+
+    Raises CosimError as `cosim.batch.export`.
+    """
+    summary = {"planned": planned} | summarize(rows, manifest["units"], manifest["better"])
+    files.export(folder, rows, manifest, summary)
+    return summary
+
+
 def read(path: str | Path) -> Run:
     """The run in the folder `path`.
 
@@ -63,10 +76,9 @@ def read(path: str | Path) -> Run:
         raise BadInput("no such run folder", value=str(path))
     file = folder / "episodes.parquet"
     if not file.is_file():
-        problem = "holds no episodes.parquet: is it a run of `cosim evaluate`?"
         if (folder / FILE).is_file():
-            problem = f"is not finished: `cosim evaluate --resume --out {folder}` goes on"
-        raise BadInput(problem, file=folder)
+            raise BadInput(f"is not finished: `cosim evaluate --resume --out {folder}` goes on", file=folder)
+        raise BadInput("holds no episodes.parquet: is it a run of `cosim evaluate`?", file=folder)
     try:
         rows: list[dict[str, Any]] = pa.parquet.read_table(file).to_pylist()
     except (pa.ArrowException, OSError) as error:
@@ -74,20 +86,10 @@ def read(path: str | Path) -> Run:
     for name in NEEDED:
         if rows and name not in rows[0]:
             raise BadInput("has no such column: is it a run of `cosim evaluate`?", file=file, field=name)
-    return Run(folder, _named_alike(rows), _manifest(folder / "manifest.json"))
-
-
-def _manifest(file: Path) -> Mapping[str, Any]:
-    """The manifest; {} when there is none."""
-    if not file.is_file():
-        return {}
-    try:
-        found = json.loads(file.read_text(encoding="utf-8"))
-    except (ValueError, OSError) as error:
-        raise BadInput(f"cannot be read: {error}", file=file) from None
-    if not isinstance(found, dict):
-        raise BadInput("is not a manifest of ours", file=file)
-    return found
+    manifest = folder / "manifest.json"
+    return Run(
+        folder, _named_alike(rows), checked(read_json(manifest), manifest) if manifest.is_file() else {}
+    )
 
 
 def _named_alike(rows: list[dict[str, Any]]) -> list[Row]:

@@ -9,6 +9,7 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +22,7 @@ RESAMPLES = 2000  # the bounds of a mean then wander by some 2 % of the interval
 BATCH = 2_000_000  # resampled values held at once: 16 MB
 
 Array = npt.NDArray[np.float64]
+Bools = Sequence[bool] | npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,14 +87,12 @@ def mean(values: Sequence[float] | Array, seed: int = 0) -> Figure:
     Bounds: nan with fewer than two values; the value itself when all are equal (nothing to resample).
     `seed` fixes the resampling: equal values, equal figure.
     """
-    data = np.asarray(values, np.float64)
-    data = data[~np.isnan(data)]
-    return _bootstrap((data,), _mean, seed)
+    return _bootstrap((_known(values),), np.mean, seed)
 
 
 def quantile(values: Sequence[float] | Array, q: float) -> Figure:
     """A quantile of independent values with its order-statistic interval; nan values are left out."""
-    ordered = np.sort([v for v in values if not math.isnan(v)])
+    ordered = np.sort(_known(values))
     if len(ordered) < 2:
         return NA
     tail = (1.0 - CONFIDENCE) / 2.0
@@ -123,7 +123,7 @@ def median_of_blocks(samples: Sequence[tuple[int, float]]) -> Figure:
 # ---- pairs on equal seeds: entry i of `before` and of `after` is the same traffic ----
 
 
-def paired_share(before: Sequence[bool], after: Sequence[bool]) -> Figure:
+def paired_share(before: Bools, after: Bools) -> Figure:
     """Difference of two proportions, after - before, with Tango's score interval (1998).
 
     Unlike the usual ones it keeps its width when no pair differs, and its coverage at small counts.
@@ -132,10 +132,10 @@ def paired_share(before: Sequence[bool], after: Sequence[bool]) -> Figure:
     return _tango(gained, lost, len(before))
 
 
-def discordant(before: Sequence[bool], after: Sequence[bool]) -> tuple[int, int]:
+def discordant(before: Bools, after: Bools) -> tuple[int, int]:
     """How many pairs went from yes to no, and from no to yes."""
-    pairs = list(zip(before, after, strict=True))
-    return sum(b and not a for b, a in pairs), sum(a and not b for b, a in pairs)
+    b, a = np.asarray(before, np.bool_), np.asarray(after, np.bool_)
+    return int((b & ~a).sum()), int((a & ~b).sum())
 
 
 def mcnemar(lost: int, gained: int) -> float:
@@ -147,8 +147,8 @@ def mcnemar(lost: int, gained: int) -> float:
 
 def paired_mean(before: Sequence[float] | Array, after: Sequence[float] | Array, seed: int = 0) -> Figure:
     """Mean of the differences after - before, BCa bootstrap over pairs; pairs with a nan are left out."""
-    b, a = _complete(before, after)
-    return _bootstrap((a - b,), _mean, seed)
+    difference = np.asarray(after, np.float64) - np.asarray(before, np.float64)
+    return _bootstrap((_known(difference),), np.mean, seed)
 
 
 def paired_change(before: Sequence[float] | Array, after: Sequence[float] | Array, seed: int = 0) -> Figure:
@@ -156,7 +156,8 @@ def paired_change(before: Sequence[float] | Array, after: Sequence[float] | Arra
 
     inf or -inf when the mean before is 0 and that after is not; no bounds where a resample could say so.
     """
-    b, a = _complete(before, after)
+    both = np.array([before, after], np.float64)
+    b, a = both[:, ~np.isnan(both).any(0)]
     if len(b) and b.mean() == 0.0:
         change = 0.0 if a.mean() == 0.0 else math.copysign(math.inf, a.mean())
         return Figure(change, math.nan if change else 0.0, math.nan if change else 0.0)
@@ -166,14 +167,9 @@ def paired_change(before: Sequence[float] | Array, after: Sequence[float] | Arra
 # ---- inside ----
 
 
-def _complete(before: Sequence[float] | Array, after: Sequence[float] | Array) -> tuple[Array, Array]:
-    b, a = np.asarray(before, np.float64), np.asarray(after, np.float64)
-    both = ~(np.isnan(b) | np.isnan(a))
-    return b[both], a[both]
-
-
-def _mean(values: Array, axis: int = -1) -> Array:
-    return np.asarray(values.mean(axis=axis))
+def _known(values: Sequence[float] | Array) -> Array:
+    data = np.asarray(values, np.float64)
+    return data[~np.isnan(data)]
 
 
 def _change(before: Array, after: Array, axis: int = -1) -> Array:
@@ -181,15 +177,14 @@ def _change(before: Array, after: Array, axis: int = -1) -> Array:
         return np.asarray(after.mean(axis=axis) / before.mean(axis=axis) - 1.0)
 
 
-def _bootstrap(samples: tuple[Array, ...], statistic: Callable[..., Array], seed: int) -> Figure:
+def _bootstrap(samples: tuple[Array, ...], statistic: Callable[..., Any], seed: int) -> Figure:
     """BCa over the common index of the samples; percentiles where BCa is not defined."""
     count = len(samples[0])
     if count == 0:
         return NA
     value = float(statistic(*samples))
     if all(np.ptp(s) == 0.0 for s in samples):
-        same = value if count > 1 else math.nan
-        return Figure(value, same, same)
+        return Figure(value, *[value if count > 1 else math.nan] * 2)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # DegenerateDataWarning: answered below
         found = stats.bootstrap(
@@ -205,11 +200,11 @@ def _bootstrap(samples: tuple[Array, ...], statistic: Callable[..., Array], seed
         )
     if not np.isfinite(found.bootstrap_distribution).all():
         return Figure(value, math.nan, math.nan)
-    low, high = (float(x) for x in found.confidence_interval)
-    if math.isnan(low) or math.isnan(high):
+    bounds = found.confidence_interval
+    if np.isnan(bounds).any():
         tail = 50.0 * (1.0 - CONFIDENCE)
-        low, high = (float(x) for x in np.percentile(found.bootstrap_distribution, [tail, 100.0 - tail]))
-    return Figure(value, low, high)
+        bounds = np.percentile(found.bootstrap_distribution, [tail, 100.0 - tail])
+    return Figure(value, *map(float, bounds))
 
 
 def _tango(gained: int, lost: int, count: int) -> Figure:

@@ -11,21 +11,11 @@ from typing import Any
 
 from cosim.report.figures import TIMINGS, Measure, Row, measures
 from cosim.report.statistics import CONFIDENCE, mean, rule_of_three, share
-from cosim.workers.tasks import BAD_INPUT, OK, SIM_CRASH, TIMEOUT
-
-STATUSES = (OK, SIM_CRASH, TIMEOUT, BAD_INPUT)
+from cosim.types import IDENTITY
+from cosim.workers.tasks import OK, STATUSES
 
 # What must be equal for episodes to be counted together; rows of different cells never are.
-GROUP = (
-    "scenario",
-    "demand",
-    "policy",
-    "behavior",
-    "penetration",
-    "preset",
-    "svo_deg",
-    "driver_model",
-)
+GROUP = tuple(name for name in IDENTITY if name not in ("policy_label", "seed"))
 
 
 def summarize(

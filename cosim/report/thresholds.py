@@ -64,8 +64,8 @@ def parse(text: str, known: Mapping[str, Measure]) -> Threshold:
     names = {**{m.column: m for m in known.values() if m.is_rate}, **known}  # `crashed` is `collision_rate`
     measure = names.get(found["metric"])
     if measure is None:
-        near = hint(found["metric"], known)
-        raise _wrong(f"unknown metric {found['metric']!r}{near or _list(known)}", text)
+        near = hint(found["metric"], known) or f", there are: {', '.join(known)}"
+        raise _wrong(f"unknown metric {found['metric']!r}{near}", text)
     bound = found["bound"] or "value"
     if bound not in ("value", "upper", "lower"):
         raise _wrong(f"unknown bound .{bound}: there are .upper and .lower", text)
@@ -90,10 +90,8 @@ def _unit(measure: Measure, sign: str, number: float, unit: str | None, text: st
     if unit == "%":
         if measure.is_share and sign:
             raise _wrong("a difference of shares is given in pp (percentage points)", text)
-        if measure.is_share:
-            return ABSOLUTE, 0.01
-        if sign:
-            return CHANGE, 0.01
+        if measure.is_share or sign:
+            return (CHANGE if sign else ABSOLUTE), 0.01
         raise _wrong(f"{measure.name} is in {_unit_of(measure)}; with + or - it may be a change in %", text)
     raise _wrong(f"unknown unit {unit!r}: {measure.name} is in {_unit_of(measure)}", text)
 
@@ -102,10 +100,6 @@ def _unit_of(measure: Measure) -> str:
     return (
         f"{measure.unit} (% or pp)" if measure.is_share else measure.unit or "a unit this run does not name"
     )
-
-
-def _list(known: Mapping[str, Measure]) -> str:
-    return f", there are: {', '.join(known)}"
 
 
 def _wrong(problem: str, text: str) -> BadInput:

@@ -1,18 +1,24 @@
-"""A comparison for people and machines: text for a terminal, Markdown for a pull request, JSON."""
+"""A comparison for people and machines: text for a terminal, Markdown for a pull request, JSON, JUnit."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
+from junitparser import Error, Failure, JUnitXml, Skipped, TestCase, TestSuite
+
+from cosim.files import whole
 from cosim.report import wording
 from cosim.report.compare import FAILED, PASSED, SKIPPED, Compared, Comparison, PairedFigure
-from cosim.report.figures import HEADLINE
+from cosim.report.figures import HEADLINE, Row
 from cosim.report.pairing import who
 
 _MARK = {PASSED: "pass", FAILED: "FAIL", SKIPPED: "n/a "}
 _EMOJI = {PASSED: "✅ pass", FAILED: "❌ **fail**", SKIPPED: "n/a"}
-_SHOWN = 20  # failed simulations and lonely cells that are listed by name
+_SHOWN = 20  # failed simulations and cells of one side that are listed by name
+_NOT_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 def document(comparison: Comparison) -> dict[str, Any]:
@@ -48,11 +54,10 @@ def text(comparison: Comparison) -> str:
             "  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
             for row in table
         ]
-        for check in comparison.checks:
-            if check.group is compared.group:
-                lines.append(f"  {_MARK[check.status]}  {check.threshold.text}:  {check.finding}")
+        mine = [check for check in comparison.checks if check.group is compared.group]
+        lines += [f"  {_MARK[check.status]}  {check.threshold.text}:  {check.finding}" for check in mine]
         lines.append("")
-    lines += _lonely(comparison)
+    lines += _alone(comparison)
     return "\n".join([*lines, comparison.verdict])
 
 
@@ -72,11 +77,50 @@ def markdown(comparison: Comparison) -> str:
         lines += ["", "| | A | B | B - A |", "|---|---|---|---|"]
         lines += [_row([_html(cell) for cell in _cells(figure)]) for figure in _shown(comparison, compared)]
         lines += ["", "</details>", ""]
-    lines += [f"{_html(line)}  " for line in _lonely(comparison)]
+    lines += [f"{_html(line)}  " for line in _alone(comparison)]
     return "\n".join(lines).rstrip() + "\n"
 
 
+def junit(comparison: Comparison, path: Path) -> None:
+    """Write the file that every CI server reads, whole or not at all: a test case per threshold and group,
+    and one per group with simulations that gave no figures. Raises OSError."""
+    suite = TestSuite("cosim compare")
+    for name, value in (("a", comparison.a), ("b", comparison.b), ("verdict", comparison.verdict)):
+        suite.add_property(name, _clean(value))
+    for check in comparison.checks:
+        case = TestCase(_clean(check.threshold.text), classname=_clean(check.group.name))
+        message = _clean(f"{check.finding}; {check.figures}" if check.figures else check.finding)
+        if check.status == FAILED:
+            case.result = [Failure(f"{check.threshold.measure.name}: {message}", "threshold")]
+        elif check.status == SKIPPED:
+            case.result = [Skipped(message)]
+        else:
+            case.system_out = message
+        suite.add_testcase(case)
+    for group in (compared.group for compared in comparison.groups):
+        if rows := [*group.failed, *group.refused]:
+            case = TestCase("every simulation finished", classname=_clean(group.name))
+            lines = [f"{row['key']} {row['status']}: {_reason(row)}" for row in rows]
+            case.result = [Error(_clean(f"{len(rows)} did not: {lines[0]}"), "simulation")]
+            case.system_err = _clean("\n".join(lines))
+            suite.add_testcase(case)
+    suites = JUnitXml("cosim compare")
+    suites.add_testsuite(suite)
+    suites.update_statistics()  # type: ignore[no-untyped-call]
+    with whole(path) as draft:
+        suites.write(str(draft), pretty=True)
+
+
 # ---- inside ----
+
+
+def _clean(text: str) -> str:
+    """Without the characters that XML has no place for."""
+    return _NOT_XML.sub("?", text)
+
+
+def _reason(row: Row) -> str:
+    return str(row.get("error") or "no reason given")
 
 
 def _group_document(compared: Compared) -> dict[str, Any]:
@@ -100,7 +144,7 @@ def _group_document(compared: Compared) -> dict[str, Any]:
 def _shown(comparison: Comparison, compared: Compared) -> list[PairedFigure]:
     """Headline figures and those that a threshold asks for, as far as they apply."""
     asked = [check.threshold.measure.name for check in comparison.checks]
-    names = [name for name in dict.fromkeys((*HEADLINE, *asked)) if name in compared.known]
+    names = [name for name in dict.fromkeys((*HEADLINE, *asked)) if name in compared.figures]
     return [compared.figures[name] for name in names if compared.figures[name].n]
 
 
@@ -126,27 +170,26 @@ def _notes(compared: Compared) -> list[str]:
     """What a reader must know before the figures."""
     group = compared.group
     notes = [f"{len(group.pairs)} pairs, A {who(group.a)}, B {who(group.b)}"]
-    if group.identical:
-        notes.append(f"{group.identical} pairs drove exactly alike (same trace hash)")
-    if group.not_comparable:
-        notes.append(f"{group.not_comparable} pairs hold an episode that says it is not comparable")
-    for side, count in zip("AB", group.unpaired, strict=True):
-        if count:
-            notes.append(f"{count} episodes of {side} have no partner and do not count")
+    counted = {
+        f"{group.identical} pairs drove exactly alike (same trace hash)": group.identical,
+        f"{group.not_comparable} pairs hold an episode that says it is not comparable": group.not_comparable,
+        f"{group.unpaired[0]} episodes of A have no partner and do not count": group.unpaired[0],
+        f"{group.unpaired[1]} episodes of B have no partner and do not count": group.unpaired[1],
+    }
+    notes += [note for note, count in counted.items() if count]
     for row in [*group.failed, *group.refused][:_SHOWN]:
-        reason = str(row.get("error") or "no reason given")
-        notes.append(f"{row['status']} {row['key']} ({row['policy']}, seed {row['seed']}): {reason}")
+        notes.append(f"{row['status']} {row['key']} ({row['policy']}, seed {row['seed']}): {_reason(row)}")
     hidden = len(group.failed) + len(group.refused) - _SHOWN
     return [*notes, f"and {hidden} more"] if hidden > 0 else notes
 
 
-def _lonely(comparison: Comparison) -> list[str]:
-    lines = []
-    for side, names in zip("AB", comparison.alone, strict=True):
-        if names:
-            more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-            lines.append(f"only in {side}, not compared: {'; '.join(names[:_SHOWN])}{more}")
-    return lines
+def _alone(comparison: Comparison) -> list[str]:
+    return [
+        f"only in {side}, not compared: {'; '.join(names[:_SHOWN])}"
+        + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")
+        for side, names in zip("AB", comparison.alone, strict=True)
+        if names
+    ]
 
 
 def _row(cells: Sequence[str]) -> str:

@@ -59,14 +59,18 @@ def p_value(p: float) -> str:
 
 def group(identity: Mapping[str, Any], *, policy: bool = True) -> str:
     """`merge / contested / idm / moderate / unguarded / svo 45 / lc2013`."""
-    words = [identity.get("scenario"), identity.get("demand"), identity.get("policy") if policy else None]
-    words += [identity.get("behavior"), identity.get("preset")]
-    if identity.get("svo_deg") is not None:
-        words.append(f"svo {identity['svo_deg']:g}")
-    if identity.get("penetration") is not None:
-        words.append(f"penetration {identity['penetration']:g}")
-    words.append(identity.get("driver_model"))
-    return " / ".join(str(word) for word in words if word is not None)
+    forms = {
+        "scenario": "{}",
+        "demand": "{}",
+        "policy": "{}",
+        "behavior": "{}",
+        "preset": "{}",
+        "svo_deg": "svo {:g}",
+        "penetration": "penetration {:g}",
+        "driver_model": "{}",
+    }
+    known = {name: identity.get(name) for name in forms if policy or name != "policy"}
+    return " / ".join(forms[name].format(value) for name, value in known.items() if value is not None)
 
 
 def _digits(value: float, signed: bool, places: int | None = None) -> str:
@@ -75,10 +79,9 @@ def _digits(value: float, signed: bool, places: int | None = None) -> str:
     size = abs(value)
     if math.isinf(value) or size >= 1e6:
         return f"{value:{sign}.3g}"
-    if places is None:
-        places = 0 if size >= 100 else 1 if size >= 10 or size == 0 else 2 if size >= 1 else 3
-        text = f"{value:{sign}.{places}f}"
-        text = text.rstrip("0").rstrip(".") if places else text
-    else:
-        text = f"{value:{sign}.{places}f}"
+    shown = places
+    if shown is None:
+        shown = 0 if size >= 100 else 1 if size >= 10 or size == 0 else 2 if size >= 1 else 3
+    text = f"{value:{sign}.{shown}f}"
+    text = text.rstrip("0").rstrip(".") if places is None and shown else text
     return text.lstrip("+-") if not text.strip("+-0.") else text

@@ -1,19 +1,22 @@
-"""Social value orientation reward of both papers, equation (6) of P and (2) of T, term by term."""
+"""What each AV earns by a decision: the papers' rewards in one table, their weights, and a user's own."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
-from cosim.errors import BadInput
-from cosim.types import Collision, Floats, Kind, MetaAction, Snapshot
+from cosim.errors import BadInput, one_of
+from cosim.files import code
+from cosim.rewards.protocol import Reward, RewardStep, RewardTerms
+from cosim.rewards.svo import RewardP, RewardT
+from cosim.types import Collision, MetaAction, Snapshot
 
-VARIANTS = ("p", "t")
-_LANE_CHANGES = (MetaAction.LANE_LEFT, MetaAction.LANE_RIGHT)
-_SPEED_CHANGES = (MetaAction.ACCELERATE, MetaAction.DECELERATE)
+__all__ = ["REWARDS", "Reward", "RewardConfig", "RewardStep", "RewardTerms", "read", "rewards"]
+
+# name -> what makes it of its weights; `RewardConfig.variant` says which
+REWARDS: dict[str, Callable[[RewardConfig], Reward]] = {"p": RewardP, "t": RewardT}
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +25,7 @@ class RewardConfig:
     that is 0 or 1 (crash, lane change, speed change) or lies between 0 and 1 (speed, distance), once a
     decision."""
 
-    variant: str = "p"  # "p": eq. (6) of P, decays with distance; "t": T, no decay, r_i pays for maneuvers
+    variant: str = "p"  # of `cosim.rewards.REWARDS`; "p": decays with distance; "t": r_i pays for maneuvers
     crash: float = -5.0  # for a vehicle that crashed in this decision; -5 in code of the same authors
     speed: float = 1.0  # times speed / reference_speed at the decision's end; 1 in the same code
     distance: float = 1.0  # times distance / (reference_speed * duration); as much as speed: P names both
@@ -37,8 +40,7 @@ class RewardConfig:
     perception_range: float = 125.0  # m, only neighbours an AV perceives count (ObservationConfig)
 
     def __post_init__(self) -> None:
-        if self.variant not in VARIANTS:
-            raise BadInput(f"must be one of {', '.join(VARIANTS)}", field="variant", value=self.variant)
+        one_of(self.variant, REWARDS, "variant")
         for name in ("reference_speed", "nearest", "perception_range"):
             if not 0.0 < getattr(self, name) < np.inf:
                 raise BadInput("must be a positive number", field=name, value=getattr(self, name))
@@ -46,14 +48,9 @@ class RewardConfig:
             if not np.isfinite(getattr(self, name)):
                 raise BadInput("must be a finite number", field=name, value=getattr(self, name))
 
-
-class RewardTerms(NamedTuple):
-    """One AV's reward and its parts (no unit); total = cos(phi) ego + sin(phi) (av_social + hv_social)."""
-
-    ego: float  # r_i
-    av_social: float  # sum over the other AVs of r_AV(i, j)
-    hv_social: float  # sum over HVs of r_HV(i, k)
-    total: float  # R_i
+    def __call__(self, step: RewardStep) -> Mapping[str, RewardTerms | float]:
+        """The reward of this variant and these weights (`cosim.rewards.Reward`)."""
+        return REWARDS[self.variant](self)(step)
 
 
 def rewards(
@@ -62,62 +59,43 @@ def rewards(
     avs: Sequence[str],
     actions: Mapping[str, MetaAction],
     svo: float,
-    config: RewardConfig,
+    reward: Reward,
     collisions: Sequence[Collision],
 ) -> dict[str, RewardTerms]:
-    """The reward of each of `avs` for the decision that led from `before` to `after`.
+    """What `reward` pays each of `avs` for the decision that led from `before` to `after`.
 
-    Neighbours are the vehicles of both snapshots within `config.perception_range` m of the AV in `after`.
-    `actions`: what the AVs executed (an AV left out did nothing); `svo`: phi in rad, 0 egoistic, pi/2
-    altruistic. `collisions`: those of the whole decision (`Episode.events`; `after.events` holds only the
-    last frame's). An AV that is no longer on the road gets its crash and nothing else.
-    Source: P, section IV-B, equation (6); T, equation (2).
+    The arguments are those of `RewardStep`. A number alone counts as the AV's own part r_i and as the total.
+
+    Raises BadInput: an AV is left out or is none of `avs`, or what it is paid is no finite number.
     """
-    crashed = {name for c in collisions for name in (c.collider, c.victim)}
-    utility = vehicle_utility(before, after, crashed, config)  # [n]
-    alive = [name for name in avs if name in after.row]
-    rows = np.array([after.row[name] for name in alive], dtype=np.int64)  # [a]
-
-    distance = np.hypot(after.x[rows, None] - after.x, after.y[rows, None] - after.y)  # [a,n] m
-    coupling = (distance <= config.perception_range).astype(np.float64)  # [a,n]
-    coupling[np.arange(len(rows)), rows] = 0.0
-    if config.variant == "p":
-        coupling *= np.maximum(distance, config.nearest) ** -config.eta
-    weight = config.social * np.where(after.mission, config.mission, 1.0)  # [n]
-    social = coupling * (utility * weight)  # [a,n] r(i, c)
-    is_av = after.kind == Kind.AV
-    av_social, hv_social = social[:, is_av].sum(axis=1), social[:, ~is_av].sum(axis=1)  # [a]
-
-    terms = {}
-    for k, name in enumerate(alive):
-        ego = float(utility[rows[k]])
-        if config.variant == "t":
-            action = actions.get(name)
-            ego += config.lane_change * (action in _LANE_CHANGES)
-            ego += config.acceleration * (action in _SPEED_CHANGES)
-        terms[name] = _mix(ego, float(av_social[k]), float(hv_social[k]), svo)
-    for name in avs:
-        if name not in terms:
-            terms[name] = _mix(config.crash if name in crashed else 0.0, 0.0, 0.0, svo)
-    return terms
+    paid = reward(RewardStep(before, after, tuple(avs), actions, svo, collisions))
+    if not isinstance(paid, Mapping) or paid.keys() != set(avs):
+        got = sorted(map(str, paid)) if isinstance(paid, Mapping) else type(paid).__name__
+        problem = f"must pay each of {', '.join(sorted(avs))}, and nobody else"
+        raise BadInput(problem, field="reward", value=got)
+    return {name: _terms(name, value) for name, value in paid.items()}
 
 
-def vehicle_utility(before: Snapshot, after: Snapshot, crashed: set[str], config: RewardConfig) -> Floats:
-    """sum_m w_m x_m of every vehicle of `after`: [n], no unit; x_m: crash, speed, distance travelled (P).
+def read(what: str | Reward, field: str = "--reward") -> Reward:
+    """The reward that a text names (of `REWARDS`, FILE.py:NAME or MODULE:NAME); an object is one already.
 
-    A vehicle that was not there `before` has no distance yet and counts 0, unless it crashed.
+    A class is made without arguments; a function, or another object that can be called, is the reward itself.
+
+    Raises BadInput: there is no such reward, its code cannot be loaded or called.
     """
-    then = np.array([before.row.get(name, -1) for name in after.ids], dtype=np.int64)  # [n]
-    old = then >= 0
-    # the mean speed of the decision over the reference speed: distance / (reference_speed * duration)
-    mean = np.zeros(after.n)  # [n] m/s
-    mean[old] = 0.5 * (before.speed[then[old]] + after.speed[old])
-    speed = np.where(old, np.clip(after.speed / config.reference_speed, 0.0, 1.0), 0.0)
-    travelled = np.clip(mean / config.reference_speed, 0.0, 1.0)
-    crash = np.array([name in crashed for name in after.ids], dtype=np.float64)  # [n]
-    return np.asarray(config.crash * crash + config.speed * speed + config.distance * travelled)
+    if not isinstance(what, str):
+        return what
+    if not code.is_code(what):
+        return RewardConfig(variant=one_of(what, REWARDS, field))
+    found: Reward = code.read(what, field).make(field)
+    return found
 
 
-def _mix(ego: float, av_social: float, hv_social: float, svo: float) -> RewardTerms:
-    total = float(np.cos(svo)) * ego + float(np.sin(svo)) * (av_social + hv_social)
-    return RewardTerms(ego, av_social, hv_social, total)
+def _terms(name: str, value: RewardTerms | float) -> RewardTerms:
+    try:
+        terms = value if isinstance(value, RewardTerms) else RewardTerms(value, 0.0, 0.0, float(value))
+        if np.isfinite(terms.total):
+            return terms
+    except (TypeError, ValueError):
+        pass
+    raise BadInput("must be a finite number or RewardTerms", field=f"reward of {name}", value=value)

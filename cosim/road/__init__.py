@@ -125,9 +125,8 @@ class RoadMap:
     def straight_on(self) -> LaneGraph:
         """The straightest successor of every lane (another vehicle's route is unknown)."""
         steps = [self._successor(k, None, 0) for k in range(len(self.lanes))]
-        following = [-1 if step is None else step[0] for step in steps]
-        lengths = [lane.length for lane in self.lanes]
-        return LaneGraph(np.array(following, np.int64), np.array(lengths, np.float64))
+        following = np.array([-1 if step is None else step[0] for step in steps], np.int64)
+        return LaneGraph(following, np.array([lane.length for lane in self.lanes], np.float64))
 
     def ahead(self, lane: int, lane_position: float, length: float, route: tuple[str, ...]) -> RouteAhead:
         """Route knowledge of a vehicle of `length` m whose front bumper is at `lane_position` m of `lane`."""
@@ -162,11 +161,9 @@ class RoadMap:
                 break
             step = self._successor(lanes[-1], route, place)
             if step is None:
-                dead_end = True
-                if route is None and not lane.successors:
-                    beside = [self.lanes[o] for o in (lane.left, lane.right) if o >= 0]
-                    dead_end = any(other.successors for other in beside)
-                    leaves = not dead_end
+                beside = [self.lanes[o] for o in (lane.left, lane.right) if o >= 0]
+                dead_end = route is not None or any(other.successors for other in (lane, *beside))
+                leaves = not dead_end
                 break
             following, place = step
             if following in lanes:  # a ring: once round is far enough
@@ -218,15 +215,9 @@ class RoadMap:
         return self.lanes[lane].edge == edge
 
     def _join(self, indices: tuple[int, ...], dead_end: bool, leaves: bool) -> LanePath:
-        pieces: list[Floats] = []
-        starts = []  # m
-        total = 0.0
-        for i in indices:
-            shape = self.lanes[i].shape
-            starts.append(total)
-            pieces.append(shape if not pieces else shape[1:])
-            total += self._lengths[i]
-        points = np.concatenate(pieces)
+        starts = np.cumsum([0.0, *(self._lengths[i] for i in indices[:-1])])  # m
+        shapes = [self.lanes[i].shape for i in indices]
+        points = np.concatenate([shapes[0], *(shape[1:] for shape in shapes[1:])])
         step = np.sqrt((np.diff(points, axis=0) ** 2).sum(1))
         keep = np.concatenate([[True], step > 1e-6])
         if keep.sum() < 2:
@@ -234,14 +225,16 @@ class RoadMap:
         points = points[keep]
         arc = np.concatenate([[0.0], np.cumsum(np.sqrt((np.diff(points, axis=0) ** 2).sum(1)))])
         conflict = [
-            start for start, i in zip(starts, indices, strict=True) if any(i in z.lanes for z in self.zones)
+            start
+            for start, i in zip(starts.tolist(), indices, strict=True)
+            if any(i in z.lanes for z in self.zones)
         ]
         first = self.lanes[indices[0]]
         return LanePath(
             points,
             arc,
             indices,
-            np.array(starts),
+            starts,
             dead_end,
             leaves,
             scale=self._lengths[indices[0]] / max(first.length, 1e-6),

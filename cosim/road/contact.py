@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 import numpy.typing as npt
 
@@ -27,8 +29,6 @@ class Contact:
         self._edge: Ints = np.array([*numbered, len(edges)], np.int64)  # [l+1], the last for OFF
         self._number: Ints = np.full(len(edges) + 1, -1, np.int64)  # of every edge, -1 not met yet
         self._members: list[int] = []  # a lane of every edge met
-        self._near: dict[str, frozenset[str]] = {}
-        self._at: dict[str, list[Lane]] | None = None
         self.table: Bools = np.zeros((16, 16), np.bool_)
 
     def numbers(self, lane: npt.NDArray[np.integer]) -> Ints:
@@ -49,30 +49,26 @@ class Contact:
         edge = self._edge[lane]
         if self._number[edge] >= 0:
             return
+        near = None if lane == OFF else self._edges_near(self._lanes[lane])  # None: all
         new = self._number[edge] = len(self._members)
         self._members.append(lane)
         if new == len(self.table):
-            larger = np.zeros((2 * new, 2 * new), np.bool_)
-            larger[:new, :new] = self.table
-            self.table = larger
+            self.table = np.pad(self.table, (0, new))
         for k, other in enumerate(self._members):
-            self.table[new, k] = self.table[k, new] = self._can(lane, other)
+            touch = near is None or other == OFF or self._lanes[other].edge in near
+            self.table[new, k] = self.table[k, new] = touch
 
-    def _can(self, a: int, b: int) -> bool:
-        if a == OFF or b == OFF:
-            return True
-        edge = self._lanes[a].edge
-        near = self._near.get(edge)
-        if near is None:
-            near = self._near[edge] = self._edges_near(self._lanes[a])
-        return self._lanes[b].edge in near
+    @cached_property
+    def _at(self) -> dict[str, list[Lane]]:
+        """Junction -> the lanes that begin or end there."""
+        found: dict[str, list[Lane]] = {}
+        for lane in self._lanes:
+            for junction in (lane.start, lane.end):
+                found.setdefault(junction, []).append(lane)
+        return found
 
-    def _edges_near(self, lane: Lane) -> frozenset[str]:
-        if self._at is None:
-            self._at = {}
-            for other in self._lanes:
-                self._at.setdefault(other.start, []).append(other)
-                self._at.setdefault(other.end, []).append(other)
+    def _edges_near(self, lane: Lane) -> set[str]:
+        """The edges reached from the lane's within `REACH` m of road, its own among them."""
         found, seen = {lane.edge}, {lane.start: 0.0, lane.end: 0.0}
         waiting = [lane.start, lane.end]
         while waiting:
@@ -84,4 +80,4 @@ class Contact:
                 if distance < min(REACH, seen.get(far, np.inf)):
                     seen[far] = distance
                     waiting.append(far)
-        return frozenset(found)
+        return found

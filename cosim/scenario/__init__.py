@@ -1,21 +1,24 @@
-"""What to simulate: one of our worlds by name, or any user's .sumocfg, read into one `Scenario`."""
+"""What to simulate: a world by name or by its folder, or any user's .sumocfg, read into one `Scenario`."""
 
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import sumo_scenarios
-from cosim.errors import BadInput, hint, one_of
+from cosim.errors import BadInput, check_pattern, hint, one_of
 from cosim.files import yaml_input
 from cosim.files.xml_input import is_there, regular_file
+from cosim.files.yaml_input import NonNegative, Positive
 from cosim.scenario import sumocfg
 from cosim.scenario.behaviors import AS_IS, DRIVER_MODELS, LC2013, MIXED, load_behaviors
-from cosim.types import Preset, Timing
+from cosim.types import Identity, Preset, Timing
 
 BEHAVIORS = load_behaviors().names
+DEFINITION = "scenario.yaml"  # what makes a folder a world
 FOREIGN_DURATION = 60.0  # s, for a .sumocfg that names no end
 MISSIONS = ("merge", "exit", "roundabout", "intersection", "none", "auto")
 
@@ -33,8 +36,8 @@ class Mission:
 class Zone:
     """A conflict zone as written in scenario.yaml: edges, internal edges (":J") included."""
 
-    name: str
-    edges: tuple[str, ...]
+    name: str = ""
+    edges: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +54,17 @@ class Fleet:
         if self.ids is not None:
             return f"ids {self.ids}"
         return f"penetration {self.penetration:g}" if self.penetration is not None else "none"
+
+
+def chosen_fleet(
+    av_type: str | None, av_ids: str | None, penetration: float | None, fleet: Fleet | None = None
+) -> Fleet | None:
+    """The fleet that one of these asks for; None: the scenario's own. Raises BadInput where two are given."""
+    words = {"fleet": fleet, "av_type": av_type, "av_ids": av_ids, "penetration": penetration}
+    given = [name for name, value in words.items() if value is not None]
+    if len(given) > 1:
+        raise BadInput(f"excludes {given[1]}: give one of them", field=given[0], value=words[given[0]])
+    return fleet if fleet is not None or not given else Fleet(av_type, av_ids, penetration)
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,14 +89,34 @@ class Scenario:
     demand_name: str = "as-is"
     behavior: str = AS_IS
     driver_model: str = LC2013
-    demands: Mapping[str, Path] | None = None  # name -> file, of a built-in world
+    demands: Mapping[str, Path] | None = None  # name -> file, of a world
     title: str = ""
-    definition: Path | None = None  # the scenario.yaml of a built-in world
+    definition: Path | None = None  # the scenario.yaml of a world
     warnings: tuple[str, ...] = ()  # what `cosim.scenario.vet` found odd: reasons not to compare the result
 
     @property
     def built_in(self) -> bool:
+        """A world, ours or a user's, whose scenario.yaml says everything; not a bare .sumocfg."""
         return self.demands is not None
+
+    @property
+    def ships(self) -> bool:
+        return self.definition is not None and self.definition.parent.parent == sumo_scenarios.ROOT
+
+    def identity(self, policy: str, label: str | None, svo_deg: float, seed: int) -> Identity:
+        """What an episode of it is called, driven by this policy."""
+        return Identity(
+            scenario=self.name,
+            demand=self.demand_name,
+            policy=policy,
+            policy_label=label,
+            behavior=self.behavior,
+            driver_model=self.driver_model,
+            penetration=self.fleet.penetration,
+            preset=self.preset,
+            svo_deg=svo_deg,
+            seed=seed,
+        )
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -104,7 +138,7 @@ def load(
     duration: float | None = None,
     options: Sequence[str] = (),
 ) -> Scenario:
-    """The scenario `what` (a world's name or a .sumocfg), with what the command line says otherwise.
+    """The scenario `what` (a world's name or folder, a .sumocfg), with what the command line says otherwise.
 
     `demand`: names of the world's demands or files; `options`: SUMO options as typed after `--`, which win
     over the file's. `duration` in s. Only this file's own syntax is checked: `cosim.scenario.vet` reads the
@@ -114,7 +148,12 @@ def load(
         BadInput: names file (or option), field and value, with the nearest name where one is near.
     """
     chosen = sumocfg.command_line(options)
-    scenario = _world(what) if what in sumo_scenarios.names() else _foreign(what)
+    if what in sumo_scenarios.names():
+        scenario = _world(sumo_scenarios.folder(what))
+    elif is_there(Path(what) / DEFINITION):
+        scenario = _world(Path(os.path.abspath(what)))
+    else:
+        scenario = _foreign(what)
     if demand:
         scenario = _with_demand(scenario, demand)
     scenario = _with_sumo_options(scenario, chosen)
@@ -133,25 +172,53 @@ def load(
     )
 
 
-def _world(name: str) -> Scenario:
-    """One of our worlds: its scenario.yaml over its .sumocfg."""
-    folder = sumo_scenarios.folder(name)
-    file = folder / "scenario.yaml"
-    known = ("name", "title", "duration", "warmup", "timing", "preset", "demand", "fleet", "mission")
-    top = yaml_input.read(file, (*known, "conflict_zones"))
-    if top.text("name", name) != name:
-        raise BadInput("differs from its folder's name", file=file, field="name", value=top.text("name"))
+@dataclass(frozen=True, slots=True)
+class _WorldFile:
+    """scenario.yaml as written."""
+
+    name: str = ""
+    title: str = ""
+    duration: Positive = FOREIGN_DURATION
+    warmup: NonNegative = 0.0
+    timing: Timing = Timing()
+    preset: str = Preset.UNGUARDED
+    demand: str = ""
+    fleet: Fleet = Fleet()
+    mission: Mission = Mission()
+    conflict_zones: tuple[Zone, ...] = ()
+
+
+def place(what: str) -> str:
+    """`what` as it is found from anywhere: a folder or file by its absolute path, a world's name as it is."""
+    is_path = what not in sumo_scenarios.names() and is_there(Path(what))
+    return os.path.abspath(what) if is_path else what
+
+
+def _world(folder: Path) -> Scenario:
+    """A world, ours or a user's: its scenario.yaml over its NAME.sumocfg.
+
+    A user's may be in a folder of another name than its own, but may not be called as one that ships.
+    """
+    file = folder / DEFINITION
+    top = yaml_input.read(file, _WorldFile)
+    name, ships = top.name or folder.name, folder.parent == sumo_scenarios.ROOT
+    if ships and name != folder.name:
+        raise BadInput("differs from its folder's name", file=file, field="name", value=name)
+    if not ships and name in sumo_scenarios.names():
+        raise BadInput(
+            "is the name of a world that ships: name yours otherwise", file=file, field="name", value=name
+        )
     config = sumocfg.read(folder / f"{name}.sumocfg")
     demands = {_demand_name(path): path for path in sorted((folder / "demand").glob("*.rou.xml"))}
     if not demands:
         raise BadInput("holds no *.rou.xml", file=file, field="demand", value=str(folder / "demand"))
-    demand = top.choice("demand", demands, next(iter(demands)))
-    fleet = top.section("fleet", ("type", "ids", "penetration"))
-    mission = top.section("mission", ("kind", "vehicles", "goal"))
-    zones = top.sections("conflict_zones", ("name", "edges"))
+    demand = one_of(top.demand or next(iter(demands)), demands, "demand", file)
+    one_of(top.mission.kind, MISSIONS, "mission.kind", file)
+    check_pattern(top.mission.vehicles, "mission.vehicles", file)
+    _check_timing(top.timing, file, "timing.step", top.timing.step)
     return Scenario(
         name=name,
-        title=top.text("title") or "",
+        title=top.title,
         definition=file,
         config=config.path,
         net=config.net,
@@ -162,27 +229,23 @@ def _world(name: str) -> Scenario:
         options=config.options,
         ignored=config.ignored,
         begin=config.begin,
-        warmup=top.number("warmup", low=0.0) or 0.0,
-        duration=top.number("duration", low=0.0, above=True) or FOREIGN_DURATION,
-        timing=_timing(top.section("timing", ("step", "frame", "decision")), file),
-        preset=top.choice("preset", Preset.ALL, Preset.UNGUARDED),
-        mission=Mission(
-            mission.choice("kind", MISSIONS, "auto"), mission.pattern("vehicles") or "", mission.names("goal")
-        ),
-        zones=tuple(Zone(z.text("name") or f"zone{i}", z.names("edges")) for i, z in enumerate(zones)),
-        fleet=_checked_fleet(
-            Fleet(fleet.text("type"), fleet.pattern("ids"), fleet.number("penetration")), file, "fleet."
-        ),
+        warmup=top.warmup,
+        duration=top.duration,
+        timing=top.timing,
+        preset=one_of(top.preset, Preset.ALL, "preset", file),
+        mission=top.mission,
+        zones=tuple(replace(z, name=z.name or f"zone{i}") for i, z in enumerate(top.conflict_zones)),
+        fleet=_checked_fleet(top.fleet, file, "fleet."),
     )
 
 
 def _foreign(what: str) -> Scenario:
     """Somebody's .sumocfg: its own duration, types and options; our clocks."""
     path = Path(what)
-    names = sumo_scenarios.names()
     if not is_there(path) and path.suffix != ".sumocfg":
-        problem = f"no such scenario{hint(what, names)}"
-        raise BadInput(problem, field="scenario", value=what)
+        sumo_scenarios.folder(what)  # raises, with the nearest name
+    if path.is_dir():
+        raise BadInput(f"a world's folder holds {DEFINITION}", field="scenario", value=what)
     config = sumocfg.read(regular_file(path, file=None, field="scenario"))
     if config.end is not None and config.end <= config.begin:
         raise BadInput("ends before it begins", file=path, field="end", value=f"{config.end:g}")
@@ -259,17 +322,6 @@ def _default_behavior(scenario: Scenario) -> str:
     return "moderate" if scenario.demand_name == "contested" else MIXED
 
 
-def _timing(section: yaml_input.Section, file: Path) -> Timing:
-    default = Timing()
-    timing = Timing(
-        section.number("step", low=0.0, above=True) or default.step,
-        section.number("frame", low=0.0, above=True) or default.frame,
-        section.number("decision", low=0.0, above=True) or default.decision,
-    )
-    _check_timing(timing, file, "timing.step", timing.step)
-    return timing
-
-
 def _check_timing(timing: Timing, file: object, field: str, value: object) -> None:
     """Each clock must be a whole number of the one below it (definitions.md, Time)."""
     for name, long, short in (
@@ -284,7 +336,7 @@ def _check_timing(timing: Timing, file: object, field: str, value: object) -> No
 
 def _checked_fleet(fleet: Fleet, file: object = None, prefix: str = "--av-") -> Fleet:
     if fleet.ids is not None:
-        yaml_input.check_pattern(fleet.ids, file, f"{prefix}ids")
+        check_pattern(fleet.ids, f"{prefix}ids", file)
     share = fleet.penetration
     if share is not None and not 0.0 <= share <= 1.0:
         field = "--penetration" if file is None else f"{prefix}penetration"

@@ -4,36 +4,44 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
-from cosim.scenario import Fleet, Scenario, load
+from cosim.errors import inside
+from cosim.files.yaml_input import dataclass_from, mapping
+from cosim.scenario import Scenario, chosen_fleet, load
+from cosim.scenario.behaviors import LC2013
+from cosim.seeding import FIRST_TEST_SEED
 
+OPTIONAL = ("metrics", "reward")  # named only where they are asked for: older keys stay as they are
 KEY_LENGTH = 12  # hexadecimal digits of a cell: 48 bits, a collision among 10,000 cells has odds of 2e-7
 
 
 @dataclass(frozen=True)
-class Case:
+class EpisodeId:
     """One episode. Files are absolute paths, worlds and demands of ours are names.
 
     All cases that differ in nothing but the seed are one `cell`.
     """
 
-    what: str  # a world's name, or a .sumocfg
-    demand: tuple[str, ...]  # one demand: names or files that are driven together; () is the scenario's own
-    policy: str
-    behavior: str | None  # None: the scenario's default
-    driver_model: str
-    penetration: float | None  # share of AVs; None: the scenario's own fleet
-    av_type: str | None
-    av_ids: str | None
-    svo_deg: float  # degrees
-    preset: str | None  # None: the scenario's default
-    duration: float | None  # s; None: the scenario's own
-    seed: int
+    what: str  # a world's name or folder, or a .sumocfg
+    demand: tuple[str, ...] = ()  # one demand: names or files driven together; () is the scenario's own
+    policy: str = "idm"
+    behavior: str | None = None  # None: the scenario's default
+    driver_model: str = LC2013
+    penetration: float | None = None  # share of AVs; None: the scenario's own fleet
+    av_type: str | None = None
+    av_ids: str | None = None
+    svo_deg: float = 45.0  # degrees
+    preset: str | None = None  # None: the scenario's default
+    duration: float | None = None  # s; None: the scenario's own
+    seed: int = FIRST_TEST_SEED
     outputs: tuple[str, ...] = ()  # SUMO's own outputs, by SUMO's names
+    metrics: tuple[str, ...] = ()  # measured besides, FILE.py:NAME or MODULE:NAME
+    reward: str | None = None  # paid and reported: a name of `cosim.rewards.REWARDS`, or code likewise
 
     @cached_property
     def cell(self) -> str:
@@ -52,18 +60,24 @@ class Case:
         return json.dumps(settings, sort_keys=True)
 
     def document(self) -> dict[str, Any]:
-        """Plain JSON values; `Case.read` is the way back."""
-        return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
+        """Plain JSON values; `EpisodeId.read` is the way back."""
+        given = {k: v for k, v in asdict(self).items() if v or k not in OPTIONAL}
+        return {k: list(v) if isinstance(v, tuple) else v for k, v in given.items()}
 
     @classmethod
-    def read(cls, document: Mapping[str, Any]) -> Case:
-        """The case of a `document()`."""
-        names = [field.name for field in fields(cls)]
-        values: dict[str, Any] = {name: document[name] for name in names if name in document}
-        values |= {k: tuple(v) for k, v in values.items() if isinstance(v, list)}
-        return cls(**values)
+    def read(cls, document: object, file: Path | None = None, where: str = "case") -> EpisodeId:
+        """The episode of a `document()` that `file` holds under the name `where`.
 
-    def with_seed(self, seed: int) -> Case:
+        Raises BadInput: a field of another type.
+        """
+        with inside(where, file):
+            given = mapping(document)
+        values = {field.name: given[field.name] for field in fields(cls) if field.name in given}
+        dataclass_from(cls, values, file, where)
+        plain: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+        return cls(**plain)
+
+    def with_seed(self, seed: int) -> EpisodeId:
         """Another episode of the same cell."""
         return replace(self, seed=seed)
 
@@ -73,16 +87,13 @@ class Case:
         Raises:
             BadInput: see `cosim.scenario.load`.
         """
-        fleet = None
-        if self.av_type is not None or self.av_ids is not None or self.penetration is not None:
-            fleet = Fleet(self.av_type, self.av_ids, self.penetration)
         return load(
             self.what,
             demand=self.demand,
             behavior=self.behavior,
             driver_model=self.driver_model,
             preset=self.preset,
-            fleet=fleet,
+            fleet=chosen_fleet(self.av_type, self.av_ids, self.penetration),
             duration=self.duration,
             options=options,
         )

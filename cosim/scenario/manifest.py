@@ -4,16 +4,30 @@ from __future__ import annotations
 
 import hashlib
 import platform
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from cosim.errors import inside
+from cosim.files.yaml_input import mapping, value_of
 from cosim.scenario import Scenario
+from cosim.scenario.episode_id import EpisodeId
+from cosim.scenario.sumocfg import CLOCK, INPUTS, command_line, keeps
 
 POLICY_FILES = "policy_files"  # what decides how the policy drives: weights, or its own code
-PACKAGES = ("cosim", "libsumo", "numpy", "numba", "torch")
+_KINDS: Mapping[str, Any] = {  # what is read again of the documents of `cosim run` and `cosim evaluate`
+    **dict.fromkeys(("files", POLICY_FILES, "sumo_options", "units", "better"), Mapping[str, str]),
+    "versions": Mapping[str, str | None],
+    "sumo_arguments": tuple[str, ...],
+    "seed": int,
+    "seeds": tuple[int, int],
+    "trace_hash": str,
+}
+CASE, OPTIONS = "case", "sumo_arguments"  # what `cosim run --out` adds
+# A name in the manifest -> the distribution whose version it is.
+PACKAGES = {"cosim": "cosim-sumo", "libsumo": "libsumo", "numpy": "numpy", "numba": "numba", "torch": "torch"}
 
 
 def manifest(scenario: Scenario, seed: int) -> dict[str, Any]:
@@ -34,9 +48,45 @@ def manifest(scenario: Scenario, seed: int) -> dict[str, Any]:
         },
         "sumo_options": dict(scenario.options),
         "options_not_passed_on": list(scenario.ignored),
-        "versions": {"python": platform.python_version(), **{p: _version(p) for p in PACKAGES}},
+        "versions": {
+            "python": platform.python_version(),
+            **{name: _version(distribution) for name, distribution in PACKAGES.items()},
+        },
         "files": digests(scenario.files),
     }
+
+
+def checked(document: object, file: Path, where: str = "") -> dict[str, Any]:
+    """`document`, a manifest as `file` has it (there called `where`), with what is read again of its kind.
+
+    Raises:
+        BadInput: a field of another type, in the manifest itself or in those of its cells.
+    """
+    with inside(where, file):
+        found = mapping(document)
+        for name in found.keys() & _KINDS.keys():
+            with inside(name):
+                value_of(_KINDS[name], found[name])
+    cells = checked(found["cells"], file, "cells") if "cells" in found else {}
+    for name in cells:
+        cell = checked(cells[name], file, f"cells.{name}")
+        for part in cell.keys() & {"case", "manifest"}:
+            checked(cell[part], file, f"cells.{name}.{part}")
+    return found
+
+
+def remembered(case: EpisodeId, options: Sequence[str]) -> dict[str, Any]:
+    """What a manifest has to hold beside the usual so that `cosim replay` finds the episode again.
+
+    Outputs are left out: a replay does not write them again.
+    """
+    kept: list[str] = []
+    for name, value in command_line(options).items():
+        if name in INPUTS:
+            value = ",".join(str(Path(part.strip()).absolute()) for part in value.split(","))
+        if name in (*INPUTS, *CLOCK) or keeps(name):
+            kept += [f"--{name}={value}"]
+    return {CASE: case.document(), OPTIONS: kept}
 
 
 def digests(files: Iterable[Path]) -> dict[str, str]:
@@ -60,9 +110,9 @@ def named(files: Iterable[Path]) -> dict[str, Path]:
 
 
 @lru_cache
-def _version(package: str) -> str | None:
+def _version(distribution: str) -> str | None:
     try:
-        return metadata.version(package)
+        return metadata.version(distribution)
     except metadata.PackageNotFoundError:
         return None
 

@@ -2,7 +2,7 @@
 
 `[LABEL=]RUN` or `[LABEL=]FILE.safetensors` are weights of `cosim train`, `[LABEL=]FILE.py:NAME` and
 `[LABEL=]MODULE:NAME` code; anything else is the name of a policy that ships. The label stands in rows and
-tables. Text only: whether there is such a policy, the roof knows (`cosim.policies`).
+tables. Text only: `cosim.policies` knows whether there is such a policy.
 """
 
 from __future__ import annotations
@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from cosim.errors import BadInput
+from cosim.files.code import Code, is_code
+from cosim.files.code import read as read_code
 
 WEIGHTS, BEST = ".safetensors", "best.safetensors"  # a training's folder stands for its best
 _LABEL = re.compile(r"[\w.+-]+")
-_MODULE = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*")
 
 
 class PolicyName(NamedTuple):
@@ -29,6 +30,11 @@ class PolicyName(NamedTuple):
     @property
     def ships(self) -> bool:
         return not self.place
+
+    @property
+    def code(self) -> Code:
+        """Of code: where it stands."""
+        return Code(self.place, self.member)
 
     @property
     def text(self) -> str:
@@ -58,18 +64,11 @@ def read(text: str, folder: Path | None = None, field: str = "--policy", file: o
         raise wrong("a label has letters, digits, dots, dashes, plus signs and underscores")
     if not equals and not any(mark in rest for mark in "/:") and not rest.endswith((WEIGHTS, ".py")):
         return PolicyName(rest)
-    place, colon, member = rest.rpartition(":") if ":" in rest else (rest, "", "")
-    path = Path(os.path.abspath((folder or Path()) / os.path.expanduser(place)))
-    code = place.endswith(".py")
-    if code and not colon:
-        raise wrong(f"name the policy in it: {rest}:NAME")
-    if code or (colon and _MODULE.fullmatch(place)):
-        if not member.isidentifier():
-            raise wrong("behind the colon stands a class, a factory or a function")
-        found = PolicyName(label or member, str(path) if code else place, member)
-    elif colon:
-        raise wrong("a colon belongs to FILE.py:NAME and MODULE:NAME")
-    elif place.endswith(WEIGHTS):
+    if is_code(rest):
+        code = read_code(rest, field, folder=folder, file=file, value=text)
+        return PolicyName(label or code.member, *code)
+    path = Path(os.path.abspath((folder or Path()) / os.path.expanduser(rest)))
+    if rest.endswith(WEIGHTS):
         name = path.parent.name if path.name == BEST else path.stem
         found = PolicyName(label or _plain(name), str(path))
     elif path.is_dir():
@@ -79,7 +78,7 @@ def read(text: str, folder: Path | None = None, field: str = "--policy", file: o
         raise wrong(f"no such file: {path}")
     else:
         raise wrong("neither a run of cosim train, nor FILE.safetensors, FILE.py:NAME or MODULE:NAME")
-    if os.path.isabs(found.place) and not path.is_file():
+    if not path.is_file():
         raise wrong(f"no such file: {path}")
     return found
 

@@ -12,6 +12,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 from xml.parsers import expat
+from xml.sax.saxutils import escape
 
 from cosim.files.xml_input import content
 from cosim.scenario import Scenario
@@ -47,14 +48,11 @@ def _silenced(path: Path, folder: Path) -> Path:
     edits = _edits(whole, path, folder)
     if not any(writes for *_, writes in edits):
         return path
-    parts, done = [], 0
-    for begin, end, value, _ in edits:
-        parts += [whole[done:begin], value]
-        done = end
-    parts.append(whole[done:])
+    for begin, end, value, _ in sorted(edits, reverse=True):  # from the back, so that places stay
+        whole = whole[:begin] + value + whole[end:]
     folder.mkdir(parents=True, exist_ok=True)
     copy = folder / f"{sum(1 for _ in folder.iterdir())}-{path.name.removesuffix('.gz')}"
-    copy.write_bytes(b"".join(parts))
+    copy.write_bytes(whole)
     return copy
 
 
@@ -72,9 +70,9 @@ def _edits(whole: bytes, path: Path, folder: Path) -> list[tuple[int, int, bytes
         if read is not None and attributes.get(read):
             source = path.parent / attributes[read]
             target = _silenced(source, folder) if tag == "include" else source
-            text = str(target.absolute()).replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")
+            text = escape(str(target.absolute()), {'"': "&quot;", "'": "&apos;"})
             place = _place(whole, parser.CurrentByteIndex, read)
-            found.append((*place, text.replace("'", "&apos;").encode(), target != source))
+            found.append((*place, text.encode(), target != source))
 
     parser.StartElementHandler = start
     parser.Parse(whole, True)
@@ -85,8 +83,7 @@ def _place(whole: bytes, tag_begin: int, attribute: str) -> tuple[int, int]:
     """Where the value of `attribute` lies in the tag that begins at byte `tag_begin`."""
     tag = _TAG.match(whole, tag_begin)
     assert tag is not None, "vetted XML"
-    for match in re.finditer(rb"([\w:.-]+)\s*=\s*(?:\"([^\"]*)\"|'([^']*)')", tag[0]):
-        if match[1] == attribute.encode():
-            group = 2 if match[2] is not None else 3
-            return tag_begin + match.start(group), tag_begin + match.end(group)
-    raise AssertionError("vetted XML")
+    values = re.finditer(rb"([\w:.-]+)\s*=\s*(?:\"([^\"]*)\"|'([^']*)')", tag[0])
+    match = next(match for match in values if match[1] == attribute.encode())
+    begin, end = match.span(2 if match[2] is not None else 3)
+    return tag_begin + begin, tag_begin + end

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cosim.errors import BadInput, SimulationError, one_of
+from cosim.files import cannot
 from cosim.scenario import Scenario
 
 DRAFT = ".part"  # folder of files that SUMO is still writing
@@ -105,11 +106,9 @@ def drafts(names: Sequence[str], folder: Path | None) -> Iterator[dict[str, Path
         yield {}
         return
     draft = folder / DRAFT
-    try:
-        shutil.rmtree(draft, ignore_errors=True)  # of a run that was killed
+    shutil.rmtree(draft, ignore_errors=True)  # of a run that was killed
+    with cannot("make this folder", file=draft, field=FIELD):
         draft.mkdir(parents=True)
-    except OSError as error:
-        raise BadInput(f"cannot make this folder: {error.strerror}", file=draft, field=FIELD) from None
     try:
         files = {name: draft / f"{name}.xml" for name in dict.fromkeys(names)}
         yield files

@@ -88,6 +88,13 @@ _REFUSED = {
     "mesosim": "the mesoscopic model has no vehicle positions",
     "lateral-resolution": "LC2013, which is what drives here, has no sublane model",
 }
+# Why an option of a .sumocfg is set aside, where that is not plain.
+_SET_ASIDE = {
+    "step-length": " (cosim's own step is used; `-- --step-length X` overrides it)",
+    "seed": " (the episode's --seed decides)",
+    "random": " (the episode's --seed decides)",
+    "collision.action": " (collisions are counted, never removed)",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +133,7 @@ def read(path: Path) -> SumoConfig:
         if (name, value) in _AS_OURS:
             continue
         if not keeps(name):
-            ignored.append(f"{name}={value}{_reason(name)}")
+            ignored.append(f"{name}={value}{_SET_ASIDE.get(name, '')}")
         elif name in FILE_OPTIONS:
             kept.append((name, ",".join(str(p) for p in files(value, folder, path, name))))
         else:
@@ -237,13 +244,3 @@ def _check_finite(value: str, file: object, field: str) -> None:
     """SUMO takes `scale` NaN without a word."""
     if value.strip().lstrip("+-").lower() in ("nan", "inf", "infinity"):
         raise BadInput("must be finite", file=file, field=field, value=value)
-
-
-def _reason(name: str) -> str:
-    if name == "step-length":
-        return " (cosim's own step is used; `-- --step-length X` overrides it)"
-    if name in ("seed", "random"):
-        return " (the episode's --seed decides)"
-    if name == "collision.action":
-        return " (collisions are counted, never removed)"
-    return ""

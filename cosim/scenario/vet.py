@@ -7,7 +7,7 @@ numbers are checked, and every name it refers to must exist. Files that have not
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -16,9 +16,10 @@ from cosim.errors import BadInput, hint
 from cosim.files.xml_input import regular_file
 from cosim.scenario import Scenario
 from cosim.scenario.sumocfg import FILE_OPTIONS
-from cosim.scenario.vet_demand import Demand, Use, read_demand
+from cosim.scenario.vet_demand import Demand, read_demand
 from cosim.scenario.vet_net import Net, read_net
 
+MAX_WARNINGS = 20  # of one kind
 MAX_INCLUDES = 64  # files; more is a cycle
 # Types SUMO always has.
 DEFAULT_TYPES = frozenset(
@@ -54,19 +55,18 @@ def vet(scenario: Scenario) -> VetReport:
     net = _net(*_stamp(regular_file(scenario.net, file=config, field="net-file")))
     demands = [*_all(scenario.additional, config, additional=True), *_all(scenario.demand, config)]
     _check_options(scenario)
-    _check_references(net, demands)
-    _check_drivers(demands)
     types = DEFAULT_TYPES.union(*(d.types for d in demands))
+    _check_references(net, demands, types)
+    clashes = _check_drivers(demands)
     if scenario.fleet.type is not None and scenario.fleet.type not in types:
         where = ", ".join(path.name for path in scenario.demand) or "the demand"
         problem = f"no such vehicle type in {where}{hint(scenario.fleet.type, sorted(types))}"
         raise BadInput(problem, file=config, field="--av-type", value=scenario.fleet.type)
-    flows = sum(d.flows for d in demands)
     return VetReport(
         edges=sum(1 for edge in net.lanes if not edge.startswith(":")),
-        vehicles=sum(len(d.drivers) for d in demands) - flows,
-        flows=flows,
-        warnings=(*(w for d in demands for w in d.warnings), *_gaps(net, demands)),
+        vehicles=sum(len(d.vehicles) for d in demands),
+        flows=sum(len(d.flows) for d in demands),
+        warnings=(*(w for d in demands for w in d.warnings), *clashes, *_gaps(net, demands)),
         outputs=tuple(output for d in demands for output in d.outputs),
     )
 
@@ -104,60 +104,62 @@ def _check_options(scenario: Scenario) -> None:
                 regular_file(Path(path), file=scenario.config, field=name)
 
 
-def _check_references(net: Net, demands: list[Demand]) -> None:
+def _check_references(net: Net, demands: list[Demand], types: frozenset[str]) -> None:
     """Every edge, lane, junction, type and route that is used must exist."""
-    types = DEFAULT_TYPES.union(*(d.types for d in demands))
     routes = frozenset[str]().union(*(d.routes for d in demands))
+    here = f" in {net.path.name}"
+    near = net.lanes if len(net.lanes) < 5000 else ()
+    kinds: tuple[tuple[str, Callable[[str], bool], str, Iterable[str]], ...] = (
+        ("edge", net.lanes.__contains__, here, near),
+        ("lane", net.has_lane, here, ()),
+        ("junction", net.junctions.__contains__, here, ()),
+        ("vehicle type", types.__contains__, "", sorted(types)),
+        ("route", routes.__contains__, "", sorted(routes)[:5000]),
+    )
     for demand in demands:
-        for edge, use in demand.used_edges.items():
-            if edge not in net.lanes:
-                near = hint(edge, net.lanes) if len(net.lanes) < 5000 else ""
-                _refuse(demand.path, use, edge, f"no such edge in {net.path.name}{near}")
-        for lane, use in demand.used_lanes.items():
-            if not net.has_lane(lane):
-                _refuse(demand.path, use, lane, f"no such lane in {net.path.name}")
-        for junction, use in demand.used_junctions.items():
-            if junction not in net.junctions:
-                _refuse(demand.path, use, junction, f"no such junction in {net.path.name}")
-        for name, use in demand.used_types.items():
-            if name not in types:
-                _refuse(demand.path, use, name, f"no such vehicle type{hint(name, sorted(types))}")
-        for name, use in demand.used_routes.items():
-            if name not in routes:
-                _refuse(demand.path, use, name, f"no such route{hint(name, sorted(routes)[:5000])}")
+        for kind, exists, where, known in kinds:
+            for name, place in demand.used[kind].items():
+                if not exists(name):
+                    raise place.wrong(f"no such {kind}{where}{hint(name, known)}", name)
 
 
-def _check_drivers(demands: list[Demand]) -> None:
-    """No vehicle may be in two files: SUMO would stop in mid-run when the second one departs."""
-    seen: dict[str, Path] = {}
+def _check_drivers(demands: list[Demand]) -> list[str]:
+    """No vehicle and no flow may be in two files: SUMO would stop in mid-run when the second one departs.
+
+    A vehicle and a flow may share an id; a vehicle named like one that a flow makes (FLOW.0, FLOW.1, ...)
+    stops SUMO if both depart, which is a warning.
+    """
+    for field in ("vehicles", "flows"):
+        seen: dict[str, Path] = {}
+        for demand in demands:
+            for name in getattr(demand, field):
+                if name in seen:
+                    problem = f"is also in {seen[name]}"
+                    raise BadInput(problem, file=demand.path, field=f"{field[:-1]}.id", value=name)
+                seen[name] = demand.path
+    most = {name: number for demand in demands for name, (_, number) in demand.flows.items()}
+    found = []
     for demand in demands:
-        for name in demand.drivers:
-            if name in seen:
-                problem = f"is also in {seen[name]}"
-                raise BadInput(problem, file=demand.path, field="vehicle.id", value=name)
-            seen[name] = demand.path
+        for name in demand.vehicles:
+            flow, _, index = name.rpartition(".")
+            if flow in most and index.isdigit() and int(index) < most[flow]:
+                found.append(f"{demand.path}: {name!r} is the name of a vehicle of the flow {flow!r} too")
+    return found[:MAX_WARNINGS]
 
 
 def _gaps(net: Net, demands: list[Demand]) -> list[str]:
-    """Routes that cannot be driven: SUMO finds out only when the vehicle departs, so these are warnings."""
+    """Where nobody can drive, which SUMO finds out only on the way or never: these are warnings."""
     found = []
+    if net.closed:
+        some = ", ".join(net.closed[:3]) + (", ..." if len(net.closed) > 3 else "")
+        found.append(f"{net.path}: the speed limit is 0 on {some}: whoever comes there stands for ever")
     for demand in demands:
-        broken = [(pair, use) for pair, use in demand.steps.items() if pair not in net.links]
-        for (a, b), use in broken[:3]:
-            found.append(
-                f"{demand.path}: impossible route ({_place(use)}): no connection from {a!r} to {b!r}"
-            )
+        broken = [(pair, place) for pair, place in demand.steps.items() if pair not in net.links]
+        for (a, b), place in broken[:3]:
+            found.append(f"{demand.path}: impossible route ({place}): no connection from {a!r} to {b!r}")
         if len(broken) > 3:
             found.append(f"{demand.path}: {len(broken) - 3} further pairs of edges without a connection")
     return found
-
-
-def _refuse(path: Path, use: Use, value: str, problem: str) -> None:
-    raise BadInput(f"{problem} ({_place(use)})", file=path, field=use.field, value=value)
-
-
-def _place(use: Use) -> str:
-    return f"{use.owner}, line {use.line}" if use.owner else f"line {use.line}"
 
 
 def _stamp(path: Path) -> tuple[Path, int, int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -16,8 +17,8 @@ from cosim.scenario.vet_rules import (
     SL2015_ONLY,
     VEHICLE_TYPE,
     VEHICLE_TYPE_TEXT,
-    clip,
-    problem,
+    Place,
+    Reader,
     words,
 )
 
@@ -30,7 +31,7 @@ _DRIVERS = frozenset({"vehicle", "trip", "flow"})
 _MOVING = _DRIVERS | {"person", "personFlow", "container", "containerFlow"}
 _TRAVEL = _DRIVERS | {"route", "walk", "ride", "personTrip", "transport", "tranship", "stop"}
 _EDGE_LISTS = ("edges", "via")
-_EDGE_NAMES = ("from", "to", "edge")
+_PLACES = {"from": "edge", "to": "edge", "edge": "edge", "fromJunction": "junction", "toJunction": "junction"}
 _ON_A_LANE = words(
     "stop busStop trainStop containerStop chargingStation parkingArea inductionLoop e1Detector "
     "instantInductionLoop laneAreaDetector e2Detector detEntry detExit"
@@ -50,15 +51,6 @@ OUTPUTS: Mapping[str, str] = {
 OUTPUT_PARAMETERS = frozenset({"device.ssm.file", "device.toc.file", "device.rerouting.output"})
 
 
-@dataclass(frozen=True, slots=True)
-class Use:
-    """Where a name was first used: for the error, should it not exist."""
-
-    field: str
-    owner: str
-    line: int
-
-
 @dataclass(slots=True)
 class Demand:
     """What one route or additional file defines and what it refers to."""
@@ -66,14 +58,11 @@ class Demand:
     path: Path
     types: set[str] = field(default_factory=set)
     routes: set[str] = field(default_factory=set)
-    drivers: dict[str, int] = field(default_factory=dict)  # vehicle, trip or flow -> line
-    flows: int = 0
-    used_types: dict[str, Use] = field(default_factory=dict)
-    used_routes: dict[str, Use] = field(default_factory=dict)
-    used_edges: dict[str, Use] = field(default_factory=dict)
-    used_lanes: dict[str, Use] = field(default_factory=dict)
-    used_junctions: dict[str, Use] = field(default_factory=dict)
-    steps: dict[tuple[str, str], Use] = field(default_factory=dict)  # (edge, next edge) of whole routes
+    vehicles: dict[str, int] = field(default_factory=dict)  # vehicle or trip -> line
+    flows: dict[str, tuple[int, float]] = field(default_factory=dict)  # -> line, vehicles at most
+    used: defaultdict[str, dict[str, Place]] = field(default_factory=lambda: defaultdict(dict))
+    # kind (edge, lane, junction, vehicle type, route) -> name -> where it is first used
+    steps: dict[tuple[str, str], Place] = field(default_factory=dict)  # (edge, next edge) of whole routes
     includes: list[Path] = field(default_factory=list)
     outputs: list[str] = field(default_factory=list)  # files SUMO would write, as written
     warnings: list[str] = field(default_factory=list)
@@ -93,11 +82,11 @@ def read_demand(path: Path, *, additional: bool) -> Demand:
     return reader.finish()
 
 
-class _DemandReader:
+class _DemandReader(Reader):
     """The handlers of one pass over a route or additional file."""
 
     def __init__(self, path: Path, additional: bool) -> None:
-        self._path = path
+        super().__init__(path)
         self._additional = additional
         self.found = Demand(path)
         self._owners: list[tuple[str, str]] = []  # (tag, id) of every open element
@@ -109,30 +98,24 @@ class _DemandReader:
         owner = attributes.get("id") or (self._owners[-1][1] if self._owners else "")
         is_type = tag == "vType" or tag.startswith("carFollowing-")
         rules = VEHICLE_TYPE if is_type else DEMAND.get(tag)
-        if rules is not None:
-            for name, value in attributes.items():
-                rule = rules.get(name)
-                if rule is not None:
-                    wrong = problem(value, rule)
-                    if wrong is not None:
-                        self._refuse(tag, name, value, wrong, owner, line)
-                elif is_type and name not in VEHICLE_TYPE_TEXT:
-                    self._unknown(tag, name, value, owner, line)
+        self._check(tag, attributes, rules or {}, owner, line)
         if is_type:
+            for name in attributes:
+                if name not in VEHICLE_TYPE and name not in VEHICLE_TYPE_TEXT:
+                    self._unknown(tag, name, attributes[name], owner, line)
             self._type(attributes, owner)
         elif tag in _MOVING:
             self._driver(tag, attributes, owner, line)
-        elif tag in ("route", "routeDistribution"):
-            if "id" in attributes:
-                self.found.routes.add(attributes["id"])
-        elif tag == "vTypeDistribution" and "id" in attributes:
-            self.found.types.add(attributes["id"])
         elif tag == "include":
             self._include(attributes, line)
+        if "id" in attributes and (is_type or tag == "vTypeDistribution"):
+            self.found.types.add(attributes["id"])
+        elif "id" in attributes and tag in ("route", "routeDistribution"):
+            self.found.routes.add(attributes["id"])
         if tag in _TRAVEL:
             self._edges(tag, attributes, owner, line)
         if tag in _ON_A_LANE and "lane" in attributes:
-            self.found.used_lanes.setdefault(attributes["lane"], Use(f"{tag}.lane", owner, line))
+            self._use("lane", attributes["lane"], tag, "lane", owner, line)
         if tag in OUTPUTS and OUTPUTS[tag] in attributes:
             self.found.outputs.append(attributes[OUTPUTS[tag]])
         elif tag == "param" and attributes.get("key") in OUTPUT_PARAMETERS and attributes.get("value"):
@@ -151,8 +134,6 @@ class _DemandReader:
         return self.found
 
     def _type(self, attributes: dict[str, str], owner: str) -> None:
-        if "id" in attributes:
-            self.found.types.add(attributes["id"])
         idle = sorted(SL2015_ONLY & attributes.keys())
         if idle:
             self._warn(f"vType {owner!r}: {', '.join(idle)} only work with SL2015, LC2013 drives here")
@@ -171,17 +152,19 @@ class _DemandReader:
 
     def _driver(self, tag: str, attributes: dict[str, str], owner: str, line: int) -> None:
         if "type" in attributes:
-            self.found.used_types.setdefault(attributes["type"], Use(f"{tag}.type", owner, line))
+            self._use("vehicle type", attributes["type"], tag, "type", owner, line)
         if tag not in _DRIVERS or "id" not in attributes:
             return  # flows inside a calibrator have no id of their own
         name = attributes["id"]
-        if name in self.found.drivers:
-            first = self.found.drivers[name]
+        first = self.found.flows.get(name, (None,))[0] if tag == "flow" else self.found.vehicles.get(name)
+        if first is not None:
             self._refuse(tag, "id", name, f"is there twice, first in line {first}", "", line)
-        self.found.drivers[name] = line
-        self.found.flows += tag == "flow"
+        if tag == "flow":
+            self.found.flows[name] = (line, float(attributes.get("number", "inf")))
+        else:
+            self.found.vehicles[name] = line
         if "route" in attributes:
-            self.found.used_routes.setdefault(attributes["route"], Use(f"{tag}.route", owner, line))
+            self._use("route", attributes["route"], tag, "route", owner, line)
         # a flow that names no begin begins with the simulation, so it is late behind anything later
         depart = attributes.get("begin", "0") if tag == "flow" else attributes.get("depart", "")
         if self._additional or not depart[:1].isdigit():  # an additional file is loaded whole: order is free
@@ -193,24 +176,24 @@ class _DemandReader:
             self._last_depart = when
 
     def _edges(self, tag: str, attributes: dict[str, str], owner: str, line: int) -> None:
-        for name in _EDGE_NAMES:
-            if name in attributes and (name == "edge" or tag != "stop"):
-                self.found.used_edges.setdefault(attributes[name], Use(f"{tag}.{name}", owner, line))
+        for name, kind in _PLACES.items():
+            if name in attributes and (tag != "stop" or name not in ("from", "to")):
+                self._use(kind, attributes[name], tag, name, owner, line)
         for name in _EDGE_LISTS:
             value = attributes.get(name)
             if value is None or value in self._seen_lists:
                 continue
             self._seen_lists.add(value)
-            use = Use(f"{tag}.{name}", owner, line)
+            place = Place(self._path, f"{tag}.{name}", owner, line)
             edges = value.split()
             for edge in edges:
-                self.found.used_edges.setdefault(edge, use)
+                self.found.used["edge"].setdefault(edge, place)
             if name == "edges" and tag == "route":
                 for pair in pairwise(edges):
-                    self.found.steps.setdefault(pair, use)
-        for name in ("fromJunction", "toJunction"):
-            if name in attributes:
-                self.found.used_junctions.setdefault(attributes[name], Use(f"{tag}.{name}", owner, line))
+                    self.found.steps.setdefault(pair, place)
+
+    def _use(self, kind: str, used: str, tag: str, name: str, owner: str, line: int) -> None:
+        self.found.used[kind].setdefault(used, Place(self._path, f"{tag}.{name}", owner, line))
 
     def _include(self, attributes: dict[str, str], line: int) -> None:
         href = attributes.get("href", "")
@@ -224,7 +207,3 @@ class _DemandReader:
     def _warn(self, text: str) -> None:
         if len(self.found.warnings) < 20:  # a type may be written a thousand times
             self.found.warnings.append(f"{self._path}: {text}")
-
-    def _refuse(self, tag: str, name: str, value: str, wrong: str, owner: str, line: int) -> None:
-        place = f"{owner}, line {line}" if owner else f"line {line}"
-        raise BadInput(f"{wrong} ({place})", file=self._path, field=f"{tag}.{name}", value=clip(value))

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from cosim.errors import BadInput
 from cosim.files.xml_input import scan
-from cosim.scenario.vet_rules import NET, SHAPES, clip, problem, shape_problem
+from cosim.scenario.vet_rules import NET, Reader
 
 _CROSSING = re.compile(r":(.+)_c\d+")  # netconvert's name for the crossings of a junction
 
@@ -23,6 +23,7 @@ class Net:
     lanes: Mapping[str, int]  # edge -> number of lanes; internal edges (":...") included
     junctions: frozenset[str]
     links: frozenset[tuple[str, str]]  # (edge, edge) pairs that a connection joins
+    closed: tuple[str, ...] = ()  # lanes with a speed limit of 0
 
     def has_lane(self, lane: str) -> bool:
         """Whether "edge_2" is a lane of this net."""
@@ -43,11 +44,11 @@ def read_net(path: Path) -> Net:
     return reader.finish()
 
 
-class _NetReader:
+class _NetReader(Reader):
     """The handlers of one pass over a net."""
 
     def __init__(self, path: Path) -> None:
-        self._path = path
+        super().__init__(path)
         self._lanes: dict[str, int] = {}
         self._origins: dict[str, str] = {}  # edge -> junction it comes from; not for internal ones
         self._ends: dict[str, str] = {}  # edge -> junction it leads to
@@ -58,26 +59,16 @@ class _NetReader:
         self._edge: str | None = None
         self._junction = ""
         self._is_first = True
+        self._closed: list[str] = []  # lanes with a speed limit of 0
 
     def start(self, tag: str, attributes: dict[str, str], line: int) -> None:
         if self._is_first:
             self._is_first = False
             self._check_version(attributes)
-        rules = NET.get(tag)
-        if rules is None:
-            if tag == "request":
-                self._request(attributes, line)
-            return
-        for name, value in attributes.items():
-            if name in rules:
-                wrong = problem(value, rules[name])
-            elif name in SHAPES:
-                wrong = shape_problem(value)
-            else:
-                continue
-            if wrong is not None:
-                self._refuse(tag, name, value, wrong, attributes.get("id"), line)
-        if tag == "lane":
+        self._check(tag, attributes, NET.get(tag, {}), attributes.get("id", ""), line)
+        if tag == "request":
+            self._request(attributes, line)
+        elif tag == "lane":
             self._lane(attributes, line)
         elif tag == "edge":
             self._open_edge(attributes, line)
@@ -104,13 +95,11 @@ class _NetReader:
         for (a, b, i, j), (line, via) in self._links.items():
             for end, edge, lane in (("from", a, i), ("to", b, j)):
                 if edge not in self._lanes:
-                    self._refuse("connection", end, edge, "no such edge in the net", None, line)
+                    self._refuse("connection", end, edge, "no such edge in the net", "", line)
                 if int(lane) >= self._lanes[edge]:
-                    self._refuse(
-                        "connection", f"{end}Lane", lane, f"edge {edge} has no such lane", None, line
-                    )
+                    self._refuse("connection", f"{end}Lane", lane, f"edge {edge} has no such lane", "", line)
             if via and not self._has_lane(via):
-                self._refuse("connection", "via", via, "no such lane in the net", None, line)
+                self._refuse("connection", "via", via, "no such lane in the net", "", line)
             if a in self._ends and not b.startswith(":"):  # ":J_w0" is a sidewalk
                 counts[self._ends[a]] += 1
         self._check_ends()
@@ -123,6 +112,7 @@ class _NetReader:
             lanes=self._lanes,
             junctions=frozenset(self._junctions),
             links=frozenset((a, b) for a, b, _, _ in self._links),
+            closed=tuple(self._closed),
         )
 
     def _check_version(self, attributes: dict[str, str]) -> None:
@@ -138,14 +128,13 @@ class _NetReader:
     def _open_edge(self, attributes: dict[str, str], line: int) -> None:
         edge = self._need("edge", "id", attributes, line)
         if edge in self._lanes:
-            self._refuse("edge", "id", edge, "is there twice", None, line)
+            self._refuse("edge", "id", edge, "is there twice", "", line)
         self._edge = edge
         self._lanes[edge] = 0
         if edge.startswith(":"):
-            if attributes.get("function") not in ("internal", "crossing", "walkingarea"):
-                self._refuse(
-                    "edge", "function", attributes.get("function", ""), "must be internal", edge, line
-                )
+            function = attributes.get("function", "")
+            if function not in ("internal", "crossing", "walkingarea"):
+                self._refuse("edge", "function", function, "must be internal", edge, line)
             return
         for name, ends in (("from", self._origins), ("to", self._ends)):
             ends[edge] = self._need("edge", name, attributes, line)
@@ -155,18 +144,19 @@ class _NetReader:
         for name in ("index", "length", "speed", "shape"):
             self._need("lane", name, attributes, line)
         if self._edge is None:
-            self._refuse("lane", "id", lane, "is outside every edge", None, line)
-            return
+            self._refuse("lane", "id", lane, "is outside every edge", "", line)
         expected = self._lanes[self._edge]
         internal = self._edge.startswith(":")  # netconvert itself repeats an index inside junctions
         if attributes["index"] != str(expected) and not (internal and int(attributes["index"]) < expected):
             gap = f"lane indices must run 0, 1, 2, ...: {expected} is due"
             self._refuse("lane", "index", attributes["index"], gap, lane, line)
         if lane != f"{self._edge}_{expected}":
-            self._refuse("lane", "id", lane, f"must be {self._edge}_{expected}", None, line)
+            self._refuse("lane", "id", lane, f"must be {self._edge}_{expected}", "", line)
         if len(attributes["shape"].split()) < 2:
             self._refuse("lane", "shape", attributes["shape"], "needs at least two points", lane, line)
         self._lanes[self._edge] = expected + 1
+        if float(attributes["speed"]) == 0.0:
+            self._closed.append(lane)
 
     def _request(self, attributes: dict[str, str], line: int) -> None:
         """A row of the right-of-way table: SUMO indexes with what it says."""
@@ -192,13 +182,13 @@ class _NetReader:
         for (a, b, _, j), (line, via) in self._links.items():
             edge, _, index = via.rpartition("_")
             if via and (edge, b, index, j) not in leaving:
-                self._refuse("connection", "via", via, f"leads from {a} to nowhere near {b}_{j}", None, line)
+                self._refuse("connection", "via", via, f"leads from {a} to nowhere near {b}_{j}", "", line)
             if via and a in self._ends and not via.startswith(f":{self._ends[a]}_"):
-                self._refuse("connection", "via", via, f"is not in junction {self._ends[a]}", None, line)
+                self._refuse("connection", "via", via, f"is not in junction {self._ends[a]}", "", line)
             if via and a.startswith(":") and via not in self._junctions:
-                self._refuse("connection", "via", via, "no such internal junction in the net", None, line)
+                self._refuse("connection", "via", via, "no such internal junction in the net", "", line)
             if not via and not b.startswith(":") and self._ends.get(a) in with_via:
-                self._refuse("connection", "via", "", f"is missing, {a} to {b}", None, line)
+                self._refuse("connection", "via", "", f"is missing, {a} to {b}", "", line)
 
     def _check_junctions(self, connections: Mapping[str, int]) -> None:
         """A junction's right-of-way table has one row for each connection through it (and crossing)."""
@@ -222,9 +212,5 @@ class _NetReader:
 
     def _need(self, tag: str, name: str, attributes: dict[str, str], line: int) -> str:
         if name not in attributes:
-            self._refuse(tag, name, "", "is missing", attributes.get("id"), line)
+            self._refuse(tag, name, "", "is missing", attributes.get("id", ""), line)
         return attributes[name]
-
-    def _refuse(self, tag: str, name: str, value: str, wrong: str, owner: str | None, line: int) -> None:
-        place = f"{owner}, line {line}" if owner else f"line {line}"
-        raise BadInput(f"{wrong} ({place})", file=self._path, field=f"{tag}.{name}", value=clip(value))

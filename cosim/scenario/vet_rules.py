@@ -7,23 +7,24 @@ accepts NaN, infinities and negative speeds silently (docs/sumo.md). Words such 
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple, NoReturn
+
+from cosim.errors import BadInput, Range
 
 
 @dataclass(frozen=True, slots=True)
-class Number:
+class Number(Range):
     """The range of a numeric attribute."""
 
-    low: float = -math.inf
-    above: bool = False  # strictly more than `low`
-    high: float = math.inf
     words: bool = False  # text that is not a number is SUMO's to judge
     time: bool = False  # H:M:S is legal too
     distribution: bool = False  # "normc(1,0.1,0.2,2)" is legal too
     whole: bool = False  # digits only
+    shape: bool = False  # a list of coordinates "x,y x,y[,z]"
 
 
 FINITE = Number()
@@ -35,6 +36,7 @@ TIME = Number(0.0, time=True)
 WORD_OR_TIME = Number(0.0, words=True, time=True)
 WORD_OR_NON_NEGATIVE = Number(0.0, words=True)
 WORD_OR_FINITE = Number(words=True)
+LANE_SPEED = Number(0.0, high=1000.0)  # m/s: more is no speed, though SUMO 1.28 takes 1e308 silently
 
 _NOT_A_SHAPE = re.compile(r"[^0-9eE+\-., \t\r\n]")  # NaN and inf have letters that no coordinate has
 _CALL = re.compile(r"\s*[A-Za-z]\w*\((.*)\)\s*", re.DOTALL)
@@ -49,11 +51,11 @@ def words(names: str) -> frozenset[str]:
     return frozenset(names.split())
 
 
-NET: Mapping[str, Mapping[str, Number]] = {
+_NET: Mapping[str, Mapping[str, Number]] = {
     "lane": {
         **_each(POSITIVE, "length width"),
-        **_each(NON_NEGATIVE, "speed"),
-        **_each(INDEX, "index"),
+        "speed": LANE_SPEED,
+        "index": INDEX,
         **_each(FINITE, "endOffset"),
     },
     "edge": _each(FINITE, "priority length"),
@@ -65,7 +67,8 @@ NET: Mapping[str, Mapping[str, Number]] = {
     "phase": _each(TIME, "duration"),
     "tlLogic": _each(WORD_OR_FINITE, "offset"),
 }
-SHAPES = frozenset({"shape", "customShape", "outlineShape"})
+_SHAPES = _each(Number(shape=True), "shape customShape outlineShape")
+NET = {tag: {**_SHAPES, **rules} for tag, rules in _NET.items()}
 
 # Lane-change attributes SUMO 1.28 knows. The first group moves LC2013; the second only SL2015.
 LC2013 = words(
@@ -175,37 +178,56 @@ DEMAND: Mapping[str, Mapping[str, Number]] = {
 
 def problem(value: str, rule: Number) -> str | None:
     """What is wrong with `value` under `rule`; None when it is fine."""
+    if rule.shape:
+        return "holds something that is not a finite number" if _NOT_A_SHAPE.search(value) else None
     try:
         number = float(value)
     except ValueError:
         return _problem_of_text(value, rule)
-    if math.isnan(number) or math.isinf(number):
-        return "must be finite"
-    if number < rule.low or (rule.above and number == rule.low):
-        return f"must be {'more than' if rule.above else 'at least'} {rule.low:g}"
-    if rule.whole and not (value.isascii() and value.isdigit()):
+    wrong = rule.problem(number)
+    if wrong is None and rule.whole and not (value.isascii() and value.isdigit()):
         return "must be a whole number"
-    if number > rule.high:
-        return f"must be at most {rule.high:g}"
-    return None
+    return wrong
 
 
 def _problem_of_text(value: str, rule: Number) -> str | None:
     if rule.time and ":" in value:
-        bad = [problem(part, NON_NEGATIVE) for part in value.split(":")]
-        return next((b for b in bad if b is not None), None)
+        return next(filter(None, (problem(part, NON_NEGATIVE) for part in value.split(":"))), None)
     if rule.distribution and (call := _CALL.fullmatch(value)):
-        bad = [problem(part.strip(), FINITE) for part in call[1].split(",")]
-        return next((b for b in bad if b is not None), None)
+        return next(filter(None, (problem(part.strip(), FINITE) for part in call[1].split(","))), None)
     return None if rule.words and value.strip() else "is not a number"
 
 
-def shape_problem(value: str) -> str | None:
-    """What is wrong with a list of coordinates "x,y x,y[,z]"; None when it is fine."""
-    bad = _NOT_A_SHAPE.search(value)
-    return None if bad is None else "holds something that is not a finite number"
+class Place(NamedTuple):
+    """Where an attribute stands, for the error about it."""
+
+    file: Path
+    field: str  # tag.attribute
+    owner: str  # id of the element, "" where it has none
+    line: int
+
+    def __str__(self) -> str:
+        return f"{self.owner}, line {self.line}" if self.owner else f"line {self.line}"
+
+    def wrong(self, problem: str, value: str) -> BadInput:
+        """The error; a long value is cut, for a shape may have a thousand points."""
+        shown = value if len(value) <= 80 else f"{value[:77]}..."
+        return BadInput(f"{problem} ({self})", file=self.file, field=self.field, value=shown)
 
 
-def clip(value: str) -> str:
-    """A value as an error shows it: a shape may have a thousand points."""
-    return value if len(value) <= 80 else f"{value[:77]}..."
+class Reader:
+    """What the handlers of one pass over an XML file share."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def _check(
+        self, tag: str, attributes: Mapping[str, str], rules: Mapping[str, Number], owner: str, line: int
+    ) -> None:
+        """Refuse the first attribute that is not as its rule wants it."""
+        for name, value in attributes.items():
+            if name in rules and (wrong := problem(value, rules[name])):
+                self._refuse(tag, name, value, wrong, owner, line)
+
+    def _refuse(self, tag: str, name: str, value: str, wrong: str, owner: str, line: int) -> NoReturn:
+        raise Place(self._path, f"{tag}.{name}", owner, line).wrong(wrong, value)

@@ -22,12 +22,16 @@ SETTLED = 1e-3  # m/s: closer to its target an AV needs no new command
 
 @dataclass(slots=True)
 class Controlled:
-    """What the loop remembers of one commanded AV."""
+    """The state of one commanded AV."""
 
     target: float  # m/s
-    change: int = 0  # lane change under way: +1 left, -1 right
-    change_until: float = -1.0  # s
+    change: int = 0  # the last lane change: +1 left, -1 right
+    change_until: float = -1.0  # s, when it ends
     requested: float = -1.0  # m/s, the last speed handed to SUMO
+
+    def changing(self, now: float) -> int:
+        """The lane change under way at time `now` (s): +1 left, -1 right, 0 none."""
+        return self.change if now < self.change_until - 1e-9 else 0
 
 
 class Commander:
@@ -53,11 +57,13 @@ class Commander:
             libsumo.vehicle.setLaneChangeMode(name, LANE_CHANGE_MODE[self._preset])
             libsumo.vehicle.setDecel(name, MAX_DECEL)
         state.target = command.target_speed
-        if now >= state.change_until - 1e-9:
-            state.change = 0
         if command.lane_offset == 0:
             return Receipt(name, True)
-        why = self._cannot_change(name, lane, state, command.lane_offset)
+        why = (
+            "a lane change is under way"
+            if state.changing(now)
+            else _forbidden(name, lane, command.lane_offset)
+        )
         if why is not None:
             return Receipt(name, False, why)
         libsumo.vehicle.changeLaneRelative(name, command.lane_offset, command.hold)
@@ -83,7 +89,7 @@ class Commander:
             if not command.lane_offset or not receipt.executed:
                 continue
             name, state = command.vehicle, self.controlled.get(command.vehicle)
-            if state is None or name not in libsumo.vehicle.getIDList():
+            if not state or name not in libsumo.vehicle.getIDList():
                 continue
             if abs(libsumo.vehicle.getLateralLanePosition(name)) < 0.05:
                 state.change, state.change_until = 0, -1.0
@@ -101,24 +107,22 @@ class Commander:
                 vehicle.setSpeed(name, wanted)
                 state.requested = wanted
 
-    def forget(self, name: str) -> None:
+    def drop(self, name: str) -> None:
         """The vehicle left the road."""
         self.controlled.pop(name, None)
         self.lane_changes.pop(name, None)
 
-    def _cannot_change(self, name: str, lane: str, state: Controlled, offset: int) -> str | None:
-        if state.change:
-            return "a lane change is under way"
-        if lane.startswith(":"):
-            return "inside a junction"
-        edge, _, index = lane.rpartition("_")
-        target = int(index) + offset
-        if not 0 <= target < libsumo.edge.getLaneNumber(edge):
-            return "no lane on that side"
-        kind = libsumo.vehicle.getVehicleClass(name)
-        allowed = libsumo.lane.getAllowed(f"{edge}_{target}")
-        if allowed and kind not in allowed:
-            return "the lane is closed to this vehicle class"
-        if not may_change(lane, offset, kind):
-            return "lane changes are forbidden here"
-        return None
+
+def _forbidden(name: str, lane: str, offset: int) -> str | None:
+    """Why the road does not let vehicle `name` on `lane` change by `offset` lanes; None if it does."""
+    if lane.startswith(":"):
+        return "inside a junction"
+    edge, _, index = lane.rpartition("_")
+    target = int(index) + offset
+    if not 0 <= target < libsumo.edge.getLaneNumber(edge):
+        return "no lane on that side"
+    kind = libsumo.vehicle.getVehicleClass(name)
+    allowed = libsumo.lane.getAllowed(f"{edge}_{target}")
+    if allowed and kind not in allowed:
+        return "the lane is closed to this vehicle class"
+    return None if may_change(lane, offset, kind) else "lane changes are forbidden here"

@@ -1,4 +1,4 @@
-"""SUMO's way of saying where a vehicle is, turned into ours: needs no SUMO, so files can be read with it."""
+"""Converts SUMO's positions and angles of vehicles to ours, without SUMO, so that files can be read with it."""
 
 from __future__ import annotations
 
@@ -15,6 +15,5 @@ def centres(
 
     front_x, front_y, half_length [n] m, angle [n] degrees -> x [n] m, y [n] m, heading [n] rad in [-pi, pi).
     """
-    heading = np.radians(90.0 - angle)
-    heading = (heading + np.pi) % (2 * np.pi) - np.pi
+    heading = (np.radians(90.0 - angle) + np.pi) % (2 * np.pi) - np.pi
     return front_x - half_length * np.cos(heading), front_y - half_length * np.sin(heading), heading

@@ -41,15 +41,19 @@ class SnapshotReader:
     def __init__(self, road: RoadMap) -> None:
         self._lane_index = road.index
         self._ids: tuple[str, ...] | None = None
-        self._static: tuple[np.ndarray, ...] = ()
-        self._front = np.zeros(0)  # [n] m, half lengths
+        self._static: tuple[np.ndarray, ...] = ()  # kind, mission, length m, width m [n] of `_ids`
 
-    def forget(self) -> None:
-        """The bodies changed (a new episode, a new mission vehicle)."""
+    def bodies_changed(self) -> None:
+        """Build the constant columns anew at the next read (a new episode, a new mission vehicle)."""
         self._ids = None
 
     def read(self, bodies: dict[str, Body], events: Events) -> Snapshot:
-        """One snapshot of every vehicle on the road, sorted by id."""
+        """One snapshot of every vehicle on the road, sorted by id.
+
+        Args:
+            bodies: what is constant of each vehicle that has departed, by id.
+            events: what happened since the last snapshot.
+        """
         ids = tuple(sorted(libsumo.vehicle.getIDList()))
         if ids != self._ids:
             present = [bodies[i] for i in ids]
@@ -59,13 +63,12 @@ class SnapshotReader:
                 np.array([b.length for b in present], np.float64),
                 np.array([b.width for b in present], np.float64),
             )
-            self._front = 0.5 * self._static[2]
             self._ids = ids
         kind, mission, length, width = self._static
         position, angle, speed, accel, lane_id, lane_position = GETTERS
         index = self._lane_index
         front = np.array([position(i) for i in ids], np.float64).reshape(-1, 2)  # [n,2] m
-        x, y, heading = centres(front[:, 0], front[:, 1], np.array([angle(i) for i in ids]), self._front)
+        x, y, heading = centres(front[:, 0], front[:, 1], np.array([angle(i) for i in ids]), 0.5 * length)
         return Snapshot(
             time=libsumo.simulation.getTime(),
             ids=ids,
@@ -85,9 +88,14 @@ class SnapshotReader:
 
 
 def read_road(zones: Sequence[Zone], scenario_file: object) -> RoadMap:
-    """The loaded net as a RoadMap: every lane a motor vehicle may use.
+    """The loaded net as a RoadMap (m, m/s): every lane that a motor vehicle may use.
 
-    Raises BadInput when a conflict zone names an edge that the net does not have.
+    Args:
+        zones: the conflict zones by their edges; without any, minor approaches and ending lanes make one.
+        scenario_file: named in errors.
+
+    Raises:
+        BadInput: a conflict zone names an edge that the net does not have.
     """
     get = libsumo.lane
     ids = [i for i in get.getIDList() if not (a := get.getAllowed(i)) or MOTOR_CLASSES.intersection(a)]
@@ -95,22 +103,17 @@ def read_road(zones: Sequence[Zone], scenario_file: object) -> RoadMap:
     lanes = []
     for name in ids:
         edge, _, number = name.rpartition("_")
-        successors = []
-        for link in get.getLinks(name):
-            follower = link[4] or link[0]
-            if follower in place:
-                successors.append(place[follower])
-        shape = np.array(get.getShape(name), np.float64)[:, :2]
+        followers = [link[4] or link[0] for link in get.getLinks(name)]
         lanes.append(
             Lane(
                 id=name,
                 edge=edge,
                 index=int(number),
-                shape=shape,
+                shape=np.array(get.getShape(name), np.float64)[:, :2],
                 length=get.getLength(name),
                 width=get.getWidth(name),
                 speed_limit=get.getMaxSpeed(name),
-                successors=tuple(dict.fromkeys(successors)),
+                successors=tuple(place[i] for i in dict.fromkeys(followers) if i in place),
                 left=_beside(name, place, 1),
                 right=_beside(name, place, -1),
                 internal=name.startswith(":"),
@@ -146,34 +149,27 @@ def _beside(lane: str, place: Mapping[str, int], offset: int) -> int:
 
 
 def struggling_lanes(road: RoadMap) -> frozenset[int]:
-    """Lanes whose driver needs somebody's help: they end beside others that go on, or must give way.
+    """Lanes whose driver needs the help of others: they end beside others that go on, or must give way.
 
-    This is how the mission vehicle of a user's own net is found when nobody names one.
+    This is how the mission vehicle of a user's own net is found when none is named.
     """
-    result = set()
-    for i, lane in enumerate(road.lanes):
-        if lane.internal:
-            continue
-        if not lane.successors:
-            if any(o >= 0 and road.lanes[o].successors for o in (lane.left, lane.right)):
-                result.add(i)
-            continue
-        links = libsumo.lane.getLinks(lane.id)
-        if links and all(link[5] in GIVE_WAY for link in links):
-            result.add(i)
-    return frozenset(result)
+    return frozenset(
+        i for i, lane in enumerate(road.lanes) if not lane.internal and _needs_help(lane, road.lanes)
+    )
+
+
+def _needs_help(lane: Lane, lanes: Sequence[Lane]) -> bool:
+    if not lane.successors:
+        return any(o >= 0 and lanes[o].successors for o in (lane.left, lane.right))
+    links = libsumo.lane.getLinks(lane.id)
+    return bool(links) and all(link[5] in GIVE_WAY for link in links)
 
 
 def _struggling_zone(road: RoadMap) -> ConflictZone:
     """Without a scenario.yaml the conflict lies where a minor approach or an ending lane meets others."""
-    lanes: set[int] = set()
-    for i in struggling_lanes(road):
-        lane = road.lanes[i]
-        if lane.successors:
-            lanes.update(lane.successors)
-        else:
-            lanes.update(o for o in (lane.left, lane.right) if o >= 0)
-    return ConflictZone("found", frozenset(lanes))
+    ways = [road.lanes[i] for i in struggling_lanes(road)]
+    entered = (o for way in ways for o in way.successors or (way.left, way.right) if o >= 0)
+    return ConflictZone("found", frozenset(entered))
 
 
 def _zone(zone: Zone, lanes: Sequence[Lane], scenario_file: object) -> ConflictZone:

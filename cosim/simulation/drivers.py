@@ -6,7 +6,7 @@ import hashlib
 
 import libsumo
 
-from cosim.errors import BadInput
+from cosim.errors import BadInput, one_of
 from cosim.scenario.behaviors import AS_IS, DRIVER_MODELS, MOBIL, Behaviors, DriverClass, load_behaviors
 from cosim.simulation.mobil import MobilDriving
 
@@ -14,25 +14,24 @@ from cosim.simulation.mobil import MobilDriving
 # whose types do not use IDM gets this one as an additional file (sumo_scenarios/types.add.xml).
 IDM_TYPE = "cosim.idm"
 
-EMERGENCY_DECELERATION = 9.0  # m/s2, what tyres give: even a gentle driver's last resort (SUMO's default)
+# What a derived type keeps of its original: getters and setters of libsumo.vehicletype, in this order.
+BODY = ("VehicleClass", "Length", "Width", "Height", "MaxSpeed", "ShapeClass", "Color")
+
+EMERGENCY_DECELERATION = 9.0  # m/s2, the limit of the tyres (SUMO's default)
+LARGEST_DRAW = 1.0 - 1e-12  # in (0, 1): the division rounds up to 1 for the largest integers
 
 
 def derive_idm_type(original: str, name: str) -> None:
-    """Make vehicle type `name`: IDM with the size, class, maximum speed and looks of type `original`.
+    """Make vehicle type `name`: IDM with the size, class, maximum speed, shape and color of type `original`.
 
     Raises BadInput if `original` does not use IDM and the base type has not been loaded.
     """
     get = libsumo.vehicletype
     if IDM_TYPE in get.getIDList():
         get.copy(IDM_TYPE, name)
-        get.setVehicleClass(name, get.getVehicleClass(original))
-        get.setLength(name, get.getLength(original))
-        get.setWidth(name, get.getWidth(original))
-        get.setHeight(name, get.getHeight(original))
-        get.setMaxSpeed(name, get.getMaxSpeed(original))
-        get.setShapeClass(name, get.getShapeClass(original))
-        get.setColor(name, get.getColor(original))
-    elif get.getImperfection(original) == -1.0:  # SUMO's IDM has no driver imperfection and says -1
+        for parameter in BODY:
+            getattr(get, f"set{parameter}")(name, getattr(get, f"get{parameter}")(original))
+    elif get.getImperfection(original) == -1.0:  # SUMO's IDM has no driver imperfection: the value is -1
         get.copy(original, name)
     else:
         raise BadInput(
@@ -54,18 +53,8 @@ class Drivers:
         self, behavior: str, driver_model: str, seed: int, behaviors: Behaviors | None = None
     ) -> None:
         self.behaviors = behaviors or load_behaviors()
-        if behavior not in self.behaviors.names:
-            raise BadInput(
-                f"unknown behavior; known are {', '.join(self.behaviors.names)}",
-                field="behavior",
-                value=behavior,
-            )
-        if driver_model not in DRIVER_MODELS:
-            raise BadInput(
-                f"unknown driver model; known are {', '.join(DRIVER_MODELS)}",
-                field="driver-model",
-                value=driver_model,
-            )
+        one_of(behavior, self.behaviors.names, "behavior")
+        one_of(driver_model, DRIVER_MODELS, "driver-model")
         if driver_model == MOBIL and behavior == AS_IS:
             raise BadInput(
                 f"MOBIL needs Table II's drivers: choose another --behavior than {AS_IS}",
@@ -73,7 +62,7 @@ class Drivers:
                 value=driver_model,
             )
         self.behavior, self.driver_model, self.seed = behavior, driver_model, seed
-        self.classes: dict[str, str] = {}  # vehicle -> class, of everybody applied so far
+        self.classes: dict[str, str] = {}  # vehicle -> class, of all HVs so far
         self.mobil = MobilDriving(self.behaviors.mobil_period) if driver_model == MOBIL else None
         self._types: dict[tuple[str, str], str] = {}
 
@@ -81,9 +70,10 @@ class Drivers:
         """Three uniform numbers in (0, 1) of one vehicle: for its class, desired speed and phase."""
         key = f"{self.seed}/behavior/{vehicle}".encode()
         digest = hashlib.blake2b(key, digest_size=24).digest()
-        a, b, c = ((int.from_bytes(digest[i : i + 8], "big") + 0.5) / 2.0**64 for i in (0, 8, 16))
-        top = 1.0 - 1e-12  # the division rounds up to 1 for the largest integers
-        return min(a, top), min(b, top), min(c, top)
+        a, b, c = (
+            min((int.from_bytes(digest[i : i + 8], "big") + 0.5) / 2.0**64, LARGEST_DRAW) for i in (0, 8, 16)
+        )
+        return a, b, c
 
     def apply(self, vehicle: str) -> str:
         """Make one departed HV drive like its class; returns the class ("as-is": nothing is touched)."""
@@ -115,15 +105,19 @@ class Drivers:
             draft = f"{name}/draft"
             derive_idm_type(original, draft)
             set_, idm = libsumo.vehicletype, driver.idm
-            set_.setTau(draft, idm.time_headway)
-            set_.setMinGap(draft, idm.minimum_gap)
-            set_.setAccel(draft, idm.max_acceleration)
-            # Emergency deceleration first: SUMO warns when it is below the comfortable one.
-            set_.setEmergencyDecel(draft, max(EMERGENCY_DECELERATION, idm.comfortable_deceleration))
-            set_.setDecel(draft, idm.comfortable_deceleration)
-            set_.setApparentDecel(draft, idm.comfortable_deceleration)
+            parameters = {
+                "Tau": idm.time_headway,
+                "MinGap": idm.minimum_gap,
+                "Accel": idm.max_acceleration,
+                # before Decel: SUMO warns when it is below the comfortable one
+                "EmergencyDecel": max(EMERGENCY_DECELERATION, idm.comfortable_deceleration),
+                "Decel": idm.comfortable_deceleration,
+                "ApparentDecel": idm.comfortable_deceleration,
+                "SpeedDeviation": 0.0,
+            }
+            for parameter, value in parameters.items():
+                getattr(set_, f"set{parameter}")(draft, value)
             set_.setActionStepLength(draft, libsumo.simulation.getDeltaT(), True)
-            set_.setSpeedDeviation(draft, 0.0)
             # SUMO's IDM keeps the 2 sqrt(a b) of its construction: setAccel and setDecel change a and b, but
             # not d* (measured: -0.06 instead of -0.44 m/s2). Copying the type constructs the model anew.
             set_.copy(draft, name)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -17,7 +18,7 @@ LATERAL_SPEED = LANE_WIDTH / 2.0  # m/s: a lane change takes 2 s (definitions.md
 
 @dataclass(slots=True)
 class FakeVehicle:
-    """One vehicle of the fake world; `x` is the front bumper's place along the road in m."""
+    """One vehicle of the fake simulator; `x` is the front bumper's place along the road in m."""
 
     id: str
     x: float
@@ -25,7 +26,7 @@ class FakeVehicle:
     speed: float  # m/s
     is_av: bool = False
     mission: bool = False
-    desired: float = 25.0  # m/s, of an HV (and of an AV nobody commands)
+    desired: float = 25.0  # m/s, of an HV (and of an AV without a command)
     target: float | None = None  # m/s, once commanded
     goal_lane: int = -1  # while a lane change is under way
     offset: float = 0.0  # m, lateral, from the centre of `lane`
@@ -55,20 +56,13 @@ class FakeSimulator:
         self._template = tuple(vehicles)
         self._timing = timing
         self._length = length
-        self._vehicles: dict[str, FakeVehicle] = {}
-        self._time = 0.0
-        self._hit: set[frozenset[str]] = set()
 
     def reset(self, seed: int) -> tuple[Snapshot, ...]:
-        """One frame: everyone at the start."""
+        """One frame: all vehicles at the start."""
         rng = np.random.default_rng(seed)
         self._time = 0.0
-        self._hit.clear()
-        self._vehicles = {}
-        for v in self._template:
-            copy = FakeVehicle(v.id, v.x + rng.uniform(-1, 1), v.lane, v.speed, v.is_av, v.mission, v.desired)
-            copy.length, copy.width = v.length, v.width
-            self._vehicles[v.id] = copy
+        self._hit: set[frozenset[str]] = set()
+        self._vehicles = {v.id: replace(v, x=v.x + rng.uniform(-1, 1)) for v in self._template}
         return (self._snapshot(),)
 
     def advance(self, commands: Sequence[Command]) -> tuple[tuple[Receipt, ...], tuple[Snapshot, ...]]:
@@ -96,7 +90,7 @@ class FakeSimulator:
         return v.target, 0 if v.goal_lane < 0 else int(np.sign(v.goal_lane - v.lane))
 
     def counts(self) -> dict[str, int]:
-        """Everybody is inserted at once."""
+        """All vehicles are inserted at the start."""
         return {"inserted": len(self._template), "waiting": 0}
 
     def close(self) -> None:
@@ -120,10 +114,8 @@ class FakeSimulator:
         step = self._timing.step
         old = {v.id: v.speed for v in self._vehicles.values()}
         for v in self._vehicles.values():
-            if v.target is not None:
-                wanted = tracked_speed(v.speed, v.target, step)
-            else:
-                wanted = max(v.speed + self._idm(v, old) * step, 0.0)
+            free = max(v.speed + self._idm(v, old) * step, 0.0)
+            wanted = free if v.target is None else tracked_speed(v.speed, v.target, step)
             v.accel = (wanted - v.speed) / step
             v.speed = wanted
         for v in list(self._vehicles.values()):
@@ -174,21 +166,19 @@ class FakeSimulator:
 
     def _collisions(self, vs: list[FakeVehicle], y: np.ndarray) -> list[Collision]:
         found = []
-        for i, a in enumerate(vs):
-            for j in range(i + 1, len(vs)):
-                b = vs[j]
-                if abs(y[i] - y[j]) >= (a.width + b.width) / 2:
-                    continue
-                if a.x - a.length >= b.x or b.x - b.length >= a.x or frozenset((a.id, b.id)) in self._hit:
-                    continue
-                self._hit.add(frozenset((a.id, b.id)))
-                hits, hit = (a, b) if a.x < b.x else (b, a)
-                found.append(
-                    Collision(
-                        self._time, hits.id, hit.id, hits.is_av, hit.is_av, "overlap", "box",
-                        f"road_{hits.lane}", hits.x, float(y[i]), hits.mission or hit.mission, hits.is_av,
-                    )
-                )  # fmt: skip
+        for (ya, a), (yb, b) in combinations(zip(y, vs, strict=True), 2):
+            pair = frozenset((a.id, b.id))
+            beside = abs(ya - yb) < (a.width + b.width) / 2
+            if pair in self._hit or not beside or a.x - a.length >= b.x or b.x - b.length >= a.x:
+                continue
+            self._hit.add(pair)
+            hits, hit = (a, b) if a.x < b.x else (b, a)
+            found.append(
+                Collision(
+                    self._time, hits.id, hit.id, hits.is_av, hit.is_av, "overlap", "box",
+                    f"road_{hits.lane}", hits.x, float(ya), hits.mission or hit.mission, hits.is_av,
+                )
+            )  # fmt: skip
         return found
 
 

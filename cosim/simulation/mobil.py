@@ -15,7 +15,7 @@ import libsumo
 
 from cosim.scenario.behaviors import IdmParameters, MobilParameters
 
-FAR = 1.0e6  # m: the gap to nobody
+FAR = 1.0e6  # m: the gap without a leader
 TOUCHING = 0.01  # m: smaller gaps (also overlaps) brake as hard as this one
 
 LEFT, RIGHT = 1, -1
@@ -34,7 +34,7 @@ CONFLICT_RANGE = 60.0  # m: two requests of one step into one lane this close: t
 
 
 class Car(NamedTuple):
-    """One vehicle as MOBIL sees it."""
+    """The state of one vehicle that MOBIL needs."""
 
     speed: float  # m/s
     desired_speed: float  # m/s, v0
@@ -50,7 +50,7 @@ class Beside(NamedTuple):
 
 
 class Situation(NamedTuple):
-    """Everybody whom a lane change concerns; None where nobody is."""
+    """The vehicles that a lane change concerns; None where there is none."""
 
     ego: Car
     leader: Beside | None
@@ -73,7 +73,13 @@ class Accelerations(NamedTuple):
 def idm_acceleration(
     idm: IdmParameters, speed: float, desired_speed: float, gap: float = FAR, leader_speed: float = 0.0
 ) -> float:
-    """IDM acceleration in m/s2 at a bumper gap in m behind a leader (FAR: a free road).
+    """IDM acceleration in m/s2 (P, section V-A.2).
+
+    Args:
+        idm: the driver's parameters.
+        speed, desired_speed: v and v0, m/s.
+        gap: m, bumper to bumper, to the leader (FAR: a free road).
+        leader_speed: m/s.
 
     The desired gap never falls below d0 (Treiber's max(0, .)): opening gaps do not repel.
     """
@@ -81,33 +87,27 @@ def idm_acceleration(
     if gap >= FAR:
         return idm.max_acceleration * free
     root = 2.0 * math.sqrt(idm.max_acceleration * idm.comfortable_deceleration)
-    wished = idm.minimum_gap + max(0.0, speed * idm.time_headway + speed * (speed - leader_speed) / root)
-    return idm.max_acceleration * (free - (wished / max(gap, TOUCHING)) ** 2)
+    desired_gap = idm.minimum_gap + max(0.0, speed * idm.time_headway + speed * (speed - leader_speed) / root)
+    return idm.max_acceleration * (free - (desired_gap / max(gap, TOUCHING)) ** 2)
 
 
 def _follow(car: Car, ahead: Beside | None) -> float:
-    if ahead is None:
-        return idm_acceleration(car.idm, car.speed, car.desired_speed)
-    return idm_acceleration(car.idm, car.speed, car.desired_speed, ahead.gap, ahead.car.speed)
+    gap, leader_speed = (FAR, 0.0) if ahead is None else (ahead.gap, ahead.car.speed)
+    return idm_acceleration(car.idm, car.speed, car.desired_speed, gap, leader_speed)
+
+
+def _follower(behind: Beside | None, ego: Car, ahead: Beside | None) -> tuple[float, float]:
+    """Acceleration in m/s2 of a follower behind `ego`, and behind `ahead` across ego's place."""
+    if behind is None:
+        return 0.0, 0.0
+    beyond = None if ahead is None else Beside(behind.gap + ego.length + ahead.gap, ahead.car)
+    return _follow(behind.car, Beside(behind.gap, ego)), _follow(behind.car, beyond)
 
 
 def accelerations(s: Situation) -> Accelerations:
     """What the change does to the changer, the new and the old follower (each with its own parameters)."""
-    new = old = new_after = old_after = 0.0
-    if s.new_follower is not None:
-        gap, car = s.new_follower
-        ahead = s.new_leader
-        if ahead is not None:  # without the change it follows the new leader across ego's place
-            ahead = Beside(gap + s.ego.length + ahead.gap, ahead.car)
-        new = _follow(car, ahead)
-        new_after = _follow(car, Beside(gap, s.ego))
-    if s.follower is not None:
-        gap, car = s.follower
-        ahead = s.leader
-        if ahead is not None:
-            ahead = Beside(gap + s.ego.length + ahead.gap, ahead.car)
-        old = _follow(car, Beside(gap, s.ego))
-        old_after = _follow(car, ahead)
+    new_after, new = _follower(s.new_follower, s.ego, s.new_leader)
+    old, old_after = _follower(s.follower, s.ego, s.leader)
     return Accelerations(
         _follow(s.ego, s.leader), _follow(s.ego, s.new_leader), new, new_after, old, old_after
     )
@@ -153,26 +153,23 @@ def read_car(vehicle: str, known: IdmParameters | None = None) -> Car:
 Known = Callable[[str], IdmParameters | None]
 
 
-def _ahead(found: tuple[str, float] | None, ego: str, minimum_gap: float, known: Known) -> Beside | None:
-    """SUMO's gaps are net of the rear vehicle's minGap; ours are bumper to bumper."""
-    if not found or not found[0] or found[0] == ego:
-        return None
-    return Beside(found[1] + minimum_gap, read_car(found[0], known(found[0])))
-
-
-def _behind(found: tuple[str, float] | None, ego: str, known: Known) -> Beside | None:
+def _neighbor(
+    found: tuple[str, float] | None, ego: str, known: Known, minimum_gap: float | None = None
+) -> Beside | None:
+    """SUMO's gaps are net of the rear vehicle's minGap (`minimum_gap` m; None: the found vehicle is the rear
+    one); ours are bumper to bumper."""
     if not found or not found[0] or found[0] == ego:
         return None
     car = read_car(found[0], known(found[0]))
-    return Beside(found[1] + car.idm.minimum_gap, car)
+    return Beside(found[1] + (car.idm.minimum_gap if minimum_gap is None else minimum_gap), car)
 
 
 def read_own_lane(vehicle: str, known: Known) -> Situation:
-    """The vehicle, its leader and its follower; nobody beside yet."""
+    """The vehicle, its leader and its follower; the next lanes are not read yet."""
     get = libsumo.vehicle
     ego = read_car(vehicle, known(vehicle))
-    leader = _ahead(get.getLeader(vehicle, LOOK_AHEAD), vehicle, ego.idm.minimum_gap, known)
-    return Situation(ego, leader, _behind(get.getFollower(vehicle, LOOK_AHEAD), vehicle, known), None, None)
+    leader = _neighbor(get.getLeader(vehicle, LOOK_AHEAD), vehicle, known, ego.idm.minimum_gap)
+    return Situation(ego, leader, _neighbor(get.getFollower(vehicle, LOOK_AHEAD), vehicle, known), None, None)
 
 
 def read_beside(own: Situation, vehicle: str, direction: int, known: Known) -> Situation:
@@ -181,13 +178,13 @@ def read_beside(own: Situation, vehicle: str, direction: int, known: Known) -> S
     A vehicle in the middle of its own change is already seen in the lane that it enters.
     """
     side = 0 if direction == LEFT else 1  # getNeighbors: bit 0 = right side, bit 1 = those ahead
-    ahead = libsumo.vehicle.getNeighbors(vehicle, 2 | side)
-    behind = libsumo.vehicle.getNeighbors(vehicle, side)
+    ahead, behind = (
+        min(libsumo.vehicle.getNeighbors(vehicle, which | side), key=lambda v: v[1], default=None)
+        for which in (2, 0)
+    )
     return own._replace(
-        new_leader=_ahead(
-            min(ahead, key=lambda v: v[1]) if ahead else None, vehicle, own.ego.idm.minimum_gap, known
-        ),
-        new_follower=_behind(min(behind, key=lambda v: v[1]) if behind else None, vehicle, known),
+        new_leader=_neighbor(ahead, vehicle, known, own.ego.idm.minimum_gap),
+        new_follower=_neighbor(behind, vehicle, known),
     )
 
 
@@ -213,8 +210,8 @@ def route_allows(vehicle: str, direction: int) -> bool:
 class MobilDriving:
     """Drives the lane changes of HVs by MOBIL; SUMO keeps only those that the route needs.
 
-    Each driver decides once per `period`, at a phase of its own, so that neither drivers move in lockstep
-    nor two of them answer the same gap at once. 1 s is also the shortest interval between two lane changes
+    Each driver decides once per `period`, at a phase of its own, so that drivers neither decide all in one
+    step nor two of them take the same gap at once. 1 s is also the shortest interval between two lane changes
     in the simulator of P's lineage (HighwayEnv).
     """
 
@@ -225,9 +222,8 @@ class MobilDriving:
         self._steps = 0
 
     def known(self, vehicle: str) -> IdmParameters | None:
-        """Parameters of a driver of ours, None for anybody else."""
-        found = self._drivers.get(vehicle)
-        return found[0] if found else None
+        """Parameters of a driver of ours, None for another vehicle."""
+        return self._drivers.get(vehicle, (None,))[0]
 
     def add(self, vehicle: str, idm: IdmParameters, mobil: MobilParameters, phase: float) -> None:
         """Take over one HV; `phase` in [0, 1) of the period."""
@@ -237,17 +233,14 @@ class MobilDriving:
         self._drivers[vehicle] = (idm, mobil)
         self._due[int(phase * len(self._due))].append(vehicle)
 
-    def step(self) -> list[tuple[str, int]]:
-        """Decide for the drivers whose turn it is; returns the commanded (vehicle, direction)."""
+    def step(self) -> None:
+        """Decide for the drivers whose turn it is."""
         if not self._due:
-            return []
+            return
         turn = self._steps % len(self._due)
         self._steps += 1
         on_road: list[str] = []
-        commanded: list[tuple[str, int]] = []
-        claimed: list[
-            tuple[str, int, float]
-        ] = []  # edge, target lane index, position of this step's requests
+        requested: list[tuple[str, int, float]] = []  # edge, target lane's index, m along it, of this step
         for vehicle in self._due[turn]:
             try:
                 direction = self._decide(vehicle)
@@ -255,11 +248,9 @@ class MobilDriving:
                 del self._drivers[vehicle]
                 continue
             on_road.append(vehicle)
-            if direction and self._claim(vehicle, direction, claimed):
+            if direction and _gap_is_free(vehicle, direction, requested):
                 libsumo.vehicle.changeLaneRelative(vehicle, direction, 0.0)
-                commanded.append((vehicle, direction))
         self._due[turn] = on_road
-        return commanded
 
     def _decide(self, vehicle: str) -> int:
         if changing(vehicle):
@@ -281,16 +272,13 @@ class MobilDriving:
                 best, best_gain = direction, gain
         return best
 
-    @staticmethod
-    def _claim(vehicle: str, direction: int, claimed: list[tuple[str, int, float]]) -> bool:
-        """Two drivers of one step may both find the same gap free: only the first gets it."""
-        get = libsumo.vehicle
-        edge, lane, place = (
-            get.getRoadID(vehicle),
-            get.getLaneIndex(vehicle) + direction,
-            get.getLanePosition(vehicle),
-        )
-        if any(e == edge and i == lane and abs(p - place) < CONFLICT_RANGE for e, i, p in claimed):
-            return False
-        claimed.append((edge, lane, place))
-        return True
+
+def _gap_is_free(vehicle: str, direction: int, requested: list[tuple[str, int, float]]) -> bool:
+    """Whether no earlier request of this step is for the same gap; this one is then added to `requested`."""
+    get = libsumo.vehicle
+    edge, lane = get.getRoadID(vehicle), get.getLaneIndex(vehicle) + direction
+    place = get.getLanePosition(vehicle)
+    if any(e == edge and i == lane and abs(p - place) < CONFLICT_RANGE for e, i, p in requested):
+        return False
+    requested.append((edge, lane, place))
+    return True

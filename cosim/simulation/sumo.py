@@ -6,7 +6,9 @@ import re
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import libsumo
 import numpy as np
@@ -24,18 +26,18 @@ from cosim.simulation.convert import Body, SnapshotReader, read_road, struggling
 from cosim.simulation.drivers import Drivers
 from cosim.simulation.fleet import Fleet
 from cosim.simulation.stderr import SumoStderr
-from cosim.simulation.xerces import keep_awake
-from cosim.types import Bools, Collision, Command, Events, Kind, Receipt, Snapshot
+from cosim.simulation.xerces import keep_initialized
+from cosim.types import Command, Events, Kind, Receipt, Snapshot
 
 SUMO_ERRORS = (libsumo.TraCIException, libsumo.FatalTraCIError)
 
-# Ours, where a user's file does not say otherwise. A teleport would be a vehicle out of thin air.
+# Ours, where a user's file does not say otherwise. A teleport would let a vehicle appear on the road.
 DEFAULTS = {
     "lanechange.duration": "2",  # continuous lateral motion, definitions.md
     "time-to-teleport": "-1",
     "default.speeddev": "0",
 }
-# Ours whatever the file says: collisions must be seen (docs/sumo.md: never `collision.action none`).
+# Ours whatever the file says: collisions must be reported (docs/sumo.md: never `collision.action none`).
 FORCED = {
     "collision.action": "warn",
     "collision.check-junctions": "true",
@@ -45,11 +47,11 @@ FORCED = {
     "duration-log.disable": "true",
     "xml-validation": "never",  # cosim.scenario.vet has read the files already
 }
-# What SUMO says in the middle of a run, where it loads routes, of a vehicle that cannot depart as written.
+# SUMO's message in the middle of a run, where it loads routes, about a vehicle that cannot depart as written.
 WRONG_DEMAND = re.compile(
     r"[Ii]nvalid depart|Departure \w+ .*for vehicle|has no valid route|No connection between edge"
 )
-GIVES_UP = "max-depart-delay"  # SUMO drops who waited so long, and says so nowhere
+GIVES_UP = "max-depart-delay"  # SUMO drops vehicles that waited so long, without a message
 
 _in_use = False
 
@@ -70,8 +72,8 @@ class SumoSimulator:
                 "use one process per simulation (cosim.envs and cosim.open do)"
             )
         self._scratch = tempfile.TemporaryDirectory(prefix="cosim-")
-        # a user's detectors would write beside his scenario, and workers over one another
-        self._scenario = scenario if scenario.built_in else quiet(scenario, Path(self._scratch.name))
+        # a user's detectors would write beside the scenario, and workers would overwrite one another's files
+        self._scenario = scenario if scenario.ships else quiet(scenario, Path(self._scratch.name))
         self._av_parameters = dict(av_parameters or {})
         self._history = history
         self._stderr = SumoStderr()
@@ -83,8 +85,6 @@ class SumoSimulator:
         self._steps_per_decision = round(timing.decision / timing.step)
         patience = time_of(dict(scenario.options).get(GIVES_UP, "-1"), scenario.config, GIVES_UP)  # s
         self._gives_up = 0.0 <= patience < scenario.warmup + scenario.duration
-        self._bodies: dict[str, Body] = {}
-        self._watch = CollisionWatch()
         try:
             self._load(seed=0)
             self.road: RoadMap = read_road(scenario.zones, scenario.config)
@@ -101,14 +101,14 @@ class SumoSimulator:
         self._drivers = Drivers(self._scenario.behavior, self._scenario.driver_model, seed)
         self._fleet = Fleet(self._scenario, self._drivers, self._av_parameters)
         self._commander = Commander(self._scenario.preset, self._scenario.timing.step)
-        self._bodies.clear()
+        self._bodies: dict[str, Body] = {}
         self._routes: dict[str, tuple[str, ...]] = {}
-        self._watch.reset()
-        self._reader.forget()
+        self._watch = CollisionWatch()
+        self._reader.bodies_changed()
         self._mission_found = bool(self._scenario.mission.vehicles) or self._scenario.mission.kind == "none"
         self._inserted = 0
         self._waited: set[str] = set()  # only where SUMO gives up: seen waiting, not inserted since
-        self._clear_events()
+        self._happened: list[tuple[Any, ...]] = []  # per step since the last frame: the fields of Events
         steps = round(self._scenario.warmup / self._scenario.timing.step)
         first_kept = steps - (self._history - 1) * self._steps_per_frame
         frames = []
@@ -117,9 +117,7 @@ class SumoSimulator:
                 self._step()
                 if k >= first_kept and (steps - k) % self._steps_per_frame == 0:
                     frames.append(self._snapshot())
-        if not frames:
-            frames.append(self._snapshot())
-        return tuple(frames)
+        return tuple(frames) or (self._snapshot(),)
 
     def advance(self, commands: Sequence[Command]) -> tuple[tuple[Receipt, ...], tuple[Snapshot, ...]]:
         """Hold the commands for one decision; one snapshot per frame. Raises SimulationError."""
@@ -149,12 +147,11 @@ class SumoSimulator:
         state = self._commander.controlled.get(vehicle)
         if state is None:
             return None, 0
-        under_way = libsumo.simulation.getTime() < state.change_until - 1e-9
-        return state.target, state.change if under_way else 0
+        return state.target, state.changing(libsumo.simulation.getTime())
 
     def counts(self) -> dict[str, int]:
-        """Vehicles since the start: `inserted`, and `waiting`: were due and found no room, SUMO having given
-        them up (`max-depart-delay`) or not."""
+        """Vehicles since the start: `inserted`, and `waiting`: due and not inserted, whether SUMO has dropped
+        them (`max-depart-delay`) or not."""
         waiting = self._waited.union(libsumo.simulation.getPendingVehicles())
         return {"inserted": self._inserted, "waiting": len(waiting)}
 
@@ -180,14 +177,10 @@ class SumoSimulator:
         if self._closed:
             return
         self._closed = True
-        if self._started:
-            with self._stderr:
-                libsumo.close()
+        self.finish_outputs()
         self._stderr.close()
         self._scratch.cleanup()
         _in_use = False
-
-    # ---- inside ----
 
     def _load(self, seed: int) -> None:
         arguments = self._arguments(seed)
@@ -198,16 +191,14 @@ class SumoSimulator:
                 else:
                     libsumo.start(["sumo", *arguments])
                     self._started = True
-                    keep_awake()
+                    keep_initialized()
         except SUMO_ERRORS as error:
             self._started = libsumo.isLoaded()
             raise self._explain(error, starting=True) from None
 
     def _arguments(self, seed: int) -> list[str]:
         s = self._scenario
-        additional = [*s.additional]
-        if not s.built_in:
-            additional.append(sumo_scenarios.TYPES)
+        additional = s.additional if s.built_in else (*s.additional, sumo_scenarios.TYPES)
         settings, files = sumo_options(self._outputs, s)
         options = {
             "net-file": str(s.net),
@@ -228,11 +219,11 @@ class SumoSimulator:
         words = " ".join((self._stderr.take() or str(error)).split())
         if starting:  # everything SUMO refuses before the first step is wrong input
             return BadInput(f"SUMO refuses it: {words}", file=self._scenario.config)
-        told = "".join(f"; found before: {warning}" for warning in self._scenario.warnings)
+        warned = "".join(f"; found before: {warning}" for warning in self._scenario.warnings)
         if WRONG_DEMAND.search(words):
             files = ", ".join(map(str, self._scenario.demand)) or self._scenario.config
-            return BadInput(f"SUMO refuses it: {words}{told}", file=files)
-        return SimulationError(f"{self._scenario.config}: SUMO failed: {words}{told}")
+            return BadInput(f"SUMO refuses it: {words}{warned}", file=files)
+        return SimulationError(f"{self._scenario.config}: SUMO failed: {words}{warned}")
 
     def _step(self) -> None:
         simulation = libsumo.simulation
@@ -240,87 +231,66 @@ class SumoSimulator:
             libsumo.simulationStep()
         except SUMO_ERRORS as error:
             raise self._explain(error) from None
-        now = simulation.getTime()
         departed = simulation.getDepartedIDList()
-        if departed:
-            self._inserted += len(departed)
-            self._waited.difference_update(departed)
-            self._departed += departed
-            for name in departed:
-                self._bodies[name] = self._fleet.welcome(name, self._seed)
+        self._inserted += len(departed)
+        self._waited.difference_update(departed)
+        for name in departed:
+            self._bodies[name] = self._fleet.depart(name, self._seed)
         arrived = simulation.getArrivedIDList()
-        if arrived:
-            self._arrived += arrived
-            for name in arrived:
-                self._commander.forget(name)
-                self._routes.pop(name, None)
-        if simulation.getCollidingVehiclesNumber():
-            self._collisions += self._watch.from_sumo(self._bodies, self._commander.lane_changes, now)
-        teleported = simulation.getStartingTeleportIDList()
-        if teleported:
-            self._teleported += teleported
-        stopped = simulation.getEmergencyStoppingVehiclesIDList()
-        if stopped:
-            self._stopped += stopped
+        for name in arrived:
+            self._commander.drop(name)
+            self._routes.pop(name, None)
+        now = simulation.getTime()
+        self._happened.append(
+            (
+                self._watch.from_sumo(self._bodies, self._commander.lane_changes, now),
+                departed,
+                arrived,
+                simulation.getStartingTeleportIDList(),
+                simulation.getEmergencyStoppingVehiclesIDList(),
+            )
+        )
         if self._gives_up:
             self._waited.update(simulation.getPendingVehicles())
         self._drivers.step(now)
 
     def _snapshot(self) -> Snapshot:
-        events = Events(
-            tuple(self._collisions),
-            tuple(self._departed),
-            tuple(self._arrived),
-            tuple(self._teleported),
-            tuple(self._stopped),
-        )
-        self._clear_events()
+        events = Events(*(tuple(chain.from_iterable(field)) for field in zip(*self._happened, strict=True)))
+        self._happened.clear()
         snapshot = self._reader.read(self._bodies, events)
         if not self._mission_found:
             snapshot = self._find_mission(snapshot)
         self._watch.lane_changes(snapshot, self.road, self._commander)
         extra = self._watch.from_boxes(snapshot, self.road, self._bodies, self._commander.lane_changes)
         if extra:
-            collisions = events.collisions + tuple(extra)
-            snapshot = replace(snapshot, events=replace(events, collisions=collisions))
+            events = replace(events, collisions=(*events.collisions, *extra))
+            snapshot = replace(snapshot, events=events)
         return snapshot
 
-    def _clear_events(self) -> None:
-        self._collisions: list[Collision] = []
-        self._departed: list[str] = []
-        self._arrived: list[str] = []
-        self._teleported: list[str] = []
-        self._stopped: list[str] = []
-
-    def _goal(self) -> tuple[frozenset[int], Bools]:
-        """Lanes on which the mission is fulfilled; [lanes + 1] which make a vehicle the mission vehicle.
-
-        The last entry answers for lane -1 (off every lane).
-        """
-        mission = self._scenario.mission
-        struggling = np.zeros(len(self.road.lanes) + 1, np.bool_)
+    def _goal(self) -> tuple[frozenset[int], frozenset[int]]:
+        """Lanes on which the mission is fulfilled; lanes that make a vehicle the mission vehicle."""
+        mission, lanes = self._scenario.mission, self.road.lanes
         if mission.kind == "auto":
-            found = struggling_lanes(self.road)
-            struggling[list(found)] = True
-            free = frozenset(
-                i for i, lane in enumerate(self.road.lanes) if not lane.internal and i not in found
-            )
-            return free, struggling
-        goal = frozenset(i for i, lane in enumerate(self.road.lanes) if lane.edge in mission.goal)
-        missing = [e for e in mission.goal if not any(lane.edge == e for lane in self.road.lanes)]
+            struggling = struggling_lanes(self.road)
+            return frozenset(i for i, lane in enumerate(lanes) if not lane.internal) - struggling, struggling
+        missing = [e for e in mission.goal if not any(lane.edge == e for lane in lanes)]
         if missing:
             raise BadInput(
-                "the net has no such edge", file=self._scenario.config, field="mission.goal", value=missing[0]
+                "the net has no such edge",
+                file=self._scenario.config,
+                field="mission.goal",
+                value=missing[0],
             )
-        return goal, struggling
+        return frozenset(i for i, lane in enumerate(lanes) if lane.edge in mission.goal), frozenset()
 
     def _find_mission(self, snapshot: Snapshot) -> Snapshot:
-        """Nobody named one: the first HV (by id) that drives on a lane that ends or must give way."""
-        candidates = np.flatnonzero(self._struggling[snapshot.lane] & (snapshot.kind == Kind.HV))
-        if not len(candidates):
+        """Without a named one: the first HV (by id) that drives on a lane that ends or must give way."""
+        humans = np.flatnonzero(snapshot.kind == Kind.HV)
+        row = next((k for k in humans if snapshot.lane[k] in self._struggling), None)
+        if row is None:
             return snapshot
-        name = snapshot.ids[candidates[0]]
+        name = snapshot.ids[row]
         self._bodies[name] = replace(self._bodies[name], mission=True)
         self._mission_found = True
-        self._reader.forget()
+        self._reader.bodies_changed()
         return self._reader.read(self._bodies, snapshot.events)

@@ -11,5 +11,5 @@ def make_torch_deterministic() -> None:
     if torch is None:
         return
     torch.set_num_threads(1)
-    torch.use_deterministic_algorithms(True)
+    torch.set_deterministic_debug_mode("error")  # use_deterministic_algorithms would import the compiler
     torch.utils.deterministic.fill_uninitialized_memory = False  # costs 6 ms a decision, changes nothing

@@ -5,69 +5,93 @@ from __future__ import annotations
 import contextlib
 import sys
 import threading
-import time
-from typing import TextIO
+from collections.abc import Callable
+from typing import Any, TextIO
 
-BAR = 30  # characters
+from tqdm import tqdm
+
 REDRAW = 0.1  # s between redraws on a terminal
-LINE_EVERY = 10.0  # s between lines in a log
-STARTING = "starting SUMO, compiling kernels (first use only: up to half a minute) ..."
+LINE_EVERY = 10.0  # s between lines in a log; shorter work needs none
+COUNTED = "{n:.0f}/{total:.0f}{unit}, {rate_noinv_fmt}, {remaining} left"
+STARTING = "starting SUMO ..."
+COMPILING = "compiling kernels (first use only: up to half a minute) ..."
+
+
+class _Lines(tqdm):  # type: ignore[misc]  # tqdm is not typed
+    """A line instead of each redraw."""
+
+    @staticmethod
+    def status_printer(file: TextIO) -> Callable[[str], None]:
+        """How one is written."""
+        return lambda text: print(text, file=file, flush=True)
+
+    def close(self) -> None:
+        """There is nothing to clear."""
+        self.disable = True
 
 
 class Progress:
-    """Call it with (done, total); `unit` names what is counted. Silent when `quiet`."""
+    """Call it with (done, total); `unit` names what is counted. Silent when `quiet`.
+
+    A total of 0: there is nothing to count yet, kernels are being compiled.
+
+    Rate and time left are a moving average over the last reports; what came before the first one, the start
+    of processes and the like, does not count.
+    """
 
     def __init__(self, title: str, unit: str, *, quiet: bool = False, stream: TextIO | None = None) -> None:
         self._title, self._unit, self._quiet = title, unit, quiet
         self._stream = stream or sys.stderr
         self._terminal = self._stream.isatty()
-        self._began = self._last = time.monotonic()
-        self._drawn = False
-        self._note: threading.Timer | None = None
+        self._bar: tqdm[Any] | None = None
+        self._note = threading.Timer(3.0, self._say, [STARTING])
+        self._note.daemon = True
 
     def starting(self, after: float = 3.0) -> None:
         """Say what takes so long if nothing has been done `after` s from now."""
         if not self._quiet:
-            self._note = threading.Timer(after, self._say, [f"{self._title}: {STARTING}\n"])
-            self._note.daemon = True
+            self._note.interval = after
             self._note.start()
 
     def __call__(self, done: float, total: float) -> None:
         if self._quiet:
             return
-        self._begun()
-        now = time.monotonic()
-        if now - self._last < (REDRAW if self._terminal else LINE_EVERY) and done < total:
+        self._note.cancel()
+        if not total:
+            self._say(COMPILING)
             return
-        if not self._terminal and now - self._began < LINE_EVERY:
-            return  # short work needs no line in a log
-        self._last = now
-        rate = done / max(now - self._began, 1e-9)
-        left = (total - done) / rate if rate > 0 else float("inf")
-        share = min(done / total, 1.0) if total else 1.0
-        text = f"{done:.0f}/{total:.0f} {self._unit}, {rate:.1f} {self._unit}/s, {left:.0f} s left"
-        if self._terminal:
-            filled = round(BAR * share)
-            bar = "#" * filled + "." * (BAR - filled)
-            self._stream.write(f"\r{self._title} [{bar}] {share:4.0%} {text}\x1b[K")
-            self._drawn = True
-        else:
-            self._stream.write(f"{self._title}: {share:.0%}, {text}\n")
-        self._stream.flush()
+        if self._bar is None:
+            every = REDRAW if self._terminal else LINE_EVERY
+            self._bar = (tqdm if self._terminal else _Lines)(
+                desc=self._title,
+                unit=f" {self._unit}",
+                total=total,
+                initial=done,
+                file=self._stream,
+                bar_format=("{desc} |{bar:30}| " if self._terminal else "{desc}: ")
+                + "{percentage:3.0f}%, "
+                + COUNTED,
+                mininterval=every,
+                delay=every,
+                miniters=0,
+                position=0,
+                leave=False,
+            )
+        self._bar.total = total
+        self._bar.update(min(done, total) - self._bar.n)
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.done()
 
     def done(self) -> None:
         """Clear the bar."""
-        self._begun()
-        if self._drawn:
-            self._stream.write("\r\x1b[K")
-            self._stream.flush()
+        self._note.cancel()
+        if self._bar is not None:
+            self._bar.close()
 
     def _say(self, line: str) -> None:
         with contextlib.suppress(ValueError):  # the stream is closed: nobody listens any more
-            self._stream.write(line)
-            self._stream.flush()
-
-    def _begun(self) -> None:
-        if self._note is not None:
-            self._note.cancel()
-            self._note = None
+            print(f"{self._title}: {line}", file=self._stream, flush=True)

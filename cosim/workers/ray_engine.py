@@ -47,7 +47,7 @@ class RayEngine:
             import ray
         except ModuleNotFoundError:
             raise BadInput(
-                "ray is not installed: pip install 'cosim[ray]'", field="--engine", value="ray"
+                "ray is not installed: pip install 'cosim-sumo[ray]'", field="--engine", value="ray"
             ) from None
         self._ray: Any = ray
         self._factory = factory

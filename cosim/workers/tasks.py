@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from cosim.errors import BadInput, CosimError, SimulationCrashed
+
 OK, SIM_CRASH, TIMEOUT, BAD_INPUT = STATUSES = ("ok", "sim_crash", "timeout", "bad_input")
 FAULT = "fault"  # our own code failed: says nothing about the task, which should be done again once mended
 
@@ -57,6 +59,16 @@ class Outcome:
     @property
     def ok(self) -> bool:
         return self.status == OK
+
+    def result(self) -> Any:
+        """The value. Raises what the status says: BadInput, SimulationCrashed, or CosimError of our own."""
+        if self.ok:
+            return self.value
+        if self.status == BAD_INPUT:
+            raise BadInput(self.error or "")
+        if self.status == FAULT:
+            raise CosimError(self.stderr or self.error)
+        raise SimulationCrashed(self.error or "", stderr=self.stderr or "")
 
 
 class Dispenser:

@@ -6,6 +6,7 @@ a simulation lives in a spawned worker, called through a pipe; its death or sile
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import multiprocessing
 import os
@@ -197,7 +198,15 @@ def _serve(pipe: Connection, factory: Callable[..., Any], arguments: tuple[Any, 
     file = os.open(stderr, os.O_RDWR | os.O_APPEND)  # as `cosim.simulation.stderr` wants it, to read back
     os.dup2(file, 2)
     os.close(file)
-    target = None
+    target, done = None, False
+
+    def leave() -> None:
+        """Without taking numba and torch apart, which takes longer than a short episode."""
+        sys.stdout.flush()
+        if done:
+            os._exit(0)
+
+    atexit.register(leave)  # comes after every other exit function: they run in reverse order
 
     def attempt(work: Callable[[], Any]) -> bool:
         try:
@@ -224,3 +233,4 @@ def _serve(pipe: Connection, factory: Callable[..., Any], arguments: tuple[Any, 
     if target is not None and hasattr(target, "close"):
         with contextlib.suppress(Exception):
             target.close()
+    done = True

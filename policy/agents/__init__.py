@@ -1,37 +1,52 @@
-"""Every policy by name: the explicit table that `--policy` reads."""
+"""Every policy by name: the explicit tables that `--policy` reads; they need no torch."""
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal
 
 from cosim.errors import BadInput, hint
 from cosim.types import Policy
 
-# policy.agents.approaches has the table; its names alone are needed before torch is
-LEARNING = ("vfn-p", "vfn", "vfn-p-egoistic", "safe-dqn", "conv3d-dqn", "conv3d-a2c", "conv2d-dqn")
+
+@dataclass(frozen=True, slots=True)
+class Approach:
+    """One row of definitions.md's table of approaches."""
+
+    extractor: Literal["conv3d", "conv2d"] = "conv3d"
+    kinematics: bool = True  # K and the route join the maps
+    predicted_maps: bool = True
+    mask: Literal["gp-indirect", "cs", "none"] = "gp-indirect"
+    learning: Literal["ddqn", "a2c"] = "ddqn"
 
 
-def _prediction_aware(name: str) -> Callable[[], Policy]:
-    def build() -> Policy:
-        from policy.agents.prediction_aware import PredictionAware  # torch: only when it is asked for
+APPROACHES = {
+    "vfn-p": Approach(),
+    "vfn-p-egoistic": Approach(),  # the twin: the same agent, trained with phi = 0
+    "vfn": Approach(predicted_maps=False, mask="cs"),
+    "safe-dqn": Approach(kinematics=False, predicted_maps=False, mask="cs"),
+    "conv3d-dqn": Approach(kinematics=False, predicted_maps=False, mask="none"),
+    "conv3d-a2c": Approach(kinematics=False, predicted_maps=False, mask="none", learning="a2c"),
+    "conv2d-dqn": Approach("conv2d", kinematics=False, predicted_maps=False, mask="none"),
+}
 
-        return PredictionAware(name)
 
-    return build
-
-
-def _rules() -> dict[str, Callable[[], Policy]]:
-    from policy.agents.altruist_rule import AltruistRule
-    from policy.agents.idm import Idm, IdmCourteous
-    from policy.agents.keep_lane import KeepLane
-    from policy.agents.random import Random
-
-    return {c.name: c for c in (Idm, IdmCourteous, KeepLane, Random, AltruistRule)}
+def _made(module: str, kind: str, *arguments: str) -> Policy:
+    """A policy's class by name: its module (torch, compiled kernels) is imported when one is made."""
+    made: Policy = getattr(importlib.import_module(f"policy.agents.{module}"), kind)(*arguments)
+    return made
 
 
 POLICIES: dict[str, Callable[[], Policy]] = {
-    **_rules(),
-    **{name: _prediction_aware(name) for name in LEARNING},
+    "idm": partial(_made, "idm", "Idm"),
+    "idm-courteous": partial(_made, "idm", "IdmCourteous"),
+    "keep-lane": partial(_made, "keep_lane", "KeepLane"),
+    "random": partial(_made, "random", "Random"),
+    "altruist-rule": partial(_made, "altruist_rule", "AltruistRule"),
+    **{name: partial(_made, "prediction_aware", "PredictionAware", name) for name in APPROACHES},
 }
 
 

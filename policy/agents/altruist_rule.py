@@ -7,29 +7,24 @@ for the learned policies. AVs share what they know (V2V), so one guide is chosen
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import NamedTuple
 
 from cosim.types import Decision, History, MetaAction, PolicyContext
-from policy.agents.idm import NO_MAPS, wished_gap
+from policy.agents.idm import Idm, desired_gap
 from policy.meeting import CAR, LANE, Meeting, Seen, along, meet, missions
 
-
-@dataclass(frozen=True, slots=True)
-class AltruistConfig:
-    """When the guide yields and how much. Distances in m, speeds in m/s."""
-
-    behind_min: float = -5.0  # a guide this far ahead of the mission vehicle can still fall back
-    behind_max: float = 80.0  # further back its gap would come too late
-    upstream_min: float = 60.0  # junctions: stopping at the line does not help, the gap opens upstream
-    upstream_max: float = 260.0
-    crawl: float = 2.0  # the guide waits upstream of a junction (on the grid: it stops)
-    pace_below: float = 5.0  # beside an ending lane the guide drives this much slower than the other
-    pace_min: float = 5.0  # and never slower than this
-    clear: float = 10.0  # a free left lane: this much room ahead and behind,
-    clear_time: float = 0.8  # s of a follower's way on top,
-    max_closing: float = 3.0  # m/s that a follower there may be faster,
-    closing_time: float = 3.0  # s of what the two close in on each other
+# When the guide yields and how much; m, m/s
+BEHIND_MIN = -5.0  # a guide this far ahead of the mission vehicle can still fall back
+BEHIND_MAX = 80.0  # further back its gap would come too late
+UPSTREAM_MIN = 60.0  # junctions: stopping at the line does not help, the gap opens upstream
+UPSTREAM_MAX = 260.0
+CRAWL = 2.0  # the guide waits upstream of a junction (on the grid: it stops)
+PACE_BELOW = 5.0  # beside an ending lane the guide drives this much slower than the other
+PACE_MIN = 5.0  # and never slower than this
+CLEAR = 10.0  # a free left lane: this much space ahead and behind,
+CLEAR_TIME = 0.8  # s of a follower's way on top,
+MAX_CLOSING = 3.0  # m/s that a follower there may be faster,
+CLOSING_TIME = 3.0  # s of what the two close in on each other
 
 
 class Need(NamedTuple):
@@ -39,20 +34,14 @@ class Need(NamedTuple):
     meeting: Meeting
 
 
-class AltruistRule:
+class AltruistRule(Idm):
     """Left if the left lane is free, else slower; at junctions slower, far upstream."""
 
     name = "altruist-rule"
-    label = ""
-    observation = NO_MAPS
-    av_parameters: Mapping[str, str] = {}
-
-    def __init__(self, config: AltruistConfig = AltruistConfig()) -> None:
-        self._config = config
 
     def reset(self, context: PolicyContext) -> None:
         """A new episode: nobody has been served yet."""
-        self._road = context.road
+        super().reset(context)
         self._served: set[str] = set()
         self._guide: dict[str, Need] = {}  # mission vehicle -> its guide
 
@@ -78,7 +67,7 @@ class AltruistRule:
 
     def _need(self, av: str, history: History, mission: str, seen: Seen) -> Need | None:
         """Whether this AV's way meets the mission vehicle's, and where; None when it does not."""
-        guide, meeting = self._guide.get(mission), meet(self._road, history, seen)
+        guide, meeting = self._guide.get(mission), meet(self.context.road, history, seen)
         if guide is not None and self._is_served(guide, av, history, seen, meeting):
             self._served.add(mission)
             return None
@@ -90,38 +79,36 @@ class AltruistRule:
         if own is None or seen.lane < 0:
             return False
         if guide.meeting.crossing:
-            return self._road.lanes[seen.lane].internal or seen.lane in own.lanes
+            return self.context.road.lanes[seen.lane].internal or seen.lane in own.lanes
         return meeting is not None and guide.av == av and seen.lane in own.lanes[:3]
 
     def _choose(self, mission: str, candidates: list[Need]) -> Need | None:
-        c = self._config
         present = {n.av: n for n in candidates}
         before = self._guide.get(mission)
         chosen = None if before is None else present.get(before.av)
         if chosen is not None and (
-            chosen.meeting.crossing or c.behind_min <= chosen.meeting.behind <= 2 * c.behind_max
+            chosen.meeting.crossing or BEHIND_MIN <= chosen.meeting.behind <= 2 * BEHIND_MAX
         ):
             return chosen
         fitting = [
             n
             for n in candidates
             if (
-                c.upstream_min <= n.meeting.behind <= c.upstream_max
+                UPSTREAM_MIN <= n.meeting.behind <= UPSTREAM_MAX
                 if n.meeting.crossing
-                else c.behind_min <= n.meeting.behind <= c.behind_max
+                else BEHIND_MIN <= n.meeting.behind <= BEHIND_MAX
             )
         ]
         return min(fitting, key=lambda n: n.meeting.behind, default=None)
 
     def _yield(self, need: Need, history: History) -> MetaAction | None:
         """What the guide does; None: it is so close to its leader that IDM shall drive."""
-        c = self._config
         if need.meeting.crossing:
-            wanted = c.crawl
+            wanted = CRAWL
         else:
             if need.meeting.from_right and self._left_is_free(history):
                 return MetaAction.LANE_LEFT
-            wanted = max(need.meeting.speed - c.pace_below, c.pace_min)
+            wanted = max(need.meeting.speed - PACE_BELOW, PACE_MIN)
         if history.lane_changing:
             return MetaAction.IDLE
         if history.target_speed > wanted + 2.5:
@@ -130,15 +117,15 @@ class AltruistRule:
 
     def _left_is_free(self, history: History) -> bool:
         """Nobody there, nobody who would have to brake hard for us, nobody we would run into."""
-        c, speed = self._config, history.ego_speed
+        speed = history.ego_speed
         left = history.route.paths[0]
         if left is None or history.route.to_end(0) < 100.0 or history.lane_changing:
             return False
         for ahead, other in along(history, left, side=LANE):
-            if ahead < 0.0 and other - speed > c.max_closing:
+            if ahead < 0.0 and other - speed > MAX_CLOSING:
                 return False  # a guide that has slowed down already stays in its lane
-            behind = c.clear + other * c.clear_time + max(other - speed, 0.0) * c.closing_time
-            front = c.clear + max(speed - other, 0.0) * c.closing_time
+            behind = CLEAR + other * CLEAR_TIME + max(other - speed, 0.0) * CLOSING_TIME
+            front = CLEAR + max(speed - other, 0.0) * CLOSING_TIME
             if -behind < ahead < front:
                 return False
         return True
@@ -149,6 +136,6 @@ class AltruistRule:
         if own is None:
             return False
         for ahead, other in along(history, own):
-            if ahead > 0.0 and ahead - CAR < 1.1 * wished_gap(speed, min(other, speed)):
+            if ahead > 0.0 and ahead - CAR < 1.1 * desired_gap(speed, min(other, speed)):
                 return True
         return False

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
 
 from cosim.errors import BadInput
 from cosim.types import COMPACT, PAPER, ObservationConfig
+from policy.agents import APPROACHES as APPROACHES
 from policy.chain import ChainConfig
 from policy.checkpoint import SHIPPED
 from policy.hpn import HpnConfig
@@ -35,28 +35,6 @@ class AgentConfig:
     vfn_weights: Path | None = None  # a checkpoint of policy.checkpoint; None: untrained
     hpn_weights: Path | None = None
     note: str = ""  # goes into the label
-
-
-@dataclass(frozen=True, slots=True)
-class Approach:
-    """One row of definitions.md's table of approaches."""
-
-    extractor: Literal["conv3d", "conv2d"] = "conv3d"
-    kinematics: bool = True  # K and the route join the maps
-    predicted_maps: bool = True
-    mask: Literal["gp-indirect", "cs", "none"] = "gp-indirect"
-    learning: Literal["ddqn", "a2c"] = "ddqn"
-
-
-APPROACHES = {
-    "vfn-p": Approach(),
-    "vfn-p-egoistic": Approach(),  # the twin: the same agent, trained with phi = 0
-    "vfn": Approach(predicted_maps=False, mask="cs"),
-    "safe-dqn": Approach(kinematics=False, predicted_maps=False, mask="cs"),
-    "conv3d-dqn": Approach(kinematics=False, predicted_maps=False, mask="none"),
-    "conv3d-a2c": Approach(kinematics=False, predicted_maps=False, mask="none", learning="a2c"),
-    "conv2d-dqn": Approach("conv2d", kinematics=False, predicted_maps=False, mask="none"),
-}
 
 
 def compact(name: str) -> AgentConfig:

@@ -7,27 +7,39 @@ from collections.abc import Mapping
 
 from cosim.types import Decision, History, ObservationConfig, PolicyContext
 
-NO_MAPS = ObservationConfig(maps=False)
 # An AV as `idm` (definitions.md, Vehicles):
 TIME_GAP, STANDSTILL, ACCEL, COMFORT = 0.8, 2.0, 3.0, 7.0  # s, m, m/s2, m/s2
 
 
-def wished_gap(speed: float, leader_speed: float, time_gap: float = TIME_GAP) -> float:
-    """The gap in m, bumper to bumper, that IDM wishes to its leader (P, section V-A.2); speeds in m/s."""
+def desired_gap(speed: float, leader_speed: float, time_gap: float = TIME_GAP) -> float:
+    """IDM's desired gap to its leader (P, section V-A.2).
+
+    Args:
+        speed: own, m/s.
+        leader_speed: m/s.
+        time_gap: s.
+
+    Returns:
+        m, bumper to bumper.
+    """
     closing = speed * (speed - leader_speed) / (2.0 * math.sqrt(ACCEL * COMFORT))
     return STANDSTILL + max(speed * time_gap + closing, 0.0)
 
 
 class Idm:
-    """Egoistic IDM + LC2013 (definitions.md, Vehicles): no cooperation of any kind. The baseline `idm`."""
+    """Egoistic IDM + LC2013 (definitions.md, Vehicles): no cooperation of any kind. The baseline `idm`.
+
+    Base of all policies that need no maps and leave SUMO's parameters as they are.
+    """
 
     name = "idm"
     label = ""
-    observation = NO_MAPS
+    observation = ObservationConfig(maps=False)
     av_parameters: Mapping[str, str] = {}
 
     def reset(self, context: PolicyContext) -> None:
-        """Nothing to remember."""
+        """A new episode."""
+        self.context = context
 
     def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
         """Nobody is commanded."""

@@ -32,7 +32,7 @@ from policy.safety import prioritize
 from policy.scene import Scene, join
 from policy.seeded import seeded
 from policy.tensors import States, pixels, situation_tensor, svo_tensor, to_batch, to_numpy
-from policy.traffic import Traffic, predict_traffic
+from policy.traffic import Traffic, foresee
 from policy.vfn import VFN, Frames
 
 UNTRAINED = "untrained"
@@ -92,14 +92,28 @@ class PredictionAware:
         )
 
     def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
-        """One decision for every AV, each explained (`cosim.types.Decision`)."""
+        """One decision for every AV, each explained (P, figure 2; `cosim.types.Decision`).
+
+        Args:
+            histories: AV -> what it has observed (`cosim.types.History`), all of the same instant.
+
+        Raises:
+            FloatingPointError: the value network returned values that are not finite.
+        """
         if not histories:
             return {}
         inputs = self.perceive(histories)
         return self.choose(self.values(inputs), inputs)
 
     def perceive(self, histories: Mapping[str, History]) -> Inputs:
-        """Predict the next seconds: what the value network and the prioritizer work on."""
+        """Predict the next seconds: what the value network and the prioritizer work on (P, algorithm 1).
+
+        Args:
+            histories: AV -> what it has observed.
+
+        Returns:
+            scene of B AVs and V vehicles, the networks' states of the B AVs, the traffic of the V vehicles.
+        """
         c, context = self.config, self._context
         scene, traffic, forecast = self.foresee(histories)
         with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=c.bf16):
@@ -119,8 +133,7 @@ class PredictionAware:
         """What all AVs see together, and where everybody in it will be."""
         c, context = self.config, self._context
         scene = join(histories, context.observation.share_perception)
-        forecast = self._predictor.predict(scene.state, scene.valid)
-        traffic = predict_traffic(scene, forecast, context.road, c.traffic, c.safety.frames)
+        forecast, traffic = foresee(scene, self._predictor, context.road, c.traffic, c.safety.frames)
         self._expected = scene.vehicles, traffic, forecast
         return scene, traffic, forecast
 
@@ -129,8 +142,16 @@ class PredictionAware:
         return self.valued(self.vfn, inputs.scene.agents, inputs.states)
 
     def valued(self, network: VFN, agents: Sequence[str], states: States) -> Floats32:
-        """What `network` gives for the states of these AVs: [B,A]. Raises FloatingPointError when not
-        finite."""
+        """Action values [B,A] of `network`.
+
+        Args:
+            network: the value network.
+            agents: names of the B AVs.
+            states: their inputs.
+
+        Raises:
+            FloatingPointError: a value is not finite.
+        """
         timing = self._context.timing
         with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=self.config.bf16):
             if network not in self._memories:
@@ -144,8 +165,12 @@ class PredictionAware:
         return q
 
     def choose(self, q: Floats32, inputs: Inputs) -> dict[str, Decision]:
-        """The safety prioritizer's choice by the action values q [B,A] (P, algorithm 3); without a mask the
-        best valued action."""
+        """The safety prioritizer's choice (P, algorithm 3); without a mask the best valued action.
+
+        Args:
+            q: [B,A] action values, in the order of `inputs.scene.agents`.
+            inputs: what `perceive` gave.
+        """
         c, context, scene = self.config, self._context, inputs.scene
         if not c.mask:
             best = q.argmax(1)
@@ -183,20 +208,15 @@ class PredictionAware:
 
     def _refused(self, histories: Mapping[str, History]) -> dict[str, MetaAction]:
         """Lane changes that were commanded within RETRY s and did not begin (a closed lane, a solid line)."""
-        refused = {}
         for name, history in histories.items():
-            action, when = self._asked.get(name, (None, 0.0))
-            if action is None:
-                continue
+            _, when = self._asked.get(name, (None, np.inf))
             if history.lane_changing or history.time - when > RETRY:
-                del self._asked[name]
-            else:
-                refused[name] = action
-        return refused
+                self._asked.pop(name, None)
+        return {name: action for name, (action, _) in self._asked.items() if name in histories}
 
 
 def _networks(c: AgentConfig) -> tuple[VFN, HPN | None]:
-    """As they are born."""
+    """Untrained networks."""
     vfn = VFN(c.vfn).eval()
     return vfn, HPN(c.hpn).eval() if c.predicted_maps and c.chain.source == "hpn" else None
 
@@ -204,6 +224,5 @@ def _networks(c: AgentConfig) -> tuple[VFN, HPN | None]:
 def _label(parts: Mapping[str, Path | None]) -> str:
     """What to warn of: nothing, `untrained`, or which part is."""
     missing = [part for part, weights in parts.items() if weights is None]
-    if len(missing) == len(parts):
-        return UNTRAINED
-    return f"{UNTRAINED} {', '.join(missing)}" if missing else ""
+    which = "" if len(missing) == len(parts) else f" {', '.join(missing)}"
+    return UNTRAINED + which if missing else ""

@@ -1,11 +1,12 @@
-"""Kinematic predictors: name -> class."""
+"""Kinematic predictors: P's eight in one table, and a user's own."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
 
-from cosim.errors import BadInput
+from cosim.errors import BadInput, one_of
+from cosim.files import code
 from policy.forecast import KinematicForecast
 from policy.predictors.constant import ConstantAcceleration, ConstantSpeed
 from policy.predictors.gp import GaussianProcessDirect, GaussianProcessIndirect
@@ -25,10 +26,18 @@ PREDICTORS: dict[str, Callable[[int, float], Predictor]] = {
 
 
 def make_predictor(name: str, horizon: int, dt: float) -> Predictor:
-    """A predictor `horizon` frames of `dt` s ahead. Raises BadInput for an unknown name."""
-    if name not in PREDICTORS:
-        raise BadInput(f"unknown predictor (one of {', '.join(PREDICTORS)})", field="predictor", value=name)
-    return PREDICTORS[name](horizon, dt)
+    """A predictor `horizon` frames of `dt` s ahead: of the table, or the class FILE.py:NAME or MODULE:NAME.
+
+    Raises BadInput: there is none of that name; the user's cannot be loaded or called, or lacks something.
+    """
+    if not code.is_code(name):
+        return PREDICTORS[one_of(name, PREDICTORS, "predictor")](horizon, dt)
+    own = code.read(name, "predictor")
+    made: Predictor = own.make("predictor", horizon, dt)
+    if (made.horizon, made.dt, isinstance(made.name, str)) != (horizon, dt, True):
+        problem = f"a predictor needs a name, horizon = {horizon} frames and dt = {dt:g} s"
+        raise BadInput(problem, file=own.place, field=own.member)
+    return made
 
 
 __all__ = ["PREDICTORS", "KinematicForecast", "Predictor", "make_predictor"]

@@ -47,9 +47,11 @@ class _GaussianProcess:
         return PriorConfig(tuple(len(c.kernels()) for c in cls.configs), cls.spreads)
 
     def predict(self, kinematics: Floats, valid: Bools) -> KinematicForecast:
-        """See `Predictor.predict`. Only the unbroken run of valid, finite frames up to now counts, and what
-        lies before it is completed (`policy.past`); a vehicle that is not valid now gets no forecast (`valid`
-        False, zeros)."""
+        """See `Predictor.predict`; P, eq. 7 to 9.
+
+        Only the unbroken run of valid, finite frames up to now counts, and what lies before it is completed
+        (`policy.past`); a vehicle that is not valid now gets no forecast (`valid` False, zeros).
+        """
         state = np.asarray(kinematics[:, :, :4], dtype=np.float64)
         run = trailing_run(state, valid)
         known = run > 0

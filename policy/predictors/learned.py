@@ -61,7 +61,15 @@ class KinematicNet(nn.Module):
             )
 
     def forward(self, past: torch.Tensor, speed: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """past [V,N,INPUTS], speed [V] m/s now -> x, y [V,M] m; indirect also speed m/s, heading rad."""
+        """The next M frames of V vehicles.
+
+        Args:
+            past: [V,N,INPUTS] (`features`).
+            speed: [V] m/s, now.
+
+        Returns:
+            x, y [V,M] m in the own frame; an indirect network also speed [V,M] m/s, heading [V,M] rad.
+        """
         c = self.config
         if c.kind == "lstm":
             past = self.lstm(past)[0][:, -1]
@@ -146,5 +154,4 @@ class Learned:
         x, y = now[:, :1] + c * u - s * w, now[:, 1:2] + s * u + c * w
         speed, heading = (rest[0], now[:, 3:4] + rest[1]) if rest else motion_of(now, x, y, self.dt)
         x, y, speed, heading = (np.where(known[:, None], a, 0.0) for a in (x, y, speed, heading))
-        zero = np.zeros_like(x)
-        return KinematicForecast(x, y, speed, heading, zero, zero, zero, zero, known)
+        return KinematicForecast.without_spread(x, y, speed, heading, known)

@@ -16,4 +16,12 @@ class Predictor(Protocol):
     dt: float  # s between frames
 
     def predict(self, kinematics: Floats, valid: Bools) -> KinematicForecast:
-        """kinematics [V,N,>=4] x m, y m, speed m/s, heading rad (unwrapped), oldest first; valid [V,N]."""
+        """Forecast V vehicles M frames ahead.
+
+        Args:
+            kinematics: [V,N,>=4] x m, y m, speed m/s, heading rad (unwrapped), oldest first; nan: unknown.
+            valid: [V,N] perceived in that frame.
+
+        Returns:
+            states and standard deviations [V,M]; zeros for vehicles that are not valid in the newest frame.
+        """

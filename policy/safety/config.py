@@ -21,7 +21,7 @@ class SafetyConfig:
     horizon: float = 4.0  # s, P, Table I
     dt: float = 0.2  # s
     margin_length: float = 1.0  # m, added to the ego's box along
-    margin_width: float = 0.6  # m, and across: half of the room between cars in neighbouring lanes
+    margin_width: float = 0.6  # m, and across: half of the space between cars in neighbouring lanes
     reach: float = 125.0  # m, as the kinematic rows
     reaction: float = 0.4  # s until the next decision can brake
     # s that an action is held before braking, as far as cars ahead in the own lane are concerned; longer than

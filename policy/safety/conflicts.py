@@ -1,4 +1,4 @@
-"""What stands in the way of the ego's futures: first contacts, and the gaps around it."""
+"""First contacts of the ego's futures with other vehicles, and the gaps around it."""
 
 from __future__ import annotations
 
@@ -21,22 +21,21 @@ class Others(NamedTuple):
     """The O vehicles that an AV knows and can touch."""
 
     rows: Ints  # [O] places in the scene
-    x: Floats  # [O,T+1] m, centre; frame 0 is now
-    y: Floats  # [O,T+1] m
-    heading: Floats  # [O,T+1] rad
-    speed: Floats  # [O,T+1] m/s
-    length: Floats  # [O] m
-    width: Floats  # [O] m
-    intended: Bools  # [O] drives as it said, not as predicted
+    boxes: Boxes  # [O,T+1] frame 0 is now
+    intended: Bools  # [O] moves by a shared intention, not by a prediction
 
 
 def others_near(
     b: int, me: int, scene: Scene, traffic: Traffic, road: RoadMap, reach: float, intended: Bools
 ) -> Others:
-    """Those within `reach` m.
+    """The vehicles that an AV can touch: its own rows; with shared perception also its allies' rows.
 
-    Its own rows; with shared perception also those of its allies, for rows are few in a queue. `intended`
-    [V]: whose rollout is a shared intention.
+    Args:
+        b: place of the AV among `scene.agents`.
+        me: its place among `scene.vehicles`.
+        scene, traffic, road: as in `policy.safety.prioritize`.
+        reach: m, with shared perception.
+        intended: [V] whose rollout is a shared intention.
     """
     r = traffic.rollout
     if scene.shared:
@@ -49,26 +48,34 @@ def others_near(
         rows = rows[rows >= 0]
         rows = rows[traffic.known[rows]]
     rows = rows[road.contact.touch(int(scene.lane[me]), scene.lane[rows])]
-    moves = (r.x[rows], r.y[rows], r.heading[rows], r.speed[rows])
-    return Others(rows, *moves, traffic.length[rows], traffic.width[rows], intended[rows])
+    boxes = Boxes(r.x, r.y, r.heading, traffic.length, traffic.width, r.speed)
+    return Others(rows, _only(boxes, rows), intended[rows])
 
 
 def first_contact(ego: Rollout, length: float, width: float, others: Others, c: SafetyConfig) -> Floats:
-    """When the ego's box (m) first touches each other's: [A,O] s, inf for never.
+    """When the ego's box first touches each other's (P, algorithm 2).
 
     Between two frames both boxes keep their velocity, so nothing is jumped over.
+
+    Args:
+        ego: [A,T+1] its futures.
+        length, width: m, of its box.
+        others: the O vehicles near it.
+        c: margins and time step.
+
+    Returns:
+        [A,O] s, inf for never.
     """
-    theirs = Boxes(others.x, others.y, others.heading, others.length, others.width, others.speed)
     mine = Boxes(ego.x, ego.y, ego.heading, length + c.margin_length, width + c.margin_width, ego.speed)
-    touch = first_contacts(mine, theirs, c.dt)
-    close = (touch == 0.0).any(0)  # within the margin already: only the cars themselves tell actions apart
+    touch = first_contacts(mine, others.boxes, c.dt)
+    close = (touch == 0.0).any(0)  # within the margin already: only without the margins do actions differ
     if close.any():
         exact = mine._replace(length=length, width=width)
-        touch[:, close] = first_contacts(exact, _only(theirs, close), c.dt)
+        touch[:, close] = first_contacts(exact, _only(others.boxes, close), c.dt)
     return touch
 
 
-def _only(boxes: Boxes, which: Bools) -> Boxes:
+def _only(boxes: Boxes, which: Bools | Ints) -> Boxes:
     return Boxes(*(np.asarray(array)[which] for array in boxes))
 
 
@@ -84,15 +91,25 @@ class Neighbours(NamedTuple):
 def neighbours(
     course: Ways, arc: Floats, heading: float, length: float, others: Others, c: SafetyConfig
 ) -> Neighbours:
-    """The ego: its centre's place on the path of every action, arc [A] m, its heading, rad, and length, m."""
+    """How the others stand to the path of every action.
+
+    Args:
+        course: the paths.
+        arc: [A] m, place of the ego's centre on each of them.
+        heading: rad, of the ego.
+        length: m, of the ego.
+        others: the O vehicles near it.
+        c: limits.
+    """
     paths, same = course.paths, course.same
-    soon = min(5, others.x.shape[1] - 1)  # 1 s ahead: who drifts in is in
-    theirs, offset = project_each(*paths, same, others.x[:, 0], others.y[:, 0])
-    _, later = project_each(*paths, same, others.x[:, soon], others.y[:, soon])
-    turn = np.abs((others.heading[:, 0] - heading + np.pi) % (2 * np.pi) - np.pi)
+    x, y, headings, lengths = (np.asarray(array) for array in others.boxes[:4])
+    soon = min(5, x.shape[1] - 1)  # 1 s ahead: who drifts in is in
+    theirs, offset = project_each(*paths, same, x[:, 0], y[:, 0])
+    _, later = project_each(*paths, same, x[:, soon], y[:, soon])
+    turn = np.abs((headings[:, 0] - heading + np.pi) % (2 * np.pi) - np.pi)
     in_lane = (turn < c.same_way) & (np.minimum(np.abs(offset), np.abs(later)) < c.lane_half)
     distance = theirs - arc[:, None]
-    gap = np.abs(distance) - 0.5 * (length + others.length)
+    gap = np.abs(distance) - 0.5 * (length + lengths)
     return Neighbours(in_lane, gap, in_lane & (distance > 0), in_lane & (distance < 0) & (gap > 0))
 
 
@@ -101,20 +118,28 @@ def gap_margin(
 ) -> tuple[Floats, Ints]:
     """The score [A] s that the gaps around the ego leave, and which of the others limits it [A].
 
-    stopping [A] m: the ego's way to standstill; speed: now, m/s; changes [A]: to another lane.
     Leader: if it brakes with `leader_brake` from now on, and the ego as hard as it can from its next decision
     on, they must not touch; one that shares its intentions brakes no earlier than they say. A lane change
     further needs the place beside the ego, and a new follower that need not brake harder than
     `follower_brake`. At the limit the score is safe_th, below it falls with the gap. Decelerating never makes
     a gap smaller.
+
+    Args:
+        stopping: [A] m, the ego's way to standstill.
+        speed: its speed now, m/s.
+        changes: [A] leads to another lane.
+        near: how the others stand to the path of every action.
+        others: the O vehicles near it.
+        c: limits.
     """
-    soon = others.speed[:, min(round(c.reaction / c.dt), others.speed.shape[1] - 1)]
+    speeds = np.asarray(others.boxes.speed)
+    soon = speeds[:, min(round(c.reaction / c.dt), speeds.shape[1] - 1)]
     ratio, who = _tightest(
         stopping,
         speed,
         changes,
         *near,
-        others.speed[:, 0],
+        speeds[:, 0],
         soon,
         others.intended,
         c.leader_brake,
@@ -164,8 +189,8 @@ def _tightest(
             if changes[a]:
                 if behind[a, k]:
                     closing = max(speed[k] - own_speed, 0.0)
-                    room = speed[k] * follower_reaction + closing * closing / (2 * follower_brake)
-                    ratio = gap[a, k] / (follower_gap + room)
+                    needed = speed[k] * follower_reaction + closing * closing / (2 * follower_brake)
+                    ratio = gap[a, k] / (follower_gap + needed)
                 if in_lane[a, k] and gap[a, k] < standstill_gap:
                     ratio = 0.0
             if ratio < best[a]:

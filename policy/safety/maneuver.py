@@ -100,8 +100,8 @@ class Futures(NamedTuple):
     under: Rollout  # [A+1,T+1] what each action is judged by, then: Decelerate once
     stopping: Floats  # [A] m until standstill, when Decelerate follows from the next decision on
 
-    def told(self, action: int) -> list[Floats]:
-        """What the allies are told [6][T+1]: of one step of Decelerate."""
+    def shared(self, action: int) -> list[Floats]:
+        """The intention that is shared [6][T+1]: of one step of Decelerate alone."""
         row = len(ACTIONS) if action == SLOWER else action
         return [array[row] for array in self.under]
 

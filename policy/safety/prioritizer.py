@@ -64,10 +64,22 @@ def prioritize(
     share_intentions: bool = True,
     refused: Mapping[str, MetaAction] | None = None,
 ) -> dict[str, Decision]:
-    """Decide for every AV of the scene. q [B,A] action values; refused: lane changes just found impossible.
+    """Decide for every AV of the scene, front to back (P, algorithm 3).
 
-    With `share_intentions` the rollouts of the AVs ahead replace their predictions; `traffic` is not changed.
-    It must reach `config.frames` steps ahead (ValueError).
+    Args:
+        q: [B,A] action values, in the order of `scene.agents`.
+        scene: what the AVs know (`policy.scene.join`).
+        traffic: where everybody in it goes, `config.frames` frames of `config.dt` s ahead; not changed.
+        road: the road map.
+        config: thresholds and driving limits.
+        share_intentions: V2V: the chosen rollouts of the AVs ahead replace their predictions.
+        refused: AV -> the lane change just found impossible.
+
+    Returns:
+        AV -> decision with action, safety scores [A] s, mask [A] and who is to blame for it.
+
+    Raises:
+        ValueError: `traffic` does not reach `config.frames` frames ahead.
     """
     if traffic.rollout.x.shape[1] != config.frames + 1:
         raise ValueError(f"traffic must be predicted {config.frames} frames ahead")
@@ -84,8 +96,8 @@ def prioritize(
         if share_intentions:
             me = name_row[scene.agents[b]]
             intended[me] = True
-            for mine, told in zip(ours, evaluation.futures.told(decision.action), strict=True):
-                mine[me] = told
+            for mine, shared in zip(ours, evaluation.futures.shared(decision.action), strict=True):
+                mine[me] = shared
     return {agent: decisions[agent] for agent in scene.agents}
 
 
@@ -99,9 +111,13 @@ def _ties(history: History, c: SafetyConfig) -> tuple[MetaAction, ...]:
 def select(
     q: Floats32, evaluation: Evaluation, config: SafetyConfig, ties: Sequence[MetaAction] = ()
 ) -> Decision:
-    """Algorithm 3: the best valued safe action; if there is none, the one with the highest score.
+    """The best valued safe action; if there is none, the one with the highest score (P, algorithm 3).
 
-    `ties`: the order of equally valued actions (default: the configured one).
+    Args:
+        q: [A] action values.
+        evaluation: of this AV (`evaluate`).
+        config: thresholds.
+        ties: the order of equally valued actions (default: the configured one).
     """
     values = q.tolist()
     order = sorted(ties or config.ties, key=lambda a: -values[a])  # stable
@@ -131,9 +147,13 @@ def evaluate(
     intended: Bools,
     refused: MetaAction | None = None,
 ) -> Evaluation:
-    """Algorithm 2 for AV `b`, all five actions at once; `refused`: a lane change found impossible.
+    """Times to collision and safety scores of all five actions of one AV (P, algorithm 2).
 
-    `intended` [V]: whose rollout is a shared intention, not a prediction.
+    Args:
+        b: place of the AV among `scene.agents`.
+        scene, traffic, road, config: as in `prioritize`.
+        intended: [V] whose rollout is a shared intention, not a prediction.
+        refused: a lane change found impossible.
     """
     c, history = config, scene.histories[b]
     me = int(scene.ego[b])
@@ -224,7 +244,7 @@ def front_to_back(scene: Scene, config: SafetyConfig) -> list[int]:
     dx, dy = x[None, :] - x[:, None], y[None, :] - y[:, None]  # [b,a] of a as seen from b
     ahead_by = dx * np.cos(heading)[:, None] + dy * np.sin(heading)[:, None]
     turn = np.abs((heading[None, :] - heading[:, None] + np.pi) % (2 * np.pi) - np.pi)
-    near = dx * dx + dy * dy < 150.0**2  # m: further away nobody cares
+    near = dx * dx + dy * dy < 150.0**2  # m: further away nobody matters
     conflict = np.array([h.route.conflict_distance for h in scene.histories])
     same = turn < config.same_way
     ahead = near & np.where(same, ahead_by > 0.0, conflict[None, :] < conflict[:, None])

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import nn
 
 from cosim.errors import in_range
 from cosim.types import Floats32
-from policy.seeded import seeded
-from policy.training.experience import Advised, Trajectory, states
-from policy.training.networks import adam_tensors, restore_adam
-from policy.vfn import VFN, VfnConfig
+from policy.training.experience import Trajectory, states
+from policy.training.learner import Learner, Metrics, mean_metrics
+from policy.training.replay_buffer import Advised
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,57 +27,40 @@ class A2cConfig:
     critic: float = 0.5  # weight of the value loss
     scale: float = 0.1  # of all rewards, as the DDQN's
     clip: float = 0.5  # largest gradient norm
-    imitation: float = 0.0  # weight of the mentor's advice: the chance of what he thinks right is to be 1
+    imitation: float = 0.0  # weight of the demonstrations: the chance of a demonstrated action is to be 1
 
     def __post_init__(self) -> None:
         """Raises BadInput for a number out of range."""
         in_range(self, positive="learning_rate n_step gamma batch scale clip", not_negative="imitation")
 
 
-class A2cLosses(NamedTuple):
-    """Means over one pass."""
-
-    policy: float
-    value: float
-    entropy: float  # nat
-    imitation: float  # minus the log of the chance of what the mentor thinks right
-
-
-class A2cLearner:
+class A2cLearner(Learner):
     """Actor and critic over one extractor, with their optimiser."""
 
-    def __init__(self, vfn: VfnConfig, config: A2cConfig, seed: int, device: str = "cpu") -> None:
-        self.config, self.device = config, device
-        self.online: VFN = seeded(lambda: VFN(vfn), seed)
-        self.online.to(device=device, memory_format=self.online.layout)  # type: ignore[call-overload]
-        self.optimizer = torch.optim.Adam(self.online.parameters(), lr=config.learning_rate)
-        self.updates = 0
-
-    @property
-    def listens(self) -> bool:
-        """Whether the mentor is heard."""
-        return self.config.imitation > 0.0
+    config: A2cConfig
 
     def imitate(self, batch: Advised) -> float:
-        """One step towards the mentor alone; returns the mean chance of what he thinks right."""
-        assert batch.maps is not None  # this network has nothing else
-        preference, _ = self.online.actor_critic(batch.maps, batch.kinematics, batch.situation, batch.phi)
+        """See `Learner.imitate`; returns the mean chance of the demonstrated actions."""
+        preference, _ = self.online.actor_critic(*batch.now)
         loss = _misfit(preference.log_softmax(1), batch.wrong)
-        self._descend(loss)
+        self.step(loss)
         return float((-loss.detach()).exp())
 
-    def learn(self, drives: Sequence[Trajectory], rng: np.random.Generator) -> A2cLosses | None:
-        """One pass over the decisions of `drives`, which were driven with the present weights, in random
-        order. None when there are none."""
+    def learn(self, drives: Sequence[Trajectory], rng: np.random.Generator) -> Metrics:
+        """One pass, in random order, over the transitions of trajectories driven with the present weights.
+
+        Returns the means of `policy`, `value`, `entropy` (nat) and `imitation` (minus the log of the chance
+        of the demonstrated actions); nothing when there are no transitions.
+        """
         places = [(t, k) for t in drives for k in range(len(t))]
         if not places:
-            return None
+            return {}
         returns = np.concatenate([self._returns(t) for t in drives if len(t)])
         losses = [
-            self._step([places[i] for i in rows], returns[rows])
+            self._update([places[i] for i in rows], returns[rows])
             for rows in _batches(rng.permutation(len(places)), self.config.batch)
         ]
-        return A2cLosses(*(float(v) for v in np.mean(losses, 0)))
+        return mean_metrics(losses)
 
     def _returns(self, drive: Trajectory) -> Floats32:
         """n-step returns [D], bootstrapped by the critic unless the drive ended in a crash before."""
@@ -103,7 +83,7 @@ class A2cLearner:
             out[t] = c.gamma ** np.arange(end - t) @ reward[t:end] + c.gamma ** (end - t) * values[end]
         return out
 
-    def _step(self, places: list[tuple[Trajectory, int]], returns: Floats32) -> A2cLosses:
+    def _update(self, places: list[tuple[Trajectory, int]], returns: Floats32) -> Metrics:
         c, device = self.config, self.device
         phi = np.array([t.phi for t, _ in places], np.float32)
         action = torch.tensor([int(t.action[k]) for t, k in places], device=device)
@@ -111,33 +91,22 @@ class A2cLearner:
         preference, value = self.online.actor_critic(*states(places, phi, device))
         logs = preference.log_softmax(1)
         advantage = (goal - value).detach()
-        policy = -(advantage * logs.gather(1, action[:, None])[:, 0]).mean()
-        worth = (goal - value).square().mean()
-        entropy = -(logs.exp() * logs).sum(1).mean()
-        wrong = torch.from_numpy(np.stack([t.wrong[k] for t, k in places])).to(device)
-        imitation = _misfit(logs, wrong)
-        self._descend(policy + c.critic * worth - c.entropy * entropy + c.imitation * imitation)
+        losses = {
+            "policy": -(advantage * logs.gather(1, action[:, None])[:, 0]).mean(),
+            "value": (goal - value).square().mean(),
+            "entropy": -(logs.exp() * logs).sum(1).mean(),
+            "imitation": _misfit(
+                logs, torch.from_numpy(np.stack([t.wrong[k] for t, k in places])).to(device)
+            ),
+        }
+        actor = losses["policy"] + c.critic * losses["value"] - c.entropy * losses["entropy"]
+        self.step(actor + c.imitation * losses["imitation"])
         self.updates += 1
-        return A2cLosses(*(float(x.detach()) for x in (policy, worth, entropy, imitation)))
-
-    def _descend(self, loss: torch.Tensor) -> None:
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
-        nn.utils.clip_grad_norm_(self.online.parameters(), self.config.clip)
-        self.optimizer.step()
-
-    def tensors(self) -> dict[str, torch.Tensor]:
-        """Network and optimiser as named tensors."""
-        return adam_tensors({"online": self.online}, self.optimizer)
-
-    def restore(self, tensors: dict[str, torch.Tensor], updates: int) -> None:
-        """Go on from what `tensors` gave after `updates` updates."""
-        restore_adam(tensors, {"online": self.online}, self.optimizer)
-        self.updates = updates
+        return {name: float(loss.detach()) for name, loss in losses.items()}
 
 
 def _misfit(logs: torch.Tensor, wrong: torch.Tensor) -> torch.Tensor:
-    """Minus the log of the chance of what the mentor thinks right, mean; 0 where he had no opinion."""
+    """Minus the log of the chance of the demonstrated actions, mean; 0 where nothing was demonstrated."""
     return -logs.masked_fill(wrong, -torch.inf).logsumexp(1).mean()
 
 

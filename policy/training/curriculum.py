@@ -1,4 +1,4 @@
-"""What is driven when: lessons, seeds, exploration and who is at the wheel, all drawn from one seed."""
+"""What is driven when: lessons, seeds, exploration and who drives, all drawn from one seed."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from cosim.seeding import TRAINING_SEEDS, TUNING_SEEDS, subseed, uniform
 from policy.training.a2c import A2cConfig
 from policy.training.ddqn import DdqnConfig
 from policy.training.experience import Trajectory
-from policy.training.replay import ReplayConfig
+from policy.training.replay_buffer import ReplayConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,11 +35,14 @@ class VfnTraining:
     episodes: int = 2  # an iteration
     updates: int = 40  # an iteration: one every five joint decisions; 4 to 8 do
     prefill: int = 2_000  # decisions recorded before the first update (Alg. 4), with epsilon 1
-    warm_up: int = 0  # steps towards the mentor alone before the first update,
+    warm_up: int = 0  # steps towards the demonstrations alone before the first update,
     warm_up_after: int = 0  # from as many decisions at least
     epsilon: tuple[float, float] = (1.0, 0.05)  # P, Table I: linear
     epsilon_iterations: int = 200
-    guided: tuple[float, float] = (0.5, 0.1)  # share of the episodes that the mentor drives, linear likewise
+    guided: tuple[float, float] = (
+        0.5,
+        0.1,
+    )  # share of demonstrated episodes, linear likewise
     disseminate: int = 5  # iterations between copies of the learner's weights to the frozen AVs
     svo: tuple[float, ...] = (45.0, 60.0)  # deg, drawn per episode; (0,) trains the egoistic twin
     seed: int = 0  # of everything
@@ -62,7 +65,7 @@ class Drive(NamedTuple):
     weights: str  # file of the learning AVs' network, "" for untrained
     frozen: str  # file of the others'
     record: bool  # False: validation, greedy, nothing is recorded
-    guided: bool = False  # by the mentor
+    guided: bool = False  # by the demonstrator
 
 
 class Drove(NamedTuple):
@@ -73,20 +76,20 @@ class Drove(NamedTuple):
 
 
 def drives(c: VfnTraining, k: int, weights: str, frozen: str, epsilon: float, guided: float) -> list[Drive]:
-    """The episodes of iteration `k`; `guided`: the share of them that the mentor drives."""
+    """The episodes of iteration `k`; `guided`: the share of them that the demonstrator drives."""
     drawn = []
     for j in range(c.episodes):
-        luck = [uniform(c.seed, name, str(k), str(j)) for name in ("lesson", "svo", "guided")]
+        draws = [uniform(c.seed, name, str(k), str(j)) for name in ("lesson", "svo", "guided")]
         drawn.append(
             Drive(
-                _drawn(c.lessons, luck[0]),
+                _drawn(c.lessons, draws[0]),
                 (k * c.episodes + j + subseed(c.seed, "episodes")) % len(TRAINING_SEEDS),
-                math.radians(c.svo[int(luck[1] * len(c.svo))]),
+                math.radians(c.svo[int(draws[1] * len(c.svo))]),
                 epsilon,
                 weights,
                 frozen,
                 record=True,
-                guided=luck[2] < guided,
+                guided=draws[2] < guided,
             )
         )
     return drawn
@@ -107,13 +110,13 @@ def validation(c: VfnTraining, weights: str) -> list[Drive]:
     ]
 
 
-def faded(c: VfnTraining, ends: tuple[float, float], k: int) -> float:
+def interpolated(c: VfnTraining, ends: tuple[float, float], k: int) -> float:
     """Between `ends`, linear over `epsilon_iterations`, then the last."""
     first, last = ends
     return first + (last - first) * min(k / c.epsilon_iterations, 1.0)
 
 
-def _drawn(lessons: Sequence[Lesson], luck: float) -> Lesson:
-    """The lesson at `luck` (0 to 1) of the weights laid end to end."""
+def _drawn(lessons: Sequence[Lesson], at: float) -> Lesson:
+    """The lesson at `at` (0 to 1) of the weights laid end to end."""
     edges = np.cumsum([lesson.weight for lesson in lessons])
-    return lessons[int(np.searchsorted(edges / edges[-1], luck, side="right").clip(0, len(lessons) - 1))]
+    return lessons[int(np.searchsorted(edges / edges[-1], at, side="right").clip(0, len(lessons) - 1))]

@@ -1,4 +1,4 @@
-"""What one AV lived through in one episode, as learners store it: every frame once, no stack twice."""
+"""One AV's trajectory of one episode, as learners store it: every frame once, no stack twice."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import zipfile
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -38,10 +38,10 @@ class Trajectory:
     unsafe: Bools  # [D+1, A] what the prioritizer masked
     action: npt.NDArray[np.int8]  # [D] carried out
     vetoed: npt.NDArray[np.int8]  # [D] the preferred action that was masked, or -1
-    wrong: Bools  # [D,A] what the mentor would not have done, though it was safe; none: he had no opinion
+    wrong: Bools  # [D,A] what the demonstrator would not have done, though safe; none: no demonstration
     terms: Floats32  # [D,3] reward terms: ego, AVs, HVs (equation 6)
-    interacting: Bools  # [D] near a mission vehicle, or vetoed: what a rebalanced replay wants more of
-    yielding: Bools  # [D] the mentor would have yielded to a mission vehicle here
+    interacting: Bools  # [D] near a mission vehicle, or vetoed: drawn more often
+    yielding: Bools  # [D] the demonstrator would have yielded to a mission vehicle here
     phi: float  # rad, the SVO it acted with
     ending: Ending
 
@@ -59,50 +59,31 @@ class Trajectory:
         return [self.frames[start : start + self.past], self.ahead[t]]
 
 
-class Advised(NamedTuple):
-    """A batch for learning from the mentor alone."""
-
-    maps: torch.Tensor | None  # [B,T,C,H,W] uint8 pixels; None: he is heard without, which is cheap
-    kinematics: torch.Tensor  # [B,T,R,F+1]
-    situation: torch.Tensor  # [B,.]
-    phi: torch.Tensor  # [B,2]
-    possible: torch.Tensor  # [B,A] bool, actions that were safe
-    wrong: torch.Tensor  # [B,A] bool, those of them that the mentor would not have taken
-
-
-def advised(chosen: list[tuple[Trajectory, int]], with_maps: bool, device: str = "cpu") -> Advised:
-    """Stack what the mentor said, for the SVO of the drives."""
-    phi = np.array([trajectory.phi for trajectory, _ in chosen], np.float32)
-    said = (
-        np.stack([~trajectory.unsafe[t] for trajectory, t in chosen]),
-        np.stack([trajectory.wrong[t] for trajectory, t in chosen]),
-    )
-    maps = _maps(chosen, device) if with_maps else None
-    return Advised(maps, *_known(chosen, phi, device), *(torch.from_numpy(x).to(device) for x in said))
-
-
 def states(chosen: list[tuple[Trajectory, int]], phi: Floats32, device: str = "cpu") -> States:
-    """Stack states (trajectory, t) for the network; phi [B] rad."""
-    return States(_maps(chosen, device), *_known(chosen, phi, device))
+    """Stack states for the network.
 
-
-def _maps(chosen: list[tuple[Trajectory, int]], device: str) -> torch.Tensor:
-    """[B,T,C,H,W] uint8 pixels, the past frames first."""
+    Args:
+        chosen: B pairs (trajectory, t).
+        phi: [B] rad, the SVO to act with.
+        device: of torch.
+    """
     first = chosen[0][0]
     past, ahead = first.past, first.ahead.shape[1]
     maps = np.empty((len(chosen), past + ahead, *first.frames.shape[1:]), np.uint8)
     for row, (trajectory, t) in zip(maps, chosen, strict=True):
         row[:past], row[past:] = trajectory.maps(t)
-    return torch.from_numpy(maps).to(device)
+    return States(torch.from_numpy(maps).to(device), *states_without_maps(chosen, phi, device))
 
 
-def _known(
+def states_without_maps(
     chosen: list[tuple[Trajectory, int]], phi: Floats32, device: str
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Kinematics [B,T,R,F+1], situation [B,.] and phi [B,2] of `States`."""
-    kinematics = np.stack([trajectory.kinematics[t] for trajectory, t in chosen]).astype(np.float32)
-    situation = np.stack([trajectory.situation[t] for trajectory, t in chosen])
-    direction = np.stack([np.cos(phi), np.sin(phi)], 1).astype(np.float32)
+    """Kinematics [B,T,R,F+1], situation [B,.] and phi [B,2] of `States`; arguments as in `states`."""
+    kinematics, situation, direction = (
+        np.stack([trajectory.kinematics[t] for trajectory, t in chosen]).astype(np.float32),
+        np.stack([trajectory.situation[t] for trajectory, t in chosen]),
+        np.stack([np.cos(phi), np.sin(phi)], 1).astype(np.float32),
+    )
     return (
         torch.from_numpy(kinematics).to(device),
         torch.from_numpy(situation).to(device),
@@ -112,14 +93,11 @@ def _known(
 
 def save(path: Path, trajectories: list[Trajectory]) -> None:
     """Write trajectories to one compressed .npz, whole or not at all: nothing in it is ever unpickled."""
-    arrays: dict[str, Any] = {"count": np.array(len(trajectories))}
-    for k, trajectory in enumerate(trajectories):
-        for name, value in vars(trajectory).items():
-            arrays[f"{k}.{name}"] = np.asarray(value)
+    arrays = {f"{k}.{name}": value for k, one in enumerate(trajectories) for name, value in vars(one).items()}
     # mostly zeros: level 1 will do
     deflated = partial(zipfile.ZipFile, compression=zipfile.ZIP_DEFLATED, compresslevel=1)
     with whole(path) as draft, deflated(draft, "w") as file:
-        for name, value in arrays.items():
+        for name, value in {"count": len(trajectories), **arrays}.items():
             with file.open(f"{name}.npy", "w", force_zip64=True) as part:
                 np.lib.format.write_array(part, np.asarray(value), allow_pickle=False)
 

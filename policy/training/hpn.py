@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -43,11 +43,6 @@ def seeded(training: HpnTraining, seed: int) -> HpnTraining:
         kinematics=replace(training.kinematics, seed=seed),
         maps=replace(training.maps, seed=seed),
     )
-
-
-def layout(name: str, training: HpnTraining, data: Mapping[str, Any]) -> dict[str, Any]:
-    """What a run is: a folder's run is only gone on with when nothing of it has changed."""
-    return {"hpn": asdict(VARIANTS[name]), "training": asdict(training), "data": dict(data)}
 
 
 def assemble(name: str, task: KinematicTask | MapTask) -> HPN:

@@ -8,21 +8,19 @@ than nothing, ten metres off are as wrong as twenty.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import nn
 
-from cosim.seeding import generator, subseed
 from cosim.types import Bools, Floats32
 from policy.kinematic_branch import KinematicBranch, KinematicConfig, correct, sureness
-from policy.seeded import seeded
-from policy.training.loop import one_cycle
+from policy.seeded import first_weights
+from policy.training.loop import Task, drawn, one_cycle
 from policy.training.moments import Moment
-from policy.training.networks import adam_tensors, restore_adam
 
 HALF_LENGTH, HALF_WIDTH = 2.5, 1.0  # m, half a car: an error of that size loses half of the box
 WINDOW = (128.0, 16.0)  # m, what lies outside of both pictures counts for nothing
@@ -70,18 +68,10 @@ def collate(moments: Sequence[Moment], device: str = "cpu") -> Batch:
         seen.append(place[all_[other]])
         first += int(m.known.sum())
 
-    def joined(name: str) -> torch.Tensor:
-        return torch.from_numpy(np.concatenate([getattr(m, name)[m.known] for m in moments])).to(device)
-
-    return Batch(
-        joined("own"),
-        joined("near"),
-        joined("lane"),
-        joined("gp"),
-        joined("truth"),
-        torch.from_numpy(np.concatenate(looking)).to(device),
-        torch.from_numpy(np.concatenate(seen)).to(device),
-    )
+    names = ("own", "near", "lane", "gp", "truth")
+    vehicles = [np.concatenate([getattr(m, name)[m.known] for m in moments]) for name in names]
+    pairs = [np.concatenate(looking), np.concatenate(seen)]
+    return Batch(*(torch.from_numpy(array).to(device) for array in vehicles + pairs))
 
 
 def _near(egos: Floats32, others: Floats32) -> Bools:
@@ -143,8 +133,16 @@ def _mean(values: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
     return (values * weight).sum() / weight.sum().clamp_min(1e-9)
 
 
-class KinematicTask:
-    """`policy.training.loop.Task` of the kinematic branch."""
+class KinematicTask(Task):
+    """Training of the kinematic branch.
+
+    Args:
+        config: layout of the branch.
+        training: batch size, learning rate, weights of the losses, seed.
+        updates: how many there will be; the learning rate's cycle ends with the last.
+        train, validation: examples (`policy.training.moments.moment`).
+        device: of torch.
+    """
 
     def __init__(
         self,
@@ -156,42 +154,17 @@ class KinematicTask:
         device: str = "cpu",
     ) -> None:
         self._training, self._train, self._device = training, train, device
-        self._validation = [collate(validation[k : k + 64], device) for k in range(0, len(validation), 64)]
-        self.updates = updates
-        seed = subseed(training.seed, "network") % 2**31
-        self.network = seeded(lambda: KinematicBranch(config), seed).to(device)
-        self._optimizer = torch.optim.AdamW(
-            self.network.parameters(), lr=training.rate, weight_decay=training.decay
-        )
+        self.network = first_weights(lambda: KinematicBranch(config), training.seed).to(device)
+        adam = torch.optim.AdamW(self.network.parameters(), lr=training.rate, weight_decay=training.decay)
+        blocks = [(collate(validation[k : k + 64], device), 1) for k in range(0, len(validation), 64)]
+        schedule = partial(one_cycle, updates=updates, rate=training.rate)
+        super().__init__(self.network, adam, schedule, blocks, training.clip)
 
-    def update(self, number: int) -> dict[str, float]:
-        """See `Task.update`."""
+    def batch(self, number: int) -> Batch:
+        """See `Task.batch`."""
         t = self._training
-        rng = generator(t.seed, "batch", str(number))
-        chosen = rng.integers(len(self._train), size=t.batch)
-        batch = collate([self._train[k] for k in chosen], self._device)
-        found = losses(self.network(batch.own, batch.near), batch, t)
-        self._optimizer.zero_grad(set_to_none=True)
-        found["loss"].backward()  # type: ignore[no-untyped-call]
-        for group in self._optimizer.param_groups:
-            group["lr"] = one_cycle(number, self.updates, t.rate)
-        nn.utils.clip_grad_norm_(self.network.parameters(), t.clip)
-        self._optimizer.step()
-        return {name: float(value.detach()) for name, value in found.items()}
+        return collate(drawn(self._train, t.batch, t.seed, number), self._device)
 
-    def validate(self) -> dict[str, float]:
-        """See `Task.validate`."""
-        sums: dict[str, float] = {}
-        with torch.no_grad():
-            for batch in self._validation:
-                for name, value in losses(self.network(batch.own, batch.near), batch, self._training).items():
-                    sums[name] = sums.get(name, 0.0) + float(value) / len(self._validation)
-        return sums
-
-    def tensors(self) -> dict[str, torch.Tensor]:
-        """See `Task.tensors`."""
-        return adam_tensors({"network": self.network}, self._optimizer)
-
-    def restore(self, tensors: Mapping[str, torch.Tensor]) -> None:
-        """See `Task.restore`."""
-        restore_adam(tensors, {"network": self.network}, self._optimizer)
+    def losses(self, batch: Batch) -> dict[str, torch.Tensor]:
+        """See `Task.losses`."""
+        return losses(self.network(batch.own, batch.near), batch, self._training)

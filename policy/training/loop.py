@@ -15,18 +15,21 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, TypeVar
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
+from torch import nn
 
 from cosim.errors import BadInput
 from cosim.files import whole
-from policy.training.log import tensorboard
+from cosim.seeding import generator
+from policy.training.networks import Optimized
 
 Progress = Callable[[float, float], None]  # updates so far, of updates in all
 Line = dict[str, float]
+Example = TypeVar("Example")
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,20 +42,56 @@ class LoopConfig:
     save_every: float = 30.0  # s between checkpoints: what a kill may cost
 
 
-class Task(Protocol):
-    """What is trained."""
+class Task(Optimized):
+    """One network that learns from examples; a kind of training says what its batches and losses are.
+
+    Args:
+        network: what is trained.
+        optimizer: of its parameters.
+        schedule: update number, from 0 -> learning rate.
+        validation: batches as `losses` takes them, and the weight of each in the mean.
+        clip: largest norm of the gradient; None: as it is.
+    """
+
+    def __init__(
+        self,
+        network: nn.Module,
+        optimizer: torch.optim.Optimizer,
+        schedule: Callable[[int], float],
+        validation: Sequence[tuple[Any, int]],
+        clip: float | None = None,
+    ) -> None:
+        super().__init__({"network": network}, optimizer, clip)
+        self._schedule, self._validation = schedule, validation
+
+    def batch(self, number: int) -> Any:
+        """The batch of update `number`; it depends on that and the seed alone."""
+        raise NotImplementedError
+
+    def losses(self, batch: Any) -> dict[str, torch.Tensor]:
+        """Scalars by name; `loss` is what is minimised."""
+        raise NotImplementedError
 
     def update(self, number: int) -> Line:
         """Update number `number`, from 0; its losses by name."""
+        found = self.losses(self.batch(number))
+        self.step(found["loss"], self._schedule(number))
+        return {name: float(value.detach()) for name, value in found.items()}
 
     def validate(self) -> Line:
-        """Losses on the validation episodes."""
+        """Mean losses over the validation batches."""
+        sums: Line = {}
+        total = sum(weight for _, weight in self._validation)
+        with torch.no_grad():
+            for batch, weight in self._validation:
+                for name, value in self.losses(batch).items():
+                    sums[name] = sums.get(name, 0.0) + float(value) * weight / total
+        return sums
 
-    def tensors(self) -> dict[str, torch.Tensor]:
-        """Everything that the next update depends on, copied to the host."""
 
-    def restore(self, tensors: Mapping[str, torch.Tensor]) -> None:
-        """Back to a state."""
+def drawn(examples: Sequence[Example], count: int, seed: int, number: int) -> list[Example]:
+    """`count` examples for update `number`, with replacement."""
+    return [examples[k] for k in generator(seed, "batch", str(number)).integers(len(examples), size=count)]
 
 
 def train(
@@ -69,7 +108,7 @@ def train(
     Raises BadInput when the folder holds a run already (and `resume` is not given), or another one.
     """
     state_file = folder / "state.safetensors"
-    said = json.loads(json.dumps(layout))
+    wanted = json.loads(json.dumps(layout))
     log: list[Line] = []
     sums: Line = {}  # since the last line of the log
     done = 0
@@ -77,18 +116,17 @@ def train(
         if not resume:
             raise BadInput("holds a training run already: --resume goes on", field="--out", value=str(folder))
         about, tensors = _read(state_file)
-        if about["layout"] != said:
-            names = said.keys() | about["layout"].keys()
-            differs = sorted(k for k in names if said.get(k) != about["layout"].get(k))
+        names = wanted.keys() | about["layout"].keys()
+        differs = sorted(k for k in names if wanted.get(k) != about["layout"].get(k))
+        if differs:
             raise BadInput(
                 f"the run in this folder is another one ({', '.join(differs)} differ)", file=folder
             )
         task.restore(tensors)
         done, log, sums = about["done"], about["log"], about["sums"]
     folder.mkdir(parents=True, exist_ok=True)
-    writer = tensorboard(folder, done)
     saved = time.monotonic()
-    try:
+    with tensorboard(folder, done) as writer:
         while done < config.updates:
             for name, value in task.update(done).items():
                 sums[name] = sums.get(name, 0.0) + value
@@ -106,16 +144,22 @@ def train(
                 for name, value in line.items():
                     writer.add_scalar(name.replace("_", "/", 1), value, done)
             if last or time.monotonic() - saved > config.save_every:
-                about = {"layout": said, "done": done, "log": log, "sums": sums}
-                _write(state_file, about, task.tensors())
+                about = {"layout": wanted, "done": done, "log": log, "sums": sums}
+                with whole(state_file) as draft:
+                    save_file(task.tensors(), draft, metadata={"about": json.dumps(about)})
                 write_log(folder / "log.csv", log)
                 writer.flush()
                 saved = time.monotonic()
             if progress is not None:
                 progress(done, config.updates)
-    finally:
-        writer.close()
     return log
+
+
+def tensorboard(folder: Path, begin: int | None = None) -> Any:
+    """A writer of scalars into `folder`/tensorboard; what it holds from step `begin` on is superseded."""
+    from torch.utils.tensorboard import SummaryWriter
+
+    return SummaryWriter(str(folder / "tensorboard"), purge_step=begin)
 
 
 def one_cycle(number: int, updates: int, rate: float) -> float:
@@ -133,11 +177,6 @@ def write_log(path: Path, log: Sequence[Line]) -> None:
         rows = csv.DictWriter(file, names, restval="")
         rows.writeheader()
         rows.writerows({k: f"{v:.6g}" for k, v in line.items()} for line in log)
-
-
-def _write(path: Path, about: Mapping[str, Any], tensors: dict[str, torch.Tensor]) -> None:
-    with whole(path) as draft:
-        save_file(tensors, draft, metadata={"about": json.dumps(about)})
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:

@@ -61,8 +61,8 @@ def moment(
     truth = states_of(scene.vehicles, future)  # [V,M,4]
     truth[..., 3] -= TURN * np.round((truth[..., 3] - inputs.lane[..., 3]) / TURN)
     origin = np.array([*scene.pose[0, :2], 0.0, 0.0])
-    moved = [np.asarray(a - origin, np.float32) for a in (inputs.lane, inputs.gp, truth)]
-    return Moment(inputs.own, inputs.near, moved[0], moved[1], moved[2], inputs.known, scene.ego)
+    lane, gp, later = (np.asarray(a - origin, np.float32) for a in (inputs.lane, inputs.gp, truth))
+    return Moment(inputs.own, inputs.near, lane, gp, later, inputs.known, scene.ego)
 
 
 def states_of(vehicles: Sequence[str], frames: Sequence[Snapshot]) -> Floats:

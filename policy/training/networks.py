@@ -1,4 +1,4 @@
-"""Networks with their optimiser as named tensors: nothing is ever pickled."""
+"""Networks with their optimiser: steps, and a state of named tensors (nothing is ever pickled)."""
 
 from __future__ import annotations
 
@@ -8,32 +8,50 @@ import torch
 from torch import nn
 
 
-def adam_tensors(
-    networks: Mapping[str, nn.Module], optimizer: torch.optim.Optimizer
-) -> dict[str, torch.Tensor]:
-    """Copies of every weight and of the optimiser's state, on the host."""
-    out = {f"{name}.{k}": v for name, network in networks.items() for k, v in network.state_dict().items()}
-    for index, slots in optimizer.state_dict()["state"].items():
-        out |= {f"adam.{index}.{name}": value for name, value in slots.items()}
-    return {name: value.detach().to("cpu").contiguous().clone() for name, value in out.items()}
+class Optimized:
+    """Networks and the optimiser that changes them; `tensors` and `restore` carry both over a kill.
 
+    Args:
+        networks: name -> module; the names are prefixes in the saved state.
+        optimizer: of the parameters that are trained.
+        clip: largest norm of the gradient; None: as it is.
+    """
 
-def restore_adam(
-    tensors: Mapping[str, torch.Tensor], networks: Mapping[str, nn.Module], optimizer: torch.optim.Optimizer
-) -> None:
-    """The other way round."""
-    for name, network in networks.items():
-        network.load_state_dict(
-            {k.removeprefix(f"{name}."): v for k, v in tensors.items() if k.startswith(f"{name}.")}
-        )
-    slots: dict[int, dict[str, torch.Tensor]] = {}
-    for key, value in tensors.items():
-        if key.startswith("adam."):
+    def __init__(
+        self, networks: dict[str, nn.Module], optimizer: torch.optim.Optimizer, clip: float | None
+    ) -> None:
+        self._networks, self._optimizer, self._clip = networks, optimizer, clip
+
+    def step(self, loss: torch.Tensor, rate: float | None = None) -> None:
+        """One step down `loss` (none when it depends on no parameter), at learning rate `rate` if given."""
+        if not loss.requires_grad:
+            return
+        self._optimizer.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        for group in self._optimizer.param_groups:
+            group["lr"] = group["lr"] if rate is None else rate
+            if self._clip is not None:
+                nn.utils.clip_grad_norm_(group["params"], self._clip)
+        self._optimizer.step()
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """Copies of every weight and of the optimiser's state, on the host."""
+        out = {f"{name}.{k}": v for name, net in self._networks.items() for k, v in net.state_dict().items()}
+        for index, slots in self._optimizer.state_dict()["state"].items():
+            out |= {f"adam.{index}.{name}": value for name, value in slots.items()}
+        return {name: value.detach().to("cpu").contiguous().clone() for name, value in out.items()}
+
+    def restore(self, tensors: Mapping[str, torch.Tensor]) -> None:
+        """Back to the state that `tensors` gave."""
+        for name, network in self._networks.items():
+            network.load_state_dict(
+                {k.removeprefix(f"{name}."): v for k, v in tensors.items() if k.startswith(f"{name}.")}
+            )
+        slots: dict[int, dict[str, torch.Tensor]] = {}
+        for key in (key for key in tensors if key.startswith("adam.")):
             _, index, slot = key.split(".")
-            slots.setdefault(int(index), {})[slot] = value
-    whole = optimizer.state_dict()
-    whole["state"] = slots
-    optimizer.load_state_dict(whole)
+            slots.setdefault(int(index), {})[slot] = tensors[key]
+        self._optimizer.load_state_dict({**self._optimizer.state_dict(), "state": slots})
 
 
 def usable(device: str) -> bool:

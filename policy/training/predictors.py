@@ -1,4 +1,4 @@
-"""Fits what the kinematic predictors learn: the prior over kernels, its calibration, and P's baselines.
+"""Fits the kinematic predictors: the prior over kernels, its calibration, and P's learned baselines.
 
 All of them see the same windows of recorded episodes and minimise the same figure, the mean position error
 over the horizon (PE), so that their table compares methods and not objectives.
@@ -6,7 +6,11 @@ over the horizon (PE), so that their table compares methods and not objectives.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -14,12 +18,16 @@ import torch
 from torch import nn
 
 from cosim.types import Bools, Floats
-from policy.gaussian_process import GaussianProcessBank, Operators
+from policy.gaussian_process import GaussianProcessBank, Operators, trapezoid
 from policy.kernel_prior import PriorNetwork, describe
 from policy.predictors.gp import GaussianProcessDirect, GaussianProcessIndirect
 from policy.predictors.learned import KinematicNet, NetConfig, features, integrate
 from policy.seeded import seeded
+from policy.training.loop import Line, LoopConfig, Progress, Task, train
 
+Batch = Mapping[str, torch.Tensor]  # name -> [S,...], S the same for all
+Loss = Callable[[Batch], torch.Tensor]
+CHECKED = 8192  # validation examples a loss is taken on, about
 COVERED = 0.9  # what an interval shall cover
 NORMAL = 1.645  # half its width in standard deviations, if errors were normal
 SPREAD_WEIGHT = 0.05  # of the intervals' loss: it shall not move the mean forecast
@@ -64,13 +72,13 @@ def fresh_net(config: NetConfig, seed: int) -> KinematicNet:
     return seeded(lambda: KinematicNet(config), seed)
 
 
-def net_loss(network: KinematicNet, batch: Mapping[str, torch.Tensor]) -> torch.Tensor:
+def net_loss(network: KinematicNet, batch: Batch) -> torch.Tensor:
     """Mean position error of an LSTM's or autoencoder's forecast, m."""
     x, y = network(batch["past"], batch["speed"])[:2]
     return position_error(x, y, batch)
 
 
-def position_error(x: torch.Tensor, y: torch.Tensor, batch: Mapping[str, torch.Tensor]) -> torch.Tensor:
+def position_error(x: torch.Tensor, y: torch.Tensor, batch: Batch) -> torch.Tensor:
     """PE: distance between forecast and truth, mean over the frames that have one, then over vehicles."""
     here = batch["here"]
     squared = (x - batch["future"][:, :, 0]) ** 2 + (y - batch["future"][:, :, 1]) ** 2
@@ -92,10 +100,9 @@ class BankMath(nn.Module):
         self.unit, self.kernels, self.steps = bank.config.unit, len(bank.kernels), bank.horizon
         each = np.concatenate([op.predict, op.drift[None]]).reshape(frames + 1, self.kernels, self.steps)
         self.register_buffer("table", _tensor(each.swapaxes(0, 1).reshape(-1, self.steps)), persistent=False)
-        trapezoid = np.tril(np.full((bank.horizon, bank.horizon), bank.dt))
-        trapezoid[np.diag_indices(bank.horizon)] = 0.5 * bank.dt
-        both = np.concatenate([each, each @ trapezoid.T], 2).reshape(frames + 1, -1)
-        for name, values in (("both", both), ("variance", op.variance), ("integral", trapezoid.T)):
+        integral = trapezoid(bank.horizon, bank.dt).T
+        both = np.concatenate([each, each @ integral], 2).reshape(frames + 1, -1)
+        for name, values in (("both", both), ("variance", op.variance), ("integral", integral)):
             self.register_buffer(name, _tensor(values), persistent=False)
 
     def forward(
@@ -150,7 +157,7 @@ class PriorFit:
         """Set the factors [N,spreads,M] on the standard deviations, by how many frames are known."""
         self.network.calibration.copy_(torch.from_numpy(factors))
 
-    def loss(self, batch: Mapping[str, torch.Tensor]) -> torch.Tensor:
+    def loss(self, batch: Batch) -> torch.Tensor:
         """Position error, and a little of how badly the intervals fit (pinball loss of their edge)."""
         raw = self.network(batch["motion"])
         kernels = self.network.config.kernels
@@ -217,3 +224,64 @@ def _truth(windows: Windows) -> dict[str, torch.Tensor]:
 
 def _tensor(values: Floats | Bools) -> torch.Tensor:
     return torch.from_numpy(np.ascontiguousarray(values, np.float32))
+
+
+@dataclass(frozen=True, slots=True)
+class FitConfig:
+    """One fit with Adam and a learning rate that falls along a cosine to 0."""
+
+    steps: int = 6000
+    batch: int = 1024
+    learning_rate: float = 1e-2
+    seed: int = 0
+
+
+class FitTask(Task):
+    """Training of one network by one loss; arguments as in `fit`."""
+
+    def __init__(
+        self, network: nn.Module, loss: Loss, config: FitConfig, examples: Batch, validation: Batch
+    ) -> None:
+        self._loss, self._config, self._examples = loss, config, examples
+        stride = max(len(next(iter(validation.values()))) // CHECKED, 1)
+        checked = {name: tensor[::stride] for name, tensor in validation.items()}
+        adam = torch.optim.Adam(network.parameters(), config.learning_rate)
+        super().__init__(network, adam, self._rate, [(checked, 1)])
+
+    def _rate(self, number: int) -> float:
+        c = self._config
+        return 0.5 * c.learning_rate * (1.0 + math.cos(math.pi * number / c.steps))
+
+    def batch(self, number: int) -> Batch:
+        """See `Task.batch`."""
+        rng = np.random.default_rng((self._config.seed, number))
+        count = len(next(iter(self._examples.values())))
+        rows = torch.from_numpy(rng.integers(0, count, self._config.batch))
+        return {name: tensor[rows] for name, tensor in self._examples.items()}
+
+    def losses(self, batch: Batch) -> dict[str, torch.Tensor]:
+        """See `Task.losses`."""
+        return {"loss": self._loss(batch)}
+
+
+def fit(
+    network: nn.Module,
+    loss: Loss,
+    config: FitConfig,
+    examples: Batch,
+    validation: Batch,
+    *,
+    folder: Path | None = None,
+    progress: Progress | None = None,
+) -> list[Line]:
+    """Fit `network` in place; returns the log of losses. A fit that left a state in `folder` goes on.
+
+    Raises BadInput when `folder` holds another fit.
+    """
+    task = FitTask(network, loss, config, examples, validation)
+    shapes = {name: list(value.shape) for name, value in network.state_dict().items()}
+    layout = {"config": asdict(config), "shapes": shapes, "examples": len(next(iter(examples.values())))}
+    times = LoopConfig(updates=config.steps)
+    with tempfile.TemporaryDirectory(prefix="cosim-fit-") as scratch:
+        where = folder or Path(scratch)
+        return train(task, times, where, layout=layout, resume=True, progress=progress)

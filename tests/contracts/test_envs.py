@@ -22,6 +22,7 @@ from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
 
 import cosim
 import cosim.envs
+import sumo_scenarios
 from cosim.envs.gym import SumoEnv
 from cosim.envs.parallel import SumoParallelEnv, parallel_env
 from cosim.envs.session import Session, StepResult
@@ -103,8 +104,7 @@ def test_pettingzoo_accepts_the_parallel_environment() -> None:
 
 def test_every_world_is_registered() -> None:
     names = {name for name in gymnasium.registry if name.startswith("cosim/")}
-    worlds = {f"cosim/{w}-v0" for w in ("Merge", "Exit", "Roundabout", "Intersection", "Highway", "Sumo")}
-    assert names == worlds
+    assert names == {f"cosim/{world.capitalize()}-v0" for world in (*sumo_scenarios.names(), "sumo")}
 
 
 # ---- seeds ----

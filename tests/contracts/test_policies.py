@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import pytest
 from policy_contract import PolicyContract
 
 from cosim.errors import BadInput
-from cosim.types import Policy
+from cosim.types import SMOKE, Decision, History, MetaAction, Policy, PolicyContext
 from policy.agents import POLICIES, make
 
 
@@ -21,6 +21,24 @@ def _one_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+class Some:
+    """Commands the first AV by id, and SUMO drives the others."""
+
+    name, label, observation = "some", "", SMOKE
+    av_parameters: Mapping[str, str] = {}
+
+    def reset(self, context: PolicyContext) -> None: ...
+
+    def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
+        return {av: Decision(MetaAction.DECELERATE) for av in sorted(histories)[:1]}
+
+
+class TestCommandingSome(PolicyContract):
+    @pytest.fixture
+    def policy(self) -> Policy:
+        return Some()
 
 
 class TestPolicies(PolicyContract):

@@ -28,11 +28,11 @@ from policy.tensors import KINEMATIC_INPUTS
 from policy.training import experience
 from policy.training.a2c import A2cConfig, A2cLearner
 from policy.training.curriculum import Drive, Drove, Lesson, VfnTraining
-from policy.training.ddqn import DdqnConfig, Learner
+from policy.training.ddqn import DdqnConfig, DdqnLearner
 from policy.training.experience import Trajectory
 from policy.training.explorer import ExploreConfig, Explorer
-from policy.training.replay import Replay, ReplayConfig
-from policy.training.vfn import Trainer
+from policy.training.replay_buffer import ReplayBuffer, ReplayConfig
+from policy.training.vfn import TrainingRun
 from policy.vfn import VfnConfig
 
 torch.set_num_threads(1)
@@ -50,7 +50,7 @@ def trajectory(
     vetoed: list[int] | None = None,
     near: bool = True,
 ) -> Trajectory:
-    """A drive whose states are told apart by one number of the situation: `situation` [D+1]."""
+    """A drive whose states differ in one number of the situation: `situation` [D+1]."""
     d = len(actions)
     states = np.zeros((d + 1, SITUATION_INPUTS), np.float32)
     for t, place in enumerate(situation or range(d + 1)):
@@ -75,11 +75,11 @@ def trajectory(
     )
 
 
-BUT_BRAKE = np.array([[True, True, True, True, False]])  # what the mentor thinks wrong
+BUT_BRAKE = np.array([[True, True, True, True, False]])  # what the demonstrator would not do
 
 
-def only(config: ReplayConfig, one: Trajectory, seed: int = 0) -> tuple[Replay, object]:
-    replay = Replay(config)
+def only(config: ReplayConfig, one: Trajectory, seed: int = 0) -> tuple[ReplayBuffer, object]:
+    replay = ReplayBuffer(config)
     replay.add([one])
     return replay, replay.sample(np.random.default_rng(seed))
 
@@ -103,28 +103,28 @@ def test_an_n_step_return_is_the_discounted_sum_and_stops_at_a_crash() -> None:
 def test_relabelling_learns_for_another_orientation_than_was_driven() -> None:
     config = ReplayConfig(batch=300, n_step=1, relabel=1.0, phi=(90.0, 90.0))
     _, batch = only(config, trajectory([1], [(1.0, 10.0, 100.0)]))
-    assert batch.reward == pytest.approx(np.full(300, 110.0), abs=1e-3)  # altruistic: the others' alone
+    assert batch.reward.numpy() == pytest.approx(np.full(300, 110.0), abs=1e-3)  # the others' alone
     assert batch.now.phi[:, 1].numpy() == pytest.approx(np.ones(300))
 
 
 def test_rare_moments_have_their_share_of_a_batch() -> None:
     far, near = trajectory([1] * 30, [(0, 0, 0)] * 30, near=False), trajectory([4], [(0, 0, 0)])
     config = ReplayConfig(batch=100, yielding=0.25, interaction=0.5)
-    replay = Replay(config)
+    replay = ReplayBuffer(config)
     replay.add([far, near])
     actions = replay.sample(np.random.default_rng(0)).action
     assert (actions == 4).sum() == 67, "nobody yields: the others share the batch 2 to 1"
     replay.add([replace(trajectory([3], [(0, 0, 0)]), yielding=np.ones(1, np.bool_))])
     actions = replay.sample(np.random.default_rng(0)).action
     assert [(actions == a).sum() for a in (3, 4, 1)] == [25, 50, 25]
-    replay = Replay(replace(config, correcting=0.2, interaction=0.3))
+    replay = ReplayBuffer(replace(config, correcting=0.2, interaction=0.3))
     replay.add([far, near, replace(trajectory([0], [(0, 0, 0)], near=False), wrong=BUT_BRAKE)])
     actions = replay.sample(np.random.default_rng(0)).action
     assert [(actions == a).sum() for a in (0, 4, 1)] == [27, 40, 33]
 
 
 def test_the_oldest_drives_are_forgotten_first() -> None:
-    replay = Replay(ReplayConfig(capacity=25))
+    replay = ReplayBuffer(ReplayConfig(capacity=25))
     dropped = [replay.add([trajectory([k] * 10, [(0, 0, 0)] * 10)]) for k in range(5)]
     assert dropped == [0, 0, 1, 1, 1]
     assert replay.size == 20
@@ -150,9 +150,9 @@ def test_a_corridor_is_walked_to_its_end() -> None:
             terms.append((10.0 if place == 4 else 0.0, 0.0, 0.0))
         ending = "crashed" if place == 4 else "cut"  # the end is terminal
         drives.append(trajectory(actions, terms, situation=situation, ending=ending))
-    replay = Replay(ReplayConfig(batch=64, n_step=1, gamma=0.9, relabel=0.0))
+    replay = ReplayBuffer(ReplayConfig(batch=64, n_step=1, gamma=0.9, relabel=0.0))
     replay.add(drives)
-    learner = Learner(TINY, DdqnConfig(learning_rate=3e-3, target_every=20), seed=0)
+    learner = DdqnLearner(TINY, DdqnConfig(learning_rate=3e-3, target_every=20), seed=0)
     draws = np.random.default_rng(0)
     for _ in range(250):
         losses = learner.update(replay.sample(draws))
@@ -167,7 +167,7 @@ def test_a_corridor_is_walked_to_its_end() -> None:
         )
     assert q.argmax(1).tolist() == [MetaAction.ACCELERATE] * 4
     assert q.max(1).values.tolist() == pytest.approx([0.9**3, 0.9**2, 0.9, 1.0], abs=0.15)  # reward x 0.1
-    assert losses.td < 0.01
+    assert losses["td"] < 0.01
 
 
 def test_what_the_prioritizer_masks_is_not_hoped_for() -> None:
@@ -175,19 +175,19 @@ def test_what_the_prioritizer_masks_is_not_hoped_for() -> None:
     unsafe = np.zeros((2, 5), np.bool_)
     unsafe[1, 3] = True
     one = trajectory([1], [(0.0, 0.0, 0.0)], unsafe=unsafe)
-    learner = Learner(replace(TINY, dueling=False), DdqnConfig(), seed=1)
+    learner = DdqnLearner(replace(TINY, dueling=False), DdqnConfig(), seed=1)
     for network in (learner.online, learner.target):
         with torch.no_grad():
             network.value.weight.zero_()
             network.value.bias.copy_(torch.tensor([0.0, 0.0, 0.0, 100.0, 2.0]))
     _, batch = only(ReplayConfig(batch=8, n_step=1, gamma=0.5, relabel=0.0), one)
-    td = learner.update(batch).td
+    td = learner.update(batch)["td"]
     assert td == pytest.approx(0.5 * 1.0**2)  # goal 0.5 * 2 against q = 0; with the masked one it were 49.5
 
 
 def test_a_refused_action_is_worth_a_crash() -> None:
     one = trajectory([1], [(0.0, 0.0, 0.0)], vetoed=[3])
-    learner = Learner(TINY, DdqnConfig(learning_rate=1e-2), seed=1)
+    learner = DdqnLearner(TINY, DdqnConfig(learning_rate=1e-2), seed=1)
     _, batch = only(ReplayConfig(batch=8, n_step=1, relabel=0.0), one)
     for _ in range(150):
         learner.update(batch)
@@ -197,11 +197,11 @@ def test_a_refused_action_is_worth_a_crash() -> None:
     assert q[1].item() > -0.1
 
 
-def test_the_mentors_advice_leads_by_the_margin_where_nothing_else_speaks_for_it() -> None:
-    """Somebody idled and was paid; the mentor would have braked."""
+def test_the_demonstrated_action_leads_by_the_margin_where_no_reward_speaks_for_it() -> None:
+    """Somebody idled and was paid; the demonstrator would have braked."""
     one = trajectory([1], [(1.0, 0.0, 0.0)], ending="crashed")
     one = replace(one, wrong=BUT_BRAKE)
-    learner = Learner(TINY, DdqnConfig(learning_rate=1e-2, imitation=0.5, margin=0.1), seed=1)
+    learner = DdqnLearner(TINY, DdqnConfig(learning_rate=1e-2, imitation=0.5, margin=0.1), seed=1)
     replay, _ = only(ReplayConfig(batch=16, n_step=1, relabel=0.0), one)
     rng = np.random.default_rng(0)
     for _ in range(150):
@@ -212,30 +212,30 @@ def test_the_mentors_advice_leads_by_the_margin_where_nothing_else_speaks_for_it
     assert q[4].item() - q[[0, 1, 2, 3]].max().item() > 0.08
 
 
-def test_the_mentor_is_heard_without_maps_too_and_two_good_actions_are_not_told_apart() -> None:
+def test_demonstrations_are_learned_without_maps_too_and_two_good_actions_are_equal() -> None:
     one = trajectory([1], [(0.0, 0.0, 0.0)])
     one = replace(one, wrong=np.array([[True, False, True, True, False]]))
     config = DdqnConfig(learning_rate=1e-2, margin=0.1)
-    learner = Learner(replace(TINY, kinematic=8), config, seed=1)
+    learner = DdqnLearner(replace(TINY, kinematic=8), config, seed=1)
     replay, _ = only(ReplayConfig(advised=16, relabel=1.0), one)
     rng = np.random.default_rng(0)
     agrees = [learner.imitate(replay.advised(rng, with_maps=False)) for _ in range(100)]
     assert agrees[-1] == 1.0
     seen = replay.advised(rng, with_maps=False)
     with torch.no_grad():
-        q = learner.online(None, seen.kinematics, seen.situation, seen.phi)[0]
+        q = learner.online(*seen.now)[0]
     assert q[[1, 4]].max() > q[[0, 2, 3]].max() + 0.08
     assert learner.updates == 0, "what is learned from rewards alone is counted"
 
 
-def test_a_network_that_sees_maps_alone_hears_the_mentor_on_them() -> None:
-    """He brakes where the map is dark and accelerates where it is bright: all else is alike."""
+def test_a_network_that_sees_maps_alone_imitates_on_them() -> None:
+    """The demonstrator brakes where the map is dark and accelerates where it is bright: all else is alike."""
     brakes, goes = (np.array([[k != a for k in range(5)]]) for a in (4, 3))
     dark = trajectory([1], [(0.0, 0.0, 0.0)], situation=[0, 0])
     bright = replace(dark, frames=np.full_like(dark.frames, 255), wrong=goes)
-    replay = Replay(ReplayConfig(advised=16))
+    replay = ReplayBuffer(ReplayConfig(advised=16))
     replay.add([replace(dark, frames=np.zeros_like(dark.frames), wrong=brakes), bright])
-    learner = Learner(replace(TINY, kinematic=0), DdqnConfig(learning_rate=1e-2), seed=1)
+    learner = DdqnLearner(replace(TINY, kinematic=0), DdqnConfig(learning_rate=1e-2), seed=1)
     rng = np.random.default_rng(0)
     agrees = [learner.imitate(replay.advised(rng, with_maps=True)) for _ in range(60)]
     assert agrees[-10:] == [1.0] * 10
@@ -244,19 +244,20 @@ def test_a_network_that_sees_maps_alone_hears_the_mentor_on_them() -> None:
 
 def test_advice_holds_for_the_orientation_of_the_drive_alone() -> None:
     one = replace(trajectory([4], [(1.0, 0.0, 0.0)]), wrong=BUT_BRAKE)
-    assert (only(ReplayConfig(batch=20, relabel=0.0), one)[1].wrong == BUT_BRAKE).all()
+    assert (only(ReplayConfig(batch=20, relabel=0.0), one)[1].wrong.numpy() == BUT_BRAKE).all()
     assert not only(ReplayConfig(batch=20, relabel=1.0), one)[1].wrong.any()
 
 
 def test_saved_and_loaded_a_learner_goes_on_exactly(tmp_path: Path) -> None:
     one = trajectory([1, 3, 4, 0], [(1, 2, 3)] * 4)
     replay, _ = only(ReplayConfig(batch=8), one)
-    first = Learner(TINY, DdqnConfig(target_every=3), seed=2)
+    first = DdqnLearner(TINY, DdqnConfig(target_every=3), seed=2)
     draws = np.random.default_rng(1)
     for _ in range(4):
         first.update(replay.sample(draws))
-    second = Learner(TINY, DdqnConfig(target_every=3), seed=9)
-    second.restore(first.tensors(), first.updates)
+    second = DdqnLearner(TINY, DdqnConfig(target_every=3), seed=9)
+    second.restore(first.tensors())
+    second.updates = first.updates
     batches = [replay.sample(draws) for _ in range(4)]
     assert [first.update(b) for b in batches] == [second.update(b) for b in batches]
     experience.save(tmp_path / "a.npz", [one])
@@ -330,7 +331,7 @@ def test_a_crashed_av_ends_its_drive_and_the_others_are_cut() -> None:
     assert ends["a"].terms[-1, 0] < -3.0  # crash: -5, and what speed it had
 
 
-def test_the_mentor_cruises_up_to_the_limit_and_his_advice_is_what_he_does() -> None:
+def test_the_demonstrator_cruises_up_to_the_limit_and_records_what_it_does() -> None:
     episode = fake_episode(FakeVehicle("a", 100.0, 0, 15.0, is_av=True))
     drive = Drive(Lesson("fake"), 5, 0.7, 1.0, "", "", True, guided=True)
     (drove,) = drive_episode(episode, agent(), drive, RewardConfig()).trajectories
@@ -375,8 +376,8 @@ def losses(folder: Path) -> list[dict[str, float]]:
 
 
 def test_a_killed_run_goes_on_exactly(tmp_path: Path) -> None:
-    Trainer(SHORT, TINY, Pretend(), tmp_path / "whole").run()
-    killed = Trainer(SHORT, TINY, Pretend(), tmp_path / "killed")
+    TrainingRun(SHORT, TINY, Pretend(), tmp_path / "whole").run()
+    killed = TrainingRun(SHORT, TINY, Pretend(), tmp_path / "killed")
 
     def die(done: float, _: float) -> None:
         if done == 7:
@@ -384,7 +385,7 @@ def test_a_killed_run_goes_on_exactly(tmp_path: Path) -> None:
 
     with pytest.raises(KeyboardInterrupt):
         killed.run(die)
-    again = Trainer(SHORT, TINY, Pretend(), tmp_path / "killed")
+    again = TrainingRun(SHORT, TINY, Pretend(), tmp_path / "killed")
     assert again.resume()
     assert again.iteration == 6  # the last checkpoint; iteration 6 is driven once more
     again.run()
@@ -398,12 +399,12 @@ def test_a_killed_run_goes_on_exactly(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("imitation", [0.0, 1.0])
 def test_a_killed_a2c_run_goes_on_exactly_too(imitation: float, tmp_path: Path) -> None:
-    """With a mentor the first two iterations' drives are his: they are kept, and learned from once."""
+    """With demonstrations the first two iterations are the demonstrator's: kept, and learned from once."""
     a2c = A2cConfig(imitation=imitation)
     config = replace(SHORT, learning="a2c", iterations=6, warm_up=2, a2c=a2c)
     critic = replace(TINY, critic=True, kinematic=0)
-    Trainer(config, critic, Pretend(), tmp_path / "whole").run()
-    killed = Trainer(config, critic, Pretend(), tmp_path / "killed")
+    TrainingRun(config, critic, Pretend(), tmp_path / "whole").run()
+    killed = TrainingRun(config, critic, Pretend(), tmp_path / "killed")
 
     def die(done: float, _: float) -> None:
         if done == 3:
@@ -411,7 +412,7 @@ def test_a_killed_a2c_run_goes_on_exactly_too(imitation: float, tmp_path: Path) 
 
     with pytest.raises(KeyboardInterrupt):
         killed.run(die)
-    again = Trainer(config, critic, Pretend(), tmp_path / "killed")
+    again = TrainingRun(config, critic, Pretend(), tmp_path / "killed")
     assert again.resume()
     again.run()
     assert losses(tmp_path / "killed") == losses(tmp_path / "whole")
@@ -421,7 +422,7 @@ def test_a_killed_a2c_run_goes_on_exactly_too(imitation: float, tmp_path: Path) 
     assert learned[0]["loss/entropy"] == pytest.approx(np.log(5.0), abs=0.05)
 
 
-def test_while_a2c_listens_the_mentor_drives_and_afterwards_it_drives_alone(tmp_path: Path) -> None:
+def test_a2c_is_demonstrated_first_and_drives_alone_afterwards(tmp_path: Path) -> None:
     a2c = A2cConfig(learning_rate=1e-2, imitation=1.0)
     config = replace(SHORT, learning="a2c", iterations=5, warm_up=60, a2c=a2c)
     driven: list[Drive] = []
@@ -430,15 +431,15 @@ def test_while_a2c_listens_the_mentor_drives_and_afterwards_it_drives_alone(tmp_
         def submit(self, drive: Drive) -> Future[Drove]:
             driven.append(drive)
             drove = super().submit(drive).result()
-            told = [replace(t, wrong=np.repeat(BUT_BRAKE, len(t), 0)) for t in drove.trajectories]
+            shown = [replace(t, wrong=np.repeat(BUT_BRAKE, len(t), 0)) for t in drove.trajectories]
             future: Future[Drove] = Future()
-            future.set_result(drove._replace(trajectories=told))
+            future.set_result(drove._replace(trajectories=shown))
             return future
 
-    Trainer(config, replace(TINY, critic=True, kinematic=0), Braking(), tmp_path).run()
+    TrainingRun(config, replace(TINY, critic=True, kinematic=0), Braking(), tmp_path).run()
     assert [d.guided for d in driven if d.record] == [True] * 4 + [False] * 6
-    heard = [line["loss/imitation"] for line in losses(tmp_path) if "loss/imitation" in line]
-    assert heard[0] < 0.2, "he was heard before the first drive of its own"
+    imitation = [line["loss/imitation"] for line in losses(tmp_path) if "loss/imitation" in line]
+    assert imitation[0] < 0.2, "it was imitated before the first drive of its own"
 
 
 def test_actor_and_critic_learn_which_action_pays() -> None:
@@ -459,18 +460,18 @@ def test_actor_and_critic_learn_which_action_pays() -> None:
     assert chances[MetaAction.ACCELERATE] > 0.9
 
 
-def test_actor_and_critic_hear_the_mentor_where_nothing_else_speaks_for_it() -> None:
+def test_actor_and_critic_imitate_where_no_reward_speaks_for_it() -> None:
     config = A2cConfig(learning_rate=1e-2, imitation=1.0)
     learner = A2cLearner(replace(TINY, critic=True), config, seed=0)
     one = replace(trajectory([1], [(0.0, 0.0, 0.0)]), wrong=BUT_BRAKE)
     rng = np.random.default_rng(0)
     losses = [learner.learn([one], rng) for _ in range(40)]
-    assert losses[0].imitation == pytest.approx(np.log(5.0))
-    assert losses[-1].imitation < 0.1, "the chance of braking"
+    assert losses[0]["imitation"] == pytest.approx(np.log(5.0))
+    assert losses[-1]["imitation"] < 0.1, "the chance of braking"
 
 
 def test_another_configuration_is_not_gone_on_with(tmp_path: Path) -> None:
-    Trainer(replace(SHORT, iterations=2), TINY, Pretend(), tmp_path).run()
-    other = Trainer(replace(SHORT, updates=5), TINY, Pretend(), tmp_path)
+    TrainingRun(replace(SHORT, iterations=2), TINY, Pretend(), tmp_path).run()
+    other = TrainingRun(replace(SHORT, updates=5), TINY, Pretend(), tmp_path)
     with pytest.raises(BadInput, match="updates"):
         other.resume()

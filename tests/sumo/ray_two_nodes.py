@@ -12,7 +12,7 @@ import sys
 from ray.cluster_utils import Cluster
 
 from cosim.batch import matrix
-from cosim.batch.case_runner import CaseRunner
+from cosim.batch.episode_runner import EpisodeRunner
 from cosim.batch.spec import FIELDS, read
 from cosim.cli.main import parser
 from cosim.workers.ray_engine import RayEngine
@@ -28,7 +28,7 @@ def main() -> None:
     doomed = cluster.add_node(num_cpus=1)
     hashes: dict[str, str] = {}
     begun: set[str] = set()
-    for outcome in RayEngine(CaseRunner, workers=2, address=cluster.address).run(tasks):
+    for outcome in RayEngine(EpisodeRunner, workers=2, address=cluster.address).run(tasks):
         hashes[outcome.key] = outcome.value["trace_hash"] if outcome.ok else str(outcome.error)
         begun.add(outcome.key.partition("-")[0])
         if doomed is not None and len(begun) == 2:  # each node keeps to a cell: both are at work

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cosim.batch.case_runner import CaseRunner
+from cosim.batch.episode_runner import EpisodeRunner
 from cosim.batch.record import cases
 from cosim.cli.main import main
 from cosim.learning.attribution import Asking
@@ -17,7 +17,7 @@ from cosim.workers.worker import Worker
 def test_who_is_asked_drives_the_same_episode() -> None:
     (case,) = cases(["merge"], ["contested"], [], ["vfn-p"], [150000], duration=3.2)
     hashes = []
-    for host in (CaseRunner, Asking):
+    for host in (EpisodeRunner, Asking):
         with Worker(host) as worker:
             found = worker.call("run", case, (), None, progress=lambda *_: None)
             hashes.append(found["trace_hash"])

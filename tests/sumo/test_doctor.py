@@ -2,16 +2,17 @@
 
 import json
 import os
+from argparse import Namespace
 from pathlib import Path
 
 import pytest
 
-from cosim.cli import doctor_work as doctor
-from cosim.cli.doctor_work import FAIL, OK, WARN
+from cosim.cli import doctor
+from cosim.cli.doctor import FAIL, OK, WARN
 
 
 def test_a_sound_installation_passes_with_a_simulated_second(capsys: pytest.CaptureFixture[str]) -> None:
-    assert doctor.doctor(json=True) == 0
+    assert doctor.work(Namespace(json=True)) == 0
     report = json.loads(capsys.readouterr().out)
     checks = {check["name"]: check for check in report["checks"]}
     assert report["failed"] == 0
@@ -25,7 +26,7 @@ def test_one_failure_makes_the_exit_code_3(
 ) -> None:
     checks = [doctor.Check("a", OK, "1"), doctor.Check("b", FAIL, "gone", "fetch it")]
     monkeypatch.setattr(doctor, "examine", lambda _: iter(checks))
-    assert doctor.doctor(json=False) == 3
+    assert doctor.work(Namespace(json=False)) == 3
     assert capsys.readouterr().out == "ok   a: 1\nFAIL b: gone (fetch it)\n"
 
 
@@ -48,7 +49,7 @@ def test_a_sumo_package_of_another_version_is_named() -> None:
 
 
 def test_missing_packages_are_listed_with_the_line_that_installs_them() -> None:
-    versions = {"cosim": "0.1.0", "numpy": "2.0"}
+    versions = {"cosim-sumo": "0.1.0", "numpy": "2.0"}
     checks = list(doctor.packages(versions.get))
     assert [check.state for check in checks] == [OK, FAIL, OK]
     assert "torch" in checks[1].detail

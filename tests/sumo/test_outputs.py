@@ -12,7 +12,7 @@ import pytest
 
 from cosim.cli.main import main
 from cosim.errors import BadInput, SimulationError
-from cosim.runner import Runner
+from cosim.host import Host
 from cosim.scenario import load
 from cosim.scenario.sumo_outputs import DRAFT, OUTPUTS, check, drafts
 from cosim.workers.worker import Worker
@@ -27,9 +27,7 @@ def episodes(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, 
     folder = tmp_path_factory.mktemp("outputs")
     names = tuple(name for name in OUTPUTS if name not in ("full", "link", "emission", "netstate", "amitran"))
     found = {}
-    with Worker(
-        Runner, load("merge", demand=["contested"], duration=12.0), "altruist-rule", math.pi / 4
-    ) as w:
+    with Worker(Host, load("merge", demand=["contested"], duration=12.0), "altruist-rule", math.pi / 4) as w:
         for seed in (200_031, 200_032):
             found[str(seed)] = w.call("run", seed, outputs=names, folder=folder / str(seed))
         found["without"] = w.call("run", 200_031)
@@ -74,7 +72,7 @@ def test_the_fcd_file_yields_the_figures_of_the_episode(
 
 
 def test_a_collision_ends_the_files_where_it_ends_the_episode(tmp_path: Path) -> None:
-    with Worker(Runner, load("merge", demand=["contested"]), "random", math.pi / 4) as worker:
+    with Worker(Host, load("merge", demand=["contested"]), "random", math.pi / 4) as worker:
         result = worker.call("run", 200_031, outputs=("fcd", "collision"), folder=tmp_path)
     assert result.value("crashed") is True
     steps = ElementTree.parse(tmp_path / "fcd.xml").getroot()

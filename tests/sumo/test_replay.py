@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -95,6 +96,43 @@ def test_whom_the_film_shall_follow_must_be_there(run: Path, capsys: pytest.Capt
     assert main(["replay", str(run), "--mp4", str(film), "--follow", "mission.9"]) == 2
     assert "--follow='mission.9': no such vehicle, did you mean 'mission.0'?" in capsys.readouterr().err
     assert not film.exists()
+
+
+@pytest.mark.parametrize(
+    ("file", "wrong", "said"),
+    [
+        ("manifest", {"seed": "x"}, "seed='x': a whole number is needed"),
+        ("manifest", {"case": 3}, "case=3: a mapping is needed"),
+        ("manifest", {"case": {"seed": "x"}}, "case.seed='x': a whole number is needed"),
+        ("manifest", {"case": {"svo_deg": "east"}}, "case.svo_deg='east': a finite number is needed"),
+        ("manifest", {"case": {"policy": 3}}, "case.policy=3: text is needed"),
+        ("manifest", {"files": []}, "files=[]: a mapping is needed"),
+        ("manifest", {"versions": 3}, "versions=3: a mapping is needed"),
+        ("manifest", {"policy_files": {"a": 1}}, "policy_files.a=1: text is needed"),
+        ("manifest", {"sumo_arguments": [3]}, "sumo_arguments=3: text is needed"),
+        ("manifest", {"cells": {"a": {"case": 3}}}, "cells.a.case=3: a mapping is needed"),
+        ("result", {"trace_hash": 3}, "trace_hash=3: text is needed"),
+    ],
+)
+def test_a_field_of_the_wrong_type_is_one_clear_sentence(
+    run: Path, file: str, wrong: dict[str, Any], said: str
+) -> None:
+    path = run / f"{file}.json"
+    document = json.loads(path.read_text())
+    for name, value in wrong.items():
+        merged = isinstance(value, dict) and name in document
+        document[name] = {**document[name], **value} if merged else value
+    path.write_text(json.dumps(document))
+    with pytest.raises(BadInput) as refused:
+        find(run, None)
+    assert str(refused.value) == f"{path}: {said}"
+
+
+def test_a_case_without_its_policy_is_refused(run: Path) -> None:
+    case = json.loads((run / "manifest.json").read_text())["case"]
+    changed(run, case={name: value for name, value in case.items() if name != "policy"})
+    with pytest.raises(BadInput, match=r"manifest\.json: case\.policy: is missing"):
+        find(run, None)
 
 
 def test_a_folder_that_is_none_is_one_clear_sentence(tmp_path: Path, run: Path) -> None:

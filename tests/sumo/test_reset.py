@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from cosim.scenario import Scenario, load
 from cosim.simulation.sumo import SumoSimulator
-from cosim.simulation.xerces import keep_awake
+from cosim.simulation.xerces import keep_initialized
 from cosim.types import Snapshot
 from cosim.workers.worker import Worker
 
@@ -16,7 +16,7 @@ class Awake:
         self._simulator = SumoSimulator(scenario)
 
     def found(self) -> bool:
-        return keep_awake()
+        return keep_initialized()
 
     def reset(self, seed: int) -> Snapshot:
         return self._simulator.reset(seed)[-1]

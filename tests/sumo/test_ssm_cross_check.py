@@ -39,6 +39,9 @@ EDGES = f"""<edges>
 CONNECTIONS = """<connections>
     <connection from="wc" to="ce"/> <connection from="sc" to="cn"/>
 </connections>"""
+MERGING = """<connections>
+    <connection from="wc" to="ce"/> <connection from="sc" to="ce"/>
+</connections>"""
 ROUTES = """<routes>
     <vType id="car" length="{length}" width="{width}" carFollowModel="IDM" minGap="2" tau="1"/>
     <route id="east" edges="wc ce"/> <route id="north" edges="sc cn"/>
@@ -86,8 +89,12 @@ class Drive(NamedTuple):
 @pytest.fixture(scope="module")
 def net(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two roads that cross at a right angle."""
-    folder = tmp_path_factory.mktemp("crossing")
-    for name, text in (("nod", NODES), ("edg", EDGES), ("con", CONNECTIONS)):
+    return built(tmp_path_factory.mktemp("crossing"), NODES, CONNECTIONS)
+
+
+def built(folder: Path, nodes: str, connections: str) -> Path:
+    """netconvert's net of these nodes and connections."""
+    for name, text in (("nod", nodes), ("edg", EDGES), ("con", connections)):
         (folder / f"plain.{name}.xml").write_text(text)
     spec = importlib.util.find_spec("sumo")  # the eclipse-sumo package
     assert spec is not None
@@ -186,6 +193,24 @@ def test_a_crossing_conflict_agrees_with_the_ssm_device(
         ego_at=100, ego_speed=15, foe_route="north", foe_at=foe_at, foe_speed=foe_speed,
     )  # fmt: skip
     compare(seen, least=100)
+
+
+def test_merging_at_45_degrees_is_closer_by_our_definition_until_both_are_on_one_lane(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """SUMO counts to where the lanes have become one, cosim to where the straight ways meet."""
+    monkeypatch.setitem(globals(), "ROUTES", ROUTES.replace('"sc cn"', '"sc ce"'))
+    nodes = NODES.replace('id="s" x="0" y="-300"', 'id="s" x="-200" y="-200"')
+    seen = drive(
+        built(tmp_path, nodes, MERGING), tmp_path, {"ego": 15.0, "foe": 12.0},
+        ego_at=100, ego_speed=15, foe_route="north", foe_at=123, foe_speed=12,
+    )  # fmt: skip
+    both = np.isfinite(seen.ttc) & (seen.ttc > 0.5)
+    ours, theirs = time_to_collision(seen.ego, seen.foe)[both], seen.ttc[both]
+    apart = np.abs(np.remainder(seen.ego.heading - seen.foe.heading + np.pi, 2 * np.pi) - np.pi)[both] > 0.7
+    assert apart.sum() > 50
+    assert (ours[apart] < theirs[apart] - 0.2).all()
+    assert (ours[apart] > theirs[apart] - 0.5).all()
 
 
 @pytest.mark.parametrize("foe_at", [65, 130], ids=["the other passes second", "the other passes first"])

@@ -118,3 +118,26 @@ def _history(
         route=road.ahead(ego.lane, ego.x + 2.5, 5.0, route),
         time=0.0,
     )
+
+
+def cars(speed: np.ndarray, heading: np.ndarray | None = None) -> np.ndarray:
+    """[V,N,8] that are at (100, 50) now and came there with speeds and headings [V,N]."""
+    state = np.zeros((*speed.shape, 8))
+    state[:, :, 2] = speed
+    state[:, :, 3] = 0.0 if heading is None else heading
+    way = np.exp(1j * 0.5 * (state[:, 1:, 3] + state[:, :-1, 3])) * 0.5 * (speed[:, 1:] + speed[:, :-1])
+    place = np.concatenate([np.zeros((len(speed), 1)), 0.2 * np.cumsum(way, 1)], 1)
+    place += 100.0 + 50.0j - place[:, -1:]
+    state[:, :, 0], state[:, :, 1] = place.real, place.imag
+    state[:, :, 4:6] = (5.0, 2.0)
+    return state
+
+
+def braking_cars(seed: int, count: int = 600) -> tuple[np.ndarray, np.ndarray]:
+    """Pasts and futures of cars whose braking or accelerating ends within the next second."""
+    rng = np.random.default_rng(seed)
+    time = 0.2 * np.arange(-9, 21)
+    accel = rng.normal(0.0, 1.5, (count, 1))
+    speed = np.maximum(15.0 + accel * np.minimum(time, rng.uniform(0.0, 1.0, (count, 1))), 0.0)
+    state = cars(speed, rng.normal(0.0, 0.05, (count, 1)) * time)[:, :, :4]
+    return state[:, :10], state[:, 10:]

@@ -9,7 +9,7 @@ from typing import Any
 
 from cosim.batch.export import export
 from cosim.report.summary import summarize
-from cosim.scenario.episode_id import Case
+from cosim.scenario.episode_id import EpisodeId
 
 UNITS = {
     "crashed": "bool",
@@ -35,7 +35,7 @@ BETTER = {
     "hard_brakings_av": "lower",
     "veto_rate": "lower",
 }
-CASE = Case(
+CASE = EpisodeId(
     what="merge",
     demand=("contested",),
     policy="idm",
@@ -51,7 +51,7 @@ CASE = Case(
 )
 
 
-def row(case: Case, **values: Any) -> dict[str, Any]:
+def row(case: EpisodeId, **values: Any) -> dict[str, Any]:
     """One ok episode without a crash; `values` replace or add columns."""
     plain = {
         "key": case.key,
@@ -90,7 +90,7 @@ def row(case: Case, **values: Any) -> dict[str, Any]:
     return plain | values
 
 
-def failed(case: Case, status: str = "sim_crash") -> dict[str, Any]:
+def failed(case: EpisodeId, status: str = "sim_crash") -> dict[str, Any]:
     """An episode without figures, as the batch keeps it."""
     identity = list(row(case))[: list(row(case)).index("steps")]
     found = {name: value for name, value in row(case).items() if name in identity}
@@ -105,7 +105,7 @@ def cell(
     first: int = 200_000,
     columns: dict[str, Sequence[Any]] | None = None,
     **case: Any,
-) -> list[tuple[Case, dict[str, Any]]]:
+) -> list[tuple[EpisodeId, dict[str, Any]]]:
     """`count` episodes of one policy; `columns`: by name, one value per episode."""
     cases = [replace(CASE, policy=policy, seed=first + k, **case) for k in range(count)]
     values = columns or {}
@@ -114,7 +114,7 @@ def cell(
 
 def write(
     folder: Path,
-    *cells: list[tuple[Case, dict[str, Any]]],
+    *cells: list[tuple[EpisodeId, dict[str, Any]]],
     manifest: bool = True,
     planned: int | None = None,
 ) -> Path:

@@ -33,7 +33,7 @@ def test_a_lane_change_is_noted_of_an_av_that_sumo_drives_and_of_nobody_else() -
     assert commander.lane_changes == {"av": 0.4}
     watch.lane_changes(seen(1.0, (2, 1, 1)), ROAD, commander)
     assert commander.lane_changes == {"av": 0.4}, "it was nowhere: that is no lane change"
-    watch.reset()
+    watch = CollisionWatch()  # a new episode
     watch.lane_changes(seen(1.2, (0, 1, 1)), ROAD, commander)
     assert commander.lane_changes == {"av": 0.4}
 

@@ -134,11 +134,11 @@ def test_every_service_says_what_the_command_line_understands(name: str) -> None
 
 def test_an_extra_that_names_others_is_unfolded() -> None:
     project = {
-        "name": "cosim",
+        "name": "cosim-sumo",
         "dependencies": ["numpy>=1"],
         "optional-dependencies": {
             "ray": ["ray>=2"],
-            "all": ["cosim[ray, dev]"],
+            "all": ["cosim-sumo[ray, dev]"],
             "dev": ["pytest", "numpy>=1"],
         },
     }

@@ -11,7 +11,7 @@ import pytest
 from cosim.batch import matrix
 from cosim.batch.spec import FIELDS, Spec, read
 from cosim.errors import BadInput
-from cosim.scenario.episode_id import Case
+from cosim.scenario.episode_id import EpisodeId
 from policy.agents import check_name
 
 ROUTES = """<routes><vType id="hv"/><vType id="av"/><route id="main" edges="main_in main_acc main_out"/>
@@ -174,7 +174,7 @@ def test_a_net_that_would_kill_sumo_costs_its_own_cells_only(tmp_path: Path) -> 
 
 def test_a_case_keeps_its_key_and_comes_back_from_its_document() -> None:
     case = next(iter(matrix.cells(of_flags(scenario=["merge"], seeds="3:9", svo=[90.0]))))
-    assert Case.read(case.document()) == case
+    assert EpisodeId.read(case.document()) == case
     assert case.key == f"{case.cell}-3"
     assert case.with_seed(4).cell == case.cell
     assert case.cell == "a6779b4d52e4", "stores and manifests of earlier runs hold this hash"

@@ -21,7 +21,7 @@ from cosim.batch.records import row
 from cosim.batch.spec import Spec
 from cosim.batch.store import Store
 from cosim.errors import BadInput, CosimError
-from cosim.scenario.episode_id import Case
+from cosim.scenario.episode_id import EpisodeId
 from cosim.workers.tasks import Outcome, Task
 from policy.agents import check_name
 
@@ -33,7 +33,7 @@ def plan() -> matrix.Plan:
     return matrix.plan(matrix.cells(spec), range(*spec.seeds), check_name)
 
 
-def document(case: Case, cell: matrix.Cell) -> dict[str, Any]:
+def document(case: EpisodeId, cell: matrix.Cell) -> dict[str, Any]:
     """As `cosim run --json` has it, of an episode that was never driven."""
     return {
         "scenario": "merge",
@@ -173,7 +173,7 @@ def test_a_store_that_cannot_be_is_one_sentence_without_the_password() -> None:
     try:
         import psycopg  # noqa: F401
     except ModuleNotFoundError:
-        with pytest.raises(BadInput, match=r"pip install 'cosim\[postgresql\]'") as caught:
+        with pytest.raises(BadInput, match=r"pip install 'cosim-sumo\[postgresql\]'") as caught:
             Store("postgresql+psycopg://me:secret@host/db")
         assert "secret" not in str(caught.value)
 

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import gzip
 import json
+import math
 import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from cosim.cli.main import main
 from cosim.errors import BadInput
 from cosim.fcd import Analysis, Roles, analyse
 from cosim.fcd.vehicle_types import Size, read_sizes, size_of
+from cosim.road import Lane, RoadMap
 from cosim.simulation.fake import straight_road
 
 HEAD = '<fcd-export xmlns:xsi="http://www.w3.org/2001/XMLSchema-instance">\n'
@@ -77,6 +80,8 @@ def test_every_single_conflict_is_listed_once_with_its_worst_moment(fcd: Any, tm
     assert first["max_drac_mps2"] == pytest.approx(10**2 / (2 * 30), rel=1e-3)
     assert (first["ego_speed_mps"], first["foe_speed_mps"]) == (20.0, 10.0)
     assert (second["begin_s"], second["min_ttc_s"]) == (3.4, pytest.approx(1.0))
+    assert first["type"] == second["type"] == "following"
+    assert math.isnan(first["pet_s"]), "who follows has no PET"
     assert analyse(path, critical=0.5).encounters == ()
     out = tmp_path / "deep" / "conflicts.csv"
     assert main(["metrics", str(path), "--conflicts", str(out), "--json"]) == 0
@@ -86,6 +91,73 @@ def test_every_single_conflict_is_listed_once_with_its_worst_moment(fcd: Any, tm
     assert main(["metrics", str(path), "--conflicts", str(out), "--ttc", "0.1"]) == 0
     assert out.read_text().splitlines() == [head]
     assert main(["metrics", str(path), "--conflicts", str(tmp_path)]) == 2
+
+
+def meeting(angle: float, lane: str, *, first: float, last: float = 14.0) -> str:
+    """At 10 m/s: `a` goes east along y = 0 through the origin at 10 s, `b` passes it at `first` s on a course
+    of `angle` degrees and ends on `lane`."""
+
+    def at(name: str, reached: float, course: float, now: float, where: str) -> str:
+        along = 10.0 * (now - reached)
+        x, y = along * math.sin(math.radians(course)), along * math.cos(math.radians(course))
+        return car(name, x, 10.0, y=y, angle=course).replace("road_0", where)
+
+    times = (8.0 + 0.2 * k for k in range(round((last - 8.0) / 0.2) + 1))
+    return "".join(step(t, at("a", 10.0, 90.0, t, "road_0"), at("b", first, angle, t, lane)) for t in times)
+
+
+@pytest.mark.parametrize(
+    ("angle", "lane", "first", "kind"),
+    [
+        (0.0, "side_0", 10.6, "crossing"),
+        (45.0, "side_0", 10.3, "crossing"),
+        (270.0, "road_1", 10.0, "oncoming"),
+        (88.0, "road_1", 10.05, "lane change"),
+        (90.0, "road_0", 10.3, "following"),
+    ],
+)
+def test_a_conflict_has_its_type(fcd: Any, angle: float, lane: str, first: float, kind: str) -> None:
+    (found,) = analyse(fcd(meeting(angle, lane, first=first)), critical=1.5).encounters
+    assert found["type"] == kind
+
+
+def test_two_ways_into_one_lane_merge(fcd: Any) -> None:
+    shape = np.array([[0.0, 0.0], [1.0, 0.0]])
+    lanes = [Lane(name, "", 0, shape, 1e6, 3.2, 20.0, successors=(2,)) for name in ("road_0", "side_0")]
+    road = RoadMap((*lanes, Lane("out_0", "", 0, shape, 1e6, 3.2, 20.0)))
+    (found,) = analyse(fcd(meeting(60.0, "side_0", first=10.3)), road=road, critical=1.5).encounters
+    assert found["type"] == "merging"
+
+
+def test_a_crossing_conflict_has_the_time_between_both_passages(fcd: Any) -> None:
+    """On a collision course at first; then `b` is late, and reaches the path 0.32 s after `a` has left it."""
+    slowed = meeting(0.0, "side_0", first=10.5, last=9.0)
+    text = slowed + "".join(
+        step(t, car("a", 10 * (t - 10), 10.0), car("b", 0.0, 10.0, y=10 * (t - 11.0), angle=0.0))
+        for t in (9.2 + 0.2 * k for k in range(40))
+    )
+    (found,) = analyse(fcd(text.replace('y="1.600"', 'y="0.000"')), critical=1.5).encounters
+    assert found["pet_s"] == pytest.approx(1.0 - (5.0 + 1.8) / 10.0, abs=0.05)
+    assert (found["ego_speed_mps"], found["foe_speed_mps"]) == (10.0, 10.0)
+
+
+def test_a_lane_change_that_takes_no_time_makes_no_conflict_at_that_moment(fcd: Any) -> None:
+    def frame(k: int) -> str:
+        there = k == 5  # for one frame, so that nothing else of it can be seen
+        jumper = car("b", 107.0 + 4.0 * k, 10.0, y=1.6 if there else 4.8)
+        jumper = jumper if there else jumper.replace("road_0", "road_1")
+        return step(0.2 * k, car("a", 100.0 + 4.0 * k, 20.0), jumper)
+
+    found = analyse(fcd("".join(map(frame, range(6)))), critical=1.5)
+    assert value(found, "min_ttc_s") is None
+    assert value(found, "max_drac_mps2") == 0.0
+    assert found.encounters == ()
+    assert any(note.startswith("1 lane changes that took no time") for note in found.notes)
+    slowly = "".join(
+        step(0.2 * k, car("a", 100.0 + 4.0 * k, 20.0), car("b", 140.0, 10.0, y=4.8 - 0.32 * k))
+        for k in range(9)
+    )
+    assert not any("took no time" in note for note in analyse(fcd(slowly)).notes)
 
 
 def test_heading_north_is_no_other_thing_than_heading_east(fcd: Any) -> None:

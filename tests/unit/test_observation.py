@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cosim.geometry.raster import ROAD_LINE, ROAD_SURFACE, rasterize_road
-from cosim.observation import Observer
+from cosim.observation.observer import Observer
 from cosim.simulation.fake import FakeSimulator, FakeVehicle, straight_road
 from cosim.types import COMPACT, PAPER, History, Kind, ObservationConfig, Snapshot
 

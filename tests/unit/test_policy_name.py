@@ -56,7 +56,7 @@ def test_a_module_is_no_file() -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("mine.py", "name the policy in it: mine.py:NAME"),
+        ("mine.py", "name the class or function in it: mine.py:NAME"),
         ("mine.py:", "behind the colon stands a class, a factory or a function"),
         ("mine.py:a-b", "behind the colon stands a class"),
         ("my label=runs/old.safetensors", "a label has letters, digits"),
@@ -65,7 +65,7 @@ def test_a_module_is_no_file() -> None:
         ("new=none.py:Agent", "no such file: /"),
         ("./empty", "/empty/best.safetensors"),
         ("./mine.py.bak:Agent", "a colon belongs to FILE.py:NAME and MODULE:NAME"),
-        ("new=mine.py", "name the policy in it"),
+        ("new=mine.py", "name the class or function in it"),
     ],
 )
 def test_what_is_wrong_with_a_name_is_said(here: Path, text: str, said: str) -> None:

@@ -25,7 +25,7 @@ def step(config: MapBranchConfig, batch: int = 2) -> tuple[torch.Tensor, torch.T
     rendered = torch.rand(batch, config.block * config.channels, config.height, config.width)
     kinematics = torch.rand(batch, config.seen, config.rows, KINEMATIC_INPUTS)
     with torch.inference_mode():
-        maps, moved = network([past], kinematics, rendered if config.correct else None)
+        maps, moved = network(past, kinematics, rendered if config.correct else None)
     return maps, moved, rendered
 
 
@@ -61,18 +61,7 @@ def test_the_map_branch_without_history_sees_the_current_frame_only() -> None:
 def test_a_network_that_corrects_asks_for_the_rendered_map() -> None:
     network = MapBranch(MapBranchConfig(correct=True))
     with pytest.raises(ValueError, match="rendered"):
-        network([torch.zeros(1, 40, 32, 128)], torch.zeros(1, 10, 16, KINEMATIC_INPUTS))
-
-
-def test_window_groups_are_as_good_as_one_stack() -> None:
-    torch.manual_seed(0)
-    network = MapBranch(MapBranchConfig()).eval()
-    past = torch.rand(1, 40, 32, 128)
-    kinematics = torch.rand(1, 10, 16, KINEMATIC_INPUTS)
-    with torch.inference_mode():
-        whole, _ = network([past], kinematics)
-        parts, _ = network([past[:, :20], past[:, 20:]], kinematics)
-    torch.testing.assert_close(whole, parts)
+        network(torch.zeros(1, 40, 32, 128), torch.zeros(1, 10, 16, KINEMATIC_INPUTS))
 
 
 @pytest.mark.parametrize("strides", ["temporal", "literal"])
@@ -122,7 +111,7 @@ def test_gradients_reach_every_layer_of_both_networks() -> None:
         torch.nn.init.normal_(head.weight)  # type: ignore[union-attr]
     torch.nn.init.normal_(hpn.decoder[2].weight)  # type: ignore[arg-type]
     maps, moved = hpn(
-        [torch.rand(2, 40, 16, 128)], torch.rand(2, 10, 16, KINEMATIC_INPUTS), torch.rand(2, 20, 16, 128)
+        torch.rand(2, 40, 16, 128), torch.rand(2, 10, 16, KINEMATIC_INPUTS), torch.rand(2, 20, 16, 128)
     )
     q = vfn(
         torch.rand(2, 14, 4, 16, 128),

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
+from policy_scenes import braking_cars, cars
 
 from cosim.errors import BadInput, WeightsMismatch
 from cosim.road import Lane, RoadMap
@@ -20,40 +18,15 @@ from policy.predictors import PREDICTORS, make_predictor
 from policy.predictors.gp import GaussianProcessIndirect
 from policy.predictors.lane import along_lanes
 from policy.predictors.learned import KinematicNet, Learned, NetConfig
-from policy.training.fitting import FitConfig, fit
-from policy.training.loop import LoopConfig
 from policy.training.predictors import (
-    PriorFit,
-    examples_for_net,
-    factors_for,
-    fresh_net,
     in_own_frame,
-    net_loss,
 )
 
 TIME = 0.2 * np.arange(-9, 1)
-EIGHT = ("cs", "ca", "lstm-direct", "lstm-indirect", "ae-direct", "ae-indirect", "gp-direct", "gp-indirect")
-
-
-def cars(speed: np.ndarray, heading: np.ndarray | None = None) -> np.ndarray:
-    """[V,N,8] that are at (100, 50) now and came there with speeds and headings [V,N]."""
-    state = np.zeros((*speed.shape, 8))
-    state[:, :, 2] = speed
-    state[:, :, 3] = 0.0 if heading is None else heading
-    way = np.exp(1j * 0.5 * (state[:, 1:, 3] + state[:, :-1, 3])) * 0.5 * (speed[:, 1:] + speed[:, :-1])
-    place = np.concatenate([np.zeros((len(speed), 1)), 0.2 * np.cumsum(way, 1)], 1)
-    place += 100.0 + 50.0j - place[:, -1:]
-    state[:, :, 0], state[:, :, 1] = place.real, place.imag
-    state[:, :, 4:6] = (5.0, 2.0)
-    return state
 
 
 def everywhere(state: np.ndarray) -> np.ndarray:
     return np.ones(state.shape[:2], bool)
-
-
-def test_the_eight_of_the_paper_are_there() -> None:
-    assert set(EIGHT) <= set(PREDICTORS)
 
 
 @pytest.mark.parametrize("name", PREDICTORS)
@@ -228,73 +201,8 @@ def test_led_along_its_lane_a_car_takes_the_bend_that_its_past_does_not_show() -
     np.testing.assert_allclose(led.speed, plain.speed, atol=0.5)
 
 
-# ---- fitting ----
-
-
-def episodes(seed: int, count: int = 600) -> tuple[np.ndarray, np.ndarray]:
-    """Pasts and futures of cars whose braking or accelerating ends within the next second."""
-    rng = np.random.default_rng(seed)
-    time = 0.2 * np.arange(-9, 21)
-    accel = rng.normal(0.0, 1.5, (count, 1))
-    speed = np.maximum(15.0 + accel * np.minimum(time, rng.uniform(0.0, 1.0, (count, 1))), 0.0)
-    state = cars(speed, rng.normal(0.0, 0.05, (count, 1)) * time)[:, :, :4]
-    return state[:, :10], state[:, 10:]
-
-
-def test_fitting_the_prior_lowers_the_error_and_calibration_gives_the_coverage_promised() -> None:
-    past, future = episodes(0)
-    windows = in_own_frame(past, future, np.ones(len(past)))
-    prior = PriorFit(GaussianProcessIndirect)
-    examples = prior.examples(windows)
-
-    def error(predictor: GaussianProcessIndirect) -> float:
-        f = predictor.predict(past, np.ones(past.shape[:2], bool))
-        return float(np.hypot(f.x - future[:, :, 0], f.y - future[:, :, 1]).mean())
-
-    before = error(prior.fitted())
-    log = fit(prior.network, prior.loss, FitConfig(steps=60, batch=256), examples, examples)
-    assert log[-1]["validation_loss"] < before
-    assert error(prior.fitted()) < 0.6 * before
-    fresh_past, fresh_future = episodes(1, 2000)
-    f = prior.fitted().predict(fresh_past, np.ones(fresh_past.shape[:2], bool))
-    miss = fresh_future[:, :, 2] - f.speed
-    factor = factors_for((f.speed_std[:1000],), (miss[:1000],), np.ones(1000))
-    assert (np.abs(miss[1000:]) <= 1.645 * factor * f.speed_std[1000:]).mean() == pytest.approx(0.9, abs=0.03)
-
-
-@pytest.mark.parametrize("kind", ["lstm", "ae"])
-def test_a_killed_fit_goes_on_to_the_same_weights(
-    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    past, future = episodes(2, 200)
-    examples = examples_for_net(in_own_frame(past, future, np.ones(len(past))))
-    config = FitConfig(steps=30, batch=32, learning_rate=2e-3)
-
-    def fresh() -> tuple[KinematicNet, Callable[..., list[dict[str, float]]]]:
-        network = fresh_net(NetConfig(kind, "indirect"), 0)  # type: ignore[arg-type]
-        return network, partial(fit, network, partial(net_loss, network), config, examples, examples)
-
-    whole, fit_whole = fresh()
-    untrained = float(net_loss(whole, examples).detach())
-    assert fit_whole()[-1]["validation_loss"] < untrained
-    monkeypatch.setattr("policy.training.fitting.LoopConfig", partial(LoopConfig, save_every=0.0))
-
-    def killed(done: float, _: float) -> None:
-        if done == 15:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        fresh()[1](folder=tmp_path, progress=killed)
-    again, fit_again = fresh()
-    steps: list[float] = []
-    fit_again(folder=tmp_path, progress=lambda done, _: steps.append(done))
-    assert steps[0] == 16
-    for name, value in whole.state_dict().items():
-        torch.testing.assert_close(again.state_dict()[name], value, rtol=0.0, atol=0.0)
-
-
 def test_windows_are_seen_from_the_vehicle_and_unknown_pasts_are_left_out() -> None:
-    past, future = episodes(3, 5)
+    past, future = braking_cars(3, 5)
     c, s = np.cos(1.0), np.sin(1.0)
     for part in (past, future):
         x, y = part[:, :, 0].copy(), part[:, :, 1].copy()
@@ -334,7 +242,7 @@ def test_weights_of_another_layout_are_refused(tmp_path: Path) -> None:
     assert GaussianProcessIndirect(weights=tmp_path / "y.safetensors").horizon == 20
 
 
-@pytest.mark.parametrize("name", [n for n in EIGHT if n not in ("cs", "ca")])
+@pytest.mark.parametrize("name", [n for n in PREDICTORS if (SHIPPED / f"{n}.safetensors").is_file()])
 def test_shipped_weights_say_what_they_are(name: str) -> None:
     from policy.checkpoint import read_card
 

@@ -260,7 +260,7 @@ def test_a_follower_knows_that_its_leader_is_about_to_brake() -> None:
         Car("front", 112.0, 0, 20.0, is_av=True),
         Car("wall", 150.0, 0, 0.0),
     ]
-    assert decide(cars[:2], road)["rear"].action == IDLE, "close, but it would be told"
+    assert decide(cars[:2], road)["rear"].action == IDLE, "close, but the intention would be shared"
     shared = decide(cars, road)
     assert shared["front"].action == SLOWER
     assert shared["rear"].action == SLOWER
@@ -344,18 +344,20 @@ def test_a_rollout_follows_a_bend_and_a_car_trails_its_front() -> None:
     arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(bend, axis=0).T))])
     paths = motion.Paths(bend, arc, np.array([0, 40]))
     one = np.ones(1)
-    out = motion.roll_out(
-        paths,
-        5.0 * one,
-        0.0 * one,
-        0.0 * one,
-        0.0 * one,
-        0.0 * one,
-        5.0 * one,
-        np.full((1, 21), 10.0),
-        np.inf * one,
-        8.0,
-        0.2,
+    out = motion.Rollout(
+        *motion.roll(
+            *paths,
+            5.0 * one,
+            0.0 * one,
+            0.0 * one,
+            0.0 * one,
+            0.0 * one,
+            5.0 * one,
+            np.full((1, 21), 10.0),
+            np.inf * one,
+            8.0,
+            0.2,
+        )
     )
     from_centre = np.hypot(out.x[0], out.y[0] - radius)
     np.testing.assert_allclose(from_centre[3:], radius, atol=0.3)
@@ -369,17 +371,19 @@ def test_a_lane_change_turns_the_car_as_it_does_in_sumo(speed: float, askew: flo
     """Angles in degrees measured in SUMO 1.28 at the end of a 2 s change."""
     line = motion.Paths(np.array([[0.0, 0.0], [500.0, 0.0]]), np.array([0.0, 500.0]), np.array([0, 2]))
     one = np.ones(1)
-    out = motion.roll_out(
-        line,
-        5.0 * one,
-        -3.2 * one,
-        0.0 * one,
-        0.0 * one,
-        1.6 * one,
-        5.0 * one,
-        np.full((1, 11), speed),
-        np.inf * one,
-        8.0,
-        0.2,
+    out = motion.Rollout(
+        *motion.roll(
+            *line,
+            5.0 * one,
+            -3.2 * one,
+            0.0 * one,
+            0.0 * one,
+            1.6 * one,
+            5.0 * one,
+            np.full((1, 11), speed),
+            np.inf * one,
+            8.0,
+            0.2,
+        )
     )
     assert np.degrees(out.heading[0]).max() == pytest.approx(askew, rel=0.12)

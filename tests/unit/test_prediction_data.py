@@ -9,16 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim.episode import Episode
+from cosim.episode import Episode, run_episode
 from cosim.errors import BadInput
 from cosim.files import write_csv
 from cosim.learning import map_bench, train_hpn
 from cosim.learning.prediction_data import HORIZON, MAPLESS, Followed, followed
-from cosim.recording import Folder, Recording, RecordingSimulator, histories, read, write
+from cosim.recording import Folder, Recorder, Recording, histories, read, write
 from cosim.road import RoadMap
 from cosim.scenario import Mission, load
 from cosim.simulation.fake import FakeSimulator, FakeVehicle
 from cosim.types import COMPACT
+from policy.agents.idm import Idm
 from policy.hpn import HPN, HpnConfig
 from policy.training import hpn as trained
 
@@ -29,23 +30,20 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("recordings")
     out = Folder(path)
     out.prepare()
-    simulator = RecordingSimulator(
-        FakeSimulator(
-            [
-                FakeVehicle("av", 100.0, 0, 20.0, is_av=True),
-                FakeVehicle("leaver", 280.0, 1, 20.0, is_av=True),
-                FakeVehicle("human", 130.0, 1, 12.0),
-            ],
-            length=400.0,
-        )
+    simulator = FakeSimulator(
+        [
+            FakeVehicle("av", 100.0, 0, 20.0, is_av=True),
+            FakeVehicle("leaver", 280.0, 1, 20.0, is_av=True),
+            FakeVehicle("human", 130.0, 1, 12.0),
+        ],
+        length=400.0,
     )
     scenario = replace(load("merge"), warmup=0.0, duration=8.0, mission=Mission(kind="none"))
     episode = Episode(scenario, simulator, COMPACT)
-    episode.start(7)
-    while not episode.over:
-        episode.advance({})
+    recorder = Recorder()
+    run_episode(episode, Idm(), 7, svo=0.0, hooks=[recorder])
     case = {"scenario": "merge", "behavior": "mixed", "seed": 7, "road": out.add_road(simulator.road)}
-    write(out.episode_file("cell-7"), simulator.tape, case)
+    write(out.episode_file("cell-7"), recorder, case)
     out.write_manifest({"cells": {"cell": {}}, "seeds": [7], "commands": []})
     return path
 

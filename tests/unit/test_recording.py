@@ -12,9 +12,8 @@ from cosim.episode import Episode
 from cosim.errors import BadInput
 from cosim.recording import (
     Folder,
+    Recorder,
     Recording,
-    RecordingSimulator,
-    Tape,
     histories,
     read,
     tracks,
@@ -28,11 +27,11 @@ from cosim.simulation.fake import FakeSimulator, FakeVehicle
 from cosim.types import COMPACT, Collision, Decision, Events, History, MetaAction, Snapshot
 
 
-def drive(simulator: RecordingSimulator) -> list[dict[str, History]]:
+def drive(simulator: FakeSimulator, recorder: Recorder) -> list[dict[str, History]]:
     """A short episode with commanded AVs; what they saw at every decision."""
     scenario = replace(load("merge"), warmup=0.0, duration=3.2, mission=Mission(kind="none"))
     episode = Episode(scenario, simulator, COMPACT)
-    seen = [episode.start(7)]
+    seen = [episode.start(7, [recorder])]
     actions = [MetaAction.LANE_LEFT, MetaAction.ACCELERATE, MetaAction.DECELERATE]
     while not episode.over:
         decisions = {name: Decision(actions[len(seen) % 3]) for name in seen[-1] if name != "quiet"}
@@ -55,16 +54,16 @@ def world() -> FakeSimulator:
     )
 
 
+Driven = tuple[Path, Recorder, list[dict[str, History]], RoadMap]
+
+
 @pytest.fixture
-def driven(tmp_path: Path) -> tuple[Path, Tape, list[dict[str, History]], RoadMap]:
-    simulator = RecordingSimulator(world())
-    seen = drive(simulator)
+def driven(tmp_path: Path) -> Driven:
+    simulator, recorder = world(), Recorder()
+    seen = drive(simulator, recorder)
     file = tmp_path / "a-7.parquet"
-    write(file, simulator.tape, {"scenario": "fake", "behavior": "mixed"})
-    return file, simulator.tape, seen, simulator.road
-
-
-Driven = tuple[Path, Tape, list[dict[str, History]], RoadMap]
+    write(file, recorder, {"scenario": "fake", "behavior": "mixed"})
+    return file, recorder, seen, simulator.road
 
 
 def assert_same(a: Snapshot, b: Snapshot) -> None:
@@ -108,11 +107,10 @@ def test_histories_built_from_a_recording_are_the_ones_the_policy_saw(driven: Dr
 
 
 def test_events_come_back(tmp_path: Path) -> None:
-    simulator = RecordingSimulator(world())
-    drive(simulator)
+    tape = Recorder()
+    drive(world(), tape)
     hit = Collision(1.0, "av", "human", True, False, "overlap", "box", "road_0", 1.0, 2.0, True, True)
     happened = Events((hit,), ("late",), ("early",), ("lost",), ("stopped",))
-    tape = simulator.tape
     tape.frames[3] = replace(tape.frames[3], events=happened)
     write(tmp_path / "x.parquet", tape, {})
     found = read(tmp_path / "x.parquet").snapshots()
@@ -166,7 +164,7 @@ def test_what_is_no_recording_is_bad_input(content: bytes, tmp_path: Path) -> No
 
 def turning(frames: int = 30) -> Recording:
     """An AV that stands, a car that turns left past +-pi, one that enters late and one that leaves early."""
-    tape = Tape(0, 9)
+    shown = []
     for k in range(frames):
         here = [
             n for n, there in (("av", True), ("early", k < 15), ("late", k >= 5), ("turn", True)) if there
@@ -180,7 +178,7 @@ def turning(frames: int = 30) -> Recording:
         }
         x, y, heading, speed = np.array([pose[n] for n in here]).T
         n = len(here)
-        tape.frames.append(
+        shown.append(
             Snapshot(
                 0.2 * k, tuple(here), np.array([name == "av" for name in here], np.int8), np.zeros(n, bool),
                 x, y, heading, speed, np.zeros(n), np.full(n, 5.0), np.full(n, 2.0),
@@ -188,7 +186,11 @@ def turning(frames: int = 30) -> Recording:
             )
         )  # fmt: skip
     file = Path("turning.parquet")
-    write(file, tape, {})
+    recorder = Recorder()
+    recorder.begin(shown[:10])
+    for frame in shown[10:]:
+        recorder.add(frame)
+    write(file, recorder, {})
     return read(file)
 
 

@@ -18,10 +18,10 @@ import pytest
 from PIL import Image
 
 from cosim.episode import Episode, run_episode
-from cosim.recording import watcher
-from cosim.recording.watcher import Watched, Watcher
-from cosim.report.replay import packing
-from cosim.report.replay.page import page
+from cosim.recording import Recorder
+from cosim.recording.watched import Watched
+from cosim.recording.watched import watched as watched_episode
+from cosim.report.replay.page import document, page
 from cosim.report.replay.strip import Strip, poses_at
 from cosim.report.replay.video import CAPTION, HEIGHT, LOW, SMALL, WIDTH, animation, film
 from cosim.types import Decision, Forecast, History, MetaAction, ObservationConfig, PolicyContext
@@ -73,12 +73,15 @@ class Explains:
         return dict.fromkeys(histories, why)
 
 
-def driven(world: Any = platoon, seconds: float = 4.0, policy: Any = None) -> tuple[Watched, str]:
+def driven(
+    world: Any = platoon, seconds: float = 4.0, policy: Any = None, limit: float = np.inf
+) -> tuple[Watched, str]:
     """An episode on the fake simulator, and its trace hash."""
-    watch = Watcher(world(), policy or Explains())
-    episode = Episode(scenario(seconds), watch.simulator, watch.policy.observation)
-    result = run_episode(episode, watch.policy, 200_000, svo=0.5)
-    return watch.watched(result.document()), result.trace_hash
+    policy, simulator = policy or Explains(), world()
+    recorder = Recorder(policy, limit)
+    episode = Episode(scenario(seconds), simulator, policy.observation)
+    result = run_episode(episode, policy, 200_000, svo=0.5, hooks=[recorder])
+    return watched_episode(recorder, simulator, result.document()), result.trace_hash
 
 
 @pytest.fixture(scope="module")
@@ -185,9 +188,8 @@ def test_a_collision_is_marked_where_it_happened() -> None:
     assert 100 < crash["x"] < 140
 
 
-def test_a_long_recording_keeps_every_other_frame_and_stays_small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(watcher, "MOST", 40)  # vehicle frames, of 84
-    found, _ = driven()
+def test_a_long_recording_keeps_every_other_frame_and_stays_small() -> None:
+    found, _ = driven(limit=40)  # vehicle frames, of 84
     assert sum(len(t.x) for t in found.tracks) <= 40 + 4
     assert found.interval == pytest.approx(0.8)
     assert len(found.choices) == 10  # decisions are all kept
@@ -197,18 +199,20 @@ def test_a_long_recording_keeps_every_other_frame_and_stays_small(monkeypatch: p
 
 
 def test_a_vehicle_that_was_away_has_two_tracks() -> None:
-    watch = Watcher(platoon(), Explains())
-    (first,) = watch.simulator.reset(0)
+    world, recorder = platoon(), Recorder()
+    (first,) = world.reset(0)
+    recorder.begin([first])
     gone = replace(
         first,
         ids=first.ids[1:],
         **{name: getattr(first, name)[1:] for name in COLUMNS},
     )
-    watch.see(replace(gone, time=0.2))
-    watch.see(replace(first, time=0.4))
-    tracks = [t for t in watch.watched({}).tracks if t.id == first.ids[0]]
+    recorder.add(replace(gone, time=0.2))
+    recorder.add(replace(first, time=0.4))
+    found = watched_episode(recorder, world, {})
+    tracks = [t for t in found.tracks if t.id == first.ids[0]]
     assert [(t.first, len(t.x)) for t in tracks] == [(0, 1), (2, 1)]
-    assert first.ids[0] not in {p.track.id for p in poses_at(watch.watched({}), 0.2)}
+    assert first.ids[0] not in {p.track.id for p in poses_at(found, 0.2)}
 
 
 def test_between_two_frames_a_vehicle_is_between_two_places(watched: Watched) -> None:
@@ -282,11 +286,11 @@ def test_a_film_that_fails_leaves_nothing_behind(watched: Watched, tmp_path: Pat
 
 
 def test_an_empty_world_can_be_drawn() -> None:
-    watch = Watcher(platoon(), Explains())
-    (first,) = watch.simulator.reset(0)
+    world, recorder = platoon(), Recorder()
+    (first,) = world.reset(0)
     nobody = {name: getattr(first, name)[:0] for name in COLUMNS}
     empty = replace(first, ids=(), **nobody)
-    watch.start(empty)
-    data = packing.document(watch.watched({}))
+    recorder.begin([empty])
+    data = document(watched_episode(recorder, world, {}))
     assert data["tracks"] == []
     assert math.isclose(data["begin"], 0.0)

@@ -346,3 +346,42 @@ def test_a_file_is_read_again_only_when_it_has_changed(case: Case, monkeypatch: 
     with pytest.raises(BadInput, match=r"lane\.speed"):
         vet(scenario)
     assert len(reads) == 2
+
+
+FLOW = '<flow id="f" route="r" begin="1" end="10" number="3"/>'
+
+
+def test_a_vehicle_and_a_flow_may_share_an_id_as_in_sumo(case: Case) -> None:
+    routes = ROUTES.replace('id="v0"', 'id="f"')
+    report = case(routes=routes)
+    assert (report.vehicles, report.flows, report.warnings) == (3, 1, ())
+    other = '<additional><vehicle id="f" route="r" depart="9"/></additional>'
+    assert case(additional=other).vehicles == 4
+
+
+def test_two_flows_of_one_id_are_refused_in_one_file_and_in_two(case: Case) -> None:
+    twice = ROUTES.replace("</routes>", f"{FLOW}</routes>")
+    refused(lambda: case(routes=twice), "r.rou.xml", "flow.id", "f", "twice, first in line 5")
+    other = f"<additional>{FLOW}</additional>"
+    refused(lambda: case(additional=other), "r.rou.xml", "flow.id", "f", "is also in")
+
+
+@pytest.mark.parametrize(("name", "warnings"), [("f.0", 1), ("f.2", 1), ("f.3", 0), ("f.x", 0), ("g.0", 0)])
+def test_a_vehicle_named_like_one_of_a_flow_is_a_warning(case: Case, name: str, warnings: int) -> None:
+    text = f'<routes><route id="r" edges="ab bc"/><vehicle id="{name}" route="r" depart="0"/>{FLOW}</routes>'
+    found = case(routes=text).warnings
+    assert len(found) == warnings
+    assert all(f"'{name}' is the name of a vehicle of the flow 'f' too" in warning for warning in found)
+
+
+@pytest.mark.parametrize("speed", ["-1", "1e308", "1000.1", "nan"])
+def test_a_lane_speed_that_is_none_is_refused(case: Case, speed: str) -> None:
+    text = NET.replace('id="bc_1" index="1" speed="25"', f'id="bc_1" index="1" speed="{speed}"')
+    refused(lambda: case(net=text), "n.net.xml", "lane.speed", speed, "must be")
+
+
+def test_lanes_with_a_speed_limit_of_0_are_a_warning_because_nobody_leaves_them(case: Case) -> None:
+    (warning,) = case(
+        net=NET.replace('id="bc_1" index="1" speed="25"', 'id="bc_1" index="1" speed="0"')
+    ).warnings
+    assert "n.net.xml: the speed limit is 0 on bc_1: whoever comes there stands for ever" in warning

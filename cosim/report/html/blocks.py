@@ -41,6 +41,11 @@ class Series:
         """Counts, rates and means (`summary.group_figures`)."""
         return group_figures(self.rows, self.known)
 
+    def counts(self, name: str) -> dict[str, Any]:
+        """Value, interval and counts of one measure; {} where the run does not have it."""
+        found = self.figures
+        return found["rates"].get(name) or found["means"].get(name) or found["timings"].get(name) or {}
+
     def values(self, name: str) -> list[float]:
         """One measure of every ok episode, nan for NA."""
         return self.known[name].values(self.ok) if name in self.known else []
@@ -66,18 +71,15 @@ class Block:
     def differences(self, names: Iterable[str]) -> list[Difference]:
         """Every other series against the baseline: `idm` where it is there, else the first one."""
         names = tuple(names)
-        first = self.series[0]
-        policy = EGOISTIC if any(s.identity["policy"] == EGOISTIC for s in self.series) else None
-        baselines = [s for s in self.series if s.identity["policy"] == (policy or first.identity["policy"])]
+        egoists = [s for s in self.series if s.identity["policy"] == EGOISTIC]
         found = []
         for series in self.series:
-            if series in baselines and (series is baselines[0] or policy is not None):
+            alike = [s for s in egoists if s.identity["svo_deg"] == series.identity["svo_deg"]]
+            baseline = [*alike, *egoists, *self.series][0]
+            if series is baseline or series in egoists:
                 continue
-            alike = [s for s in baselines if s.identity["svo_deg"] == series.identity["svo_deg"]]
-            baseline = (alike or baselines)[0] if policy is not None else baselines[0]
             before = {row["seed"]: row for row in baseline.ok}
-            pairs = [(before[row["seed"]], row) for row in series.ok if row["seed"] in before]
-            if pairs:
+            if pairs := [(before[row["seed"]], row) for row in series.ok if row["seed"] in before]:
                 figures = {n: paired(series.known[n], pairs) for n in names if n in series.known}
                 found.append(Difference(series, baseline, figures, len(pairs)))
         return found

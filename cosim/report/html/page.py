@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,14 +11,12 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from cosim.errors import BadInput
-from cosim.files import whole
+from cosim.files import cannot, whole
 from cosim.report import wording
-from cosim.report.figures import Row
+from cosim.report.figures import HEADLINE, Row
 from cosim.report.html import tables
 from cosim.report.html.blocks import Block, Difference, blocks
 from cosim.report.html.plots import plots
-from cosim.report.html.worst import last_line, worst
 from cosim.report.run_folder import Run
 from cosim.report.summary import not_comparable, reasons, status_counts
 from cosim.workers.tasks import OK
@@ -25,19 +24,10 @@ from cosim.workers.tasks import OK
 FILE = "report.html"
 PLOTTED = 12  # blocks that get plots: a page of more cannot be read, and each takes a second to draw
 FINDINGS = 8  # before the fold
-FAILURES = 50  # listed by name
+WORST, FAILURES = 12, 50  # listed by name
 MANIFEST = 200_000  # characters of it on the page
-COMPARED = (  # of each block against its baseline
-    "collision_rate",
-    "av_caused_collision_rate",
-    "mission_success_rate",
-    "dt_mission_m",
-    "dt_av_m",
-    "dt_mean_m",
-    "min_ttc_s",
-    "hard_brakings_av",
-)
-TOLD = {  # of these in the verdict, in words
+COMPARED = tuple(name for name in HEADLINE if name != "veto_rate")  # of each block against its baseline
+IN_WORDS = {  # of these in the verdict, in words
     "collision_rate": "collisions",
     "av_caused_collision_rate": "AV-caused collisions",
     "mission_success_rate": "mission success",
@@ -56,11 +46,8 @@ def write(run: Run, path: Path | None = None, shown: str | None = None) -> Path:
     """
     path = run.path / FILE if path is None else path
     text = html(run, shown)
-    try:
-        with whole(path) as draft:
-            draft.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise BadInput(f"cannot write the report: {error.strerror}", value=str(path)) from None
+    with cannot("write the report", value=str(path)), whole(path) as draft:
+        draft.write_text(text, encoding="utf-8")
     return path
 
 
@@ -86,10 +73,17 @@ def html(run: Run, shown: str | None = None) -> str:
         sections=[_section(block, differences[k], k < PLOTTED) for k, block in enumerate(found)],
         plotted=PLOTTED,
         worst=[
-            {"why": w.why, "row": w.row, "group": wording.group(w.row), "command": _replay(folder, w.row)}
-            for w in worst(run.rows)
+            {
+                "why": why,
+                "row": row,
+                "group": wording.group(row),
+                "command": shlex.join(["cosim", "replay", folder, str(row["key"])]),
+            }
+            for why, row in _worst(run.rows)
         ],
-        wrong=[{"row": row, "group": wording.group(row), "line": last_line(row)} for row in wrong[:FAILURES]],
+        wrong=[
+            {"row": row, "group": wording.group(row), "line": _last_line(row)} for row in wrong[:FAILURES]
+        ],
         more_wrong=max(len(wrong) - FAILURES, 0),
         reasons=reasons([row for row in run.rows if not_comparable(row)]),
         manifest=_manifest(run),
@@ -133,24 +127,24 @@ def _findings(found: Sequence[Block], differences: Sequence[list[Difference]]) -
     lines = []
     for block, mine in zip(found, differences, strict=True):
         for difference in mine:
-            told, untold = [], []
-            for name, figure in difference.figures.items():
-                if name not in TOLD or not figure.n:
-                    continue
-                tone = tables.tone(figure)
-                if tone:
-                    value = wording.interval(figure.difference, figure.measure, signed=True)
-                    told.append({"name": TOLD[name], "value": value, "tone": tone})
-                else:
-                    untold.append(TOLD[name])
+            known = {name: f for name, f in difference.figures.items() if name in IN_WORDS and f.n}
+            tones = {name: tables.tone(figure) for name, figure in known.items()}
             lines.append(
                 {
                     "block": wording.group(block.identity),
                     "series": difference.series.label,
                     "baseline": difference.baseline.label,
                     "pairs": difference.pairs,
-                    "told": told,
-                    "untold": untold,
+                    "changed": [
+                        {
+                            "name": IN_WORDS[name],
+                            "value": wording.interval(f.difference, f.measure, signed=True),
+                            "tone": tones[name],
+                        }
+                        for name, f in known.items()
+                        if tones[name]
+                    ],
+                    "alike": [IN_WORDS[name] for name in known if not tones[name]],
                 }
             )
     return lines
@@ -167,8 +161,35 @@ def _section(block: Block, differences: list[Difference], draw: bool) -> dict[st
     }
 
 
-def _replay(folder: str, row: Row) -> str:
-    return shlex.join(["cosim", "replay", folder, str(row["key"])])
+def _worst(rows: Sequence[Row]) -> list[tuple[str, Row]]:
+    """What was bad about an episode, and the episode: AV-caused crashes, other crashes, then the narrowest
+    escapes; crashes of one kind by the time they happened at."""
+    found = [(*_rank(row), str(row["key"]), row) for row in rows if row["status"] == OK]
+    bad = sorted((f for f in found if f[2]), key=lambda f: (f[0], f[1], f[3]))
+    return [(why, row) for _, _, why, _, row in bad[:WORST]]
+
+
+def _rank(row: Row) -> tuple[int, float, str]:
+    """Class, order within it, why; "" where nothing is bad enough."""
+    text = row.get("collision_list")
+    found = json.loads(text) if isinstance(text, str) else (text or [])
+    first = min(found, key=lambda c: (not c.get("av_caused"), c.get("time") or 0.0), default=None)
+    when = 0.0 if first is None else float(first.get("time") or 0.0)
+    what = ""
+    if first is not None:
+        what = f" at {when:.1f} s of SUMO's clock: {first['collider']} hit {first['victim']}"
+    if row.get("av_caused_collisions"):
+        return 0, when, f"AV-caused collision{what}"
+    if row.get("crashed"):
+        return 1, when, f"collision{what}"
+    ttc = math.inf if row.get("min_ttc_s") is None else float(row["min_ttc_s"])
+    return 2, ttc, f"time to collision down to {ttc:.2f} s" if ttc < 1.0 else ""
+
+
+def _last_line(row: Row) -> str:
+    """Of an episode without figures: the last thing its simulation said, else our own words."""
+    lines = [line.strip() for line in str(row.get("stderr") or "").splitlines() if line.strip()]
+    return lines[-1] if lines else str(row.get("error") or "no reason given")
 
 
 def _manifest(run: Run) -> dict[str, Any]:

@@ -1,23 +1,65 @@
-"""The plots of the report, one row per series each: rates, distances, times to collision, Pareto, vetoes."""
+"""The plots of the report, one row per series each: rates, distances, times to collision, Pareto, vetoes.
+
+matplotlib's SVG made fit for a page: colours of the page's theme, its fonts, ids that do not clash.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import io
 import math
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
+from matplotlib import rc_context
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from cosim.report import statistics
 from cosim.report.html.blocks import Block, Series
-from cosim.report.html.svg import FAINT, INK, SERIES, canvas, render, themed
-from cosim.report.statistics import mean
 
 CRITICAL = 1.5  # s, below it a conflict is serious (cosim.metrics.time_to_collision)
 HORIZON = 10.0  # s, times to collision beyond it are NA
 BIN = 0.5  # s
+WIDTH = 5.6  # inches; 1 in the drawing is 72 px on the page, so a phone shows its letters almost full size
+
+# matplotlib wants colours, the page has variables that differ in light and dark: these stand in for them.
+INK, FAINT, GRID = "#010101", "#020202", "#030303"
+SERIES = tuple(f"#0400{k:02x}" for k in range(1, 9))
+_THEME = {
+    INK: "var(--ink)",
+    FAINT: "var(--faint)",
+    GRID: "var(--line)",
+    **{stand_in: f"var(--series-{k})" for k, stand_in in enumerate(SERIES, 1)},
+}
+_STYLE: Any = {
+    "svg.fonttype": "none",  # text stays text: it can be read, searched, and takes the page's font
+    "svg.hashsalt": "cosim",  # equal rows, equal file
+    "font.size": 9.0,
+    "font.family": "sans-serif",
+    "text.color": INK,
+    "axes.edgecolor": FAINT,
+    "axes.labelcolor": FAINT,
+    "axes.labelsize": 8.5,
+    "xtick.color": FAINT,
+    "ytick.color": INK,
+    "xtick.labelsize": 8.5,
+    "axes.grid": True,
+    "axes.grid.axis": "x",
+    "grid.color": GRID,
+    "grid.linewidth": 0.8,
+    "axes.axisbelow": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.spines.left": False,
+    "ytick.major.size": 0.0,
+    "xtick.major.size": 0.0,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,58 +74,44 @@ class Plot:
 def plots(block: Block) -> list[Plot]:
     """Every plot that has something to show."""
     series = [s for s in block.series if s.ok]
-    if not series:
-        return []
-    with themed():
-        return [plot for plot in _all(series) if plot is not None]
+    share = ("% of episodes", "Point: share; bar: Wilson's 95 % interval; beside it the counts.")
+    mean = ("% of decisions", "Point: mean over episodes; bar: bootstrap 95 % interval.")
+    with rc_context(_STYLE):
+        found = (
+            _figures(series, "collision_rate", "Episodes with a collision", *share),
+            _figures(
+                series,
+                "av_caused_collision_rate",
+                "Episodes with a collision that an AV caused",
+                *share,
+            ),
+            _figures(series, "mission_success_rate", "Missions fulfilled", *share),
+            _spread(series, "dt_mission_m", "Distance of the mission vehicle", "m"),
+            _spread(series, "dt_av_m", "Distance of the AVs", "m"),
+            _times(series),
+            _pareto(series),
+            _figures(series, "veto_rate", "Decisions vetoed by the safety mask", *mean),
+        )
+    return [plot for plot in found if plot is not None]
 
 
-def _all(series: list[Series]) -> list[Plot | None]:
-    return [
-        _rates(series, "collision_rate", "Episodes with a collision"),
-        _rates(series, "av_caused_collision_rate", "Episodes with a collision that an AV caused"),
-        _rates(series, "mission_success_rate", "Missions fulfilled"),
-        _spread(series, "dt_mission_m", "Distance of the mission vehicle", "m"),
-        _spread(series, "dt_av_m", "Distance of the AVs", "m"),
-        _times(series),
-        _pareto(series),
-        _vetoes(series),
-    ]
-
-
-def _rates(series: list[Series], name: str, title: str) -> Plot | None:
-    """Shares with Wilson's intervals."""
-    found = [s.figures["rates"].get(name) for s in series]
-    if not any(f and f["n"] for f in found):
+def _figures(series: list[Series], name: str, title: str, label: str, note: str) -> Plot | None:
+    """Shares or means of shares, in per cent with their intervals."""
+    found = {id(s): s.counts(name) for s in series}
+    if not any(f.get("n") for f in found.values()):
         return None
 
     def draw(axes: Axes, place: float, one: Series) -> str:
-        f = one.figures["rates"][name]
-        if not f["n"]:
+        f, colour = found[id(one)], _colour(one)
+        if not f.get("n"):
             return "NA"
-        _interval(axes, place, 100 * f["value"], 100 * f["low"], 100 * f["high"], one)
-        return f"{f['hits']}/{f['n']}"
+        value, low, high = (100 * (f["value"] if f[k] is None else f[k]) for k in ("value", "low", "high"))
+        style: Any = {"linewidth": 2.5, "alpha": 0.55, "solid_capstyle": "round"}
+        axes.plot([low, high], [place, place], color=colour, **style)
+        axes.plot([value], [place], "o", markersize=6.5, color=colour, clip_on=False, zorder=3)
+        return f"n {f['n']}" if f.get("hits") is None else f"{f['hits']}/{f['n']}"
 
-    svg = _rows(series, title, "% of episodes", draw, limits=(0.0, None))
-    return Plot(title, svg, "Point: share; bar: Wilson's 95 % interval; beside it the counts.")
-
-
-def _vetoes(series: list[Series]) -> Plot | None:
-    """Mean veto rates with bootstrap intervals."""
-    name, title = "veto_rate", "Decisions vetoed by the safety mask"
-    if not any(s.figures["means"].get(name, {}).get("n") for s in series):
-        return None
-
-    def draw(axes: Axes, place: float, one: Series) -> str:
-        f = one.figures["means"][name]
-        if not f["n"]:
-            return "NA"
-        low, high = (f["value"] if f[k] is None else f[k] for k in ("low", "high"))
-        _interval(axes, place, 100 * f["value"], 100 * low, 100 * high, one)
-        return f"n {f['n']}"
-
-    svg = _rows(series, title, "% of decisions", draw, limits=(0.0, None))
-    return Plot(title, svg, "Point: mean over episodes; bar: bootstrap 95 % interval.")
+    return Plot(title, _rows(series, title, label, draw, limits=(0.0, None)), note)
 
 
 def _spread(series: list[Series], name: str, title: str, unit: str) -> Plot | None:
@@ -103,8 +131,7 @@ def _spread(series: list[Series], name: str, title: str, unit: str) -> Plot | No
         axes.plot([middle], [place], "o", markersize=6, color=colour, markeredgecolor=INK)
         return f"n {len(values)}"
 
-    svg = _rows(series, title, unit, draw)
-    return Plot(title, svg, "Dots: episodes; bar: middle half; point: median.")
+    return Plot(title, _rows(series, title, unit, draw), "Dots: episodes; bar: middle half; point: median.")
 
 
 def _times(series: list[Series]) -> Plot | None:
@@ -125,26 +152,20 @@ def _times(series: list[Series]) -> Plot | None:
         missing = sum(math.isnan(v) for v in one.values(name))
         return f"n {len(one.ok) - missing}" + (f", {missing} none" if missing else "")
 
-    svg = _rows(series, title, "s", draw, limits=(0.0, HORIZON), mark=CRITICAL)
-    return Plot(
-        title,
-        svg,
-        f"Share of episodes; line: {CRITICAL:g} s, critical; none: nobody came within {HORIZON:g} s.",
-    )
+    note = f"Share of episodes; line: {CRITICAL:g} s, critical; none: nobody came within {HORIZON:g} s."
+    return Plot(title, _rows(series, title, "s", draw, limits=(0.0, HORIZON), mark=CRITICAL), note)
 
 
 def _pareto(series: list[Series]) -> Plot | None:
     """What the AVs give and what the others get; an SVO sweep is a line."""
     others = {"dt_mission_m": "mission vehicle", "dt_hv_m": "human drivers"}
-    name = next((n for n in others if any(not math.isnan(v) for s in series for v in s.values(n))), None)
-    if name is None:
-        return None
+    name = next((n for n in others if any(s.counts(n).get("n") for s in series)), "dt_hv_m")
     who = others[name]
-    points = [(s, mean(s.values("dt_av_m")), mean(s.values(name))) for s in series]
+    points = [(s, statistics.mean(s.values("dt_av_m")), statistics.mean(s.values(name))) for s in series]
     points = [(s, x, y) for s, x, y in points if x.known and y.known]
     if len(points) < 2:
         return None
-    figure, axes = canvas(7.0)
+    figure, axes = _canvas(7.0)
     axes.grid(axis="y")
     for policy in dict.fromkeys(s.identity["policy"] for s, _, _ in points):
         mine = [p for p in points if p[0].identity["policy"] == policy]
@@ -152,8 +173,8 @@ def _pareto(series: list[Series]) -> Plot | None:
         colour = _colour(mine[0][0])
         axes.plot([x.value for _, x, _ in mine], [y.value for _, _, y in mine], color=colour, linewidth=1.0)
         for _, x, y in mine:
-            for xs, ys in (((x.low, x.high), (y.value,) * 2), ((x.value,) * 2, (y.low, y.high))):
-                axes.plot(xs, ys, color=colour, linewidth=1.6, alpha=0.5)
+            axes.plot((x.low, x.high), (y.value, y.value), color=colour, linewidth=1.6, alpha=0.5)
+            axes.plot((x.value, x.value), (y.low, y.high), color=colour, linewidth=1.6, alpha=0.5)
             axes.plot([x.value], [y.value], "o", markersize=6, color=colour)
     axes.set_xlabel("mean distance of the AVs, m")
     axes.set_ylabel(f"mean distance of the {who}, m")
@@ -161,7 +182,7 @@ def _pareto(series: list[Series]) -> Plot | None:
     axes.margins(0.15)
     _name_points(axes, [(one.label, x.value, y.value) for one, x, y in points])
     title = f"What AVs give, what the {who} get" + ("s" if who.endswith("vehicle") else "")
-    return Plot(title, render(figure, title), "Up and to the right is better for all; bars: 95 % intervals.")
+    return Plot(title, _render(figure, title), "Up and to the right is better for all; bars: 95 % intervals.")
 
 
 # ---- inside ----
@@ -177,7 +198,7 @@ def _rows(
     mark: float | None = None,
 ) -> Markup:
     """A drawing with a row per series, first on top; `draw` returns what stands at the row's right end."""
-    figure, axes = canvas(len(series))
+    figure, axes = _canvas(len(series))
     if mark is not None:
         axes.axvline(mark, color=FAINT, linewidth=1.0, linestyle=(0, (4, 3)))
     texts = [draw(axes, float(k), one) for k, one in enumerate(series)]
@@ -192,15 +213,8 @@ def _rows(
     right.set_yticks(range(len(series)), texts)
     right.tick_params(axis="y", colors=FAINT, labelsize=8.0, length=0)
     right.grid(visible=False)
-    for side in right.spines.values():
-        side.set_visible(False)
-    return render(figure, title)
-
-
-def _interval(axes: Axes, place: float, value: float, low: float, high: float, one: Series) -> None:
-    colour = _colour(one)
-    axes.plot([low, high], [place, place], color=colour, linewidth=2.5, alpha=0.55, solid_capstyle="round")
-    axes.plot([value], [place], "o", markersize=6.5, color=colour, clip_on=False, zorder=3)
+    right.spines[:].set_visible(False)
+    return _render(figure, title)
 
 
 def _name_points(axes: Axes, points: list[tuple[str, float, float]]) -> None:
@@ -212,17 +226,33 @@ def _name_points(axes: Axes, points: list[tuple[str, float, float]]) -> None:
         crowded = sum(abs(place[0] - u) < 0.25 and abs(place[1] - v) < 0.07 for u, v in taken)
         offset = ((6, 6), (6, -13), (-6, 6), (-6, -13))[crowded % 4]
         side = "left" if offset[0] > 0 else "right"
-        axes.annotate(
-            label,
-            (x, y),
-            offset,
-            textcoords="offset points",
-            fontsize=8.5,
-            color=INK,
-            horizontalalignment=side,
-        )
+        style: Any = {"textcoords": "offset points", "fontsize": 8.5, "color": INK}
+        axes.annotate(label, (x, y), offset, horizontalalignment=side, **style)
         taken.append(place)
 
 
 def _colour(one: Series) -> str:
     return SERIES[one.colour % len(SERIES)]
+
+
+def _canvas(rows: float) -> tuple[Figure, Axes]:
+    """An empty drawing with room for `rows` rows of a series each."""
+    figure = Figure(figsize=(WIDTH, 0.55 + 0.36 * rows), layout="constrained")
+    return figure, figure.add_subplot()
+
+
+def _render(figure: Figure, title: str) -> Markup:
+    """The drawing as one `<svg>` element, safe to put into the page."""
+    raw = io.StringIO()
+    figure.savefig(raw, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+    text = re.sub(r"<metadata>.*?</metadata>", "", raw.getvalue(), flags=re.DOTALL)
+    for stand_in, variable in _THEME.items():
+        text = text.replace(stand_in, variable)
+    text = re.sub(r"font: ([\d.]+)px [^;\"]*", r"font-size: \1px", text)
+    prefix = f"d{hashlib.sha256(text.encode()).hexdigest()[:8]}-"
+    text = re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>{prefix}", text)
+    opening, rest = text[text.index("<svg") :].split(">", 1)
+    box = opening[opening.index("viewBox") :]
+    box = box[: box.index('"', len('viewBox="')) + 1]
+    start = f'<svg xmlns="http://www.w3.org/2000/svg" {box} role="img"><title>{Markup.escape(title)}</title>'
+    return Markup(start + rest)

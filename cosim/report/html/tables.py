@@ -60,7 +60,7 @@ def figures(blocks: Sequence[Block], known: dict[str, Measure]) -> Table:
     varying = [n for n in GROUP if len({s.identity[n] for s in series}) > 1]
     names = [n for n in HEADLINE if n in known]
     rows = [
-        [_named(s, varying), _episodes(s), *(_figure(_counts(s, n), known[n]) for n in names)] for s in series
+        [_named(s, varying), _episodes(s), *(_figure(s.counts(n), known[n]) for n in names)] for s in series
     ]
     heads = ["policy", "episodes", *(head(known[n]) for n in names)]
     common = [
@@ -75,9 +75,8 @@ def differences(found: Sequence[Difference]) -> Table | None:
     """Every series of a block against its baseline, pair by pair; None where there is no pair."""
     if not found:
         return None
-    names = dict.fromkeys(n for d in found for n in d.figures)
-    shown = [n for n in names if any(d.figures[n].n for d in found)]
     measures = found[0].figures
+    shown = [n for n in measures if any(d.figures[n].n for d in found)]
     rows = [
         [
             Cell(d.series.label, d.series.label, (f"against {d.baseline.label}",)),
@@ -91,16 +90,13 @@ def differences(found: Sequence[Difference]) -> Table | None:
 
 def everything(block: Block) -> Table:
     """Every figure of every series of a block: measures down, series across."""
-    known = block.series[0].known
-    rows = []
-    for name, measure in known.items():
-        counts = [_counts(s, name) for s in block.series]
-        rows.append(
-            [
-                Cell(name, name, (measure.unit,) if measure.unit else ()),
-                *(_figure(c, measure) for c in counts),
-            ]
-        )
+    rows = [
+        [
+            Cell(name, name, (measure.unit,) if measure.unit else ()),
+            *(_figure(s.counts(name), measure) for s in block.series),
+        ]
+        for name, measure in block.series[0].known.items()
+    ]
     return Table(["figure", *(s.label for s in block.series)], rows, [])
 
 
@@ -117,19 +113,13 @@ def tone(figure: PairedFigure) -> str:
     crashes Tango's interval can leave 0 out where the exact test does not agree.
     """
     d = figure.difference
-    if math.isnan(d.low) or d.low <= 0.0 <= d.high or not figure.measure.better:
-        return ""
-    if figure.p is not None and figure.p >= 1.0 - CONFIDENCE:
+    chance = math.isnan(d.low) or d.low <= 0.0 <= d.high
+    if chance or (figure.p is not None and figure.p >= 1.0 - CONFIDENCE) or not figure.measure.better:
         return ""
     return "good" if (d.value > 0.0) == (figure.measure.better == "higher") else "bad"
 
 
 # ---- inside ----
-
-
-def _counts(series: Series, name: str) -> dict[str, Any]:
-    found = series.figures
-    return found["rates"].get(name) or found["means"].get(name) or found["timings"].get(name) or {}
 
 
 def _named(series: Series, varying: Sequence[str]) -> Cell:

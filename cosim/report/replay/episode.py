@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-import contextlib
-import json
 import math
-import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from cosim.errors import BadInput, CosimError, hint
-from cosim.files import whole
+from cosim.files import cannot, read_json, whole
+from cosim.host import Host
 from cosim.policies import check
-from cosim.recording.watcher import Watched
+from cosim.recording.watched import Watched
 from cosim.report import run_folder
-from cosim.runner import Runner
 from cosim.scenario import Scenario
-from cosim.scenario.episode_id import Case
-from cosim.scenario.manifest import POLICY_FILES, manifest, named
+from cosim.scenario.episode_id import EpisodeId
+from cosim.scenario.manifest import CASE, OPTIONS, POLICY_FILES, checked, manifest, named
 from cosim.scenario.policy_name import label, read
-from cosim.scenario.sumocfg import CLOCK, INPUTS, command_line, keeps
+from cosim.scenario.sumocfg import keeps
 from cosim.scenario.vet import vetted
 from cosim.types import EpisodeResult
 from cosim.workers.progress import Progress
@@ -29,8 +26,8 @@ from cosim.workers.tasks import OK
 from cosim.workers.worker import Worker
 
 MANIFEST = "manifest.json"
+ABSENT = "no such file: a folder of cosim run --out or cosim evaluate is needed"
 MOST_NAMED = 8  # episodes of one seed
-CASE, OPTIONS = "case", "sumo_arguments"  # what `cosim run --out` adds to the manifest
 
 
 class ReplayDiffers(CosimError):
@@ -43,7 +40,7 @@ class ReplayDiffers(CosimError):
 class Recorded:
     """One episode as a run folder remembers it."""
 
-    case: Case
+    case: EpisodeId
     options: tuple[str, ...]  # SUMO's own, as typed after `--`
     manifest: Mapping[str, Any]
     trace_hash: str
@@ -55,20 +52,6 @@ class Recorded:
         return f"replay-{self.case.key}" if (self.folder / "episodes.parquet").exists() else "replay"
 
 
-def remembered(case: Case, options: Sequence[str]) -> dict[str, Any]:
-    """What a manifest has to hold beside the usual so that `find` finds the episode again.
-
-    Outputs are left out: a replay does not write them again.
-    """
-    kept: list[str] = []
-    for name, value in command_line(options).items():
-        if name in INPUTS:
-            value = ",".join(str(Path(part.strip()).absolute()) for part in value.split(","))
-        if name in (*INPUTS, *CLOCK) or keeps(name):
-            kept += [f"--{name}={value}"]
-    return {CASE: case.document(), OPTIONS: kept}
-
-
 def find(folder: Path, episode: str | None) -> Recorded:
     """The episode in a folder of `cosim run --out` (`episode` may be None) or of `cosim evaluate`.
 
@@ -78,16 +61,17 @@ def find(folder: Path, episode: str | None) -> Recorded:
         BadInput: no such folder, not a run folder, no such episode (with the nearest key), one that was not
             driven to its end.
     """
-    document = _json(folder / MANIFEST)
+    file, result = folder / MANIFEST, folder / "result.json"
+    document = checked(read_json(file, ABSENT), file)
     if "cells" in document:
         return _of_batch(folder, episode)
     if CASE not in document:
-        raise BadInput("was not written by this version of cosim run or evaluate", file=folder / MANIFEST)
+        raise BadInput("was not written by this version of cosim run or evaluate", file=file)
     recorded = Recorded(
-        Case.read(document[CASE]),
+        EpisodeId.read(document[CASE], file, CASE),
         tuple(document.get(OPTIONS, ())),
         document,
-        _json(folder / "result.json").get("trace_hash", ""),
+        checked(read_json(result, ABSENT), result).get("trace_hash", ""),
         folder,
     )
     if episode is not None and episode not in (recorded.case.key, str(recorded.case.seed)):
@@ -105,26 +89,23 @@ def check_inputs(recorded: Recorded) -> tuple[Scenario, list[str]]:
     scenario = vetted(recorded.case.scenario(recorded.options))
     then, now = recorded.manifest, manifest(scenario, recorded.case.seed)
     paths = named(scenario.files)
+    driven = then.get("files", {})
     for name, digest in now["files"].items():
-        before = then.get("files", {}).get(name)
-        if before != digest:
-            problem = "was not among the files of the recorded run"
-            if before is not None:
-                problem = _changed("it was driven", before, digest)
-            raise BadInput(problem, file=paths[name])
-    for name in sorted(then.get("files", {}).keys() - now["files"].keys()):
-        raise BadInput("belonged to the recorded run, and to this one no more", file=name)
+        if name not in driven:
+            raise BadInput("was not among the files of the recorded run", file=paths[name])
+        if driven[name] != digest:
+            raise BadInput(_changed("it was driven", driven[name], digest), file=paths[name])
+    if gone := driven.keys() - now["files"].keys():
+        raise BadInput("belonged to the recorded run, and to this one no more", file=min(gone))
     for name in sorted(now.keys() - {"files", "versions", "seed", "options_not_passed_on"}):
         if name in then and (before := _lasting(name, then)) != (here := _lasting(name, now)):
             problem = f"is {here!r} now, it was {before!r} when it was driven"
             raise BadInput(problem, file=recorded.folder / MANIFEST, field=name)
-    versions = then.get("versions", {})
-    warnings = [
+    return scenario, [
         f"driven with {name} {before}, here is {now['versions'].get(name)}: the replay may differ"
-        for name, before in versions.items()
+        for name, before in then.get("versions", {}).items()
         if name in now["versions"] and now["versions"][name] != before
     ]
-    return scenario, warnings
 
 
 def drive(recorded: Recorded, scenario: Scenario, *, check: bool = True) -> tuple[EpisodeResult, Watched]:
@@ -135,8 +116,8 @@ def drive(recorded: Recorded, scenario: Scenario, *, check: bool = True) -> tupl
         ReplayDiffers: the trace hash is another one.
     """
     case = recorded.case
-    with _progress(f"replay {scenario.name} {label(case.policy)}", "s") as progress:
-        worker = Worker(Runner, scenario, case.policy, math.radians(case.svo_deg), name="cosim-replay")
+    with Progress(f"replay {scenario.name} {label(case.policy)}", "s") as progress:
+        worker = Worker(Host, scenario, case.policy, math.radians(case.svo_deg), name="cosim-replay")
         with worker:
             if check:
                 _same_policy(recorded.manifest.get(POLICY_FILES, {}), worker.call("policy_files"))
@@ -181,45 +162,49 @@ def draw(
     names = list(dict.fromkeys(track.id for r in episodes for track in r.tracks))
     if follow is not None and follow not in names:
         raise BadInput(f"no such vehicle{hint(follow, names)}", field="--follow", value=follow)
+    for file in filter(None, (html, mp4, gif)):
+        with cannot("write", file=file):
+            file.parent.mkdir(parents=True, exist_ok=True)
     if html is not None:
         from cosim.report.replay.page import page
 
-        with _writing(html), whole(html) as draft:
+        with cannot("write", file=html), whole(html) as draft:
             draft.write_text(page(episodes[0]), "utf-8")
     if mp4 is not None or gif is not None:
         from cosim.report.replay import video
 
         for path, make in ((mp4, video.film), (gif, video.animation)):
             if path is not None:
-                with _progress(path.name, "pictures") as progress, _writing(path):
+                with Progress(path.name, "pictures") as progress, cannot("write", file=path):
                     make(episodes, path, follow=follow, progress=progress)
-
-
-def warn(lines: Sequence[str]) -> None:
-    """Warnings on stderr."""
-    for line in lines:
-        print(f"cosim: warning: {line}", file=sys.stderr)
 
 
 def _of_batch(folder: Path, episode: str | None) -> Recorded:
     run = run_folder.read(folder)
     if episode is None:
         raise BadInput(f"holds {len(run.rows)} episodes: name one by its key or seed", file=folder)
-    keys = [row["key"] for row in run.rows]
     found = [r for r in run.rows if r["key"] == episode] or [r for r in run.rows if str(r["seed"]) == episode]
     if not found:
-        raise BadInput(f"no such episode{hint(episode, keys)}", field="EPISODE", value=episode)
+        raise BadInput(
+            f"no such episode{hint(episode, [row['key'] for row in run.rows])}",
+            field="EPISODE",
+            value=episode,
+        )
     if len(found) > 1:
         some = [f"{r['key']} ({r['scenario']} / {r['demand']} / {r['policy']})" for r in found[:MOST_NAMED]]
-        more = ["..."] if len(found) > MOST_NAMED else []
-        problem = f"{len(found)} episodes have this seed: {', '.join([*some, *more])}"
+        some += ["..."] * (len(found) > MOST_NAMED)
+        problem = f"{len(found)} episodes have this seed: {', '.join(some)}"
         raise BadInput(problem, field="EPISODE", value=episode)
     row = found[0]
     if row["status"] != OK:
         problem = f"was not driven to its end (status {row['status']}): nothing to compare with"
         raise BadInput(problem, field="EPISODE", value=row["key"])
-    cell = run.manifest["cells"][row["cell"]]
-    case = Case.read({**cell[CASE], "seed": row["seed"]})
+    file, where = folder / MANIFEST, f"cells.{row['cell']}"
+    cell = run.manifest["cells"].get(row["cell"], {})
+    for part in (CASE, "manifest"):
+        if part not in cell:
+            raise BadInput("is missing", file=file, field=f"{where}.{part}")
+    case = EpisodeId.read({**cell[CASE], "seed": row["seed"]}, file, f"{where}.{CASE}")
     return Recorded(case, (), cell["manifest"], row["trace_hash"], folder)
 
 
@@ -238,37 +223,3 @@ def _lasting(name: str, document: Mapping[str, Any]) -> Any:
     """A setting of a manifest; of SUMO's options only those that a replay uses again."""
     value = document[name]
     return {k: v for k, v in value.items() if keeps(k)} if name == "sumo_options" else value
-
-
-def _json(path: Path) -> dict[str, Any]:
-    try:
-        document = json.loads(path.read_text("utf-8"))
-    except FileNotFoundError:
-        problem = "no such file: a folder of cosim run --out or cosim evaluate is needed"
-        raise BadInput(problem, file=path) from None
-    except OSError as error:
-        raise BadInput(f"cannot be read: {error.strerror}", file=path) from None
-    except ValueError as error:
-        raise BadInput(f"not JSON: {error}", file=path) from None
-    if not isinstance(document, dict):
-        raise BadInput("not a JSON object", file=path)
-    return document
-
-
-@contextlib.contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    """The folder is made where it is not there. Raises BadInput when `path` cannot be written."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield
-    except OSError as error:
-        raise BadInput(f"cannot write: {error.strerror or error}", file=path) from None
-
-
-@contextlib.contextmanager
-def _progress(title: str, unit: str) -> Iterator[Progress]:
-    progress = Progress(title, unit)
-    try:
-        yield progress
-    finally:
-        progress.done()

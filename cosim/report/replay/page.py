@@ -1,26 +1,196 @@
-"""The replay as one self-contained HTML file: no network, no library, a plain canvas."""
+"""The replay as one self-contained HTML file: no network, no library, a plain canvas.
+
+The episode is packed as whole numbers, differences of differences, then gzip and base64. A track's positions
+are centimetres; their second difference is an acceleration of a few units, which gzip packs to about a byte.
+`assets/data.js` is the way back.
+"""
 
 from __future__ import annotations
 
+import base64
+import gzip
 import html
+import json
+import math
 from importlib import resources
 from string import Template
+from typing import Any
 
-from cosim.recording.watcher import Watched
-from cosim.report.replay.packing import packed
+import numpy as np
+import numpy.typing as npt
 
+from cosim.recording import Choice
+from cosim.recording.watched import Track, Watched
+from cosim.types import Floats, Forecast
+
+MARGIN = 500.0  # m around the traffic: roads further away are left out
 SCRIPTS = ("data.js", "view.js", "draw.js", "panel.js", "main.js")
+FORECAST_EVERY = 2  # every second predicted frame is drawn
 
 
 def page(watched: Watched) -> str:
     """The whole page as text."""
     assets = resources.files(__package__).joinpath("assets")
     facts = watched.facts
+    text = json.dumps(document(watched), separators=(",", ":"), allow_nan=False)
     title = " / ".join(str(facts.get(name, "")) for name in ("scenario", "demand", "policy"))
     scripts = [assets.joinpath(name).read_text("utf-8") for name in SCRIPTS]
     return Template(assets.joinpath("page.html").read_text("utf-8")).substitute(
         title=html.escape(f"{title}, seed {facts.get('seed', '')}"),
         style=assets.joinpath("style.css").read_text("utf-8"),
         script="\n".join(scripts),
-        data=packed(watched),
+        data=base64.b64encode(gzip.compress(text.encode(), 9, mtime=0)).decode(),
     )
+
+
+def document(watched: Watched) -> dict[str, Any]:
+    """The watched episode as plain JSON; lengths in cm, times in ms, headings in mrad (see each line)."""
+    r = watched
+    number = {name: k for k, name in enumerate(dict.fromkeys(t.id for t in r.tracks))}
+    words: dict[str | None, int] = {None: 0}  # names and reasons, each written once; number 0 is nobody
+    window = _window(r)
+    lanes = [k for k, lane in enumerate(r.road.lanes) if _meets(lane.shape, window)]
+    place = {lane: k for k, lane in enumerate(lanes)}
+    return {
+        "facts": _facts(r),
+        "begin": _ms(r.begin),
+        "times": _differences(r.times * 1000.0),  # ms
+        "vehicles": _vehicles(r, number),
+        "tracks": [_track(t, number, place) for t in r.tracks],
+        "lanes": [_lane(r, k) for k in lanes],
+        "junctions": [_line(shape) for shape in r.road.junctions if _meets(shape, window)],
+        "goal": [place[k] for k in sorted(r.goal) if k in place],
+        "zones": sorted({place[k] for zone in r.road.zones for k in zone.lanes if k in place}),
+        "decided": [_ms(t) for t in r.decided],
+        "choices": [
+            [_choice(number[name], c, words) for name, c in choices.items() if name in number]
+            for choices in r.choices
+        ],
+        "forecasts": [_forecast(f, number) for f in r.forecasts],
+        "forecast_interval": _forecast_interval(r),
+        "collisions": [
+            {
+                "t": _ms(c.time), "collider": c.collider, "victim": c.victim, "kind": c.kind, "lane": c.lane,
+                "x": _finite(c.x), "y": _finite(c.y), "av_caused": c.av_caused,
+            }
+            for c in r.collisions
+        ],
+        "words": [*words],
+    }  # fmt: skip
+
+
+def _facts(r: Watched) -> dict[str, Any]:
+    """What stands at the head of the page and in its table of figures."""
+    units = r.facts.get("units", {})
+    names = (
+        "scenario demand policy policy_label behavior driver_model preset svo_deg seed steps trace_hash "
+        "not_comparable_because"
+    )
+    return {
+        **{name: r.facts.get(name) for name in names.split()},
+        "metrics": [[name, r.facts.get(name), units[name]] for name in units],
+        "frame": _ms(r.interval),
+    }
+
+
+def _vehicles(r: Watched, number: dict[str, int]) -> list[list[Any]]:
+    """[id, is AV, is mission, class, length cm, width cm] by number."""
+    last = {t.id: t for t in r.tracks}
+    return [
+        [t.id, int(t.kind), int(t.mission), t.driver, round(t.length * 100), round(t.width * 100)]
+        for t in (last[name] for name in number)
+    ]
+
+
+def _track(t: Track, number: dict[str, int], place: dict[int, int]) -> list[Any]:
+    """[vehicle, first frame, x cm, y cm, heading mrad, speed cm/s, acceleration cm/s2, lane]"""
+    lane = np.array([place.get(int(k), -1) for k in t.lane], np.int64)
+    return [
+        number[t.id],
+        t.first,
+        _differences(t.x * 100.0, 2),
+        _differences(t.y * 100.0, 2),
+        _differences(np.unwrap(t.heading) * 1000.0),
+        _differences(t.speed * 100.0),
+        _differences(t.accel * 100.0),
+        _differences(lane),
+    ]
+
+
+def _choice(vehicle: int, c: Choice, words: dict[str | None, int]) -> list[Any]:
+    """[vehicle, action, target cm/s, flags, blamed, blocked, q, score, ttc, unsafe]; see data.js."""
+    d = c.decision
+    flags = int(d.vetoed) + 2 * int(d.fallback)
+    row = [
+        vehicle,
+        int(d.action),
+        round(c.target * 100),
+        flags,
+        words.setdefault(d.blamed, len(words)),
+        words.setdefault(c.blocked, len(words)),
+    ]
+    if d.q is None and d.safety_score is None and d.ttc is None and d.unsafe is None:
+        return row
+    unsafe = None if d.unsafe is None else [int(u) for u in d.unsafe]
+    return [*row, _short(d.q, 4), _short(d.safety_score, 2), _short(d.ttc, 2), unsafe]
+
+
+def _forecast(f: Forecast | None, number: dict[str, int]) -> list[Any] | None:
+    """Per vehicle [number, x dm, y dm, along dm, across dm], each in differences; None without one."""
+    if f is None:
+        return None
+    at = slice(FORECAST_EVERY - 1, None, FORECAST_EVERY)
+    return [
+        [number[name], *(_differences(a[k, at] * 10.0) for a in (f.x, f.y, f.along_std, f.across_std))]
+        for k, name in enumerate(f.ids)
+        if name in number
+    ]
+
+
+def _forecast_interval(r: Watched) -> float | None:
+    first = next((f for f in r.forecasts if f is not None), None)
+    return None if first is None else first.interval * FORECAST_EVERY
+
+
+def _window(r: Watched) -> tuple[Floats, Floats]:
+    """The traffic's bounding box with a margin: lower left and upper right corner, [2] m each."""
+    if not r.tracks:
+        return np.full(2, -np.inf), np.full(2, np.inf)
+    points = np.hstack([(t.x, t.y) for t in r.tracks])  # [2,p]
+    return points.min(1) - MARGIN, points.max(1) + MARGIN
+
+
+def _meets(shape: Floats, window: tuple[Floats, Floats]) -> bool:
+    """Whether a shape [p,2] m reaches into the window."""
+    return bool((shape.max(0) >= window[0]).all() and (shape.min(0) <= window[1]).all())
+
+
+def _lane(r: Watched, k: int) -> list[Any]:
+    """[id, width cm, is internal, centre line]"""
+    lane = r.road.lanes[k]
+    return [lane.id, round(lane.width * 100), int(lane.internal), _line(lane.shape)]
+
+
+def _line(shape: Floats) -> list[list[int]]:
+    """A polyline [p,2] m as [x cm, y cm] in differences."""
+    return [_differences(shape[:, 0] * 100.0), _differences(shape[:, 1] * 100.0)]
+
+
+def _differences(values: npt.NDArray[Any], order: int = 1) -> list[int]:
+    """Whole numbers; the first value, then the steps (`order` times)."""
+    whole = np.rint(np.nan_to_num(values)).astype(np.int64)
+    for _ in range(order):
+        whole = np.diff(whole, prepend=0)
+    return [int(v) for v in whole]
+
+
+def _short(values: npt.NDArray[Any] | None, digits: int) -> list[float | None] | None:
+    return None if values is None else [_finite(float(v), digits) for v in values]
+
+
+def _finite(value: float, digits: int = 2) -> float | None:
+    return round(value, digits) if math.isfinite(value) else None
+
+
+def _ms(seconds: float) -> int:
+    return round(seconds * 1000)

@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from cosim.recording.watcher import Choice, Track, Watched
+from cosim.recording import Choice
+from cosim.recording.watched import Track, Watched
 from cosim.types import Floats, Kind, MetaAction
 
 FINE = 2  # drawn this much larger, then reduced: smooth edges
@@ -95,7 +96,8 @@ class Strip:
     def _pixel(self, x: float, y: float) -> tuple[float, float]:
         return self._pixels(np.array([[x, y]]))[0]
 
-    def _sees(self, points: Floats) -> bool:
+    def sees(self, points: Floats) -> bool:
+        """Whether points [p,2] m reach into the picture."""
         low, high = points.min(0), points.max(0)
         here = np.array([self._x, self._y])
         return bool((high > here - self._half).all() and (low < here + self._half).all())
@@ -107,15 +109,12 @@ class Strip:
     def road(self, r: Watched) -> None:
         """Junctions, then lanes with their edges."""
         for outline in r.road.junctions:
-            if self._sees(outline):
+            if self.sees(outline):
                 self._pen.polygon(self._pixels(outline), fill=JUNCTION)
-        lanes = [lane for lane in r.road.lanes if self._sees(lane.shape)]
-        for internal in (True, False):
-            mine = [lane for lane in lanes if lane.internal == internal]
-            for colour, less in ((EDGE, -0.2), (ROAD, 0.2)):
-                if internal and colour == EDGE:
-                    continue
-                for lane in mine:
+        lanes = [lane for lane in r.road.lanes if self.sees(lane.shape)]
+        for internal, colour, less in ((True, ROAD, 0.2), (False, EDGE, -0.2), (False, ROAD, 0.2)):
+            for lane in lanes:
+                if lane.internal == internal:
                     width = max(round((lane.width - less) * self._scale), 1)
                     self._pen.line(self._pixels(lane.shape), fill=colour, width=width, joint="curve")
 
@@ -124,31 +123,28 @@ class Strip:
         forecast = r.forecasts[k] if 0 <= k < len(r.forecasts) else None
         if forecast is None:
             return
-        tracks = {t.id: t for t in r.tracks}
+        colours = {t.id: colour_of(t) for t in r.tracks}
         every = max(round(1.0 / forecast.interval), 1)
         for v, name in enumerate(forecast.ids):
             points = np.stack([forecast.x[v], forecast.y[v]], axis=1)
-            if name not in tracks or not self._sees(points):
+            if name not in colours or not self.sees(points):
                 continue
-            colour = colour_of(tracks[name])
+            colour = colours[name]
             self._pen.line(self._pixels(points), fill=(*colour, 190), width=FINE + 1)
+            deviations = np.stack([forecast.along_std[v], forecast.across_std[v]])  # [2,M] m
+            along, across = np.maximum(SIGMAS * deviations, 0.3)
             for m in range(every - 1, len(points), every):
-                along = max(SIGMAS * forecast.along_std[v, m], 0.3)
-                across = max(SIGMAS * forecast.across_std[v, m], 0.3)
-                ring = _ellipse(points[m], along, across, forecast.heading[v, m])
+                ring = _ellipse(points[m], along[m], across[m], forecast.heading[v, m])
                 self._pen.polygon(self._pixels(ring), fill=(*colour, 36), outline=(*colour, 130))
 
     def vehicle(self, p: Pose) -> None:
         """The box, its windscreen, brake lights, and the sensor on an AV's roof."""
-        t = p.track
-        length, w = t.length, t.width
+        t, length, w = p.track, p.track.length, p.track.width
 
         def box(back: float, front: float, side: float) -> list[tuple[float, float]]:
             corners = np.array([[back, -side], [front, -side], [front, side], [back, side]])
             return self._pixels(_placed(corners, p.x, p.y, p.heading))
 
-        if not self._sees(np.array([[p.x, p.y]])):
-            return
         self._pen.polygon(
             box(-length / 2, length / 2, w / 2), fill=colour_of(t), outline=(255, 255, 255), width=FINE
         )
@@ -161,15 +157,12 @@ class Strip:
 
     def choice(self, p: Pose, c: Choice, others: Mapping[str, Pose]) -> None:
         """The command beside the car; a ring where it was vetoed, a line to who was blamed."""
-        if not self._sees(np.array([[p.x, p.y]])):
-            return
         d = c.decision
         if d.vetoed or d.fallback:
             colour = BAD if d.fallback else WARN
             ring = _ellipse(np.array([p.x, p.y]), 0.62 * p.track.length, 0.62 * p.track.length, 0.0)
             self._pen.line(self._pixels(np.concatenate([ring, ring[:1]])), fill=colour, width=2 * FINE)
-            other = others.get(d.blamed or "")
-            if other is not None:
+            if other := others.get(d.blamed or ""):
                 ends = [self._pixel(p.x, p.y), self._pixel(other.x, other.y)]
                 self._pen.line(ends, fill=(*colour, 170), width=FINE)
         glyph = "×" if c.blocked else GLYPHS.get(d.action)

@@ -7,17 +7,20 @@ camera of its own, at equal times since they began.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import av
 import numpy as np
+import numpy.typing as npt
 from PIL import Image, ImageDraw
 
 from cosim.files import whole
-from cosim.recording.watcher import Choice, Watched
+from cosim.recording import Choice
+from cosim.recording.watched import Track, Watched
 from cosim.report.replay.strip import AV, BAD, TEXT, WARN, Colour, Pose, Strip, colour_of, font, poses_at
 from cosim.types import Kind, MetaAction
+from cosim.workers.tasks import Progress
 
 WIDTH, HEIGHT = 1280, 400  # pixels
 PANEL = 124  # pixels of text beneath the road
@@ -37,103 +40,73 @@ ACTIONS = {
 
 
 def film(
-    episodes: Sequence[Watched],
-    path: Path,
-    *,
-    follow: str | None = None,
-    progress: Callable[[float, float], None] | None = None,
+    episodes: Sequence[Watched], path: Path, *, follow: str | None = None, progress: Progress | None = None
 ) -> None:
     """Write the MP4. `follow`: a vehicle's id (default: the mission vehicle, else the first AV).
 
     The file appears whole or not at all. Raises OSError when it cannot be written.
     """
-    reel = _Reel(episodes, follow, picture_at)
-    count = max(round(reel.seconds * RATE) + 1, 1)
     fast = {"movflags": "faststart"}
     with whole(path) as draft, av.open(str(draft), "w", format="mp4", options=fast) as container:
         stream = container.add_stream("libx264", rate=RATE)
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT * len(episodes), "yuv420p"
         stream.options = {"crf": "23", "preset": "veryfast"}
-        for k in range(count):
-            frame = av.VideoFrame.from_ndarray(np.asarray(reel.picture(k / RATE)), format="rgb24")
-            for packet in stream.encode(frame):
-                container.mux(packet)
-            if progress is not None:
-                progress(k + 1, count)
-        for packet in stream.encode():
-            container.mux(packet)
+        for picture in _pictures(episodes, follow, RATE, progress):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        container.mux(stream.encode())
 
 
 def animation(
-    episodes: Sequence[Watched],
-    path: Path,
-    *,
-    follow: str | None = None,
-    progress: Callable[[float, float], None] | None = None,
+    episodes: Sequence[Watched], path: Path, *, follow: str | None = None, progress: Progress | None = None
 ) -> None:
     """Write a small GIF for a page or a slide: roads and outcomes without explanations, twice as fast.
 
     `follow`, the file and errors as in `film`.
     """
-    reel = _Reel(episodes, follow, caption_at)
-    count = max(round(reel.seconds / STEP) + 1, 1)
-    pictures = []
-    for k in range(count):
-        picture = reel.picture(k * STEP)
-        pictures.append(picture.quantize(COLOURS, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE))
-        if progress is not None:
-            progress(k + 1, count)
-    first, *rest = pictures
+    first, *rest = (
+        Image.fromarray(picture).quantize(COLOURS, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+        for picture in _pictures(episodes, follow, 1.0 / STEP, progress, small=True)
+    )
     times = round(1000 * SHOWN)  # ms
     with whole(path) as draft:
         first.save(draft, "GIF", save_all=True, append_images=rest, duration=times, loop=0)
 
 
-class _Reel:
-    """Pictures of all episodes, one above the other."""
-
-    def __init__(
-        self,
-        episodes: Sequence[Watched],
-        follow: str | None,
-        draw: Callable[[Watched, float, _Camera], Image.Image],
-    ) -> None:
-        self._shots = [(r, _Camera(r, follow)) for r in episodes]
-        self._draw = draw
-        self.seconds = max(float(r.times[-1] - r.times[0]) for r in episodes)
-
-    def picture(self, since: float) -> Image.Image:
-        """At `since` s after the beginning of each; who ended earlier stands still."""
-        parts = [
-            self._draw(r, min(float(r.times[0]) + since, float(r.times[-1])), camera)
-            for r, camera in self._shots
-        ]
-        if len(parts) == 1:
-            return parts[0]
-        whole = Image.new("RGB", (parts[0].width, sum(part.height for part in parts)))
-        top = 0
-        for part in parts:
-            whole.paste(part, (0, top))
-            top += part.height
-        return whole
+def _pictures(
+    episodes: Sequence[Watched],
+    follow: str | None,
+    rate: float,
+    progress: Progress | None,
+    *,
+    small: bool = False,
+) -> Iterator[npt.NDArray[np.uint8]]:
+    """`rate` pictures [height,width,3] a second, all episodes one above the other; those that ended earlier
+    stand still."""
+    cameras = [_Camera(r, follow) for r in episodes]
+    count = round(rate * max(float(r.times[-1] - r.times[0]) for r in episodes)) + 1
+    for k in range(count):
+        times = [min(float(r.times[0]) + k / rate, float(r.times[-1])) for r in episodes]
+        shots = zip(episodes, times, cameras, strict=True)
+        yield np.vstack([np.asarray(picture_at(*shot, small=small)) for shot in shots])
+        if progress is not None:
+            progress(k + 1, count)
 
 
 class _Camera:
     """Whom the film follows, and where it looks while that vehicle is not on the road."""
 
     def __init__(self, watched: Watched, follow: str | None) -> None:
-        tracks = watched.tracks
-        wanted = [t for t in tracks if t.id == follow] if follow is not None else []
-        wanted = wanted or [t for t in tracks if t.mission] or [t for t in tracks if t.kind == Kind.AV]
-        self.follow = next(iter(wanted or tracks), None)
+        def rank(t: Track) -> tuple[bool, bool, bool]:
+            return t.id != follow, not t.mission, t.kind != Kind.AV
+
+        self.follow = min(watched.tracks, key=rank, default=None)
         self.x = self.y = 0.0  # m, the middle of the picture
         if self.follow is not None:
             self.x, self.y = float(self.follow.x[0]), float(self.follow.y[0])
 
     def look(self, poses: list[Pose]) -> Pose | None:
         """Move to the followed vehicle; the AV whose decision is explained: itself, else the nearest one."""
-        name = None if self.follow is None else self.follow.id
-        here = next((p for p in poses if p.track.id == name), None)
+        here = next((p for p in poses if self.follow and p.track.id == self.follow.id), None)
         if here is not None:
             self.x, self.y = here.x, here.y
             if here.track.kind == Kind.AV:
@@ -142,50 +115,35 @@ class _Camera:
         return min(avs, key=lambda p: math.hypot(p.x - self.x, p.y - self.y), default=None)
 
 
-def picture_at(r: Watched, time: float, camera: _Camera) -> Image.Image:
-    """One picture of the film, WIDTH x HEIGHT."""
+def picture_at(r: Watched, time: float, camera: _Camera, *, small: bool = False) -> Image.Image:
+    """One picture: of the film, WIDTH x HEIGHT, or the `small` one of the GIF, SMALL x (LOW + CAPTION)."""
     poses = poses_at(r, time)
     shown = camera.look(poses)
-    strip = Strip(camera.x, camera.y, WIDTH, HEIGHT - PANEL)
+    strip = Strip(camera.x, camera.y, *((SMALL, LOW) if small else (WIDTH, HEIGHT - PANEL)))
+    strip.road(r)
     k = int(np.searchsorted(r.decided, time + 1e-6, side="right")) - 1
     choices: Mapping[str, Choice] = r.choices[k] if 0 <= k < len(r.choices) else {}
-    strip.road(r)
-    strip.forecast(r, k)
-    for pose in poses:
-        strip.vehicle(pose)
     by_name = {p.track.id: p for p in poses}
-    for pose in poses:
+    if not small:
+        strip.forecast(r, k)
+    near = [p for p in poses if strip.sees(np.array([[p.x, p.y]]))]
+    for pose in near:
+        strip.vehicle(pose)
+    for pose in () if small else near:
         if pose.track.id in choices:
             strip.choice(pose, choices[pose.track.id], by_name)
         if pose.track.mission or pose is shown:
             strip.name(pose)
-    _crashes(strip, r, time)
-    board = _Board(strip.finished(), PANEL)
-    board.legend(r)
-    board.panel(r, time, camera, by_name, shown, choices)
-    return board.picture
-
-
-def caption_at(r: Watched, time: float, camera: _Camera) -> Image.Image:
-    """One picture of the GIF, SMALL x (LOW + CAPTION)."""
-    poses = poses_at(r, time)
-    camera.look(poses)
-    strip = Strip(camera.x, camera.y, SMALL, LOW)
-    strip.road(r)
-    for pose in poses:
-        strip.vehicle(pose)
-    _crashes(strip, r, time)
-    board = _Board(strip.finished(), CAPTION)
-    board.legend(r)
-    board.caption(r, time)
-    return board.picture
-
-
-def _crashes(strip: Strip, r: Watched, time: float) -> None:
-    """Marks the collisions of the last seconds."""
     for crash in r.collisions:
         if math.isfinite(crash.x) and 0.0 <= time - crash.time + 0.05 < SHOWN_CRASH:
             strip.crash(crash.x, crash.y)
+    board = _Board(strip.finished(), CAPTION if small else PANEL)
+    board.legend(r)
+    if small:
+        board.caption(r, time)
+    else:
+        board.panel(r, time, camera, by_name, shown, choices)
+    return board.picture
 
 
 class _Board:
@@ -199,18 +157,10 @@ class _Board:
 
     def legend(self, r: Watched) -> None:
         """Which colour is who, at the top."""
-        kinds = {
-            "mission vehicle"
-            if t.mission
-            else "AV"
-            if t.kind == Kind.AV
-            else f"human, {t.driver}": colour_of(t)
-            for t in r.tracks
-        }
+        kinds = {"mission vehicle" if t.mission else _kind(t): colour_of(t) for t in r.tracks}
         x = 14.0
         for name, colour in sorted(kinds.items()):
-            box = (x, 12, (x + 18), 20)
-            self._pen.rounded_rectangle(box, 2, fill=colour)
+            self._pen.rounded_rectangle((x, 12, x + 18, 20), 2, fill=colour)
             self._line(x + 23, 8, name, TEXT, 12)
             x += 40 + self._pen.textlength(name, font(12))
 
@@ -244,12 +194,9 @@ class _Board:
         self._line(14, line + 50, f"{time - r.begin:.1f} s of {r.times[-1] - r.begin:.0f} s", TEXT, 14)
         outcome, colour = _outcome(r, time)
         self._line(14, line + 72, outcome, colour, 14)
-        followed = None if camera.follow is None else here.get(camera.follow.id)
-        if camera.follow is not None:
-            t = camera.follow
-            what = "AV" if t.kind == Kind.AV else f"human, {t.driver}"
-            what += ", mission vehicle" if t.mission else ""
-            where = f"{followed.speed:.1f} m/s" if followed is not None else "not on the road"
+        if t := camera.follow:
+            what = _kind(t) + ", mission vehicle" * t.mission
+            where = f"{here[t.id].speed:.1f} m/s" if t.id in here else "not on the road"
             self._line(14, line + 96, f"{t.id} ({what}): {where}", colour_of(t), 13)
         if shown is not None:
             self._decision(470, line, shown, choices.get(shown.track.id))
@@ -261,20 +208,16 @@ class _Board:
             return
         d = c.decision
         self._line(left, top + 8, f"{name}{ACTIONS[d.action]}, target {c.target:.0f} m/s", AV, 14, bold=True)
-        words, colour = [], QUIET
-        if d.vetoed:
-            words, colour = [f"preferred action vetoed, blamed {d.blamed}"], WARN
-        if d.fallback:
-            words, colour = [*words, "no action safe"], BAD
-        if c.blocked:
-            words, colour = [*words, f"command blocked: {c.blocked}"], BAD
-        self._line(left, top + 28, "; ".join(words) or "command executed", colour, 13)
-        rows = [
-            (n, a) for n, a in (("Q", d.q), ("score s", d.safety_score), ("TTC s", d.ttc)) if a is not None
-        ]
-        if not rows:
-            return
-        for a in MetaAction:
+        said = {
+            f"preferred action vetoed, blamed {d.blamed}": WARN if d.vetoed else None,
+            "no action safe": BAD if d.fallback else None,
+            f"command blocked: {c.blocked}": BAD if c.blocked else None,
+        }
+        words = {text: shade for text, shade in said.items() if shade} or {"command executed": QUIET}
+        self._line(left, top + 28, "; ".join(words), [*words.values()][-1], 13)
+        named = (("Q", d.q), ("score s", d.safety_score), ("TTC s", d.ttc))
+        rows = [(name, values) for name, values in named if values is not None]
+        for a in MetaAction if rows else ():
             x = left + 90 + 132 * int(a)
             unsafe = d.unsafe is not None and bool(d.unsafe[a])
             colour = AV if a == d.action else BAD if unsafe else TEXT
@@ -288,6 +231,10 @@ class _Board:
         self, x: float, y: float, text: str, colour: Colour, size: int = 13, *, bold: bool = False
     ) -> None:
         self._pen.text((x, y), text, fill=colour, font=font(size, bold))
+
+
+def _kind(t: Track) -> str:
+    return "AV" if t.kind == Kind.AV else f"human, {t.driver}"
 
 
 def _outcome(r: Watched, time: float) -> tuple[str, Colour]:

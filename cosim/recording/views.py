@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosim.observation import Observer
+from cosim.observation.observer import Observer
 from cosim.recording.file import Recording
 from cosim.road import RoadMap
 from cosim.types import Bools, Floats, History, Ints, Kind, ObservationConfig

@@ -1,4 +1,4 @@
-"""The scripted driver that shows a learner what a gap brings: guided episodes of the training."""
+"""The scripted driver whose actions a learner imitates: the demonstrator of guided episodes."""
 
 from __future__ import annotations
 
@@ -9,31 +9,34 @@ import numpy as np
 from cosim.control import MAX_DECEL, TIME_CONSTANT, next_target, tracked_speeds
 from cosim.types import Floats, Floats32, History, MetaAction, PolicyContext
 from policy.agents.altruist_rule import AltruistRule
-from policy.agents.idm import ACCEL, wished_gap
+from policy.agents.idm import ACCEL, desired_gap
 from policy.meeting import CAR, along
 
-YIELD = 2.0  # his preference for what the scripted altruist commands: all others are below 0
-TIME_GAP = 1.0  # s: he follows by IDM, with a little more than its time gap, which spares him harsh steps
-EAGER = 5.0  # m/s by which he wishes to drive faster than he may: IDM alone creeps up to its desired speed
+YIELD = 2.0  # preference for what the scripted altruist commands: all others are below 0
+TIME_GAP = 1.0  # s: IDM with a little more than its time gap, which avoids harsh steps
+EAGER = 5.0  # m/s above the limit as the desired speed: IDM alone nears its desired speed slowly
 AHEAD = 0.4  # s, over which an action's acceleration is compared with IDM's
 HARD = 3.0  # m/s2: a braking that begins harder than this, and than IDM wishes, costs
 HARSH = 10.0  # m/s2 of misfit
-AS_GOOD = 1.0  # m/s2 of misfit more than the best action's, with which another is no worse advice
-NEVER = -20.0  # m/s2: he changes lanes only to yield
+AS_GOOD = 1.0  # m/s2 of misfit more than the best action's, with which another is as good
+NEVER = -20.0  # m/s2: lane changes only to yield
 LONGITUDINAL = (MetaAction.IDLE, MetaAction.ACCELERATE, MetaAction.DECELERATE)
-FELT = (0.0, 1.4, -2.0)  # m/s2 these stand for in the eyes of who does not know what it is commanded
+APPARENT = (0.0, 1.4, -2.0)  # m/s2 these stand for where the commanded speed is not known
 
 
-class Mentor:
+class Demonstrator:
     """What `AltruistRule` commands where it commands; else the speed limit, or IDM behind a leader.
 
-    An egoist (phi = 0) has a mentor too, who only cruises. A learner that sees maps alone cannot tell an AV
-    that is braking already (Idle will do) from one that is not: its mentor does not look at the command.
+    For an egoist (phi = 0) it only cruises. A learner that sees maps alone cannot tell an AV that is braking
+    already (Idle will do) from one that is not: there the commanded speed is not looked at.
+
+    Args:
+        knows_command: whether the learner's inputs hold the commanded speed.
     """
 
     def __init__(self, knows_command: bool = True) -> None:
         self._rule = AltruistRule()
-        self._fits = self._by_command if knows_command else self._by_sight
+        self._fits = self._by_command if knows_command else self._by_appearance
 
     def reset(self, context: PolicyContext) -> None:
         """A new episode."""
@@ -41,7 +44,7 @@ class Mentor:
         self._road, self._yields = context.road, context.svo > 0.0
 
     def preferences(self, histories: Mapping[str, History]) -> Floats32:
-        """[B,A] in the order of `histories`: the largest is what it would do; the mask still guards it."""
+        """[B,A] in the order of `histories`: the largest is what it would do, mask apart."""
         yielding = self._rule.decide(histories) if self._yields else {}
         q = np.empty((len(histories), len(MetaAction)), np.float32)
         for row, (av, history) in zip(q, histories.items(), strict=True):
@@ -58,7 +61,7 @@ class Mentor:
         leaders = [] if own is None else [(x, v) for x, v in along(history, own) if x > 0.0]
         if leaders:
             ahead, other = min(leaders)
-            press = (wished_gap(speed, other, TIME_GAP) / max(ahead - CAR, 0.5)) ** 2
+            press = (desired_gap(speed, other, TIME_GAP) / max(ahead - CAR, 0.5)) ** 2
         free = 1.0 - (speed / (limit + EAGER)) ** 4
         fits = np.full(len(MetaAction), NEVER, np.float32)
         fits[list(LONGITUDINAL)] = self._fits(ACCEL * (free - press), speed, target, limit)
@@ -75,6 +78,6 @@ class Mentor:
         return np.asarray(-np.abs(got - wished) - HARSH * harsh)
 
     @staticmethod
-    def _by_sight(wished: float, *_: float) -> Floats:
+    def _by_appearance(wished: float, *_: float) -> Floats:
         """[3] m/s2 of LONGITUDINAL: faster, slower or neither, whatever is commanded."""
-        return np.asarray(-np.abs(np.array(FELT) - wished))
+        return np.asarray(-np.abs(np.array(APPARENT) - wished))

@@ -1,4 +1,4 @@
-"""How one result is shown: a short table for people, a run folder to keep."""
+"""One episode's result: a short table to read, a run folder to keep."""
 
 from __future__ import annotations
 
@@ -6,38 +6,38 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from cosim.errors import BadInput
-from cosim.files import whole
+from cosim.files import cannot, whole
 from cosim.types import EpisodeResult, Metric
 
-HEADLINE = (
-    "crashed",
-    "collisions",
-    "av_caused_collisions",
-    "teleports",
-    "emergency_stops",
-    "mission_success",
-    "mission_time_s",
-    "dt_mean_m",
-    "dt_av_m",
-    "dt_mission_m",
-    "min_ttc_s",
-    "hard_brakings_av",
-    "veto_rate",
-    "vehicles_inserted",
-    "vehicles_never_inserted",
-)
+# Columns that the table of an episode shows -> the measure of them that reports and comparisons show first.
+FIRST = {
+    "crashed": "collision_rate",
+    "collisions": "",
+    "av_caused_collisions": "av_caused_collision_rate",
+    "teleports": "",
+    "emergency_stops": "",
+    "mission_success": "mission_success_rate",
+    "mission_time_s": "",
+    "dt_mission_m": "dt_mission_m",
+    "dt_av_m": "dt_av_m",
+    "dt_mean_m": "dt_mean_m",
+    "min_ttc_s": "min_ttc_s",
+    "hard_brakings_av": "hard_brakings_av",
+    "veto_rate": "veto_rate",
+    "vehicles_inserted": "",
+    "vehicles_never_inserted": "",
+}
 
 
 def table(result: EpisodeResult) -> str:
     """A short table with units."""
-    label = f" ({result.label})" if result.label else ""
+    label = f" ({result.policy_label})" if result.policy_label else ""
     lines = [
         f"{result.scenario} / {result.demand} / {result.policy}{label}",
         f"  behaviour {result.behavior}, drivers {result.driver_model}, preset {result.preset}, "
         f"svo {result.svo_deg:g} deg, seed {result.seed}, {result.steps} decisions",
     ]
-    shown = [name for name in HEADLINE if name in result.metrics]
+    shown = [name for name in FIRST if name in result.metrics]
     lines += [f"  {name:<24} {figure(result.metrics[name])}" for name in shown]
     for c in result.collisions:
         who = f"{c.kind}, {'AV-caused' if c.av_caused else 'not AV-caused'}"
@@ -73,14 +73,12 @@ def write_folder(folder: Path, result: EpisodeResult, outputs: Sequence[str] = (
     }
     old = [*folder.glob("replay*.html"), *folder.glob("replay*.mp4"), *folder.glob("replay*.gif")]
     old += [file for file in (folder / "outputs").glob("*.xml") if file.stem not in outputs]
-    try:
+    with cannot("write", file=folder, field="--out"):
         for file in old:
             file.unlink()
         for name, text in texts.items():
             with whole(folder / name) as draft:
                 draft.write_text(text + "\n")
-    except OSError as error:
-        raise BadInput(f"cannot write: {error.strerror}", file=folder, field="--out") from None
 
 
 def figure(metric: Metric) -> str:

@@ -1,0 +1,170 @@
+"""A card for each network that ships: what it is, learned from, measured at, and what it is not good for.
+
+    python -m benchmarks.model_cards [--out docs/models.md]
+
+Made of the JSON cards beside the weights (`policy.checkpoint`), the logs of their trainings and the figures
+of docs/results/data; nothing is driven.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.tables import HEADS, markdown_row, write_page
+from cosim.errors import CosimError
+from policy.agents.approaches import APPROACHES
+from policy.checkpoint import SHIPPED, read_card
+
+Card = Mapping[str, Any]
+RESULTS = Path("docs/results")
+FIGURES = ("collision_rate", "mission_success_rate", "dt_mean_m")
+MAPS_UNUSED = (
+    "It does not use its maps, past or predicted: with every map zeroed 0.1 % of the choices of `vfn-p` "
+    "change (1,172 decisions, contested merge). A difference between `vfn-p` and `vfn` says nothing about "
+    "prediction."
+)
+MAPS_ONLY = "It sees nothing but maps, brakes for whatever is near, and has been trained for minutes only."
+DRIVING_LIMITS = (
+    "It learned from a scripted demonstrator (`altruist-rule` and a cruise rule, docs/training.md) as well "
+    "as from rewards, and chooses as that does in most states: what rewards added is not measured apart.",
+    "The human drivers of its training never err. It knows no traffic light, no speed limit of a junction's "
+    "lane, no pedestrian and no bicycle; in `unguarded` it drives through red lights.",
+)
+PREDICTING_LIMITS = (
+    "It learned from the five worlds alone, with drivers who follow IDM and LC2013 or MOBIL and never err; "
+    "nothing is known of its error on recorded traffic or on other roads.",
+)
+
+
+def names() -> list[str]:
+    """Every network that ships, value networks first."""
+    found = sorted(path.stem for path in SHIPPED.glob("*.safetensors"))
+    return sorted(found, key=lambda name: (name not in APPROACHES, not name.startswith("hpn"), name))
+
+
+def page() -> list[str]:
+    """The Markdown page. Raises BadInput and WeightsMismatch where weights and card do not agree."""
+    cards = {name: read_card(SHIPPED / f"{name}.safetensors") for name in names()}
+    lines = ["# The networks that ship", "", "Made by `python -m benchmarks.model_cards`.", ""]
+    lines += ["Licence: MIT, as the code. Rates and means with 95 % intervals.", ""]
+    for name, card in cards.items():
+        about = driving(name, card) if name in APPROACHES else predicting(name, card)
+        lines += [f"## {name}", "", *about, f"- SHA-256 of `{name}.safetensors`: `{card['sha256']}`", ""]
+    return lines
+
+
+def driving(name: str, card: Card) -> Iterator[str]:
+    """The lines about a value network or a baseline of Table III."""
+    data, approach, folder = card["data"], APPROACHES[name], RESULTS / "trainings" / f"{name}-0"
+    log = [json.loads(line) for line in (folder / "log.jsonl").read_text("utf-8").splitlines()]
+    log = [row for row in log if row["iteration"] <= card["measured"]["iteration"]]
+    training, last = data["training"], log[-1]
+    sees = "kinematics, situation and maps" if approach.kinematics else "maps"
+    predicted = ", predicted maps among them" if approach.predicted_maps else ""
+    mask = "no safety prioritizer" if approach.mask == "none" else f"prioritizer on `{approach.mask}`"
+    yield f"- Chooses an AV's meta-action from {sees}{predicted}; {approach.extractor}, {mask}."
+    phis = ", ".join(f"{phi:g}" for phi in training["svo"])
+    yield (
+        f"- Data: {len(log) * training['episodes']} episodes of {', '.join(data['scenarios'])} up to the "
+        f"shipped iteration, seeds below 100,000, drives with phi {phis} degrees"
+        + (
+            f"; predicted maps of `hpn` (SHA-256 `{data['hpn_sha256'][:12]}`)."
+            if "hpn_sha256" in data
+            else "."
+        )
+    )
+    what = "a2c" if approach.learning == "a2c" else "vfn"
+    yield (
+        f"- Training: `cosim train {what} --policy {name} --scenario all --seed {training['seed']} "
+        f"--iterations {training['iterations']} --config {folder.as_posix()}/config.yaml --out runs/{name}`"
+    )
+    hours = sum(row["iteration_s"] for row in log) / 3600
+    yield (
+        f"- Shipped: iteration {last['iteration']}, after {last['updates']:,} updates and {hours:.1f} h "
+        f"by its log; highest mean reward in {training['validation']} validation drives a case, tuning seeds."
+    )
+    yield from ("- Measured (test seeds, preset `unguarded`):", "", *measured(name), "")
+    yield from (
+        f"- Limit: {text}" for text in (MAPS_UNUSED if approach.kinematics else MAPS_ONLY, *DRIVING_LIMITS)
+    )
+
+
+def measured(name: str) -> Iterator[str]:
+    """A table of one arm's figures: docs/results' decisions and Table III."""
+    rows: dict[tuple[str, str], dict[str, str]] = {}
+    for file in ("table3", "decisions"):
+        with (RESULTS / "data" / f"{file}.csv").open(encoding="utf-8", newline="") as lines:
+            for row in csv.DictReader(lines):
+                if row["arm"] == name and not row["against"] and row["figure"] in FIGURES:
+                    rows.setdefault((row["demand"], row["scenario"]), {})[row["figure"]] = interval(row)
+    yield markdown_row(["demand", "world", *(HEADS[figure] for figure in FIGURES)])
+    yield markdown_row(["---"] * (2 + len(FIGURES)))
+    for (demand, world), found in sorted(rows.items()):
+        yield markdown_row([demand, world, *(found.get(figure, "-") for figure in FIGURES)])
+
+
+def interval(row: Mapping[str, str]) -> str:
+    """One figure with its interval and its episodes, shares in percent."""
+    if not row["value"]:
+        return "-"
+    scale, unit = (100.0, " %") if row["unit"] == "share" else (1.0, f" {row['unit']}")
+    value, low, high = (f"{scale * float(row[key]):.4g}" for key in ("value", "low", "high"))
+    return f"{value}{unit} ({low} to {high}), n {row['n']}"
+
+
+def predicting(name: str, card: Card) -> Iterator[str]:
+    """The lines about a network that predicts: HPN's variants and the trajectory predictors."""
+    data = card["data"]
+    if name.startswith("hpn"):
+        train, check, commands = data["train"], data["validation"], data["commands"]
+        recorded, training = commands["train recordings"], f"`{commands['train']}`"
+        with (SHIPPED / f"{name}.csv").open(encoding="utf-8", newline="") as lines:
+            steps = [row["update"] for row in csv.DictReader(lines)][-1]
+        yield "- Predicts the next velocity maps and kinematics of one AV's surroundings (docs/hpn.md)."
+        page, unit = "docs/results/prediction_maps.md", "loss"
+    else:
+        train, check, steps = data["training"], data["validation"], data["fit"]["steps"]
+        recorded, training = (
+            train["commands"],
+            "`cosim fit-predictors --training DIR --validation DIR --out DIR`",
+        )
+        yield "- Predicts each vehicle's trajectory for 4 s (docs/prediction.md)."
+        page, unit = "docs/results/prediction.md", "m"
+    count = len(recorded)
+    yield f"- Data: {train['episodes']} episodes, recorded by {count} commands such as `{recorded[0]}`."
+    yield f"- Training: {training}, {steps} updates." + (
+        f" {data['note'].capitalize()}." if "note" in data else ""
+    )
+    figures = {k: v for k, v in card["measured"].items() if isinstance(v, float)}
+    text = ", ".join(f"{worded(key)} {value:g} {unit}" for key, value in figures.items())
+    yield f"- Measured on {check['episodes']} validation episodes: {text}. On test seeds: {page}."
+    yield from (f"- Limit: {text}" for text in PREDICTING_LIMITS)
+
+
+def worded(figure: str) -> str:
+    """A figure of a JSON card in words: `position_error_0.2` is the one 0.2 s ahead."""
+    horizon = figure.removeprefix("position_error_")
+    return f"position error {horizon} s ahead" if horizon[0].isdigit() else figure.replace("_", " ")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Write the page."""
+    parser = argparse.ArgumentParser(description="Write the cards of the networks that ship.")
+    parser.add_argument("--out", type=Path, default=Path("docs/models.md"), metavar="FILE")
+    args = parser.parse_args(arguments)
+    try:
+        write_page(args.out, page())
+    except CosimError as error:
+        print(f"model_cards: {error}", file=sys.stderr)
+        return error.exit_code
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

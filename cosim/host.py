@@ -1,0 +1,168 @@
+"""The one place that assembles simulator, episode and policy in a process."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cosim.episode import Episode, Hook, Progress, Step, run_episode
+from cosim.files import code
+from cosim.metrics import MetricFactory, joined
+from cosim.metrics import read as read_metric
+from cosim.policies import make
+from cosim.recording import DRAWN, Recorder
+from cosim.recording.watched import Watched, watched
+from cosim.rewards import Reward, RewardTerms, rewards
+from cosim.rewards import read as read_reward
+from cosim.scenario import Scenario
+from cosim.scenario.manifest import POLICY_FILES, digests
+from cosim.scenario.sumo_outputs import drafts
+from cosim.types import EpisodeResult, Metric, ObservationConfig, Policy, Simulator
+from cosim.workers.determinism import make_torch_deterministic
+
+SimulatorFactory = Callable[[Scenario, Mapping[str, str], int], Simulator]  # ..., AV parameters, frames kept
+
+
+class Host:
+    """One scenario, one policy (a name or an object), any number of episodes; lives in a worker process.
+
+    Args:
+        scenario: what is simulated, vetted.
+        policy: who commands the AVs.
+        svo: phi in rad, told to the policy.
+        observation: what the AVs observe; by default what the policy wants to see.
+        simulator: builds another simulator than SUMO's.
+        metrics: measured besides those of `cosim.metrics.METRICS`: factories, or FILE.py:NAME.
+        reward: reported as the figure `reward_mean`: an object, or what `cosim.rewards.read` knows.
+
+    Raises BadInput for an unknown policy and for input that SUMO refuses.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        policy: str | Policy,
+        svo: float,
+        *,
+        observation: ObservationConfig | None = None,
+        simulator: SimulatorFactory | None = None,
+        metrics: Sequence[str | MetricFactory] = (),
+        reward: str | Reward | None = None,
+    ) -> None:
+        self.policy = make(policy) if isinstance(policy, str) else policy
+        self.svo = svo
+        wanted = observation or self.policy.observation
+        measured = [read_metric(metric) for metric in metrics]
+        self._reward = None if reward is None else read_reward(reward)
+        named = [text for text in (*metrics, reward) if isinstance(text, str) and code.is_code(text)]
+        own = [file for text in named if (file := code.read(text, "").file()) is not None]
+        self._policy_files = digests([*getattr(self.policy, "files", ()), *own])
+        make_torch_deterministic()
+        self.simulator = (simulator or sumo)(scenario, self.policy.av_parameters, wanted.frames)
+        self.episode = Episode(scenario, self.simulator, wanted, measured)
+
+    def policy_files(self) -> dict[str, str]:
+        """SHA-256 by file name: what decides how the policy drives, and a user's metrics and reward."""
+        return self._policy_files
+
+    def run(
+        self,
+        seed: int,
+        progress: Progress | None = None,
+        *,
+        hooks: Sequence[Hook] = (),
+        outputs: Sequence[str] = (),
+        folder: Path | None = None,
+    ) -> EpisodeResult:
+        """One whole episode; SUMO's own `outputs` (`cosim.scenario.sumo_outputs`) go whole into `folder`."""
+        with drafts(outputs, folder) as files:
+            simulator: Any = self.simulator  # files are SUMO's own
+            if files:
+                simulator.write_outputs(files)
+            try:
+                earned = None if self._reward is None else Earnings(self._reward, self.svo)
+                every = [*hooks, *filter(None, [earned])]
+                result = run_episode(
+                    self.episode, self.policy, seed, svo=self.svo, progress=progress, hooks=every
+                )
+                paid = {} if earned is None else {"reward_mean": Metric(earned.mean, "", "higher")}
+                return replace(
+                    result,
+                    metrics=joined(result.metrics, paid),
+                    manifest=result.manifest | {POLICY_FILES: self._policy_files},
+                )
+            finally:
+                if files:
+                    simulator.finish_outputs()
+
+    def watch(
+        self,
+        seed: int,
+        progress: Progress | None = None,
+        *,
+        outputs: Sequence[str] = (),
+        folder: Path | None = None,
+    ) -> tuple[EpisodeResult, Watched]:
+        """`run`, recorded: the same result, and what a replay draws."""
+        recorder = Recorder(self.policy, DRAWN)
+        result = self.run(seed, progress, hooks=[recorder], outputs=outputs, folder=folder)
+        return result, watched(recorder, self.simulator, result.document())
+
+    def close(self) -> None:
+        """End the simulation."""
+        self.simulator.close()
+
+
+class Earnings(Hook):
+    """What the AVs on the road earn by one reward, decision by decision; `svo` (phi) in rad."""
+
+    def __init__(self, reward: Reward, svo: float) -> None:
+        self.reward, self.svo = reward, svo
+        self.totals: list[float] = []
+
+    def on_step(self, episode: Episode, step: Step) -> None:
+        """One decision of every AV that was on the road."""
+        self.totals += [terms.total for terms in self.pay(step, step.before.avs).values()]
+
+    def pay(self, step: Step, avs: Sequence[str]) -> dict[str, RewardTerms]:
+        """What each of `avs` earned in this step."""
+        actions = {av: decision.action for av, decision in step.decisions.items()}
+        happened = step.events.collisions
+        return rewards(step.before, step.after, avs, actions, self.svo, self.reward, happened)
+
+    @property
+    def mean(self) -> float | None:
+        """Per AV and decision; None where no AV was on the road."""
+        return float(np.mean(self.totals)) if self.totals else None
+
+
+class Hosts:
+    """One host at a time: its next seed costs a reset, another host a start."""
+
+    def __init__(self) -> None:
+        self._host: Host | None = None
+        self._key: object = None
+
+    def host(self, key: object, build: Callable[[], Host]) -> Host:
+        """The present host where it is the one of this `key`, else what `build` makes."""
+        if self._host is None or key != self._key:
+            self.close()  # one simulation per process: the old one must go first
+            self._host, self._key = build(), key
+        return self._host
+
+    def close(self) -> None:
+        """End the simulation."""
+        host, self._host = self._host, None
+        if host is not None:
+            host.close()
+
+
+def sumo(scenario: Scenario, av_parameters: Mapping[str, str], history: int) -> Simulator:
+    """SUMO in this process; `history`: frames of the warm-up that a reset returns."""
+    from cosim.simulation.sumo import SumoSimulator  # libsumo: in the worker's process alone
+
+    return SumoSimulator(scenario, av_parameters=av_parameters, history=history)

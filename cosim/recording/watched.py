@@ -1,0 +1,90 @@
+"""A recorded episode as it is drawn: every vehicle's track, every decision and what became of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from cosim.recording.recorder import Choice, Recorder
+from cosim.road import RoadMap
+from cosim.scenario.behaviors import AS_IS
+from cosim.types import Collision, Floats, Forecast, Ints, Kind, Simulator
+
+
+@dataclass(frozen=True)
+class Track:
+    """One vehicle's drive without a gap, k frames from frame `first` on."""
+
+    id: str
+    kind: Kind
+    mission: bool
+    driver: str  # an HV's class of Table II, or "as-is"; for drawing only
+    length: float  # m
+    width: float  # m
+    first: int
+    x: Floats  # [k] m, centre
+    y: Floats  # [k] m
+    heading: Floats  # [k] rad
+    speed: Floats  # [k] m/s
+    accel: Floats  # [k] m/s2
+    lane: Ints  # [k] index into the road's lanes, -1 off every lane
+
+
+@dataclass(frozen=True)
+class Watched:
+    """One episode to be drawn; times in s of simulation time."""
+
+    facts: Mapping[str, Any]  # the document of `cosim run --json`
+    road: RoadMap
+    begin: float  # s, when the counted time began
+    interval: float  # s between frames
+    times: Floats  # [T] s
+    tracks: tuple[Track, ...]
+    decided: Floats  # [D] s, when decisions were taken
+    choices: tuple[Mapping[str, Choice], ...]  # [D] AV -> choice
+    forecasts: tuple[Forecast | None, ...]  # [D] what the policy predicted then
+    collisions: tuple[Collision, ...]
+    goal: frozenset[int] = frozenset()  # lanes on which the mission is fulfilled
+
+
+def watched(recorder: Recorder, simulator: Simulator, facts: Mapping[str, Any]) -> Watched:
+    """The counted time of the recorded episode, driven on `simulator`."""
+    times = np.array([s.time for s in recorder.frames[recorder.first :]])
+    # only SUMO's simulator knows them
+    drivers: Mapping[str, str] = getattr(simulator, "driver_classes", dict)()
+    return Watched(
+        facts=facts,
+        road=simulator.road,
+        begin=float(times[0]),
+        interval=float(times[1] - times[0]) if len(times) > 1 else 0.0,
+        times=times,
+        tracks=tuple(tracks(recorder, drivers)),
+        decided=np.array(recorder.decided),
+        choices=tuple(recorder.choices),
+        forecasts=tuple(recorder.forecasts),
+        collisions=tuple(recorder.collisions),
+        goal=simulator.goal_lanes,
+    )
+
+
+def tracks(recorder: Recorder, drivers: Mapping[str, str]) -> list[Track]:
+    """One for every stretch of frames in which a vehicle is on the road; `drivers`: each HV's class by id."""
+    body, motion = ("kind", "mission", "length", "width"), ("x", "y", "heading", "speed", "accel")
+    ids, frame, vehicle, table = recorder.vehicles(*body, *motion, "lane")
+    counted = np.flatnonzero(frame >= recorder.first)
+    gaps = np.flatnonzero((np.diff(vehicle[counted]) != 0) | (np.diff(frame[counted]) > 1)) + 1
+    found = []
+    for rows in np.split(counted, gaps) if len(counted) else ():
+        name, first, last = ids[vehicle[rows[0]]], int(frame[rows[0]]), rows[-1]
+        kind = Kind(int(table["kind"][last]))
+        driver = "" if kind == Kind.AV else drivers.get(name, AS_IS)
+        size = float(table["length"][last]), float(table["width"][last])
+        # single precision: 1 mm in 10 km
+        poses = {column: table[column][rows].astype(np.float32).astype(np.float64) for column in motion}
+        lane = table["lane"][rows].astype(np.int64)
+        mission = bool(table["mission"][last])
+        found.append(Track(name, kind, mission, driver, *size, first - recorder.first, lane=lane, **poses))
+    return found

@@ -1,0 +1,50 @@
+"""What both ways of learning have: a value network, its optimiser, and steps towards demonstrations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from policy.seeded import seeded
+from policy.training.networks import Optimized
+from policy.training.replay_buffer import Advised
+from policy.vfn import VFN, VfnConfig
+
+Metrics = dict[str, float]
+
+
+class Learner(Optimized):
+    """The network that is trained (`online`) and its optimiser.
+
+    Args:
+        vfn: layout of the network.
+        config: optimisation; both kinds have `learning_rate`, `clip` and `imitation`.
+        seed: of the first weights.
+        device: of torch.
+    """
+
+    def __init__(self, vfn: VfnConfig, config: Any, seed: int, device: str = "cpu") -> None:
+        self.config, self.device = config, device
+        self.online: VFN = seeded(lambda: VFN(vfn), seed)
+        self.online.to(device=device, memory_format=self.online.layout)  # type: ignore[call-overload]
+        adam = torch.optim.Adam(self.online.parameters(), lr=config.learning_rate)
+        super().__init__({"online": self.online}, adam, config.clip)
+        self.updates = 0
+
+    @property
+    def imitates(self) -> bool:
+        """Whether demonstrations are learned from."""
+        return bool(self.config.imitation > 0.0)
+
+    def imitate(self, batch: Advised) -> float:
+        """One step towards the demonstrations alone; returns how far they are followed, 0 to 1."""
+        raise NotImplementedError
+
+
+def mean_metrics(each: Sequence[Metrics]) -> Metrics:
+    """Means of metrics with the same names."""
+    means = np.array([list(one.values()) for one in each]).mean(0)
+    return dict(zip(each[0], means.tolist(), strict=True))

@@ -1,0 +1,134 @@
+"""Who learns when from what: DDQN from the replay buffer while others drive, A2C from what they just drove.
+
+Both learn from demonstrations first, where their configuration wants it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from cosim.seeding import generator, subseed
+from policy.training.a2c import A2cLearner
+from policy.training.curriculum import VfnTraining, interpolated
+from policy.training.ddqn import DdqnLearner
+from policy.training.experience import Trajectory
+from policy.training.learner import Learner, Metrics, mean_metrics
+from policy.training.replay_buffer import ReplayBuffer
+from policy.vfn import VfnConfig
+
+
+class Trainer:
+    """One learner and its replay buffer; `TrainingRun` asks it in every iteration `k`.
+
+    Args:
+        config: the schedule.
+        vfn: layout of the network.
+        learner: what is trained.
+        device: of torch.
+    """
+
+    keeps = True  # whether the trajectories of this iteration join the replay buffer
+
+    def __init__(self, config: VfnTraining, vfn: VfnConfig, learner: Learner, device: str) -> None:
+        self.config, self.learner, self.device = config, learner, device
+        self.kinematic = vfn.kinematic
+        self.replay = ReplayBuffer(config.replay)
+
+    def epsilon(self, k: int) -> float:
+        """Share of random actions."""
+        return interpolated(self.config, self.config.epsilon, k)
+
+    def guided(self, k: int) -> float:
+        """Share of the episodes that the demonstrator drives."""
+        raise NotImplementedError
+
+    def learn_meanwhile(self, k: int) -> Metrics:
+        """Learn what does not wait for this iteration's trajectories."""
+        return {}
+
+    def learn_afterwards(self, k: int, drives: Sequence[Trajectory], kept: bool) -> Metrics:
+        """Learn from these trajectories, which are in the replay buffer if they were `kept`."""
+        return {}
+
+    @property
+    def _prefilling(self) -> bool:
+        """Whether the replay buffer holds less than is wanted before anything is learned."""
+        c = self.config
+        return self.replay.size < (max(c.prefill, c.warm_up_after) if self.learner.imitates else c.prefill)
+
+    def _imitate(self, rng: np.random.Generator, maps: bool) -> float:
+        return self.learner.imitate(self.replay.advised(rng, maps, self.device))
+
+    def _warm_up(self, k: int) -> np.random.Generator:
+        """The generator of iteration `k`, after the steps towards the demonstrations alone (with maps for a
+        network that has no other input), if these are due."""
+        rng = generator(self.config.seed, "replay", str(k))
+        if not self.learner.updates and self.learner.imitates:
+            for _ in range(self.config.warm_up):
+                self._imitate(rng, not self.kinematic)
+        return rng
+
+
+class OffPolicyTrainer(Trainer):
+    """P, algorithm 4: fill the replay buffer by chance, imitate, then so many updates an iteration."""
+
+    learner: DdqnLearner
+
+    def epsilon(self, k: int) -> float:
+        """Share of random actions: all, while the replay buffer is filled."""
+        return 1.0 if self._prefilling else super().epsilon(k)
+
+    def guided(self, k: int) -> float:
+        """Share of the episodes that the demonstrator drives."""
+        return interpolated(self.config, self.config.guided, k)
+
+    def learn_meanwhile(self, k: int) -> Metrics:
+        """This iteration's updates, on what the replay buffer holds."""
+        if self._prefilling:
+            return {}
+        learner, rng = self.learner, self._warm_up(k)
+        if not learner.updates:
+            learner.update_target()
+        losses, agrees = [], []
+        for _ in range(self.config.updates):
+            losses.append(learner.update(self.replay.sample(rng, self.device)))
+            if learner.imitates and self.kinematic:  # without kinematics an update costs no more
+                agrees.append(self._imitate(rng, False))
+        return _named(mean_metrics(losses)) | ({"agrees": float(np.mean(agrees))} if agrees else {})
+
+
+class OnPolicyTrainer(Trainer):
+    """T's A2C: each trajectory is learned from once. Demonstrations are kept until they were learned from."""
+
+    learner: A2cLearner
+
+    def guided(self, k: int) -> float:
+        """Share of the episodes that the demonstrator drives."""
+        return float(self.keeps)
+
+    @property
+    def keeps(self) -> bool:  # type: ignore[override]
+        """Whether more demonstrations are wanted; without any the replay buffer stays empty."""
+        return self.learner.imitates and self._prefilling
+
+    def learn_afterwards(self, k: int, drives: Sequence[Trajectory], kept: bool) -> Metrics:
+        """A pass over its own trajectories; after the last demonstration, the steps towards all of them."""
+        if not kept:
+            return _named(self.learner.learn(drives, generator(self.config.seed, "order", str(k))))
+        if not self.keeps:
+            self._warm_up(k)
+        return {}
+
+
+def make_trainer(config: VfnTraining, vfn: VfnConfig, device: str) -> Trainer:
+    """The one of `config.learning`."""
+    seed = subseed(config.seed, "network") % 2**31
+    if config.learning == "a2c":
+        return OnPolicyTrainer(config, vfn, A2cLearner(vfn, config.a2c, seed, device), device)
+    return OffPolicyTrainer(config, vfn, DdqnLearner(vfn, config.ddqn, seed, device), device)
+
+
+def _named(metrics: Metrics) -> Metrics:
+    return {f"loss/{name}": value for name, value in metrics.items()}

@@ -1,0 +1,160 @@
+"""A world, a reward, a metric, a predictor and a policy of a user's, none of them in our packages."""
+
+from __future__ import annotations
+
+import shutil
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import cosim
+import sumo_scenarios
+from cosim import metrics, rewards
+from cosim.errors import BadInput
+from cosim.policies import make
+from cosim.scenario import load, place
+from cosim.simulation.fake import FakeSimulator, FakeVehicle
+from policy.predictors import make_predictor
+
+CODE = """
+from cosim.types import Decision, Metric, MetaAction, ObservationConfig
+from policy.predictors.constant import ConstantSpeed
+
+def by_speed(step):
+    now = step.after
+    return {av: float(now.speed[now.row[av]]) if av in now.row else 0.0 for av in step.avs}
+
+def forgetful(step): return {}
+
+def divides(step): return 1 / 0
+
+class Frames:
+    def reset(self, first, context): self.frames = 0
+    def add(self, snapshot): self.frames += 1
+    def result(self): return {"frames": Metric(self.frames, "frames", "")}
+
+class Crashed(Frames):
+    def result(self): return {"crashed": Metric(False, "", "lower")}
+
+class Brakes:
+    observation = ObservationConfig(maps=False)
+    def reset(self, context): ...
+    def decide(self, histories): return {av: MetaAction.DECELERATE for av in histories}
+
+class Slower(ConstantSpeed):
+    name = "slower"
+    def predict(self, kinematics, valid): return super().predict(0.5 * kinematics, valid)
+
+class Breaks(ConstantSpeed):
+    def predict(self, kinematics, valid): return kinematics[99]
+"""
+
+
+@pytest.fixture(scope="module")
+def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder outside the package: the world `mine`, which is merge by another name, and code.py."""
+    folder = tmp_path_factory.mktemp("own")
+    world = folder / "mine"
+    shutil.copytree(sumo_scenarios.folder("merge"), world)
+    (world / "merge.sumocfg").rename(world / "mine.sumocfg")
+    definition = world / "scenario.yaml"
+    definition.write_text(definition.read_text().replace("name: merge", "name: mine"))
+    (folder / "code.py").write_text(CODE)
+    return folder
+
+
+def one_av(*_: object) -> FakeSimulator:
+    return FakeSimulator([FakeVehicle("av", 50.0, 0, 20.0, is_av=True)], length=520.0)
+
+
+def test_a_world_is_a_folder_wherever_it_lies(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    theirs, ours = load(str(own / "mine"), demand=["contested"]), load("merge", demand=["contested"])
+    assert (theirs.name, theirs.behavior) == ("mine", ours.behavior)
+    assert theirs.demand[0] == own / "mine" / "demand" / "contested.rou.xml"
+    monkeypatch.chdir(own)
+    assert place("mine") == str(own / "mine")
+    assert place("merge") == "merge"
+
+
+def test_a_world_may_not_be_called_as_one_that_ships(own: Path, tmp_path: Path) -> None:
+    shutil.copytree(sumo_scenarios.folder("exit"), tmp_path / "exit")
+    with pytest.raises(BadInput, match=r"scenario\.yaml: name='exit': a world that ships is called so"):
+        load(str(tmp_path / "exit"))
+    with pytest.raises(BadInput, match=r"a world's folder holds scenario\.yaml"):
+        load(str(own))
+
+
+def test_reward_metric_and_policy_of_ones_own_drive_in_a_world_of_ones_own(own: Path) -> None:
+    code = f"{own}/code.py"
+    words = {"demand": "contested", "seed": 100_007, "others": partial(make, f"{code}:Brakes")}
+    with cosim.open("merge", **words) as session:
+        session.reset()
+        session.act({})
+        ours = session.result()
+    words |= {"reward": f"{code}:by_speed", "metrics": [f"{code}:Frames"]}
+    with cosim.open(str(own / "mine"), **words) as session:
+        before = session.reset()
+        step = session.act({})
+        now = session.snapshot()
+        theirs = session.result()
+        timing = session.scenario.timing
+    assert (theirs.scenario, theirs.trace_hash) == ("mine", ours.trace_hash)
+    assert step.rewards == {av: now.speed[now.row[av]] for av in before}
+    assert {av: terms.ego for av, terms in step.terms.items()} == step.rewards
+    assert set(step.receipts) == set(before), "the policy commands them all"
+    assert theirs.metrics["frames"].value == round(timing.decision / timing.frame)
+
+
+def test_a_share_of_all_vehicles_may_be_avs(own: Path) -> None:
+    with cosim.open(str(own / "mine"), penetration=0.0) as session:
+        assert session.reset(100_007) == {}
+    with pytest.raises(BadInput, match=r"av_type='av': excludes penetration"):
+        cosim.open("merge", penetration=0.5, av_type="av")
+
+
+@pytest.mark.parametrize(
+    ("reward", "metric", "said"),
+    [
+        ("by_speed", "Frames", "reward='by_speed': unknown"),
+        ("{code}:forgetful", "Frames", "reward=[]: must pay each of"),
+        ("{code}:divides", "Frames", "code.py:11: divides: ZeroDivisionError"),
+        ("p", "Crashed", "metric='crashed': another metric has a figure of this name"),
+        ("t", "by_speed", "code.py: reset: AttributeError"),
+    ],
+)
+def test_a_mistake_in_it_is_one_line(own: Path, reward: str, metric: str, said: str) -> None:
+    code = f"{own}/code.py"
+    words = {"reward": reward.format(code=code), "metrics": [f"{code}:{metric}"], "simulator": one_av}
+
+    def go() -> None:
+        with cosim.open(str(own / "mine"), worker=False, **words) as session:
+            session.reset(100_007)
+            session.act({})
+            session.result()
+
+    with pytest.raises(BadInput) as refused:
+        go()
+    assert said in str(refused.value)
+
+
+def test_what_cannot_be_imported_elsewhere_is_refused() -> None:
+    with pytest.raises(BadInput, match="must be importable, or worker=False"):
+        cosim.open("merge", reward=lambda _: {})
+
+
+def test_texts_name_what_tables_hold_and_what_files_hold(own: Path) -> None:
+    for name in rewards.REWARDS:
+        assert rewards.read(name) == rewards.RewardConfig(variant=name)
+    assert metrics.read(f"{own}/code.py:Frames")().result  # a fresh one each time
+    predictor = make_predictor(f"{own}/code.py:Slower", 20, 0.2)
+    state = np.zeros((3, 10, 4))
+    state[:, :, 2] = 12.0
+    everywhere = np.ones((3, 10), bool)
+    half = make_predictor("cs", 20, 0.2).predict(0.5 * state, everywhere)
+    np.testing.assert_array_equal(predictor.predict(state, everywhere).x, half.x)
+    with pytest.raises(BadInput, match=r"code\.py:\d+: predict: IndexError"):
+        make_predictor(f"{own}/code.py:Breaks", 20, 0.2).predict(state, everywhere)
+    with pytest.raises(BadInput, match=r"code\.py: Brakes: TypeError"):
+        make_predictor(f"{own}/code.py:Brakes", 20, 0.2)

@@ -22,6 +22,7 @@ from cosim.types import Bools, Floats, Ints, Snapshot
 
 Number = float | npt.NDArray[Any]
 INF = np.inf
+_Course = tuple[Any, Any, Any, Any, Any, Any, Any]  # x, y, cos and sin of the heading, speed, sizes
 EVERYWHERE: Bools = np.ones((1, 1), np.bool_)  # one road, on which all can touch
 
 
@@ -94,10 +95,9 @@ def first_contacts(a: Boxes, b: Boxes, dt: float) -> Floats:
     Returns:
         [k,n] s from the first frame on, inf without a contact.
     """
-    courses: list[Any] = []
-    for c in (a, b):
-        courses += c.x, c.y, np.cos(c.heading), np.sin(c.heading), c.speed, c.length, c.width
-    return kernels.first_contacts(*courses, dt)
+    mine: _Course = (a.x, a.y, np.cos(a.heading), np.sin(a.heading), a.speed, a.length, a.width)
+    theirs: _Course = (b.x, b.y, np.cos(b.heading), np.sin(b.heading), b.speed, b.length, b.width)
+    return kernels.first_contacts(*mine, *theirs, dt)
 
 
 def deceleration_to_avoid_crash(a: Boxes, b: Boxes) -> Floats:
@@ -135,9 +135,13 @@ def conflicts(
         horizon: s, how far ahead.
         roads: each vehicle's road [n] and which roads can touch [S,S] (`cosim.road.contact`); None: all can.
     """
-    columns: list[Any] = [np.asarray(v, dtype=np.float64) for v in all_boxes]
-    number, touch = (np.zeros(len(watched), np.int64), EVERYWHERE) if roads is None else roads
-    return Conflicts(*kernels.watched_conflicts(*columns, watched, float(horizon), number, touch))
+    x, y, heading, length, width, speed = (np.asarray(v, dtype=np.float64) for v in all_boxes)
+    number, touch = (np.zeros(len(x), np.int64), EVERYWHERE) if roads is None else roads
+    return Conflicts(
+        *kernels.watched_conflicts(
+            x, y, heading, length, width, speed, watched, float(horizon), number, touch
+        )
+    )
 
 
 def gap_ahead(

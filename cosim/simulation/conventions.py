@@ -1,4 +1,4 @@
-"""Converts SUMO's positions and angles of vehicles to ours, without SUMO, so that files can be read with it."""
+"""Converts SUMO's positions and angles of vehicles to ours; needs no SUMO: file readers use it too."""
 
 from __future__ import annotations
 

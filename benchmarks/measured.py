@@ -98,6 +98,13 @@ def reward_balance(place: Place) -> list[list[str]]:
     return [["benchmarks.reward_balance", *flags, "--out", str(place.out / "reward_balance.md")]]
 
 
+def reward_by_driving(place: Place) -> list[list[str]]:
+    """What each way of driving earns."""
+    flags = ["--ways", "--workers", "2", "--seeds", "150100:150101" if place.small else "150100:150106"]
+    flags += ["--scenario", "merge"] if place.small else []
+    return [["benchmarks.reward_balance", *flags, "--out", str(place.out / "reward_by_driving.md")]]
+
+
 def attribution(place: Place) -> list[list[str]]:
     """Which inputs the shipped value networks use."""
     flags = ["--scenario", "merge", "--demand", "contested", "--workers", "2"]
@@ -124,6 +131,7 @@ PAGES = (
     Page("performance", performance, ("performance.md",)),
     Page("startup", startup, ("startup.md",)),
     Page("reward_balance", reward_balance, ("reward_balance.md",)),
+    Page("reward_by_driving", reward_by_driving, ("reward_by_driving.md",)),
     Page(
         "attribution",
         attribution,

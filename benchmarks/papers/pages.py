@@ -28,6 +28,16 @@ from cosim.seeding import FIRST_TEST_SEED
 from cosim.workers.tasks import OK
 from policy.checkpoint import read_card
 
+# Until the networks are replaced: first on every page that drives them, in results/README.md and the README.
+SAID_FIRST = (
+    "**Until the networks are replaced:** the value networks of `vfn-p`, `vfn` and `vfn-p-egoistic` do not",
+    "use their maps, past or predicted: what a map shows changes none of their choices, or hardly one",
+    "(`docs/results/attribution.md`, by `cosim bench attribution --policy vfn-p --scenario merge --demand",
+    "contested --seeds 150000:150006 --out DIR`). So `vfn-p` against `vfn` does not measure what predicted",
+    "maps are worth. All value networks learned from a scripted demonstrator (`docs/training.md`); none was",
+    "trained on rewards alone. On real networks with signals the preset `unguarded` drives unlawfully,",
+    "through red lights and faster than lanes allow.",
+)
 STYLE: Any = {"svg.fonttype": "none", "svg.hashsalt": "cosim", "font.size": 9.0}  # equal figures, equal file
 
 
@@ -88,11 +98,13 @@ def run_jobs(jobs: Sequence[Job], settings: Settings, dry_run: bool = False) -> 
 
 
 def heading(job: Job, results: Results, settings: Settings, *more: str) -> list[str]:
-    """Title, command, what it rests on, and what is not there."""
+    """Title, what is said first of networks, command, what it rests on, and what is not there."""
     rows = [row for one in results.driven for row in one.rows]
     wrong = sum(row["status"] != OK for row in rows)
     command = f"Made by `{job.command}{settings.flags}`, resumable"
-    lines = [f"# {job.title}", "", f"{command}; figures in `data/{job.name}.csv`."]
+    weights = networks(results, settings)
+    lines = [f"# {job.title}", "", *([*SAID_FIRST, ""] if weights else [])]
+    lines += [f"{command}; figures in `data/{job.name}.csv`."]
     lines += [
         f"Preset `unguarded`, drivers `lc2013`, equal seeds from {settings.first:,} on. Rates with Wilson,",
         "means with bootstrap, differences of pairs with Tango's and bootstrap 95 % intervals; p: McNemar.",
@@ -104,7 +116,7 @@ def heading(job: Job, results: Results, settings: Settings, *more: str) -> list[
         lines += [
             "Of every arm as many episodes as were driven so far (n); pairs on the seeds that both have."
         ]
-    if weights := networks(results, settings):
+    if weights:
         lines += ["", *weights]
     if settings.untrained:
         lines += ["", "**Untrained networks: this page shows that the machinery works, and nothing else.**"]

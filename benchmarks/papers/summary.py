@@ -18,6 +18,7 @@ from benchmarks.papers.claims import APPROACHES, MERGING_ALTRUISTIC, MERGING_EGO
 from benchmarks.papers.driving import WORLDS, Settings, add_arguments, settings_of
 from benchmarks.papers.figure9 import BEHAVIORS
 from benchmarks.papers.guide import OVERTAKES, SLOWS, YIELDS
+from benchmarks.papers.pages import SAID_FIRST
 from benchmarks.tables import write_page
 from cosim.learning.bench_predict import LED
 
@@ -86,6 +87,8 @@ def write(settings: Settings) -> None:
     out = settings.out
     page = [
         "# What the papers claimed, and what we found",
+        "",
+        *SAID_FIRST,
         "",
         "P: Valiente et al., prediction-aware cooperative driving. T: Toghi et al., altruistic maneuver",
         "planning. Both simulate with HighwayEnv, we with SUMO; worlds and demands are ours. The column",

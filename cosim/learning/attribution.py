@@ -120,7 +120,7 @@ def markdown(
             for name, mine in groupby(rows, itemgetter("input"))
         }
         never = ", ".join(name for name, x in largest.items() if x == 0.0) or "none"
-        some = [f"{name} {100 * x:.1f} %" for name, x in sorted(largest.items(), key=itemgetter(1)) if x]
+        some = [f"{name} {100 * x:.2g} %" for name, x in sorted(largest.items(), key=itemgetter(1)) if x]
         page += [f"- `{policy}`: inputs that change no choice, whatever replaces them: {never}."]
         page += [f"  Largest share of the choices that a replacement changes: {', '.join(some) or '0 %'}."]
     e = driven[0]

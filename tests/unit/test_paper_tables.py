@@ -12,6 +12,7 @@ from benchmarks.papers import guide, summary, table3
 from benchmarks.papers.claims import APPROACHES
 from benchmarks.papers.driving import Settings
 from benchmarks.papers.guide import NONE, OTHER, OVERTAKES, SLOWS, YIELDS, guided
+from benchmarks.papers.pages import SAID_FIRST
 from benchmarks.tables import Line, write_csv
 from cosim.recording.watched import Track, Watched
 from cosim.report.run_folder import Run
@@ -21,6 +22,8 @@ from policy.predictors import PREDICTORS
 
 INTERVAL = 0.2  # s
 LANES = (1.6, 4.8, 8.0)  # m, the middles of the acceleration lane and of the two main lanes
+ROOT = Path(__file__).parents[2]
+SAID_ON = ("README", "table3", "figure9", "decisions", "phi")
 FRAMES, MERGE = 100, 60  # of a made-up drive, and the one in which the merging vehicle is on the main road
 
 
@@ -179,3 +182,9 @@ def test_the_guide_is_the_nearest_and_an_episode_without_a_merge_has_none() -> N
     watched = drive(near)
     alone = [t for t in watched.tracks if not t.mission]
     assert guide.guided(Watched(**{**vars(watched), "tracks": tuple(alone)})).merged is None
+
+
+@pytest.mark.parametrize("page", ["README.md", *(f"docs/results/{name}.md" for name in SAID_ON)])
+def test_what_is_known_of_the_networks_stands_before_their_figures(page: str) -> None:
+    text = (ROOT / page).read_text(encoding="utf-8")
+    assert "\n".join(SAID_FIRST) in text[:1500]

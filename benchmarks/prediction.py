@@ -27,9 +27,9 @@ from cosim.recording import Folder, windows
 from cosim.report import statistics
 from cosim.types import Floats
 from cosim.workers.memory import keep_freed_memory
-from policy.forecast import integrate_position
-from policy.gaussian_process import HEADING, SPEED, BankConfig, GaussianProcessBank
-from policy.maximum_likelihood import fit_series
+from policy.prediction.forecast import integrate_position
+from policy.prediction.gaussian_process import HEADING, SPEED, BankConfig, GaussianProcessBank
+from policy.prediction.maximum_likelihood import fit_series
 from policy.predictors.gp import GaussianProcessIndirect
 
 PLAIN = BankConfig(1.0, (0.2, 1.0, 3.0), (0.5, 2.0), (1.0, 2.5), (0.02, 0.2))  # no drifts, no prior

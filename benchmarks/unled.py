@@ -11,7 +11,7 @@ import torch
 from cosim.types import Floats32, History, MetaAction, PolicyContext
 from policy.agents.approaches import AgentConfig
 from policy.agents.prediction_aware import Inputs, PredictionAware
-from policy.tensors import States
+from policy.inputs.tensors import States
 
 
 class Unled(PredictionAware):

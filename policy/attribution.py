@@ -11,7 +11,7 @@ import torch
 
 from cosim.types import Decision, Floats, Floats32, Ints, PolicyContext
 from policy.agents.prediction_aware import Inputs, PredictionAware
-from policy.tensors import States, svo_tensor, to_numpy
+from policy.inputs.tensors import States, svo_tensor, to_numpy
 
 ANGLES = (0, 90)  # degrees that replace phi: the egoist's, and the other end
 

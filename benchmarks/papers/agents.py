@@ -17,8 +17,8 @@ from policy.agents import APPROACHES, make
 from policy.agents.approaches import AgentConfig, compact, shipped
 from policy.agents.prediction_aware import PredictionAware
 from policy.checkpoint import sha256
+from policy.networks.vfn import VFN, VfnConfig
 from policy.safety import SafetyConfig
-from policy.vfn import VFN, VfnConfig
 
 PERCEPTION = 125.0  # m, what an AV's own sensors reach (definitions.md)
 

@@ -17,7 +17,7 @@ from cosim.report import statistics
 from cosim.road import RoadMap
 from cosim.types import Floats
 from cosim.workers.progress import shown
-from policy.forecast import KinematicForecast
+from policy.prediction.forecast import KinematicForecast
 from policy.predictors import PREDICTORS, Predictor, make_predictor
 from policy.predictors.lane import along_lanes
 

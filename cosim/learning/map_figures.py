@@ -15,8 +15,8 @@ from cosim.learning.prediction_data import Followed, followed
 from cosim.recording import Folder, read
 from cosim.road import RoadMap
 from cosim.types import COMPACT, Bytes, Floats32
-from policy.inner_features import painted
-from policy.map_error import MapPredictors, frame_of, unit_maps, vehicle_channels
+from policy.networks.inner_features import painted
+from policy.prediction.map_error import MapPredictors, frame_of, unit_maps, vehicle_channels
 from policy.predictors import make_predictor
 
 SHOWN = (0.2, 1.0, 2.0, 3.0, 4.0)  # s, columns of a chain's picture

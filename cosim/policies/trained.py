@@ -10,12 +10,12 @@ from cosim.scenario.policy_name import PolicyName
 from cosim.types import COMPACT, PAPER, ObservationConfig
 from policy.agents.approaches import APPROACHES, AgentConfig, configure, shipped
 from policy.agents.prediction_aware import PredictionAware
-from policy.chain import ChainConfig
 from policy.checkpoint import read_card, sha256
-from policy.hpn import HpnConfig
+from policy.networks.hpn import HpnConfig
+from policy.networks.vfn import VfnConfig
+from policy.prediction.chain import ChainConfig
+from policy.prediction.traffic import TrafficConfig
 from policy.safety import SafetyConfig
-from policy.traffic import TrafficConfig
-from policy.vfn import VfnConfig
 
 OTHER_HPN = "trained with another HPN"
 Section = TypeVar("Section")

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from cosim.types import Decision, History, MetaAction, PolicyContext
 from policy.agents.idm import Idm, desired_gap
-from policy.meeting import CAR, LANE, Meeting, Seen, along, meet, missions
+from policy.inputs.meeting import CAR, LANE, Meeting, Seen, along, meet, missions
 
 # When the guide yields and how much; m, m/s
 BEHIND_MIN = -5.0  # a guide this far ahead of the mission vehicle can still fall back

@@ -6,13 +6,13 @@ from pathlib import Path
 from cosim.errors import BadInput
 from cosim.types import COMPACT, PAPER, ObservationConfig
 from policy.agents import APPROACHES as APPROACHES
-from policy.chain import ChainConfig
 from policy.checkpoint import SHIPPED
-from policy.hpn import HpnConfig
+from policy.inputs.tensors import APART_OF
+from policy.networks.hpn import HpnConfig
+from policy.networks.vfn import TABLE_1, VfnConfig
+from policy.prediction.chain import ChainConfig
+from policy.prediction.traffic import TrafficConfig
 from policy.safety import SafetyConfig
-from policy.tensors import APART_OF
-from policy.traffic import TrafficConfig
-from policy.vfn import TABLE_1, VfnConfig
 
 
 @dataclass(frozen=True, slots=True)

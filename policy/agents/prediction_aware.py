@@ -20,18 +20,18 @@ from cosim.types import (
     PolicyContext,
 )
 from policy.agents.approaches import AgentConfig, compact, shipped
-from policy.chain import predict
 from policy.checkpoint import load
-from policy.extractors import FrameMemory
-from policy.forecast import KinematicForecast
-from policy.hpn import HPN
+from policy.inputs.scene import Scene, join
+from policy.inputs.tensors import States, pixels, situation_tensor, svo_tensor, to_batch, to_numpy
+from policy.networks.extractors import FrameMemory
+from policy.networks.hpn import HPN
+from policy.networks.seeded import seeded
+from policy.networks.vfn import VFN, Frames
+from policy.prediction.chain import predict
+from policy.prediction.forecast import KinematicForecast
+from policy.prediction.traffic import Traffic, foresee
 from policy.predictors import make_predictor
 from policy.safety import prioritize
-from policy.scene import Scene, join
-from policy.seeded import seeded
-from policy.tensors import States, pixels, situation_tensor, svo_tensor, to_batch, to_numpy
-from policy.traffic import Traffic, foresee
-from policy.vfn import VFN, Frames
 
 UNTRAINED = "untrained"
 RETRY = 2.0  # s, a lane change's time: so long a refused one is not tried again

@@ -5,7 +5,7 @@ from functools import partial
 
 from cosim.errors import BadInput, one_of
 from cosim.files import code
-from policy.forecast import KinematicForecast
+from policy.prediction.forecast import KinematicForecast
 from policy.predictors.constant import ConstantAcceleration, ConstantSpeed
 from policy.predictors.gp import GaussianProcessDirect, GaussianProcessIndirect
 from policy.predictors.learned import Learned, NetConfig

@@ -3,7 +3,7 @@
 import numpy as np
 
 from cosim.types import HEADING, SPEED, Bools, Floats
-from policy.forecast import KinematicForecast, integrate_position
+from policy.prediction.forecast import KinematicForecast, integrate_position
 
 
 class ConstantSpeed:

@@ -6,10 +6,10 @@ import numpy as np
 
 from cosim.types import Bools, Floats
 from policy.checkpoint import SHIPPED, load
-from policy.forecast import KinematicForecast, integrate_position, motion_of
-from policy.gaussian_process import ACROSS, ALONG, HEADING, SPEED, BankConfig, GaussianProcessBank
-from policy.kernel_prior import KernelPrior, PriorConfig, PriorNetwork, describe
-from policy.past import trailing_run, whole_past
+from policy.prediction.forecast import KinematicForecast, integrate_position, motion_of
+from policy.prediction.gaussian_process import ACROSS, ALONG, HEADING, SPEED, BankConfig, GaussianProcessBank
+from policy.prediction.kernel_prior import KernelPrior, PriorConfig, PriorNetwork, describe
+from policy.prediction.past import trailing_run, whole_past
 
 
 class _GaussianProcess:
@@ -48,7 +48,7 @@ class _GaussianProcess:
         """See `Predictor.predict`; P, eq. 7 to 9.
 
         Only the unbroken run of valid, finite frames up to now counts, and what lies before it is completed
-        (`policy.past`); a vehicle that is not valid now gets no forecast (`valid` False, zeros).
+        (`policy.prediction.past`); a vehicle that is not valid now gets no forecast (`valid` False, zeros).
         """
         state = np.asarray(kinematics[:, :, :4], dtype=np.float64)
         run = trailing_run(state, valid)

@@ -7,9 +7,9 @@ import numpy as np
 
 from cosim.road import RoadMap
 from cosim.types import Bools, Floats, Ints
-from policy.forecast import KinematicForecast
-from policy.scene import Scene
-from policy.traffic import TrafficConfig, predict_traffic
+from policy.inputs.scene import Scene
+from policy.prediction.forecast import KinematicForecast
+from policy.prediction.traffic import TrafficConfig, predict_traffic
 
 
 def along_lanes(

@@ -11,8 +11,8 @@ from torch import nn
 from cosim.errors import BadInput
 from cosim.types import Bools, Floats
 from policy.checkpoint import SHIPPED, load
-from policy.forecast import KinematicForecast, motion_of
-from policy.past import trailing_run, whole_past
+from policy.prediction.forecast import KinematicForecast, motion_of
+from policy.prediction.past import trailing_run, whole_past
 
 INPUTS = 6  # per frame, see `features`
 # Scales that bring inputs and outputs to order one: m behind, m aside, m/s, rad, m/s of change.
@@ -138,7 +138,7 @@ class Learned:
             load(file, {"network": self.network}, {"network": config})
 
     def predict(self, kinematics: Floats, valid: Bools) -> KinematicForecast:
-        """See `Predictor.predict`; no intervals. Short histories are completed (`policy.past`)."""
+        """See `Predictor.predict`; no intervals. Short histories are completed (`policy.prediction.past`)."""
         state = np.asarray(kinematics[:, :, :4], dtype=np.float64)
         run = trailing_run(state, valid)
         known = run > 0

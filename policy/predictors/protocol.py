@@ -3,7 +3,7 @@
 from typing import Protocol
 
 from cosim.types import Bools, Floats
-from policy.forecast import KinematicForecast
+from policy.prediction.forecast import KinematicForecast
 
 
 class Predictor(Protocol):

@@ -8,11 +8,11 @@ from cosim.geometry import Boxes, first_contacts
 from cosim.geometry.compiled import compiled
 from cosim.road import RoadMap
 from cosim.types import Bools, Floats, Ints, MetaAction
-from policy.motion import Rollout, project_each
+from policy.inputs.scene import Scene
+from policy.prediction.motion import Rollout, project_each
+from policy.prediction.traffic import Traffic
 from policy.safety.config import SafetyConfig
 from policy.safety.maneuver import Ways
-from policy.scene import Scene
-from policy.traffic import Traffic
 
 
 class Others(NamedTuple):

@@ -14,7 +14,7 @@ from cosim.control import (
 )
 from cosim.road import LanePath, RoadMap
 from cosim.types import Bools, Floats, History, Ints, MetaAction
-from policy.motion import Paths, Rollout, pack, project, roll_one
+from policy.prediction.motion import Paths, Rollout, pack, project, roll_one
 from policy.safety.config import SafetyConfig
 
 ACTIONS = tuple(MetaAction)

@@ -19,7 +19,9 @@ import numpy as np
 from cosim.control import LANE_CHANGE_TIME
 from cosim.road import RoadMap
 from cosim.types import Bools, Decision, Floats, Floats32, History, MetaAction
-from policy.motion import Rollout
+from policy.inputs.scene import Scene
+from policy.prediction.motion import Rollout
+from policy.prediction.traffic import Traffic
 from policy.safety.config import SafetyConfig
 from policy.safety.conflicts import Others, first_contact, gap_margin, neighbours, others_near
 from policy.safety.maneuver import (
@@ -39,8 +41,6 @@ from policy.safety.maneuver import (
     straddling,
     ways_of,
 )
-from policy.scene import Scene
-from policy.traffic import Traffic
 
 
 class Evaluation(NamedTuple):
@@ -66,7 +66,7 @@ def prioritize(
 
     Args:
         q: [B,A] action values, in the order of `scene.agents`.
-        scene: what the AVs know (`policy.scene.join`).
+        scene: what the AVs know (`policy.inputs.scene.join`).
         traffic: where everybody in it goes, `config.frames` frames of `config.dt` s ahead; not changed.
         road: the road map.
         config: thresholds and driving limits.

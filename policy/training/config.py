@@ -5,14 +5,14 @@ from dataclasses import dataclass, field, replace
 from cosim.rewards import RewardConfig
 from cosim.types import ObservationConfig
 from policy.agents.approaches import AgentConfig, configure, shipped
-from policy.chain import ChainConfig
-from policy.hpn import HpnConfig
+from policy.networks.hpn import HpnConfig
+from policy.networks.vfn import VfnConfig
+from policy.prediction.chain import ChainConfig
+from policy.prediction.traffic import TrafficConfig
 from policy.safety import SafetyConfig
-from policy.traffic import TrafficConfig
 from policy.training.curriculum import VfnTraining
 from policy.training.explorer import ExploreConfig
 from policy.training.hpn import HpnTraining
-from policy.vfn import VfnConfig
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,9 +7,9 @@ import torch
 from torch.nn import functional
 
 from cosim.errors import in_range
+from policy.networks.vfn import VfnConfig
 from policy.training.learner import Learner, Metrics
 from policy.training.replay_buffer import Advised, Batch
-from policy.vfn import VfnConfig
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ from cosim.control import MAX_DECEL, TIME_CONSTANT, next_target, tracked_speeds
 from cosim.types import Floats, Floats32, History, MetaAction, PolicyContext
 from policy.agents.altruist_rule import AltruistRule
 from policy.agents.idm import ACCEL, desired_gap
-from policy.meeting import CAR, along
+from policy.inputs.meeting import CAR, along
 
 YIELD = 2.0  # preference for what the scripted altruist commands: all others are below 0
 TIME_GAP = 1.0  # s: IDM with a little more than its time gap, which avoids harsh steps

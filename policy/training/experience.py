@@ -12,7 +12,7 @@ import torch
 
 from cosim.files import whole
 from cosim.types import Bools, Bytes, Floats32
-from policy.tensors import States
+from policy.inputs.tensors import States
 
 Ending = Literal["crashed", "left", "cut"]  # cut: the episode ended before the AV's drive did
 Halves = npt.NDArray[np.float16]
@@ -31,7 +31,7 @@ class Trajectory:
     stride: int  # frames per decision
     frames: Bytes  # [N + D * stride, C,H,W] pixel * 255
     ahead: Bytes  # [D+1, M,C,H,W] predicted maps, pixel * 255
-    kinematics: Halves  # [D+1, T,R,F+1] scaled (policy.tensors)
+    kinematics: Halves  # [D+1, T,R,F+1] scaled (policy.inputs.tensors)
     situation: Floats32  # [D+1, .]
     unsafe: Bools  # [D+1, A] what the prioritizer masked
     action: npt.NDArray[np.int8]  # [D] carried out

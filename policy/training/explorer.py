@@ -12,10 +12,10 @@ from cosim.rewards import RewardTerms
 from cosim.types import IS_MISSION, Decision, Floats32, History, MetaAction
 from policy.agents.approaches import AgentConfig
 from policy.agents.prediction_aware import Inputs, PredictionAware
-from policy.tensors import States, to_numpy
+from policy.inputs.tensors import States, to_numpy
+from policy.networks.vfn import VFN
 from policy.training.demonstrator import AS_GOOD, YIELD, Demonstrator
 from policy.training.experience import Ending, Trajectory
-from policy.vfn import VFN
 
 STATE = ("ahead", "kinematics", "situation", "unsafe")  # fields of `Trajectory` with one value more
 

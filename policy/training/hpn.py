@@ -7,8 +7,8 @@ from typing import Any
 
 from cosim.errors import BadInput
 from policy import checkpoint
-from policy.hpn import HPN, HpnConfig
-from policy.kinematic_branch import KinematicConfig
+from policy.networks.hpn import HPN, HpnConfig
+from policy.networks.kinematic_branch import KinematicConfig
 from policy.training.kinematics import KinematicTask, KinematicTraining
 from policy.training.loop import Line, LoopConfig
 from policy.training.map_branch import MapTask, MapTraining

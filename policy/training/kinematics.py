@@ -15,8 +15,8 @@ import numpy as np
 import torch
 
 from cosim.types import Bools, Floats32
-from policy.kinematic_branch import KinematicBranch, KinematicConfig, correct, sureness
-from policy.seeded import first_weights
+from policy.networks.kinematic_branch import KinematicBranch, KinematicConfig, correct, sureness
+from policy.networks.seeded import first_weights
 from policy.training.loop import Task, drawn, one_cycle
 from policy.training.moments import Moment
 

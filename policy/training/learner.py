@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from policy.seeded import seeded
+from policy.networks.seeded import seeded
+from policy.networks.vfn import VFN, VfnConfig
 from policy.training.networks import Optimized
 from policy.training.replay_buffer import Advised
-from policy.vfn import VFN, VfnConfig
 
 Metrics = dict[str, float]
 

@@ -7,9 +7,9 @@ from functools import partial
 import numpy as np
 import torch
 
-from policy.map_branch import MapBranch, MapBranchConfig
-from policy.seeded import first_weights
-from policy.tensors import kinematic_tensor, unit
+from policy.inputs.tensors import kinematic_tensor, unit
+from policy.networks.map_branch import MapBranch, MapBranchConfig
+from policy.networks.seeded import first_weights
 from policy.training.loop import Task, drawn, one_cycle
 from policy.training.moments import MapSample
 

@@ -8,10 +8,10 @@ import numpy as np
 
 from cosim.road import RoadMap
 from cosim.types import Bools, Bytes, Floats, Floats32, History, Ints, Snapshot
+from policy.inputs.scene import join
+from policy.inputs.vehicle_inputs import vehicle_inputs
+from policy.prediction.traffic import TrafficConfig, foresee
 from policy.predictors import Predictor
-from policy.scene import join
-from policy.traffic import TrafficConfig, foresee
-from policy.vehicle_inputs import vehicle_inputs
 
 TURN = 2 * np.pi
 

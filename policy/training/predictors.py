@@ -16,11 +16,11 @@ import torch
 from torch import nn
 
 from cosim.types import Bools, Floats
-from policy.gaussian_process import GaussianProcessBank, Operators, trapezoid
-from policy.kernel_prior import PriorNetwork, describe
+from policy.networks.seeded import seeded
+from policy.prediction.gaussian_process import GaussianProcessBank, Operators, trapezoid
+from policy.prediction.kernel_prior import PriorNetwork, describe
 from policy.predictors.gp import GaussianProcessDirect, GaussianProcessIndirect
 from policy.predictors.learned import KinematicNet, NetConfig, features, integrate
-from policy.seeded import seeded
 from policy.training.loop import Line, LoopConfig, Progress, Task, train
 
 Batch = Mapping[str, torch.Tensor]  # name -> [S,...], S the same for all

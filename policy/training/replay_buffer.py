@@ -9,7 +9,7 @@ import torch
 
 from cosim.errors import BadInput
 from cosim.types import Ints, MetaAction
-from policy.tensors import States
+from policy.inputs.tensors import States
 from policy.training.experience import Trajectory, states, states_without_maps
 
 

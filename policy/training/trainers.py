@@ -8,13 +8,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from cosim.seeding import generator, subseed
+from policy.networks.vfn import VfnConfig
 from policy.training.a2c import A2cLearner
 from policy.training.curriculum import VfnTraining, interpolated
 from policy.training.ddqn import DdqnLearner
 from policy.training.experience import Trajectory
 from policy.training.learner import Learner, Metrics, mean_metrics
 from policy.training.replay_buffer import ReplayBuffer
-from policy.vfn import VfnConfig
 
 
 class Trainer:

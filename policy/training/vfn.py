@@ -22,10 +22,10 @@ from cosim.errors import BadInput
 from cosim.files import read_json, whole
 from cosim.seeding import TUNING_SEEDS
 from policy import checkpoint
+from policy.networks.vfn import VFN, VfnConfig
 from policy.training import curriculum, experience
 from policy.training.curriculum import Drive, Drove, VfnTraining
 from policy.training.trainers import make_trainer
-from policy.vfn import VFN, VfnConfig
 
 
 class Actors(Protocol):

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from policy.kinematic_branch import KinematicBranch, KinematicConfig, correct, sureness
+from policy.inputs.vehicle_inputs import NEIGHBOUR_INPUTS, NEIGHBOURS, own_inputs
+from policy.networks.kinematic_branch import KinematicBranch, KinematicConfig, correct, sureness
 from policy.training.kinematics import KinematicTask, KinematicTraining, collate
 from policy.training.moments import Moment
-from policy.vehicle_inputs import NEIGHBOUR_INPUTS, NEIGHBOURS, own_inputs
 
 torch.set_num_threads(1)
 CLOSING, WILD = 0, 1  # two of a vehicle's own inputs

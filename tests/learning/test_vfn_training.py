@@ -21,10 +21,11 @@ from cosim.seeding import generator
 from cosim.simulation.fake import FakeSimulator, FakeVehicle
 from cosim.types import SMOKE, MetaAction
 from policy.agents.approaches import AgentConfig
-from policy.chain import ChainConfig
+from policy.inputs.situation import SITUATION_INPUTS
+from policy.inputs.tensors import KINEMATIC_INPUTS
+from policy.networks.vfn import VfnConfig
+from policy.prediction.chain import ChainConfig
 from policy.safety import SafetyConfig
-from policy.situation import SITUATION_INPUTS
-from policy.tensors import KINEMATIC_INPUTS
 from policy.training import experience
 from policy.training.a2c import A2cConfig, A2cLearner
 from policy.training.curriculum import Drive, Drove, Lesson, VfnTraining
@@ -33,7 +34,6 @@ from policy.training.experience import Trajectory
 from policy.training.explorer import ExploreConfig, Explorer
 from policy.training.replay_buffer import ReplayBuffer, ReplayConfig
 from policy.training.vfn import TrainingRun
-from policy.vfn import VfnConfig
 
 torch.set_num_threads(1)
 TINY = VfnConfig(height=8, width=16, frames=3, rows=2, features=(4, 4, 4), hidden=16, joined=32, kinematic=32)

@@ -24,8 +24,8 @@ from cosim.types import COMPACT
 from policy import checkpoint
 from policy.agents.approaches import compact
 from policy.checkpoint import SHIPPED
+from policy.networks.vfn import VFN
 from policy.training.config import agent_config
-from policy.vfn import VFN
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 SEED = "200061"

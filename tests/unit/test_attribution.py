@@ -15,7 +15,7 @@ from cosim.learning.attribution import markdown, questioned, table
 from cosim.types import MetaAction, PolicyContext, Timing
 from policy.agents.approaches import compact
 from policy.attribution import SUMS, Questioned, answer, questions
-from policy.tensors import States
+from policy.inputs.tensors import States
 
 ROAD = straight_road(3)
 FREE = [Car("a", 300.0, 1, 20.0, is_av=True), Car("b", 100.0, 1, 20.0, is_av=True)]  # 200 m apart, alike

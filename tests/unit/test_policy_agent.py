@@ -15,8 +15,8 @@ from cosim.types import COMPACT, PAPER, SMOKE, Decision, MetaAction, PolicyConte
 from policy.agents import APPROACHES
 from policy.agents.approaches import AgentConfig, compact, paper
 from policy.agents.prediction_aware import PredictionAware
-from policy.hpn import HpnConfig
-from policy.vfn import VfnConfig
+from policy.networks.hpn import HpnConfig
+from policy.networks.vfn import VfnConfig
 
 ROAD = straight_road(3)
 CARS = [

@@ -15,7 +15,7 @@ from cosim.errors import BadInput, WeightsMismatch
 from policy.agents.approaches import compact
 from policy.agents.prediction_aware import PredictionAware
 from policy.checkpoint import load, read_card, save, sha256
-from policy.vfn import VFN, VfnConfig
+from policy.networks.vfn import VFN, VfnConfig
 
 CONFIG = VfnConfig(16, 128, frames=10)
 

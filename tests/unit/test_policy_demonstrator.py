@@ -10,7 +10,7 @@ from policy_scenes import LIMIT, Car, histories, straight_road
 
 from cosim.types import COMPACT, MetaAction, PolicyContext, Timing
 from policy.agents.idm import ACCEL, desired_gap
-from policy.meeting import CAR
+from policy.inputs.meeting import CAR
 from policy.training.demonstrator import EAGER, TIME_GAP, Demonstrator
 
 

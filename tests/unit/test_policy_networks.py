@@ -8,13 +8,13 @@ import torch
 from policy_scenes import Car, histories, straight_road
 
 from cosim.types import KINEMATIC_FEATURES
-from policy.hpn import HPN, HpnConfig
-from policy.kinematic_branch import KinematicBranch, KinematicConfig, correct, sureness
-from policy.map_branch import MapBranch, MapBranchConfig
-from policy.situation import FAR, PER_LANE, SITUATION_INPUTS, situation
-from policy.tensors import KINEMATIC_INPUTS, apart, kinematic_tensor, svo_tensor, to_batch
-from policy.vehicle_inputs import NEIGHBOUR_INPUTS, NEIGHBOURS, own_inputs
-from policy.vfn import VFN, Frames, VfnConfig
+from policy.inputs.situation import FAR, PER_LANE, SITUATION_INPUTS, situation
+from policy.inputs.tensors import KINEMATIC_INPUTS, apart, kinematic_tensor, svo_tensor, to_batch
+from policy.inputs.vehicle_inputs import NEIGHBOUR_INPUTS, NEIGHBOURS, own_inputs
+from policy.networks.hpn import HPN, HpnConfig
+from policy.networks.kinematic_branch import KinematicBranch, KinematicConfig, correct, sureness
+from policy.networks.map_branch import MapBranch, MapBranchConfig
+from policy.networks.vfn import VFN, Frames, VfnConfig
 
 
 def step(config: MapBranchConfig, batch: int = 2) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

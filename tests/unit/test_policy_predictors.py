@@ -11,9 +11,9 @@ from policy_scenes import braking_cars, cars
 from cosim.errors import BadInput, WeightsMismatch
 from cosim.road import Lane, RoadMap
 from policy.checkpoint import SHIPPED, save
-from policy.forecast import integrate_position, motion_of
-from policy.kernel_prior import PriorNetwork, describe
-from policy.past import ORDINARY, trailing_run, whole_past
+from policy.prediction.forecast import integrate_position, motion_of
+from policy.prediction.kernel_prior import PriorNetwork, describe
+from policy.prediction.past import ORDINARY, trailing_run, whole_past
 from policy.predictors import PREDICTORS, make_predictor
 from policy.predictors.gp import GaussianProcessIndirect
 from policy.predictors.lane import along_lanes

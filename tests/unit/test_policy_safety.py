@@ -12,11 +12,11 @@ from policy_scenes import LANE_WIDTH, Car, histories, straight_road
 from cosim.control import braking_speeds, next_target, tracked_speed, tracked_speeds
 from cosim.road import RoadMap
 from cosim.types import Decision, MetaAction
-from policy import motion
+from policy.inputs.scene import Scene, join
+from policy.prediction import motion
+from policy.prediction.traffic import Traffic, TrafficConfig, predict_traffic
 from policy.predictors import make_predictor
 from policy.safety import LANE_END, SafetyConfig, front_to_back, prioritize
-from policy.scene import Scene, join
-from policy.traffic import Traffic, TrafficConfig, predict_traffic
 
 LEFT, IDLE, RIGHT, FASTER, SLOWER = MetaAction
 NOTHING = np.zeros(5, np.float32)

@@ -14,14 +14,14 @@ from cosim.errors import BadInput, WeightsMismatch
 from cosim.geometry.raster import rasterize_road
 from cosim.road import Lane, RoadMap
 from cosim.types import COMPACT
-from policy.chain import ChainConfig, Prediction, predict
 from policy.checkpoint import SHIPPED
-from policy.hpn import HPN
-from policy.map_error import MapPredictors
+from policy.inputs.scene import Scene, join
+from policy.inputs.tensors import to_batch
+from policy.networks.hpn import HPN
+from policy.prediction.chain import ChainConfig, Prediction, predict
+from policy.prediction.map_error import MapPredictors
+from policy.prediction.traffic import TrafficConfig, foresee
 from policy.predictors import make_predictor
-from policy.scene import Scene, join
-from policy.tensors import to_batch
-from policy.traffic import TrafficConfig, foresee
 from policy.training import hpn as trained
 
 ROAD = straight_road(3)

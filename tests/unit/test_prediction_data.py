@@ -20,7 +20,7 @@ from cosim.scenario import Mission, load
 from cosim.simulation.fake import FakeSimulator, FakeVehicle
 from cosim.types import COMPACT
 from policy.agents.idm import Idm
-from policy.hpn import HPN, HpnConfig
+from policy.networks.hpn import HPN, HpnConfig
 from policy.training import hpn as trained
 
 

@@ -13,9 +13,9 @@ import numpy.typing as npt
 
 from cosim.geometry.compiled import compiled
 from cosim.types import HEADING, IS_AV, IS_MISSION, LENGTH, SPEED, WIDTH, Bools, Floats, Floats32, Ints, X, Y
-from policy.forecast import KinematicForecast
-from policy.scene import Scene
-from policy.traffic import Traffic
+from policy.inputs.scene import Scene
+from policy.prediction.forecast import KinematicForecast
+from policy.prediction.traffic import Traffic
 
 FRAME = 0.2  # s
 MARKS = np.array([4, 9, 14, 19])  # frames ahead (from 0) at which forecasts are shown: 1, 2, 3, 4 s

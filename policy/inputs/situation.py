@@ -12,7 +12,7 @@ from cosim.control import SPEED_STEP
 from cosim.geometry.compiled import compiled
 from cosim.road import RoadMap
 from cosim.types import Floats, Floats32, History
-from policy.meeting import LANE, along, meet, missions
+from policy.inputs.meeting import LANE, along, meet, missions
 
 LOOK_AHEAD = np.array([20.0, 50.0, 100.0])  # m, where the candidate centre lines are sampled
 FAR = 200.0  # m: lane ends and conflict zones further away are all alike

@@ -11,7 +11,7 @@ from scipy.linalg import cho_solve, cholesky
 from scipy.optimize import minimize
 
 from cosim.types import Floats
-from policy.gaussian_process import covariance
+from policy.prediction.gaussian_process import covariance
 
 BIAS = 10.0  # in units of the series, as in the bank
 START = (1.0, 1.0, 1.5, 0.1)  # slope, amplitude, length s, noise

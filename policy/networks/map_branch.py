@@ -7,7 +7,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from policy.tensors import KINEMATIC_INPUTS
+from policy.inputs.tensors import KINEMATIC_INPUTS
 
 Size = tuple[int, int]
 PREDICTED = 4  # x, y, speed, heading of each row: P's K

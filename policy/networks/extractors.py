@@ -9,7 +9,7 @@ from torch import nn
 from torch.nn import functional
 
 from cosim.types import Bytes
-from policy.tensors import unit
+from policy.inputs.tensors import unit
 
 Strides = Literal["literal", "temporal"]
 Read = Callable[[torch.Tensor], torch.Tensor]  # maps [B,C,H,W] -> the channels that are convolved, float32

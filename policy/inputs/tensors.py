@@ -9,7 +9,7 @@ import torch
 from cosim.geometry.raster import PIXEL_FLOOR, PIXEL_SPAN, PIXEL_SPEED
 from cosim.road import RoadMap
 from cosim.types import KINEMATIC_FEATURES, Bools, Floats, Floats32, History
-from policy.situation import situation
+from policy.inputs.situation import situation
 
 # Scales that bring every kinematic feature to about [-1, 1]: row range, map half width, motorway speed,
 # a U-turn, a lorry; is_av and is_mission stay.
@@ -49,7 +49,7 @@ def to_batch(histories: Sequence[History], device: str = "cpu") -> Batch:
 def situation_tensor(
     histories: Sequence[History], road: RoadMap, shared: bool, device: str = "cpu"
 ) -> torch.Tensor:
-    """What they know besides [B,SITUATION_INPUTS]: `policy.situation`."""
+    """What they know besides [B,SITUATION_INPUTS]: `policy.inputs.situation`."""
     return torch.from_numpy(situation(histories, road, shared)).to(device)
 
 

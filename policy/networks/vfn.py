@@ -13,9 +13,9 @@ from torch import nn
 from torch.nn import functional
 
 from cosim.types import IS_MISSION, MetaAction
-from policy.extractors import Conv2dMaps, Conv3dMaps, FrameMemory, Strides
-from policy.situation import SITUATION_INPUTS
-from policy.tensors import APART, KINEMATIC_INPUTS, apart, unit
+from policy.inputs.situation import SITUATION_INPUTS
+from policy.inputs.tensors import APART, KINEMATIC_INPUTS, apart, unit
+from policy.networks.extractors import Conv2dMaps, Conv3dMaps, FrameMemory, Strides
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,9 +143,9 @@ class VFN(nn.Module):
         Args:
             maps: [B,T,C,H,W] uint8 pixels (where there are kinematics, float32 in [0,1] too), the past frames
                 first; or their `Frames`; None: the map branch gives zeros, and there are no convolutions.
-            kinematics: [B,T,R,F+1] scaled, the mask last (`policy.tensors.kinematic_tensor`).
-            situation: [B,SITUATION_INPUTS] (`policy.situation.situation`).
-            phi: [B,2] cosine and sine of the SVO (`policy.tensors.svo_tensor`).
+            kinematics: [B,T,R,F+1] scaled, the mask last (`policy.inputs.tensors.kinematic_tensor`).
+            situation: [B,SITUATION_INPUTS] (`policy.inputs.situation.situation`).
+            phi: [B,2] cosine and sine of the SVO (`policy.inputs.tensors.svo_tensor`).
 
         Returns:
             q: [B,5] value of each `MetaAction`.

@@ -9,14 +9,14 @@ import torch
 from cosim.errors import in_range
 from cosim.geometry.raster import PIXEL_FLOOR, PIXEL_SPAN, PIXEL_SPEED, RoadRaster, draw_kinematics
 from cosim.types import SPEED, Bools, Bytes, Floats, ObservationConfig
-from policy.forecast import KinematicForecast
-from policy.hpn import HPN
-from policy.kinematic_branch import Corrected, apply
-from policy.map_branch import MapBranch
-from policy.scene import Scene, pictured, rows_ahead
-from policy.tensors import Batch, kinematic_tensor, unit
-from policy.traffic import Traffic
-from policy.vehicle_inputs import vehicle_inputs
+from policy.inputs.scene import Scene, pictured, rows_ahead
+from policy.inputs.tensors import Batch, kinematic_tensor, unit
+from policy.inputs.vehicle_inputs import vehicle_inputs
+from policy.networks.hpn import HPN
+from policy.networks.kinematic_branch import Corrected, apply
+from policy.networks.map_branch import MapBranch
+from policy.prediction.forecast import KinematicForecast
+from policy.prediction.traffic import Traffic
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,8 +98,8 @@ def predict(
         observation: size and channels of the maps.
         raster: the road as `cosim.geometry.raster.rasterize_road` gives it.
         hpn: the network; None: the maps are rendered from the forecast as it is.
-        scene: what the AVs know (`policy.scene.join`).
-        batch: what they saw (`policy.tensors.to_batch`), on the device of the network.
+        scene: what the AVs know (`policy.inputs.scene.join`).
+        batch: what they saw (`policy.inputs.tensors.to_batch`), on the device of the network.
         forecast: states of all vehicles of `scene` in the world (m, m/s, rad), `horizon` frames at least.
         traffic: the same speeds along the lanes, needed by a kinematic branch.
 

@@ -12,8 +12,8 @@ from typing import Literal
 
 from torch import nn
 
-from policy.kinematic_branch import KinematicBranch, KinematicConfig
-from policy.map_branch import MapBranch, MapBranchConfig
+from policy.networks.kinematic_branch import KinematicBranch, KinematicConfig
+from policy.networks.map_branch import MapBranch, MapBranchConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +26,7 @@ class HpnConfig:
 
 
 class HPN(nn.Module):
-    """The branches that the configuration asks for; `policy.chain.predict` runs them (P, fig. 3).
+    """The branches that the configuration asks for; `policy.prediction.chain.predict` runs them (P, fig. 3).
 
     Untrained, `rendered` and `corrected` return the maps rendered from the forecast along the lanes.
 

@@ -7,10 +7,10 @@ import numpy as np
 
 from cosim.road import LanePath, RoadMap
 from cosim.types import HEADING, LENGTH, SPEED, WIDTH, Bools, Floats, X, Y
-from policy.forecast import KinematicForecast
-from policy.motion import Rollout, fronts, pack, project_many, roll
+from policy.inputs.scene import Scene
+from policy.prediction.forecast import KinematicForecast
+from policy.prediction.motion import Rollout, fronts, pack, project_many, roll
 from policy.predictors.protocol import Predictor
-from policy.scene import Scene
 
 
 @dataclass(frozen=True, slots=True)

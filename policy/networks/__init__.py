@@ -1,0 +1,1 @@
+"""The agent's neural networks: layouts and forward passes."""

@@ -1,0 +1,1 @@
+"""Where everybody will be: forecasts, traffic along the lanes, the chain of predicted observations."""

@@ -8,14 +8,15 @@ from pathlib import Path
 import pytest
 
 from cosim.batch.episode_runner import EpisodeRunner
-from cosim.batch.record import cases
+from cosim.batch.record import planned
 from cosim.cli.main import main
 from cosim.learning.attribution import Asking
 from cosim.workers.worker import Worker
 
 
 def test_who_is_asked_drives_the_same_episode() -> None:
-    (case,) = cases(["merge"], ["contested"], [], ["vfn-p"], [150000], duration=3.2)
+    plan = planned(["merge"], ["contested"], [], ["vfn-p"], range(150000, 150001), duration=3.2)
+    ((_, case),) = plan.cases()
     hashes = []
     for host in (EpisodeRunner, Asking):
         with Worker(host) as worker:

@@ -61,6 +61,7 @@ class Order:
             what=self.scenario,
             demand=(self.demand,),
             policy=self.agent.name,
+            seed=FIRST_TEST_SEED,
             behavior=self.behavior,
             svo_deg=self.svo_deg,
             preset="unguarded",

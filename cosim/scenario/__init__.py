@@ -204,7 +204,7 @@ def _world(folder: Path) -> Scenario:
         raise BadInput("differs from its folder's name", file=file, field="name", value=name)
     if not ships and name in sumo_scenarios.names():
         raise BadInput(
-            "is the name of a world that ships: name yours otherwise", file=file, field="name", value=name
+            "a world that ships is called so: name yours otherwise", file=file, field="name", value=name
         )
     config = sumocfg.read(folder / f"{name}.sumocfg")
     demands = {_demand_name(path): path for path in sorted((folder / "demand").glob("*.rou.xml"))}

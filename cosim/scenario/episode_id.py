@@ -14,7 +14,6 @@ from cosim.errors import inside
 from cosim.files.yaml_input import dataclass_from, mapping
 from cosim.scenario import Scenario, chosen_fleet, load
 from cosim.scenario.behaviors import LC2013
-from cosim.seeding import FIRST_TEST_SEED
 
 OPTIONAL = ("metrics", "reward")  # named only where they are asked for: older keys stay as they are
 KEY_LENGTH = 12  # hexadecimal digits of a cell: 48 bits, a collision among 10,000 cells has odds of 2e-7
@@ -28,8 +27,9 @@ class EpisodeId:
     """
 
     what: str  # a world's name or folder, or a .sumocfg
+    policy: str
+    seed: int
     demand: tuple[str, ...] = ()  # one demand: names or files driven together; () is the scenario's own
-    policy: str = "idm"
     behavior: str | None = None  # None: the scenario's default
     driver_model: str = LC2013
     penetration: float | None = None  # share of AVs; None: the scenario's own fleet
@@ -38,7 +38,6 @@ class EpisodeId:
     svo_deg: float = 45.0  # degrees
     preset: str | None = None  # None: the scenario's default
     duration: float | None = None  # s; None: the scenario's own
-    seed: int = FIRST_TEST_SEED
     outputs: tuple[str, ...] = ()  # SUMO's own outputs, by SUMO's names
     metrics: tuple[str, ...] = ()  # measured besides, FILE.py:NAME or MODULE:NAME
     reward: str | None = None  # paid and reported: a name of `cosim.rewards.REWARDS`, or code likewise

@@ -23,8 +23,8 @@ class Approach:
 
 APPROACHES = {
     "vfn-p": Approach(),
-    "vfn-p-egoistic": Approach(),  # the twin: the same agent, trained with phi = 0
     "vfn": Approach(predicted_maps=False, mask="cs"),
+    "vfn-p-egoistic": Approach(),  # the twin: the same agent, trained with phi = 0
     "safe-dqn": Approach(kinematics=False, predicted_maps=False, mask="cs"),
     "conv3d-dqn": Approach(kinematics=False, predicted_maps=False, mask="none"),
     "conv3d-a2c": Approach(kinematics=False, predicted_maps=False, mask="none", learning="a2c"),

@@ -48,7 +48,7 @@ AGENTS, PENETRATION = 8, 0.19
 
 
 class Gatherer:
-    """Lives in a worker: drives an episode and keeps what 8 AVs saw."""
+    """Runs in a worker: drives an episode and keeps what 8 AVs saw."""
 
     def __init__(self, scenario: Scenario, observation: ObservationConfig) -> None:
         self._host = Host(scenario, "idm", 0.0, observation=observation)

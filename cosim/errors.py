@@ -5,7 +5,7 @@
     |   `-- WeightsMismatch         2   a checkpoint that does not fit its network
     |-- SimulationError             3   SUMO failed
     |   |-- SimulationInUse         3   a second simulation in one process
-    |   `-- SimulationCrashed       3   the process that held SUMO died
+    |   `-- SimulationCrashed       3   the process that ran SUMO ended
     |       `-- SimulationTimeout   3   ... or did not answer and was killed
     `-- ReplayDiffers               1   `cosim replay`: not the recorded episode (cosim.report.replay.episode)
 
@@ -71,7 +71,7 @@ class SimulationError(CosimError):
 
 
 class SimulationCrashed(SimulationError):
-    """The worker process that held the simulation died (signal, limit) or did not answer in time.
+    """The worker process that ran the simulation ended (signal, limit) or did not answer in time.
 
     `exitcode` is the process's (negative: the signal that killed it; None: not known), `stderr` the end of
     what it wrote there.
@@ -84,7 +84,7 @@ class SimulationCrashed(SimulationError):
 
 
 class SimulationTimeout(SimulationCrashed):
-    """The worker process gave no sign of life for too long and was killed."""
+    """The worker process gave no heartbeat for too long and was killed."""
 
 
 class SimulationInUse(SimulationError):

@@ -13,7 +13,7 @@ from cosim.metrics import MetricFactory, joined
 from cosim.metrics import read as read_metric
 from cosim.policies import make
 from cosim.recording import DRAWN, Recorder
-from cosim.recording.watched import Watched, watched
+from cosim.recording.replay_data import ReplayData, replay_data
 from cosim.rewards import Reward, RewardTerms, rewards
 from cosim.rewards import read as read_reward
 from cosim.scenario import Scenario
@@ -26,16 +26,16 @@ SimulatorFactory = Callable[[Scenario, Mapping[str, str], int], Simulator]  # ..
 
 
 class Host:
-    """One scenario, one policy (a name or an object), any number of episodes; lives in a worker process.
+    """One scenario, one policy (a name or an object), any number of episodes; runs in a worker process.
 
     Args:
         scenario: what is simulated, vetted.
         policy: who commands the AVs.
-        svo: phi in rad, told to the policy.
+        svo: phi in rad, passed to the policy.
         observation: what the AVs observe; by default what the policy wants to see.
         simulator: builds another simulator than SUMO's.
         metrics: measured besides those of `cosim.metrics.METRICS`: factories, or FILE.py:NAME.
-        reward: reported as the figure `reward_mean`: an object, or what `cosim.rewards.read` knows.
+        reward: reported as the figure `reward_mean`: an object, or a text that `cosim.rewards.read` accepts.
 
     Raises BadInput for an unknown policy and for input that SUMO refuses.
     """
@@ -97,18 +97,18 @@ class Host:
                 if files:
                     simulator.finish_outputs()
 
-    def watch(
+    def run_recorded(
         self,
         seed: int,
         progress: Progress | None = None,
         *,
         outputs: Sequence[str] = (),
         folder: Path | None = None,
-    ) -> tuple[EpisodeResult, Watched]:
+    ) -> tuple[EpisodeResult, ReplayData]:
         """`run`, recorded: the same result, and what a replay draws."""
         recorder = Recorder(self.policy, DRAWN)
         result = self.run(seed, progress, hooks=[recorder], outputs=outputs, folder=folder)
-        return result, watched(recorder, self.simulator, result.document())
+        return result, replay_data(recorder, self.simulator, result.document())
 
     def close(self) -> None:
         """End the simulation."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.papers.driving import AgentRunner
-from cosim.recording.watched import Track, Watched
+from cosim.recording.replay_data import ReplayData, Track
 from cosim.report.replay.strip import Strip, poses_at
 from cosim.road import Lane
 from cosim.scenario.episode_id import EpisodeId
@@ -47,20 +47,20 @@ class Guided:
     mission_speed: tuple[float | None, ...] = ()
 
 
-class GuideWatcher(AgentRunner):
+class GuideRunner(AgentRunner):
     """Hosted by the engine: drives an episode, looks at its guide AV and takes three pictures."""
 
     def run(
         self, case: EpisodeId, warnings: tuple[str, ...], outputs: str | None, progress: Progress
     ) -> dict[str, Any]:
         """`seed`, `trace_hash`, `crashed`; `guided`: the fields of `Guided`; `pictures`: PNG files."""
-        result, watched = self.open(case, warnings).watch(case.seed, progress)
-        found = guided(watched)
+        result, replay = self.open(case, warnings).run_recorded(case.seed, progress)
+        found = guided(replay)
         facts = {"seed": case.seed, "trace_hash": result.trace_hash, "crashed": result.value("crashed")}
-        return {**facts, "guided": asdict(found), "pictures": _pictures(watched, found)}
+        return {**facts, "guided": asdict(found), "pictures": _pictures(replay, found)}
 
 
-def guided(r: Watched) -> Guided:
+def guided(r: ReplayData) -> Guided:
     """Who made room, and how."""
     mission = next((t for t in r.tracks if t.mission), None)
     at = None if mission is None else _merge(r, mission)
@@ -86,7 +86,7 @@ def guided(r: Watched) -> Guided:
     )
 
 
-def _merge(r: Watched, mission: Track) -> int | None:
+def _merge(r: ReplayData, mission: Track) -> int | None:
     """The frame in which the merging vehicle is first on a lane that it changed to; None if it never is."""
     lanes = r.road.lanes
     for k in range(1, len(mission.lane)):
@@ -146,14 +146,14 @@ class _Frame:
 
 
 def _speeds(t: Track, frames: int) -> tuple[float | None, ...]:
-    """Its speed in every frame that was watched."""
+    """Its speed in every recorded frame."""
     found: list[float | None] = [None] * frames
     for k, speed in enumerate(t.speed.tolist()):
         found[t.first + k] = round(speed, 3)
     return tuple(found)
 
 
-def _pictures(r: Watched, found: Guided) -> list[bytes]:
+def _pictures(r: ReplayData, found: Guided) -> list[bytes]:
     """The road around the merging vehicle at SHOWN; [] where there is no guide."""
     if not found.guide or found.merged is None:
         return []

@@ -51,7 +51,7 @@ class Job:
     write: Callable[[Results, Settings], None]
     package: str = "benchmarks.papers"  # where its module lies
     first: int = FIRST_TEST_SEED  # seed
-    watches: bool = False  # whether its page needs episodes driven once more
+    redrives: bool = False  # whether its page needs episodes driven once more
 
     @property
     def command(self) -> str:
@@ -63,8 +63,8 @@ class Job:
         Where nothing is to be driven (`settings.held`), a page that would lack an arm is left as it was.
         """
         settings = replace(settings, first=self.first)
-        if settings.held and self.watches:
-            print(f"{self.name}: left as it is: its episodes are watched", file=sys.stderr)
+        if settings.held and self.redrives:
+            print(f"{self.name}: left as it is: its episodes are driven once more", file=sys.stderr)
             return
         results = drive(self.orders(), settings, self.name)
         if settings.held and results.lacking:

@@ -2,8 +2,8 @@
 
     python -m benchmarks.papers.t_figure8 [--scale 1] [--dry-run]
 
-Every episode is watched and sorted by what its guide AV did (`benchmarks.papers.guide`); the first of each
-kind is shown, and how many there were of each is said, so that a picture cannot pass for the rule. Watching
+Every episode is driven once more, recorded and sorted by what its guide AV did
+(`benchmarks.papers.guide`); the first of each kind is shown, with the number of episodes of each kind. It
 takes as long as driving did.
 """
 
@@ -35,7 +35,7 @@ from benchmarks.papers.guide import (
     SLOWER,
     SLOWS,
     YIELDS,
-    GuideWatcher,
+    GuideRunner,
 )
 from benchmarks.papers.pages import Job, drawing, heading, save, save_picture
 from benchmarks.tables import Line, markdown_row
@@ -52,7 +52,7 @@ AGENTS = ("vfn-p", "altruist-rule")  # the learned altruist, and what a scripted
 # demand and HVs; T's is the first. In most dense episodes no AV is near where the mission vehicle merges
 TRAFFIC = {("contested", "moderate"): 100, ("dense", "mixed"): 300}
 WANTED = (SLOWS, YIELDS, OVERTAKES)  # T's three samples, from left to right
-Watched = Mapping[str, Any]  # `GuideWatcher.run`, and the seed
+GuideRow = Mapping[str, Any]  # `GuideRunner.run`, and the seed
 
 
 def orders() -> list[Order]:
@@ -65,7 +65,7 @@ def orders() -> list[Order]:
 
 
 def write(results: Results, settings: Settings) -> None:
-    """t_figure8.md, pictures of every sample, data/t_figure8.csv; watches what was not watched yet."""
+    """t_figure8.md, pictures of every sample, data/t_figure8.csv; drives what was not recorded yet."""
     page = [
         *heading(JOB, results, settings, "World `merge`, phi 45 degrees."),
         "The guide AV is the one nearest to the merging vehicle when it merges, of those that perceive it",
@@ -75,13 +75,13 @@ def write(results: Results, settings: Settings) -> None:
         "",
     ]
     lines: list[Line] = []
-    watched = watch([one for one in results.driven if one.rows], settings)
+    found = guide_rows([one for one in results.driven if one.rows], settings)
     for traffic in TRAFFIC:
-        here = {one.name: seen for one, seen in watched if (one.order.demand, one.order.behavior) == traffic}
+        here = {one.name: seen for one, seen in found if (one.order.demand, one.order.behavior) == traffic}
         if here:
             page += _counted(", ".join(traffic), here, lines)
-    for name in dict.fromkeys(one.name for one, _ in watched):
-        mine = [(one.order, episode) for one, seen in watched if one.name == name for episode in seen]
+    for name in dict.fromkeys(one.name for one, _ in found):
+        mine = [(one.order, episode) for one, seen in found if one.name == name for episode in seen]
         for kind in WANTED:
             page += [f"## {name}: {kind}", ""]
             first = next((found for found in mine if found[1]["guided"]["kind"] == kind), None)
@@ -90,8 +90,8 @@ def write(results: Results, settings: Settings) -> None:
     save(JOB, settings, page, lines)
 
 
-def watch(driven: Sequence[Driven], settings: Settings) -> list[tuple[Driven, list[Watched]]]:
-    """Every episode that came through once more, watched: a small file each, in settings.runs/guide.
+def guide_rows(driven: Sequence[Driven], settings: Settings) -> list[tuple[Driven, list[GuideRow]]]:
+    """Every episode that came through once more, recorded: a small file each, in settings.runs/guide.
 
     Raises CosimError when one is not the same again.
     """
@@ -104,18 +104,18 @@ def watch(driven: Sequence[Driven], settings: Settings) -> list[tuple[Driven, li
             for cell, case in work.cases()
             if case.key in hashes and not (folder / f"{case.key}.json").exists()
         ]
-        engine = LocalEngine(GuideWatcher, (work.agents, settings.untrained), workers=settings.workers)
+        engine = LocalEngine(GuideRunner, (work.agents, settings.untrained), workers=settings.workers)
         _drive(todo, folder, engine, hashes)
         return [(one, _kept(folder, one)) for one in driven]
 
 
-def _kept(folder: Path, one: Driven) -> list[Watched]:
-    """What was watched of one arm, by seed."""
+def _kept(folder: Path, one: Driven) -> list[GuideRow]:
+    """The recorded episodes of one arm, by seed."""
     files = [folder / f"{row['key']}.json" for row in one.rows]
     return [json.loads(file.read_text()) for file in files if file.exists()]
 
 
-def _counted(traffic: str, found: Mapping[str, list[Watched]], lines: list[Line]) -> list[str]:
+def _counted(traffic: str, found: Mapping[str, list[GuideRow]], lines: list[Line]) -> list[str]:
     """How many episodes of each kind; rates with their intervals into `lines`."""
     heads = ["", *KINDS, "did not merge", "episodes"]
     page = [f"## {traffic}", "", markdown_row(heads), "|---" * len(heads) + "|"]
@@ -133,7 +133,7 @@ def _counted(traffic: str, found: Mapping[str, list[Watched]], lines: list[Line]
     return [*page, ""]
 
 
-def _sample(name: str, kind: str, order: Order, episode: Watched, settings: Settings) -> list[str]:
+def _sample(name: str, kind: str, order: Order, episode: GuideRow, settings: Settings) -> list[str]:
     """Speed profiles of the guide AV and of the merging vehicle, and the road at three moments."""
     g = episode["guided"]
     stem = f"t_figure8-{name.split(' (')[0]}-{WANTED.index(kind) + 1}"
@@ -163,7 +163,7 @@ def _sample(name: str, kind: str, order: Order, episode: Watched, settings: Sett
 
 def _drive(todo: Sequence[Task], folder: Path, engine: LocalEngine, hashes: Mapping[str, str]) -> None:
     """Each episode into a file of its own, whole or not at all; what fails is tried again next time."""
-    progress = Progress("t_figure8, watched", "episodes")
+    progress = Progress("t_figure8, driven once more", "episodes")
     try:
         with closing(engine.run(todo)) as outcomes:
             for k, outcome in enumerate(outcomes):
@@ -172,7 +172,7 @@ def _drive(todo: Sequence[Task], folder: Path, engine: LocalEngine, hashes: Mapp
                     print(f"t_figure8: {outcome.key}: {outcome.error or outcome.stderr}", file=sys.stderr)
                     continue
                 if outcome.value["trace_hash"] != hashes[outcome.key]:
-                    raise CosimError(f"{outcome.key}: watched, it is not the episode that was driven before")
+                    raise CosimError(f"{outcome.key}: driven once more, the episode is not the same")
                 pictures = [base64.b64encode(png).decode() for png in outcome.value["pictures"]]
                 with whole(folder / f"{outcome.key}.json") as draft:
                     draft.write_text(json.dumps({**outcome.value, "pictures": pictures}))
@@ -180,7 +180,7 @@ def _drive(todo: Sequence[Task], folder: Path, engine: LocalEngine, hashes: Mapp
         progress.done()
 
 
-JOB = Job("t_figure8", "Figure 8 of T: what the guide AV does", orders, write, watches=True)
+JOB = Job("t_figure8", "Figure 8 of T: what the guide AV does", orders, write, redrives=True)
 
 if __name__ == "__main__":
     JOB.main()

@@ -64,9 +64,9 @@ class Driver:
         self._host: Host | None = None
 
     def drive(
-        self, scenario: Scenario, case: EpisodeId, watch: bool, folder: Path | None, progress: Reported
+        self, scenario: Scenario, case: EpisodeId, recorded: bool, folder: Path | None, progress: Reported
     ) -> tuple[EpisodeResult, Any]:
-        """The episode, watched or not; progress of 0 s in all: kernels are being compiled.
+        """The episode, with its replay data or None; progress of 0 s in all: kernels are being compiled.
 
         Raises as `Host`.
         """
@@ -76,8 +76,8 @@ class Driver:
         self._host = self._make(
             scenario, svo=math.radians(case.svo_deg), metrics=case.metrics, reward=case.reward
         )
-        if watch:
-            return self._host.watch(case.seed, progress, outputs=case.outputs, folder=folder)
+        if recorded:
+            return self._host.run_recorded(case.seed, progress, outputs=case.outputs, folder=folder)
         return self._host.run(case.seed, progress, outputs=case.outputs, folder=folder), None
 
     def close(self) -> None:
@@ -117,22 +117,22 @@ def work(args: argparse.Namespace) -> int:
     progress.starting()
     try:
         with worker:
-            result, watched = worker.call("drive", scenario, case, args.replay, files, progress=progress)
+            result, replay = worker.call("drive", scenario, case, args.replay, files, progress=progress)
     except BaseException:
         if new and folder is not None:
             shutil.rmtree(folder, ignore_errors=True)
         raise
     finally:
-        if files is not None:  # what a simulation that died leaves behind
+        if files is not None:  # what a simulation that crashed leaves behind
             shutil.rmtree(files / sumo_outputs.DRAFT, ignore_errors=True)
         progress.done()
     result = replace(result, manifest=result.manifest | remembered(case, args.sumo_options))
     if folder is not None:
         output.write_folder(folder, result, case.outputs)
-        if watched is not None:
+        if replay is not None:
             from cosim.report.replay.episode import draw
 
-            draw([watched], folder / "replay.html", folder / "replay.mp4")
+            draw([replay], folder / "replay.html", folder / "replay.mp4")
     if args.json:
         print(json.dumps(result.document()))
     else:

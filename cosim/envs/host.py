@@ -1,4 +1,4 @@
-"""The simulation's side of a session: lives in the worker process, one decision at a time."""
+"""The simulation's side of a session: runs in the worker process, one decision at a time."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace

@@ -93,9 +93,9 @@ def open(
     `REWARDS`, FILE.py:NAME or MODULE:NAME; without it P's. `metrics`: classes like those of `cosim.metrics`,
     or FILE.py:NAME, measured besides. `others` builds a policy for the AVs you do not command (without it
     SUMO's IDM drives them). What is no text must be importable: it runs in the simulation's process.
-    `simulator` replaces SUMO, for tests (`cosim.simulation.fake`). `timeout`: the longest silence in s before
-    the process counts as hung.
-    `worker=False` runs the simulation in this process, for debugging: one at a time, and its death is yours.
+    `simulator` replaces SUMO, for tests (`cosim.simulation.fake`). `timeout`: the longest time in s without a
+    heartbeat before the process counts as hung. `worker=False` runs the simulation in this process, for
+    debugging: one at a time, and a crash of SUMO ends your process.
 
     Raises:
         BadInput: naming file (or option), field and value.
@@ -137,10 +137,10 @@ def open(
 
 
 class Session:
-    """One scenario in a supervised process; several sessions can live side by side. Made by `cosim.open`.
+    """One scenario in a supervised process; several sessions can be open at once. Made by `cosim.open`.
 
     An AV without an action in `act` is driven by SUMO's IDM: also one that was commanded before, it is handed
-    back (the same rule as everywhere in cosim). When the process dies, the call that notices raises
+    back (the same rule as everywhere in cosim). When the process ends, the call that notices raises
     SimulationCrashed; `reset` then starts a fresh process. Use it in a `with` statement, or close it.
     """
 
@@ -187,7 +187,7 @@ class Session:
 
         Raises:
             BadInput: an id that is not an AV on the road, something that is no meta-action, no episode.
-            SimulationError, SimulationCrashed: SUMO failed, its process died or hung.
+            SimulationError, SimulationCrashed: SUMO failed, its process ended or hung.
         """
         if self._views is None:
             raise BadInput("no episode has begun: call reset first")

@@ -41,7 +41,7 @@ def hpn_weights() -> dict[str, Path]:
 
 
 class MapMeter(EpisodeReader):
-    """Lives in a worker: predicts maps on recorded episodes and compares them with what followed."""
+    """Runs in a worker: predicts maps on recorded episodes and compares them with what followed."""
 
     def __init__(self, weights: Mapping[str, str], stride: int) -> None:
         super().__init__()

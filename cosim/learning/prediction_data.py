@@ -75,7 +75,7 @@ def recorded_by(manifest: Mapping[str, Any]) -> list[str]:
 
 
 class EpisodeReader:
-    """What lives in a worker and reads recorded episodes."""
+    """What runs in a worker and reads recorded episodes."""
 
     def __init__(self) -> None:
         self._folders: dict[str, Folder] = {}

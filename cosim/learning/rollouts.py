@@ -37,9 +37,9 @@ LIMITS = Limits(step=300.0, crashes=3)  # a drive is its iteration's: it is trie
 
 
 class Rollout(Hosts):
-    """Drives one episode after another; lives in a worker process.
+    """Drives one episode after another; runs in a worker process.
 
-    `reward` and `metrics` are objects, or texts as `cosim.rewards.read` and `cosim.metrics.read` know them.
+    `reward` and `metrics` are objects, or texts as `cosim.rewards.read` and `cosim.metrics.read` accept them.
     """
 
     def __init__(
@@ -126,7 +126,7 @@ def drive_episode(
 
 
 class Rollouts:
-    """`policy.training.vfn.Actors` on `workers` supervised processes, watched as those of a batch are."""
+    """`policy.training.vfn.Actors` on `workers` supervised processes, supervised as those of a batch are."""
 
     def __init__(self, workers: int, *factory: Any) -> None:
         self._factory = factory
@@ -137,7 +137,7 @@ class Rollouts:
     def submit(self, drive: Drive) -> Future[Drove]:
         """Drive it on the next free process.
 
-        The future raises SimulationCrashed when the process died or hung as often as `LIMITS` allow.
+        The future raises SimulationCrashed when the process ended or hung as often as `LIMITS` allow.
         """
         return self._pool.submit(self._drive, drive)
 

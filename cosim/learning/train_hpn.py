@@ -86,7 +86,7 @@ def _commands(args: argparse.Namespace, found: Mapping[str, Sequence[tuple[Path,
 
 
 class Gatherer(EpisodeReader):
-    """Lives in a worker: turns recorded episodes into examples."""
+    """Runs in a worker: turns recorded episodes into examples."""
 
     def __init__(self, variant: str, training: hpn.HpnTraining) -> None:
         super().__init__()

@@ -30,7 +30,7 @@ class Choice:
 
 
 class Recorder(Hook):
-    """Keeps the episode driven last; `cosim.recording.write` stores it, `cosim.recording.watched` draws it.
+    """Keeps the episode driven last; `cosim.recording.write` stores it, `cosim.recording.replay_data` reads it.
 
     `limit`: vehicle frames kept at most; beyond, every second frame goes, which is enough to draw from.
     `policy`: whose forecasts are kept.

@@ -33,9 +33,9 @@ def read_net(path: Path) -> Net:
     """The net `path`, checked.
 
     Raises:
-        BadInput: what `cosim.files.xml_input.scan` refuses; no `version` (SUMO dies of it); NaN, infinite or
+        BadInput: what `cosim.files.xml_input.scan` refuses; no `version` (SUMO crashes); NaN, infinite or
             negative numbers; gaps in lane indices; connections to lanes that are not there; junctions
-            whose right-of-way table does not fit their connections (SUMO dies of that too).
+            whose right-of-way table does not fit their connections (SUMO crashes too).
     """
     reader = _NetReader(path)
     scan(path, ("net",), reader.start, reader.end)
@@ -116,11 +116,11 @@ class _NetReader(Reader):
     def _check_version(self, attributes: dict[str, str]) -> None:
         version = attributes.get("version")
         if version is None:
-            problem_ = "is missing (SUMO dies on such a net): build it with netconvert"
+            problem_ = "is missing (SUMO crashes on such a net): build it with netconvert"
             raise BadInput(problem_, file=self._path, field="net.version", value="")
         if not re.fullmatch(r"\d+(\.\d+)*", version) or int(version.split(".")[0]) > 1:
             raise BadInput(
-                "is not a version SUMO 1 knows", file=self._path, field="net.version", value=version
+                "is not a version that SUMO 1 reads", file=self._path, field="net.version", value=version
             )
 
     def _open_edge(self, attributes: dict[str, str], line: int) -> None:
@@ -157,7 +157,7 @@ class _NetReader(Reader):
             self._closed.append(lane)
 
     def _request(self, attributes: dict[str, str], line: int) -> None:
-        """A row of the right-of-way table: SUMO indexes with what it says."""
+        """A row of the right-of-way table: SUMO uses its entries as indices."""
         due = self._requests[self._junction]
         self._requests[self._junction] += 1
         for name, allowed in (("index", (str(due),)), ("cont", ("0", "1", "false", "true"))):
@@ -174,7 +174,7 @@ class _NetReader(Reader):
                     raise BadInput(problem_, file=self._path, field=field, value=junction)
 
     def _check_inside(self) -> None:
-        """A lane inside a junction that a connection uses must lead out of it: SUMO follows it blindly."""
+        """A lane inside a junction that a connection uses must lead out of it: SUMO does not check it."""
         leaving = {link for link in self._links if link[0].startswith(":")}
         with_via = {self._ends[a] for (a, *_), (_, via) in self._links.items() if via and a in self._ends}
         for (a, b, _, j), (line, via) in self._links.items():

@@ -13,7 +13,7 @@ SIDE_BY_SIDE = np.radians(20.0)  # lanes whose directions differ by less do not 
 CUT_IN_WINDOW = 3.0  # s: an AV that changed lanes so shortly before it was hit from behind had cut in
 
 
-class CollisionWatch:
+class CollisionDetector:
     """The pairs of one episode, so that each is reported once."""
 
     def __init__(self) -> None:

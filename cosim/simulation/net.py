@@ -11,7 +11,7 @@ from cosim.simulation.stderr import SumoStderr
 
 
 class NetReader:
-    """Lives in a `cosim.workers.worker.Worker`, since a bad net can kill the process. Vet the net before."""
+    """Runs in a `cosim.workers.worker.Worker`, since a bad net can crash the process. Vet the net before."""
 
     def __init__(self, net: Path) -> None:
         stderr = SumoStderr()

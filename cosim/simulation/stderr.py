@@ -15,7 +15,7 @@ class SumoStderr:
     """A context manager that sends file descriptor 2 to a file while SUMO works.
 
     In a worker process it goes to a file already, and stays there: should SUMO kill the process, the parent
-    finds SUMO's last words in it (`cosim.workers.worker`). Elsewhere the file is a hidden one.
+    finds SUMO's last messages in it (`cosim.workers.worker`). Elsewhere the file is a hidden one.
     """
 
     def __init__(self) -> None:

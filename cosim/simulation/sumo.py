@@ -15,10 +15,10 @@ import sumo_scenarios
 from cosim.errors import BadInput, SimulationError, SimulationInUse
 from cosim.road import RoadMap
 from cosim.scenario import Scenario
-from cosim.scenario.quiet import quiet
+from cosim.scenario.disabled_outputs import disable_outputs
 from cosim.scenario.sumo_outputs import sumo_options
 from cosim.scenario.sumocfg import time_of
-from cosim.simulation.collisions import CollisionWatch
+from cosim.simulation.collisions import CollisionDetector
 from cosim.simulation.commands import Commander
 from cosim.simulation.convert import Body, SnapshotReader, read_road, struggling_lanes
 from cosim.simulation.drivers import Drivers
@@ -71,7 +71,7 @@ class SumoSimulator:
             )
         self._scratch = tempfile.TemporaryDirectory(prefix="cosim-")
         # a user's detectors would write beside the scenario, and workers would overwrite one another's files
-        self._scenario = scenario if scenario.ships else quiet(scenario, Path(self._scratch.name))
+        self._scenario = scenario if scenario.ships else disable_outputs(scenario, Path(self._scratch.name))
         self._av_parameters = dict(av_parameters or {})
         self._history = history
         self._stderr = SumoStderr()
@@ -101,7 +101,7 @@ class SumoSimulator:
         self._commander = Commander(self._scenario.preset, self._scenario.timing.step)
         self._bodies: dict[str, Body] = {}
         self._routes: dict[str, tuple[str, ...]] = {}
-        self._watch = CollisionWatch()
+        self._detector = CollisionDetector()
         self._reader.bodies_changed()
         self._mission_found = bool(self._scenario.mission.vehicles) or self._scenario.mission.kind == "none"
         self._inserted = 0
@@ -241,7 +241,7 @@ class SumoSimulator:
         now = simulation.getTime()
         self._happened.append(
             (
-                self._watch.from_sumo(self._bodies, self._commander.lane_changes, now),
+                self._detector.from_sumo(self._bodies, self._commander.lane_changes, now),
                 departed,
                 arrived,
                 simulation.getStartingTeleportIDList(),
@@ -258,8 +258,8 @@ class SumoSimulator:
         snapshot = self._reader.read(self._bodies, events)
         if not self._mission_found:
             snapshot = self._find_mission(snapshot)
-        self._watch.lane_changes(snapshot, self.road, self._commander)
-        extra = self._watch.from_boxes(snapshot, self.road, self._bodies, self._commander.lane_changes)
+        self._detector.lane_changes(snapshot, self.road, self._commander)
+        extra = self._detector.from_boxes(snapshot, self.road, self._bodies, self._commander.lane_changes)
         if extra:
             events = replace(events, collisions=(*events.collisions, *extra))
             snapshot = replace(snapshot, events=events)

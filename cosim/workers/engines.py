@@ -7,7 +7,7 @@ from collections.abc import Generator, Sequence
 from typing import Any, Protocol
 
 from cosim.workers.supervisor import Factory, Limits, Supervisor
-from cosim.workers.tasks import Dispenser, Outcome, Task
+from cosim.workers.tasks import Outcome, Task, TaskQueue
 
 ENDING = 10.0  # s that a worker may take to end
 
@@ -23,7 +23,7 @@ class Engine(Protocol):
 
 
 class LocalEngine:
-    """`workers` supervised processes on this machine, each watched by a thread of its own.
+    """`workers` supervised processes on this machine, each supervised by a thread of its own.
 
     `factory(*arguments)` builds the hosted object in each process.
     """
@@ -43,7 +43,7 @@ class LocalEngine:
 
     def run(self, tasks: Sequence[Task]) -> Generator[Outcome, None, None]:
         """Exactly one outcome per task."""
-        dispenser = Dispenser(tasks)
+        tasks_left = TaskQueue(tasks)
         arrived: queue.SimpleQueue[Outcome | BaseException] = queue.SimpleQueue()
         supervisors = [
             Supervisor(self._factory, self._arguments, self._limits)
@@ -51,19 +51,19 @@ class LocalEngine:
         ]
         stopped = threading.Event()
 
-        def watch(supervisor: Supervisor) -> None:
+        def supervise(supervisor: Supervisor) -> None:
             group: str | None = None
             try:
-                while not stopped.is_set() and (task := dispenser.take(group)) is not None:
+                while not stopped.is_set() and (task := tasks_left.take(group)) is not None:
                     group = task.group
                     arrived.put(supervisor.run(task))
-            except BaseException as error:  # ours: the caller's thread must hear of it
+            except BaseException as error:  # a fault of ours: raised in the caller's thread
                 arrived.put(error)
             finally:
                 supervisor.close()
 
         threads = [
-            threading.Thread(target=watch, args=(s,), name=f"cosim-watch-{i}", daemon=True)
+            threading.Thread(target=supervise, args=(s,), name=f"cosim-supervisor-{i}", daemon=True)
             for i, s in enumerate(supervisors)
         ]
         for thread in threads:

@@ -8,7 +8,7 @@ _PAD = 64 * 2**20  # bytes by which the heap grows at once
 
 
 def keep_freed_memory() -> None:
-    """Ask glibc never to hand freed memory back; elsewhere nothing happens.
+    """Ask glibc to keep freed memory for reuse; elsewhere nothing happens.
 
     Batches of maps are tens of megabytes: by default each is mapped, faulted in page by page and unmapped
     again.

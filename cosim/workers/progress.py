@@ -32,7 +32,7 @@ class _Lines(tqdm):  # type: ignore[misc]  # tqdm is not typed
 
 
 class Progress:
-    """Call it with (done, total); `unit` names what is counted. Silent when `quiet`.
+    """Call it with (done, total); `unit` names what is counted. Writes nothing when `quiet`.
 
     A total of 0: there is nothing to count yet, kernels are being compiled.
 
@@ -94,7 +94,7 @@ class Progress:
             self._bar.close()
 
     def _say(self, line: str) -> None:
-        with contextlib.suppress(ValueError):  # the stream is closed: nobody listens any more
+        with contextlib.suppress(ValueError):  # the stream is closed
             print(f"{self._title}: {line}", file=self._stream, flush=True)
 
 

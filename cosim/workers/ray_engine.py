@@ -1,4 +1,4 @@
-"""The engine that spreads tasks over a Ray cluster: an extra, imported only when it is asked for.
+"""The engine that distributes tasks over a Ray cluster: an extra, imported only when it is asked for.
 
 An actor per worker holds the same `Supervisor` as the local engine does, so that crashes, hangs and retries
 are treated alike and SUMO never runs inside a Ray process. What Ray adds is the loss of an actor, with its
@@ -13,10 +13,10 @@ from typing import Any
 
 from cosim.errors import BadInput, CosimError
 from cosim.workers.supervisor import Factory, Limits, Supervisor
-from cosim.workers.tasks import SIM_CRASH, Dispenser, Outcome, Task
+from cosim.workers.tasks import SIM_CRASH, Outcome, Task, TaskQueue
 
-LOSSES = 6  # actors that may die under one task: as often as a process may be killed under it
-PATIENCE = 30.0  # s without a single living actor before we say that we wait
+LOSSES = 6  # actors that may be lost at one task: as often as a process may be killed at it
+NOTICE_AFTER = 30.0  # s without any running actor before a note is printed
 
 
 class RayEngine:
@@ -40,7 +40,7 @@ class RayEngine:
         limits: Limits | None = None,
         address: str | None = None,
     ) -> None:
-        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # no run of ours reports to anybody
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray sends no usage report
         try:
             import ray
         except ModuleNotFoundError:
@@ -60,14 +60,14 @@ class RayEngine:
             return
         own = not self._ray.is_initialized()
         self._connect()
-        fleet = _Fleet(self._ray, self._factory, self._arguments, self._limits)
+        actors = _Actors(self._ray, self._factory, self._arguments, self._limits)
         try:
             count = self._workers or int(self._ray.cluster_resources().get("CPU", 1))
-            yield from fleet.drive(tasks, min(count, len(tasks)))
+            yield from actors.drive(tasks, min(count, len(tasks)))
         except self._ray.exceptions.RaySystemError as error:
             raise CosimError(f"the Ray cluster is gone: {error} (--resume goes on from here)") from None
         finally:
-            fleet.close()
+            actors.close()
             if own:
                 self._ray.shutdown()
 
@@ -90,13 +90,13 @@ class RayEngine:
             ) from None
 
 
-class _Fleet:
+class _Actors:
     """The actors, and which task each of them is at."""
 
     def __init__(self, ray: Any, factory: Factory, arguments: tuple[Any, ...], limits: Limits) -> None:
         self._ray = ray
         # never restarted by Ray: a fresh actor in its place is the same, and may start on another node
-        self._actor = ray.remote(num_cpus=1, max_restarts=0, max_task_retries=0)(_Attendant)
+        self._actor = ray.remote(num_cpus=1, max_restarts=0, max_task_retries=0)(_Actor)
         self._settings = (factory, arguments, limits)
         self._calls: dict[Any, tuple[Any, Task | None, str | None]] = {}  # future -> actor, task, its group
         self._losses: Counter[str] = Counter()
@@ -104,12 +104,12 @@ class _Fleet:
     def drive(self, tasks: Sequence[Task], count: int) -> Generator[Outcome, None, None]:
         """Spread the tasks over `count` actors."""
         errors = self._ray.exceptions
-        dispenser = Dispenser(tasks)
+        tasks_left = TaskQueue(tasks)
         left = len(tasks)
         for _ in range(count):
-            self._hire()
+            self._start_actor()
         while left:
-            ready, _ = self._ray.wait(list(self._calls), num_returns=1, timeout=PATIENCE)
+            ready, _ = self._ray.wait(list(self._calls), num_returns=1, timeout=NOTICE_AFTER)
             if not ready and all(task is None for _, task, _ in self._calls.values()):
                 print("cosim: waiting for the Ray cluster to offer a core", file=sys.stderr, flush=True)
             for future in ready:
@@ -118,13 +118,13 @@ class _Fleet:
                     outcome = self._ray.get(future)
                 except (errors.RayTaskError, errors.RaySystemError):  # a bug of ours; the cluster is gone
                     raise
-                except errors.RayError as error:  # the actor died, or its node with the result
+                except errors.RayError as error:  # the actor was lost, or its node with the result
                     self._ray.kill(actor)
-                    dispenser.leave(group)
-                    outcome = None if task is None else self._lost(task, error, dispenser)
-                    self._hire()
+                    tasks_left.leave(group)
+                    outcome = None if task is None else self._lost(task, error, tasks_left)
+                    self._start_actor()
                 else:
-                    self._assign(actor, dispenser, group)
+                    self._assign(actor, tasks_left, group)
                 if outcome is not None:
                     left -= 1
                     yield outcome
@@ -135,37 +135,37 @@ class _Fleet:
             self._ray.kill(actor)
         self._calls.clear()
 
-    def _hire(self) -> None:
-        """One more actor. It gets no task before it answers: a cluster that lost a node may have no room."""
+    def _start_actor(self) -> None:
+        """One more actor; it gets no task before it answers: after the loss of a node no core may be free."""
         actor = self._actor.remote(*self._settings)
         self._calls[actor.ready.remote()] = (actor, None, None)
 
-    def _assign(self, actor: Any, dispenser: Dispenser, group: str | None) -> None:
-        task = dispenser.take(group)
+    def _assign(self, actor: Any, tasks_left: TaskQueue, group: str | None) -> None:
+        task = tasks_left.take(group)
         if task is None:
-            self._ray.kill(actor)  # should another actor die, a new one is hired in its place
+            self._ray.kill(actor)  # should another actor be lost, a new one is started in its place
         else:
             self._calls[actor.run.remote(task)] = (actor, task, task.group)
 
-    def _lost(self, task: Task, error: Exception, dispenser: Dispenser) -> Outcome | None:
-        """The task of a dead actor goes back, unless too many died under it."""
+    def _lost(self, task: Task, error: Exception, tasks_left: TaskQueue) -> Outcome | None:
+        """The task of a lost actor goes back, unless too many were lost at it."""
         self._losses[task.key] += 1
         if self._losses[task.key] < LOSSES:
-            dispenser.put_back(task)
+            tasks_left.put_back(task)
             return None
         words = " ".join(str(error).split())[:500]
-        problem = f"{LOSSES} Ray workers died at it: {words}"
+        problem = f"{LOSSES} Ray workers were lost at it: {words}"
         return Outcome(task.key, SIM_CRASH, error=problem, attempts=LOSSES)
 
 
-class _Attendant:
+class _Actor:
     """The actor: one supervised worker process on its node."""
 
     def __init__(self, factory: Factory, arguments: tuple[Any, ...], limits: Limits) -> None:
         self._supervisor = Supervisor(factory, arguments, limits)
 
     def ready(self) -> None:
-        """The actor has a core and lives."""
+        """The actor has a core and runs."""
 
     def run(self, task: Task) -> Outcome:
         """One task."""

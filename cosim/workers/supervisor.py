@@ -1,6 +1,6 @@
 """One worker process that may crash or hang, and what is done about it: tasks in, an outcome for each.
 
-The hosted object (`cosim.workers.tasks.Hosted`) is built in the process; nothing here knows what it does.
+The hosted object (`cosim.workers.tasks.Hosted`) is built in the process and may do anything.
 """
 
 import ctypes
@@ -18,9 +18,9 @@ from cosim.workers.worker import Worker
 
 Factory = Callable[..., Hosted]
 
-# SUMO never sends itself these: somebody else (a person, the kernel short of memory) ended the process.
+# SUMO never sends itself these: a person, or the kernel short of memory, ended the process.
 KILLED_FROM_OUTSIDE = frozenset(-s for s in (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP, signal.SIGINT))
-SIGN_OF_LIFE = 1.0  # s between two that are sent: a step of 2 ms must not pay for a message
+HEARTBEAT = 1.0  # s between two that are sent: a message costs too much for a step of 2 ms
 PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 # How an attempt can end, and the status a task gets when it is not tried again.
@@ -39,19 +39,19 @@ _STATUS = {
 class Limits:
     """How long to wait, how often to try."""
 
-    step: float = 120.0  # s of silence while a task runs: a decision takes ms, seconds on a busy machine
-    start: float = 600.0  # s until its first sign of life: process, net, warm-up (A10KW: 3 s)
-    crashes: int = 2  # attempts when the process dies of itself: the second tells chance from cause
+    step: float = 120.0  # s without a heartbeat while a task runs: a decision takes ms, at most seconds
+    start: float = 600.0  # s until its first heartbeat: process, net, warm-up (A10KW: 3 s)
+    crashes: int = 2  # attempts when the process crashes: the second shows whether it does so again
     kills: int = 6  # attempts when it is killed from outside, which says nothing about the task
     timeouts: int = 1  # attempts when it hangs: the second would hang as long
     recycle: int = 200  # tasks before a fresh process: memory was flat over 120 episodes, a precaution
 
 
 class Supervisor:
-    """Owns one worker process at a time. `run` never raises for what a task does; it restarts what died.
+    """Owns one worker process at a time. `run` never raises for what a task does; it restarts the process.
 
     To be created, used and closed by one thread: the process ends with the thread that started it
-    (PR_SET_PDEATHSIG), so that nothing is left behind a parent that was killed. `kill` may come from any.
+    (PR_SET_PDEATHSIG), so that no process outlives a parent that was killed. `kill` may come from any.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class Supervisor:
     # ---- inside ----
 
     def _attempt(self, task: Task) -> tuple[str, Any, str | None, str | None]:
-        """How it ended, the value, the error in one line, the dead process's stderr."""
+        """How it ended, the value, the error in one line, stderr of the process that ended."""
         try:
             worker = self._ready()
             value = worker.call("run", task.arguments, progress=_nothing)
@@ -124,18 +124,18 @@ class Supervisor:
 
     def _ready(self) -> Worker:
         if self._ended:
-            raise SimulationCrashed("no more tasks: it was told to end")
+            raise SimulationCrashed("no more tasks: the supervisor was closed")
         worker = self._worker
         if worker is not None and (self._tasks >= self._limits.recycle or worker.pid is None):
             self._drop()
         if self._worker is None:
             self._tasks = 0
             self._worker = Worker(
-                _Shell,
+                _WorkerSide,
                 os.getpid(),
                 self._factory,
                 self._arguments,
-                timeout=self._limits.step + SIGN_OF_LIFE,
+                timeout=self._limits.step + HEARTBEAT,
                 start_timeout=self._limits.start,
                 name="cosim-evaluation",
                 wait=False,  # `kill` must reach a process that is still starting
@@ -148,42 +148,42 @@ class Supervisor:
             worker.close()
 
 
-class _Shell:
-    """The worker's side: builds the hosted object, thins its signs of life, dies with the parent."""
+class _WorkerSide:
+    """In the worker: builds the hosted object, sends a heartbeat a second at most, ends with its parent."""
 
     def __init__(self, parent: int, factory: Factory, arguments: tuple[Any, ...]) -> None:
-        _die_with(parent)
+        _end_with(parent)
         self._hosted = factory(*arguments)
 
     def run(self, arguments: tuple[Any, ...], progress: Progress) -> Any:
         """One task."""
         last = 0.0
 
-        def thinned(done: float, total: float) -> None:
+        def limited(done: float, total: float) -> None:
             nonlocal last
             now = time.monotonic()
-            if now - last >= SIGN_OF_LIFE:
+            if now - last >= HEARTBEAT:
                 last = now
                 progress(done, total)
 
-        return self._hosted.run(*arguments, progress=thinned)
+        return self._hosted.run(*arguments, progress=limited)
 
     def close(self) -> None:
         """The process ends."""
         self._hosted.close()
 
 
-def _die_with(parent: int) -> None:
+def _end_with(parent: int) -> None:
     """Have the kernel kill this process when its parent is gone, even in the midst of a step of SUMO's."""
     if not hasattr(ctypes, "CDLL") or os.uname().sysname != "Linux":
-        return  # elsewhere the broken pipe ends it at the next sign of life
+        return  # elsewhere the broken pipe ends it at the next heartbeat
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:  # it was gone before we asked
         os._exit(1)
 
 
 def _nothing(done: float, total: float) -> None:
-    """Progress of a task that nobody watches: still the sign of life."""
+    """Progress of a task without a progress bar: it still reports that the process is alive."""
 
 
 def _line(error: Exception) -> str:

@@ -1,4 +1,4 @@
-"""Tasks and their outcomes, and who gets which task next: all that an engine knows of the work it spreads."""
+"""Tasks and their outcomes, and the queue that decides which worker gets which task next."""
 
 import threading
 from collections import Counter, deque
@@ -9,22 +9,22 @@ from typing import Any, Protocol
 from cosim.errors import BadInput, CosimError, SimulationCrashed
 
 OK, SIM_CRASH, TIMEOUT, BAD_INPUT = STATUSES = ("ok", "sim_crash", "timeout", "bad_input")
-FAULT = "fault"  # our own code failed: says nothing about the task, which should be done again once mended
+FAULT = "fault"  # our own code failed: the task has no result and should be run again once the code is fixed
 
 
 class Progress(Protocol):
-    """A sign of life: how much is done, of how much."""
+    """A heartbeat: how much is done, of how much."""
 
     def __call__(self, done: float, total: float) -> None: ...
 
 
 class Hosted(Protocol):
-    """What lives in a worker process."""
+    """What runs in a worker process."""
 
     @property
     def run(self) -> Callable[..., Any]:
-        """`run(*task.arguments, progress=...)` does one task, calling `progress` now and then: the sign of
-        life that the watchdog waits for. Everything in and out must be picklable.
+        """`run(*task.arguments, progress=...)` does one task, calling `progress` now and then: the
+        heartbeat that the supervisor waits for. Everything in and out must be picklable.
 
         Raises BadInput or SimulationError; anything else is a fault of ours.
         """
@@ -50,7 +50,7 @@ class Outcome:
     status: str  # one of STATUSES, or FAULT
     value: Any = None
     error: str | None = None  # one line
-    stderr: str | None = None  # the end of what a dead process wrote there; of a fault, the traceback
+    stderr: str | None = None  # the end of what a process that ended wrote there; of a fault, the traceback
     attempts: int = 1
     seconds: float = 0.0  # wall time of the last attempt
 
@@ -69,43 +69,43 @@ class Outcome:
         raise SimulationCrashed(self.error or "", stderr=self.stderr or "")
 
 
-class Dispenser:
-    """Hands out tasks to many takers, each of which keeps to one group while it lasts. Thread-safe.
+class TaskQueue:
+    """Gives tasks to many workers, each of which stays with one group while it has tasks. Thread-safe.
 
-    A taker without a group gets one that nobody works on, or else helps where most is left.
+    A worker without a group gets one that no other works on, or else the one with most tasks left.
     """
 
     def __init__(self, tasks: Iterable[Task]) -> None:
         self._lock = threading.Lock()
         self._groups: dict[str, deque[Task]] = {}
-        self._takers: Counter[str] = Counter()
+        self._workers: Counter[str] = Counter()
         for task in tasks:
             self._groups.setdefault(task.group, deque()).append(task)
 
     def take(self, last: str | None) -> Task | None:
-        """The next task of a taker whose last one was of the group `last`; None when none is left."""
+        """The next task of a worker whose last one was of the group `last`; None when none is left."""
         with self._lock:
             if last is not None and self._groups.get(last):
                 return self._groups[last].popleft()
             if last is not None:
-                self._takers[last] -= 1
+                self._workers[last] -= 1
                 self._groups.pop(last, None)
             waiting = {name: len(tasks) for name, tasks in self._groups.items() if tasks}
             if not waiting:
                 return None
-            fewest = min(self._takers[name] for name in waiting)
-            free = [name for name in waiting if self._takers[name] == fewest]
+            fewest = min(self._workers[name] for name in waiting)
+            free = [name for name in waiting if self._workers[name] == fewest]
             group = free[0] if fewest == 0 else max(free, key=waiting.__getitem__)
-            self._takers[group] += 1
+            self._workers[group] += 1
             return self._groups[group].popleft()
 
     def put_back(self, task: Task) -> None:
-        """The taker of this task is gone: somebody else must do it, and soon."""
+        """The worker of this task is lost: another one does it next."""
         with self._lock:
             self._groups.setdefault(task.group, deque()).appendleft(task)
 
     def leave(self, last: str | None) -> None:
-        """A taker whose last task was of the group `last` takes no more."""
+        """A worker whose last task was of the group `last` takes no more."""
         with self._lock:
             if last is not None:
-                self._takers[last] -= 1
+                self._workers[last] -= 1

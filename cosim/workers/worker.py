@@ -1,7 +1,7 @@
-"""One object in a process of its own, supervised: SUMO may die, the caller must not.
+"""One object in a process of its own, supervised: when SUMO crashes, the caller does not.
 
-A net that SUMO cannot bear kills the process that imported libsumo (docs/sumo.md). So whatever drives
-a simulation lives in a spawned worker, called through a pipe; its death or silence becomes an exception.
+A net that crashes SUMO ends the process that imported libsumo (docs/sumo.md). So whatever drives a
+simulation runs in a spawned worker, called through a pipe; its crash or missing heartbeat is an exception.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from typing import Any
 from cosim.errors import CosimError, SimulationCrashed, SimulationTimeout
 from cosim.workers.memory import keep_freed_memory
 
-STDERR_KEPT = 4000  # characters of a dead process's stderr that its error carries
+STDERR_KEPT = 4000  # characters of a process's stderr that the error of its crash holds
 
 _CONTEXT = multiprocessing.get_context("spawn")
 _STARTING = threading.Lock()
@@ -33,12 +33,12 @@ _STARTING = threading.Lock()
 class Worker:
     """`factory(*arguments)` built in a spawned process; `call` runs one of its methods there.
 
-    Everything that crosses must be picklable. `timeout` is the longest silence in s that a call may keep
-    (progress counts as a sign of life); `start_timeout` is the longest one before the first sign of life, of
-    the factory and of each call (default: the same). Raises whatever CosimError the method raised,
-    SimulationCrashed when the process died, SimulationTimeout when it stayed silent. A worker whose process
-    is gone stays gone: make a new one. Without `wait` the first call waits for the start, and raises what the
-    factory raised.
+    Everything that crosses must be picklable. `timeout` is the longest time in s without a heartbeat (a call
+    of `progress`); `start_timeout` is the longest time before the first heartbeat, of the factory and of
+    each call (default: the same). Raises whatever CosimError the method raised,
+    SimulationCrashed when the process ended, SimulationTimeout without a heartbeat. A worker whose process
+    has ended cannot be used again: make a new one. Without `wait` the first call waits for the start, and
+    raises what the factory raised.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class Worker:
         handle, path = tempfile.mkstemp(prefix="cosim-worker-", suffix=".stderr")
         os.close(handle)
         self._stderr = Path(path)
-        self._heard = 0  # bytes of it that belong to earlier calls
+        self._call_begin = 0  # bytes of it that belong to earlier calls
         self._pipe, theirs = _CONTEXT.Pipe()
         self._process = _CONTEXT.Process(
             target=_serve, args=(theirs, factory, arguments, path), name=name, daemon=True
@@ -80,11 +80,11 @@ class Worker:
         if self._closed:
             raise SimulationCrashed("the simulation's process has ended already")
         self._wait()
-        self._heard = self._stderr.stat().st_size
+        self._call_begin = self._stderr.stat().st_size
         try:
             self._pipe.send((method, arguments, options, progress is not None))
         except (BrokenPipeError, OSError):
-            raise self._died(method) from None
+            raise self._crashed(method) from None
         return self._answer(method, progress)
 
     def kill(self) -> None:
@@ -129,22 +129,22 @@ class Worker:
         self._started = True
 
     def _answer(self, method: str, progress: Callable[..., None] | None) -> Any:
-        patience = self._timeout if self._start_timeout is None else self._start_timeout
+        limit = self._timeout if self._start_timeout is None else self._start_timeout
         while True:
             try:
-                if not self._pipe.poll(patience):
+                if not self._pipe.poll(limit):
                     self._process.kill()
                     self._process.join()
                     error = SimulationTimeout(
-                        f"no sign of life for {patience:g} s during '{method}': process killed",
-                        stderr=self._last_words(),
+                        f"no heartbeat for {limit:g} s during '{method}': process killed",
+                        stderr=self._call_stderr(),
                     )
                     self.close()
                     raise error
                 kind, value = self._pipe.recv()
-                patience = self._timeout
+                limit = self._timeout
             except (EOFError, ConnectionResetError):
-                raise self._died(method) from None
+                raise self._crashed(method) from None
             if kind == "progress":
                 if progress is not None:
                     progress(*value)
@@ -153,21 +153,21 @@ class Worker:
             else:
                 return value
 
-    def _died(self, method: str) -> SimulationCrashed:
+    def _crashed(self, method: str) -> SimulationCrashed:
         self._process.join(5.0)
         code = self._process.exitcode
         how = f"exit code {code}"
         if code is not None and code < 0:
             how = f"killed by {signal.Signals(-code).name}"
-        stderr = self._last_words()
-        words = f"; last words: {stderr.splitlines()[-1]}" if stderr else ""
+        stderr = self._call_stderr()
+        words = f"; stderr ends: {stderr.splitlines()[-1]}" if stderr else ""
         self.close()
-        problem = f"the simulation's process died during '{method}' ({how}){words}"
+        problem = f"the simulation's process ended during '{method}' ({how}){words}"
         return SimulationCrashed(problem, exitcode=code, stderr=stderr)
 
-    def _last_words(self) -> str:
+    def _call_stderr(self) -> str:
         """What the process wrote during this call."""
-        return self._stderr.read_bytes()[self._heard :].decode("utf-8", "replace").strip()[-STDERR_KEPT:]
+        return self._stderr.read_bytes()[self._call_begin :].decode("utf-8", "replace").strip()[-STDERR_KEPT:]
 
 
 @contextlib.contextmanager
@@ -194,7 +194,7 @@ def _serve(pipe: Connection, factory: Callable[..., Any], arguments: tuple[Any, 
     """The worker's whole life. Ends when the pipe breaks, so it never outlives its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
     keep_freed_memory()
-    os.dup2(2, 1)  # what a policy prints is for eyes: stdout belongs to the caller's document
+    os.dup2(2, 1)  # what a policy prints goes to stderr: stdout is for the caller's document
     file = os.open(stderr, os.O_RDWR | os.O_APPEND)  # as `cosim.simulation.stderr` wants it, to read back
     os.dup2(file, 2)
     os.close(file)

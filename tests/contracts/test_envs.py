@@ -334,7 +334,7 @@ def test_a_simulation_that_hangs_is_killed_after_its_timeout(make: Make) -> None
     pid = env.session.pid
     env.session._caller._timeout = 0.5  # type: ignore[union-attr] - the start needs longer than this test
     began = time.monotonic()
-    with pytest.raises(SimulationCrashed, match=r"no sign of life for 0.5 s"):
+    with pytest.raises(SimulationCrashed, match=r"no heartbeat for 0.5 s"):
         env.step(np.int64(1))
     assert time.monotonic() - began < 10.0
     assert not Path(f"/proc/{pid}").exists()

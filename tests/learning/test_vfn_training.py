@@ -285,7 +285,7 @@ def fake_episode(*vehicles: FakeVehicle) -> Episode:
     return Episode(scenario, FakeSimulator(vehicles, length=3000.0), SMOKE)
 
 
-class Watching(Explorer):
+class Recording(Explorer):
     """Keeps every map it was shown, to compare."""
 
     def reset(self, context):  # type: ignore[no-untyped-def]
@@ -299,7 +299,7 @@ class Watching(Explorer):
 
 def test_what_is_stored_is_what_was_seen() -> None:
     one = agent()
-    one.__class__ = Watching
+    one.__class__ = Recording
     episode = fake_episode(
         FakeVehicle("a", 100.0, 0, 20.0, is_av=True),
         FakeVehicle("b", 150.0, 1, 20.0, is_av=True),

@@ -182,7 +182,7 @@ def test_with_held_nothing_is_driven_and_a_page_that_would_lack_an_arm_is_left(
         run_jobs([table3.JOB, t_figure8.JOB], held)
         run_jobs([table3.JOB], replace(held, runs=tmp_path / "runs"))
     said = capfd.readouterr().err
-    assert "t_figure8: left as it is: its episodes are watched" in said
+    assert "t_figure8: left as it is: its episodes are driven once more" in said
     assert f"table3: left as it is: {len(table3.orders()) // 5} arms have no episode" in said
     text = page(held, "table3")
     assert "Of every arm as many episodes as were driven so far (n)" in text
@@ -225,11 +225,11 @@ def test_a_shipped_episode_that_is_not_the_same_again_is_found_and_named(
         episodes.keep(mine, jobs)
 
 
-def test_what_was_watched_is_the_episode_that_was_counted(small: Settings) -> None:
-    watched = [json.loads(p.read_text()) for p in (small.runs / t_figure8.FOLDER).glob("*.json")]
-    assert len(watched) == len(t_figure8.AGENTS) * len(t_figure8.TRAFFIC)
-    assert {one["seed"] for one in watched} == {200_000}
-    assert all(len(one["trace_hash"]) == 64 for one in watched)
+def test_what_was_driven_once_more_is_the_episode_that_was_counted(small: Settings) -> None:
+    found = [json.loads(p.read_text()) for p in (small.runs / t_figure8.FOLDER).glob("*.json")]
+    assert len(found) == len(t_figure8.AGENTS) * len(t_figure8.TRAFFIC)
+    assert {one["seed"] for one in found} == {200_000}
+    assert all(len(one["trace_hash"]) == 64 for one in found)
 
 
 def test_the_course_of_training_is_drawn_where_there_is_a_log_and_missed_where_there_is_none(

@@ -40,7 +40,7 @@ def session() -> Iterator[Session]:
 
 
 class Loop:
-    """The loop itself, without any environment around it; lives in a worker."""
+    """The loop itself, without any environment around it; runs in a worker."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._simulator = SumoSimulator(scenario, history=COMPACT.frames)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from policy_scenes import straight_road
 
-from cosim.simulation.collisions import CUT_IN_WINDOW, CollisionWatch, _collision
+from cosim.simulation.collisions import CUT_IN_WINDOW, CollisionDetector, _collision
 from cosim.simulation.commands import Commander, Controlled
 from cosim.simulation.convert import Body
 from cosim.types import NO_EVENTS, Kind, Snapshot
@@ -26,15 +26,15 @@ def seen(time: float, lanes: Sequence[int]) -> Snapshot:
 
 
 def test_a_lane_change_is_noted_of_an_av_that_sumo_drives_and_of_nobody_else() -> None:
-    watch, commander = CollisionWatch(), Commander("unguarded", 0.1)
+    detector, commander = CollisionDetector(), Commander("unguarded", 0.1)
     commander.controlled["commanded"] = Controlled(20.0)
     for time, lanes in ((0.2, (0, 0, 0)), (0.4, (1, 1, 1)), (0.6, (1, 1, 1)), (0.8, (-1, 1, 1))):
-        watch.lane_changes(seen(time, lanes), ROAD, commander)
+        detector.lane_changes(seen(time, lanes), ROAD, commander)
     assert commander.lane_changes == {"av": 0.4}
-    watch.lane_changes(seen(1.0, (2, 1, 1)), ROAD, commander)
+    detector.lane_changes(seen(1.0, (2, 1, 1)), ROAD, commander)
     assert commander.lane_changes == {"av": 0.4}, "it was nowhere: that is no lane change"
-    watch = CollisionWatch()  # a new episode
-    watch.lane_changes(seen(1.2, (0, 1, 1)), ROAD, commander)
+    detector = CollisionDetector()  # a new episode
+    detector.lane_changes(seen(1.2, (0, 1, 1)), ROAD, commander)
     assert commander.lane_changes == {"av": 0.4}
 
 

@@ -15,7 +15,7 @@ import pytest
 from cosim.errors import BadInput, SimulationError
 from cosim.workers.engines import LocalEngine
 from cosim.workers.supervisor import Limits, Supervisor
-from cosim.workers.tasks import Dispenser, Progress, Task
+from cosim.workers.tasks import Progress, Task, TaskQueue
 
 QUICK = Limits(step=0.5, start=30.0)
 
@@ -40,8 +40,8 @@ class Driver:
         if what == "refuse":
             raise BadInput("no such edge", file="a.rou.xml", field="route.edges", value="x")
         if what == "fail":
-            raise SimulationError("SUMO says no")
-        if what == "stumble":
+            raise SimulationError("SUMO refuses")
+        if what == "fault":
             raise ZeroDivisionError("a bug of ours")
         return what, os.getpid()
 
@@ -75,23 +75,23 @@ def tasks(*what: str) -> list[Task]:
 def test_what_a_task_does_to_its_process_becomes_its_outcome_and_the_next_one_is_fine(
     supervisor: Supervisor,
 ) -> None:
-    refuse, fail, stumble, crash, hang, fine = (
-        supervisor.run(task) for task in tasks("refuse", "fail", "stumble", "crash", "hang", "fine")
+    refuse, fail, fault, crash, hang, fine = (
+        supervisor.run(task) for task in tasks("refuse", "fail", "fault", "crash", "hang", "fine")
     )
     assert (refuse.status, refuse.attempts) == ("bad_input", 1)
     assert refuse.error == "a.rou.xml: route.edges='x': no such edge"
-    assert (fail.status, fail.attempts, fail.error) == ("sim_crash", 1, "SUMO says no")
-    assert stumble.status == "fault"
-    assert stumble.error is not None
-    assert stumble.error.endswith("ZeroDivisionError: a bug of ours")
-    assert "Traceback" in (stumble.stderr or "")
-    assert (crash.status, crash.attempts) == ("sim_crash", 2), "the second tells chance from cause"
+    assert (fail.status, fail.attempts, fail.error) == ("sim_crash", 1, "SUMO refuses")
+    assert fault.status == "fault"
+    assert fault.error is not None
+    assert fault.error.endswith("ZeroDivisionError: a bug of ours")
+    assert "Traceback" in (fault.stderr or "")
+    assert (crash.status, crash.attempts) == ("sim_crash", 2), "the second shows that it crashes again"
     assert crash.error is not None
     assert "SIGSEGV" in crash.error
     assert crash.stderr == "Error: the net is broken"
     assert (hang.status, hang.attempts) == ("timeout", 1)
     assert hang.error is not None
-    assert "no sign of life" in hang.error
+    assert "no heartbeat" in hang.error
     assert (fine.status, fine.error, fine.value[0]) == ("ok", None, "fine")
 
 
@@ -137,7 +137,7 @@ def test_leaving_the_engine_early_ends_its_workers_at_once() -> None:
         pid = next(outcomes).value[1]
     assert time.monotonic() - began < 30.0, "a hanging task would last a minute"
     assert not alive(pid)
-    assert not [t for t in threading.enumerate() if t.name.startswith("cosim-watch")]
+    assert not [t for t in threading.enumerate() if t.name.startswith("cosim-supervisor")]
 
 
 def test_a_factory_that_fails_is_the_callers_to_hear_of() -> None:
@@ -150,17 +150,17 @@ def unwilling() -> Driver:
 
 
 def test_each_taker_keeps_to_its_group_and_helps_where_most_is_left() -> None:
-    dispenser = Dispenser(Task(f"{g}{i}", g) for g, n in (("a", 1), ("b", 2), ("c", 5)) for i in range(n))
-    one, two, three = dispenser.take(None), dispenser.take(None), dispenser.take(None)
+    tasks_left = TaskQueue(Task(f"{g}{i}", g) for g, n in (("a", 1), ("b", 2), ("c", 5)) for i in range(n))
+    one, two, three = tasks_left.take(None), tasks_left.take(None), tasks_left.take(None)
     assert [t.group for t in (one, two, three) if t] == ["a", "b", "c"], "a group each"
-    helping = dispenser.take("a")
+    helping = tasks_left.take("a")
     assert helping is not None
     assert helping.group == "c", "of the groups left, c has the most"
-    own = dispenser.take("b")
+    own = tasks_left.take("b")
     assert own is not None
     assert own.group == "b"
-    dispenser.put_back(Task("b0", "b"))
+    tasks_left.put_back(Task("b0", "b"))
     left = []
-    while (task := dispenser.take("c")) is not None:
+    while (task := tasks_left.take("c")) is not None:
         left.append(task.key)
     assert sorted(left) == ["b0", "c2", "c3", "c4"]

@@ -73,7 +73,7 @@ class Pretender:
 
 
 def nothing(done: float, total: float) -> None:
-    """Nobody watches."""
+    """Ignores the progress."""
 
 
 def test_rows_come_back_in_the_matrix_s_order_whatever_order_they_came_in(
@@ -196,7 +196,7 @@ def test_exports_say_null_where_there_is_no_figure_and_hold_every_digit(
     cell = plan.cells[0]
     cases = [case for c, case in plan.cases() if c is cell]
     rows = [row(cell, case, Outcome(case.key, "ok", document(case, cell))) for case in cases[:2]]
-    rows.append(row(cell, cases[2], Outcome(cases[2].key, "timeout", error="no sign of life", attempts=1)))
+    rows.append(row(cell, cases[2], Outcome(cases[2].key, "timeout", error="no heartbeat", attempts=1)))
     export(tmp_path, rows, {"cells": {}}, {"episodes": 3})
     assert sorted(p.name for p in tmp_path.iterdir()) == [
         "episodes.csv",

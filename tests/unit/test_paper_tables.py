@@ -14,7 +14,7 @@ from benchmarks.papers.driving import Settings
 from benchmarks.papers.guide import NONE, OTHER, OVERTAKES, SLOWS, YIELDS, guided
 from benchmarks.papers.pages import SAID_FIRST
 from benchmarks.tables import Line, write_csv
-from cosim.recording.watched import Track, Watched
+from cosim.recording.replay_data import ReplayData, Track
 from cosim.report.run_folder import Run
 from cosim.road import Lane, RoadMap
 from cosim.types import Floats, Kind
@@ -120,7 +120,7 @@ def track(
     return Track(name, kind, mission, "", 5.0, 2.0, 0, x, y, still, speed, still, lane)
 
 
-def drive(*others: Track) -> Watched:
+def drive(*others: Track) -> ReplayData:
     """The merging vehicle (20 m/s) is in the first main lane from frame MERGE on; `others` are beside it."""
     lanes = tuple(
         Lane(f"acc_{k}", "acc", k, np.array([[0.0, y], [2000.0, y]]), 2000.0, 3.2, 30.0)
@@ -131,7 +131,7 @@ def drive(*others: Track) -> Watched:
                     np.full(FRAMES, 20.0), Kind.HV, mission=True)  # fmt: skip
     facts: dict[str, Any] = {}
     tracks = (merging, *others)
-    return Watched(facts, RoadMap(lanes), 0.0, INTERVAL, times, tracks, times, (), (), ())
+    return ReplayData(facts, RoadMap(lanes), 0.0, INTERVAL, times, tracks, times, (), (), ())
 
 
 def lateral(*changes: tuple[int, float], start: float = LANES[1]) -> Floats:
@@ -179,9 +179,9 @@ def test_the_guide_is_the_nearest_and_an_episode_without_a_merge_has_none() -> N
     assert (found.guide, found.mission) == ("near", "mission")
     assert found.guide_speed[MERGE] == pytest.approx(18.0)
     assert found.times[MERGE] == 0.0
-    watched = drive(near)
-    alone = [t for t in watched.tracks if not t.mission]
-    assert guide.guided(Watched(**{**vars(watched), "tracks": tuple(alone)})).merged is None
+    data = drive(near)
+    alone = [t for t in data.tracks if not t.mission]
+    assert guide.guided(ReplayData(**{**vars(data), "tracks": tuple(alone)})).merged is None
 
 
 @pytest.mark.parametrize("page", ["README.md", *(f"docs/results/{name}.md" for name in SAID_ON)])

@@ -1,4 +1,4 @@
-"""Replays without SUMO: watching changes nothing, the page holds everything, the film is a film."""
+"""Replays without SUMO: recording changes nothing, the page holds everything, the film is a film."""
 
 from __future__ import annotations
 
@@ -19,8 +19,7 @@ from PIL import Image
 
 from cosim.episode import Episode, run_episode
 from cosim.recording import Recorder
-from cosim.recording.watched import Watched
-from cosim.recording.watched import watched as watched_episode
+from cosim.recording.replay_data import ReplayData, replay_data
 from cosim.report.replay.page import document, page
 from cosim.report.replay.strip import Strip, poses_at
 from cosim.report.replay.video import CAPTION, HEIGHT, LOW, SMALL, WIDTH, animation, film
@@ -75,17 +74,17 @@ class Explains:
 
 def driven(
     world: Any = platoon, seconds: float = 4.0, policy: Any = None, limit: float = np.inf
-) -> tuple[Watched, str]:
+) -> tuple[ReplayData, str]:
     """An episode on the fake simulator, and its trace hash."""
     policy, simulator = policy or Explains(), world()
     recorder = Recorder(policy, limit)
     episode = Episode(scenario(seconds), simulator, policy.observation)
     result = run_episode(episode, policy, 200_000, svo=0.5, hooks=[recorder])
-    return watched_episode(recorder, simulator, result.document()), result.trace_hash
+    return replay_data(recorder, simulator, result.document()), result.trace_hash
 
 
 @pytest.fixture(scope="module")
-def watched() -> Watched:
+def replay() -> ReplayData:
     return driven()[0]
 
 
@@ -105,51 +104,51 @@ def restored(steps: list[int], unit: float, order: int = 1) -> np.ndarray:
     return values * unit
 
 
-def test_an_episode_that_is_watched_is_the_same_episode() -> None:
+def test_an_episode_that_is_recorded_is_the_same_episode() -> None:
     policy, world = Explains(), platoon()
     episode = Episode(scenario(), world, policy.observation)
     alone = run_episode(episode, policy, 200_000, svo=0.5)
     assert driven()[1] == alone.trace_hash
 
 
-def test_every_vehicle_is_followed_through_every_frame(watched: Watched) -> None:
-    assert watched.times == pytest.approx(0.2 * np.arange(21))
-    assert sorted(t.id for t in watched.tracks) == ["a", "b", "c", "human"]
-    for track in watched.tracks:
+def test_every_vehicle_is_followed_through_every_frame(replay: ReplayData) -> None:
+    assert replay.times == pytest.approx(0.2 * np.arange(21))
+    assert sorted(t.id for t in replay.tracks) == ["a", "b", "c", "human"]
+    for track in replay.tracks:
         assert (track.first, len(track.x)) == (0, 21)
         driven = np.diff(track.x)
         assert driven == pytest.approx(0.2 * (track.speed[1:] + track.speed[:-1]) / 2, abs=0.25)
 
 
-def test_what_was_decided_predicted_and_refused_is_kept(watched: Watched) -> None:
-    assert watched.decided == pytest.approx(0.4 * np.arange(10))
-    assert set(watched.choices[0]) == {"a", "b", "c"}
-    blocked = [choices["a"].blocked for choices in watched.choices]
+def test_what_was_decided_predicted_and_refused_is_kept(replay: ReplayData) -> None:
+    assert replay.decided == pytest.approx(0.4 * np.arange(10))
+    assert set(replay.choices[0]) == {"a", "b", "c"}
+    blocked = [choices["a"].blocked for choices in replay.choices]
     assert blocked[0] is None  # the first change begins ...
     assert blocked[1] == "a lane change is under way"
     assert blocked[-1] == "no lane on that side"  # ... and there are two lanes only
-    forecast = watched.forecasts[3]
+    forecast = replay.forecasts[3]
     assert forecast is not None
     assert forecast.ids == ("a", "b", "c")
 
 
-def test_the_page_holds_the_positions_to_half_a_centimetre(watched: Watched) -> None:
-    data = unpacked(page(watched))
+def test_the_page_holds_the_positions_to_half_a_centimetre(replay: ReplayData) -> None:
+    data = unpacked(page(replay))
     names = [v[0] for v in data["vehicles"]]
     for packed in data["tracks"]:
-        track = next(t for t in watched.tracks if t.id == names[packed[0]])
+        track = next(t for t in replay.tracks if t.id == names[packed[0]])
         assert packed[1] == track.first
         assert restored(packed[2], 0.01, 2) == pytest.approx(track.x, abs=0.006)
         assert restored(packed[3], 0.01, 2) == pytest.approx(track.y, abs=0.006)
         assert restored(packed[5], 0.01) == pytest.approx(track.speed, abs=0.006)
     path = next(p for p in data["forecasts"][0] if names[p[0]] == "a")
-    assert watched.forecasts[0] is not None
-    assert restored(path[1], 0.1) == pytest.approx(watched.forecasts[0].x[0, 1::2], abs=0.051)
+    assert replay.forecasts[0] is not None
+    assert restored(path[1], 0.1) == pytest.approx(replay.forecasts[0].x[0, 1::2], abs=0.051)
     assert restored(path[3], 0.1) == pytest.approx(0.3 * np.arange(1, 10, 2), abs=0.051)
 
 
-def test_the_page_holds_values_vetoes_blame_and_refusals(watched: Watched) -> None:
-    data = unpacked(page(watched))
+def test_the_page_holds_values_vetoes_blame_and_refusals(replay: ReplayData) -> None:
+    data = unpacked(page(replay))
     names, words = [v[0] for v in data["vehicles"]], data["words"]
     vehicle, action, _, flags, blamed, blocked, q, score, ttc, unsafe = data["choices"][-1][0]
     assert names[vehicle] == "a"
@@ -163,8 +162,8 @@ def test_the_page_holds_values_vetoes_blame_and_refusals(watched: Watched) -> No
     assert unsafe == [1, 0, 0, 1, 0]
 
 
-def test_the_page_needs_no_network_and_names_no_other_file(watched: Watched) -> None:
-    text = page(watched)
+def test_the_page_needs_no_network_and_names_no_other_file(replay: ReplayData) -> None:
+    text = page(replay)
     assert "default-src 'none'" in text
     assert not re.search(r"https?://|\bsrc=|<link|@import|\bimport\(|fetch\(", text)
     assert len(text) < 100_000
@@ -209,21 +208,21 @@ def test_a_vehicle_that_was_away_has_two_tracks() -> None:
     )
     recorder.add(replace(gone, time=0.2))
     recorder.add(replace(first, time=0.4))
-    found = watched_episode(recorder, world, {})
+    found = replay_data(recorder, world, {})
     tracks = [t for t in found.tracks if t.id == first.ids[0]]
     assert [(t.first, len(t.x)) for t in tracks] == [(0, 1), (2, 1)]
     assert first.ids[0] not in {p.track.id for p in poses_at(found, 0.2)}
 
 
-def test_between_two_frames_a_vehicle_is_between_two_places(watched: Watched) -> None:
-    a, b = (next(p for p in poses_at(watched, t) if p.track.id == "human") for t in (1.0, 1.2))
-    middle = next(p for p in poses_at(watched, 1.1) if p.track.id == "human")
+def test_between_two_frames_a_vehicle_is_between_two_places(replay: ReplayData) -> None:
+    a, b = (next(p for p in poses_at(replay, t) if p.track.id == "human") for t in (1.0, 1.2))
+    middle = next(p for p in poses_at(replay, 1.1) if p.track.id == "human")
     assert middle.x == pytest.approx((a.x + b.x) / 2)
     assert a.x < middle.x < b.x
 
 
-def test_a_vehicle_is_drawn_where_it_is(watched: Watched) -> None:
-    pose = next(p for p in poses_at(watched, 0.0) if p.track.id == "human")
+def test_a_vehicle_is_drawn_where_it_is(replay: ReplayData) -> None:
+    pose = next(p for p in poses_at(replay, 0.0) if p.track.id == "human")
     strip = Strip(pose.x, pose.y, 640, 200)
     empty = np.asarray(strip.finished()).copy()
     strip.vehicle(pose)
@@ -234,9 +233,9 @@ def test_a_vehicle_is_drawn_where_it_is(watched: Watched) -> None:
     assert columns.max() - columns.min() == pytest.approx(5.0 * 640 / 200, abs=3)  # 5 m at 200 m a picture
 
 
-def test_the_film_has_ten_pictures_a_second_that_move(watched: Watched, tmp_path: Path) -> None:
+def test_the_film_has_ten_pictures_a_second_that_move(replay: ReplayData, tmp_path: Path) -> None:
     path = tmp_path / "film.mp4"
-    film([watched], path, follow="human")
+    film([replay], path, follow="human")
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         assert stream.codec_context.name == "h264"
@@ -248,10 +247,10 @@ def test_the_film_has_ten_pictures_a_second_that_move(watched: Watched, tmp_path
 
 
 def test_two_episodes_are_filmed_one_above_the_other_and_the_shorter_one_waits(
-    watched: Watched, tmp_path: Path
+    replay: ReplayData, tmp_path: Path
 ) -> None:
-    half = replace(watched, times=watched.times[: len(watched.times) // 2])
-    film([watched, half], tmp_path / "film.mp4")
+    half = replace(replay, times=replay.times[: len(replay.times) // 2])
+    film([replay, half], tmp_path / "film.mp4")
     with av.open(str(tmp_path / "film.mp4")) as container:
         pictures = [f.to_ndarray(format="rgb24") for f in container.decode(container.streams.video[0])]
     assert len(pictures) == 41
@@ -261,9 +260,9 @@ def test_two_episodes_are_filmed_one_above_the_other_and_the_shorter_one_waits(
     assert not moved[HEIGHT:].any()
 
 
-def test_the_gif_is_small_moves_and_runs_twice_as_fast(watched: Watched, tmp_path: Path) -> None:
+def test_the_gif_is_small_moves_and_runs_twice_as_fast(replay: ReplayData, tmp_path: Path) -> None:
     path = tmp_path / "small.gif"
-    animation([watched, watched], path)
+    animation([replay, replay], path)
     with Image.open(path) as gif:
         assert gif.size == (SMALL, 2 * (LOW + CAPTION))
         assert gif.n_frames == 11  # of 4 s
@@ -276,12 +275,12 @@ def test_the_gif_is_small_moves_and_runs_twice_as_fast(watched: Watched, tmp_pat
     assert [p.name for p in tmp_path.iterdir()] == ["small.gif"]
 
 
-def test_a_film_that_fails_leaves_nothing_behind(watched: Watched, tmp_path: Path) -> None:
+def test_a_film_that_fails_leaves_nothing_behind(replay: ReplayData, tmp_path: Path) -> None:
     def stop(*_: float) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        film([watched], tmp_path / "film.mp4", progress=stop)
+        film([replay], tmp_path / "film.mp4", progress=stop)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -291,6 +290,6 @@ def test_an_empty_world_can_be_drawn() -> None:
     nobody = {name: getattr(first, name)[:0] for name in COLUMNS}
     empty = replace(first, ids=(), **nobody)
     recorder.begin([empty])
-    data = document(watched_episode(recorder, world, {}))
+    data = document(replay_data(recorder, world, {}))
     assert data["tracks"] == []
     assert math.isclose(data["begin"], 0.0)

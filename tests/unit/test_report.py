@@ -53,7 +53,7 @@ class Page(HTMLParser):
 
 @pytest.fixture(scope="module")
 def full(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Page]:
-    """Two policies, one with an SVO sweep, crashes, vetoes and a simulation that died."""
+    """Two policies, one with an SVO sweep, crashes, vetoes and a simulation that crashed."""
     spread = [700.0 + 10 * k for k in range(10)]
     hit = {"time": 12.3, "collider": "av.1", "victim": "hv.7", "av_caused": True, "lane": "a_0"}
     crashed = {
@@ -102,7 +102,7 @@ def test_worst_episodes_come_with_their_replay_command(full: tuple[Path, Page]) 
     assert text.index("AV-caused collision at") < text.index("time to collision down to 0.90 s")
 
 
-def test_a_dead_simulation_is_listed_with_its_last_words(full: tuple[Path, Page]) -> None:
+def test_a_crashed_simulation_is_listed_with_its_stderr(full: tuple[Path, Page]) -> None:
     text = full[1].text
     assert "Error: no such junction" in text
     assert "seed 200010" in text

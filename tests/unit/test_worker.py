@@ -1,4 +1,4 @@
-"""The supervised process: what its object raises, how it dies, and that nothing of it stays."""
+"""The supervised process: what its object raises, how it ends, and that nothing of it stays."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from cosim.simulation.stderr import SumoStderr
 from cosim.workers.worker import Worker
 
 
-class Servant:
+class Served:
     """What the worker holds in these tests."""
 
     def __init__(self, bequest: str | None = None) -> None:
@@ -38,29 +38,29 @@ class Servant:
         raise BadInput("must be even", file="a.xml", field="n", value=3)
 
     def fail(self) -> None:
-        raise SimulationError("SUMO says no")
+        raise SimulationError("SUMO refuses")
 
-    def stumble(self) -> None:
+    def fault(self) -> None:
         raise ZeroDivisionError("a bug of ours")
 
     def sleep(self) -> None:
         time.sleep(60.0)
 
-    def murmur_and_die(self) -> None:
+    def write_and_crash(self) -> None:
         os.write(2, b"Error: the net is broken\n")
         os.kill(os.getpid(), signal.SIGSEGV)
 
-    def let_sumo_speak_and_die(self) -> None:
+    def crash_with_sumos_stderr(self) -> None:
         with SumoStderr() as stderr:
             os.write(2, b"Error: first\n")
             assert stderr.take() == "first"
-            os.write(2, b"Error: SUMO is at its wits' end\n")
+            os.write(2, b"Error: SUMO cannot go on\n")
             os.kill(os.getpid(), signal.SIGSEGV)
 
     def leave(self) -> None:
         os._exit(3)
 
-    def shout(self) -> str:
+    def write(self) -> str:
         print("Warning: of no concern", file=sys.stderr, flush=True)
         return "ok"
 
@@ -69,14 +69,14 @@ class Servant:
             Path(self._bequest).write_text("closed")
 
 
-def unwilling() -> Servant:
+def unwilling() -> Served:
     """A factory that refuses."""
     raise BadInput("no such thing", field="what", value="x")
 
 
 @pytest.fixture
 def worker() -> Iterator[Worker]:
-    with Worker(Servant, timeout=30.0) as worker:
+    with Worker(Served, timeout=30.0) as worker:
         yield worker
 
 
@@ -93,42 +93,42 @@ def test_our_errors_come_back_whole_and_the_worker_goes_on(worker: Worker) -> No
     with pytest.raises(BadInput, match=r"a\.xml: n=3: must be even") as caught:
         worker.call("refuse")
     assert (caught.value.file, caught.value.field, caught.value.value) == ("a.xml", "n", 3)
-    with pytest.raises(SimulationError, match="SUMO says no"):
+    with pytest.raises(SimulationError, match="SUMO refuses"):
         worker.call("fail")
     assert worker.call("add", 1) == 1
 
 
 def test_a_bug_says_where_it_is(worker: Worker) -> None:
-    with pytest.raises(CosimError, match=r"(?s)internal error.*stumble.*ZeroDivisionError: a bug of ours"):
-        worker.call("stumble")
+    with pytest.raises(CosimError, match=r"(?s)internal error.*fault.*ZeroDivisionError: a bug of ours"):
+        worker.call("fault")
     assert worker.call("add", 1) == 1
 
 
-def test_progress_is_passed_on_and_counts_as_a_sign_of_life() -> None:
+def test_progress_is_passed_on_and_counts_as_a_heartbeat() -> None:
     seen: list[tuple[int, int]] = []
-    with Worker(Servant, timeout=30.0) as worker:
+    with Worker(Served, timeout=30.0) as worker:
         worker._timeout = 0.4  # shorter than the 0.75 s the call takes in all
         assert worker.call("count", 5, progress=lambda k, n: seen.append((k, n))) == "done"
     assert seen == [(k, 5) for k in range(5)]
 
 
-def test_a_killed_process_is_named_with_its_signal_and_last_words(worker: Worker) -> None:
-    with pytest.raises(SimulationCrashed, match=r"SIGSEGV.*last words: Error: the net is broken"):
-        worker.call("murmur_and_die")
+def test_a_killed_process_is_named_with_its_signal_and_call_stderr(worker: Worker) -> None:
+    with pytest.raises(SimulationCrashed, match=r"SIGSEGV.*stderr ends: Error: the net is broken"):
+        worker.call("write_and_crash")
     with pytest.raises(SimulationCrashed, match="ended already"):
         worker.call("add", 1)
 
 
-def test_sumo_s_own_last_words_are_heard_too(worker: Worker) -> None:
-    worker.call("shout")  # words of an earlier call are not those of this one
-    with pytest.raises(SimulationCrashed, match=r"last words: Error: SUMO is at its wits' end") as caught:
-        worker.call("let_sumo_speak_and_die")
+def test_sumo_s_own_call_stderr_are_heard_too(worker: Worker) -> None:
+    worker.call("write")  # stderr of an earlier call is not that of this one
+    with pytest.raises(SimulationCrashed, match=r"stderr ends: Error: SUMO cannot go on") as caught:
+        worker.call("crash_with_sumos_stderr")
     assert caught.value.exitcode == -signal.SIGSEGV
-    assert caught.value.stderr.splitlines() == ["Error: first", "Error: SUMO is at its wits' end"]
+    assert caught.value.stderr.splitlines() == ["Error: first", "Error: SUMO cannot go on"]
 
 
-def test_silence_before_the_first_sign_of_life_has_a_limit_of_its_own() -> None:
-    with Worker(Servant, timeout=0.1, start_timeout=30.0) as worker:
+def test_silence_before_the_first_heartbeat_has_a_limit_of_its_own() -> None:
+    with Worker(Served, timeout=0.1, start_timeout=30.0) as worker:
         assert worker.call("add", 1) == 1, "the start took longer than 0.1 s"
         worker._start_timeout = 0.2
         with pytest.raises(SimulationTimeout, match=r"0\.2 s during 'sleep'"):
@@ -143,17 +143,17 @@ def test_a_process_that_was_killed_between_calls_is_noticed(worker: Worker) -> N
         worker.call("add", 1)
 
 
-def test_a_process_that_leaves_is_told_from_one_that_was_killed(worker: Worker) -> None:
+def test_a_process_that_leaves_is_distinguished_from_one_that_was_killed(worker: Worker) -> None:
     with pytest.raises(SimulationCrashed, match="exit code 3"):
         worker.call("leave")
 
 
 def test_a_silent_process_is_killed_after_the_timeout() -> None:
-    worker = Worker(Servant, timeout=30.0)
+    worker = Worker(Served, timeout=30.0)
     pid = worker.pid
     worker._timeout = 0.3
     began = time.monotonic()
-    with pytest.raises(SimulationCrashed, match=r"no sign of life for 0\.3 s during 'sleep'"):
+    with pytest.raises(SimulationCrashed, match=r"no heartbeat for 0\.3 s during 'sleep'"):
         worker.call("sleep")
     assert time.monotonic() - began < 5.0
     assert gone(pid)
@@ -169,7 +169,7 @@ def test_a_factory_that_refuses_leaves_no_process() -> None:
 
 def test_closing_closes_the_object_the_process_and_the_files(tmp_path: Path) -> None:
     files = len(os.listdir("/proc/self/fd"))
-    worker = Worker(Servant, str(tmp_path / "bequest"))
+    worker = Worker(Served, str(tmp_path / "bequest"))
     pid = worker.pid
     worker.close()
     worker.close()
@@ -181,12 +181,12 @@ def test_closing_closes_the_object_the_process_and_the_files(tmp_path: Path) -> 
 
 
 def test_two_workers_are_two_processes(worker: Worker) -> None:
-    with Worker(Servant) as other:
+    with Worker(Served) as other:
         assert worker.call("pid") != other.call("pid")
 
 
 def test_what_the_process_prints_on_stderr_stays_out_of_ours(
     worker: Worker, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    assert worker.call("shout") == "ok"
+    assert worker.call("write") == "ok"
     assert capfd.readouterr().err == ""

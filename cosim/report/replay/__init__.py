@@ -1,1 +1,1 @@
-"""Replays: an episode watched while it is driven, then drawn as an interactive page and as a film."""
+"""Replays: an episode recorded while it is driven, then drawn as an interactive page and as a film."""

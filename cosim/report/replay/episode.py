@@ -10,7 +10,7 @@ from cosim.errors import BadInput, CosimError, hint
 from cosim.files import cannot, read_json, whole
 from cosim.host import Host
 from cosim.policies import check
-from cosim.recording.watched import Watched
+from cosim.recording.replay_data import ReplayData
 from cosim.report import run_folder
 from cosim.scenario import Scenario
 from cosim.scenario.episode_id import EpisodeId
@@ -106,8 +106,8 @@ def check_inputs(recorded: Recorded) -> tuple[Scenario, list[str]]:
     ]
 
 
-def drive(recorded: Recorded, scenario: Scenario, *, check: bool = True) -> tuple[EpisodeResult, Watched]:
-    """Drive it again, watched.
+def drive(recorded: Recorded, scenario: Scenario, *, check: bool = True) -> tuple[EpisodeResult, ReplayData]:
+    """Drive it again, recorded.
 
     Raises (only with `check`):
         BadInput: the policy's weights or code have changed.
@@ -119,14 +119,14 @@ def drive(recorded: Recorded, scenario: Scenario, *, check: bool = True) -> tupl
         with worker:
             if check:
                 _same_policy(recorded.manifest.get(POLICY_FILES, {}), worker.call("policy_files"))
-            result, watched = worker.call("watch", case.seed, progress=progress)
+            result, replay = worker.call("run_recorded", case.seed, progress=progress)
     if check and result.trace_hash != recorded.trace_hash:
         raise ReplayDiffers(
             f"the replay is not the recorded episode: trace hash {result.trace_hash[:16]}... after "
             f"{result.steps} decisions, recorded was {recorded.trace_hash[:16]}... (--no-check draws it all "
             "the same)"
         )
-    return result, watched
+    return result, replay
 
 
 def beside(recorded: Recorded, policy: str) -> Recorded:
@@ -146,7 +146,7 @@ def beside(recorded: Recorded, policy: str) -> Recorded:
 
 
 def draw(
-    episodes: Sequence[Watched],
+    episodes: Sequence[ReplayData],
     html: Path | None = None,
     mp4: Path | None = None,
     gif: Path | None = None,

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cosim.recording import Choice
-from cosim.recording.watched import Track, Watched
+from cosim.recording.replay_data import ReplayData, Track
 from cosim.types import Floats, Forecast
 
 MARGIN = 500.0  # m around the traffic: roads further away are left out
@@ -26,11 +26,11 @@ SCRIPTS = ("data.js", "view.js", "draw.js", "panel.js", "main.js")
 FORECAST_EVERY = 2  # every second predicted frame is drawn
 
 
-def page(watched: Watched) -> str:
+def page(replay: ReplayData) -> str:
     """The whole page as text."""
     assets = resources.files(__package__).joinpath("assets")
-    facts = watched.facts
-    text = json.dumps(document(watched), separators=(",", ":"), allow_nan=False)
+    facts = replay.facts
+    text = json.dumps(document(replay), separators=(",", ":"), allow_nan=False)
     title = " / ".join(str(facts.get(name, "")) for name in ("scenario", "demand", "policy"))
     scripts = [assets.joinpath(name).read_text("utf-8") for name in SCRIPTS]
     return Template(assets.joinpath("page.html").read_text("utf-8")).substitute(
@@ -41,9 +41,9 @@ def page(watched: Watched) -> str:
     )
 
 
-def document(watched: Watched) -> dict[str, Any]:
-    """The watched episode as plain JSON; lengths in cm, times in ms, headings in mrad (see each line)."""
-    r = watched
+def document(replay: ReplayData) -> dict[str, Any]:
+    """The episode as plain JSON; lengths in cm, times in ms, headings in mrad (see each line)."""
+    r = replay
     number = {name: k for k, name in enumerate(dict.fromkeys(t.id for t in r.tracks))}
     words: dict[str | None, int] = {None: 0}  # names and reasons, each written once; number 0 is nobody
     window = _window(r)
@@ -77,7 +77,7 @@ def document(watched: Watched) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _facts(r: Watched) -> dict[str, Any]:
+def _facts(r: ReplayData) -> dict[str, Any]:
     """What stands at the head of the page and in its table of figures."""
     units = r.facts.get("units", {})
     names = (
@@ -91,7 +91,7 @@ def _facts(r: Watched) -> dict[str, Any]:
     }
 
 
-def _vehicles(r: Watched, number: dict[str, int]) -> list[list[Any]]:
+def _vehicles(r: ReplayData, number: dict[str, int]) -> list[list[Any]]:
     """[id, is AV, is mission, class, length cm, width cm] by number."""
     last = {t.id: t for t in r.tracks}
     return [
@@ -145,12 +145,12 @@ def _forecast(f: Forecast | None, number: dict[str, int]) -> list[Any] | None:
     ]
 
 
-def _forecast_interval(r: Watched) -> float | None:
+def _forecast_interval(r: ReplayData) -> float | None:
     first = next((f for f in r.forecasts if f is not None), None)
     return None if first is None else first.interval * FORECAST_EVERY
 
 
-def _window(r: Watched) -> tuple[Floats, Floats]:
+def _window(r: ReplayData) -> tuple[Floats, Floats]:
     """The traffic's bounding box with a margin: lower left and upper right corner, [2] m each."""
     if not r.tracks:
         return np.full(2, -np.inf), np.full(2, np.inf)
@@ -163,7 +163,7 @@ def _meets(shape: Floats, window: tuple[Floats, Floats]) -> bool:
     return bool((shape.max(0) >= window[0]).all() and (shape.min(0) <= window[1]).all())
 
 
-def _lane(r: Watched, k: int) -> list[Any]:
+def _lane(r: ReplayData, k: int) -> list[Any]:
     """[id, width cm, is internal, centre line]"""
     lane = r.road.lanes[k]
     return [lane.id, round(lane.width * 100), int(lane.internal), _line(lane.shape)]

@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from cosim.recording import Choice
-from cosim.recording.watched import Track, Watched
+from cosim.recording.replay_data import ReplayData, Track
 from cosim.types import Floats, Kind, MetaAction
 
 FINE = 2  # drawn this much larger, then reduced: smooth edges
@@ -42,7 +42,7 @@ class Pose(NamedTuple):
     accel: float  # m/s2
 
 
-def poses_at(r: Watched, time: float) -> list[Pose]:
+def poses_at(r: ReplayData, time: float) -> list[Pose]:
     """Everybody on the road at `time` s, on the straight line between two frames."""
     k = max(int(np.searchsorted(r.times, time + 1e-6, side="right")) - 1, 0)
     span = r.times[k + 1] - r.times[k] if k + 1 < len(r.times) else 1.0
@@ -104,7 +104,7 @@ class Strip:
         """The picture in its own size."""
         return self._image.reduce(FINE)
 
-    def road(self, r: Watched) -> None:
+    def road(self, r: ReplayData) -> None:
         """Junctions, then lanes with their edges."""
         for outline in r.road.junctions:
             if self.sees(outline):
@@ -116,7 +116,7 @@ class Strip:
                     width = max(round((lane.width - less) * self._scale), 1)
                     self._pen.line(self._pixels(lane.shape), fill=colour, width=width, joint="curve")
 
-    def forecast(self, r: Watched, k: int) -> None:
+    def forecast(self, r: ReplayData, k: int) -> None:
         """Predicted paths, with an ellipse every second that holds the interval."""
         forecast = r.forecasts[k] if 0 <= k < len(r.forecasts) else None
         if forecast is None:

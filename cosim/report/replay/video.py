@@ -15,7 +15,7 @@ from PIL import Image, ImageDraw
 
 from cosim.files import whole
 from cosim.recording import Choice
-from cosim.recording.watched import Track, Watched
+from cosim.recording.replay_data import ReplayData, Track
 from cosim.report.replay.strip import AV, BAD, TEXT, WARN, Colour, Pose, Strip, colour_of, font, poses_at
 from cosim.types import Kind, MetaAction
 from cosim.workers.tasks import Progress
@@ -38,7 +38,7 @@ ACTIONS = {
 
 
 def film(
-    episodes: Sequence[Watched], path: Path, *, follow: str | None = None, progress: Progress | None = None
+    episodes: Sequence[ReplayData], path: Path, *, follow: str | None = None, progress: Progress | None = None
 ) -> None:
     """Write the MP4. `follow`: a vehicle's id (default: the mission vehicle, else the first AV).
 
@@ -55,7 +55,7 @@ def film(
 
 
 def animation(
-    episodes: Sequence[Watched], path: Path, *, follow: str | None = None, progress: Progress | None = None
+    episodes: Sequence[ReplayData], path: Path, *, follow: str | None = None, progress: Progress | None = None
 ) -> None:
     """Write a small GIF for a page or a slide: roads and outcomes without explanations, twice as fast.
 
@@ -71,7 +71,7 @@ def animation(
 
 
 def _pictures(
-    episodes: Sequence[Watched],
+    episodes: Sequence[ReplayData],
     follow: str | None,
     rate: float,
     progress: Progress | None,
@@ -93,11 +93,11 @@ def _pictures(
 class _Camera:
     """Whom the film follows, and where it looks while that vehicle is not on the road."""
 
-    def __init__(self, watched: Watched, follow: str | None) -> None:
+    def __init__(self, replay: ReplayData, follow: str | None) -> None:
         def rank(t: Track) -> tuple[bool, bool, bool]:
             return t.id != follow, not t.mission, t.kind != Kind.AV
 
-        self.follow = min(watched.tracks, key=rank, default=None)
+        self.follow = min(replay.tracks, key=rank, default=None)
         self.x = self.y = 0.0  # m, the middle of the picture
         if self.follow is not None:
             self.x, self.y = float(self.follow.x[0]), float(self.follow.y[0])
@@ -113,7 +113,7 @@ class _Camera:
         return min(avs, key=lambda p: math.hypot(p.x - self.x, p.y - self.y), default=None)
 
 
-def picture_at(r: Watched, time: float, camera: _Camera, *, small: bool = False) -> Image.Image:
+def picture_at(r: ReplayData, time: float, camera: _Camera, *, small: bool = False) -> Image.Image:
     """One picture: of the film, WIDTH x HEIGHT, or the `small` one of the GIF, SMALL x (LOW + CAPTION)."""
     poses = poses_at(r, time)
     shown = camera.look(poses)
@@ -153,7 +153,7 @@ class _Board:
         self._line_top = strip.height
         self._pen = ImageDraw.Draw(self.picture)
 
-    def legend(self, r: Watched) -> None:
+    def legend(self, r: ReplayData) -> None:
         """Which colour is who, at the top."""
         kinds = {"mission vehicle" if t.mission else _kind(t): colour_of(t) for t in r.tracks}
         x = 14.0
@@ -162,7 +162,7 @@ class _Board:
             self._line(x + 23, 8, name, TEXT, 12)
             x += 40 + self._pen.textlength(name, font(12))
 
-    def caption(self, r: Watched, time: float) -> None:
+    def caption(self, r: ReplayData, time: float) -> None:
         """One line: who drives, what has come of it, when."""
         top = self._line_top + 4
         policy = str(r.facts.get("policy"))
@@ -174,7 +174,7 @@ class _Board:
 
     def panel(
         self,
-        r: Watched,
+        r: ReplayData,
         time: float,
         camera: _Camera,
         here: Mapping[str, Pose],
@@ -235,7 +235,7 @@ def _kind(t: Track) -> str:
     return "AV" if t.kind == Kind.AV else f"human, {t.driver}"
 
 
-def _outcome(r: Watched, time: float) -> tuple[str, Colour]:
+def _outcome(r: ReplayData, time: float) -> tuple[str, Colour]:
     """What has happened so far, in a few words."""
     crashes = [c for c in r.collisions if c.time <= time + 0.05]
     if crashes:

@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 import pytest
 
 from cosim.scenario import Scenario, load
-from cosim.scenario.quiet import quiet
+from cosim.scenario.disabled_outputs import disable_outputs
 
 LOUD = """<additional>
   <!-- file="comment.xml" stays -->
@@ -34,7 +34,7 @@ def scenario(tmp_path: Path) -> Scenario:
 
 
 def test_outputs_go_nowhere_and_all_else_stays(scenario: Scenario, tmp_path: Path) -> None:
-    loud, still = quiet(scenario, tmp_path / "copies").additional
+    loud, still = disable_outputs(scenario, tmp_path / "copies").additional
     assert still == tmp_path / "still.add.xml"
     assert loud.parent == tmp_path / "copies"
     root = ElementTree.fromstring(loud.read_text())
@@ -51,7 +51,7 @@ def test_outputs_go_nowhere_and_all_else_stays(scenario: Scenario, tmp_path: Pat
 
 def test_a_silent_scenario_is_left_as_it_is(scenario: Scenario, tmp_path: Path) -> None:
     (tmp_path / "loud.add.xml").write_text("<additional/>")
-    assert quiet(scenario, tmp_path / "copies") == scenario
+    assert disable_outputs(scenario, tmp_path / "copies") == scenario
     assert not (tmp_path / "copies").exists()
 
 
@@ -59,7 +59,7 @@ def test_an_included_file_is_silenced_too(scenario: Scenario, tmp_path: Path) ->
     (tmp_path / "outer.xml").write_text('<additional><include href="loud.add.xml"/></additional>')
     (tmp_path / "loud.add.xml").write_bytes(LOUD.encode())
     (tmp_path / "still.add.xml").write_text('<additional><include href="outer.xml"/></additional>')
-    still = quiet(scenario, tmp_path / "copies").additional[1]
+    still = disable_outputs(scenario, tmp_path / "copies").additional[1]
     outer = Path(ElementTree.fromstring(still.read_text())[0].get("href", ""))
     loud = Path(ElementTree.fromstring(outer.read_text())[0].get("href", ""))
     assert "loop.xml" not in loud.read_text()
@@ -68,5 +68,5 @@ def test_an_included_file_is_silenced_too(scenario: Scenario, tmp_path: Path) ->
 
 def test_a_packed_file_is_unpacked(scenario: Scenario, tmp_path: Path) -> None:
     (tmp_path / "loud.add.xml").write_bytes(gzip.compress(LOUD.encode()))
-    loud = quiet(scenario, tmp_path / "copies").additional[0]
+    loud = disable_outputs(scenario, tmp_path / "copies").additional[0]
     assert "NUL" in loud.read_text()

@@ -1,4 +1,4 @@
-"""Keep a user's additional files from writing: copies of them in which every output goes nowhere.
+"""Keep a user's additional files from writing: copies of them in which no output is written.
 
 Detectors, edgeData and timed events write wherever their `file` or `dest` says, beside the scenario as a
 rule (A10KW: netstate.xml, tlsstate.xml). That fails in a read-only folder, is overwritten by the next run,
@@ -28,19 +28,19 @@ _INPUTS = {
 _TAG = re.compile(rb"<(?:[^\"'>]|\"[^\"]*\"|'[^']*')*>")
 
 
-def quiet(scenario: Scenario, folder: Path) -> Scenario:
-    """`scenario` with its writing files replaced by silent copies in `folder`; the others stay as they are.
+def disable_outputs(scenario: Scenario, folder: Path) -> Scenario:
+    """`scenario` with its writing files replaced by copies in `folder` that write nothing; the others stay.
 
     Call after `cosim.scenario.vet.vet`: the files are taken to be sound XML.
     """
     return replace(
         scenario,
-        additional=tuple(_silenced(path, folder) for path in scenario.additional),
-        demand=tuple(_silenced(path, folder) for path in scenario.demand),
+        additional=tuple(_disabled(path, folder) for path in scenario.additional),
+        demand=tuple(_disabled(path, folder) for path in scenario.demand),
     )
 
 
-def _silenced(path: Path, folder: Path) -> Path:
+def _disabled(path: Path, folder: Path) -> Path:
     """`path` itself when it writes nothing, else its copy in `folder`."""
     whole = content(path)
     edits = _edits(whole, path, folder)
@@ -67,7 +67,7 @@ def _edits(whole: bytes, path: Path, folder: Path) -> list[tuple[int, int, bytes
         read = _INPUTS.get(tag)
         if read is not None and attributes.get(read):
             source = path.parent / attributes[read]
-            target = _silenced(source, folder) if tag == "include" else source
+            target = _disabled(source, folder) if tag == "include" else source
             text = escape(str(target.absolute()), {'"': "&quot;", "'": "&apos;"})
             place = _place(whole, parser.CurrentByteIndex, read)
             found.append((*place, text.encode(), target != source))

@@ -32,7 +32,7 @@ class Track:
 
 
 @dataclass(frozen=True)
-class Watched:
+class ReplayData:
     """One episode to be drawn; times in s of simulation time."""
 
     facts: Mapping[str, Any]  # the document of `cosim run --json`
@@ -48,12 +48,12 @@ class Watched:
     goal: frozenset[int] = frozenset()  # lanes on which the mission is fulfilled
 
 
-def watched(recorder: Recorder, simulator: Simulator, facts: Mapping[str, Any]) -> Watched:
+def replay_data(recorder: Recorder, simulator: Simulator, facts: Mapping[str, Any]) -> ReplayData:
     """The counted time of the recorded episode, driven on `simulator`."""
     times = np.array([s.time for s in recorder.frames[recorder.first :]])
     # only SUMO's simulator knows them
     drivers: Mapping[str, str] = getattr(simulator, "driver_classes", dict)()
-    return Watched(
+    return ReplayData(
         facts=facts,
         road=simulator.road,
         begin=float(times[0]),

@@ -36,10 +36,10 @@ check: $(VENV)/.installed-dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-# Every table and figure of docs/results/: first what is measured (costs, predictions; better on a quiet
-# machine), then what is driven. Killed? the same goes on. SCALE=0.1: a tenth of the episodes. Those in
+# Every table and figure of docs/results/: first what is measured (costs, predictions; better on an idle
+# machine), then what is driven. The same command continues after an interruption. SCALE=0.1: a tenth of the episodes. Those in
 # docs/results/episodes/ need not be driven; ANEW=1 drives them all the same, `make audit` a few of them.
-# What lacks trained weights is left out and named; `python -m benchmarks.papers --dry-run` tells what is
+# What has no trained weights is left out and named; `python -m benchmarks.papers --dry-run` lists what is
 # still to be driven, and its CPU hours.
 results: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.measured

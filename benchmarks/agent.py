@@ -175,8 +175,8 @@ def page(found: Mapping[str, Any], command: str) -> list[str]:
         for size, by_threads in found["decisions"].items():
             for threads, parts in by_threads.items():
                 times = [f"{parts[name]:.1f}" for name in columns]
-                told = verdict(parts["decision"], TARGET_MS, most=True) if size == "compact" else "measured"
-                lines.append(markdown_row([size, str(threads), *times, told]))
+                result = verdict(parts["decision"], TARGET_MS, most=True) if size == "compact" else "measured"
+                lines.append(markdown_row([size, str(threads), *times, result]))
         lines += [""]
     if found["closed loop"]:
         parts = found["closed loop"]
@@ -184,18 +184,18 @@ def page(found: Mapping[str, Any], command: str) -> list[str]:
         lines += [", ".join(f"{name} {value:.1f}" for name, value in parts.items()) + ".", ""]
     for config, rates in found["training"].items():
         rate = verdict(rates["joint decisions/s"], TARGET_RATE, most=False)
-        told = rate if config == "compact" else "measured"
+        rate_shown = rate if config == "compact" else "measured"
         lines += [
-            f"Training, `{config}`, a rollout process beside the learner (joint decisions/s: {told}):",
+            f"Training, `{config}`, a rollout process beside the learner (joint decisions/s: {rate_shown}):",
             "",
         ]
         lines += [markdown_row(["", "measured"]), "|---|---|"]
-        lines += [markdown_row([name, told_in(value)]) for name, value in rates.items()]
+        lines += [markdown_row([name, rate_text(value)]) for name, value in rates.items()]
         lines += [""]
     return lines
 
 
-def told_in(value: float) -> str:
+def rate_text(value: float) -> str:
     """Three digits, whole numbers whole."""
     return f"{value:,.0f}" if value == round(value) or value >= 1000.0 else f"{value:.3g}"
 

@@ -83,7 +83,7 @@ def disturbed(out: Path, kills: int, dice: random.Random, longest: float, engine
 
 
 def check_gone(workers: list[int]) -> None:
-    """Workers must die with their parent."""
+    """Workers must end with their parent."""
     end = time.monotonic() + 5.0
     while any(alive(pid) for pid in workers):
         if time.monotonic() > end:
@@ -92,7 +92,7 @@ def check_gone(workers: list[int]) -> None:
 
 
 def alive(pid: int) -> bool:
-    """Whether a process runs (a zombie that nobody has fetched yet does not)."""
+    """Whether a process runs (a zombie whose parent has not waited for it yet does not)."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:

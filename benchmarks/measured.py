@@ -120,7 +120,7 @@ def behaviors(place: Place) -> list[list[str]]:
 
 
 def real_nets(place: Place) -> list[list[str]]:
-    """A scenario of somebody else's."""
+    """A scenario of another project."""
     limit = ["--duration", "4"] if place.small else []
     return [["benchmarks.real_nets", *limit, "--out", str(place.out / "real_nets.md")]]
 
@@ -195,8 +195,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         except KeyboardInterrupt:
             print("interrupted: the same command goes on", file=sys.stderr)
             raise SystemExit(130) from None
-        told = f"{time.perf_counter() - began:.0f} s" if fresh else "finished before (--again measures anew)"
-        print(f"measured {number}/{len(pages)}: {page.name}: {told}", file=sys.stderr, flush=True)
+        took = f"{time.perf_counter() - began:.0f} s" if fresh else "finished before (--again measures anew)"
+        print(f"measured {number}/{len(pages)}: {page.name}: {took}", file=sys.stderr, flush=True)
         print(place.out / page.files[0])
 
 

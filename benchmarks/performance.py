@@ -81,8 +81,8 @@ def _loop(one: dict[str, Any], command: str) -> list[str]:
     def times(size: str) -> tuple[str, str, str]:
         part = one[size]
         low, high = part["ratio_range"]
-        told = f"{part['ratio']:.2f} ({low:.2f} to {high:.2f})"
-        return f"{size} size, times bare libsumo", told, _target(part["ratio"], part["target"])
+        ratio = f"{part['ratio']:.2f} ({low:.2f} to {high:.2f})"
+        return f"{size} size, times bare libsumo", ratio, _target(part["ratio"], part["target"])
 
     other = one["highway_env"]
     return [

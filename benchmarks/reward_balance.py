@@ -151,7 +151,7 @@ def balance(worlds: Sequence[str], seeds: range, command: str, workers: int) -> 
     lines = [
         "# Does yielding pay?",
         "",
-        f"`{command}`: the mentor (docs/training.md) drives every AV of `contested`, as an altruist",
+        f"`{command}`: the demonstrator (docs/training.md) drives every AV of `contested`, as an altruist",
         f"and as an egoist, on the same {len(seeds)} tuning seeds a world. "
         "What all AVs together earn at phi = 60",
         "degrees under several settings of equation (6): the altruist's gain over the egoist, mean of paired",

@@ -1,4 +1,4 @@
-"""Array types by what they hold; shapes and units stand where an array is born."""
+"""Array types by what they hold; shapes and units stand where an array is created."""
 
 import numpy as np
 import numpy.typing as npt

@@ -34,8 +34,8 @@ from cosim.types import (
 )
 
 # Of the vehicles that were due: if more were never inserted, the demand is above capacity. Fewer are a queue
-# that empties: somebody is always due at the very end.
-NO_ROOM = 0.05
+# that empties: a vehicle is always due at the very end.
+MAX_WAITING_SHARE = 0.05
 Progress = Callable[[float, float], None]  # simulated s so far, of s in all
 
 
@@ -151,7 +151,7 @@ class Episode:
         return self.histories
 
     def context(self, seed: int, svo: float) -> PolicyContext:
-        """What a policy knows of the episode `seed` before it starts; `svo` (phi) in rad."""
+        """What a policy gets to know of the episode `seed` before it starts; `svo` (phi) in rad."""
         return PolicyContext(
             road=self.simulator.road,
             timing=self.scenario.timing,
@@ -225,7 +225,7 @@ class Episode:
         self._tally["fallbacks"] += sum(d.fallback for d in decisions.values())
 
     def _validity(self, metrics: Mapping[str, Metric]) -> tuple[str, ...]:
-        """Why this result must not be compared with others; empty when nothing speaks against it."""
+        """Why this result must not be compared with others; empty when it may be."""
         reasons = list(self.scenario.warnings)
         waiting = metrics["vehicles_never_inserted"].value or 0
         inserted = metrics["vehicles_inserted"].value or 0
@@ -233,7 +233,7 @@ class Episode:
             reasons.append(
                 "no vehicle was ever inserted: the demand is empty for this time, or its routes are"
             )
-        if waiting > NO_ROOM * (waiting + inserted):
+        if waiting > MAX_WAITING_SHARE * (waiting + inserted):
             reasons.append(f"{waiting} vehicles found no room and were never inserted: demand above capacity")
         if teleports := metrics["teleports"].value:
             reasons.append(f"{teleports} vehicles were teleported by SUMO")

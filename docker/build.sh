@@ -8,7 +8,7 @@
 #
 #   BASE     the image to start from (default: debian:bookworm-slim, or made by debootstrap)
 #   EXTRAS   extras of pyproject.toml to put in, with commas between: ray,postgresql
-#   PIP_INDEX_URL, PIP_EXTRA_INDEX_URL   all that a Docker engine is told of pip, for it mounts nothing
+#   PIP_INDEX_URL, PIP_EXTRA_INDEX_URL   all pip settings that a Docker engine gets, for it mounts nothing
 set -euo pipefail
 cd "$(dirname "$0")/.."
 . docker/engine.sh

@@ -27,8 +27,8 @@ clean() {
 trap clean EXIT
 "${engine[@]}" network create "$name" >/dev/null
 
-# What every node is told; a link that is cut in silence is given up after 15 s instead of two minutes.
-told=(--env RAY_AUTH_MODE=token --env RAY_AUTH_TOKEN_PATH=/run/ray-token --volume "$token:/run/ray-token:ro"
+# Options of every node; a link that is cut without notice is given up after 15 s instead of two minutes.
+node_options=(--env RAY_AUTH_MODE=token --env RAY_AUTH_TOKEN_PATH=/run/ray-token --volume "$token:/run/ray-token:ro"
     --env RAY_grpc_client_keepalive_time_ms=2000 --env RAY_grpc_client_keepalive_timeout_ms=2000
     --env RAY_grpc_keepalive_time_ms=2000 --env RAY_grpc_keepalive_timeout_ms=2000
     --env RAY_USAGE_STATS_ENABLED=0)
@@ -37,7 +37,7 @@ locked=(--network "$name" --read-only --tmpfs /tmp:size=1g --shm-size 512m --cap
 node() { # node NAME RAY ARGUMENTS...
     local own=$1
     shift
-    "${engine[@]}" run --detach --name "$name-$own" "${locked[@]}" "${told[@]}" "${run_args[@]}" \
+    "${engine[@]}" run --detach --name "$name-$own" "${locked[@]}" "${node_options[@]}" "${run_args[@]}" \
         --volume "$results:/results" --entrypoint tini "$IMAGE" -- with-caches ray start --block \
         --num-cpus 1 --object-store-memory 200000000 "$@" >/dev/null
 }

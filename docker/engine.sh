@@ -1,5 +1,5 @@
 # shellcheck shell=bash disable=SC2034
-# Sourced by build.sh and smoke.sh: which container engine there is, and what it has to be told.
+# Sourced by build.sh and smoke.sh: which container engine there is, and the options it needs.
 #
 #   ENGINE      docker or podman (default: docker if an engine answers, else podman)
 #   IMAGE       the tag to build and to run (default: cosim:ci)

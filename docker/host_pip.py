@@ -1,6 +1,6 @@
 """Lends this machine's pip settings to an image's build: `host_pip.py FOLDER`.
 
-Wherever pip finds packages for the person who builds (a folder of wheels, an index of the house, a
+Wherever pip finds packages for the person who builds (a folder of wheels, a company's index, a
 certificate bundle), the build shall find them too. FOLDER gets a pip.conf and the bundle; the folders that
 the settings name are printed, a line `SOURCE TARGET` each, to be mounted for the build. The pip.conf knows
 only the mounted places, so that no path of this machine ends in the image.

@@ -16,7 +16,7 @@ def my_agent(seen: cosim.View) -> MetaAction:
 
 
 def keep_distance(rows: Floats32, valid: Bools) -> MetaAction:
-    """Fall back from whoever is close ahead in my lane; the mission vehicle counts beside it as well.
+    """Fall back from the vehicle close ahead in my lane; the mission vehicle counts beside it as well.
 
     rows [R,F]: the newest frame, myself first; valid [R]: which rows hold a vehicle.
     """

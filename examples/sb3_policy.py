@@ -29,7 +29,7 @@ class Dqn:
         self.model = DQN.load(model, device="cpu")
 
     def reset(self, context: PolicyContext) -> None:
-        """Nobody is chosen yet."""
+        """No AV is chosen yet."""
         self.learner = ""
 
     def decide(self, histories: Mapping[str, History]) -> dict[str, int]:

@@ -60,7 +60,7 @@ class Agent:
 
 
 def config(agent: Agent, untrained: bool = False) -> AgentConfig:
-    """Its configuration at compact size; `untrained`: with the value network as it is born."""
+    """Its configuration at compact size; `untrained`: with the value network of initial weights."""
     c = compact(agent.base)
     if agent.weights:
         path = Path(agent.weights)
@@ -110,8 +110,8 @@ def fingerprint(agent: Agent, untrained: bool = False) -> dict[str, Any]:
     needed = ("predictor",) if agent.preference else ("vfn", "hpn", "predictor")
     weights = {name: sha256(path) for name in needed if (path := _file(c, name))}
     plain = json.loads(json.dumps(asdict(replace(c, vfn_weights=None, hpn_weights=None))))
-    told = {"preference": agent.preference} if agent.preference else {}
-    return {"config": plain, "weights": weights, "v2v": agent.share_intentions, **told}
+    setting = {"preference": agent.preference} if agent.preference else {}
+    return {"config": plain, "weights": weights, "v2v": agent.share_intentions, **setting}
 
 
 def short(document: Any) -> str:
@@ -126,12 +126,12 @@ def build(agent: Agent, untrained: bool = False) -> Policy:
     if agent.preference:
         random = agent.preference == "random"
         return Unled(agent.name, config(agent, untrained), agent.share_intentions, random=random)
-    kind = PredictionAware if agent.share_intentions else _Unheard
+    kind = PredictionAware if agent.share_intentions else _WithoutIntentions
     return kind(agent.name, config(agent, untrained))
 
 
-class _Unheard(PredictionAware):
-    """Its AVs do not tell one another what they intend."""
+class _WithoutIntentions(PredictionAware):
+    """Its AVs do not share their intentions."""
 
     def reset(self, context: PolicyContext) -> None:
         super().reset(replace(context, share_intentions=False))

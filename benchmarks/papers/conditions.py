@@ -1,4 +1,4 @@
-"""What perception range, V2V and the human drivers change: senses taken from the AVs, courtesy from the HVs.
+"""What perception range, V2V and the human drivers change: AVs perceive and share less, HVs cooperate less.
 
     python -m benchmarks.papers.conditions [--scale 1] [--scenario merge] [--dry-run]
 
@@ -43,9 +43,9 @@ def sensing() -> list[Agent]:
     whole = Agent(AGENT)
     alone = [Agent(f"{r:g} m, alone", AGENT, perception_range=r, share_perception=False) for r in RANGES]
     shared = [Agent(f"{r:g} m, shared", AGENT, perception_range=r) for r in RANGES[:-1]]
-    silent = Agent("no intentions", AGENT, share_intentions=False)
-    mute = Agent("no V2V at all", AGENT, share_perception=False, share_intentions=False)
-    return [whole, *shared, *alone, silent, mute]
+    no_intentions = Agent("no intentions", AGENT, share_intentions=False)
+    no_v2v = Agent("no V2V at all", AGENT, share_perception=False, share_intentions=False)
+    return [whole, *shared, *alone, no_intentions, no_v2v]
 
 
 def orders() -> list[Order]:
@@ -75,7 +75,7 @@ def write(results: Results, settings: Settings) -> None:
         if not runs:
             continue
         traffic = f"{demand}, {behavior}"
-        page += [f"## Senses: {world}, {traffic}", "", *_told(), *table(world, runs, FIGURES)]
+        page += [f"## Senses: {world}, {traffic}", "", *_legend(), *table(world, runs, FIGURES)]
         lines += lines_of(traffic, [world], runs, FIGURES)
         for title, measure in SHOWN.items():
             panels[f"{title}: {world}, {demand}"] = {
@@ -109,7 +109,7 @@ def write(results: Results, settings: Settings) -> None:
     save(JOB, settings, page, lines)
 
 
-def _told() -> list[str]:
+def _legend() -> list[str]:
     return [
         "`shared`: AVs also know what their allies perceive; `alone`: they do not. Intentions are what each",
         "AV tells those behind it that it will do.",

@@ -88,7 +88,7 @@ def write(results: Results, settings: Settings) -> None:
     )
     page = heading(JOB, results, settings, *about)
     findings = list(found_targets(runs, worlds, names))
-    page += told(findings)
+    page += target_lines(findings)
     if worlds:
         settings.out.mkdir(parents=True, exist_ok=True)
         picture(settings.out / "decisions.png", panels(runs, worlds), PERCENT)
@@ -107,7 +107,7 @@ def found_targets(runs: Runs, worlds: Sequence[str], names: Mapping[str, str]) -
         yield from targets.contested(runs["contested"], worlds, parts)
 
 
-def told(findings: Sequence[Finding]) -> list[str]:
+def target_lines(findings: Sequence[Finding]) -> list[str]:
     """The targets: first which are missed, then all of them with their figures."""
     if not findings:
         return ["The targets need `vfn-p`, its twin, `altruist-rule` and `idm`: not driven yet.", ""]

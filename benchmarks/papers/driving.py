@@ -77,7 +77,7 @@ class Settings:
     scale: float = 1.0  # of the numbers of episodes
     scenarios: tuple[str, ...] = ()  # (): all that a table has
     workers: int = 2
-    untrained: bool = False  # value networks as they are born: nothing needs to have been trained
+    untrained: bool = False  # value networks with initial weights: nothing needs to have been trained
     duration: float | None = None  # s; None: the scenario's own
     first: int = FIRST_TEST_SEED  # seed; what is compared to tune something belongs on tuning seeds
     trainings: Mapping[str, tuple[Path, ...]] = field(default_factory=dict)  # policy -> runs of cosim train
@@ -93,7 +93,7 @@ class Settings:
         return [o for o in dict.fromkeys(orders) if not self.scenarios or o.scenario in self.scenarios]
 
     def trained(self, policy: str) -> tuple[Path, ...]:
-        """The runs of `cosim train` it is known of: as told, else runs/POLICY and runs/POLICY-0, -1, ...,
+        """The runs of `cosim train` it is known of: as given, else runs/POLICY and runs/POLICY-0, -1, ...,
         else the logs of the shipped weights' trainings."""
         found: tuple[Path, ...] = ()
         for root in (Path("runs"), TRAININGS):
@@ -132,7 +132,7 @@ class Driven:
 
 @dataclass(frozen=True)
 class Results:
-    """Every order with its rows, and what the store knows of all figures."""
+    """Every order with its rows, and what the store holds of all figures."""
 
     driven: tuple[Driven, ...]
     notes: Mapping[str, Mapping[str, str]]  # `units` and `better` of the figures
@@ -185,7 +185,7 @@ def drive(orders: Sequence[Order], settings: Settings, title: str) -> Results:
         cell = work.cell_of.get(order)
         last = settings.first + settings.episodes(order.episodes)
         mine: list[Row] = [
-            {**row, "policy": order.agent.name}  # rows that failed bear the fingerprint
+            {**row, "policy": order.agent.name}  # rows that failed name the fingerprint
             for row in rows.get(cell or "", [])
             if settings.first <= row["seed"] < last
         ]
@@ -217,7 +217,7 @@ class Planned(matrix.Plan):
     counts: tuple[int, ...]
     cell_of: Mapping[Order, str]
     agents: Mapping[str, Agent]
-    untrained: bool  # driven with networks as they are born
+    untrained: bool  # driven with networks of initial weights
 
     @property
     def episodes(self) -> int:
@@ -236,7 +236,7 @@ class Planned(matrix.Plan):
 
 
 def planned(orders: Sequence[Order], settings: Settings) -> Planned:
-    """Every cell that is ordered, once; its policy bears the fingerprint of agent, files and packages.
+    """Every cell that is ordered, once; its policy name holds the fingerprint of agent, files and packages.
 
     Raises BadInput when a world or demand is wrong.
     """
@@ -267,14 +267,14 @@ def agent_of(policy: str) -> str:
 
 
 class AgentRunner(EpisodeRunner):
-    """Hosted by the engine: like `cosim evaluate`, for agents that `--policy` does not know."""
+    """Hosted by the engine: like `cosim evaluate`, for agents that `--policy` cannot name."""
 
     def __init__(self, agents: Mapping[str, Agent], untrained: bool) -> None:
         super().__init__()
         self._agents, self._untrained = agents, untrained
 
     def policy(self, case: EpisodeId) -> Policy:
-        """The agent whose name the case bears."""
+        """The agent that the case names."""
         return build(self._agents[agent_of(case.policy)], self._untrained)
 
 
@@ -300,7 +300,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--scenario", action="append", default=[], choices=names(), help="default: all that a table has")
     add("--duration", type=float, metavar="S", help="of an episode; default: the scenario's own")
     add("--workers", type=int, default=default.workers, metavar="N")
-    add("--untrained", action="store_true", help="value networks as they are born, labelled so")
+    add("--untrained", action="store_true", help="value networks with initial weights, labelled so")
     add("--runs", type=Path, default=default.runs, help="where the episodes are kept")
     add("--out", type=Path, default=default.out, help="folder of pages, pictures and data/*.csv")
     add("--held", action="store_true", help="drive nothing: pages of the episodes that there are")
@@ -368,8 +368,8 @@ def _take(work: Planned, store: Store, settings: Settings, title: str) -> None:
     other = shipped.other_versions(here, settings.shipped)
     taken = shipped.take(store, work.wanted, settings.shipped)
     if other and work.cells:
-        told = f"{settings.shipped} was driven with {other}: what was not driven here is driven anew"
-        print(f"{title}: {told}", file=sys.stderr, flush=True)
+        note = f"{settings.shipped} was driven with {other}: what was not driven here is driven anew"
+        print(f"{title}: {note}", file=sys.stderr, flush=True)
     if taken:
-        told = f"{taken} episodes taken from {settings.shipped} (--anew drives them)"
-        print(f"{title}: {told}", file=sys.stderr, flush=True)
+        note = f"{taken} episodes taken from {settings.shipped} (--anew drives them)"
+        print(f"{title}: {note}", file=sys.stderr, flush=True)

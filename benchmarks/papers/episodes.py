@@ -1,4 +1,4 @@
-"""The episodes that come with the repository: kept once they were driven, checked by whoever doubts.
+"""The episodes that come with the repository: kept once they were driven, checked on demand.
 
     python -m benchmarks.papers.episodes keep                # what the pages need of runs/results
     python -m benchmarks.papers.episodes check --sample 20   # some of them driven anew: all the same?
@@ -191,9 +191,9 @@ def _differences(row: Row, anew: Row) -> list[str]:
     """A line per column that is not the same."""
     if anew["status"] != OK:
         return [f"{row['key']}: {anew['status']}: {anew['error'] or anew['stderr']}"]
-    told = f"{row['key']}: {row['policy']} in {row['scenario']}, {row['demand']}, seed {row['seed']}"
+    episode = f"{row['key']}: {row['policy']} in {row['scenario']}, {row['demand']}, seed {row['seed']}"
     return [
-        f"{told}: {name} is {value}, shipped is {row.get(name)}"
+        f"{episode}: {name} is {value}, shipped is {row.get(name)}"
         for name, value in shipped.plain(anew).items()
         if name in row and row[name] != value
     ]

@@ -140,9 +140,9 @@ def networks(results: Results, settings: Settings) -> list[str]:
             card = read_card(file)
             after = card["measured"].get("iteration")
             planned = card["data"].get("training", {}).get("iterations")
-            told = "" if after is None else f", iteration {after} of {planned or '?'}"
+            iteration = "" if after is None else f", iteration {after} of {planned or '?'}"
             name = agent.name if agent.weights else agent.base
-            lines[f"- weights of `{name}`: SHA-256 {card['sha256'][:12]}{told}"] = None
+            lines[f"- weights of `{name}`: SHA-256 {card['sha256'][:12]}{iteration}"] = None
     return list(lines)
 
 
@@ -177,8 +177,8 @@ def _tell_cost(jobs: Sequence[Job], settings: Settings) -> None:
     for job in jobs:
         found = reckoning.left(job.name, job.orders(), replace(settings, first=job.first))
         for one in found:
-            told = "? (no short episode came through)" if one.hours is None else f"{one.hours:.2f}"
-            print(f"{job.name}: {one.agent}: {one.episodes} episodes, {told} CPU hours")
+            hours = "? (no short episode came through)" if one.hours is None else f"{one.hours:.2f}"
+            print(f"{job.name}: {one.agent}: {one.episodes} episodes, {hours} CPU hours")
         episodes, hours = sum(one.episodes for one in found), sum(one.hours or 0.0 for one in found)
         print(f"{job.name}: {episodes} episodes, {hours:.1f} CPU hours", flush=True)
         all_episodes, all_hours = all_episodes + episodes, all_hours + hours

@@ -2,7 +2,7 @@
 
     python -m benchmarks.papers.phi [--scale 1] [--scenario merge] [--dry-run]
 
-One network, told phi at run time (it is an input); its egoistic twin, the scripted altruist and SUMO's IDM
+One network that gets phi as an input at run time; its egoistic twin, the scripted altruist and SUMO's IDM
 beside it. The picture is the Pareto plot: what the AVs drive against what mission vehicle and HVs drive.
 """
 
@@ -19,7 +19,7 @@ from benchmarks.worlds import WITH_MISSION
 from cosim.report.figures import Measure
 from cosim.report.run_folder import Run
 
-PHIS = (0.0, 15.0, 30.0, 45.0, 60.0, 75.0, 90.0)  # degrees: from egoist to whoever lives for others
+PHIS = (0.0, 15.0, 30.0, 45.0, 60.0, 75.0, 90.0)  # degrees: from egoist to pure altruist
 AGENT = "vfn-p"
 YARDSTICKS = (("vfn-p-egoistic", 0.0), ("idm", 45.0), ("altruist-rule", 45.0))
 DEMAND, BEHAVIOR = "contested", "moderate"

@@ -48,7 +48,7 @@ class Read(NamedTuple):
 
     @property
     def untrained(self) -> bool:
-        """Whether a network of it is as it was born."""
+        """Whether a network of it has its initial weights."""
         return "untrained" in self.arm + self.against
 
 
@@ -191,11 +191,11 @@ def predictors(out: Path) -> str:
     if len(rows) < 2:
         return NOT_RUN
     best, second = sorted(rows, key=lambda r: float(r["mean_m"]))[:2]
-    told = [
+    two = [
         f"{r['predictor']} {float(r['mean_m']):.2f} m ({float(r['ci_low']):.2f} to {float(r['ci_high']):.2f})"
         for r in (best, second)
     ]
-    return f"lowest: {told[0]}, then {told[1]}"
+    return f"lowest: {two[0]}, then {two[1]}"
 
 
 def history(out: Path) -> str:
@@ -242,15 +242,15 @@ def altruism(out: Path) -> str:
 def samples(out: Path) -> str:
     """T, figure 8: how many episodes of each kind."""
     lines = Lines(out, "t_figure8")
-    told = []
+    shares = []
     for arm, demand in (("vfn-p", T_TRAFFIC), ("altruist-rule", "dense, mixed")):
         kinds = _parts(
             (kind, lines.get(kind, arm, scenario="merge", demand=demand), 100.0, 0, " %")
             for kind in (SLOWS, YIELDS, OVERTAKES)
         )
         if kinds != NOT_RUN:
-            told.append(f"{arm}, {demand.split(',')[0]}: {kinds}")
-    return "; ".join(told) or NOT_RUN
+            shares.append(f"{arm}, {demand.split(',')[0]}: {kinds}")
+    return "; ".join(shares) or NOT_RUN
 
 
 def payment(out: Path) -> str:
@@ -258,12 +258,12 @@ def payment(out: Path) -> str:
     lines = Lines(out, "phi")
     parts = []
     for world in ("merge", "exit", "roundabout", "intersection"):
-        told = _parts(
+        gains = _parts(
             (name, lines.get(figure, "vfn-p, phi 45", scenario=world, against="vfn-p, phi 0"), 1.0, 0, " m")
             for name, figure in (("AVs", "dt_av_m"), ("HVs", "dt_hv_m"), ("mission", "dt_mission_m"))
         )
-        if told != NOT_RUN:
-            parts.append(f"{world}: {told}")
+        if gains != NOT_RUN:
+            parts.append(f"{world}: {gains}")
     return "; ".join(parts) or NOT_RUN
 
 

@@ -96,8 +96,8 @@ def _courses(settings: Settings) -> list[str]:
         settings.out.mkdir(parents=True, exist_ok=True)
         learning_curves.draw(settings.out / "t_figure7.png", runs)
         page += ["![t_figure7](t_figure7.png)", ""]
-        told = f"Training drives explore: means over {learning_curves.WINDOW} iterations."
-        page += [f"{told} Validation is greedy, on", "tuning seeds. Thin: a run each; thick: their mean.", ""]
+        note = f"Training drives explore: means over {learning_curves.WINDOW} iterations."
+        page += [f"{note} Validation is greedy, on", "tuning seeds. Thin: a run each; thick: their mean.", ""]
     return page
 
 

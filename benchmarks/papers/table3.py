@@ -36,10 +36,10 @@ ABLATION = (
     Agent("vfn"),
     Agent("no maps, mask gp", "vfn", mask="gp-indirect"),
 )
-SCHOOL = (
+TRAINING = (
     "",
-    "Our networks saw two drives an iteration, a mentor's among them (docs/training.md); P's saw thousands",
-    "of episodes and no mentor.",
+    "Our networks saw two drives an iteration, a demonstrator's among them (docs/training.md); P's saw",
+    "thousands of episodes and no demonstrator.",
 )
 ABLATED = (
     "Ablation: predicted maps yes or no, mask none, constant speed or Gaussian process. The networks are",
@@ -74,7 +74,7 @@ def write(results: Results, settings: Settings) -> None:
     ablated = {names[a.name]: runs[names[a.name]] for a in ABLATION if a.name in names}
     worlds = [w for w in WORLDS if any(of_world(run, w) for run in runs.values())]
     page = heading(
-        *(JOB, results, settings), "Demand `dense`, HVs `mixed` in equal parts, phi 45 degrees.", *SCHOOL
+        *(JOB, results, settings), "Demand `dense`, HVs `mixed` in equal parts, phi 45 degrees.", *TRAINING
     )
     lines = lines_of("dense", worlds, runs, FIGURES)
     if worlds:

@@ -1,4 +1,4 @@
-"""The folder of a run: made, locked and measured before anything is run, left as it was if that fails."""
+"""The folder of a run: made, locked, checked for disk space before anything is run, removed if that fails."""
 
 import contextlib
 import fcntl
@@ -10,8 +10,8 @@ from cosim.batch.store import FILE
 from cosim.errors import BadInput
 from cosim.files import cannot
 
-ROOM = 32_000  # bytes per episode: 6 kB in the store, 2 kB exported, and the store's log beside it
-ROOM_AT_LEAST = 4_000_000  # bytes
+EPISODE_BYTES = 32_000  # 6 kB in the store, 2 kB exported, and the store's log beside it
+LEAST_BYTES = 4_000_000  # bytes
 RESULTS = (FILE, "episodes.parquet", "episodes.csv", "summary.json", "manifest.json")
 
 
@@ -19,7 +19,7 @@ class RunFolder(contextlib.AbstractContextManager["RunFolder"]):
     """Holds the lock on a run folder until `close`.
 
     Raises:
-        BadInput: the path cannot be made or written, has not room for `episodes`, is in use by another
+        BadInput: the path cannot be made or written, has no space for `episodes`, is in use by another
             process, or holds results already (without `resume`).
     """
 
@@ -33,7 +33,7 @@ class RunFolder(contextlib.AbstractContextManager["RunFolder"]):
             held = [name for name in RESULTS if (self.path / name).exists()]
             if held and not resume:
                 raise self._wrong(f"holds {held[0]} already: go on with --resume, or name another folder")
-            self._check_room(max(episodes * ROOM, ROOM_AT_LEAST))
+            self._check_space(max(episodes * EPISODE_BYTES, LEAST_BYTES))
         except BaseException:
             self._remove_made()
             raise
@@ -70,7 +70,7 @@ class RunFolder(contextlib.AbstractContextManager["RunFolder"]):
     def _remove_made(self) -> None:
         self.close()
         for folder in self._made:
-            with contextlib.suppress(OSError):  # somebody put something there in the meantime
+            with contextlib.suppress(OSError):  # another process put a file there in the meantime
                 folder.rmdir()
 
     def _take_lock(self) -> None:
@@ -82,9 +82,9 @@ class RunFolder(contextlib.AbstractContextManager["RunFolder"]):
             except BlockingIOError:
                 raise self._wrong("another process is working in it") from None
 
-    def _check_room(self, size: int) -> None:
+    def _check_space(self, size: int) -> None:
         """Write and remove a file of the size that the results may reach."""
-        probe = self.path / ".room.part"
+        probe = self.path / ".space.part"
         with self._cannot(f"hold the results ({size / 1e6:.0f} MB at most)"):
             try:
                 with probe.open("wb") as file:

@@ -49,7 +49,7 @@ def _shared() -> dict[str, dict[str, Any]]:
         "--av-type": {"metavar": "T", "help": "AVs are the vehicles of this vType"},
         "--av-ids": {"metavar": "REGEX", "help": "AVs are the vehicles whose id matches"},
         "--svo": {"type": degrees, "metavar": "DEG", "help": "SVO angle, 0..90 (default 45)"},
-        "--preset": {"choices": Preset.ALL, "help": "who guards the AVs (default: the scenario's)"},
+        "--preset": {"choices": Preset.ALL, "help": "safety checks on the AVs (default: the scenario's)"},
         "--seed": {"type": seed, "metavar": "N"},
         "--seeds": {"metavar": "A:B", "help": "seeds A, A+1, ... B-1"},
         "--duration": {

@@ -1,4 +1,4 @@
-"""`cosim metrics`: our figures for floating-car data that SUMO wrote, whoever drove."""
+"""`cosim metrics`: our figures for floating-car data that SUMO wrote, with any drivers."""
 
 import argparse
 import json

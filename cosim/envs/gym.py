@@ -126,7 +126,7 @@ class SumoEnv(gymnasium.Env[Observation, np.int64]):
     def _info(self, step: StepResult) -> dict[str, Any]:
         return {
             "action_mask": self.action_masks(),
-            **spaces.told(step, self.learner),
+            **spaces.decision_info(step, self.learner),
             "time": step.info["elapsed"],
         }
 
@@ -139,7 +139,7 @@ def nearest_upstream(views: Mapping[str, View]) -> str:
 
 
 def no_av(seed: int, name: str | None) -> BadInput:
-    """Nobody to learn: how to get one."""
+    """There is no learner: how to get one."""
     if name is not None:
         return BadInput(f"this AV was never on the road in episode {seed}", field="learner", value=name)
     return BadInput(

@@ -69,7 +69,7 @@ class SumoParallelEnv(ParallelEnv):  # type: ignore[misc]
         self.action_spaces = {a: spaces.action_space() for a in self.possible_agents}
         self._config, self._flatten = observation, flatten
         self._rng = np.random.default_rng(NATIVE_RANDOM)
-        self._slots: dict[str, str] = {}  # SUMO id -> agent, whoever had one in this episode
+        self._slots: dict[str, str] = {}  # SUMO id -> agent, for all that had one in this episode
         self._session: Session = sessions.open(config, observation=observation, **words)
 
     @property
@@ -120,7 +120,7 @@ class SumoParallelEnv(ParallelEnv):  # type: ignore[misc]
         infos = {a: self._info(a) for a in acting}
         for agent in acting:
             name = av_of[agent]
-            infos[agent] |= spaces.told(step, name)
+            infos[agent] |= spaces.decision_info(step, name)
             if name in step.ended:
                 infos[agent]["ended"] = step.ended[name]
         self._drive_on()

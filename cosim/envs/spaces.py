@@ -71,7 +71,7 @@ def checked(
 
 
 def training_seed(rng: np.random.Generator) -> int:
-    """A seed for an episode nobody named one for."""
+    """A seed for an episode without a given one."""
     return int(rng.integers(len(TRAINING_SEEDS)))
 
 
@@ -102,7 +102,7 @@ def kinematics(matrix: Floats32) -> Floats32:
 
 
 def ego(view: View) -> Floats32:
-    """[E] EGO_FEATURES: the AV's own command, what its route knows, who drives next on the three lanes."""
+    """[E] EGO_FEATURES: the AV's own command, what lies on its route, who drives next on the three lanes."""
     speeds = np.array([view.ego_speed, view.target_speed, view.speed_limit]) / SPEED
     distances = np.minimum([*view.to_dead_end, view.conflict_distance], FAR) / FAR
     gaps, faster = neighbours(view)
@@ -137,8 +137,8 @@ def action_mask(view: View) -> npt.NDArray[np.int8]:
     return view.action_mask.astype(np.int8)
 
 
-def told(step: StepResult, av: str) -> dict[str, Any]:
-    """What both faces say of one AV's decision in `info`: the reward's terms, what became of its command."""
+def decision_info(step: StepResult, av: str) -> dict[str, Any]:
+    """One AV's decision in the `info` of both environments: the reward's terms, its command's result."""
     receipt = step.receipts.get(av)
     return {
         "reward_terms": step.terms[av]._asdict(),

@@ -26,7 +26,7 @@ FIGURES = ("time_to_collision", "post_encroachment", "drac", "hard_braking", "je
 CONFLICTS = ("time_to_collision", "drac")  # figures of single frames, which a jump would make up
 SIDEWAYS = 5.0  # m/s: nobody moves faster to the side, but for SUMO's lane changes that take no time
 FRAME = Timing().frame  # s: finer data are thinned to it, so that figures compare with an episode's
-DRIVEN = 200.0  # m that all vehicles have driven before the positions are doubted
+DRIVEN = 200.0  # m that all vehicles have driven before the positions are checked
 WHOLE_LANE = 1e6  # m, of a lane whose length is not known
 
 

@@ -83,7 +83,7 @@ class Encounters:
         self._interval, self._time = math.nan, math.nan  # s between frames, of the newest
 
     def add(self, snapshot: Snapshot, seen: Snapshot | None = None) -> None:
-        """The next frame; `seen`: the frame without the vehicles that can meet nobody in it."""
+        """The next frame; `seen`: the frame without the vehicles that can meet no other in it."""
         s = snapshot if seen is None else seen
         self._interval, self._time = snapshot.time - self._time, snapshot.time
         rows = np.flatnonzero(watched(s))
@@ -156,7 +156,7 @@ class Encounters:
         return "following" if turned <= ALIGNED else "crossing"
 
     def _ahead(self, lane: int) -> set[int]:
-        """The lane and those that whoever is on it drives on to, as long as there is no choice."""
+        """The lane and those that a vehicle on it drives on to, as long as there is no choice."""
         found = [lane]
         while len(found) <= STEPS and len(onward := self._road.lanes[found[-1]].successors) == 1:
             found.append(onward[0])

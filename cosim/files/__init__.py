@@ -17,7 +17,7 @@ def whole(path: Path, *, contended: bool = False) -> Iterator[Path]:
     """A draft beside `path` that takes its place when the block ends well, and is gone when it does not.
 
     `contended`: several processes may write it at the same time, and the last one's stands. What a killed
-    process has left is written over by the next one, where nobody contends. OSErrors are not caught.
+    process has left is written over by the next one, if no other one writes it. OSErrors are not caught.
     """
     mine = f".{os.getpid()}" if contended else ""
     draft = path.with_name(f".{path.name}{mine}.part")

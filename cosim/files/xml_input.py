@@ -69,7 +69,7 @@ def scan(
 ) -> str:
     """Call `start` for every element (the root included) and `end` when it closes; return the root's tag.
 
-    Plain and gzip-packed files are told apart by their first bytes, as SUMO does. `roots`: the root tags
+    Plain and gzip-packed files are distinguished by their first bytes, as SUMO does. `roots`: the root tags
     that are right here; empty for any. `unpacked`: bytes that a .gz may hold (MAX_UNPACKED).
 
     Raises:

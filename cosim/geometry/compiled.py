@@ -25,14 +25,14 @@ def on_compilation(begun: Callable[[], None]) -> None:
     """Call `begun` in this process when numba begins to compile a kernel, not when it loads one from its
     cache."""
 
-    class Listener(event.Listener):
+    class Compilations(event.Listener):
         def on_start(self, event: object) -> None:
             begun()
 
         def on_end(self, event: object) -> None:
             pass
 
-    _numba.core.event.register("numba:compile", Listener())
+    _numba.core.event.register("numba:compile", Compilations())
 
 
 def cached(decorator: Callable[..., Any]) -> Callable[[Function], Function]:

@@ -102,13 +102,13 @@ def _ttc(a: Box, b: Box, cap: float) -> float:
 
 
 @compiled
-def _needed(t: float, room: float, v: float) -> float:
-    """Deceleration (m/s2) with which a car at v m/s has driven at most `room` m at time t s."""
-    if room >= v * t:
+def _needed(t: float, distance: float, v: float) -> float:
+    """Deceleration (m/s2) with which a car at v m/s has driven at most `distance` m at time t s."""
+    if distance >= v * t:
         return 0.0
-    if 2.0 * room >= v * t:
-        return 2.0 * (v * t - room) / (t * t)
-    return v * v / (2.0 * room) if room > 0.0 else np.inf  # it must stop before t
+    if 2.0 * distance >= v * t:
+        return 2.0 * (v * t - distance) / (t * t)
+    return v * v / (2.0 * distance) if distance > 0.0 else np.inf  # it must stop before t
 
 
 @compiled
@@ -174,10 +174,10 @@ def _lone_deceleration(a: Box, b: Box) -> float:
             else:
                 t = t0
             if t0 <= t <= t1:
-                room = low[0] + slope[0] * t
+                distance = low[0] + slope[0] * t
                 for k in range(1, lines):
-                    room = max(room, low[k] + slope[k] * t)
-                worst = max(worst, _needed(t, room, v))
+                    distance = max(distance, low[k] + slope[k] * t)
+                worst = max(worst, _needed(t, distance, v))
     return worst
 
 

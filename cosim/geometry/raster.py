@@ -31,8 +31,8 @@ from cosim.types import (
 )
 
 CHANNELS = ("av", "hv", "road", "mission", "ego")
-# A vehicle's pixel, of 1: FLOOR + SPAN clip((dv + SPEED) / (2 SPEED), 0, 1), dv in m/s relative to the ego.
-PIXEL_FLOOR, PIXEL_SPAN, PIXEL_SPEED = 0.1, 0.9, 30.0
+# A vehicle's pixel, of 1: LOWEST + SPAN clip((dv + SPEED) / (2 SPEED), 0, 1), dv in m/s relative to the ego.
+PIXEL_LOWEST, PIXEL_SPAN, PIXEL_SPEED = 0.1, 0.9, 30.0
 ROAD_SURFACE = 128  # a lane's surface
 ROAD_LINE = 255  # within LINE_WIDTH of a lane's edge, so that neighbouring lanes can be distinguished
 LINE_WIDTH = 0.5  # m
@@ -254,7 +254,7 @@ def _draw_vehicle(
     if not (abs(ahead) - reach_x < 0.5 * columns * along and abs(left) - reach_y < 0.5 * height * across):
         return
     level = min(max((dv + PIXEL_SPEED) / (2.0 * PIXEL_SPEED), 0.0), 1.0)
-    value = np.uint8(255.0 * (PIXEL_FLOOR + PIXEL_SPAN * level) + 0.5)
+    value = np.uint8(255.0 * (PIXEL_LOWEST + PIXEL_SPAN * level) + 0.5)
     first = channels[4] if is_ego else (channels[0] if is_av else channels[1])
     second = channels[3] if mission and not is_ego else -1
     u0 = max(int(np.floor((ahead - reach_x) / along + 0.5 * columns)), 0)

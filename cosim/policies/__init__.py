@@ -1,4 +1,4 @@
-"""Every policy that `--policy` can name: those that ship, weights of a training, somebody's own code."""
+"""Every policy that `--policy` can name: those that ship, weights of a training, a user's own code."""
 
 from pathlib import Path
 

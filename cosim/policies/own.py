@@ -1,4 +1,4 @@
-"""Somebody's own policy behind our protocol: class, factory or function, its mistakes named as its own."""
+"""A user's own policy behind our protocol: class, factory or function; errors name the user's code."""
 
 import inspect
 import operator
@@ -79,7 +79,7 @@ class OwnPolicy:
 class PerVehicle:
     """A function of one AV's `cosim.View`, as `Session.act` wants it, that commands every AV alike.
 
-    Its attribute `observation` says what it wants to see; without one it sees compact maps.
+    Its attribute `observation` is what it wants to see; without one it sees compact maps.
     """
 
     def __init__(self, act: Callable[[View], Any]) -> None:
@@ -90,7 +90,7 @@ class PerVehicle:
         """It remembers nothing."""
 
     def decide(self, histories: Mapping[str, History]) -> dict[str, Any]:
-        """What the function says of each."""
+        """What the function returns for each."""
         return {av: self._act(view) for av, view in views(histories).items()}
 
 

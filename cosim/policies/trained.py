@@ -1,4 +1,4 @@
-"""The agent of a training, built again from its weights and what their card says of them."""
+"""The agent of a training, built again from its weights and their card."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -41,7 +41,7 @@ def config(weights: Path) -> AgentConfig:
         return dataclass_from(kind, about.get(name, {}), file, f"data.{name}")
 
     vfn = dataclass_from(VfnConfig, card["configs"]["vfn"], file, "configs.vfn")
-    # cards of before observations were told are of one of the two sizes that ship
+    # a card without an observation is of one of the two sizes that ship
     seen = PAPER if vfn.height == PAPER.height else COMPACT
     if "observation" in about:
         seen = section(ObservationConfig, "observation")

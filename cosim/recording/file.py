@@ -40,7 +40,7 @@ SCHEMA = pa.schema(
 class Recording:
     """One episode read back. Arrays [L] run over vehicles, then frames: see SCHEMA for units."""
 
-    case: Mapping[str, Any]  # scenario, demand, behavior, policy, seed, ..., as the recorder was told
+    case: Mapping[str, Any]  # scenario, demand, behavior, policy, seed, ..., as passed to the recorder
     times: npt.NDArray[np.float64]  # [T] s
     ids: tuple[str, ...]  # sorted
     first: int  # frame at which the episode's clock is 0

@@ -30,7 +30,7 @@ class Choice:
 
 
 class Recorder(Hook):
-    """Keeps the episode driven last; `cosim.recording.write` stores it, `cosim.recording.replay_data` reads it.
+    """Keeps the last episode; `cosim.recording.write` stores it, `cosim.recording.replay_data` reads it.
 
     `limit`: vehicle frames kept at most; beyond, every second frame goes, which is enough to draw from.
     `policy`: whose forecasts are kept.
@@ -57,7 +57,7 @@ class Recorder(Hook):
         self._know(episode)
 
     def begin(self, frames: Sequence[Snapshot]) -> None:
-        """Forget the last episode; the clock of the next one is 0 at the last of these frames."""
+        """Discard the last episode; the clock of the next one is 0 at the last of these frames."""
         self.frames: list[Snapshot] = list(frames)
         self.first = len(frames) - 1
         self.known: dict[int, dict[str, Knowledge]] = {}  # decision frame -> AV -> what it knew

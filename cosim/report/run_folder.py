@@ -91,6 +91,6 @@ def read(path: str | Path) -> Run:
 
 
 def _named_alike(rows: list[dict[str, Any]]) -> list[Row]:
-    """Episodes that failed bear the policy's name as typed; give them the one that it gives itself."""
+    """Episodes that failed have the policy's name as typed; give them the one that it gives itself."""
     names = {row["cell"]: row["policy"] for row in rows if row["status"] == OK}
     return [{**row, "policy": names.get(row["cell"], row["policy"])} for row in rows]

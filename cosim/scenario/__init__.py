@@ -23,7 +23,7 @@ MISSIONS = ("merge", "exit", "roundabout", "intersection", "none", "auto")
 
 @dataclass(frozen=True, slots=True)
 class Mission:
-    """The vehicle that needs somebody's help. `auto`: found from the net while running."""
+    """The vehicle that needs another driver's help. `auto`: found from the net while running."""
 
     kind: str = "auto"
     vehicles: str = ""  # regular expression on vehicle ids; full match
@@ -238,7 +238,7 @@ def _world(folder: Path) -> Scenario:
 
 
 def _foreign(what: str) -> Scenario:
-    """Somebody's .sumocfg: its own duration, types and options; our clocks."""
+    """A user's .sumocfg: its own duration, types and options; our clocks."""
     path = Path(what)
     if not is_there(path) and path.suffix != ".sumocfg":
         sumo_scenarios.folder(what)  # raises, with the nearest name

@@ -14,7 +14,7 @@ from cosim.files import yaml_input
 from cosim.files.yaml_input import NonNegative, Positive
 from cosim.scenario.vet_rules import LC2013 as LC2013_ATTRIBUTES
 
-AS_IS = "as-is"  # the behaviour of nobody: vehicles drive as their file says
+AS_IS = "as-is"  # no behaviour of ours: vehicles drive as their file says
 MIXED = "mixed"
 LC2013, MOBIL = DRIVER_MODELS = ("lc2013", "mobil")
 

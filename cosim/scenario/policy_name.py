@@ -1,8 +1,8 @@
-"""How a policy is named: one that ships, the weights of a training, or somebody's own code.
+"""How a policy is named: one that ships, the weights of a training, or a user's own code.
 
 `[LABEL=]RUN` or `[LABEL=]FILE.safetensors` are weights of `cosim train`, `[LABEL=]FILE.py:NAME` and
 `[LABEL=]MODULE:NAME` code; anything else is the name of a policy that ships. The label stands in rows and
-tables. Text only: `cosim.policies` knows whether there is such a policy.
+tables. Text only: `cosim.policies` checks whether there is such a policy.
 """
 
 import os

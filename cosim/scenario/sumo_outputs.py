@@ -75,7 +75,7 @@ def check(names: Sequence[str], options: Mapping[str, str] | Sequence[tuple[str,
 
 
 def sumo_options(files: Mapping[str, Path], scenario: Scenario) -> tuple[dict[str, str], dict[str, str]]:
-    """What SUMO is told for these files (name -> path): (settings a user may override, the files' names).
+    """The SUMO options for these files (name -> path): (settings a user may override, the files' names).
 
     Floating-car data begin with the counted time and hold the frames that the figures are made of, so
     that `cosim metrics` finds the same figures again; SUMO stamps a step with the time it began. All files

@@ -97,7 +97,7 @@ _SET_ASIDE = {
 
 @dataclass(frozen=True, slots=True)
 class SumoConfig:
-    """A .sumocfg, read: files absolute, options sorted. Times in s; None where the file is silent."""
+    """A .sumocfg, read: files absolute, options sorted. Times in s; None where the file sets nothing."""
 
     path: Path
     net: Path

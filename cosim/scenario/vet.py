@@ -1,6 +1,6 @@
 """Vet everything a scenario hands to SUMO before SUMO sees it: bad input becomes one clear sentence.
 
-SUMO answers bad input with "Process Error", silence or SIGSEGV (docs/sumo.md). Here every
+SUMO answers bad input with "Process Error", nothing or SIGSEGV (docs/sumo.md). Here every
 file is read once as a stream (memory does not grow with the demand's size, except for its names), its
 numbers are checked, and every name it refers to must exist. Files that have not changed are not read again.
 """
@@ -150,7 +150,7 @@ def _gaps(net: Net, demands: list[Demand]) -> list[str]:
     found = []
     if net.closed:
         some = ", ".join(net.closed[:3]) + (", ..." if len(net.closed) > 3 else "")
-        found.append(f"{net.path}: the speed limit is 0 on {some}: whoever comes there stands for ever")
+        found.append(f"{net.path}: the speed limit is 0 on {some}: a vehicle there stands for ever")
     for demand in demands:
         broken = [(pair, place) for pair, place in demand.steps.items() if pair not in net.links]
         for (a, b), place in broken[:3]:

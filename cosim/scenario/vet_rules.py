@@ -2,7 +2,7 @@
 
 Taken from SUMO 1.28's own schemas (net_file.xsd, route.xsd), which SUMO does not apply to most inputs: it
 accepts NaN, infinities and negative speeds silently (docs/sumo.md). Words such as
-`departPos="random"` are legal where the schema has them; SUMO itself refuses a word it does not know.
+`departPos="random"` are legal where the schema has them; SUMO itself refuses other words.
 """
 
 import re
@@ -68,7 +68,7 @@ _NET: Mapping[str, Mapping[str, Number]] = {
 _SHAPES = _each(Number(shape=True), "shape customShape outlineShape")
 NET = {tag: {**_SHAPES, **rules} for tag, rules in _NET.items()}
 
-# Lane-change attributes SUMO 1.28 knows. The first group moves LC2013; the second only SL2015.
+# Lane-change attributes of SUMO 1.28. The first group moves LC2013; the second only SL2015.
 LC2013 = words(
     "lcStrategic lcStrategicLookahead lcCooperative lcCooperativeSpeed lcCooperativeRoundabout lcSpeedGain "
     "lcSpeedGainRight lcSpeedGainLookahead lcSpeedGainRemainTime lcSpeedGainUrgency lcKeepRight "

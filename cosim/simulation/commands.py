@@ -81,7 +81,7 @@ class Commander:
             libsumo.vehicle.setDecel(name, AV_IDM["Decel"])
 
     def confirm(self, receipts: Sequence[Receipt], commands: Sequence[Command]) -> tuple[Receipt, ...]:
-        """After the hold: a lane change that did not begin was refused by SUMO's guard."""
+        """After the hold: a lane change that did not begin was refused by SUMO's safety checks."""
         confirmed = list(receipts)
         for k, (receipt, command) in enumerate(zip(receipts, commands, strict=True)):
             if not command.lane_offset or not receipt.executed:

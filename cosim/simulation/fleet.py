@@ -1,4 +1,4 @@
-"""Says which vehicles are AVs and mission vehicles, and gives each departed vehicle its driver."""
+"""Decides which vehicles are AVs and mission vehicles, and gives each departed vehicle its driver."""
 
 import re
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""AVs that hold their lane and speed: with nobody guarding them, how hard is the traffic?"""
+"""AVs that hold their lane and speed: without a safety check they show how hard the traffic is."""
 
 from collections.abc import Mapping
 

@@ -1,4 +1,4 @@
-"""What all AVs know together: every vehicle once, in world coordinates, with the rows that refer to it."""
+"""What all AVs perceive: every vehicle once, in world coordinates, with the rows that refer to it."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from cosim.geometry.raster import PIXEL_FLOOR, PIXEL_SPAN, PIXEL_SPEED
+from cosim.geometry.raster import PIXEL_LOWEST, PIXEL_SPAN, PIXEL_SPEED
 from cosim.road import RoadMap
 from cosim.types import KINEMATIC_FEATURES, Bools, Floats, Floats32, History
 from policy.inputs.situation import situation
@@ -18,7 +18,7 @@ KINEMATIC_INPUTS = len(KINEMATIC_FEATURES) + 1  # the features and the mask
 
 APART_OF = ("av", "hv", "road", "mission")  # channels that `apart` reads
 APART = 5  # channels of `apart`: AV, HV, road, ego or mission vehicle, relative speed
-STILL = 255 * (PIXEL_FLOOR + PIXEL_SPAN / 2)  # pixel of a vehicle as fast as the ego
+STILL = 255 * (PIXEL_LOWEST + PIXEL_SPAN / 2)  # pixel of a vehicle as fast as the ego
 BRISK = 255 * PIXEL_SPAN / (2 * PIXEL_SPEED) * 15.0  # what 15 m/s of relative speed add to it: 1 in `apart`
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from cosim.errors import in_range
-from cosim.geometry.raster import PIXEL_FLOOR, PIXEL_SPAN, PIXEL_SPEED, RoadRaster, draw_kinematics
+from cosim.geometry.raster import PIXEL_LOWEST, PIXEL_SPAN, PIXEL_SPEED, RoadRaster, draw_kinematics
 from cosim.types import SPEED, Bools, Bytes, Floats, ObservationConfig
 from policy.inputs.scene import Scene, pictured, rows_ahead
 from policy.inputs.tensors import Batch, kinematic_tensor, unit
@@ -70,12 +70,12 @@ def shade(rows: Floats, share: Floats) -> Floats:
     """Rows [B,M,k,8] (row 0 the ego) whose pixels are darkened to share [B,M,k] of their value.
 
     A vehicle whose box is expected to be right by one half is drawn with half of its pixel value: the
-    expected picture, which has the least squared error. Never darker than the floor: nobody vanishes.
+    expected picture, which has the least squared error. Never below PIXEL_LOWEST: no vehicle vanishes.
     """
     out = rows.copy()
     ego, top = rows[..., :1, SPEED], PIXEL_SPEED
-    level = PIXEL_FLOOR + PIXEL_SPAN * np.clip((rows[..., SPEED] - ego + top) / (2 * top), 0.0, 1.0)
-    shaded = np.maximum(level * share, PIXEL_FLOOR) - PIXEL_FLOOR
+    level = PIXEL_LOWEST + PIXEL_SPAN * np.clip((rows[..., SPEED] - ego + top) / (2 * top), 0.0, 1.0)
+    shaded = np.maximum(level * share, PIXEL_LOWEST) - PIXEL_LOWEST
     out[..., SPEED] = ego + shaded * (2 * top / PIXEL_SPAN) - top
     out[..., 0, SPEED] = ego[..., 0]
     return out

@@ -55,7 +55,7 @@ class Explorer(PredictionAware):
             epsilon: how much exploration, 0 to 1.
             rng: every random draw comes from it.
             guided: the demonstrator drives every AV.
-            record: False: nobody learns, all drive greedily by the frozen network.
+            record: False: no AV learns, all drive greedily by the frozen network.
         """
         self._label, self._epsilon, self._rng = label, epsilon, rng
         self._guided, self._learners = guided, self.explore.learners if record else 0

@@ -74,5 +74,5 @@ def hanging(*_: object) -> FakeSimulator:
 
 
 def dying(*_: object) -> FakeSimulator:
-    """One AV in a world that dies."""
+    """One AV in a world whose simulation crashes."""
     return Dying([FakeVehicle("a", 100.0, 0, 20.0, is_av=True)])

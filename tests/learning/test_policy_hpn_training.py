@@ -126,7 +126,7 @@ def test_who_leaves_the_road_has_no_truth_and_costs_nothing() -> None:
     assert torch.isfinite(raw.grad).all()
 
 
-def test_the_right_correction_costs_less_than_none_and_a_shared_shift_is_seen_by_nobody() -> None:
+def test_the_right_correction_costs_less_than_none_and_the_picture_hides_a_shared_shift() -> None:
     batch = collate([a_moment()])
     config = KinematicTraining()
     none = losses(torch.zeros(4, 20, OUTPUTS), batch, config)

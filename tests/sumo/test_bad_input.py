@@ -230,7 +230,7 @@ def test_an_unknown_scenario_comes_with_the_nearest_name(capfd: pytest.CaptureFi
     assert "did you mean 'merge'?" in line
 
 
-def test_what_only_sumo_finds_is_told_in_sumos_words(config: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_what_only_sumo_finds_is_in_sumos_words(config: Path, capfd: pytest.CaptureFixture[str]) -> None:
     swap(ROUTES, 'departSpeed="max"', 'departSpeed="fastest"')(config.parent)
     assert main(["run", str(config)]) == 2
     out, err = capfd.readouterr()
@@ -240,20 +240,20 @@ def test_what_only_sumo_finds_is_told_in_sumos_words(config: Path, capfd: pytest
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "told"),
+    ("old", "new", "problem"),
     [
         ('departSpeed="max"', 'departSpeed="999"', "Departure speed"),
         ('departLane="free"', 'departLane="77"', "Invalid departLane"),
     ],
 )
 def test_what_sumo_finds_while_driving_is_the_route_file_s_and_nothing_is_left_behind(
-    old: str, new: str, told: str, config: Path, capfd: pytest.CaptureFixture[str]
+    old: str, new: str, problem: str, config: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     swap(ROUTES, old, new)(config.parent)
     out = config.parent / "out"
     assert main(["run", str(config), "--out", str(out)]) == 2
     err = capfd.readouterr().err
-    assert f"{ROUTES}: SUMO refuses it: {told}" in err
+    assert f"{ROUTES}: SUMO refuses it: {problem}" in err
     assert not out.exists()
 
 
@@ -265,13 +265,13 @@ def test_options_after_two_dashes_are_refused_by_verbs_that_would_drop_them(
         assert "only `cosim run` passes options on to SUMO" in capfd.readouterr().err
 
 
-def test_a_set_aside_option_of_the_file_is_told(config: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_an_ignored_option_of_the_file_is_named(config: Path, capfd: pytest.CaptureFixture[str]) -> None:
     config.write_text(config.read_text().replace("</configuration>", '<x value="3"/></configuration>'))
     assert main(["run", str(config), "--duration", "1"]) == 0
     assert "not passed on to SUMO: x=3" in capfd.readouterr().out
 
 
-def test_an_unknown_sumo_option_is_told_in_sumos_words(capfd: pytest.CaptureFixture[str]) -> None:
+def test_an_unknown_sumo_option_is_reported_in_sumos_words(capfd: pytest.CaptureFixture[str]) -> None:
     assert "no-such-option" in refused(["merge", "--", "--no-such-option", "1"], capfd)
 
 
@@ -284,7 +284,7 @@ def test_the_sound_scenario_runs_packed_as_well(config: Path, capfd: pytest.Capt
 
 
 def test_a_net_that_kills_sumo_leaves_a_live_process_and_exit_2(config: Path) -> None:
-    """SUMO itself dies of a net without version (SIGSEGV): a fresh process shows that ours does not."""
+    """SUMO itself crashes on a net without version (SIGSEGV): a fresh process shows that ours does not."""
     swap(NET, r'<net version="[^"]*"', "<net")(config.parent)
     command = [sys.executable, "-m", "cosim.cli.main", "run", str(config), "--json"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)

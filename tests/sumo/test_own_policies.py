@@ -1,4 +1,4 @@
-"""Weights of a training and somebody's own code as `--policy`: driven like what ships, mistakes named."""
+"""Weights of a training and a user's own code as `--policy`: driven like what ships, mistakes named."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Raises(Holds):
 class Text(Holds):
     def answer(self, av): return "left"
 
-class Strangers(Holds):
+class UnknownVehicle(Holds):
     def decide(self, histories): return {"nobody": None}
 
 class Lists(Holds):
@@ -160,7 +160,7 @@ def test_a_class_a_factory_and_a_function_of_ones_own_drive(code: Path, tmp_path
         ("Filed", "Filed.files='nowhere.zip': no such file"),
         ("Numbered", "Numbered.av_parameters=('lcSpeedGain', 3): must map SUMO's parameters to text"),
         ("Leaves", "decide: SystemExit: 3"),
-        ("Strangers", "decide: decided for one that is no AV on the road: 'nobody'"),
+        ("UnknownVehicle", "decide: decided for one that is no AV on the road: 'nobody'"),
         ("Lists", "decide='list': must return a mapping of AV to decision"),
         ("Blind", "Blind.observation: must be a cosim.types.ObservationConfig"),
         ("Fails", "Fails: OSError: no model file"),

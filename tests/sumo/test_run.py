@@ -1,4 +1,4 @@
-"""`cosim run` as a user meets it: one JSON document, exit codes, equal seeds, somebody else's scenario."""
+"""`cosim run` as a user meets it: one JSON document, exit codes, equal seeds, a user's own scenario."""
 
 from __future__ import annotations
 
@@ -87,8 +87,8 @@ def test_somebody_else_s_scenario_runs_unmodified(a10kw: str) -> None:
     assert found["hv_hv_collisions"] == 0
     assert found["mission_success"] is not None, "the mission vehicle is found from the net"
     waiting, inserted = found["vehicles_never_inserted"], found["vehicles_inserted"]
-    told = any("no room" in reason for reason in found["not_comparable_because"])
-    assert told == (waiting > 0.05 * (waiting + inserted))
+    said = any("no room" in reason for reason in found["not_comparable_because"])
+    assert said == (waiting > 0.05 * (waiting + inserted))
 
 
 def test_somebody_else_s_scenario_with_table_ii_drivers(a10kw: str) -> None:

@@ -9,8 +9,8 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 PAGES = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "examples").rglob("*.md")]
-MADE = {"FILE.md"}  # what a command is told to write
-ROOMS = "docs|policy|benchmarks|tests|examples|sumo_scenarios|docker"
+MADE = {"FILE.md"}  # what a command is asked to write
+FOLDERS = "docs|policy|benchmarks|tests|examples|sumo_scenarios|docker"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
@@ -18,16 +18,16 @@ def test_links_pictures_and_files_named_in_a_page_exist(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     links = [link for link in re.findall(r"\]\(([^)#]+)[^)]*\)", text) if "://" not in link]
     assert [link for link in links if not (page.parent / link).exists()] == []
-    files = re.findall(rf"`((?:{ROOMS})/[\w./-]+\.\w+)`", text)
+    files = re.findall(rf"`((?:{FOLDERS})/[\w./-]+\.\w+)`", text)
     assert [file for file in files if not (ROOT / file).exists() and "NAME" not in file] == []
 
 
-@pytest.mark.parametrize("room", ["benchmarks", "cosim", "policy", "sumo_scenarios"])
-def test_pages_named_in_the_code_exist(room: str) -> None:
+@pytest.mark.parametrize("folder", ["benchmarks", "cosim", "policy", "sumo_scenarios"])
+def test_pages_named_in_the_code_exist(folder: str) -> None:
     pages = {page.name for page in PAGES} | MADE
     named = {
         (file.relative_to(ROOT).as_posix(), name)
-        for file in (ROOT / room).rglob("*")
+        for file in (ROOT / folder).rglob("*")
         if file.suffix in (".py", ".yaml", ".xml")
         for name in re.findall(r"[\w-]+\.md\b", file.read_text(encoding="utf-8"))
     }

@@ -59,8 +59,8 @@ def test_the_page_shows_first_and_last_over_the_seeds(tmp_path: Path) -> None:
         training(tmp_path / "b", [v / 2 for v in falling], 1),
         training(tmp_path / "c", [0.0] * 50, 2),
     ]
-    told = [*(f"vfn-p={r}" for r in runs[:2]), f"twin={runs[2]}"]
-    lines = page([read(text) for text in told], "a command")
+    texts = [*(f"vfn-p={r}" for r in runs[:2]), f"twin={runs[2]}"]
+    lines = page([read(text) for text in texts], "a command")
     line = next(x for x in lines if x.startswith("| vfn-p | 0, 1 | 50 | training drives | crashed"))
     assert line.endswith("| 75.0 (50.0 to 100.0) | 0.0 |")
     assert any(

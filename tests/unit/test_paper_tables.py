@@ -51,8 +51,8 @@ def test_there_are_episodes_enough_that_a_crash_free_agent_can_lie_below_the_pap
         n = table3.enough(world)
         assert n >= table3.MOST
         name = "vfn-p"
-        told = table3.against_p({name: of_world(world, n)}, {name: name}, [world])[-2]
-        assert f", below P's {claimed[name]}" in told
+        line = table3.against_p({name: of_world(world, n)}, {name: name}, [world])[-2]
+        assert f", below P's {claimed[name]}" in line
     assert table3.enough("highway") == 1300
 
 
@@ -65,9 +65,9 @@ def test_the_fewest_crashes_are_counted_on_common_seeds_and_ties_are_named() -> 
     runs = {"vfn": run([0, 1], 10), "vfn-p": run([2, 700], 1000), "safe-dqn": run([5], 10)}
     assert table3.crashes_in_common(runs, "merge") == ({"vfn": 2, "vfn-p": 1, "safe-dqn": 1}, 10)
     names = {name: name for name in runs}
-    told = table3.fewest(runs, names, ["merge"])
-    assert any("merge: `safe-dqn`, `vfn-p` (tie) with 1 of 10" in line for line in told)
-    assert "3 of 6 approaches" in told[0]
+    lines = table3.fewest(runs, names, ["merge"])
+    assert any("merge: `safe-dqn`, `vfn-p` (tie) with 1 of 10" in line for line in lines)
+    assert "3 of 6 approaches" in lines[0]
 
 
 def test_the_summary_is_filled_from_the_csv_and_from_nothing_else(tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ def context(agent: PredictionAware, svo: float = 0.0) -> PolicyContext:
 
 
 def untrained(name: str) -> PredictionAware:
-    """The approach as it is born, whatever is shipped for it."""
+    """The approach with its initial weights, whatever is shipped for it."""
     return PredictionAware(name, dataclasses.replace(compact(name), vfn_weights=None, hpn_weights=None))
 
 

@@ -1,4 +1,4 @@
-"""The demonstrator: what it shows a learner that does not know what it is commanded."""
+"""The demonstrator: what it shows a learner that does not see its own command."""
 
 from __future__ import annotations
 

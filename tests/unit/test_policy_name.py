@@ -26,7 +26,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ("text", "found"),
     [
         ("idm", PolicyName("idm")),  # ships, whatever folder has this name
-        ("no-such", PolicyName("no-such")),  # the roof knows that it does not
+        ("no-such", PolicyName("no-such")),  # `cosim.policies` refuses it
         ("vfn-p, 25 m#0a1b", PolicyName("vfn-p, 25 m#0a1b")),
         ("runs/a=b c", PolicyName("a-b-c", "runs/a=b c/best.safetensors")),
         ("runs/a=b c/best.safetensors", PolicyName("a-b-c", "runs/a=b c/best.safetensors")),

@@ -195,7 +195,7 @@ def test_masked_and_nan_rows_reach_no_network() -> None:
     assert tensor[0, 5, 7, -1] == 1.0
 
 
-def test_the_ego_is_told_where_its_lanes_end() -> None:
+def test_the_ego_gets_where_its_lanes_end() -> None:
     road = straight_road(3, dead_end=0, at=400.0)
     on_it, beside = (histories(road, [Car("e", 300.0, lane, 20.0, is_av=True)])["e"] for lane in (0, 1))
     assert to_batch([on_it, beside]).maps.shape == (2, 10, 4, 32, 128)
@@ -209,7 +209,7 @@ def test_the_ego_is_told_where_its_lanes_end() -> None:
     torch.testing.assert_close(svo_tensor(np.pi / 4, 2), torch.full((2, 2), float(np.sqrt(0.5))))
 
 
-def test_the_ego_is_told_who_drives_around_it() -> None:
+def test_the_ego_gets_who_drives_around_it() -> None:
     road = straight_road(2)
     cars = [
         Car("e", 300.0, 0, 20.0, is_av=True),

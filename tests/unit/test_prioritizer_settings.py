@@ -46,11 +46,11 @@ def test_after_giving_way_it_picks_up_speed_again() -> None:
 
 
 def test_without_intentions_a_follower_may_not_drive_as_close() -> None:
-    """5 m behind an AV at 20 m/s: enough for one that is told of every braking, not for one that sees it."""
+    """5 m behind an AV at 20 m/s: enough for an AV that gets braking by V2V, not for one that sees it."""
     cars = Car("lead", 300.0, 0, 20.0, is_av=True), Car("follow", 290.0, 0, 20.0, is_av=True)
-    heard, unheard = (decide(Unled("cruise", PLAIN, share), *cars)["follow"] for share in (True, False))
-    assert (heard.action, heard.vetoed) == (MetaAction.IDLE, False)
-    assert (unheard.vetoed, unheard.blamed) == (True, "lead")
+    shared, seen = (decide(Unled("cruise", PLAIN, share), *cars)["follow"] for share in (True, False))
+    assert (shared.action, shared.vetoed) == (MetaAction.IDLE, False)
+    assert (seen.vetoed, seen.blamed) == (True, "lead")
 
 
 def test_random_preferences_are_guarded_and_come_from_the_episodes_generator() -> None:

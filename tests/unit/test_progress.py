@@ -43,7 +43,7 @@ def test_a_slow_start_says_what_it_is_doing_and_a_quick_one_says_nothing() -> No
     assert quick.getvalue() == ""
 
 
-def test_nobody_hears_anything_once_the_stream_is_closed_or_when_quiet() -> None:
+def test_nothing_is_written_once_the_stream_is_closed_or_when_quiet() -> None:
     gone, silent = Terminal(), Terminal()
     waiting = Progress("run", "s", stream=gone)
     waiting.starting(after=0.02)

@@ -66,7 +66,7 @@ def contested(world: str, **success: int) -> dict[str, Run]:
 
 
 @pytest.mark.parametrize(
-    ("value", "low", "high", "told"),
+    ("value", "low", "high", "verdict"),
     [
         (0.95, 0.91, 0.98, "met"),
         (0.92, 0.85, 0.96, "met; the interval reaches beyond the target"),
@@ -77,11 +77,11 @@ def contested(world: str, **success: int) -> dict[str, Run]:
     ],
 )
 def test_a_target_is_met_by_its_value_and_the_interval_says_how_surely(
-    value: float, low: float, high: float, told: str
+    value: float, low: float, high: float, verdict: str
 ) -> None:
-    assert targets.judged(Figure(value, low, high), "at least", 0.9) == told
+    assert targets.judged(Figure(value, low, high), "at least", 0.9) == verdict
     mirrored = Figure(-value, -high, -low)
-    assert targets.judged(mirrored, "at most", -0.9) == told
+    assert targets.judged(mirrored, "at most", -0.9) == verdict
 
 
 def test_three_crashes_in_three_hundred_are_at_most_one_per_cent() -> None:
@@ -140,21 +140,21 @@ def test_crashes_and_lost_distance_are_judged_in_every_world() -> None:
     assert verdicts["merge", "DT of all vehicles no lower than idm's"] == "**missed**"
 
 
-def test_the_headline_is_told_either_way() -> None:
+def test_the_headline_is_given_either_way() -> None:
     twin = run(
         rows("vfn-p-egoistic", "merge", crashed=first(30), dt_mean_m=[700.0 + k % 3 for k in range(100)])
     )
     agent = run(rows("vfn-p", "merge", crashed=first(2), dt_mean_m=[690.0 + k % 3 for k in range(100)]))
-    told = {f.target: f.verdict for f in targets.altruists_against_twin("dense", twin, agent, ["merge"])}
-    assert told == {
+    verdicts = {f.target: f.verdict for f in targets.altruists_against_twin("dense", twin, agent, ["merge"])}
+    assert verdicts == {
         "altruists crash less": "shown",
         "the distance of all vehicles is higher": "the other way round",
     }
-    told = {
+    verdicts = {
         f.target: f.verdict
         for f in targets.altruists_against_twin("dense", agent, agent_like(agent), ["merge"])
     }
-    assert set(told.values()) == {"not shown"}
+    assert set(verdicts.values()) == {"not shown"}
 
 
 def agent_like(one: Run) -> Run:

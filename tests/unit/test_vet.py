@@ -384,4 +384,4 @@ def test_lanes_with_a_speed_limit_of_0_are_a_warning_because_nobody_leaves_them(
     (warning,) = case(
         net=NET.replace('id="bc_1" index="1" speed="25"', 'id="bc_1" index="1" speed="0"')
     ).warnings
-    assert "n.net.xml: the speed limit is 0 on bc_1: whoever comes there stands for ever" in warning
+    assert "n.net.xml: the speed limit is 0 on bc_1: a vehicle there stands for ever" in warning

@@ -133,7 +133,7 @@ class Snapshot:
 
 
 # Columns of the kinematic matrix, in the ego's frame at the newest frame of the history
-# (x ahead, y to the left), so that one history lives in one fixed frame and series are smooth.
+# (x ahead, y to the left), so that one history is in one fixed frame and series are smooth.
 KINEMATIC_FEATURES = ("x", "y", "speed", "heading", "length", "width", "is_av", "is_mission")
 X, Y, SPEED, HEADING, LENGTH, WIDTH, IS_AV, IS_MISSION = range(len(KINEMATIC_FEATURES))
 

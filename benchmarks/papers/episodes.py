@@ -114,17 +114,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.papers.episodes", description=__doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     default = Settings()
-    verbs = parser.add_subparsers(required=True, metavar="keep|check")
-    keeping = verbs.add_parser("keep", help="ship what the pages need of the episodes that were driven")
+    commands = parser.add_subparsers(required=True, metavar="keep|check")
+    keeping = commands.add_parser("keep", help="ship what the pages need of the episodes that were driven")
     keeping.add_argument("--runs", type=Path, default=default.runs, help="where the episodes are kept")
     keeping.set_defaults(work=_keep)
-    checking = verbs.add_parser("check", help="drive some of the shipped episodes anew and compare")
+    checking = commands.add_parser("check", help="drive some of the shipped episodes anew and compare")
     checking.add_argument("--sample", type=int, default=SAMPLE, metavar="N", help=f"default {SAMPLE}")
     checking.add_argument("--seed", type=int, default=0, help="which ones; default 0")
     checking.add_argument("--workers", type=int, default=default.workers, metavar="N")
     checking.set_defaults(work=_check)
-    for verb in (keeping, checking):
-        verb.add_argument("--episodes", type=Path, default=shipped.FOLDER, help="the shipped ones' folder")
+    for command in (keeping, checking):
+        command.add_argument("--episodes", type=Path, default=shipped.FOLDER, help="the shipped ones' folder")
     args = parser.parse_args()
     try:
         raise SystemExit(args.work(args))

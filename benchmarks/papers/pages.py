@@ -177,8 +177,8 @@ def _tell_cost(jobs: Sequence[Job], settings: Settings) -> None:
     for job in jobs:
         found = reckoning.left(job.name, job.orders(), replace(settings, first=job.first))
         for one in found:
-            hours = "? (no short episode came through)" if one.hours is None else f"{one.hours:.2f}"
-            print(f"{job.name}: {one.agent}: {one.episodes} episodes, {hours} CPU hours")
+            cost = "? (no short episode came through)" if one.hours is None else f"{one.hours:.2f}"
+            print(f"{job.name}: {one.agent}: {one.episodes} episodes, {cost} CPU hours")
         episodes, hours = sum(one.episodes for one in found), sum(one.hours or 0.0 for one in found)
         print(f"{job.name}: {episodes} episodes, {hours:.1f} CPU hours", flush=True)
         all_episodes, all_hours = all_episodes + episodes, all_hours + hours

@@ -1,11 +1,11 @@
-"""The verbs of the command line, in the order `cosim --help` shows them.
+"""The commands of the command line, in the order `cosim --help` shows them.
 
-The module of each has `add(verbs)`, which registers one sub-command and its flags, and `work(args) -> int`,
-which does it and returns the exit code. Only the module of the verb that was asked for is imported, and what
-a verb needs is imported inside `work`.
+The module of each has `add(commands)`, which registers one sub-command and its flags, and
+`work(args) -> int`, which runs it and returns the exit code. Only the module of the command that was asked
+for is imported, and what a command needs is imported inside `work`.
 """
 
-VERBS = (
+COMMANDS = (
     "run",
     "evaluate",
     "compare",

@@ -1,4 +1,4 @@
-"""Flags and types of values that several verbs share: argparse says what is wrong and exits with 2."""
+"""Flags and types of values that several commands share: argparse says what is wrong and exits with 2."""
 
 import argparse
 import functools
@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-Verbs = Any  # what ArgumentParser.add_subparsers returns: argparse keeps its type private
+SubCommands = Any  # what ArgumentParser.add_subparsers returns: argparse keeps its type private
 
 POLICY = (
     "who commands the AVs (default idm): a name; RUN or FILE.safetensors of cosim train; FILE.py:NAME or "

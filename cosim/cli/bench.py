@@ -13,9 +13,9 @@ DEMANDS = ("dense", "contested")
 POLICIES = ("idm", "altruist-rule", "vfn")
 
 
-def add(verbs: arguments.Verbs) -> None:
-    """Register the verb and its flags."""
-    kinds = verbs.add_parser("bench", help="measure and write tables").add_subparsers(
+def add(commands: arguments.SubCommands) -> None:
+    """Register the command and its flags."""
+    kinds = commands.add_parser("bench", help="measure and write tables").add_subparsers(
         required=True, metavar="WHAT"
     )
     predict = kinds.add_parser(
@@ -81,21 +81,21 @@ def work(args: argparse.Namespace) -> int:
     return 0
 
 
-def _add_attribution(kinds: arguments.Verbs) -> None:
-    verb = kinds.add_parser(
+def _add_attribution(kinds: arguments.SubCommands) -> None:
+    command = kinds.add_parser(
         "attribution",
         help="which inputs of a value network change its choices",
         description="Drive episodes as `cosim run` does; at every decision ask the same network again with "
         "one input replaced. Writes attribution.csv, .md and .png.",
     )
-    arguments.add(verb, "--policy", action="append", required=True)
-    arguments.add(verb, "--scenario", "--out", required=True)
-    arguments.add(verb, "--demand", default="")
-    arguments.add(verb, "--seeds", type=arguments.seeds, required=True)
-    arguments.add(verb, "--svo", default=45.0)
-    arguments.add(verb, "--duration")
-    arguments.add(verb, "--workers", default=1)
-    verb.set_defaults(work=work_attribution)
+    arguments.add(command, "--policy", action="append", required=True)
+    arguments.add(command, "--scenario", "--out", required=True)
+    arguments.add(command, "--demand", default="")
+    arguments.add(command, "--seeds", type=arguments.seeds, required=True)
+    arguments.add(command, "--svo", default=45.0)
+    arguments.add(command, "--duration")
+    arguments.add(command, "--workers", default=1)
+    command.set_defaults(work=work_attribution)
 
 
 def work_attribution(args: argparse.Namespace) -> int:

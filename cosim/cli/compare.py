@@ -24,9 +24,9 @@ exit codes:  0 passed, 1 a threshold failed, 2 bad input, 3 simulations failed a
 """
 
 
-def add(verbs: arguments.Verbs) -> None:
-    """Register the verb and its flags."""
-    compare = verbs.add_parser(
+def add(commands: arguments.SubCommands) -> None:
+    """Register the command and its flags."""
+    compare = commands.add_parser(
         "compare",
         help="compare two policies or runs on equal seeds, with thresholds for CI",
         description="Compare A (baseline) with B (candidate), pair by pair on equal seeds.",

@@ -1,4 +1,4 @@
-"""`cosim doctor`: what this installation consists of, what is wrong with it, and how to mend that."""
+"""`cosim doctor`: what this installation consists of, what is wrong with it, and how to fix that."""
 
 import argparse
 import json
@@ -40,20 +40,20 @@ _VERSION = "import libsumo; print(libsumo.getVersion()[1])"
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One line of the report; `mend` says what to do and is empty when all is well."""
+    """One line of the report; `fix` is what to do and is empty when all is well."""
 
     name: str
     state: str  # OK, WARN or FAIL
     detail: str
-    mend: str = ""
+    fix: str = ""
 
     def line(self) -> str:
-        return f"{self.state:<4} {self.name}: {self.detail}" + (f" ({self.mend})" if self.mend else "")
+        return f"{self.state:<4} {self.name}: {self.detail}" + (f" ({self.fix})" if self.fix else "")
 
 
-def add(verbs: arguments.Verbs) -> None:
-    """Register the verb and its flags."""
-    doctor = verbs.add_parser("doctor", help="check this installation and say how to mend it")
+def add(commands: arguments.SubCommands) -> None:
+    """Register the command and its flags."""
+    doctor = commands.add_parser("doctor", help="check this installation and say how to fix it")
     arguments.add(doctor, "--json")
     doctor.set_defaults(work=work)
 
@@ -113,8 +113,8 @@ def packages(version: Callable[[str], str | None]) -> Iterator[Check]:
     yield Check("cosim", OK, own) if own else Check("cosim", FAIL, "is not installed", INSTALL)
     found = {name: version(name) for name in requirements()}
     if missing := [name for name, number in found.items() if number is None]:
-        mend = f"pip install -c constraints.txt {' '.join(missing)}"
-        yield Check("packages", FAIL, f"missing: {', '.join(missing)}", mend)
+        fix = f"pip install -c constraints.txt {' '.join(missing)}"
+        yield Check("packages", FAIL, f"missing: {', '.join(missing)}", fix)
     if there := ", ".join(f"{name} {number}" for name, number in found.items() if number is not None):
         yield Check("packages", OK, there)
 
@@ -146,11 +146,11 @@ def sumo_copies(environment: Mapping[str, str], pinned: str | None) -> Iterator[
         seen.add(Path(program).resolve())
         number = _program_version(program)
         if number is None:
-            yield Check("sumo", WARN, f"{program} does not start", "cosim does not use it; mend or remove it")
+            yield Check("sumo", WARN, f"{program} does not start", "cosim does not use it; fix or remove it")
             continue
         other = pinned is not None and number != pinned
-        mend = f"cosim uses libsumo {pinned}; results of this copy may differ" if other else ""
-        yield Check("sumo", WARN if other else OK, f"{number} at {program}", mend)
+        fix = f"cosim uses libsumo {pinned}; results of this copy may differ" if other else ""
+        yield Check("sumo", WARN if other else OK, f"{number} at {program}", fix)
     if home := environment.get("SUMO_HOME"):
         yield (
             Check("SUMO_HOME", OK, f"{home} (not needed)")
@@ -168,7 +168,7 @@ def libsumo_library() -> Check:
 
 
 def explain_import(code: int, stderr: str) -> tuple[str, str]:
-    """What went wrong when libsumo was imported, and how to mend it."""
+    """What went wrong when libsumo was imported, and how to fix it."""
     if missing := re.search(r"(lib[\w.+-]+\.so[\w.]*): cannot open shared object", stderr):
         return f"the system has no {missing[1]}", APT_LINE
     return _last_line(code, stderr.strip()), REINSTALL
@@ -177,8 +177,8 @@ def explain_import(code: int, stderr: str) -> tuple[str, str]:
 def processors() -> Check:
     """Cores this process may use: evaluation and training take one process each."""
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    mend = "simulation and learning will share it" if count == 1 else ""
-    return Check("processors", WARN if mend else OK, str(count), mend)
+    fix = "simulation and learning will share it" if count == 1 else ""
+    return Check("processors", WARN if fix else OK, str(count), fix)
 
 
 def numba_cache(environment: Mapping[str, str]) -> Check:

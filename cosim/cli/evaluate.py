@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 LISTED = 200  # cells that a dry run lists
 
 
-def add(verbs: arguments.Verbs) -> None:
-    """Register the verb and its flags."""
-    evaluate = verbs.add_parser(
+def add(commands: arguments.SubCommands) -> None:
+    """Register the command and its flags."""
+    evaluate = commands.add_parser(
         "evaluate",
         help="drive a matrix of scenarios, demands, policies and seeds",
         description="Drive every combination of what the flags or SPEC.yaml name, once per seed. A flag that "

@@ -5,9 +5,9 @@ import argparse
 from cosim.cli import arguments
 
 
-def add(verbs: arguments.Verbs) -> None:
-    """Register the verb and its flags."""
-    verb = verbs.add_parser(
+def add(commands: arguments.SubCommands) -> None:
+    """Register the command and its flags."""
+    command = commands.add_parser(
         "fit-predictors",
         help="fit the kinematic predictors on recorded episodes",
         description="Fit P's learned baselines and the Gaussian processes' prior over kernels on recordings "
@@ -17,12 +17,14 @@ def add(verbs: arguments.Verbs) -> None:
         "--training": ("DIR", "recordings, seeds below 100000"),
         "--validation": ("DIR", "recordings, seeds 100000..199999"),
     }
-    arguments.texts(verb, needed, required=True)
-    verb.add_argument("--only", action="append", default=[], metavar="NAME", help="repeatable (default all)")
-    verb.add_argument("--steps", type=arguments.count, metavar="N", help="gradient steps (6000)")
-    arguments.add(verb, "--out", required=True, help="for the weights and their cards")
-    verb.add_argument("--state", metavar="DIR", help="logs, and what a killed fit needs to go on")
-    verb.set_defaults(work=work)
+    arguments.texts(command, needed, required=True)
+    command.add_argument(
+        "--only", action="append", default=[], metavar="NAME", help="repeatable (default all)"
+    )
+    command.add_argument("--steps", type=arguments.count, metavar="N", help="gradient steps (6000)")
+    arguments.add(command, "--out", required=True, help="for the weights and their cards")
+    command.add_argument("--state", metavar="DIR", help="logs, and the state to continue an interrupted fit")
+    command.set_defaults(work=work)
 
 
 def work(args: argparse.Namespace) -> int:

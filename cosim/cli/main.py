@@ -10,7 +10,7 @@ import traceback
 from collections.abc import Iterator, Sequence
 
 from cosim import __version__
-from cosim.cli import VERBS
+from cosim.cli import COMMANDS
 from cosim.errors import BadInput, CosimError
 
 
@@ -62,15 +62,15 @@ def _terminable() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def parser(verb: str = "") -> argparse.ArgumentParser:
-    """Every flag of one verb, or of all."""
+def parser(command: str = "") -> argparse.ArgumentParser:
+    """Every flag of one command, or of all."""
     top = argparse.ArgumentParser(
         prog="cosim", description="Altruistic cooperative driving in mixed traffic on SUMO."
     )
     top.add_argument("--version", action="version", version=f"cosim {__version__}", help="cosim's version")
-    verbs = top.add_subparsers(required=True, metavar="VERB")
-    for name in (verb,) if verb in VERBS else VERBS:
-        importlib.import_module(f"cosim.cli.{name.replace('-', '_')}").add(verbs)
+    commands = top.add_subparsers(required=True, metavar="COMMAND")
+    for name in (command,) if command in COMMANDS else COMMANDS:
+        importlib.import_module(f"cosim.cli.{name.replace('-', '_')}").add(commands)
     return top
 
 

@@ -13,9 +13,9 @@ from cosim.cli import arguments
 from cosim.errors import BadInput
 
 
-def add(verbs: arguments.Verbs) -> None:
-    """Register the verb and its flags."""
-    metrics = verbs.add_parser(
+def add(commands: arguments.SubCommands) -> None:
+    """Register the command and its flags."""
+    metrics = commands.add_parser(
         "metrics",
         help="time to collision, PET, DRAC, ... of existing floating-car data",
         description="Read SUMO's fcd-output (.xml or .xml.gz, any size) and count what `cosim run` counts.",
@@ -28,8 +28,8 @@ def add(verbs: arguments.Verbs) -> None:
         metavar="FILE",
         help="route or additional file with the vTypes: lengths and widths; repeatable",
     )
-    arguments.add(metrics, "--av-type", help="watch the vehicles of this vType (default: everybody)")
-    arguments.add(metrics, "--av-ids", help="watch the vehicles whose id matches")
+    arguments.add(metrics, "--av-type", help="measure the vehicles of this vType (default: all)")
+    arguments.add(metrics, "--av-ids", help="measure the vehicles whose id matches")
     metrics.add_argument(
         "--begin", type=float, default=-math.inf, metavar="S", help="leave out what is earlier"
     )
@@ -39,7 +39,7 @@ def add(verbs: arguments.Verbs) -> None:
     )
     more = {
         "--net": ("NET", "the .net.xml: bridges and lane successions"),
-        "--mission": ("REGEX", "watch these too, as mission vehicles"),
+        "--mission": ("REGEX", "measure these too, as mission vehicles"),
         "--conflicts": ("CSV", "write every single conflict there: who, when, where, how close"),
     }
     arguments.texts(metrics, more)

@@ -5,9 +5,9 @@ import argparse
 from cosim.cli import arguments
 
 
-def add(verbs: arguments.Verbs) -> None:
-    """Register the verb and its flags."""
-    record = verbs.add_parser(
+def add(commands: arguments.SubCommands) -> None:
+    """Register the command and its flags."""
+    record = commands.add_parser(
         "record",
         help="drive episodes and record every vehicle's states",
         description="Drive every combination of scenario, demand, behaviour, policy and seed on worker "

@@ -8,9 +8,9 @@ from cosim.cli import arguments
 from cosim.scenario.policy_name import label
 
 
-def add(verbs: arguments.Verbs) -> None:
-    """Register the verb and its flags."""
-    replay = verbs.add_parser(
+def add(commands: arguments.SubCommands) -> None:
+    """Register the command and its flags."""
+    replay = commands.add_parser(
         "replay",
         help="draw an episode of a run as an interactive page and a film",
         description="Drive an episode once more from its manifest, check that it is the same (exit code 1 "

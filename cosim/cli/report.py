@@ -6,9 +6,9 @@ from pathlib import Path
 from cosim.cli import arguments
 
 
-def add(verbs: arguments.Verbs) -> None:
-    """Register the verb and its flags."""
-    report = verbs.add_parser(
+def add(commands: arguments.SubCommands) -> None:
+    """Register the command and its flags."""
+    report = commands.add_parser(
         "report",
         help="write a run's report: one HTML file",
         description="Write report.html: tables with intervals, plots, worst episodes, manifest. The file "

@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from cosim.host import Host
 
 
-def add(verbs: arguments.Verbs) -> None:
-    """Register the verb and its flags."""
-    run = verbs.add_parser(
+def add(commands: arguments.SubCommands) -> None:
+    """Register the command and its flags."""
+    run = commands.add_parser(
         "run",
         help="drive one episode of a scenario",
         description="Drive one episode. Everything after -- goes to SUMO as it stands.",

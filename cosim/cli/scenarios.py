@@ -7,9 +7,9 @@ from typing import Any
 from cosim.cli import arguments
 
 
-def add(verbs: arguments.Verbs) -> None:
-    """Register the verb and its flags."""
-    scenarios = verbs.add_parser("scenarios", help="list the worlds and their demands")
+def add(commands: arguments.SubCommands) -> None:
+    """Register the command and its flags."""
+    scenarios = commands.add_parser("scenarios", help="list the worlds and their demands")
     arguments.add(scenarios, "--json")
     scenarios.set_defaults(work=work)
 

@@ -1,4 +1,4 @@
-"""`cosim train`: train one of the networks; killed at any moment, `--resume` goes on exactly."""
+"""`cosim train`: train one of the networks; `--resume` continues an interrupted training exactly."""
 
 import argparse
 
@@ -8,9 +8,9 @@ WHAT = ("vfn", "a2c", "hpn")
 VARIANTS = ("hpn", "hpn-no-history", "hpn-plain")
 
 
-def add(verbs: arguments.Verbs) -> None:
-    """Register the verb and its flags."""
-    train = verbs.add_parser(
+def add(commands: arguments.SubCommands) -> None:
+    """Register the command and its flags."""
+    train = commands.add_parser(
         "train",
         help="train the value network, one of the baselines, or the predictor",
         description="Train a network. The folder --out then holds log.jsonl, tensorboard/, best and last "

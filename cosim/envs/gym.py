@@ -1,4 +1,4 @@
-"""The Gymnasium face of the loop: one learning AV among humans and other AVs."""
+"""The Gymnasium environment on the one loop: one learning AV among humans and other AVs."""
 
 from __future__ import annotations
 

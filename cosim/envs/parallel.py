@@ -1,4 +1,4 @@
-"""The PettingZoo face of the loop: every AV is an agent, all act at once."""
+"""The PettingZoo environment on the one loop: every AV is an agent, all act at once."""
 
 from __future__ import annotations
 

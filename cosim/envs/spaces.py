@@ -26,7 +26,7 @@ BOUND = 4.0
 EGO_FEATURES = (
     "speed", "target_speed", "speed_limit", "lane_changing",
     "to_dead_end_left", "to_dead_end_keep", "to_dead_end_right", "conflict_distance",
-    "gap_ahead_left", "gap_ahead_keep", "gap_ahead_right",  # to whoever is next along that lane
+    "gap_ahead_left", "gap_ahead_keep", "gap_ahead_right",  # to the next vehicle along that lane
     "gap_behind_left", "gap_behind_keep", "gap_behind_right",
     "faster_ahead_left", "faster_ahead_keep", "faster_ahead_right",  # its speed less one's own
     "faster_behind_left", "faster_behind_keep", "faster_behind_right",
@@ -61,7 +61,7 @@ def observation_space(config: ObservationConfig, flatten: str | None) -> Space:
 def checked(
     observation: ObservationConfig, flatten: str | None, render_mode: str | None
 ) -> ObservationConfig:
-    """What an environment of this face has to observe. Raises BadInput for an unknown flatten or mode."""
+    """What an environment has to observe. Raises BadInput for an unknown flatten or mode."""
     if render_mode is not None:
         one_of(render_mode, RENDER_MODES, "render_mode")
     if flatten is None:

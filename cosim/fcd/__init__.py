@@ -1,4 +1,4 @@
-"""A user's floating-car data (SUMO's fcd-output) through the very metrics that an episode goes through."""
+"""A user's floating-car data (SUMO's fcd-output) through the same metrics as an episode."""
 
 import itertools
 import math

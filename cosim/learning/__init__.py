@@ -1,1 +1,1 @@
-"""Where agent and world meet: training from rollouts and recordings, measurements of predictions."""
+"""What joins agent and simulation: training from rollouts and recordings, measurements of predictions."""

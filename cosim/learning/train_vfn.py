@@ -28,7 +28,7 @@ from policy.training.vfn import TrainingRun
 from sumo_scenarios import names
 
 ABOUT = ("observation", "hpn", "reward", "explore", "chain", "safety", "traffic")  # sections in the card
-WEIGHTS = {"contested": 2.0, "dense": 1.0}  # altruism is learned where somebody must yield
+WEIGHTS = {"contested": 2.0, "dense": 1.0}  # altruism is learned where an AV must yield
 
 
 def train(args: argparse.Namespace) -> int:
@@ -38,8 +38,8 @@ def train(args: argparse.Namespace) -> int:
     agent = agent_config(name, file)
     learning = APPROACHES[name].learning
     if (learning == "a2c") != (args.what == "a2c"):
-        verb = "a2c" if learning == "a2c" else "vfn"
-        raise BadInput(f"is trained by cosim train {verb}", field="--policy", value=name)
+        command = "a2c" if learning == "a2c" else "vfn"
+        raise BadInput(f"is trained by cosim train {command}", field="--policy", value=name)
     if not usable(args.device):
         raise BadInput("torch has no such device here", field="--device", value=args.device)
     training = _scheduled(file.training, args, name)

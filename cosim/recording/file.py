@@ -96,7 +96,7 @@ def write(path: Path, recorder: Recorder, case: Mapping[str, Any]) -> None:
     """Write the recorded episode to `path`; until it is whole it has another name. Raises BadInput."""
     columns: dict[str, npt.NDArray[Any]]
     ids, frame, vehicle, columns = recorder.vehicles(*WHOLE, *REAL)
-    empty = Knowledge((), float("nan"))  # of whoever decides nothing
+    empty = Knowledge((), float("nan"))  # of an AV that decides nothing
     known = [recorder.known.get(k, {}).get(ids[i]) for k, i in zip(frame, vehicle, strict=True)]
     routes = {r: k for k, r in enumerate(dict.fromkeys(a.route for a in known if a is not None))}
     columns |= {"frame": frame, "vehicle": vehicle}

@@ -1,4 +1,4 @@
-"""Read a SUMO net as a stream: refuse what would kill or fool SUMO, keep what routes are checked against."""
+"""Read a SUMO net as a stream: refuse what would crash or mislead SUMO, keep what routes are checked by."""
 
 import re
 from collections import Counter

@@ -1,1 +1,1 @@
-"""Objects in supervised processes of their own: one worker, its supervisor, the engines that spread tasks."""
+"""Objects in supervised processes of their own: a worker, its supervisor, engines that run tasks."""

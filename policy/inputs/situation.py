@@ -1,4 +1,4 @@
-"""What an AV knows in few numbers: its command, its lanes, who drives on them, and who has to yield.
+"""What an AV perceives in few numbers: its command, its lanes, who drives on them, and who has to yield.
 
 The maps and kinematic rows hold nearly all of it too, but from the few drives that two cores have time for
 a network does not find it there (docs/training.md, What it took to learn from few drives).
@@ -105,13 +105,13 @@ def _met(histories: Sequence[History], road: RoadMap, shared: bool) -> list[list
 
 
 def _order(histories: Sequence[History], road: RoadMap) -> list[list[float]]:
-    nobody = [0.0, 1.0, 1.0, 0.0, 0.0, 0.0]
+    absent = [0.0, 1.0, 1.0, 0.0, 0.0, 0.0]
     seen = missions(histories).items()
     meetings = [{name: m for name, at in seen if (m := meet(road, h, at)) is not None} for h in histories]
     out = []
     for mine in meetings:
         if not mine:
-            out.append(nobody)
+            out.append(absent)
             continue
         name, m = min(mine.items(), key=lambda item: abs(item[1].behind))
         before = [o[name].behind for o in meetings if name in o and o[name].behind < m.behind]

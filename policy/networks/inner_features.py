@@ -1,4 +1,4 @@
-"""What goes on inside a trained HPN, as pictures (P, figure 7)."""
+"""The inner features of a trained HPN, as pictures (P, figure 7)."""
 
 from collections.abc import Mapping
 

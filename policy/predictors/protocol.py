@@ -1,4 +1,4 @@
-"""What every kinematic predictor promises: a history of states in, the next frames of states out."""
+"""The protocol of every kinematic predictor: a history of states in, the next frames of states out."""
 
 from typing import Protocol
 

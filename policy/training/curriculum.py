@@ -1,4 +1,4 @@
-"""What is driven when: lessons, seeds, exploration and who drives, all drawn from one seed."""
+"""The schedule of drives: lessons, seeds, exploration and who drives, all drawn from one seed."""
 
 import math
 from collections.abc import Sequence

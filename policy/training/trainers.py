@@ -1,4 +1,4 @@
-"""Who learns when from what: DDQN from the replay buffer while others drive, A2C from what they just drove.
+"""The two trainers: DDQN learns off-policy from the replay buffer, A2C on-policy from the latest drives.
 
 Both learn from demonstrations first, where their configuration wants it.
 """

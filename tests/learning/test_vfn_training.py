@@ -198,7 +198,7 @@ def test_a_refused_action_is_worth_a_crash() -> None:
 
 
 def test_the_demonstrated_action_leads_by_the_margin_where_no_reward_speaks_for_it() -> None:
-    """Somebody idled and was paid; the demonstrator would have braked."""
+    """An AV idled and was rewarded; the demonstrator would have braked."""
     one = trajectory([1], [(1.0, 0.0, 0.0)], ending="crashed")
     one = replace(one, wrong=BUT_BRAKE)
     learner = DdqnLearner(TINY, DdqnConfig(learning_rate=1e-2, imitation=0.5, margin=0.1), seed=1)

@@ -20,7 +20,7 @@ CONFIG = f"""<configuration>
     <begin value="0"/><end value="4"/>
 </configuration>"""
 
-Spoil = Callable[[Path], None]
+Damage = Callable[[Path], None]
 
 
 @pytest.fixture
@@ -33,33 +33,33 @@ def config(tmp_path: Path) -> Path:
     return tmp_path / "mine.sumocfg"
 
 
-def swap(name: str, pattern: str, new: str) -> Spoil:
+def swap(name: str, pattern: str, new: str) -> Damage:
     """Replace the first match of `pattern` in the file `name`."""
 
-    def spoil(folder: Path) -> None:
+    def damage(folder: Path) -> None:
         text, count = re.subn(pattern, new, (folder / name).read_text(), count=1)
         assert count == 1
         (folder / name).write_text(text)
 
-    return spoil
+    return damage
 
 
-def put(name: str, content: bytes) -> Spoil:
+def put(name: str, content: bytes) -> Damage:
     """Replace the file `name`."""
     return lambda folder: (folder / name).write_bytes(content) and None
 
 
-def cut(name: str, share: float) -> Spoil:
+def cut(name: str, share: float) -> Damage:
     """Keep only the first `share` of the file `name`."""
 
-    def spoil(folder: Path) -> None:
+    def damage(folder: Path) -> None:
         content = (folder / name).read_bytes()
         (folder / name).write_bytes(content[: int(len(content) * share)])
 
-    return spoil
+    return damage
 
 
-def drop(name: str) -> Spoil:
+def drop(name: str) -> Damage:
     return lambda folder: (folder / name).unlink()
 
 
@@ -69,8 +69,8 @@ BOMB = (
 )
 OUTSIDE = b"<!DOCTYPE r [<!ENTITY x SYSTEM 'file:///etc/hostname'>]><routes>&x;</routes>"
 
-# what is spoilt -> how; then what the one line must name: file, field, value, and the problem
-FILES: dict[str, tuple[Spoil, str, str, str, str]] = {
+# what is damaged -> how; then what the one line must name: file, field, value, and the problem
+FILES: dict[str, tuple[Damage, str, str, str, str]] = {
     "missing net": (drop(NET), "mine.sumocfg", "net-file", NET, "no such file"),
     "empty net": (put(NET, b""), NET, "size", "0", "empty"),
     "truncated net": (cut(NET, 0.6), NET, "line", "", ""),
@@ -208,9 +208,9 @@ def refused(arguments: list[str], capfd: pytest.CaptureFixture[str]) -> str:
 
 
 @pytest.mark.parametrize("case", FILES)
-def test_a_spoilt_file_is_refused(case: str, config: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    spoil, file, field, value, problem = FILES[case]
-    spoil(config.parent)
+def test_a_damaged_file_is_refused(case: str, config: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    damage, file, field, value, problem = FILES[case]
+    damage(config.parent)
     line = refused([str(config), "--json"], capfd)
     for part in (file, field, value, problem):
         assert part in line

@@ -1,4 +1,4 @@
-"""`cosim doctor` says what is there, what is wrong and how to mend it."""
+"""`cosim doctor` says what is there, what is wrong and how to fix it."""
 
 import json
 import os
@@ -32,10 +32,10 @@ def test_one_failure_makes_the_exit_code_3(
 
 def test_a_missing_system_library_comes_with_the_apt_line() -> None:
     stderr = "ImportError: libX11.so.6: cannot open shared object file: No such file or directory"
-    detail, mend = doctor.explain_import(1, stderr)
+    detail, fix = doctor.explain_import(1, stderr)
     assert "libX11.so.6" in detail
-    assert mend.startswith("apt-get install")
-    assert "libx11-6" in mend
+    assert fix.startswith("apt-get install")
+    assert "libx11-6" in fix
 
 
 def test_a_sumo_package_of_another_version_is_named() -> None:
@@ -44,7 +44,7 @@ def test_a_sumo_package_of_another_version_is_named() -> None:
     assert checks["libsumo"].state == OK
     assert checks["sumolib"].state == FAIL
     assert checks["traci"].state == WARN
-    assert "pip install sumolib==1.28.0" in checks["sumolib"].mend
+    assert "pip install sumolib==1.28.0" in checks["sumolib"].fix
     assert checks["eclipse-sumo"].state == WARN
 
 
@@ -53,7 +53,7 @@ def test_missing_packages_are_listed_with_the_line_that_installs_them() -> None:
     checks = list(doctor.packages(versions.get))
     assert [check.state for check in checks] == [OK, FAIL, OK]
     assert "torch" in checks[1].detail
-    assert "torch" in checks[1].mend
+    assert "torch" in checks[1].fix
 
 
 def test_another_sumo_on_the_path_and_a_wrong_sumo_home_are_warnings(tmp_path: Path) -> None:
@@ -74,4 +74,4 @@ def test_a_numba_cache_that_cannot_be_written_is_a_warning(tmp_path: Path) -> No
     assert doctor.numba_cache({"NUMBA_CACHE_DIR": str(tmp_path)}).state == OK
     broken = doctor.numba_cache({"NUMBA_CACHE_DIR": str(file / "cache")})
     assert broken.state == WARN
-    assert "NUMBA_CACHE_DIR" in broken.mend
+    assert "NUMBA_CACHE_DIR" in broken.fix

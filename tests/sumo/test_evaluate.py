@@ -25,7 +25,7 @@ TIMES = {"timings", "reset_s", "simulation_s", "observation_s", "decision_s", "t
 
 
 def evaluate(flags: str, *more: object, expect: int = 0) -> None:
-    """The verb, in this process: the simulations are in others."""
+    """The command, in this process: the simulations are in others."""
     assert main(["evaluate", *flags.split(), *map(str, more)]) == expect
 
 

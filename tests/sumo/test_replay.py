@@ -28,7 +28,7 @@ def driven(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def run(driven: Path, tmp_path: Path) -> Path:
-    """A copy of it to spoil."""
+    """A copy of it to change."""
     return Path(shutil.copytree(driven, tmp_path / "run"))
 
 

@@ -77,7 +77,7 @@ def test_the_whole_agent_commands_every_av_and_says_what_is_untrained() -> None:
     assert found["timings"]["decision_s"] > 0
 
 
-def test_somebody_else_s_scenario_runs_unmodified(a10kw: str) -> None:
+def test_a_users_scenario_runs_unmodified(a10kw: str) -> None:
     found = document(
         a10kw, "--penetration", "0.2", "--policy", "idm", "--duration", "200", "--seed", "200000"
     )
@@ -91,7 +91,7 @@ def test_somebody_else_s_scenario_runs_unmodified(a10kw: str) -> None:
     assert said == (waiting > 0.05 * (waiting + inserted))
 
 
-def test_somebody_else_s_scenario_with_table_ii_drivers(a10kw: str) -> None:
+def test_a_users_scenario_with_table_ii_drivers(a10kw: str) -> None:
     found = document(
         a10kw, "--penetration", "0.2", "--policy", "idm", "--duration", "200", "--behavior", "mixed"
     )
@@ -99,7 +99,7 @@ def test_somebody_else_s_scenario_with_table_ii_drivers(a10kw: str) -> None:
     assert found["hv_hv_collisions"] == 0
 
 
-def test_the_whole_agent_drives_on_somebody_else_s_scenario(a10kw: str) -> None:
+def test_the_whole_agent_drives_on_a_users_scenario(a10kw: str) -> None:
     found = document(a10kw, "--penetration", "0.2", "--policy", "vfn-p", "--duration", "12")
     assert found["policy_label"] == make("vfn-p").label
     assert found["steps"] > 1

@@ -1,4 +1,4 @@
-"""Sessions and environments on real SUMO: the same episode whichever face it is driven through."""
+"""Sessions and environments on real SUMO: the same episode through every interface."""
 
 from __future__ import annotations
 

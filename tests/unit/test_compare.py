@@ -96,7 +96,7 @@ def test_exactly_the_limit_does_not_fail() -> None:
     assert found.fails(2 / 1000)
 
 
-def test_what_is_not_known_proves_nothing_and_fails() -> None:
+def test_what_is_not_known_fails() -> None:
     nothing = Figure(0.0, float("nan"), float("nan"))
     found = parse("dt_av_m.lower < -5%", KNOWN)
     assert found.fails(found.of(nothing))
@@ -144,7 +144,7 @@ def test_demands_of_one_name_in_two_folders_are_not_mixed_up(tmp_path: Path) -> 
     assert [len(g.group.pairs) for g in found.groups] == [2, 2]
 
 
-def test_cells_that_cannot_be_told_apart_are_refused(tmp_path: Path) -> None:
+def test_cells_that_cannot_be_distinguished_are_refused(tmp_path: Path) -> None:
     a = write(tmp_path / "a", cell("idm", 2), cell("idm", 2, duration=20.0))
     b = write(tmp_path / "b", cell("idm", 2))
     with pytest.raises(BadInput, match="two cells would be one"):
@@ -258,7 +258,7 @@ def test_episodes_without_figures_leave_no_verdict(
     assert broken.key in errors[0].system_err
 
 
-def test_failed_episodes_that_have_no_partner_spoil_nothing(tmp_path: Path) -> None:
+def test_failed_episodes_that_have_no_partner_are_left_out(tmp_path: Path) -> None:
     broken = replace(CASE, policy="rash", seed=200_099)
     cells = [cell("idm", 3), [*cell("rash", 3), (broken, failed(broken))]]
     folder = write(tmp_path / "run", *cells)

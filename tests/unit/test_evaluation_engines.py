@@ -100,7 +100,7 @@ def test_a_crash_that_does_not_come_back_leaves_no_mark_but_the_attempts(supervi
     assert (outcome.status, outcome.attempts, outcome.error) == ("ok", 2, None)
 
 
-def test_a_kill_from_outside_says_nothing_about_the_task(tmp_path: Path) -> None:
+def test_a_task_killed_from_outside_is_tried_again(tmp_path: Path) -> None:
     strict = Supervisor(Driver, (str(tmp_path),), Limits(crashes=1))
     outcome = strict.run(Task("a", "a", ("shot once",)))
     pid = strict.pid
@@ -140,7 +140,7 @@ def test_leaving_the_engine_early_ends_its_workers_at_once() -> None:
     assert not [t for t in threading.enumerate() if t.name.startswith("cosim-supervisor")]
 
 
-def test_a_factory_that_fails_is_the_callers_to_hear_of() -> None:
+def test_a_factory_that_fails_raises_in_the_caller() -> None:
     (outcome,) = LocalEngine(unwilling, workers=1).run(tasks("a"))
     assert (outcome.status, outcome.value) == ("fault", None)
 

@@ -224,7 +224,7 @@ def test_a_column_of_whole_numbers_and_fractions_is_one_of_fractions() -> None:
     assert [str(table.schema.field(n).type) for n in "abc"] == ["double", "bool", "int64"]
 
 
-def test_a_folder_in_use_or_with_results_is_refused_and_left_alone(tmp_path: Path) -> None:
+def test_a_folder_in_use_or_with_results_is_refused_and_not_changed(tmp_path: Path) -> None:
     with RunFolder(str(tmp_path), resume=False, episodes=1):
         with pytest.raises(BadInput, match="another process is working in it"):
             RunFolder(str(tmp_path), resume=True, episodes=1)
@@ -241,7 +241,7 @@ def test_a_folder_that_cannot_be_made_leaves_nothing(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
 
-def test_a_disk_without_room_for_the_results_is_found_before_the_run(tmp_path: Path) -> None:
+def test_a_disk_without_space_for_the_results_is_found_before_the_run(tmp_path: Path) -> None:
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, before[1]))  # a small quota
     try:

@@ -1,4 +1,4 @@
-"""The whole prediction-aware agent on a small scene: explained, repeatable, particular about its input."""
+"""The whole prediction-aware agent on a small scene: explained, repeatable, strict about its input."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_every_av_gets_an_explained_decision(name: str) -> None:
     assert decisions["b"].action == MetaAction.IDLE
 
 
-def test_two_agents_built_alike_have_the_same_weights_and_leave_torchs_generator_alone() -> None:
+def test_two_agents_built_alike_have_the_same_weights_and_do_not_change_torchs_generator() -> None:
     torch.manual_seed(7)
     expected = torch.rand(1)
     torch.manual_seed(7)

@@ -18,10 +18,10 @@ from policy.training.demonstrator import EAGER, TIME_GAP, Demonstrator
     ("wished", "good"), [(1.5, MetaAction.ACCELERATE), (0.0, MetaAction.IDLE), (-2.0, MetaAction.DECELERATE)]
 )
 def test_a_learner_that_sees_maps_alone_is_shown_what_can_be_seen(wished: float, good: MetaAction) -> None:
-    """Whatever is commanded: an AV that brakes for somebody already is shown braking."""
+    """Whatever is commanded: an AV that brakes for another vehicle already is shown braking."""
     road = straight_road(lanes=1)
     speed = 20.0
-    # IDM's wish by the gap alone, behind somebody as fast: free road less (wished gap / gap)^2
+    # IDM's acceleration by the gap alone, behind a vehicle as fast: free road less (wished gap / gap)^2
     free = ACCEL * (1.0 - (speed / (LIMIT + EAGER)) ** 4)
     gap = desired_gap(speed, speed, TIME_GAP) / math.sqrt((free - wished) / ACCEL)
     shown = []

@@ -1,4 +1,4 @@
-"""The HPN that ships, on small scenes: it goes on from what it sees, whoever stands, enters or turns."""
+"""The HPN that ships, on small scenes: it predicts from what it sees: vehicles that stand, enter or turn."""
 
 from __future__ import annotations
 

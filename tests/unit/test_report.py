@@ -1,4 +1,4 @@
-"""The report is one file that needs nothing else, tells the truth about NA, and survives hostile names."""
+"""The report is one file that needs no other, shows NA as NA, and escapes names with markup."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ def test_the_same_run_gives_the_same_file(full: tuple[Path, Page]) -> None:
     assert report.html(read(full[0]), "runs/my run") == written
 
 
-def test_hostile_names_stay_words(tmp_path: Path) -> None:
+def test_names_with_markup_are_escaped(tmp_path: Path) -> None:
     evil = "<script>alert(1)</script>"
     case = replace(CASE, policy=evil, demand=(evil,))
     broken = {**failed(replace(case, seed=200_001)), "stderr": f"Error: {evil}", "demand": evil}

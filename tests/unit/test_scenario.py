@@ -54,7 +54,7 @@ def foreign(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A world of ours, `lane`, in a folder that the test may spoil."""
+    """A world of ours, `lane`, in a folder that the test may change."""
     folder = tmp_path / "lane"
     (folder / "demand").mkdir(parents=True)
     (folder / "scenario.yaml").write_text(WORLD)

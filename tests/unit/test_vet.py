@@ -249,7 +249,9 @@ def test_a_bad_additional_file_is_refused(case: Case, text: str, field: str, val
         (b"<routes>" + b"<param key='a'/>" * 3, "line", 1, "inside <routes>"),
     ],
 )
-def test_hostile_bytes_are_refused(case: Case, content: bytes, field: str, value: object, word: str) -> None:
+def test_malformed_bytes_are_refused(
+    case: Case, content: bytes, field: str, value: object, word: str
+) -> None:
     refused(lambda: case(routes=content), "r.rou.xml", field, value, word)
 
 

@@ -12,10 +12,7 @@ OK, SIM_CRASH, TIMEOUT, BAD_INPUT = STATUSES = ("ok", "sim_crash", "timeout", "b
 FAULT = "fault"  # our own code failed: says nothing about the task, which should be done again once mended
 
 
-class Progress(Protocol):
-    """A sign of life: how much is done, of how much."""
-
-    def __call__(self, done: float, total: float) -> None: ...
+Progress = Callable[[float, float], None]  # a sign of life: how much is done, of how much
 
 
 class Hosted(Protocol):

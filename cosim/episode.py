@@ -108,7 +108,6 @@ class Episode:
             ("decisions", "vetoes", "fallbacks", "lane_changes", "blocked"), 0
         )
         self._hash = hashlib.sha256()
-        self._inserted_before = self.simulator.counts()["inserted"]
         context = MetricContext(
             road=self.simulator.road,
             timing=self.scenario.timing,
@@ -127,7 +126,9 @@ class Episode:
     def advance(self, decisions: Mapping[str, Decision]) -> dict[str, History]:
         """Carry the decisions out for one decision period."""
         self._trace(decisions)
-        self._count(decisions)
+        self._tally["decisions"] += len(decisions)
+        self._tally["vetoes"] += sum(d.vetoed for d in decisions.values())
+        self._tally["fallbacks"] += sum(d.fallback for d in decisions.values())
         commands = to_commands(decisions, self.histories, self.scenario.timing.decision)
         began = time.perf_counter()
         receipts, self.frames = self.simulator.advance(commands)
@@ -219,11 +220,6 @@ class Episode:
         update(s.lane.tobytes())
         update(repr(sorted((name, int(d.action)) for name, d in decisions.items())).encode())
 
-    def _count(self, decisions: Mapping[str, Decision]) -> None:
-        self._tally["decisions"] += len(decisions)
-        self._tally["vetoes"] += sum(d.vetoed for d in decisions.values())
-        self._tally["fallbacks"] += sum(d.fallback for d in decisions.values())
-
     def _validity(self, metrics: Mapping[str, Metric]) -> tuple[str, ...]:
         """Why this result must not be compared with others; empty when it may be."""
         reasons = list(self.scenario.warnings)
@@ -237,12 +233,9 @@ class Episode:
             reasons.append(f"{waiting} vehicles found no room and were never inserted: demand above capacity")
         if teleports := metrics["teleports"].value:
             reasons.append(f"{teleports} vehicles were teleported by SUMO")
-        if self.steps and not self._tally["decisions"] and not self._had_avs():
+        if self.steps and not self._tally["decisions"] and not self._metrics.had_avs:
             reasons.append("no AV was ever on the road")
         return tuple(reasons)
-
-    def _had_avs(self) -> bool:
-        return self._metrics.had_avs
 
 
 def run_episode(

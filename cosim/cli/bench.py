@@ -54,6 +54,7 @@ def work(args: argparse.Namespace) -> int:
     from cosim.learning.bench_predict import MAPS_PAGE, PAGE, bench_maps, bench_predict
     from cosim.learning.prediction_data import recorded_by
     from cosim.recording import Folder
+    from cosim.scenario import load, place
 
     out = prepare_folder(args.out)
     where = Path(args.recordings) if args.recordings else out / "recordings"
@@ -72,7 +73,8 @@ def work(args: argparse.Namespace) -> int:
     folder = Folder(where)
     folder.manifest()
     command = "\n".join([*recorded_by(folder.manifest()), "cosim " + shlex.join(sys.argv[1:])])
-    wanted = {"scenarios": args.scenario, "behaviors": args.behavior, "seeds": args.seeds}
+    named = [load(what).name if "/" in place(what) else what for what in args.scenario]
+    wanted = {"scenarios": named, "behaviors": args.behavior, "seeds": args.seeds}
     bench_predict(folder, out, predictors=args.predictor, command=command, **wanted)
     print((out / PAGE).read_text())
     if not args.no_maps:

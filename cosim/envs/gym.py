@@ -16,7 +16,7 @@ from cosim.envs.spaces import Observation
 from cosim.errors import BadInput
 from cosim.observation.view import View
 from cosim.scenario import Scenario
-from cosim.types import COMPACT, Bytes, ObservationConfig
+from cosim.types import COMPACT, Bytes, MetaAction, ObservationConfig
 
 if TYPE_CHECKING:
     from cosim.envs.host import PolicyFactory
@@ -55,7 +55,7 @@ class SumoEnv(gymnasium.Env[Observation, np.int64]):
     ) -> None:
         observation = spaces.checked(observation, flatten, render_mode)
         self.render_mode = render_mode
-        self.action_space = spaces.action_space()
+        self.action_space = gymnasium.spaces.Discrete(len(MetaAction))
         self.observation_space = spaces.observation_space(observation, flatten)
         self._config, self._flatten, self._wanted = observation, flatten, learner
         self._session: Session = sessions.open(config, others=others, observation=observation, **words)
@@ -100,7 +100,7 @@ class SumoEnv(gymnasium.Env[Observation, np.int64]):
 
     def action_masks(self) -> npt.NDArray[np.int8]:
         """[5] 0 for a lane change that cannot be: no lane there, or one is under way (sb3-contrib's name)."""
-        return spaces.action_mask(self._view)
+        return self._view.action_mask.astype(np.int8)
 
     def render(self) -> Bytes | None:
         """[160, 640, 3] RGB from above, the learner in the middle looking to the right."""

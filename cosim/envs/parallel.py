@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import gymnasium
 import numpy as np
 from pettingzoo import ParallelEnv
 
@@ -16,7 +17,7 @@ from cosim.envs.spaces import Observation
 from cosim.errors import BadInput, hint
 from cosim.observation.view import View
 from cosim.scenario import Scenario
-from cosim.types import COMPACT, Bytes, ObservationConfig
+from cosim.types import COMPACT, Bytes, MetaAction, ObservationConfig
 
 MAX_AGENTS = 32  # slots: about twice the AVs on the road in our worlds; SUMO drives any further ones
 NATIVE_RANDOM = 0  # the seed of the seeds, until reset(seed=...) gives another
@@ -66,7 +67,7 @@ class SumoParallelEnv(ParallelEnv):  # type: ignore[misc]
         self.observation_spaces = {
             a: spaces.observation_space(observation, flatten) for a in self.possible_agents
         }
-        self.action_spaces = {a: spaces.action_space() for a in self.possible_agents}
+        self.action_spaces = {a: gymnasium.spaces.Discrete(len(MetaAction)) for a in self.possible_agents}
         self._config, self._flatten = observation, flatten
         self._rng = np.random.default_rng(NATIVE_RANDOM)
         self._slots: dict[str, str] = {}  # SUMO id -> agent, for all that had one in this episode
@@ -172,4 +173,4 @@ class SumoParallelEnv(ParallelEnv):  # type: ignore[misc]
 
     def _info(self, agent: str) -> dict[str, Any]:
         av = next(name for name, slot in self._slots.items() if slot == agent)
-        return {"action_mask": spaces.action_mask(self._views[agent]), "av": av}
+        return {"action_mask": self._views[agent].action_mask.astype(np.int8), "av": av}

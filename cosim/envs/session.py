@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import multiprocessing
 import operator
 import pickle
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast
 
 from cosim.errors import BadInput, hint
 from cosim.observation.view import Unpacker, View
@@ -136,7 +137,7 @@ def open(
     return Session(scenario, connect, seed)
 
 
-class Session:
+class Session(contextlib.AbstractContextManager["Session"]):
     """One scenario in a supervised process; several sessions can be open at once. Made by `cosim.open`.
 
     An AV without an action in `act` is driven by SUMO's IDM: also one that was commanded before, it is handed
@@ -210,29 +211,24 @@ class Session:
 
     def result(self, policy: str = "external") -> EpisodeResult:
         """The metrics of the episode so far; `policy` is the name it goes by in the result."""
-        result: EpisodeResult = self._call("result", policy)
-        return result
+        return cast(EpisodeResult, self._call("result", policy))
 
     def snapshot(self) -> Snapshot:
         """Every vehicle on the road (the simulator's truth: what an agent must not see)."""
-        snapshot: Snapshot = self._call("snapshot")
-        return snapshot
+        return cast(Snapshot, self._call("snapshot"))
 
     def partner(self) -> str:
         """The AV that reaches the conflict zone next after the mission vehicle does, at present speeds: the
         one that would have to yield; "" when there is none."""
-        partner: str = self._call("partner")
-        return partner
+        return cast(str, self._call("partner"))
 
     def road(self) -> RoadMap:
         """The net's lanes."""
-        road: RoadMap = self._call("road")
-        return road
+        return cast("RoadMap", self._call("road"))
 
     def picture(self, av: str | None = None) -> Bytes:
         """[160, 640, 3] RGB: 64 m x 256 m of road around `av` from above, looking to the right."""
-        picture: Bytes = self._call("picture", av)
-        return picture
+        return cast(Bytes, self._call("picture", av))
 
     @property
     def pid(self) -> int | None:
@@ -245,9 +241,6 @@ class Session:
         if self._caller is not None:
             self._caller.close()
             self._caller = None
-
-    def __enter__(self) -> Session:
-        return self
 
     def __exit__(self, *error: object) -> None:
         self.close()

@@ -11,7 +11,7 @@ from cosim.envs.session import StepResult
 from cosim.errors import one_of
 from cosim.observation.view import View
 from cosim.seeding import TRAINING_SEEDS
-from cosim.types import KINEMATIC_FEATURES, Floats, Floats32, MetaAction, ObservationConfig
+from cosim.types import KINEMATIC_FEATURES, Floats, Floats32, ObservationConfig
 
 Observation = dict[str, npt.NDArray[np.generic]] | Floats32
 Space = gymnasium.Space[Observation]
@@ -75,11 +75,6 @@ def training_seed(rng: np.random.Generator) -> int:
     return int(rng.integers(len(TRAINING_SEEDS)))
 
 
-def action_space() -> gymnasium.spaces.Discrete:
-    """The five meta-actions, in the order of `MetaAction`."""
-    return gymnasium.spaces.Discrete(len(MetaAction))
-
-
 def observation(view: View, config: ObservationConfig, flatten: str | None) -> Observation:
     """The View in the numbers of `observation_space`; `flatten` keeps the newest frame only."""
     if flatten == "kinematics":
@@ -130,11 +125,6 @@ def neighbours(view: View) -> tuple[Floats, Floats]:
                 gaps[k, side] = min(float(gap[next_one]), NO_GAP)
                 faster[k, side] = speed[next_one] - view.ego_speed
     return gaps, faster
-
-
-def action_mask(view: View) -> npt.NDArray[np.int8]:
-    """[A] 1 where the action can do something, as `Discrete.sample(mask)` wants it."""
-    return view.action_mask.astype(np.int8)
 
 
 def decision_info(step: StepResult, av: str) -> dict[str, Any]:

@@ -124,12 +124,11 @@ def markdown(
         page += [f"- `{policy}`: inputs that change no choice, whatever replaces them: {never}."]
         page += [f"  Largest share of the choices that a replacement changes: {', '.join(some) or '0 %'}."]
     e = driven[0]
-    about = (
-        f"World `{e['scenario']}`, demand `{e['demand']}`, HVs {e['behavior']} ({e['driver_model']}), preset"
+    drivers = (
+        f"HVs {e['behavior']} ({e['driver_model']}), preset `{e['preset']}`, phi {e['svo_deg']:g} degrees"
     )
-    about += (
-        f" `{e['preset']}`, phi {e['svo_deg']:g} degrees; {len(driven) // len(tables)} episodes a policy."
-    )
+    count = len(driven) // len(tables)
+    about = f"World `{e['scenario']}`, demand `{e['demand']}`, {drivers}; {count} episodes a policy."
     page += ["", f"`{command}`", "", about, METHOD, "", f"![choices changed]({PICTURE})", ""]
     for policy, rows in tables.items():
         page += [f"## {policy}", "", *HEAD]

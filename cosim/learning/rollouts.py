@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -125,7 +126,7 @@ def drive_episode(
     return Drove(trajectories, figures)
 
 
-class Rollouts:
+class Rollouts(contextlib.AbstractContextManager["Rollouts"]):
     """`policy.training.vfn.Actors` on `workers` supervised processes, supervised as those of a batch are."""
 
     def __init__(self, workers: int, *factory: Any) -> None:
@@ -146,9 +147,6 @@ class Rollouts:
         self._pool.shutdown(cancel_futures=True)
         for supervisor in self._supervisors:
             supervisor.close()
-
-    def __enter__(self) -> Rollouts:
-        return self
 
     def __exit__(self, *error: object) -> None:
         self.close()

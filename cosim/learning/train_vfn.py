@@ -70,15 +70,12 @@ def train(args: argparse.Namespace) -> int:
         if args.resume and not run.resume():
             print("nothing to resume: starting anew", file=sys.stderr)
         run.run(progress)
+    # as `--policy` wants the folder: a bare word would be a policy that ships
+    typed = shlex.quote(args.out if "/" in args.out else f"./{args.out}")
     best = f", best validation reward {run.best:.3f}" if math.isfinite(run.best) else ""
     print(f"{name}: {run.iteration} iterations, {run.trainer.learner.updates} updates{best}")
-    print(f"  {folder / BEST}" + (f" (cosim run merge --policy {_typed(args.out)})" if best else ""))
+    print(f"  {folder / BEST}" + (f" (cosim run merge --policy {typed})" if best else ""))
     return 0
-
-
-def _typed(folder: str) -> str:
-    """The folder as `--policy` wants it: a bare word would be a policy that ships."""
-    return shlex.quote(folder if "/" in folder else f"./{folder}")
 
 
 def _scheduled(training: VfnTraining, args: argparse.Namespace, name: str) -> VfnTraining:

@@ -154,12 +154,11 @@ def read(path: Path) -> Recording:
         first=about["first"],
         table=columns,
         routes=tuple(tuple(route) for route in about["routes"]),
-        events={int(k): _events(e) for k, e in about["events"].items()},
-    )
-
-
-def _events(plain: Mapping[str, Any]) -> Events:
-    return Events(
-        collisions=tuple(Collision(**c) for c in plain["collisions"]),
-        **{name: tuple(values) for name, values in plain.items() if name != "collisions"},
+        events={
+            int(k): Events(
+                **{name: tuple(values) for name, values in e.items()}
+                | {"collisions": tuple(Collision(**c) for c in e["collisions"])}
+            )
+            for k, e in about["events"].items()
+        },
     )

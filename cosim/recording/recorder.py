@@ -89,13 +89,11 @@ class Recorder(Hook):
         Returns: ids, sorted [V]; the frame and the vehicle (index into the ids) of each row [L]; the
         `columns` of `Snapshot` [L].
         """
-        names = sorted({name for frame in self.frames for name in frame.ids})
-        place = {name: i for i, name in enumerate(names)}
         frame = np.repeat(np.arange(len(self.frames)), [s.n for s in self.frames])
-        vehicle = np.array([place[name] for s in self.frames for name in s.ids], np.int64)
+        names, vehicle = np.unique([name for s in self.frames for name in s.ids], return_inverse=True)
         order = np.lexsort((frame, vehicle))
         joined = {name: np.concatenate([getattr(s, name) for s in self.frames])[order] for name in columns}
-        return names, frame[order], vehicle[order], joined
+        return names.tolist(), frame[order], vehicle[order], joined
 
     def _know(self, episode: Episode) -> None:
         s = episode.simulator

@@ -2,7 +2,6 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -13,36 +12,15 @@ from cosim.road import ConflictZone, Lane, RoadMap
 FORMAT = "cosim-road-1"
 
 
-def document(road: RoadMap) -> dict[str, Any]:
-    """Everything a RoadMap holds; floats survive exactly (JSON writes their shortest exact form)."""
-    return {
+def text(road: RoadMap) -> str:
+    """Everything a RoadMap holds as JSON: floats survive exactly, the same road gives the same text."""
+    document = {
         "format": FORMAT,
-        "lanes": [
-            {
-                "id": lane.id,
-                "edge": lane.edge,
-                "index": lane.index,
-                "shape": lane.shape.tolist(),
-                "length": lane.length,
-                "width": lane.width,
-                "speed_limit": lane.speed_limit,
-                "successors": list(lane.successors),
-                "left": lane.left,
-                "right": lane.right,
-                "internal": lane.internal,
-                "start": lane.start,
-                "end": lane.end,
-            }
-            for lane in road.lanes
-        ],
+        "lanes": [vars(lane) | {"shape": lane.shape.tolist()} for lane in road.lanes],
         "zones": [{"name": zone.name, "lanes": sorted(zone.lanes)} for zone in road.zones],
         "junctions": [outline.tolist() for outline in road.junctions],
     }
-
-
-def text(road: RoadMap) -> str:
-    """The document as it is written: the same road gives the same text."""
-    return json.dumps(document(road), separators=(",", ":"), sort_keys=True)
+    return json.dumps(document, separators=(",", ":"), sort_keys=True)
 
 
 def read_road(file: Path) -> RoadMap:

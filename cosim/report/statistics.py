@@ -101,23 +101,6 @@ def quantile(values: Sequence[float] | Array, q: float) -> Figure:
     )
 
 
-def median_of_blocks(samples: Sequence[tuple[int, float]]) -> Figure:
-    """Median of autocorrelated (block, value) samples: percentile bootstrap over whole blocks (minutes)."""
-    blocks: dict[int, list[float]] = {}
-    for block, value in samples:
-        blocks.setdefault(block, []).append(value)
-    parts = [np.asarray(v) for v in blocks.values()]
-    if not parts:
-        return NA
-    rng = np.random.default_rng(0)
-    medians = [
-        np.median(np.concatenate([parts[i] for i in rng.integers(0, len(parts), len(parts))]))
-        for _ in range(200)
-    ]
-    value = float(np.median(np.concatenate(parts)))
-    return Figure(value, float(np.quantile(medians, 0.025)), float(np.quantile(medians, 0.975)))
-
-
 # ---- pairs on equal seeds: entry i of `before` and of `after` is the same traffic ----
 
 

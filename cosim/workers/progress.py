@@ -31,7 +31,7 @@ class _Lines(tqdm):  # type: ignore[misc]  # tqdm is not typed
         self.disable = True
 
 
-class Progress:
+class Progress(contextlib.AbstractContextManager["Progress"]):
     """Call it with (done, total); `unit` names what is counted. Writes nothing when `quiet`.
 
     A total of 0: there is nothing to count yet, kernels are being compiled.
@@ -80,9 +80,6 @@ class Progress:
             )
         self._bar.total = total
         self._bar.update(min(done, total) - self._bar.n)
-
-    def __enter__(self) -> Progress:
-        return self
 
     def __exit__(self, *error: object) -> None:
         self.done()

@@ -23,6 +23,13 @@ KILLED_FROM_OUTSIDE = frozenset(-s for s in (signal.SIGKILL, signal.SIGTERM, sig
 HEARTBEAT = 1.0  # s between two that are sent: a message costs too much for a step of 2 ms
 PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
+_ENDS: dict[type[CosimError], str] = {  # the first that an error is
+    BadInput: "refused",
+    SimulationTimeout: "hung",
+    SimulationCrashed: "crashed",
+    SimulationError: "failed",
+    CosimError: "fault",
+}
 # How an attempt can end, and the status a task gets when it is not tried again.
 _STATUS = {
     "done": OK,
@@ -108,17 +115,12 @@ class Supervisor:
         try:
             worker = self._ready()
             value = worker.call("run", task.arguments, progress=_nothing)
-        except BadInput as error:
-            return "refused", None, _line(error), None
-        except SimulationTimeout as error:
-            return "hung", None, _line(error), error.stderr or None
-        except SimulationCrashed as error:
-            end = "killed" if error.exitcode in KILLED_FROM_OUTSIDE else "crashed"
-            return end, None, _line(error), error.stderr or None
-        except SimulationError as error:
-            return "failed", None, _line(error), None
         except CosimError as error:
-            return "fault", None, _line(error), str(error)
+            end = next(end for kind, end in _ENDS.items() if isinstance(error, kind))
+            if end == "crashed" and getattr(error, "exitcode", None) in KILLED_FROM_OUTSIDE:
+                end = "killed"
+            stderr = str(error) if end == "fault" else getattr(error, "stderr", None)
+            return end, None, _line(error), stderr or None
         self._tasks += 1
         return "done", value, None, None
 

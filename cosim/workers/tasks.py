@@ -12,10 +12,7 @@ OK, SIM_CRASH, TIMEOUT, BAD_INPUT = STATUSES = ("ok", "sim_crash", "timeout", "b
 FAULT = "fault"  # our own code failed: the task has no result and should be run again once the code is fixed
 
 
-class Progress(Protocol):
-    """A heartbeat: how much is done, of how much."""
-
-    def __call__(self, done: float, total: float) -> None: ...
+Progress = Callable[[float, float], None]  # a heartbeat: how much is done, of how much
 
 
 class Hosted(Protocol):

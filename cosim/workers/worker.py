@@ -30,7 +30,7 @@ _CONTEXT = multiprocessing.get_context("spawn")
 _STARTING = threading.Lock()
 
 
-class Worker:
+class Worker(contextlib.AbstractContextManager["Worker"]):
     """`factory(*arguments)` built in a spawned process; `call` runs one of its methods there.
 
     Everything that crosses must be picklable. `timeout` is the longest time in s without a heartbeat (a call
@@ -106,9 +106,6 @@ class Worker:
         self._process.close()  # frees its descriptors now, not when the garbage collector comes
         self._pipe.close()
         self._stderr.unlink(missing_ok=True)
-
-    def __enter__(self) -> Worker:
-        return self
 
     def __exit__(self, *error: object) -> None:
         self.close()

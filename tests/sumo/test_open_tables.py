@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import json
 import shutil
 from functools import partial
 from pathlib import Path
@@ -12,8 +14,10 @@ import pytest
 import cosim
 import sumo_scenarios
 from cosim import metrics, rewards
+from cosim.cli.main import main
 from cosim.errors import BadInput
 from cosim.policies import make
+from cosim.report import run_folder
 from cosim.scenario import load, place
 from cosim.simulation.fake import FakeSimulator, FakeVehicle
 from policy.predictors import make_predictor
@@ -158,3 +162,42 @@ def test_texts_name_what_tables_hold_and_what_files_hold(own: Path) -> None:
         make_predictor(f"{own}/code.py:Breaks", 20, 0.2).predict(state, everywhere)
     with pytest.raises(BadInput, match=r"code\.py: Brakes: TypeError"):
         make_predictor(f"{own}/code.py:Brakes", 20, 0.2)
+
+
+def test_all_of_them_together_are_evaluated(own: Path, tmp_path: Path) -> None:
+    code = f"{own}/code.py"
+    words = ["--policy", f"{code}:Brakes", "--metric", f"{code}:Frames", "--reward", f"{code}:by_speed"]
+    words += ["--scenario", str(own / "mine"), "--duration", "4", "--seeds", "200000:200001"]
+    assert main(["evaluate", *words, "--workers", "1", "--no-report", "--out", str(tmp_path)]) == 0
+    (row,) = run_folder.read(tmp_path).rows
+    assert (row["scenario"], row["policy"], row["status"]) == ("mine", "Brakes", "ok")
+    assert row["frames"] == 2 * row["steps"] > 0
+    assert 0.0 < row["reward_mean"] < 25.0, "by speed in m/s"
+    manifest = run_folder.read(tmp_path).manifest
+    (cell,) = manifest["cells"].values()
+    assert set(cell["manifest"]["policy_files"]) == {"code.py"}
+    assert manifest["better"]["frames"] == ""
+
+
+def test_all_of_them_together_are_trained_with(own: Path, tmp_path: Path) -> None:
+    code = f"{own}/code.py"
+    words = ["--reward", f"{code}:by_speed", "--metric", f"{code}:Frames", "--scenario", str(own / "mine")]
+    assert (
+        main(["train", "vfn", "--config", "smoke", *words, "--iterations", "2", "--out", str(tmp_path)]) == 0
+    )
+    log = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert len(log) == 2
+    assert all(entry["train/frames"] > 0 for entry in log)
+    assert all(entry["train/reward"] > 1.0 for entry in log), "by speed in m/s"
+    assert json.loads((tmp_path / "best.json").read_text())["data"]["reward"] == f"{code}:by_speed"
+
+
+def test_a_predictor_is_measured_where_one_s_own_policy_drives(own: Path, tmp_path: Path) -> None:
+    code = f"{own}/code.py"
+    words = ["--scenario", str(own / "mine"), "--demand", "free", "--behavior", "mixed", "--no-maps"]
+    words += ["--policy", f"{code}:Brakes", "--predictor", f"{code}:Slower", "--predictor", "cs"]
+    assert main(["bench", "predict", *words, "--seeds", "200000:200001", "--out", str(tmp_path)]) == 0
+    with (tmp_path / "position_error.csv").open() as file:
+        rows = [r for r in csv.DictReader(file) if r["scenario"] == "mine" and r["horizon_s"] == "mean"]
+    error = {r["predictor"]: float(r["mean_m"]) for r in rows if r["behavior"] == "all"}
+    assert error["slower"] > error["cs"] > 0.0

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from benchmarks.behaviors import median_of_blocks
 from cosim.report.statistics import (
     Figure,
     discordant,
     mcnemar,
     mean,
-    median_of_blocks,
     paired_change,
     paired_mean,
     paired_share,

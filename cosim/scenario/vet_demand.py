@@ -101,7 +101,8 @@ class _DemandReader(Reader):
             for name in attributes:
                 if name not in VEHICLE_TYPE and name not in VEHICLE_TYPE_TEXT:
                     self._unknown(tag, name, attributes[name], owner, line)
-            self._type(attributes, owner)
+            if idle := sorted(SL2015_ONLY & attributes.keys()):
+                self._warn(f"vType {owner!r}: {', '.join(idle)} only work with SL2015, LC2013 drives here")
         elif tag in _MOVING:
             self._driver(tag, attributes, owner, line)
         elif tag == "include":
@@ -130,11 +131,6 @@ class _DemandReader(Reader):
                 f"{self._path}: not sorted by departure: SUMO drops {len(self._unsorted)} of them ({some})"
             )
         return self.found
-
-    def _type(self, attributes: dict[str, str], owner: str) -> None:
-        idle = sorted(SL2015_ONLY & attributes.keys())
-        if idle:
-            self._warn(f"vType {owner!r}: {', '.join(idle)} only work with SL2015, LC2013 drives here")
 
     def _unknown(self, tag: str, name: str, value: str, owner: str, line: int) -> None:
         """An attribute of a vehicle type that SUMO would ignore without a word."""

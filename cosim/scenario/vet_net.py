@@ -56,12 +56,10 @@ class _NetReader(Reader):
         self._links: dict[tuple[str, str, str, str], tuple[int, str]] = {}  # -> line, via
         self._edge: str | None = None
         self._junction = ""
-        self._is_first = True
         self._closed: list[str] = []  # lanes with a speed limit of 0
 
     def start(self, tag: str, attributes: dict[str, str], line: int) -> None:
-        if self._is_first:
-            self._is_first = False
+        if tag == "net":
             self._check_version(attributes)
         self._check(tag, attributes, NET.get(tag, {}), attributes.get("id", ""), line)
         if tag == "request":
@@ -89,6 +87,13 @@ class _NetReader(Reader):
 
     def finish(self) -> Net:
         """The net, once every connection is known to join lanes that are there."""
+        net = Net(
+            path=self._path,
+            lanes=self._lanes,
+            junctions=frozenset(self._junctions),
+            links=frozenset((a, b) for a, b, _, _ in self._links),
+            closed=tuple(self._closed),
+        )
         counts = Counter[str]()
         for (a, b, i, j), (line, via) in self._links.items():
             for end, edge, lane in (("from", a, i), ("to", b, j)):
@@ -96,22 +101,16 @@ class _NetReader(Reader):
                     self._refuse("connection", end, edge, "no such edge in the net", "", line)
                 if int(lane) >= self._lanes[edge]:
                     self._refuse("connection", f"{end}Lane", lane, f"edge {edge} has no such lane", "", line)
-            if via and not self._has_lane(via):
+            if via and not net.has_lane(via):
                 self._refuse("connection", "via", via, "no such lane in the net", "", line)
             if a in self._ends and not b.startswith(":"):  # ":J_w0" is a sidewalk
                 counts[self._ends[a]] += 1
         self._check_ends()
         self._check_inside()
-        self._check_junctions(counts)
+        self._check_junctions(counts, net)
         if not self._lanes:
             raise BadInput("holds no edge", file=self._path, field="net", value=0)
-        return Net(
-            path=self._path,
-            lanes=self._lanes,
-            junctions=frozenset(self._junctions),
-            links=frozenset((a, b) for a, b, _, _ in self._links),
-            closed=tuple(self._closed),
-        )
+        return net
 
     def _check_version(self, attributes: dict[str, str]) -> None:
         version = attributes.get("version")
@@ -188,7 +187,7 @@ class _NetReader(Reader):
             if not via and not b.startswith(":") and self._ends.get(a) in with_via:
                 self._refuse("connection", "via", "", f"is missing, {a} to {b}", "", line)
 
-    def _check_junctions(self, connections: Mapping[str, int]) -> None:
+    def _check_junctions(self, connections: Mapping[str, int], net: Net) -> None:
         """A junction's right-of-way table has one row for each connection through it (and crossing)."""
         crossings = Counter(m[1] for m in map(_CROSSING.fullmatch, self._lanes) if m)
         for junction, rows in self._requests.items():
@@ -200,13 +199,9 @@ class _NetReader(Reader):
                 raise BadInput(problem_, file=self._path, field="junction.id", value=junction)
         for junction, lanes in self._inside.items():
             for lane in lanes:
-                if not self._has_lane(lane):
+                if not net.has_lane(lane):
                     problem_ = f"no such lane in the net (junction {junction})"
                     raise BadInput(problem_, file=self._path, field="junction.intLanes", value=lane)
-
-    def _has_lane(self, lane: str) -> bool:
-        edge, _, index = lane.rpartition("_")
-        return index.isdigit() and int(index) < self._lanes.get(edge, 0)
 
     def _need(self, tag: str, name: str, attributes: dict[str, str], line: int) -> str:
         if name not in attributes:

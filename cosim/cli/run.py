@@ -136,7 +136,7 @@ def work(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps(result.document()))
     else:
-        print(output.table(result))
+        print(output.table(result, first=not (case.metrics or case.reward)))  # else every figure
         if folder is not None:
             print(f"  run folder               {folder} (cosim replay {shlex.quote(args.out)} draws it)")
     return 0

@@ -27,15 +27,15 @@ FIRST = {
 }
 
 
-def table(result: EpisodeResult) -> str:
-    """A short table with units."""
+def table(result: EpisodeResult, *, first: bool = True) -> str:
+    """The figures with their units: the `first` ones, or all."""
     label = f" ({result.policy_label})" if result.policy_label else ""
     lines = [
         f"{result.scenario} / {result.demand} / {result.policy}{label}",
         f"  behaviour {result.behavior}, drivers {result.driver_model}, preset {result.preset}, "
         f"svo {result.svo_deg:g} deg, seed {result.seed}, {result.steps} decisions",
     ]
-    shown = [name for name in FIRST if name in result.metrics]
+    shown = [name for name in FIRST if name in result.metrics] if first else result.metrics
     lines += [f"  {name:<24} {figure(result.metrics[name])}" for name in shown]
     for c in result.collisions:
         who = f"{c.kind}, {'AV-caused' if c.av_caused else 'not AV-caused'}"

@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.maximum_likelihood import fit_series
 from cosim.learning.prediction_scores import NORMAL
 from cosim.recording import Folder, windows
 from cosim.report import statistics
@@ -29,7 +30,6 @@ from cosim.types import Floats
 from cosim.workers.memory import keep_freed_memory
 from policy.prediction.forecast import integrate_position
 from policy.prediction.gaussian_process import HEADING, SPEED, BankConfig, GaussianProcessBank
-from policy.prediction.maximum_likelihood import fit_series
 from policy.predictors.gp import GaussianProcessIndirect
 
 PLAIN = BankConfig(1.0, (0.2, 1.0, 3.0), (0.5, 2.0), (1.0, 2.5), (0.02, 0.2))  # no drifts, no prior

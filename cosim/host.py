@@ -56,8 +56,7 @@ class Host:
         wanted = observation or self.policy.observation
         measured = [read_metric(metric) for metric in metrics]
         self._reward = None if reward is None else read_reward(reward)
-        named = [text for text in (*metrics, reward) if isinstance(text, str) and code.is_code(text)]
-        own = [file for text in named if (file := code.read(text, "").file()) is not None]
+        own = code.files_of([*metrics, reward])
         self._policy_files = digests([*getattr(self.policy, "files", ()), *own])
         make_torch_deterministic()
         self.simulator = (simulator or sumo)(scenario, self.policy.av_parameters, wanted.frames)

@@ -322,6 +322,12 @@ class Identity:
 
 
 IDENTITY = tuple(field.name for field in fields(Identity))
+TIMINGS = ("reset_s", "simulation_s", "observation_s", "decision_s", "total_s")  # wall time, never repeatable
+# What stands beside the figures in documents and rows: no figure may be called so.
+RESERVED = {*IDENTITY, *TIMINGS, "key", "cell", "status", "error", "stderr", "attempts", "steps"} | {
+    *("trace_hash", "timings", "comparable", "not_comparable_because", "collision_list"),
+    *("units", "better", "manifest"),
+}
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,8 @@ from typing import Any
 
 from cosim.batch.spec import AXES, Spec
 from cosim.errors import BadInput
+from cosim.metrics import read as read_metric
+from cosim.rewards import read as read_reward
 from cosim.scenario import Scenario, sumo_outputs
 from cosim.scenario.episode_id import EpisodeId
 from cosim.scenario.manifest import manifest
@@ -91,6 +93,10 @@ def plan(cases: Iterable[EpisodeId], seeds: range, check_policy: CheckPolicy) ->
     worlds: dict[EpisodeId, tuple[Scenario, Mapping[str, Any], str | None]] = {}
     for case in cases:
         check_policy(case.policy)
+        for metric in case.metrics:
+            read_metric(metric)
+        if case.reward is not None:
+            read_reward(case.reward)
         world = replace(case, policy="", svo_deg=0.0, seed=seeds[0])  # who drives changes nothing of it
         if world not in worlds:
             worlds[world] = _read(world)

@@ -135,9 +135,9 @@ def _axis(name: str, value: object, folder: Path, file: object, field: str) -> A
     if name == "policy":
         found = [policy_name.read(item, folder, field, file).text for item in found]
     elif name == "metric":
-        found = [code.read(item, field, folder=folder, file=file).text for item in found]
-    elif name == "reward" and code.is_code(found):
-        found = code.read(found, field, folder=folder, file=file).text
+        found = [code.absolute(item, field, folder=folder, file=file) for item in found]
+    elif name == "reward":
+        found = code.absolute(found, field, folder=folder, file=file)
     elif name in ("scenario", "demand"):
         found = [point for item in found for point in _expand(item, folder, file, field, name)]
         found = [point[0] for point in found] if name == "scenario" else found

@@ -37,12 +37,13 @@ def _shared() -> dict[str, dict[str, Any]]:
     from cosim.types import Preset
 
     return {
-        "--scenario": {"metavar": "NAME|FILE", "help": "a world, or a .sumocfg"},
+        "--scenario": {"metavar": "NAME|FILE", "help": "a world, its folder, or a .sumocfg"},
         "--demand": {"metavar": "NAME|FILE", "help": "a name, or a route file"},
         "--policy": {"metavar": "POLICY", "help": POLICY},
         "--behavior": {
             "choices": BEHAVIORS,
-            "help": "Table II class of the human drivers (ours: mixed; contested: moderate)",
+            "help": "Table II class of the human drivers "
+            "(default: mixed; contested: moderate; your files: as-is)",
         },
         "--driver-model": {"choices": DRIVER_MODELS, "help": "of the human drivers"},
         "--penetration": {"type": share, "metavar": "P", "help": "this share of vehicles are AVs, 0..1"},
@@ -61,7 +62,10 @@ def _shared() -> dict[str, dict[str, Any]]:
             "metavar": "NAME",
             "help": "have SUMO write its NAME output (tripinfo, fcd, ...)",
         },
-        "--metric": {"metavar": "FILE:NAME", "help": "measure this besides; FILE.py:NAME or MODULE:NAME"},
+        "--metric": {
+            "metavar": "FILE:NAME",
+            "help": "measure this besides (FILE.py:NAME, MODULE:NAME); repeatable",
+        },
         "--reward": {
             "metavar": "NAME|FILE:NAME",
             "help": "report what AVs earn by it: p, t, or your own",

@@ -22,7 +22,7 @@ def add(commands: arguments.SubCommands) -> None:
         "predict",
         help="position error, interval coverage and map error of the predictors",
         description="Measure every predictor on recorded episodes; records what it needs itself unless "
-        "--recordings names a folder of `cosim record`.",
+        "--recordings names a folder of `cosim record`. The first four flags may be repeated (all worlds).",
     )
     arguments.add(predict, "--scenario", "--demand", "--behavior", "--policy", action="append", default=[])
     predict.add_argument(

@@ -22,9 +22,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if "--" in arguments:
         cut = arguments.index("--")
         arguments, options = arguments[:cut], arguments[cut + 1 :]
-    args = parser(*arguments[:1]).parse_args(arguments)
-    args.sumo_options = options
     try:
+        args = parser(*arguments[:1]).parse_args(arguments)
+        args.sumo_options = options
         if options and not getattr(args, "passes_on", False):
             problem = "only `cosim run` passes options on to SUMO; else they belong into the .sumocfg"
             raise BadInput(problem, field="--", value=" ".join(options))

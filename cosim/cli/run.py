@@ -38,14 +38,17 @@ def add(commands: arguments.SubCommands) -> None:
     run.add_argument(
         "what", metavar="WHAT", help="a scenario's name (cosim scenarios), a world's folder or any .sumocfg"
     )
-    arguments.add(run, "--demand", action="append", default=[])
+    demands = "by name (default of our worlds: dense), or route files; repeatable"
+    arguments.add(run, "--demand", action="append", default=[], help=demands)
     arguments.add(run, "--policy", default="idm")
     arguments.add(run, "--svo", default=45.0)
     arguments.add(run, "--behavior", "--preset", "--duration", "--reward", "--out")
     arguments.add(run, "--driver-model", default="lc2013", help="of the human drivers (default lc2013)")
     arguments.add(run.add_mutually_exclusive_group(), "--av-type", "--av-ids", "--penetration")
     arguments.add(run, "--seed", default=FIRST_TEST_SEED, help=f"default {FIRST_TEST_SEED}")
-    arguments.add(run, "--output", "--metric", action="append", default=[])
+    outputs = "have SUMO write its NAME output (tripinfo, fcd, ssm, ...) to DIR/outputs; repeatable"
+    arguments.add(run, "--output", action="append", default=[], help=outputs)
+    arguments.add(run, "--metric", action="append", default=[])
     run.add_argument("--replay", action="store_true", help="draw DIR/replay.html and DIR/replay.mp4 too")
     arguments.add(run, "--json")
     run.set_defaults(work=work, passes_on=True)
@@ -116,13 +119,14 @@ def work(args: argparse.Namespace) -> int:
     progress = Progress(f"{scenario.name} {label(case.policy)}", "s")
     progress.starting()
     try:
-        with worker:
-            result, replay = worker.call("drive", scenario, case, args.replay, files, progress=progress)
+        result, replay = worker.call("drive", scenario, case, args.replay, files, progress=progress)
     except BaseException:
+        worker.kill()
         if new and folder is not None:
             shutil.rmtree(folder, ignore_errors=True)
         raise
     finally:
+        worker.close()
         if files is not None:  # what a simulation that crashed leaves behind
             shutil.rmtree(files / sumo_outputs.DRAFT, ignore_errors=True)
         progress.done()
@@ -145,15 +149,14 @@ def work(args: argparse.Namespace) -> int:
 def case_of(args: argparse.Namespace) -> EpisodeId:
     """The episode that the flags describe; files by absolute path, so that it can be found again."""
     same = ("behavior", "driver_model", "penetration", "av_type", "av_ids", "preset", "duration", "seed")
-    reward = args.reward
     return EpisodeId(
         what=place(args.what),
         demand=tuple(map(_demand, args.demand)),
         policy=read(args.policy).text,
         svo_deg=args.svo,
         outputs=tuple(dict.fromkeys(args.output)),
-        metrics=tuple(code.read(metric, "--metric").text for metric in args.metric),
-        reward=code.read(reward, "--reward").text if reward and code.is_code(reward) else reward,
+        metrics=tuple(code.absolute(metric, "--metric") for metric in args.metric),
+        reward=args.reward and code.absolute(args.reward, "--reward"),
         **{name: getattr(args, name) for name in same},
     )
 

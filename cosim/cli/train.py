@@ -26,9 +26,9 @@ def add(commands: arguments.SubCommands) -> None:
         action="append",
         default=[],
         metavar="NAME",
-        help="a world, its folder, or all",
+        help="a world, its folder, or all (merge)",
     )
-    arguments.add(train, "--reward", metavar="FILE:NAME", help="your own, instead of the file's weights")
+    arguments.add(train, "--reward", help="learn from this: p, t, or your own (default: the file's)")
     arguments.add(train, "--metric", action="append", default=[])
     train.add_argument("--iterations", type=arguments.count, metavar="N", help="instead of the file's")
     arguments.add(train, "--seed", help="of everything; instead of the file's")

@@ -7,7 +7,7 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
 from types import ModuleType
@@ -109,6 +109,22 @@ def read(
         if not os.path.isfile(place):
             raise wrong(f"no such file: {place}")
     return Code(place, member)
+
+
+def absolute(text: str, field: str, **where: Any) -> str:
+    """Code by its absolute path, found from anywhere; an entry of a table as it is. Raises as `read`."""
+    return read(text, field, **where).text if is_code(text) else text
+
+
+def files_of(texts: Iterable[object]) -> list[Path]:
+    """The files of those that name code, once it is loaded."""
+    named = [read(text, "").file() for text in texts if isinstance(text, str) and is_code(text)]
+    return [file for file in named if file is not None]
+
+
+def place_of(thing: object) -> object:
+    """The file or module that a user's object is from; None for ours."""
+    return vars(thing)["_place"] if isinstance(thing, Guarded) else None
 
 
 def guarded(place: object, what: str, call: Callable[..., Any], *arguments: Any) -> Any:

@@ -13,8 +13,10 @@ from cosim.errors import BadInput
 from cosim.files import code, prepare_folder
 from cosim.learning.configuration import configuration
 from cosim.learning.rollouts import Rollouts
-from cosim.rewards import RewardConfig
+from cosim.metrics import read as read_metric
+from cosim.rewards import read as read_reward
 from cosim.scenario import load, place
+from cosim.scenario.manifest import digests
 from cosim.scenario.policy_name import BEST
 from cosim.workers.memory import keep_freed_memory
 from cosim.workers.progress import Progress
@@ -54,17 +56,15 @@ def train(args: argparse.Namespace) -> int:
         "scenarios": sorted({lesson.scenario for lesson in training.lessons}),
         **{part: asdict(getattr(file, part)) for part in ABOUT},
     }
-    reward: str | RewardConfig = file.reward
-    if args.reward is not None:
-        reward = about["reward"] = code.read(args.reward, "--reward").text
-    metrics = [code.read(metric, "--metric").text for metric in args.metric]
+    if training.reward:
+        about["reward"] = training.reward
     if agent.predicted_maps and agent.chain.source == "hpn" and agent.hpn_weights is not None:
         about["hpn_sha256"] = sha256(agent.hpn_weights)
     explore = replace(file.explore, sample=learning == "a2c")
     keep_freed_memory()
     use_threads(args.threads)  # more threads than cores stall each other (docs/training.md)
     writer = tensorboard(folder)
-    rollouts = Rollouts(args.workers, name, agent, explore, reward, metrics)
+    rollouts = Rollouts(args.workers, name, agent, explore, training.reward or file.reward, training.metrics)
     with closing(writer), Progress(f"train {name}", "iterations") as progress, rollouts as actors:
         run = TrainingRun(training, agent.vfn, actors, folder, device=args.device, log=writer, about=about)
         if args.resume and not run.resume():
@@ -86,6 +86,14 @@ def _scheduled(training: VfnTraining, args: argparse.Namespace, name: str) -> Vf
         training = replace(training, lessons=lessons)
     if name.endswith("-egoistic"):  # the twin never weighs anybody's interest but its own
         training = replace(training, svo=(0.0,), replay=replace(training.replay, phi=(0.0, 0.0)))
+    reward = code.absolute(args.reward or training.reward, "--reward")
+    metrics = tuple(code.absolute(metric, "--metric") for metric in args.metric or training.metrics)
+    if reward:
+        read_reward(reward)
+    for metric in metrics:
+        read_metric(metric)
+    own = tuple(" ".join(item) for item in digests(code.files_of([*metrics, reward])).items())
+    training = replace(training, reward=reward, metrics=metrics, code=own)
     given = {field: getattr(args, field) for field in ("iterations", "seed")}
     changes = {field: value for field, value in given.items() if value is not None}
     return replace(training, learning=APPROACHES[name].learning, **changes)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from numbers import Number
 
 from cosim.errors import BadInput
 from cosim.files import code
@@ -16,7 +17,7 @@ from cosim.metrics.jerk import Jerk
 from cosim.metrics.mission import MissionSuccess
 from cosim.metrics.post_encroachment import PostEncroachment
 from cosim.metrics.time_to_collision import TimeToCollision
-from cosim.types import Kind, Metric, Snapshot
+from cosim.types import RESERVED, Kind, Metric, Snapshot
 
 __all__ = ["METRICS", "EpisodeMetric", "MetricContext", "MetricFactory", "Metrics", "joined", "read"]
 
@@ -58,20 +59,26 @@ class Metrics:
 
     def result(self) -> dict[str, Metric]:
         """Name -> figure with unit and better direction, in the table's order. Raises as `joined`."""
-        return joined(*(metric.result() for metric in self._metrics))
+        figures: dict[str, Metric] = {}
+        for metric in self._metrics:
+            figures = joined(figures, metric.result(), code.place_of(metric))
+        return figures
 
 
-def joined(*parts: Mapping[str, Metric]) -> dict[str, Metric]:
-    """The figures of several metrics. Raises BadInput: two have one name, or a figure is no `Metric`."""
-    figures: dict[str, Metric] = {}
-    for part in parts:
-        for name, figure in part.items():
-            if name in figures:
-                raise BadInput("another metric has a figure of this name", field="metric", value=name)
-            if not isinstance(figure, Metric):
-                raise BadInput("must be a cosim.types.Metric", field=f"metric.{name}", value=figure)
-            figures[name] = figure
-    return figures
+def joined(figures: Mapping[str, Metric], more: object, file: object = None) -> dict[str, Metric]:
+    """`figures`, and those of another metric, whose code is in `file`.
+
+    Raises BadInput: it has no mapping of names to `Metric`, a name that is taken, a value that is no number.
+    """
+    if not isinstance(more, Mapping):
+        raise BadInput("must return a mapping of names to cosim.types.Metric", file=file, field="result")
+    for name, figure in more.items():
+        if name in figures or name in RESERVED:
+            raise BadInput("is the name of something else in a row", file=file, field="metric", value=name)
+        if not isinstance(figure, Metric) or not isinstance(figure.value, Number | None):
+            problem = "must be a cosim.types.Metric of a number, true, false or None"
+            raise BadInput(problem, file=file, field=f"metric.{name}", value=figure)
+    return {**figures, **more}
 
 
 def read(what: str | MetricFactory, field: str = "--metric") -> MetricFactory:

@@ -5,8 +5,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from cosim.batch import records
 from cosim.report.result import FIRST
+from cosim.types import RESERVED, TIMINGS
 
 Row = Mapping[str, Any]  # one episode: a line of episodes.parquet, NA as None
 
@@ -48,22 +48,6 @@ RATES: dict[str, Measure] = {
 
 HEADLINE = tuple(filter(None, FIRST.values()))  # what reports and comparisons show first
 
-TIMINGS = ("reset_s", "simulation_s", "observation_s", "decision_s", "total_s")  # wall time: never repeatable
-
-# What identifies, explains or times an episode, but measures nothing of the traffic.
-_NOT_FIGURES = frozenset(
-    (
-        *records.FIRST,
-        *records.LAST,
-        "steps",
-        "trace_hash",
-        "timings",
-        "comparable",
-        "not_comparable_because",
-        "collision_list",
-    )
-)
-
 
 def measures(
     rows: Iterable[Row], units: Mapping[str, str] | None = None, better: Mapping[str, str] | None = None
@@ -81,7 +65,7 @@ def measures(
     rates = {m.name: m for m in RATES.values() if m.column in kinds}
     rated = {m.column for m in rates.values() if kinds[m.column] <= {bool}}
     means = {}
-    for column in [c for c in kinds if c not in _NOT_FIGURES | rated | {*TIMINGS}]:
+    for column in [c for c in kinds if c not in RESERVED | rated]:
         if kinds[column] == {bool}:
             name = f"{column}_rate"
             rates[name] = Measure(name, column, SHARE, better.get(column, ""), True)

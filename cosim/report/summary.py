@@ -7,9 +7,9 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from cosim.report.figures import TIMINGS, Measure, Row, measures
+from cosim.report.figures import Measure, Row, measures
 from cosim.report.statistics import CONFIDENCE, mean, rule_of_three, share
-from cosim.types import IDENTITY
+from cosim.types import IDENTITY, TIMINGS
 from cosim.workers.tasks import OK, STATUSES
 
 # What must be equal for episodes to be counted together; rows of different cells never are.

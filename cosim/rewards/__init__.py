@@ -72,8 +72,8 @@ def rewards(
     if not isinstance(paid, Mapping) or paid.keys() != set(avs):
         got = sorted(map(str, paid)) if isinstance(paid, Mapping) else type(paid).__name__
         problem = f"must pay each of {', '.join(sorted(avs))}, and nobody else"
-        raise BadInput(problem, field="reward", value=got)
-    return {name: _terms(name, value) for name, value in paid.items()}
+        raise BadInput(problem, file=code.place_of(reward), field="reward", value=got)
+    return {name: _terms(name, value, code.place_of(reward)) for name, value in paid.items()}
 
 
 def read(what: str | Reward, field: str = "--reward") -> Reward:
@@ -91,11 +91,12 @@ def read(what: str | Reward, field: str = "--reward") -> Reward:
     return found
 
 
-def _terms(name: str, value: RewardTerms | float) -> RewardTerms:
+def _terms(name: str, value: RewardTerms | float, file: object) -> RewardTerms:
     try:
         terms = value if isinstance(value, RewardTerms) else RewardTerms(value, 0.0, 0.0, float(value))
         if np.isfinite(terms.total):
             return terms
     except (TypeError, ValueError):
         pass
-    raise BadInput("must be a finite number or RewardTerms", field=f"reward of {name}", value=value)
+    problem = "must be a finite number or RewardTerms"
+    raise BadInput(problem, file=file, field=f"reward of {name}", value=value)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TextIO, TypeVar
 
@@ -45,6 +46,7 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
         self._stream = stream or sys.stderr
         self._terminal = self._stream.isatty()
         self._bar: tqdm[Any] | None = None
+        self._began = time.monotonic()
         self._note = threading.Timer(3.0, self._say, [STARTING])
         self._note.daemon = True
 
@@ -88,6 +90,8 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
         """Clear the bar."""
         self._note.cancel()
         if self._bar is not None:
+            if not self._terminal and time.monotonic() - self._began > LINE_EVERY:
+                self._bar.refresh()  # the last line of long work
             self._bar.close()
 
     def _say(self, line: str) -> None:

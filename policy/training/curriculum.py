@@ -48,6 +48,9 @@ class VfnTraining:
     validation: int = 4  # episodes of every lesson, greedy, on tuning seeds
     save_every: int = 5  # iterations
     learning: Literal["ddqn", "a2c"] = "ddqn"
+    reward: str = ""  # a user's, FILE.py:NAME, or one of `cosim.rewards.REWARDS`; "": the file's section
+    metrics: tuple[str, ...] = ()  # a user's, FILE.py:NAME: logged besides
+    code: tuple[str, ...] = ()  # their files and SHA-256
     replay: ReplayConfig = field(default_factory=ReplayConfig)
     ddqn: DdqnConfig = field(default_factory=DdqnConfig)
     a2c: A2cConfig = field(default_factory=A2cConfig)

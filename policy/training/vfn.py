@@ -182,7 +182,9 @@ class TrainingRun:
             return False
         state = read_json(file)
         mine = json.loads(json.dumps(asdict(self.config)))
-        differs = [name for name in mine if mine[name] != state["config"].get(name) and name != "iterations"]
+        # a folder of before has the defaults of what it did not know
+        theirs = json.loads(json.dumps(asdict(VfnTraining()))) | state["config"]
+        differs = [name for name in mine if mine[name] != theirs[name] and name != "iterations"]
         if differs:
             raise BadInput("was trained with another configuration", file=file, field=", ".join(differs))
         self.iteration, self._gone = state["iteration"], state["gone"]

@@ -42,6 +42,15 @@ class Frames:
 class Crashed(Frames):
     def result(self): return {"crashed": Metric(False, "", "lower")}
 
+class Seed(Frames):
+    def result(self): return {"seed": Metric(7, "", "")}
+
+class Words(Frames):
+    def result(self): return {"words": Metric("abc", "", "")}
+
+class Five(Frames):
+    def result(self): return 5
+
 class Brakes:
     observation = ObservationConfig(maps=False)
     def reset(self, context): ...
@@ -122,9 +131,12 @@ def test_a_share_of_all_vehicles_may_be_avs(own: Path) -> None:
     ("reward", "metric", "said"),
     [
         ("by_speed", "Frames", "reward='by_speed': unknown"),
-        ("{code}:forgetful", "Frames", "reward=[]: must pay each of"),
+        ("{code}:forgetful", "Frames", "code.py: reward=[]: must pay each of"),
         ("{code}:divides", "Frames", "code.py:11: divides: ZeroDivisionError"),
-        ("p", "Crashed", "metric='crashed': another metric has a figure of this name"),
+        ("p", "Crashed", "code.py: metric='crashed': is the name of something else in a row"),
+        ("p", "Seed", "code.py: metric='seed': is the name of something else in a row"),
+        ("p", "Words", "code.py: metric.words="),
+        ("p", "Five", "code.py: result: must return a mapping"),
         ("t", "by_speed", "code.py: reset: AttributeError"),
     ],
 )
@@ -179,7 +191,9 @@ def test_all_of_them_together_are_evaluated(own: Path, tmp_path: Path) -> None:
     assert manifest["better"]["frames"] == ""
 
 
-def test_all_of_them_together_are_trained_with(own: Path, tmp_path: Path) -> None:
+def test_all_of_them_together_are_trained_with(
+    own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     code = f"{own}/code.py"
     words = ["--reward", f"{code}:by_speed", "--metric", f"{code}:Frames", "--scenario", str(own / "mine")]
     assert (
@@ -190,6 +204,10 @@ def test_all_of_them_together_are_trained_with(own: Path, tmp_path: Path) -> Non
     assert all(entry["train/frames"] > 0 for entry in log)
     assert all(entry["train/reward"] > 1.0 for entry in log), "by speed in m/s"
     assert json.loads((tmp_path / "best.json").read_text())["data"]["reward"] == f"{code}:by_speed"
+    capsys.readouterr()
+    again = ["--scenario", str(own / "mine"), "--config", "smoke", "--out", str(tmp_path), "--resume"]
+    assert main(["train", "vfn", *again, "--iterations", "3"]) == 2, "without its reward"
+    assert "was trained with another configuration" in capsys.readouterr().err
 
 
 def test_a_predictor_is_measured_where_one_s_own_policy_drives(own: Path, tmp_path: Path) -> None:
@@ -201,3 +219,17 @@ def test_a_predictor_is_measured_where_one_s_own_policy_drives(own: Path, tmp_pa
         rows = [r for r in csv.DictReader(file) if r["scenario"] == "mine" and r["horizon_s"] == "mean"]
     error = {r["predictor"]: float(r["mean_m"]) for r in rows if r["behavior"] == "all"}
     assert error["slower"] > error["cs"] > 0.0
+
+
+@pytest.mark.parametrize("command", ["evaluate", "train"])
+@pytest.mark.parametrize("flag", ["--reward", "--metric"])
+def test_what_cannot_be_loaded_is_refused_before_anything_is_made(
+    own: Path, tmp_path: Path, command: str, flag: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = (
+        ["evaluate", "--duration", "4"] if command == "evaluate" else ["train", "vfn", "--config", "smoke"]
+    )
+    words += ["--scenario", "merge", flag, f"{own}/code.py:nope", "--out", str(tmp_path / "out")]
+    assert main(words) == 2
+    assert f"{flag}='nope': nothing to call of this name" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

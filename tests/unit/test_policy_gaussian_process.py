@@ -11,9 +11,9 @@ import torch
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct, WhiteKernel
 
+from benchmarks.maximum_likelihood import BOUNDS, fit_series
 from policy.prediction.gaussian_process import HEADING, SPEED, BankConfig, GaussianProcessBank
 from policy.prediction.kernel_prior import KernelPrior, PriorNetwork, describe
-from policy.prediction.maximum_likelihood import BOUNDS, fit_series
 from policy.predictors.gp import GaussianProcessIndirect
 
 PAST = 0.2 * np.arange(-9, 1)  # s

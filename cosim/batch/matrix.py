@@ -10,7 +10,7 @@ from typing import Any
 
 from cosim.batch.spec import AXES, Spec
 from cosim.errors import BadInput
-from cosim.metrics import read as read_metric
+from cosim.files import code
 from cosim.rewards import read as read_reward
 from cosim.scenario import Scenario, sumo_outputs
 from cosim.scenario.episode_id import EpisodeId
@@ -94,7 +94,7 @@ def plan(cases: Iterable[EpisodeId], seeds: range, check_policy: CheckPolicy) ->
     for case in cases:
         check_policy(case.policy)
         for metric in case.metrics:
-            read_metric(metric)
+            code.read(metric, "--metric").load("--metric")
         if case.reward is not None:
             read_reward(case.reward)
         world = replace(case, policy="", svo_deg=0.0, seed=seeds[0])  # who drives changes nothing of it

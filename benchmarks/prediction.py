@@ -24,7 +24,8 @@ import numpy as np
 
 from benchmarks.maximum_likelihood import fit_series
 from cosim.learning.prediction_scores import NORMAL
-from cosim.recording import Folder, windows
+from cosim.recording.folder import Folder
+from cosim.recording.views import windows
 from cosim.report import statistics
 from cosim.types import Floats
 from cosim.workers.memory import keep_freed_memory

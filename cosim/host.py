@@ -12,7 +12,7 @@ from cosim.files import code
 from cosim.metrics import MetricFactory, joined
 from cosim.metrics import read as read_metric
 from cosim.policies import make
-from cosim.recording import DRAWN, Recorder
+from cosim.recording.recorder import DRAWN, Recorder
 from cosim.recording.replay_data import ReplayData, replay_data
 from cosim.rewards import Reward, RewardTerms, rewards
 from cosim.rewards import read as read_reward

@@ -12,7 +12,9 @@ from cosim.batch.matrix import Plan
 from cosim.batch.spec import Spec
 from cosim.errors import BadInput
 from cosim.policies import check
-from cosim.recording import Folder, Recorder, write
+from cosim.recording.file import write
+from cosim.recording.folder import Folder
+from cosim.recording.recorder import Recorder
 from cosim.scenario import place
 from cosim.scenario.episode_id import EpisodeId
 from cosim.scenario.policy_name import read

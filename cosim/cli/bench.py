@@ -53,7 +53,7 @@ def work(args: argparse.Namespace) -> int:
     from cosim.files import prepare_folder
     from cosim.learning.bench_predict import MAPS_PAGE, PAGE, bench_maps, bench_predict
     from cosim.learning.prediction_data import recorded_by
-    from cosim.recording import Folder
+    from cosim.recording.folder import Folder
     from cosim.scenario import load, place
 
     out = prepare_folder(args.out)

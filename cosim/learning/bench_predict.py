@@ -12,7 +12,9 @@ from cosim.errors import BadInput
 from cosim.files import write_csv
 from cosim.learning import map_bench, map_figures
 from cosim.learning.prediction_scores import LEVEL, Predicted, Scores
-from cosim.recording import Folder, Recording, Windows, read, windows
+from cosim.recording.file import Recording, read
+from cosim.recording.folder import Folder
+from cosim.recording.views import Windows, windows
 from cosim.report import statistics
 from cosim.road import RoadMap
 from cosim.types import Floats

@@ -14,7 +14,8 @@ from cosim.errors import BadInput
 from cosim.learning.bench_predict import forecast
 from cosim.learning.prediction_data import recorded_by
 from cosim.learning.prediction_scores import Scores, interval_errors
-from cosim.recording import Folder, windows
+from cosim.recording.folder import Folder
+from cosim.recording.views import windows
 from cosim.seeding import TRAINING_SEEDS, TUNING_SEEDS
 from cosim.workers.memory import keep_freed_memory
 from cosim.workers.progress import Progress

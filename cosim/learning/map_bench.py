@@ -9,7 +9,8 @@ import numpy as np
 
 from cosim.errors import BadInput
 from cosim.learning.prediction_data import EpisodeReader, followed, spread
-from cosim.recording import Folder, read
+from cosim.recording.file import read
+from cosim.recording.folder import Folder
 from cosim.report import statistics
 from cosim.types import COMPACT, Floats
 from cosim.workers.engines import LocalEngine

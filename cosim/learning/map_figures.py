@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 from cosim.errors import BadInput
 from cosim.learning.map_bench import load_hpns
 from cosim.learning.prediction_data import Followed, followed
-from cosim.recording import Folder, read
+from cosim.recording.file import read
+from cosim.recording.folder import Folder
 from cosim.road import RoadMap
 from cosim.types import COMPACT, Bytes, Floats32
 from policy.networks.inner_features import painted

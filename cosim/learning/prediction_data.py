@@ -9,7 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cosim.errors import CosimError
-from cosim.recording import Folder, Recording, histories, read
+from cosim.recording.file import Recording, read
+from cosim.recording.folder import Folder
+from cosim.recording.views import histories
 from cosim.road import RoadMap
 from cosim.types import COMPACT, Bytes, History, ObservationConfig, Snapshot
 from cosim.workers.engines import Engine

@@ -13,7 +13,7 @@ from cosim.errors import BadInput
 from cosim.files import prepare_folder
 from cosim.learning.configuration import configuration
 from cosim.learning.prediction_data import MAPLESS, EpisodeReader, episodes, followed, recorded_by, spread
-from cosim.recording import Folder
+from cosim.recording.folder import Folder
 from cosim.seeding import TRAINING_SEEDS, TUNING_SEEDS
 from cosim.types import COMPACT
 from cosim.workers.engines import LocalEngine

@@ -30,7 +30,7 @@ class Choice:
 
 
 class Recorder(Hook):
-    """Keeps the last episode; `cosim.recording.write` stores it, `cosim.recording.replay_data` reads it.
+    """Keeps the last episode; `recording.file.write` stores it, `recording.replay_data` reads it.
 
     `limit`: vehicle frames kept at most; beyond, every second frame goes, which is enough to draw from.
     `policy`: whose forecasts are kept.

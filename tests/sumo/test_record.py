@@ -14,7 +14,9 @@ import numpy as np
 import pytest
 
 from cosim.cli.main import main
-from cosim.recording import Folder, histories, read
+from cosim.recording.file import read
+from cosim.recording.folder import Folder
+from cosim.recording.views import histories
 from cosim.types import COMPACT
 
 FLAGS = "record --scenario merge --demand free --behavior mixed --policy idm --policy keep-lane --duration 4"

@@ -14,7 +14,10 @@ from cosim.errors import BadInput
 from cosim.files import write_csv
 from cosim.learning import map_bench, train_hpn
 from cosim.learning.prediction_data import HORIZON, MAPLESS, Followed, followed
-from cosim.recording import Folder, Recorder, Recording, histories, read, write
+from cosim.recording.file import Recording, read, write
+from cosim.recording.folder import Folder
+from cosim.recording.recorder import Recorder
+from cosim.recording.views import histories
 from cosim.road import RoadMap
 from cosim.scenario import Mission, load
 from cosim.simulation.fake import FakeSimulator, FakeVehicle

@@ -10,17 +10,11 @@ import pytest
 
 from cosim.episode import Episode
 from cosim.errors import BadInput
-from cosim.recording import (
-    Folder,
-    Recorder,
-    Recording,
-    histories,
-    read,
-    tracks,
-    windows,
-    write,
-)
+from cosim.recording.file import Recording, read, write
+from cosim.recording.folder import Folder
+from cosim.recording.recorder import Recorder
 from cosim.recording.roads import read_road, text
+from cosim.recording.views import histories, tracks, windows
 from cosim.road import ConflictZone, Lane, RoadMap
 from cosim.scenario import Mission, load
 from cosim.simulation.fake import FakeSimulator, FakeVehicle

@@ -18,7 +18,7 @@ import pytest
 from PIL import Image
 
 from cosim.episode import Episode, run_episode
-from cosim.recording import Recorder
+from cosim.recording.recorder import Recorder
 from cosim.recording.replay_data import ReplayData, replay_data
 from cosim.report.replay.page import document, page
 from cosim.report.replay.strip import Strip, poses_at

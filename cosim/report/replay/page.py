@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cosim.recording import Choice
+from cosim.recording.recorder import Choice
 from cosim.recording.replay_data import ReplayData, Track
 from cosim.types import Floats, Forecast
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from cosim.recording import Choice
+from cosim.recording.recorder import Choice
 from cosim.recording.replay_data import ReplayData, Track
 from cosim.types import Floats, Kind, MetaAction
 

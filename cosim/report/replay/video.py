@@ -14,7 +14,7 @@ import numpy.typing as npt
 from PIL import Image, ImageDraw
 
 from cosim.files import whole
-from cosim.recording import Choice
+from cosim.recording.recorder import Choice
 from cosim.recording.replay_data import ReplayData, Track
 from cosim.report.replay.strip import AV, BAD, TEXT, WARN, Colour, Pose, Strip, colour_of, font, poses_at
 from cosim.types import Kind, MetaAction

@@ -17,6 +17,7 @@ import tempfile
 import threading
 import traceback
 from collections.abc import Callable, Iterator
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -60,8 +61,14 @@ class Worker(contextlib.AbstractContextManager["Worker"]):
         self._process = _CONTEXT.Process(
             target=_serve, args=(theirs, factory, arguments, path), name=name, daemon=True
         )
-        with _script_left_out(factory, arguments):
-            self._process.start()
+        # Ctrl-C reaches the parent alone, which decides: blocked signals stay blocked in a new process
+        resource_tracker.ensure_running()  # its start would unblock the signal again
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+        try:
+            with _script_left_out(factory, arguments):
+                self._process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         theirs.close()
         self._closed = False
         self._started = False
@@ -189,7 +196,6 @@ def _script_left_out(*needed: object) -> Iterator[None]:
 
 def _serve(pipe: Connection, factory: Callable[..., Any], arguments: tuple[Any, ...], stderr: str) -> None:
     """The worker's whole life. Ends when the pipe breaks, so it never outlives its parent."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
     keep_freed_memory()
     os.dup2(2, 1)  # what a policy prints goes to stderr: stdout is for the caller's document
     file = os.open(stderr, os.O_RDWR | os.O_APPEND)  # as `cosim.simulation.stderr` wants it, to read back

@@ -1,5 +1,6 @@
 """SUMO's conventions end here: front bumper and degrees clockwise from north become centre and radians."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -7,7 +8,7 @@ import libsumo
 import numpy as np
 
 from cosim.errors import BadInput
-from cosim.road import ConflictZone, Lane, RoadMap
+from cosim.road import ConflictZone, Crossing, Lane, Link, RoadMap, Rule
 from cosim.scenario import Zone
 from cosim.simulation.conventions import centres
 from cosim.types import Events, Kind, Snapshot
@@ -19,6 +20,9 @@ GETTERS = tuple(
     for name in ("Position", "Angle", "Speed", "Acceleration", "LaneID", "LanePosition")
 )
 GIVE_WAY = "mswZ"  # link states: minor, stop, all-way stop, zipper (SUMO, Networks/SUMO_Road_Networks)
+# link states at a stop line without signals (SUMO, Networks/SUMO_Road_Networks)
+RULES = {"m": Rule.YIELD, "s": Rule.STOP, "w": Rule.ALL_WAY_STOP, "=": Rule.EQUAL, "Z": Rule.ZIPPER}
+CROSSING = re.compile(r":.+_c\d+")  # netconvert's name for a pedestrian crossing
 CAR = "passenger"  # SUMO's class of cars, AVs among them
 MOTOR_CLASSES = frozenset({CAR, "private", "taxi", "bus", "truck", "trailer", "delivery", "motorcycle"})
 
@@ -125,8 +129,58 @@ def read_road(zones: Sequence[Zone], scenario_file: object) -> RoadMap:
         for j in libsumo.junction.getIDList()
         if not j.startswith(":") and len(shape := libsumo.junction.getShape(j)) > 2
     )
-    road = RoadMap(tuple(lanes), found, outlines)
+    links, signals = _links(lanes, place)
+    road = RoadMap(tuple(lanes), found, outlines, links, signals, _crossings(place, signals))
     return road if found else replace(road, zones=(_struggling_zone(road),))
+
+
+def _links(
+    lanes: Sequence[Lane], place: Mapping[str, int]
+) -> tuple[tuple[Link, ...], tuple[tuple[str, int], ...]]:
+    """Every link with its rule and foes; and the (traffic light, link index) of every signal."""
+    get, lights = libsumo.lane, libsumo.trafficlight
+    signals: list[tuple[str, int]] = []
+    signal_of: dict[tuple[str, str], int] = {}  # (origin, target) -> index into `signals`
+    for light in lights.getIDList():
+        for index, ways in enumerate(lights.getControlledLinks(light)):
+            signal_of.update(((way[0], way[1]), len(signals)) for way in ways)
+            signals.append((light, index))
+    links, foes = [], []
+    for lane in lanes:
+        for target, _, _, _, via, state, *_ in () if lane.internal else get.getLinks(lane.id):
+            if target not in place:
+                continue
+            signal = signal_of.get((lane.id, target), -1)
+            before = frozenset(get.getFoes(lane.id, target))
+            crossed = frozenset(get.getInternalFoes(via)) if via else frozenset()
+            rule = RULES.get(state, Rule.PRIORITY) if signal < 0 else Rule.YIELD if before else Rule.PRIORITY
+            links.append(Link(place[lane.id], place.get(via, -1), place[target], signal, rule))
+            foes.append((before, crossed))
+    by_name = [(lanes[k.origin].id, lanes[k.via].id if k.via >= 0 else "") for k in links]
+    at: dict[str, list[int]] = {}
+    for number, (origin, _) in enumerate(by_name):
+        at.setdefault(origin, []).append(number)
+    found = [
+        tuple(n for name in sorted(before) for n in at.get(name, ()) if by_name[n][1] in crossed)
+        for before, crossed in foes
+    ]
+    return tuple(replace(k, foes=f) for k, f in zip(links, found, strict=True)), tuple(signals)
+
+
+def _crossings(place: Mapping[str, int], signals: Sequence[tuple[str, int]]) -> tuple[Crossing, ...]:
+    """Every pedestrian crossing of the net."""
+    get, found = libsumo.lane, []
+    signal_of: dict[str, int] = {}
+    for number, (light, index) in enumerate(signals):
+        for way in libsumo.trafficlight.getControlledLinks(light)[index]:
+            signal_of[way[1]] = signal_of[way[2]] = number
+    for edge in libsumo.edge.getIDList():
+        if CROSSING.fullmatch(edge):
+            lane = f"{edge}_0"
+            crossed = tuple(place[i] for i in get.getInternalFoes(lane) if i in place)
+            shape = np.array(get.getShape(lane), np.float64)[:, :2]
+            found.append(Crossing(edge, shape, get.getWidth(lane), crossed, signal_of.get(lane, -1)))
+    return tuple(found)
 
 
 def may_change(lane: str, offset: int, vehicle_class: str) -> bool:

@@ -302,6 +302,7 @@ class PolicyContext:
     observation: ObservationConfig
     svo: float  # rad, the social value orientation phi
     rng: np.random.Generator
+    preset: str = Preset.UNGUARDED
     share_intentions: bool = True  # V2V: AVs decide front to back and know the choices before theirs
 
 

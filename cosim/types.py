@@ -101,7 +101,8 @@ class Entry:
     least_speed: float  # m/s, over the last 10 m before the line
     yellow_since: float = -1.0  # s, when the signal turned yellow; -1 where it is not
     yellow_distance: float = 0.0  # m to the line and
-    yellow_speed: float = 0.0  # m/s of the vehicle at that instant
+    yellow_speed: float = 0.0  # m/s of the vehicle at that instant; inf if it was not on the road yet
+    foes: tuple[tuple[str, int], ...] = ()  # who has the right of way within 100 m, each with its link
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,6 +125,8 @@ class Events:
     emergency_stopped: tuple[str, ...] = ()
     entries: tuple[Entry, ...] = ()
     interventions: tuple[Intervention, ...] = ()
+    stopped: tuple[str, ...] = ()  # reached a stop of their plan
+    resumed: tuple[str, ...] = ()  # drove on from one
 
     @classmethod
     def of(cls, frames: Sequence[Snapshot]) -> Events:

@@ -23,6 +23,7 @@ from cosim.simulation.collisions import CollisionDetector
 from cosim.simulation.commands import Commander
 from cosim.simulation.convert import Body, SnapshotReader, read_road, struggling_lanes
 from cosim.simulation.drivers import Drivers
+from cosim.simulation.entries import EntryWatcher
 from cosim.simulation.fleet import Fleet
 from cosim.simulation.stderr import SumoStderr
 from cosim.simulation.xerces import keep_initialized
@@ -92,6 +93,7 @@ class SumoSimulator:
             self.close()
             raise
         self._reader = SnapshotReader(self.road)
+        self._entries = EntryWatcher(self.road, scenario.timing.step)
 
     def reset(self, seed: int) -> tuple[Snapshot, ...]:
         """Load the episode `seed` anew, drive the warm-up; the last `history` frames, newest last."""
@@ -105,6 +107,7 @@ class SumoSimulator:
         self._routes: dict[str, tuple[str, ...]] = {}
         self._detector = CollisionDetector()
         self._reader.bodies_changed()
+        self._entries.reset()
         self._mission_found = bool(self._scenario.mission.vehicles) or self._scenario.mission.kind == "none"
         self._inserted = 0
         self._waited: set[str] = set()  # only where SUMO gives up: seen waiting, not inserted since
@@ -249,8 +252,10 @@ class SumoSimulator:
                 arrived,
                 simulation.getStartingTeleportIDList(),
                 simulation.getEmergencyStoppingVehiclesIDList(),
-                (),
+                self._entries.step(now, [i for i in departed if self._bodies[i].kind == Kind.AV]),
                 self._commander.observe(now),
+                simulation.getStopStartingVehiclesIDList(),
+                simulation.getStopEndingVehiclesIDList(),
             )
         )
         if self._gives_up:

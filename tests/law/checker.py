@@ -7,6 +7,7 @@ program at the stamp (tested against libsumo). Definitions: docs/definitions.md,
 
 from __future__ import annotations
 
+import itertools
 import re
 import xml.etree.ElementTree as ET
 from collections import defaultdict
@@ -435,7 +436,7 @@ class Checker:
         elif not now.startswith(":") and av.place[row] == av.place[row - 1]:
             return []  # on one edge
         ways = av.way[av.place[row - 1] : av.place[row] + 1]
-        pairs = list(zip(ways, ways[1:], strict=False))
+        pairs = list(itertools.pairwise(ways))
         if before.startswith(":"):
             pairs = pairs[1:]  # the first is the junction that it was in
         links: list[Link] = []
@@ -484,7 +485,7 @@ class Checker:
             element.clear()
         if len(self.times) > 1:
             step = round(self.times[1] - self.times[0], 6)
-            if any(abs(b - a - step) > 1e-3 for a, b in zip(self.times, self.times[1:], strict=False)):
+            if any(abs(b - a - step) > 1e-3 for a, b in itertools.pairwise(self.times)):
                 raise ValueError(f"{path}: not every step is there: ask for {OPTIONS}")
             for track in self.tracks.values():
                 track.step = step

@@ -35,6 +35,7 @@ class Body:
     mission: bool
     length: float  # m
     width: float  # m
+    guessed: bool = False  # a mission vehicle that nobody named
 
 
 class SnapshotReader:

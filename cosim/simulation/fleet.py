@@ -34,7 +34,7 @@ class Fleet:
     def depart(self, vehicle: str, seed: int) -> Body:
         """A vehicle departed: give it its driver; what it is."""
         get, s = libsumo.vehicle, self._scenario
-        mission = bool(s.mission.vehicles and re.fullmatch(s.mission.vehicles, vehicle))
+        mission = s.mission.includes(vehicle)
         is_av = not mission and self._is_av(vehicle, seed)
         if not s.built_in and (is_av or s.behavior != AS_IS):
             take_idm_type(vehicle)

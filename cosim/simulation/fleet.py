@@ -37,7 +37,10 @@ class Fleet:
         mission = s.mission.includes(vehicle)
         is_av = not mission and self._is_av(vehicle, seed)
         if not s.built_in and (is_av or s.behavior != AS_IS):
+            factor = libsumo.vehicletype.getSpeedFactor(get.getTypeID(vehicle))
             take_idm_type(vehicle)
+            if is_av:
+                get.setSpeedFactor(vehicle, factor)  # its type's mean, not a draw about it
         if is_av:
             for name, value in AV_IDM.items():
                 getattr(get, f"set{name}")(vehicle, value)

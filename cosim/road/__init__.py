@@ -120,7 +120,7 @@ class RoadMap:
 
     @cached_property
     def link_of(self) -> dict[tuple[int, int], int]:
-        """(lane before the stop line, lane after it: inside the junction or beyond it) -> index of the link."""
+        """(lane before the stop line, lane inside the junction or beyond it) -> index of the link."""
         found: dict[tuple[int, int], int] = {}
         for k, link in enumerate(self.links):
             found[link.origin, link.target] = k

@@ -77,6 +77,7 @@ def cells(spec: Spec) -> Iterator[EpisodeId]:
             outputs=spec.output,
             metrics=spec.metric,
             reward=spec.reward,
+            on_collision=spec.on_collision,
         )
 
 

@@ -32,6 +32,7 @@ def planned(
     seeds: range,
     svo_deg: float = 45.0,
     duration: float | None = None,
+    on_collision: str | None = None,
 ) -> Plan:
     """Every combination; what is left out is the scenario's own. Raises BadInput."""
     spec = Spec(
@@ -42,6 +43,7 @@ def planned(
         svo=(svo_deg,),
         seeds=(seeds.start, seeds.stop),
         duration=duration,
+        on_collision=on_collision,
     )
     plan = matrix.plan(dict.fromkeys(matrix.cells(spec)), seeds, check)
     for cell in plan.cells:

@@ -77,6 +77,7 @@ def open(
     av_type: str | None = None,
     av_ids: str | None = None,
     duration: float | None = None,
+    on_collision: str | None = None,
     options: Sequence[str] = (),
     seed: int | None = None,
     observation: ObservationConfig = COMPACT,
@@ -114,6 +115,7 @@ def open(
             preset=preset,
             fleet=chosen_fleet(av_type, av_ids, penetration, fleet),
             duration=duration,
+            on_collision=on_collision,
             options=options,
         )
     if simulator is None:

@@ -15,7 +15,11 @@ from cosim.files.yaml_input import dataclass_from, mapping
 from cosim.scenario import Scenario, chosen_fleet, load
 from cosim.scenario.behaviors import LC2013
 
-OPTIONAL = ("metrics", "reward")  # named only where they are asked for: older keys stay as they are
+OPTIONAL = (
+    "metrics",
+    "reward",
+    "on_collision",
+)  # named only where they are asked for: older keys stay as they are
 KEY_LENGTH = 12  # hexadecimal digits of a cell: 48 bits, a collision among 10,000 cells has odds of 2e-7
 
 
@@ -41,6 +45,7 @@ class EpisodeId:
     outputs: tuple[str, ...] = ()  # SUMO's own outputs, by SUMO's names
     metrics: tuple[str, ...] = ()  # measured besides, FILE.py:NAME or MODULE:NAME
     reward: str | None = None  # paid and reported: a name of `cosim.rewards.REWARDS`, or code likewise
+    on_collision: str | None = None  # of `OnCollision`; None: the scenario's own
 
     @cached_property
     def cell(self) -> str:
@@ -94,5 +99,6 @@ class EpisodeId:
             preset=self.preset,
             fleet=chosen_fleet(self.av_type, self.av_ids, self.penetration),
             duration=self.duration,
+            on_collision=self.on_collision,
             options=options,
         )

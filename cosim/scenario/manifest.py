@@ -33,6 +33,7 @@ def manifest(scenario: Scenario, seed: int) -> dict[str, Any]:
     return {
         "seed": seed,
         "preset": scenario.preset,
+        "on_collision": scenario.on_collision,
         "driver_model": scenario.driver_model,
         "behavior": scenario.behavior,
         "fleet": scenario.fleet.describe(),

@@ -19,7 +19,8 @@ AV_LANE_CHANGE = {
     "laneChangeModel.lcCooperativeSpeed": "0",
     "laneChangeModel.lcKeepRight": "0",
 }
-# What a vehicle of a user's file keeps: getters and setters of libsumo.vehicle, in this order.
+AV_TYPE = "cosim.av"  # the types of AVs in SUMO's outputs begin so, and nobody else's
+# What an AV of a user's file keeps: getters and setters of libsumo.vehicle, in this order.
 KEPT = ("Length", "Width", "MaxSpeed", "SpeedFactor", "VehicleClass")
 
 
@@ -30,15 +31,15 @@ class Fleet:
         self._scenario = scenario
         self._drivers = drivers
         self._av_parameters = av_parameters
+        self._av_types: dict[str, str] = {}  # a vehicle's own type -> the type of such an AV
 
     def depart(self, vehicle: str, seed: int) -> Body:
         """A vehicle departed: give it its driver; what it is."""
         get, s = libsumo.vehicle, self._scenario
         mission = bool(s.mission.vehicles and re.fullmatch(s.mission.vehicles, vehicle))
         is_av = not mission and self._is_av(vehicle, seed)
-        if not s.built_in and (is_av or s.behavior != AS_IS):
-            take_idm_type(vehicle)
         if is_av:
+            self._take_av_type(vehicle)
             for name, value in AV_IDM.items():
                 getattr(get, f"set{name}")(vehicle, value)
             for key, text in {**AV_LANE_CHANGE, **self._av_parameters}.items():
@@ -46,6 +47,20 @@ class Fleet:
         elif s.behavior != AS_IS:
             self._drivers.apply(vehicle)
         return Body(Kind.AV if is_av else Kind.HV, mission, get.getLength(vehicle), get.getWidth(vehicle))
+
+    def _take_av_type(self, vehicle: str) -> None:
+        """In our worlds an AV drives as its type says; one of a user's file by IDM, with the size, class and
+        maximum speed that it has: `setType` replaces the car-following model, nothing else can."""
+        get, own = libsumo.vehicle, libsumo.vehicle.getTypeID(vehicle)
+        ours = self._scenario.built_in
+        name = self._av_types.get(own)
+        if name is None:
+            name = self._av_types[own] = f"{AV_TYPE}.{own}"
+            libsumo.vehicletype.copy(own if ours else IDM_TYPE, name)
+        kept = {} if ours else {field: getattr(get, f"get{field}")(vehicle) for field in KEPT}
+        get.setType(vehicle, name)
+        for field, value in kept.items():
+            getattr(get, f"set{field}")(vehicle, value)
 
     def _is_av(self, vehicle: str, seed: int) -> bool:
         rule = self._scenario.fleet
@@ -57,15 +72,3 @@ class Fleet:
             name: str = libsumo.vehicle.getTypeID(vehicle)
             return name == rule.type or name.startswith(f"{rule.type}@")
         return False
-
-
-def take_idm_type(vehicle: str) -> None:
-    """Give a vehicle of a user's file the IDM type; its size, class and maximum speed stay.
-
-    `setType` replaces the car-following model (Krauss in most files); nothing else can.
-    """
-    get = libsumo.vehicle
-    kept = {name: getattr(get, f"get{name}")(vehicle) for name in KEPT}
-    get.setType(vehicle, IDM_TYPE)
-    for name, value in kept.items():
-        getattr(get, f"set{name}")(vehicle, value)

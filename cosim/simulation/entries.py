@@ -27,7 +27,11 @@ HOPS = 8  # lanes that one step may lead across
 EPSILON = 1e-6
 
 _sumo = libsumo._libsumo  # the compiled getters, as in cosim.simulation.convert
-lane_of, position_of, speed_of = _sumo.vehicle_getLaneID, _sumo.vehicle_getLanePosition, _sumo.vehicle_getSpeed
+lane_of, position_of, speed_of = (
+    _sumo.vehicle_getLaneID,
+    _sumo.vehicle_getLanePosition,
+    _sumo.vehicle_getSpeed,
+)
 odometer_of, accel_of = _sumo.vehicle_getDistance, _sumo.vehicle_getAcceleration
 
 
@@ -138,7 +142,9 @@ class EntryWatcher:
         while trail[0][0] < odometer - 2.0 * LAST:
             trail.popleft()
 
-    def _entry(self, name: str, av: Watched, passed: Passed, position: float, speed: float, now: float) -> Entry:
+    def _entry(
+        self, name: str, av: Watched, passed: Passed, position: float, speed: float, now: float
+    ) -> Entry:
         link = self._road.links[passed.link]
         line = odometer_of(name) - passed.beyond - position  # the odometer at the line, m
         last = [v for at, v in av.trail if line - LAST - EPSILON <= at]
@@ -216,7 +222,9 @@ class EntryWatcher:
             length[lane.edge] = min(length.get(lane.edge, math.inf), lane.length)
             for successor in lane.successors:
                 origins[lanes[successor].edge].add(lane.edge)
-        heap = [(0.0, lanes[k.origin].edge) for k, matters in zip(links, self._matters, strict=True) if matters]
+        heap = [
+            (0.0, lanes[k.origin].edge) for k, matters in zip(links, self._matters, strict=True) if matters
+        ]
         while heap:
             free, edge = heapq.heappop(heap)
             if edge in shortest:

@@ -37,7 +37,7 @@ class Fleet:
         mission = bool(s.mission.vehicles and re.fullmatch(s.mission.vehicles, vehicle))
         is_av = not mission and self._is_av(vehicle, seed)
         if not s.built_in and (is_av or s.behavior != AS_IS):
-            take_idm_type(vehicle)
+            set_type(vehicle)
         if is_av:
             for name, value in AV_IDM.items():
                 getattr(get, f"set{name}")(vehicle, value)
@@ -59,13 +59,13 @@ class Fleet:
         return False
 
 
-def take_idm_type(vehicle: str) -> None:
-    """Give a vehicle of a user's file the IDM type; its size, class and maximum speed stay.
+def set_type(vehicle: str, name: str = IDM_TYPE) -> None:
+    """Give a vehicle another type, by default IDM; its size, class and maximum speed stay.
 
     `setType` replaces the car-following model (Krauss in most files); nothing else can.
     """
     get = libsumo.vehicle
     kept = {name: getattr(get, f"get{name}")(vehicle) for name in KEPT}
-    get.setType(vehicle, IDM_TYPE)
+    get.setType(vehicle, name)
     for name, value in kept.items():
         getattr(get, f"set{name}")(vehicle, value)

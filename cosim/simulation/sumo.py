@@ -18,6 +18,7 @@ from cosim.scenario import Scenario
 from cosim.scenario.disabled_outputs import disable_outputs
 from cosim.scenario.sumo_outputs import sumo_options
 from cosim.scenario.sumocfg import time_of
+from cosim.simulation.assistance import Assistance
 from cosim.simulation.collisions import CollisionDetector
 from cosim.simulation.commands import Commander
 from cosim.simulation.convert import Body, SnapshotReader, read_road, struggling_lanes
@@ -25,7 +26,7 @@ from cosim.simulation.drivers import Drivers
 from cosim.simulation.fleet import Fleet
 from cosim.simulation.stderr import SumoStderr
 from cosim.simulation.xerces import keep_initialized
-from cosim.types import Command, Events, Kind, Receipt, Snapshot
+from cosim.types import Command, Events, Kind, Preset, Receipt, Snapshot
 
 SUMO_ERRORS = (libsumo.TraCIException, libsumo.FatalTraCIError)
 
@@ -98,7 +99,8 @@ class SumoSimulator:
         self._seed = seed
         self._drivers = Drivers(self._scenario.behavior, self._scenario.driver_model, seed)
         self._fleet = Fleet(self._scenario, self._drivers, self._av_parameters)
-        self._commander = Commander(self._scenario.preset, self._scenario.timing.step)
+        preset, step = self._scenario.preset, self._scenario.timing.step
+        self._commander = Assistance(step) if preset == Preset.LAWFUL else Commander(preset, step)
         self._bodies: dict[str, Body] = {}
         self._routes: dict[str, tuple[str, ...]] = {}
         self._detector = CollisionDetector()
@@ -196,7 +198,8 @@ class SumoSimulator:
 
     def _arguments(self, seed: int) -> list[str]:
         s = self._scenario
-        additional = s.additional if s.built_in else (*s.additional, sumo_scenarios.TYPES)
+        types = () if s.built_in and s.preset != Preset.LAWFUL else (sumo_scenarios.TYPES,)
+        additional = (*s.additional, *types)
         settings, files = sumo_options(self._outputs, s)
         options = {
             "net-file": str(s.net),
@@ -246,6 +249,8 @@ class SumoSimulator:
                 arrived,
                 simulation.getStartingTeleportIDList(),
                 simulation.getEmergencyStoppingVehiclesIDList(),
+                (),
+                self._commander.observe(now),
             )
         )
         if self._gives_up:

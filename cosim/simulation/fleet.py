@@ -8,9 +8,9 @@ import libsumo
 from cosim.scenario import Scenario
 from cosim.scenario.behaviors import AS_IS
 from cosim.seeding import uniform
-from cosim.simulation.convert import Body
+from cosim.simulation.convert import ACTORS, Body
 from cosim.simulation.drivers import IDM_TYPE, Drivers
-from cosim.types import Kind
+from cosim.types import Actor, Kind
 
 # definitions.md, Vehicles: what an AV drives with while it has no command (egoistic IDM).
 AV_IDM = {"Tau": 0.8, "MinGap": 2.0, "Accel": 3.0, "Decel": 7.0}
@@ -45,7 +45,9 @@ class Fleet:
                 get.setParameter(vehicle, key, text)
         elif s.behavior != AS_IS:
             self._drivers.apply(vehicle)
-        return Body(Kind.AV if is_av else Kind.HV, mission, get.getLength(vehicle), get.getWidth(vehicle))
+        size = get.getLength(vehicle), get.getWidth(vehicle)
+        actor = ACTORS.get(get.getVehicleClass(vehicle), Actor.CAR)
+        return Body(Kind.AV if is_av else Kind.HV, mission, *size, actor)
 
     def _is_av(self, vehicle: str, seed: int) -> bool:
         rule = self._scenario.fleet

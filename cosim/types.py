@@ -125,8 +125,7 @@ class Events:
     emergency_stopped: tuple[str, ...] = ()
     entries: tuple[Entry, ...] = ()
     interventions: tuple[Intervention, ...] = ()
-    stopped: tuple[str, ...] = ()  # reached a stop of their plan
-    resumed: tuple[str, ...] = ()  # drove on from one
+    stopped: tuple[str, ...] = ()  # stand at a stop of their plan at the frame's end
 
     @classmethod
     def of(cls, frames: Sequence[Snapshot]) -> Events:

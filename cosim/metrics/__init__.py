@@ -16,6 +16,7 @@ from cosim.metrics.headway import Headway
 from cosim.metrics.jerk import Jerk
 from cosim.metrics.law import StopLines
 from cosim.metrics.mission import MissionSuccess
+from cosim.metrics.persons import PersonConflicts
 from cosim.metrics.post_encroachment import PostEncroachment
 from cosim.metrics.speeding import Speeding
 from cosim.metrics.standing import Standing
@@ -42,6 +43,7 @@ METRICS: dict[str, type[EpisodeMetric]] = {
     "speeding": Speeding,
     "standing": Standing,
     "trips": Trips,
+    "persons": PersonConflicts,
     "interventions": Interventions,
 }
 

@@ -34,10 +34,13 @@ class Fleet:
     def depart(self, vehicle: str, seed: int) -> Body:
         """A vehicle departed: give it its driver; what it is."""
         get, s = libsumo.vehicle, self._scenario
-        mission = bool(s.mission.vehicles and re.fullmatch(s.mission.vehicles, vehicle))
+        mission = s.mission.includes(vehicle)
         is_av = not mission and self._is_av(vehicle, seed)
         if not s.built_in and (is_av or s.behavior != AS_IS):
+            factor = libsumo.vehicletype.getSpeedFactor(get.getTypeID(vehicle))
             set_type(vehicle)
+            if is_av:
+                get.setSpeedFactor(vehicle, factor)  # its type's mean, not a draw about it
         if is_av:
             for name, value in AV_IDM.items():
                 getattr(get, f"set{name}")(vehicle, value)

@@ -101,7 +101,8 @@ class Entry:
     least_speed: float  # m/s, over the last 10 m before the line
     yellow_since: float = -1.0  # s, when the signal turned yellow; -1 where it is not
     yellow_distance: float = 0.0  # m to the line and
-    yellow_speed: float = 0.0  # m/s of the vehicle at that instant
+    yellow_speed: float = 0.0  # m/s of the vehicle at that instant; inf if it was not on the road yet
+    foes: tuple[tuple[str, int], ...] = ()  # who has the right of way within 100 m, each with its link
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,6 +125,8 @@ class Events:
     emergency_stopped: tuple[str, ...] = ()
     entries: tuple[Entry, ...] = ()
     interventions: tuple[Intervention, ...] = ()
+    stopped: tuple[str, ...] = ()  # reached a stop of their plan
+    resumed: tuple[str, ...] = ()  # drove on from one
 
     @classmethod
     def of(cls, frames: Sequence[Snapshot]) -> Events:
@@ -302,6 +305,7 @@ class PolicyContext:
     observation: ObservationConfig
     svo: float  # rad, the social value orientation phi
     rng: np.random.Generator
+    preset: str = Preset.UNGUARDED
     share_intentions: bool = True  # V2V: AVs decide front to back and know the choices before theirs
 
 
@@ -373,7 +377,19 @@ class Identity:
 IDENTITY = tuple(field.name for field in fields(Identity))
 TIMINGS = ("reset_s", "simulation_s", "observation_s", "decision_s", "total_s")  # wall time, never repeatable
 # What stands beside the figures in documents and rows: no figure may be called so.
-RESERVED = {*IDENTITY, *TIMINGS, "key", "cell", "status", "error", "stderr", "attempts", "steps"} | {
+MISSION = ("mission_vehicle", "mission_guessed")
+RESERVED = {
+    *IDENTITY,
+    *TIMINGS,
+    *MISSION,
+    "key",
+    "cell",
+    "status",
+    "error",
+    "stderr",
+    "attempts",
+    "steps",
+} | {
     *("trace_hash", "timings", "comparable", "not_comparable_because", "collision_list"),
     *("units", "better", "manifest"),
 }
@@ -389,6 +405,8 @@ class EpisodeResult(Identity):
     collisions: tuple[Collision, ...]
     timings: dict[str, float]  # s: simulation, observation, decision, reset, total
     validity: tuple[str, ...]  # reasons why the result is not comparable; empty when it is
+    mission_vehicle: str | None = None  # its id (of several: joined by ", "); None: none was on the road
+    mission_guessed: bool = False  # nobody named it: its figures feed no gate
     manifest: dict[str, Any] = field(default_factory=dict)
 
     def value(self, name: str) -> float | int | bool | None:
@@ -400,6 +418,7 @@ class EpisodeResult(Identity):
         return {
             **{name: getattr(self, name) for name in IDENTITY},
             "steps": self.steps,
+            **{name: getattr(self, name) for name in MISSION},
             **{name: _plain(metric.value) for name, metric in self.metrics.items()},
             "trace_hash": self.trace_hash,
             "timings": {name: round(value, 6) for name, value in self.timings.items()},

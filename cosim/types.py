@@ -39,18 +39,32 @@ LANE_OFFSET = {MetaAction.LANE_LEFT: 1, MetaAction.LANE_RIGHT: -1}  # as SUMO co
 
 
 class Kind(IntEnum):
-    """Who drives: a human-driven vehicle (HV) or an autonomous one (AV)."""
+    """Who it is: a human-driven vehicle (HV), an autonomous one (AV), or a person on foot."""
 
     HV = 0
     AV = 1
+    PERSON = 2
+
+
+class Actor(IntEnum):
+    """What it is, by SUMO's vehicle class."""
+
+    CAR = 0
+    TRUCK = 1
+    BUS = 2
+    MOTORCYCLE = 3
+    BICYCLE = 4
+    PERSON = 5
+    OTHER = 6
 
 
 class Preset:
-    """Names of the two guards (docs/definitions.md): every result says which one was on."""
+    """What the car does whoever commands it (docs/definitions.md, Presets): every result names it."""
 
-    UNGUARDED = "unguarded"
-    GUARDED = "guarded"
-    ALL = (UNGUARDED, GUARDED)
+    LAWFUL = "lawful"  # the car keeps the law, comfortably, and brakes in an emergency
+    UNGUARDED = "unguarded"  # commands are carried out within physical limits: the agent can crash
+    GUARDED = "guarded"  # SUMO's own safety overrides commands
+    ALL = (LAWFUL, UNGUARDED, GUARDED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +90,31 @@ class Collision:
 
 
 @dataclass(frozen=True, slots=True)
+class Entry:
+    """An AV's front bumper passed a stop line in this simulation step."""
+
+    time: float  # s, the end of the step
+    vehicle: str
+    link: int  # index into RoadMap.links
+    state: str  # the signal's in this step (rRyYgGosu), "" without a signal
+    speed: float  # m/s
+    least_speed: float  # m/s, over the last 10 m before the line
+    yellow_since: float = -1.0  # s, when the signal turned yellow; -1 where it is not
+    yellow_distance: float = 0.0  # m to the line and
+    yellow_speed: float = 0.0  # m/s of the vehicle at that instant; inf if it was not on the road yet
+    foes: tuple[tuple[str, int], ...] = ()  # who has the right of way within 100 m, each with its link
+
+
+@dataclass(frozen=True, slots=True)
+class Intervention:
+    """The car began to drive otherwise than commanded (preset `lawful`)."""
+
+    time: float  # s
+    vehicle: str
+    reason: str  # one of `cosim.control.REASONS`
+
+
+@dataclass(frozen=True, slots=True)
 class Events:
     """What happened since the last snapshot; ids in SUMO's order."""
 
@@ -84,6 +123,10 @@ class Events:
     arrived: tuple[str, ...] = ()
     teleported: tuple[str, ...] = ()
     emergency_stopped: tuple[str, ...] = ()
+    entries: tuple[Entry, ...] = ()
+    interventions: tuple[Intervention, ...] = ()
+    stopped: tuple[str, ...] = ()  # reached a stop of their plan
+    resumed: tuple[str, ...] = ()  # drove on from one
 
     @classmethod
     def of(cls, frames: Sequence[Snapshot]) -> Events:
@@ -97,17 +140,17 @@ NO_EVENTS = Events()
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Every vehicle on the road at one moment, sorted by id.
+    """Everybody on the road at one moment, sorted by id: vehicles and persons (`person:ID`).
 
-    Shapes: all arrays [n]. Units: m, s, rad (counter-clockwise from east), m/s, m/s2.
+    Shapes: all arrays [n], `signals` [s]. Units: m, s, rad (counter-clockwise from east), m/s, m/s2.
     """
 
     time: float  # s
     ids: tuple[str, ...]
     kind: npt.NDArray[np.int8]  # [n] Kind
     mission: Bools  # [n] is a mission vehicle
-    x: Floats  # [n] m, vehicle centre
-    y: Floats  # [n] m, vehicle centre
+    x: Floats  # [n] m, centre
+    y: Floats  # [n] m, centre
     heading: Floats  # [n] rad
     speed: Floats  # [n] m/s
     accel: Floats  # [n] m/s2
@@ -116,6 +159,15 @@ class Snapshot:
     lane: npt.NDArray[np.int32]  # [n] index into RoadMap.lanes, -1 off every lane
     lane_position: Floats  # [n] m, of the front bumper along the lane
     events: Events = NO_EVENTS
+    # [n] Actor; where nothing is given all are cars, persons apart
+    actor: npt.NDArray[np.int8] = field(default_factory=lambda: np.zeros(0, np.int8))
+    # [s] ord() of each state (rRyYgGosu), in the order of RoadMap.signals
+    signals: Bytes = field(default_factory=lambda: np.zeros(0, np.uint8))
+
+    def __post_init__(self) -> None:
+        if len(self.actor) != len(self.kind):
+            actor = np.where(self.kind == Kind.PERSON, Actor.PERSON, Actor.CAR).astype(np.int8)
+            object.__setattr__(self, "actor", actor)
 
     @cached_property
     def row(self) -> dict[str, int]:
@@ -253,6 +305,7 @@ class PolicyContext:
     observation: ObservationConfig
     svo: float  # rad, the social value orientation phi
     rng: np.random.Generator
+    preset: str = Preset.UNGUARDED
     share_intentions: bool = True  # V2V: AVs decide front to back and know the choices before theirs
 
 
@@ -324,7 +377,19 @@ class Identity:
 IDENTITY = tuple(field.name for field in fields(Identity))
 TIMINGS = ("reset_s", "simulation_s", "observation_s", "decision_s", "total_s")  # wall time, never repeatable
 # What stands beside the figures in documents and rows: no figure may be called so.
-RESERVED = {*IDENTITY, *TIMINGS, "key", "cell", "status", "error", "stderr", "attempts", "steps"} | {
+MISSION = ("mission_vehicle", "mission_guessed")
+RESERVED = {
+    *IDENTITY,
+    *TIMINGS,
+    *MISSION,
+    "key",
+    "cell",
+    "status",
+    "error",
+    "stderr",
+    "attempts",
+    "steps",
+} | {
     *("trace_hash", "timings", "comparable", "not_comparable_because", "collision_list"),
     *("units", "better", "manifest"),
 }
@@ -340,6 +405,8 @@ class EpisodeResult(Identity):
     collisions: tuple[Collision, ...]
     timings: dict[str, float]  # s: simulation, observation, decision, reset, total
     validity: tuple[str, ...]  # reasons why the result is not comparable; empty when it is
+    mission_vehicle: str | None = None  # its id (of several: joined by ", "); None: none was on the road
+    mission_guessed: bool = False  # nobody named it: its figures feed no gate
     manifest: dict[str, Any] = field(default_factory=dict)
 
     def value(self, name: str) -> float | int | bool | None:
@@ -351,6 +418,7 @@ class EpisodeResult(Identity):
         return {
             **{name: getattr(self, name) for name in IDENTITY},
             "steps": self.steps,
+            **{name: getattr(self, name) for name in MISSION},
             **{name: _plain(metric.value) for name, metric in self.metrics.items()},
             "trace_hash": self.trace_hash,
             "timings": {name: round(value, 6) for name, value in self.timings.items()},

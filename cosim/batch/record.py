@@ -32,6 +32,8 @@ def planned(
     seeds: range,
     svo_deg: float = 45.0,
     duration: float | None = None,
+    warmup: float | None = None,
+    mission: str | None = None,
 ) -> Plan:
     """Every combination; what is left out is the scenario's own. Raises BadInput."""
     spec = Spec(
@@ -42,6 +44,8 @@ def planned(
         svo=(svo_deg,),
         seeds=(seeds.start, seeds.stop),
         duration=duration,
+        warmup=warmup,
+        mission=mission,
     )
     plan = matrix.plan(dict.fromkeys(matrix.cells(spec)), seeds, check)
     for cell in plan.cells:

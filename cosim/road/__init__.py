@@ -9,6 +9,9 @@ import numpy as np
 from cosim.arrays import Floats, Ints
 from cosim.road.contact import Contact
 from cosim.road.lane import Lane as Lane
+from cosim.road.link import Crossing as Crossing
+from cosim.road.link import Link as Link
+from cosim.road.link import Rule as Rule
 
 PATH_HORIZON = 400.0  # m: further than any AV drives within the 4 s horizon, and than arms are long
 
@@ -91,6 +94,11 @@ class RoadMap:
     lanes: tuple[Lane, ...]
     zones: tuple[ConflictZone, ...] = ()
     junctions: tuple[Floats, ...] = ()  # [p,2] m, outlines
+    links: tuple[Link, ...] = ()  # every way from a lane into a junction
+    signals: tuple[
+        tuple[str, int], ...
+    ] = ()  # (traffic light, its link index) of every entry of `Snapshot.signals`
+    crossings: tuple[Crossing, ...] = ()
     _paths: dict[tuple[int, tuple[str, ...] | None], LanePath] = field(default_factory=dict, repr=False)
     index: dict[str, int] = field(default_factory=dict, repr=False)
 
@@ -108,6 +116,16 @@ class RoadMap:
         found = self._paths.get(key)
         if found is None:
             found = self._paths[key] = self._follow(lane, route)
+        return found
+
+    @cached_property
+    def link_of(self) -> dict[tuple[int, int], int]:
+        """(lane before the stop line, lane inside the junction or beyond it) -> index of the link."""
+        found: dict[tuple[int, int], int] = {}
+        for k, link in enumerate(self.links):
+            found[link.origin, link.target] = k
+            if link.via >= 0:
+                found[link.origin, link.via] = k
         return found
 
     @cached_property

@@ -140,6 +140,6 @@ def _collision(
         lane=lane,
         x=x,
         y=y,
-        involves_mission=hits.mission or hit.mission,
+        involves_mission=any(body.mission and not body.guessed for body in (hits, hit)),
         av_caused=hits.kind == Kind.AV or (hit.kind == Kind.AV and bool(cut_in)),
     )

@@ -1,5 +1,7 @@
 """SUMO's conventions end here: front bumper and degrees clockwise from north become centre and radians."""
 
+import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -7,10 +9,10 @@ import libsumo
 import numpy as np
 
 from cosim.errors import BadInput
-from cosim.road import ConflictZone, Lane, RoadMap
+from cosim.road import ConflictZone, Crossing, Lane, Link, RoadMap, Rule
 from cosim.scenario import Zone
 from cosim.simulation.conventions import centres
-from cosim.types import Events, Kind, Snapshot
+from cosim.types import Actor, Bytes, Events, Kind, Snapshot
 
 # The compiled getters: libsumo's Python wrappers around them double the cost of a read. The version
 # is pinned; a test compares them with the public ones.
@@ -18,9 +20,32 @@ GETTERS = tuple(
     getattr(libsumo._libsumo, f"vehicle_get{name}")
     for name in ("Position", "Angle", "Speed", "Acceleration", "LaneID", "LanePosition")
 )
+# the same of persons, of whose acceleration SUMO says nothing
+PERSON_GETTERS = tuple(
+    getattr(libsumo._libsumo, f"person_get{name}", lambda _: 0.0)
+    for name in ("Position", "Angle", "Speed", "Acceleration", "LaneID", "LanePosition")
+)
+PERSON = "person:"  # a person's name in a snapshot: this and its id, which may be a vehicle's too
 GIVE_WAY = "mswZ"  # link states: minor, stop, all-way stop, zipper (SUMO, Networks/SUMO_Road_Networks)
+# link states at a stop line without signals (SUMO, Networks/SUMO_Road_Networks)
+RULES = {"m": Rule.YIELD, "s": Rule.STOP, "w": Rule.ALL_WAY_STOP, "=": Rule.EQUAL, "Z": Rule.ZIPPER}
+CROSSING = re.compile(r":.+_c\d+")  # netconvert's name for a pedestrian crossing
 CAR = "passenger"  # SUMO's class of cars, AVs among them
 MOTOR_CLASSES = frozenset({CAR, "private", "taxi", "bus", "truck", "trailer", "delivery", "motorcycle"})
+# SUMO's vehicle classes (Definition_of_Vehicles, Abstract Vehicle Class); all others are cars
+ACTORS = {
+    name: actor
+    for actor, names in {
+        Actor.TRUCK: "truck trailer delivery",
+        Actor.BUS: "bus coach",
+        Actor.MOTORCYCLE: "motorcycle moped",
+        Actor.BICYCLE: "bicycle scooter",
+        Actor.PERSON: "pedestrian wheelchair",
+        Actor.OTHER: "tram rail rail_urban rail_electric rail_fast subway cable_car ship aircraft drone "
+        "container",
+    }.items()
+    for name in names.split()
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +56,8 @@ class Body:
     mission: bool
     length: float  # m
     width: float  # m
+    actor: Actor = Actor.CAR
+    guessed: bool = False  # a mission vehicle that nobody named
 
 
 class SnapshotReader:
@@ -38,35 +65,43 @@ class SnapshotReader:
 
     def __init__(self, road: RoadMap) -> None:
         self._lane_index = road.index
+        self._lights = Counter(light for light, _ in road.signals)  # -> how many signals, in their order
         self._ids: tuple[str, ...] | None = None
-        self._static: tuple[np.ndarray, ...] = ()  # kind, mission, length m, width m [n] of `_ids`
+        # kind, mission, length m, width m, actor [n] of `_ids`
+        self._static: tuple[np.ndarray, ...] = ()
 
     def bodies_changed(self) -> None:
         """Build the constant columns anew at the next read (a new episode, a new mission vehicle)."""
         self._ids = None
 
     def read(self, bodies: dict[str, Body], events: Events) -> Snapshot:
-        """One snapshot of every vehicle on the road, sorted by id.
+        """One snapshot of every vehicle and every walking person on the road, sorted by id.
 
         Args:
-            bodies: what is constant of each vehicle that has departed, by id.
+            bodies: what is constant of each vehicle that has departed, by id; new persons are added.
             events: what happened since the last snapshot.
         """
-        ids = tuple(sorted(libsumo.vehicle.getIDList()))
+        persons = _walking() if libsumo.person.getIDCount() else {}
+        ids = tuple(sorted((*libsumo.vehicle.getIDList(), *persons)))
         if ids != self._ids:
-            present = [bodies[i] for i in ids]
+            present = [bodies.get(i) or bodies.setdefault(i, _person(persons[i])) for i in ids]
             self._static = (
                 np.array([b.kind for b in present], np.int8),
                 np.array([b.mission for b in present], np.bool_),
                 np.array([b.length for b in present], np.float64),
                 np.array([b.width for b in present], np.float64),
+                np.array([b.actor for b in present], np.int8),
             )
             self._ids = ids
-        kind, mission, length, width = self._static
-        position, angle, speed, accel, lane_id, lane_position = GETTERS
-        index = self._lane_index
-        front = np.array([position(i) for i in ids], np.float64).reshape(-1, 2)  # [n,2] m
-        x, y, heading = centres(front[:, 0], front[:, 1], np.array([angle(i) for i in ids]), 0.5 * length)
+        kind, mission, length, width, actor = self._static
+        position, angle, speed, accel, lane, lane_position = (
+            [vehicle(i) for i in ids]
+            if not persons
+            else [person(persons[i]) if i in persons else vehicle(i) for i in ids]
+            for vehicle, person in zip(GETTERS, PERSON_GETTERS, strict=True)
+        )
+        front = np.array(position, np.float64).reshape(-1, 2)  # [n,2] m
+        x, y, heading = centres(front[:, 0], front[:, 1], np.array(angle), 0.5 * length)
         return Snapshot(
             time=libsumo.simulation.getTime(),
             ids=ids,
@@ -75,14 +110,33 @@ class SnapshotReader:
             x=x,
             y=y,
             heading=heading,
-            speed=np.array([speed(i) for i in ids], np.float64),
-            accel=np.array([accel(i) for i in ids], np.float64),
+            speed=np.array(speed, np.float64),
+            accel=np.array(accel, np.float64),
             length=length,
             width=width,
-            lane=np.array([index.get(lane_id(i), -1) for i in ids], np.int32),
-            lane_position=np.array([lane_position(i) for i in ids], np.float64),
+            lane=np.array([self._lane_index.get(i, -1) for i in lane], np.int32),
+            lane_position=np.array(lane_position, np.float64),
             events=events,
+            actor=actor,
+            signals=self._signals(),
         )
+
+    def _signals(self) -> Bytes:
+        """[s] the state of every signal; a light may have states for more links than there are."""
+        get = libsumo.trafficlight
+        states = (get.getRedYellowGreenState(light)[:count] for light, count in self._lights.items())
+        return np.frombuffer("".join(states).encode(), np.uint8)
+
+
+def _walking() -> dict[str, str]:
+    """Name -> SUMO's id of everybody on foot: neither in a vehicle or waiting for one, nor busy elsewhere."""
+    get = libsumo.person
+    return {PERSON + i: i for i in get.getIDList() if get.getStage(i).type == libsumo.constants.STAGE_WALKING}
+
+
+def _person(person: str) -> Body:
+    get = libsumo.person
+    return Body(Kind.PERSON, False, get.getLength(person), get.getWidth(person), Actor.PERSON)
 
 
 def read_road(zones: Sequence[Zone], scenario_file: object) -> RoadMap:
@@ -125,8 +179,58 @@ def read_road(zones: Sequence[Zone], scenario_file: object) -> RoadMap:
         for j in libsumo.junction.getIDList()
         if not j.startswith(":") and len(shape := libsumo.junction.getShape(j)) > 2
     )
-    road = RoadMap(tuple(lanes), found, outlines)
+    links, signals = _links(lanes, place)
+    road = RoadMap(tuple(lanes), found, outlines, links, signals, _crossings(place, signals))
     return road if found else replace(road, zones=(_struggling_zone(road),))
+
+
+def _links(
+    lanes: Sequence[Lane], place: Mapping[str, int]
+) -> tuple[tuple[Link, ...], tuple[tuple[str, int], ...]]:
+    """Every link with its rule and foes; and the (traffic light, link index) of every signal."""
+    get, lights = libsumo.lane, libsumo.trafficlight
+    signals: list[tuple[str, int]] = []
+    signal_of: dict[tuple[str, str], int] = {}  # (origin, target) -> index into `signals`
+    for light in lights.getIDList():
+        for index, ways in enumerate(lights.getControlledLinks(light)):
+            signal_of.update(((way[0], way[1]), len(signals)) for way in ways)
+            signals.append((light, index))
+    links, foes = [], []
+    for lane in lanes:
+        for target, _, _, _, via, state, *_ in () if lane.internal else get.getLinks(lane.id):
+            if target not in place:
+                continue
+            signal = signal_of.get((lane.id, target), -1)
+            before = frozenset(get.getFoes(lane.id, target))
+            crossed = frozenset(get.getInternalFoes(via)) if via else frozenset()
+            rule = RULES.get(state, Rule.PRIORITY) if signal < 0 else Rule.YIELD if before else Rule.PRIORITY
+            links.append(Link(place[lane.id], place.get(via, -1), place[target], signal, rule))
+            foes.append((before, crossed))
+    by_name = [(lanes[k.origin].id, lanes[k.via].id if k.via >= 0 else "") for k in links]
+    at: dict[str, list[int]] = {}
+    for number, (origin, _) in enumerate(by_name):
+        at.setdefault(origin, []).append(number)
+    found = [
+        tuple(n for name in sorted(before) for n in at.get(name, ()) if by_name[n][1] in crossed)
+        for before, crossed in foes
+    ]
+    return tuple(replace(k, foes=f) for k, f in zip(links, found, strict=True)), tuple(signals)
+
+
+def _crossings(place: Mapping[str, int], signals: Sequence[tuple[str, int]]) -> tuple[Crossing, ...]:
+    """Every pedestrian crossing of the net."""
+    get, found = libsumo.lane, []
+    signal_of: dict[str, int] = {}
+    for number, (light, index) in enumerate(signals):
+        for way in libsumo.trafficlight.getControlledLinks(light)[index]:
+            signal_of[way[1]] = signal_of[way[2]] = number
+    for edge in libsumo.edge.getIDList():
+        if CROSSING.fullmatch(edge):
+            lane = f"{edge}_0"
+            crossed = tuple(place[i] for i in get.getInternalFoes(lane) if i in place)
+            shape = np.array(get.getShape(lane), np.float64)[:, :2]
+            found.append(Crossing(edge, shape, get.getWidth(lane), crossed, signal_of.get(lane, -1)))
+    return tuple(found)
 
 
 def may_change(lane: str, offset: int, vehicle_class: str) -> bool:

@@ -8,9 +8,9 @@ import libsumo
 from cosim.scenario import Scenario
 from cosim.scenario.behaviors import AS_IS
 from cosim.seeding import uniform
-from cosim.simulation.convert import Body
+from cosim.simulation.convert import ACTORS, Body
 from cosim.simulation.drivers import IDM_TYPE, Drivers
-from cosim.types import Kind
+from cosim.types import Actor, Kind
 
 # definitions.md, Vehicles: what an AV drives with while it has no command (egoistic IDM).
 AV_IDM = {"Tau": 0.8, "MinGap": 2.0, "Accel": 3.0, "Decel": 7.0}
@@ -34,10 +34,13 @@ class Fleet:
     def depart(self, vehicle: str, seed: int) -> Body:
         """A vehicle departed: give it its driver; what it is."""
         get, s = libsumo.vehicle, self._scenario
-        mission = bool(s.mission.vehicles and re.fullmatch(s.mission.vehicles, vehicle))
+        mission = s.mission.includes(vehicle)
         is_av = not mission and self._is_av(vehicle, seed)
         if not s.built_in and (is_av or s.behavior != AS_IS):
-            take_idm_type(vehicle)
+            factor = libsumo.vehicletype.getSpeedFactor(get.getTypeID(vehicle))
+            set_type(vehicle)
+            if is_av:
+                get.setSpeedFactor(vehicle, factor)  # its type's mean, not a draw about it
         if is_av:
             for name, value in AV_IDM.items():
                 getattr(get, f"set{name}")(vehicle, value)
@@ -45,7 +48,9 @@ class Fleet:
                 get.setParameter(vehicle, key, text)
         elif s.behavior != AS_IS:
             self._drivers.apply(vehicle)
-        return Body(Kind.AV if is_av else Kind.HV, mission, get.getLength(vehicle), get.getWidth(vehicle))
+        size = get.getLength(vehicle), get.getWidth(vehicle)
+        actor = ACTORS.get(get.getVehicleClass(vehicle), Actor.CAR)
+        return Body(Kind.AV if is_av else Kind.HV, mission, *size, actor)
 
     def _is_av(self, vehicle: str, seed: int) -> bool:
         rule = self._scenario.fleet
@@ -59,13 +64,13 @@ class Fleet:
         return False
 
 
-def take_idm_type(vehicle: str) -> None:
-    """Give a vehicle of a user's file the IDM type; its size, class and maximum speed stay.
+def set_type(vehicle: str, name: str = IDM_TYPE) -> None:
+    """Give a vehicle another type, by default IDM; its size, class and maximum speed stay.
 
     `setType` replaces the car-following model (Krauss in most files); nothing else can.
     """
     get = libsumo.vehicle
     kept = {name: getattr(get, f"get{name}")(vehicle) for name in KEPT}
-    get.setType(vehicle, IDM_TYPE)
+    get.setType(vehicle, name)
     for name, value in kept.items():
         getattr(get, f"set{name}")(vehicle, value)

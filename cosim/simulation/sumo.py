@@ -15,17 +15,20 @@ import sumo_scenarios
 from cosim.errors import BadInput, SimulationError, SimulationInUse
 from cosim.road import RoadMap
 from cosim.scenario import Scenario
+from cosim.scenario.behaviors import AS_IS
 from cosim.scenario.disabled_outputs import disable_outputs
 from cosim.scenario.sumo_outputs import sumo_options
 from cosim.scenario.sumocfg import time_of
+from cosim.simulation.assistance import Assistance
 from cosim.simulation.collisions import CollisionDetector
 from cosim.simulation.commands import Commander
 from cosim.simulation.convert import Body, SnapshotReader, read_road, struggling_lanes
 from cosim.simulation.drivers import Drivers
+from cosim.simulation.entries import EntryWatcher
 from cosim.simulation.fleet import Fleet
 from cosim.simulation.stderr import SumoStderr
 from cosim.simulation.xerces import keep_initialized
-from cosim.types import Command, Events, Kind, Receipt, Snapshot
+from cosim.types import Command, Events, Kind, Preset, Receipt, Snapshot
 
 SUMO_ERRORS = (libsumo.TraCIException, libsumo.FatalTraCIError)
 
@@ -33,8 +36,8 @@ SUMO_ERRORS = (libsumo.TraCIException, libsumo.FatalTraCIError)
 DEFAULTS = {
     "lanechange.duration": "2",  # continuous lateral motion, definitions.md
     "time-to-teleport": "-1",
-    "default.speeddev": "0",
 }
+ONE_SPEED = {"default.speeddev": "0"}  # our drivers' speeds are drawn by `cosim.scenario.behaviors`
 # Ours whatever the file says: collisions must be reported (docs/sumo.md: never `collision.action none`).
 FORCED = {
     "collision.action": "warn",
@@ -91,6 +94,7 @@ class SumoSimulator:
             self.close()
             raise
         self._reader = SnapshotReader(self.road)
+        self._entries = EntryWatcher(self.road, scenario.timing.step)
 
     def reset(self, seed: int) -> tuple[Snapshot, ...]:
         """Load the episode `seed` anew, drive the warm-up; the last `history` frames, newest last."""
@@ -98,12 +102,14 @@ class SumoSimulator:
         self._seed = seed
         self._drivers = Drivers(self._scenario.behavior, self._scenario.driver_model, seed)
         self._fleet = Fleet(self._scenario, self._drivers, self._av_parameters)
-        self._commander = Commander(self._scenario.preset, self._scenario.timing.step)
+        preset, step = self._scenario.preset, self._scenario.timing.step
+        self._commander = Assistance(step) if preset == Preset.LAWFUL else Commander(preset, step)
         self._bodies: dict[str, Body] = {}
         self._routes: dict[str, tuple[str, ...]] = {}
         self._detector = CollisionDetector()
         self._reader.bodies_changed()
-        self._mission_found = bool(self._scenario.mission.vehicles) or self._scenario.mission.kind == "none"
+        self._entries.reset()
+        self._mission_found = not self._scenario.mission.guessed
         self._inserted = 0
         self._waited: set[str] = set()  # only where SUMO gives up: seen waiting, not inserted since
         self._happened: list[tuple[Any, ...]] = []  # per step since the last frame: the fields of Events
@@ -196,7 +202,8 @@ class SumoSimulator:
 
     def _arguments(self, seed: int) -> list[str]:
         s = self._scenario
-        additional = s.additional if s.built_in else (*s.additional, sumo_scenarios.TYPES)
+        types = () if s.built_in and s.preset != Preset.LAWFUL else (sumo_scenarios.TYPES,)
+        additional = (*s.additional, *types)
         settings, files = sumo_options(self._outputs, s)
         options = {
             "net-file": str(s.net),
@@ -206,6 +213,7 @@ class SumoSimulator:
             "step-length": f"{s.timing.step:g}",
             "seed": str(seed % (2**31 - 1)),
             **DEFAULTS,
+            **(ONE_SPEED if s.ships or s.behavior != AS_IS else {}),
             **settings,
             **dict(s.options),
             **FORCED,
@@ -246,6 +254,10 @@ class SumoSimulator:
                 arrived,
                 simulation.getStartingTeleportIDList(),
                 simulation.getEmergencyStoppingVehiclesIDList(),
+                self._entries.step(now, [i for i in departed if self._bodies[i].kind == Kind.AV]),
+                self._commander.observe(now),
+                simulation.getStopStartingVehiclesIDList(),
+                simulation.getStopEndingVehiclesIDList(),
             )
         )
         if self._gives_up:
@@ -288,7 +300,7 @@ class SumoSimulator:
         if row is None:
             return snapshot
         name = snapshot.ids[row]
-        self._bodies[name] = replace(self._bodies[name], mission=True)
+        self._bodies[name] = replace(self._bodies[name], mission=True, guessed=True)
         self._mission_found = True
         self._reader.bodies_changed()
         return self._reader.read(self._bodies, snapshot.events)

@@ -155,7 +155,8 @@ class _Board:
 
     def legend(self, r: ReplayData) -> None:
         """Which colour is who, at the top."""
-        kinds = {"mission vehicle" if t.mission else _kind(t): colour_of(t) for t in r.tracks}
+        mission = "mission vehicle" + ", guessed" * bool(r.facts.get("mission_guessed"))
+        kinds = {mission if t.mission else _kind(t): colour_of(t) for t in r.tracks}
         x = 14.0
         for name, colour in sorted(kinds.items()):
             self._pen.rounded_rectangle((x, 12, x + 18, 20), 2, fill=colour)

@@ -27,7 +27,11 @@ HOPS = 8  # lanes that one step may lead across
 EPSILON = 1e-6
 
 _sumo = libsumo._libsumo  # the compiled getters, as in cosim.simulation.convert
-lane_of, position_of, speed_of = _sumo.vehicle_getLaneID, _sumo.vehicle_getLanePosition, _sumo.vehicle_getSpeed
+lane_of, position_of, speed_of = (
+    _sumo.vehicle_getLaneID,
+    _sumo.vehicle_getLanePosition,
+    _sumo.vehicle_getSpeed,
+)
 odometer_of, accel_of = _sumo.vehicle_getDistance, _sumo.vehicle_getAcceleration
 
 
@@ -120,8 +124,10 @@ class EntryWatcher:
         away = self._road.lanes[lane].length - position + self._free[lane]  # m to the next line
         steps = 1
         if away > NEAR:
-            time = 0.5 * (math.sqrt(speed * speed + 2.0 * HARDEST * (away - NEAR)) - speed) / (0.5 * HARDEST)
-            steps = min(max(int(time / self._step), 1), LONGEST)
+            time = (
+                math.sqrt(speed * speed + 2.0 * HARDEST * (away - NEAR)) - speed
+            ) / HARDEST  # s, at the least
+            steps = max(int(min(time / self._step, LONGEST)), 1)
             av.trail.clear()
         else:
             self._remember(av.trail, odometer_of(name), speed)
@@ -138,7 +144,9 @@ class EntryWatcher:
         while trail[0][0] < odometer - 2.0 * LAST:
             trail.popleft()
 
-    def _entry(self, name: str, av: Watched, passed: Passed, position: float, speed: float, now: float) -> Entry:
+    def _entry(
+        self, name: str, av: Watched, passed: Passed, position: float, speed: float, now: float
+    ) -> Entry:
         link = self._road.links[passed.link]
         line = odometer_of(name) - passed.beyond - position  # the odometer at the line, m
         last = [v for at, v in av.trail if line - LAST - EPSILON <= at]
@@ -216,7 +224,9 @@ class EntryWatcher:
             length[lane.edge] = min(length.get(lane.edge, math.inf), lane.length)
             for successor in lane.successors:
                 origins[lanes[successor].edge].add(lane.edge)
-        heap = [(0.0, lanes[k.origin].edge) for k, matters in zip(links, self._matters, strict=True) if matters]
+        heap = [
+            (0.0, lanes[k.origin].edge) for k, matters in zip(links, self._matters, strict=True) if matters
+        ]
         while heap:
             free, edge = heapq.heappop(heap)
             if edge in shortest:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from enum import IntEnum
 from functools import cached_property
 from typing import Any, NamedTuple, Protocol
@@ -202,6 +202,16 @@ class Snapshot:
     @property
     def n(self) -> int:
         return len(self.ids)
+
+    @cached_property
+    def vehicles(self) -> Snapshot:
+        """The same without persons."""
+        keep = np.flatnonzero(self.kind != int(Kind.PERSON))
+        if len(keep) == self.n:
+            return self
+        columns = {f.name: getattr(self, f.name) for f in fields(self)}
+        rows = {k: v[keep] for k, v in columns.items() if k != "signals" and isinstance(v, np.ndarray)}
+        return replace(self, ids=tuple(self.ids[k] for k in keep), **rows)
 
     @property
     def avs(self) -> tuple[str, ...]:

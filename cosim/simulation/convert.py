@@ -20,10 +20,11 @@ GETTERS = tuple(
     getattr(libsumo._libsumo, f"vehicle_get{name}")
     for name in ("Position", "Angle", "Speed", "Acceleration", "LaneID", "LanePosition")
 )
-# the same of persons, of whose acceleration SUMO says nothing
-PERSON_GETTERS = tuple(
-    getattr(libsumo._libsumo, f"person_get{name}", lambda _: 0.0)
-    for name in ("Position", "Angle", "Speed", "Acceleration", "LaneID", "LanePosition")
+# The same of persons, of whose acceleration SUMO says nothing. No lane is theirs: they walk beside, along,
+# against and across those of vehicles.
+PERSON_GETTERS = (
+    *(getattr(libsumo._libsumo, f"person_get{name}") for name in ("Position", "Angle", "Speed")),
+    *(lambda _: 0.0, lambda _: "", lambda _: 0.0),
 )
 PERSON = "person:"  # a person's name in a snapshot: this and its id, which may be a vehicle's too
 GIVE_WAY = "mswZ"  # link states: minor, stop, all-way stop, zipper (SUMO, Networks/SUMO_Road_Networks)

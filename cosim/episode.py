@@ -159,6 +159,7 @@ class Episode:
             observation=self.observation,
             svo=svo,
             rng=generator(seed, "policy"),
+            preset=self.scenario.preset,
         )
 
     @property

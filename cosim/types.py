@@ -126,7 +126,8 @@ class Entry:
     least_speed: float  # m/s, over the last 10 m before the line
     yellow_since: float = -1.0  # s, when the signal turned yellow; -1 where it is not
     yellow_distance: float = 0.0  # m to the line and
-    yellow_speed: float = 0.0  # m/s of the vehicle at that instant
+    yellow_speed: float = 0.0  # m/s of the vehicle at that instant; inf if it was not on the road yet
+    foes: tuple[tuple[str, int], ...] = ()  # who has the right of way within 100 m, each with its link
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +150,10 @@ class Events:
     emergency_stopped: tuple[str, ...] = ()
     entries: tuple[Entry, ...] = ()
     interventions: tuple[Intervention, ...] = ()
-    wrecks_removed: tuple[str, ...] = ()
+    stopped: tuple[str, ...] = ()  # reached a stop of their plan
+    resumed: tuple[str, ...] = ()  # drove on from one
+    wrecked: tuple[str, ...] = ()  # crashed in an episode that goes on: they stand
+    wrecks_removed: tuple[str, ...] = ()  # and were taken off the road
 
     @classmethod
     def of(cls, frames: Sequence[Snapshot]) -> Events:
@@ -328,6 +332,7 @@ class PolicyContext:
     observation: ObservationConfig
     svo: float  # rad, the social value orientation phi
     rng: np.random.Generator
+    preset: str = Preset.UNGUARDED
     share_intentions: bool = True  # V2V: AVs decide front to back and know the choices before theirs
 
 

@@ -11,6 +11,7 @@ import pytest
 from cosim.scenario import Fleet, Mission, Scenario, load
 from cosim.simulation.sumo import SumoSimulator
 from cosim.workers.worker import Worker
+from tests.worlds.build import build
 
 TYPES = """<routes>
     <vType id="hv" length="5" width="2" carFollowModel="IDM" tau="1" minGap="2" accel="3" decel="7"
@@ -58,3 +59,9 @@ def start(tmp_path: Path) -> Iterator[Start]:
     yield begin
     for worker in workers:
         worker.close()
+
+
+@pytest.fixture(scope="session")
+def law_worlds(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The worlds of tests/worlds, built once: name -> .sumocfg."""
+    return build(tmp_path_factory.mktemp("worlds"))

@@ -16,7 +16,7 @@ from cosim.cli import arguments
 from cosim.errors import BadInput
 from cosim.files import code
 from cosim.files.xml_input import is_there
-from cosim.scenario import Scenario, place
+from cosim.scenario import Scenario, chosen_preset, place
 from cosim.scenario.episode_id import EpisodeId
 from cosim.scenario.policy_name import label, read
 from cosim.seeding import FIRST_TEST_SEED
@@ -148,20 +148,13 @@ def work(args: argparse.Namespace) -> int:
 
 def case_of(args: argparse.Namespace) -> EpisodeId:
     """The episode that the flags describe; files by absolute path, so that it can be found again."""
-    same = (
-        "behavior",
-        "driver_model",
-        "penetration",
-        "av_type",
-        "av_ids",
-        "preset",
-        "duration",
-        "on_collision",
-    )
+    same = ("behavior", "driver_model", "penetration", "av_type", "av_ids", "duration", "on_collision")
+    what, policy = place(args.what), read(args.policy).text
     return EpisodeId(
-        what=place(args.what),
+        what=what,
         demand=tuple(map(_demand, args.demand)),
-        policy=read(args.policy).text,
+        policy=policy,
+        preset=chosen_preset(what, policy, args.preset),
         seed=args.seed,
         svo_deg=args.svo,
         outputs=tuple(dict.fromkeys(args.output)),

@@ -14,6 +14,9 @@ LEAST_STEP = 1.0  # m/s: what a step changes at least
 TIME_CONSTANT = 0.6  # s, with which the target speed is tracked
 MAX_DECEL = 8.0  # m/s2
 MAX_ACCEL = 3.0  # m/s2
+COMFORT = 3.0  # m/s2: the most that preset `lawful` accelerates or brakes on an agent's wish
+JERK = 5.0  # m/s3, how fast that changes (ISO 15622: adaptive cruise control at low speeds)
+COMFORT_TIME = 1.0  # s, with which a target speed is tracked comfortably
 LANE_CHANGE_TIME = 2.0  # s, the same as SUMO's --lanechange.duration
 _ACTIONS, _ACCELERATE, _DECELERATE = len(MetaAction), int(MetaAction.ACCELERATE), int(MetaAction.DECELERATE)
 _NEVER = 1e9  # s: longer than any rollout
@@ -61,6 +64,19 @@ def tracked_speed(speed: float, target: float, step: float) -> float:
     """
     accel = (target - speed) / TIME_CONSTANT
     return max(speed + min(max(accel, -MAX_DECEL), MAX_ACCEL) * step, 0.0)
+
+
+def wished_accel(speed: float, target: float, accel: float, step: float) -> tuple[float, float]:
+    """The acceleration that a target speed asks for in preset `lawful`, and its comfortable course, m/s2.
+
+    Args:
+        speed, target: m/s.
+        accel: m/s2, of the step before, which `JERK` bounds the change from.
+        step: s.
+    """
+    asked = min(max((target - speed) / COMFORT_TIME, -COMFORT), COMFORT)
+    before = min(max(accel, -COMFORT), COMFORT)
+    return asked, min(max(asked, before - JERK * step), before + JERK * step)
 
 
 @compiled

@@ -30,6 +30,9 @@ class Mission:
     goal: tuple[str, ...] = ()  # edges; being on one of them is success (off internal lanes)
 
 
+ALWAYS = {"keep-lane": Preset.UNGUARDED}  # what it shows is what happens where nobody brakes
+
+
 @dataclass(frozen=True, slots=True)
 class Zone:
     """A conflict zone as written in scenario.yaml: edges, internal edges (":J") included."""
@@ -80,7 +83,7 @@ class Scenario:
     warmup: float = 0.0  # s, not counted
     duration: float = 60.0  # s, counted
     timing: Timing = Timing()
-    preset: str = Preset.UNGUARDED
+    preset: str = Preset.LAWFUL
     on_collision: str = OnCollision.END  # of an AV or of the mission vehicle
     mission: Mission = Mission()
     zones: tuple[Zone, ...] = ()
@@ -173,6 +176,17 @@ def load(
     )
 
 
+def chosen_preset(what: str, policy: str, preset: str | None) -> str:
+    """The preset that an episode of scenario `what` is driven in by `policy`, where `preset` is asked for.
+
+    A policy of `ALWAYS` has one of its own; without a word a user's world decides, else it is `lawful`.
+    """
+    own = ALWAYS.get(policy) or preset
+    if own is None and what not in sumo_scenarios.names() and is_there(Path(what) / DEFINITION):
+        return _world(Path(os.path.abspath(what))).preset
+    return own or Preset.LAWFUL
+
+
 @dataclass(frozen=True, slots=True)
 class _WorldFile:
     """scenario.yaml as written."""
@@ -182,7 +196,7 @@ class _WorldFile:
     duration: Positive = FOREIGN_DURATION
     warmup: NonNegative = 0.0
     timing: Timing = Timing()
-    preset: str = Preset.UNGUARDED
+    preset: str = Preset.LAWFUL
     demand: str = ""
     fleet: Fleet = Fleet()
     mission: Mission = Mission()
@@ -233,7 +247,8 @@ def _world(folder: Path) -> Scenario:
         warmup=top.warmup,
         duration=top.duration,
         timing=top.timing,
-        preset=one_of(top.preset, Preset.ALL, "preset", file),
+        # the files of our worlds, part of every shipped episode's key, say how those were driven
+        preset=Preset.LAWFUL if ships else one_of(top.preset, Preset.ALL, "preset", file),
         mission=top.mission,
         zones=tuple(replace(z, name=z.name or f"zone{i}") for i, z in enumerate(top.conflict_zones)),
         fleet=_checked_fleet(top.fleet, file, "fleet."),

@@ -14,6 +14,7 @@ from cosim.errors import inside
 from cosim.files.yaml_input import dataclass_from, mapping
 from cosim.scenario import Scenario, chosen_fleet, load
 from cosim.scenario.behaviors import LC2013
+from cosim.types import Preset
 
 OPTIONAL = (
     "metrics",
@@ -40,7 +41,7 @@ class EpisodeId:
     av_type: str | None = None
     av_ids: str | None = None
     svo_deg: float = 45.0  # degrees
-    preset: str | None = None  # None: the scenario's default
+    preset: str | None = None  # None: unguarded, in documents from before presets were always named
     duration: float | None = None  # s; None: the scenario's own
     outputs: tuple[str, ...] = ()  # SUMO's own outputs, by SUMO's names
     metrics: tuple[str, ...] = ()  # measured besides, FILE.py:NAME or MODULE:NAME
@@ -96,7 +97,7 @@ class EpisodeId:
             demand=self.demand,
             behavior=self.behavior,
             driver_model=self.driver_model,
-            preset=self.preset,
+            preset=self.preset or Preset.UNGUARDED,
             fleet=chosen_fleet(self.av_type, self.av_ids, self.penetration),
             duration=self.duration,
             on_collision=self.on_collision,

@@ -164,29 +164,39 @@ class Wrecks:
     def __init__(self, commander: Commander, drivers: Drivers) -> None:
         self._commander, self._drivers = commander, drivers
         self._since: dict[str, float] = {}  # wreck -> s, when it crashed
+        self._stopped: list[str] = []  # since the last `take`
+        self._removed: list[str] = []
 
-    def add(self, collisions: Iterable[Collision]) -> None:
+    def add(self, collisions: Sequence[Collision]) -> None:
         """Stop the vehicles of these; SUMO's insertions onto one another are no crashes."""
         on_road = frozenset(libsumo.vehicle.getIDList()) if collisions else frozenset()
         for c in collisions:
             for name in () if c.insertion else (c.collider, c.victim):
-                if name not in self._since and name in on_road:
+                if name in on_road and name not in self._since:
                     self._since[name] = c.time
+                    self._stopped.append(name)
                     self._commander.wreck(name)
                     self._drivers.drop(name)
                     libsumo.vehicle.setSpeedMode(name, 0)  # at once, not within its deceleration
                     libsumo.vehicle.setLaneChangeMode(name, 0)
                     libsumo.vehicle.setSpeed(name, 0.0)
 
-    def remove(self, now: float) -> tuple[str, ...]:
-        """Take those off the road that have stood long enough; their names."""
-        due = tuple(name for name, since in self._since.items() if now - since >= WRECK_STANDS - 1e-6)
+    def remove(self, now: float) -> None:
+        """Take those off the road that have stood long enough."""
+        due = [name for name, since in self._since.items() if now - since >= WRECK_STANDS - 1e-6]
         on_road = frozenset(libsumo.vehicle.getIDList()) if due else frozenset()
         for name in due:
             del self._since[name]
             if name in on_road:
                 libsumo.vehicle.remove(name)
-        return due
+                self._removed.append(name)
+
+    def take(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Who has become a wreck, and which wrecks were removed, since this was asked last."""
+        found = tuple(self._stopped), tuple(self._removed)
+        self._stopped.clear()
+        self._removed.clear()
+        return found
 
 
 def mover(before: Boxes, now: Boxes) -> int | None:

@@ -8,12 +8,13 @@ import libsumo
 from cosim.control import LANE_CHANGE_TIME, MAX_DECEL, tracked_speed
 from cosim.simulation.convert import may_change
 from cosim.simulation.fleet import AV_IDM
-from cosim.types import Command, Preset, Receipt
+from cosim.types import Command, Intervention, Preset, Receipt
 
 # SUMO's bit fields (https://sumo.dlr.de/docs/TraCI/Change_Vehicle_State.html): 6 keeps only the physical
 # acceleration limits, so the agent can crash; 31 and 512 let SUMO's own safety override the agent.
-SPEED_MODE = {Preset.UNGUARDED: 6, Preset.GUARDED: 31}
-LANE_CHANGE_MODE = {Preset.UNGUARDED: 0, Preset.GUARDED: 512}
+SPEED_MODE = {Preset.UNGUARDED: 6, Preset.GUARDED: 31, Preset.LAWFUL: 31}
+# 513: SUMO's own changes for the route, if they do not contradict the agent's; the gaps of others respected
+LANE_CHANGE_MODE = {Preset.UNGUARDED: 0, Preset.GUARDED: 512, Preset.LAWFUL: 513}
 SUMO_SPEED_MODE, SUMO_LANE_CHANGE_MODE = 31, 1621  # SUMO's defaults
 SETTLED = 1e-3  # m/s: closer to its target an AV needs no new command
 
@@ -53,35 +54,48 @@ class Commander:
             return Receipt(name, False, "not on the road")
         state = self.controlled.get(name)
         if state is None:
-            state = self.controlled[name] = Controlled(command.target_speed)
-            libsumo.vehicle.setSpeedMode(name, SPEED_MODE[self._preset])
-            libsumo.vehicle.setLaneChangeMode(name, LANE_CHANGE_MODE[self._preset])
-            libsumo.vehicle.setDecel(name, MAX_DECEL)
+            state = self.controlled[name] = self._take_over(name)
         state.target = command.target_speed
         if command.lane_offset == 0:
             return Receipt(name, True)
         why = (
             "a lane change is under way"
             if state.changing(now)
-            else _forbidden(name, lane, command.lane_offset)
+            else self._forbidden(name, lane, command.lane_offset)
         )
         if why is not None:
             return Receipt(name, False, why)
         libsumo.vehicle.changeLaneRelative(name, command.lane_offset, command.hold)
-        state.change = command.lane_offset
+        self._changes(name, state, command.lane_offset, now)
+        return Receipt(name, True)
+
+    def _hand_back(self, name: str) -> None:
+        libsumo.vehicle.setSpeed(name, -1.0)
+        libsumo.vehicle.setSpeedMode(name, SUMO_SPEED_MODE)
+        libsumo.vehicle.setLaneChangeMode(name, SUMO_LANE_CHANGE_MODE)
+        libsumo.vehicle.setDecel(name, AV_IDM["Decel"])
+
+    def _changes(self, name: str, state: Controlled, offset: int, now: float) -> None:
+        state.change = offset
         state.change_until = now + LANE_CHANGE_TIME
         self.lane_changes[name] = now
-        return Receipt(name, True)
+
+    def _take_over(self, name: str) -> Controlled:
+        libsumo.vehicle.setSpeedMode(name, SPEED_MODE[self._preset])
+        libsumo.vehicle.setLaneChangeMode(name, LANE_CHANGE_MODE[self._preset])
+        libsumo.vehicle.setDecel(name, MAX_DECEL)
+        return Controlled(0.0)
+
+    def _forbidden(self, name: str, lane: str, offset: int) -> str | None:
+        """Why vehicle `name` on `lane` is not to change by `offset` lanes; None if it may."""
+        return _forbidden(name, lane, offset)
 
     def release(self, commanded: Sequence[Command]) -> None:
         """AVs that got no command this time are handed back to SUMO's own driver."""
         names = {c.vehicle for c in commanded}
         for name in [n for n in self.controlled if n not in names]:
             del self.controlled[name]
-            libsumo.vehicle.setSpeed(name, -1.0)
-            libsumo.vehicle.setSpeedMode(name, SUMO_SPEED_MODE)
-            libsumo.vehicle.setLaneChangeMode(name, SUMO_LANE_CHANGE_MODE)
-            libsumo.vehicle.setDecel(name, AV_IDM["Decel"])
+            self._hand_back(name)
 
     def confirm(self, receipts: Sequence[Receipt], commands: Sequence[Command]) -> tuple[Receipt, ...]:
         """After the hold: a lane change that did not begin was refused by SUMO's safety checks."""
@@ -112,6 +126,10 @@ class Commander:
         """The vehicle crashed: it stands, and takes no more commands."""
         self.drop(name)
         self._wrecks.add(name)
+
+    def observe(self, now: float) -> list[Intervention]:
+        """After every simulation step, at `now` (s): where the car began to drive otherwise than asked."""
+        return []
 
     def drop(self, name: str) -> None:
         """The vehicle left the road."""

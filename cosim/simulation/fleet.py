@@ -8,9 +8,9 @@ import libsumo
 from cosim.scenario import Scenario
 from cosim.scenario.behaviors import AS_IS
 from cosim.seeding import uniform
-from cosim.simulation.convert import Body
+from cosim.simulation.convert import ACTORS, Body
 from cosim.simulation.drivers import IDM_TYPE, Drivers
-from cosim.types import Kind
+from cosim.types import Actor, Kind
 
 # definitions.md, Vehicles: what an AV drives with while it has no command (egoistic IDM).
 AV_IDM = {"Tau": 0.8, "MinGap": 2.0, "Accel": 3.0, "Decel": 7.0}
@@ -20,7 +20,7 @@ AV_LANE_CHANGE = {
     "laneChangeModel.lcKeepRight": "0",
 }
 AV_TYPE = "cosim.av"  # the types of AVs in SUMO's outputs begin so, and nobody else's
-# What an AV of a user's file keeps: getters and setters of libsumo.vehicle, in this order.
+# What a vehicle keeps when its type changes: getters and setters of libsumo.vehicle, in this order.
 KEPT = ("Length", "Width", "MaxSpeed", "SpeedFactor", "VehicleClass")
 
 
@@ -46,21 +46,18 @@ class Fleet:
                 get.setParameter(vehicle, key, text)
         elif s.behavior != AS_IS:
             self._drivers.apply(vehicle)
-        return Body(Kind.AV if is_av else Kind.HV, mission, get.getLength(vehicle), get.getWidth(vehicle))
+        size = get.getLength(vehicle), get.getWidth(vehicle)
+        actor = ACTORS.get(get.getVehicleClass(vehicle), Actor.CAR)
+        return Body(Kind.AV if is_av else Kind.HV, mission, *size, actor)
 
     def _take_av_type(self, vehicle: str) -> None:
-        """In our worlds an AV drives as its type says; one of a user's file by IDM, with the size, class and
-        maximum speed that it has: `setType` replaces the car-following model, nothing else can."""
-        get, own = libsumo.vehicle, libsumo.vehicle.getTypeID(vehicle)
-        ours = self._scenario.built_in
+        """In our worlds an AV drives as its type says, one of a user's file by IDM."""
+        own, ours = libsumo.vehicle.getTypeID(vehicle), self._scenario.built_in
         name = self._av_types.get(own)
         if name is None:
             name = self._av_types[own] = f"{AV_TYPE}.{own}"
             libsumo.vehicletype.copy(own if ours else IDM_TYPE, name)
-        kept = {} if ours else {field: getattr(get, f"get{field}")(vehicle) for field in KEPT}
-        get.setType(vehicle, name)
-        for field, value in kept.items():
-            getattr(get, f"set{field}")(vehicle, value)
+        (libsumo.vehicle.setType if ours else set_type)(vehicle, name)
 
     def _is_av(self, vehicle: str, seed: int) -> bool:
         rule = self._scenario.fleet
@@ -72,3 +69,15 @@ class Fleet:
             name: str = libsumo.vehicle.getTypeID(vehicle)
             return name == rule.type or name.startswith(f"{rule.type}@")
         return False
+
+
+def set_type(vehicle: str, name: str) -> None:
+    """Give a vehicle another type; its size, class and maximum speed stay.
+
+    `setType` replaces the car-following model (Krauss in most files); nothing else can.
+    """
+    get = libsumo.vehicle
+    kept = {field: getattr(get, f"get{field}")(vehicle) for field in KEPT}
+    get.setType(vehicle, name)
+    for field, value in kept.items():
+        getattr(get, f"set{field}")(vehicle, value)

@@ -18,14 +18,16 @@ from cosim.scenario import Scenario
 from cosim.scenario.disabled_outputs import disable_outputs
 from cosim.scenario.sumo_outputs import sumo_options
 from cosim.scenario.sumocfg import time_of
+from cosim.simulation.assistance import Assistance
 from cosim.simulation.collisions import CollisionDetector, Wrecks
 from cosim.simulation.commands import Commander
 from cosim.simulation.convert import Body, SnapshotReader, read_road, struggling_lanes
 from cosim.simulation.drivers import Drivers
+from cosim.simulation.entries import EntryWatcher
 from cosim.simulation.fleet import Fleet
 from cosim.simulation.stderr import SumoStderr
 from cosim.simulation.xerces import keep_initialized
-from cosim.types import Command, Events, Kind, OnCollision, Receipt, Snapshot
+from cosim.types import Command, Events, Kind, OnCollision, Preset, Receipt, Snapshot
 
 SUMO_ERRORS = (libsumo.TraCIException, libsumo.FatalTraCIError)
 
@@ -91,6 +93,7 @@ class SumoSimulator:
             self.close()
             raise
         self._reader = SnapshotReader(self.road)
+        self._entries = EntryWatcher(self.road, scenario.timing.step)
 
     def reset(self, seed: int) -> tuple[Snapshot, ...]:
         """Load the episode `seed` anew, drive the warm-up; the last `history` frames, newest last."""
@@ -98,14 +101,15 @@ class SumoSimulator:
         self._seed = seed
         self._drivers = Drivers(self._scenario.behavior, self._scenario.driver_model, seed)
         self._fleet = Fleet(self._scenario, self._drivers, self._av_parameters)
-        self._commander = Commander(self._scenario.preset, self._scenario.timing.step)
+        preset, step = self._scenario.preset, self._scenario.timing.step
+        self._commander = Assistance(step) if preset == Preset.LAWFUL else Commander(preset, step)
         self._bodies: dict[str, Body] = {}
         self._routes: dict[str, tuple[str, ...]] = {}
         self._detector = CollisionDetector()
         goes_on = self._scenario.on_collision == OnCollision.CONTINUE
         self._wrecks = Wrecks(self._commander, self._drivers) if goes_on else None
-        self._removed: list[str] = []  # wrecks since the last frame
         self._reader.bodies_changed()
+        self._entries.reset()
         self._mission_found = bool(self._scenario.mission.vehicles) or self._scenario.mission.kind == "none"
         self._inserted = 0
         self._waited: set[str] = set()  # only where SUMO gives up: seen waiting, not inserted since
@@ -199,7 +203,8 @@ class SumoSimulator:
 
     def _arguments(self, seed: int) -> list[str]:
         s = self._scenario
-        additional = s.additional if s.built_in else (*s.additional, sumo_scenarios.TYPES)
+        types = () if s.built_in and s.preset != Preset.LAWFUL else (sumo_scenarios.TYPES,)
+        additional = (*s.additional, *types)
         settings, files = sumo_options(self._outputs, s)
         options = {
             "net-file": str(s.net),
@@ -246,7 +251,7 @@ class SumoSimulator:
         collisions = self._detector.from_sumo(self._bodies, self._commander.lane_changes, now)
         if self._wrecks is not None:
             self._wrecks.add(collisions)
-            self._removed += self._wrecks.remove(now)
+            self._wrecks.remove(now)
         self._happened.append(
             (
                 collisions,
@@ -254,6 +259,10 @@ class SumoSimulator:
                 arrived,
                 simulation.getStartingTeleportIDList(),
                 simulation.getEmergencyStoppingVehiclesIDList(),
+                self._entries.step(now, [i for i in departed if self._bodies[i].kind == Kind.AV]),
+                self._commander.observe(now),
+                simulation.getStopStartingVehiclesIDList(),
+                simulation.getStopEndingVehiclesIDList(),
             )
         )
         if self._gives_up:
@@ -268,13 +277,14 @@ class SumoSimulator:
             snapshot = self._find_mission(snapshot)
         self._detector.lane_changes(snapshot, self.road, self._commander)
         extra = self._detector.from_boxes(snapshot, self.road, self._bodies, self._commander.lane_changes)
+        wrecked = removed = ()
         if self._wrecks is not None:
             self._wrecks.add(extra)
-        if extra or self._removed:
+            wrecked, removed = self._wrecks.take()
+        if extra or wrecked or removed:
             happened = (*snapshot.events.collisions, *extra)
-            events = replace(snapshot.events, collisions=happened, wrecks_removed=tuple(self._removed))
+            events = replace(snapshot.events, collisions=happened, wrecked=wrecked, wrecks_removed=removed)
             snapshot = replace(snapshot, events=events)
-            self._removed = []
         return snapshot
 
     def _goal(self) -> tuple[frozenset[int], frozenset[int]]:

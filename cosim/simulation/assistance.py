@@ -1,0 +1,197 @@
+"""The driver assistance of preset `lawful`: SUMO's own driver keeps the law, the agent wishes within it.
+
+In every step the car drives the slower of two speeds: what the agent wishes, comfortably, and what SUMO's
+driver (speed mode 31) allows for signals, right of way, limits, persons and whoever drives ahead. Where that
+is slower, SUMO drives by itself, so that it brakes as hard as it must. Between AVs gaps are asked for and
+given (V2V), because SUMO's cooperation ends where a speed is commanded.
+"""
+
+import math
+from dataclasses import dataclass
+
+import libsumo
+
+from cosim.control import COMFORT, wished_accel
+from cosim.simulation.commands import (
+    LANE_CHANGE_MODE,
+    SPEED_MODE,
+    SUMO_LANE_CHANGE_MODE,
+    SUMO_SPEED_MODE,
+    Commander,
+    Controlled,
+)
+from cosim.simulation.fleet import set_type
+from cosim.types import Intervention, Preset
+
+AV_TYPE = "cosim.av.lawful"  # sumo_scenarios/types.add.xml: an IDM that brakes comfortably
+CORRECTED = 1.0  # m/s2 below the wish: from there on the car drives otherwise than commanded
+RESPITE = 2.0  # s without a correction: the next one is a new one
+HARD = 3.5  # m/s2: harder braking is an emergency's
+KEEPS_MOVING = 5.0  # m/s: no slower wish is followed inside a junction
+NOTICE = 100.0  # m: signals and stop lines further ahead are no reason yet
+SERVES = 60.0, 100.0  # m that a lane must serve the route at least, and more for every lane to change back
+ASKS = 0.4  # s between looks for who needs a gap
+GAP = 2.0, 1.0  # m and s: the gap given to who changes lanes
+YIELDING = 2.0  # m/s2: braking for somebody else's lane change
+
+STRATEGIC, BLOCKED = 8, 512 + 1024 + 2048 + 4096 + 8192  # bits of SUMO's lane-change state
+RED, YELLOW = frozenset("ru"), frozenset("yY")
+
+
+@dataclass(slots=True)
+class Assisted(Controlled):
+    """The state of one commanded AV."""
+
+    wish: float = math.inf  # m/s, at the end of the step that is driven
+    accel: float = 0.0  # m/s2, the wish's
+    speed: float = 0.0  # m/s, before the last step
+    raw: float = 0.0  # m/s2, what the target alone asks for
+    ours: bool = False  # whether the last step was driven by the wish
+    lateral: float = 0.0  # m, on its lane
+    corrected: float = -math.inf  # s, when the car last drove otherwise
+    gap_for: str = ""  # who asked for a gap
+
+
+class Assistance(Commander):
+    """Drives every commanded AV of preset `lawful`."""
+
+    controlled: dict[str, Assisted]
+
+    def __init__(self, step: float) -> None:
+        super().__init__(Preset.LAWFUL, step)
+        self._asked = -math.inf  # s
+        self._begun: list[Intervention] = []
+
+    def drive(self) -> None:
+        """Before every simulation step: the agent's wish where it is the slower one, else SUMO's driver."""
+        get = libsumo.vehicle
+        for name, state in self.controlled.items():
+            speed = get.getSpeed(name)
+            # what SUMO's driver did in the last step, or would have done
+            allowed = get.getSpeedWithoutTraCI(name) if state.ours else speed
+            slower = allowed < state.wish - 1e-3
+            if not state.ours:
+                state.accel = (speed - state.speed) / self._step
+            target = state.target
+            if get.getRoadID(name).startswith(":"):
+                target = max(target, KEEPS_MOVING)
+            target = min(target, get.getAllowedSpeed(name))
+            state.raw, state.accel = wished_accel(speed, target, state.accel, self._step)
+            if state.gap_for:
+                state.accel = min(state.accel, self._yielding(name, speed, state))
+            state.wish, state.speed = max(speed + state.accel * self._step, 0.0), speed
+            if not slower:
+                get.setSpeed(name, state.wish)
+            elif state.ours:
+                get.setSpeed(name, -1.0)
+            state.ours = not slower
+
+    def observe(self, now: float) -> list[Intervention]:
+        """After every simulation step, at `now` (s): where the car began to drive otherwise than asked."""
+        get, begun = libsumo.vehicle, self._begun
+        self._begun = []
+        for name, state in self.controlled.items():
+            accel = (get.getSpeed(name) - state.speed) / self._step
+            if accel < state.raw - CORRECTED and accel < 0.5 * COMFORT:
+                if now - state.corrected > RESPITE:
+                    begun.append(Intervention(now, name, _reason(name, accel)))
+                state.corrected = now
+            lateral = get.getLateralLanePosition(name)
+            drift, state.lateral = lateral - state.lateral, lateral
+            if 0.05 < abs(drift) < 1.0 and not state.changing(now):  # SUMO changes lanes for the route
+                self._changes(name, state, 1 if drift > 0.0 else -1, now)
+        if now - self._asked > ASKS - 1e-6:
+            self._asked = now
+            self._ask()
+        return begun
+
+    # ---- inside ----
+
+    def _take_over(self, name: str) -> Assisted:
+        get = libsumo.vehicle
+        set_type(name, AV_TYPE)
+        get.setSpeedFactor(name, min(get.getSpeedFactor(name), 1.0))
+        get.setSpeedMode(name, SPEED_MODE[self._preset])
+        get.setLaneChangeMode(name, LANE_CHANGE_MODE[self._preset])
+        return Assisted(0.0, speed=get.getSpeed(name), lateral=get.getLateralLanePosition(name))
+
+    def _hand_back(self, name: str) -> None:
+        libsumo.vehicle.setSpeed(name, -1.0)
+        libsumo.vehicle.setSpeedMode(name, SUMO_SPEED_MODE)
+        libsumo.vehicle.setLaneChangeMode(name, SUMO_LANE_CHANGE_MODE)
+
+    def _forbidden(self, name: str, lane: str, offset: int) -> str | None:
+        why = super()._forbidden(name, lane, offset)
+        if why is None:
+            why = _leaves_route(name, lane, offset)
+            if why is not None:
+                self._begun.append(Intervention(libsumo.simulation.getTime(), name, why))
+        return why
+
+    def _ask(self) -> None:
+        """Every AV that must change lanes and cannot asks the AV behind the gap to give way (V2V)."""
+        get = libsumo.vehicle
+        for state in self.controlled.values():
+            state.gap_for = ""
+        for name in self.controlled:
+            for side in (1, -1):
+                wanted = get.getLaneChangeState(name, side)[0]
+                if not (wanted & STRATEGIC and wanted & BLOCKED):
+                    continue
+                for other, _ in get.getNeighbors(name, 0 if side > 0 else 1):  # followers on that side
+                    asked = self.controlled.get(other)
+                    if asked is not None and not self.controlled[name].gap_for:
+                        asked.gap_for = name
+
+    def _yielding(self, name: str, speed: float, state: Assisted) -> float:
+        """The acceleration in m/s2 that opens a gap behind who asked for one."""
+        get = libsumo.vehicle
+        try:
+            if get.getRoadID(name) != get.getRoadID(state.gap_for):
+                return COMFORT
+            ahead = get.getLanePosition(state.gap_for) - get.getLength(state.gap_for)
+            gap = ahead - get.getLanePosition(name)
+            theirs = get.getSpeed(state.gap_for)
+        except libsumo.TraCIException:  # it has left
+            return COMFORT
+        least, headway = GAP
+        slower = theirs + 0.5 * (gap - least - headway * speed)  # m/s
+        return max((max(slower, 1.0) - speed) / 1.0, -YIELDING)
+
+
+def _leaves_route(name: str, lane: str, offset: int) -> str | None:
+    """Why the lane at `offset` does not serve the route long enough to change to it; None if it does."""
+    best = libsumo.vehicle.getBestLanes(name)
+    here = int(lane.rpartition("_")[2])
+    if not 0 <= here + offset < len(best):
+        return None
+    now, then = best[here], best[here + offset]
+    at = libsumo.vehicle.getLanePosition(name)
+    least, more = SERVES
+    away = abs(then[3])
+    if away <= abs(now[3]) or then[1] - at > least + more * away:
+        return None
+    return "the lane leaves the route"
+
+
+def _reason(name: str, accel: float) -> str:
+    """Why the car drives slower than the agent wishes, or brakes harder (`accel` m/s2)."""
+    get = libsumo.vehicle
+    words = "emergency: " if accel < -HARD else ""
+    speed = get.getSpeed(name)
+    reach = min(speed * speed / (2.0 * COMFORT) + 2.0 * speed + 10.0, NOTICE)  # m
+    leader = get.getLeader(name, reach)
+    gap = leader[1] if leader and leader[0] else math.inf
+    for _, _, distance, state in get.getNextTLS(name)[:1]:
+        if distance < min(reach, gap) and state in RED | YELLOW:
+            return words + ("red light" if state in RED else "yellow light")
+    if gap < reach:
+        return f"{words}vehicle ahead"
+    links = get.getNextLinks(name)
+    for link in links[:1]:
+        at = libsumo.lane.getLength(get.getLaneID(name)) - get.getLanePosition(name)
+        if at < reach and not link[1]:
+            return words + ("stop sign" if link[5] in "sw" else "right of way")
+        if at < reach and link[4] and libsumo.lane.getMaxSpeed(link[4]) < speed + 1.0:
+            return f"{words}speed limit"
+    return f"{words}lane ends" if not links else f"{words}junction or speed limit"

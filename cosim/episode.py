@@ -105,6 +105,7 @@ class Episode:
         self.terminated = self.truncated = False
         self._begin = self.snapshot.time
         self._collisions: list[Collision] = []
+        self._missions: dict[str, None] = {}  # every mission vehicle seen, in order of appearance
         self._tally: dict[str, int] = dict.fromkeys(
             ("decisions", "vetoes", "fallbacks", "lane_changes", "blocked"), 0
         )
@@ -113,6 +114,7 @@ class Episode:
             road=self.simulator.road,
             timing=self.scenario.timing,
             mission_kind=self.scenario.mission.kind,
+            mission_guessed=self.scenario.mission.guessed,
             goal=self.simulator.goal_lanes,
             duration=self.scenario.duration,
         )
@@ -199,6 +201,8 @@ class Episode:
             collisions=tuple(self._collisions),
             timings=dict(self.timings),
             validity=self._validity(metrics),
+            mission_vehicle=", ".join(self._missions) or None,
+            mission_guessed=bool(self._missions) and self.scenario.mission.guessed,
             manifest=manifest(self.scenario, self.seed),
         )
 
@@ -208,6 +212,7 @@ class Episode:
         began = time.perf_counter()
         for frame in frames:
             self._observer.add(frame)
+            self._missions.update(dict.fromkeys(frame.ids[k] for k in frame.mission.nonzero()[0]))
         self.histories: dict[str, History] = self._observer.histories(
             self.simulator.route, self.simulator.commanded
         )

@@ -404,7 +404,19 @@ class Identity:
 IDENTITY = tuple(field.name for field in fields(Identity))
 TIMINGS = ("reset_s", "simulation_s", "observation_s", "decision_s", "total_s")  # wall time, never repeatable
 # What stands beside the figures in documents and rows: no figure may be called so.
-RESERVED = {*IDENTITY, *TIMINGS, "key", "cell", "status", "error", "stderr", "attempts", "steps"} | {
+MISSION = ("mission_vehicle", "mission_guessed")
+RESERVED = {
+    *IDENTITY,
+    *TIMINGS,
+    *MISSION,
+    "key",
+    "cell",
+    "status",
+    "error",
+    "stderr",
+    "attempts",
+    "steps",
+} | {
     *("trace_hash", "timings", "comparable", "not_comparable_because", "collision_list"),
     *("units", "better", "manifest"),
 }
@@ -420,6 +432,8 @@ class EpisodeResult(Identity):
     collisions: tuple[Collision, ...]
     timings: dict[str, float]  # s: simulation, observation, decision, reset, total
     validity: tuple[str, ...]  # reasons why the result is not comparable; empty when it is
+    mission_vehicle: str | None = None  # its id (of several: joined by ", "); None: none was on the road
+    mission_guessed: bool = False  # nobody named it: its figures feed no gate
     manifest: dict[str, Any] = field(default_factory=dict)
 
     def value(self, name: str) -> float | int | bool | None:
@@ -431,6 +445,7 @@ class EpisodeResult(Identity):
         return {
             **{name: getattr(self, name) for name in IDENTITY},
             "steps": self.steps,
+            **{name: getattr(self, name) for name in MISSION},
             **{name: _plain(metric.value) for name, metric in self.metrics.items()},
             "trace_hash": self.trace_hash,
             "timings": {name: round(value, 6) for name, value in self.timings.items()},

@@ -79,6 +79,8 @@ def _cells(spec: Spec) -> Iterator[EpisodeId]:
             av_type=spec.av_type,
             av_ids=spec.av_ids,
             duration=spec.duration,
+            warmup=spec.warmup,
+            mission=spec.mission,
             seed=spec.seeds[0],
             outputs=spec.output,
             metrics=spec.metric,
@@ -109,6 +111,16 @@ def plan(cases: Iterable[EpisodeId], seeds: range, check_policy: CheckPolicy) ->
             worlds[world] = _read(world)
         found.append(Cell(replace(case, seed=seeds[0]), *worlds[world]))
     return Plan(tuple(found), seeds)
+
+
+def check_names(plan: Plan) -> None:
+    """Raises BadInput when two worlds of the plan would have one name in rows, reports and comparisons."""
+    places: dict[str, str] = {}
+    for cell in plan.cells:
+        name, what = cell.scenario.name, cell.case.what
+        if places.setdefault(name, what) != what:
+            problem = f"would be called {name}, as {places[name]} is: give the folder another name"
+            raise BadInput(problem, field="scenario", value=what)
 
 
 def _read(case: EpisodeId) -> tuple[Scenario, Mapping[str, Any], str | None]:

@@ -15,7 +15,7 @@ import sumo_scenarios
 from cosim.errors import BadInput, Range, check_pattern, hint, inside, one_of
 from cosim.files import code
 from cosim.files.xml_input import is_there
-from cosim.files.yaml_input import Positive, check_known, document, value_of
+from cosim.files.yaml_input import NonNegative, Positive, check_known, document, value_of
 from cosim.scenario import BEHAVIORS, policy_name
 from cosim.scenario.behaviors import DRIVER_MODELS
 from cosim.seeding import FIRST_TEST_SEED
@@ -58,6 +58,8 @@ class Spec:
     av_type: str | None = None
     av_ids: str | None = None
     duration: Positive | None = None  # s
+    warmup: NonNegative | None = None  # s
+    mission: str | None = None  # a vehicle's id or a pattern of ids, none, auto; None: the scenario's own
     output: tuple[str, ...] = ()  # SUMO's outputs to keep, by SUMO's names
     metric: tuple[str, ...] = ()  # measured besides, FILE.py:NAME or MODULE:NAME, files absolute
     on_collision: str | None = None  # of `OnCollision`; None: the scenario's own

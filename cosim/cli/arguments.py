@@ -62,6 +62,16 @@ def _shared() -> dict[str, dict[str, Any]]:
             "metavar": "S",
             "help": "counted s per episode (default: the scenario's)",
         },
+        "--warmup": {
+            "type": seconds,
+            "metavar": "S",
+            "help": "s driven before the counted time begins (default: the scenario's; your files: 0)",
+        },
+        "--mission": {
+            "metavar": "ID|none|auto",
+            "help": "the mission vehicle: its id, a pattern of ids, none, or auto: guessed, and out of gates "
+            "(default: the scenario's; your files: auto)",
+        },
         "--output": {
             "metavar": "NAME",
             "help": "have SUMO write its NAME output (tripinfo, fcd, ...)",
@@ -94,6 +104,11 @@ def share(text: str) -> float:
 def positive(text: str) -> float:
     """A positive number of seconds."""
     return _number(text, 0.1, 1e6, "a number of seconds from 0.1 to 1,000,000")
+
+
+def seconds(text: str) -> float:
+    """A number of seconds, 0 too."""
+    return _number(text, 0.0, 1e6, "a number of seconds from 0 to 1,000,000")
 
 
 def count(text: str) -> int:

@@ -19,6 +19,8 @@ from cosim.types import Preset
 OPTIONAL = (
     "metrics",
     "reward",
+    "warmup",
+    "mission",
     "on_collision",
 )  # named only where they are asked for: older keys stay as they are
 KEY_LENGTH = 12  # hexadecimal digits of a cell: 48 bits, a collision among 10,000 cells has odds of 2e-7
@@ -43,6 +45,8 @@ class EpisodeId:
     svo_deg: float = 45.0  # degrees
     preset: str | None = None  # None: unguarded, in documents from before presets were always named
     duration: float | None = None  # s; None: the scenario's own
+    warmup: float | None = None  # s driven before the counted time; None: the scenario's own
+    mission: str | None = None  # id or pattern of the mission vehicle, none, auto; None: the scenario's own
     outputs: tuple[str, ...] = ()  # SUMO's own outputs, by SUMO's names
     metrics: tuple[str, ...] = ()  # measured besides, FILE.py:NAME or MODULE:NAME
     reward: str | None = None  # paid and reported: a name of `cosim.rewards.REWARDS`, or code likewise
@@ -66,7 +70,7 @@ class EpisodeId:
 
     def document(self) -> dict[str, Any]:
         """Plain JSON values; `EpisodeId.read` is the way back."""
-        given = {k: v for k, v in asdict(self).items() if v or k not in OPTIONAL}
+        given = {k: v for k, v in asdict(self).items() if v not in (None, ()) or k not in OPTIONAL}
         return {k: list(v) if isinstance(v, tuple) else v for k, v in given.items()}
 
     @classmethod
@@ -100,6 +104,8 @@ class EpisodeId:
             preset=self.preset or Preset.UNGUARDED,
             fleet=chosen_fleet(self.av_type, self.av_ids, self.penetration),
             duration=self.duration,
+            warmup=self.warmup,
+            mission=self.mission,
             on_collision=self.on_collision,
             options=options,
         )

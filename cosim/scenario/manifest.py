@@ -39,6 +39,7 @@ def manifest(scenario: Scenario, seed: int) -> dict[str, Any]:
         "driver_model": scenario.driver_model,
         "behavior": scenario.behavior,
         "fleet": scenario.fleet.describe(),
+        "mission": scenario.mission.vehicles or scenario.mission.kind,
         "timing": {
             "step_s": scenario.timing.step,
             "frame_s": scenario.timing.frame,

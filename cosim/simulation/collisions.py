@@ -67,10 +67,8 @@ class CollisionDetector:
             if person:
                 names = names if c.colliderSpeed > 0.1 else names[::-1]
             else:
-                now_there = _poses(names, bodies)
-                first = (
-                    None if now_there is None else mover(self._poses_before(names, now_there, now), now_there)
-                )
+                pair = _poses(names, bodies)
+                first = None if pair is None else mover(self._poses_before(names, pair, now), pair)
                 names = names[::-1] if first == 1 else names
             try:
                 x, y = libsumo.vehicle.getPosition(c.collider)[:2]
@@ -112,13 +110,13 @@ class CollisionDetector:
 
     # ---- inside ----
 
-    def _poses_before(self, names: Sequence[str], now_there: Boxes, now: float) -> Boxes:
+    def _poses_before(self, names: Sequence[str], pair: Boxes, now: float) -> Boxes:
         """Where two were in the last frame; who was not there yet is moved back by its speed."""
         s = self._before
         elapsed = 0.0 if s is None else now - s.time
-        columns = [np.array(column, np.float64) for column in now_there]
-        columns[0] -= elapsed * now_there.speed * np.cos(now_there.heading)
-        columns[1] -= elapsed * now_there.speed * np.sin(now_there.heading)
+        columns = [np.array(column, np.float64) for column in pair]
+        columns[0] -= elapsed * pair.speed * np.cos(pair.heading)
+        columns[1] -= elapsed * pair.speed * np.sin(pair.heading)
         for k, name in enumerate(names):
             if s is not None and (row := s.row.get(name)) is not None:
                 for column, before in zip(columns, boxes(s, np.array([row])), strict=True):
@@ -152,7 +150,7 @@ class CollisionDetector:
             lane=lane,
             x=x,
             y=y,
-            involves_mission=hits.mission or hit.mission,
+            involves_mission=any(body.mission and not body.guessed for body in (hits, hit)),
             av_caused=not inserted and (hits.kind == Kind.AV or (hit.kind == Kind.AV and bool(cut_in))),
         )
 

@@ -122,14 +122,14 @@ class Commander:
                 vehicle.setSpeed(name, wanted)
                 state.requested = wanted
 
+    def observe(self, now: float) -> list[Intervention]:
+        """After every simulation step, at `now` (s): where the car began to drive otherwise than asked."""
+        return []
+
     def wreck(self, name: str) -> None:
         """The vehicle crashed: it stands, and takes no more commands."""
         self.drop(name)
         self._wrecks.add(name)
-
-    def observe(self, now: float) -> list[Intervention]:
-        """After every simulation step, at `now` (s): where the car began to drive otherwise than asked."""
-        return []
 
     def drop(self, name: str) -> None:
         """The vehicle left the road."""

@@ -36,7 +36,7 @@ class Fleet:
     def depart(self, vehicle: str, seed: int) -> Body:
         """A vehicle departed: give it its driver; what it is."""
         get, s = libsumo.vehicle, self._scenario
-        mission = bool(s.mission.vehicles and re.fullmatch(s.mission.vehicles, vehicle))
+        mission = s.mission.includes(vehicle)
         is_av = not mission and self._is_av(vehicle, seed)
         if is_av:
             self._take_av_type(vehicle)
@@ -57,7 +57,12 @@ class Fleet:
         if name is None:
             name = self._av_types[own] = f"{AV_TYPE}.{own}"
             libsumo.vehicletype.copy(own if ours else IDM_TYPE, name)
-        (libsumo.vehicle.setType if ours else set_type)(vehicle, name)
+        if ours:
+            libsumo.vehicle.setType(vehicle, name)
+        else:
+            set_type(vehicle, name)
+            mean = libsumo.vehicletype.getSpeedFactor(own)  # not a draw about it
+            libsumo.vehicle.setSpeedFactor(vehicle, mean)
 
     def _is_av(self, vehicle: str, seed: int) -> bool:
         rule = self._scenario.fleet

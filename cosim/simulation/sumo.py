@@ -15,6 +15,7 @@ import sumo_scenarios
 from cosim.errors import BadInput, SimulationError, SimulationInUse
 from cosim.road import RoadMap
 from cosim.scenario import Scenario
+from cosim.scenario.behaviors import AS_IS
 from cosim.scenario.disabled_outputs import disable_outputs
 from cosim.scenario.sumo_outputs import sumo_options
 from cosim.scenario.sumocfg import time_of
@@ -35,8 +36,8 @@ SUMO_ERRORS = (libsumo.TraCIException, libsumo.FatalTraCIError)
 DEFAULTS = {
     "lanechange.duration": "2",  # continuous lateral motion, definitions.md
     "time-to-teleport": "-1",
-    "default.speeddev": "0",
 }
+ONE_SPEED = {"default.speeddev": "0"}  # our drivers' speeds are drawn by `cosim.scenario.behaviors`
 # Ours whatever the file says: collisions must be reported (docs/sumo.md: never `collision.action none`).
 FORCED = {
     "collision.action": "warn",
@@ -110,7 +111,7 @@ class SumoSimulator:
         self._wrecks = Wrecks(self._commander, self._drivers) if goes_on else None
         self._reader.bodies_changed()
         self._entries.reset()
-        self._mission_found = bool(self._scenario.mission.vehicles) or self._scenario.mission.kind == "none"
+        self._mission_found = not self._scenario.mission.guessed
         self._inserted = 0
         self._waited: set[str] = set()  # only where SUMO gives up: seen waiting, not inserted since
         self._happened: list[tuple[Any, ...]] = []  # per step since the last frame: the fields of Events
@@ -214,6 +215,7 @@ class SumoSimulator:
             "step-length": f"{s.timing.step:g}",
             "seed": str(seed % (2**31 - 1)),
             **DEFAULTS,
+            **(ONE_SPEED if s.ships or s.behavior != AS_IS else {}),
             **settings,
             **dict(s.options),
             **FORCED,
@@ -310,7 +312,7 @@ class SumoSimulator:
         if row is None:
             return snapshot
         name = snapshot.ids[row]
-        self._bodies[name] = replace(self._bodies[name], mission=True)
+        self._bodies[name] = replace(self._bodies[name], mission=True, guessed=True)
         self._mission_found = True
         self._reader.bodies_changed()
         return self._reader.read(self._bodies, snapshot.events)

@@ -151,7 +151,8 @@ class Events:
     entries: tuple[Entry, ...] = ()
     interventions: tuple[Intervention, ...] = ()
     stopped: tuple[str, ...] = ()  # stand at a stop of their plan at the frame's end
-    wrecks_removed: tuple[str, ...] = ()
+    wrecked: tuple[str, ...] = ()  # crashed in an episode that goes on: they stand
+    wrecks_removed: tuple[str, ...] = ()  # and were taken off the road
 
     @classmethod
     def of(cls, frames: Sequence[Snapshot]) -> Events:

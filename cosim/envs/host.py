@@ -169,8 +169,9 @@ class SessionHost(Host):
         )
 
     def _ended(self, avs: tuple[str, ...], after: Snapshot, events: Events) -> dict[str, str]:
-        crashed = {name for c in events.collisions for name in (c.collider, c.victim)}
-        mission = any(c.involves_mission for c in events.collisions)
+        crashes = [c for c in events.collisions if c.crash]
+        crashed = {name for c in crashes for name in (c.collider, c.victim)}
+        mission = self.episode.terminated and any(c.involves_mission for c in crashes)
         ended = {}
         for name in avs:
             if name in crashed:

@@ -19,7 +19,7 @@ class Track:
     id: str
     kind: Kind
     mission: bool
-    driver: str  # an HV's class of Table II, or "as-is"; for drawing only
+    driver: str  # an HV's class of Table II, or "as-is", "" of others; for drawing only
     length: float  # m
     width: float  # m
     first: int
@@ -54,7 +54,8 @@ class ReplayData:
 
 def replay_data(recorder: Recorder, simulator: Simulator, facts: Mapping[str, Any]) -> ReplayData:
     """The counted time of the recorded episode, driven on `simulator`."""
-    times = np.array([s.time for s in recorder.frames[recorder.first :]])
+    frames = recorder.frames[recorder.first :]
+    times = np.array([s.time for s in frames])
     # only SUMO's simulator knows them
     drivers: Mapping[str, str] = getattr(simulator, "driver_classes", dict)()
     return ReplayData(
@@ -69,7 +70,7 @@ def replay_data(recorder: Recorder, simulator: Simulator, facts: Mapping[str, An
         forecasts=tuple(recorder.forecasts),
         collisions=tuple(recorder.collisions),
         goal=simulator.goal_lanes,
-        signals=np.stack([s.signals for s in recorder.frames[recorder.first :]]),
+        signals=np.stack([s.signals for s in frames]),
         entries=tuple(recorder.entries),
         interventions=tuple(recorder.interventions),
     )

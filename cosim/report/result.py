@@ -27,6 +27,9 @@ FIRST = {
 }
 
 
+GUESSED = "guessed: its figures feed no gate (--mission ID names it, --mission none does without)"
+
+
 def table(result: EpisodeResult, *, first: bool = True) -> str:
     """The figures with their units: the `first` ones, or all."""
     label = f" ({result.policy_label})" if result.policy_label else ""
@@ -35,6 +38,8 @@ def table(result: EpisodeResult, *, first: bool = True) -> str:
         f"  behaviour {result.behavior}, drivers {result.driver_model}, preset {result.preset}, "
         f"svo {result.svo_deg:g} deg, seed {result.seed}, {result.steps} decisions",
     ]
+    if result.mission_vehicle is not None:
+        lines.append(f"  mission vehicle {result.mission_vehicle}" + f", {GUESSED}" * result.mission_guessed)
     shown = [name for name in FIRST if name in result.metrics] if first else result.metrics
     lines += [f"  {name:<24} {figure(result.metrics[name])}" for name in shown]
     for c in result.collisions:

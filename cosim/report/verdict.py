@@ -131,6 +131,7 @@ def _group_document(compared: Compared) -> dict[str, Any]:
         "pairs": len(group.pairs),
         "identical": group.identical,
         "not_comparable": group.not_comparable,
+        "mission_guessed": group.mission_guessed,
         "failed": [row["key"] for row in group.failed],
         "refused": [row["key"] for row in group.refused],
         "only_in_a": group.unpaired[0],
@@ -171,6 +172,9 @@ def _notes(compared: Compared) -> list[str]:
     counted = {
         f"{group.identical} pairs drove exactly alike (same trace hash)": group.identical,
         f"{group.not_comparable} pairs hold an episode that says it is not comparable": group.not_comparable,
+        f"{group.mission_guessed} pairs have a guessed mission vehicle: its figures feed no gate": (
+            group.mission_guessed
+        ),
         f"{group.unpaired[0]} episodes of A have no partner and do not count": group.unpaired[0],
         f"{group.unpaired[1]} episodes of B have no partner and do not count": group.unpaired[1],
     }

@@ -57,6 +57,7 @@ class Body:
     length: float  # m
     width: float  # m
     actor: Actor = Actor.CAR
+    guessed: bool = False  # a mission vehicle that nobody named
 
 
 class SnapshotReader:

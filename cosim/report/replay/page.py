@@ -130,7 +130,7 @@ def _facts(r: ReplayData) -> dict[str, Any]:
     units = r.facts.get("units", {})
     names = (
         "scenario demand policy policy_label behavior driver_model preset svo_deg seed steps trace_hash "
-        "not_comparable_because"
+        "not_comparable_because mission_vehicle mission_guessed"
     )
     return {
         **{name: r.facts.get(name) for name in names.split()},

@@ -184,7 +184,8 @@ class _Board:
 
     def legend(self, r: ReplayData) -> None:
         """Which colour is who, then which shape is what, at the top."""
-        cars = {"mission vehicle" if t.mission else _driver(t): (Actor.CAR, colour_of(t)) for t in r.tracks}
+        mission = "mission vehicle" + ", guessed" * bool(r.facts.get("mission_guessed"))
+        cars = {mission if t.mission else _driver(t): (Actor.CAR, colour_of(t)) for t in r.tracks}
         cars.pop("", None)  # of persons
         others = sorted({t.actor for t in r.tracks} - {Actor.CAR})
         shapes = {NAMES[a]: (a, PERSON if a == Actor.PERSON else OTHER) for a in others}

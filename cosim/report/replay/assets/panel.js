@@ -248,5 +248,6 @@ function fillHead(data) {
   chip(`seed ${f.seed}`); chip(f.preset); chip(`humans ${f.behavior}, ${f.driver_model}`); chip(`svo ${f.svo_deg}\u00b0`);
   if (figure("crashed") != null) chip(figure("crashed") ? `${figure("collisions")} collision(s)` : "no collision", figure("crashed") ? "bad" : "good");
   if (figure("mission_success") != null) chip(figure("mission_success") ? "mission fulfilled" : "mission not fulfilled", figure("mission_success") ? "good" : "bad");
+  if (f.mission_vehicle) chip(`mission vehicle ${f.mission_vehicle}${f.mission_guessed ? ", guessed" : ""}`, f.mission_guessed ? "warn" : "");
   for (const reason of f.not_comparable_because || []) chip(reason, "warn");
 }

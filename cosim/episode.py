@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from typing import NamedTuple
@@ -105,6 +106,7 @@ class Episode:
         self.terminated = self.truncated = False
         self._begin = self.snapshot.time
         self._collisions: list[Collision] = []
+        self._interventions: Counter[str] = Counter()  # by reason
         self._missions: dict[str, None] = {}  # every mission vehicle seen, in order of appearance
         self._tally: dict[str, int] = dict.fromkeys(
             ("decisions", "vetoes", "fallbacks", "lane_changes", "blocked"), 0
@@ -145,6 +147,7 @@ class Episode:
         for frame in self.frames:
             self._metrics.add(frame)
             self._collisions += frame.events.collisions
+            self._interventions.update(i.reason for i in frame.events.interventions)
             if self.scenario.on_collision == OnCollision.END:
                 self.terminated |= any(c.crash for c in frame.events.collisions)
         self.truncated = not self.terminated and self.elapsed >= self.scenario.duration - 1e-6
@@ -201,6 +204,7 @@ class Episode:
             collisions=tuple(self._collisions),
             timings=dict(self.timings),
             validity=self._validity(metrics),
+            interventions_by_reason=dict(self._interventions.most_common()),
             mission_vehicle=", ".join(self._missions) or None,
             mission_guessed=bool(self._missions) and self.scenario.mission.guessed,
             manifest=manifest(self.scenario, self.seed),

@@ -150,8 +150,7 @@ class Events:
     emergency_stopped: tuple[str, ...] = ()
     entries: tuple[Entry, ...] = ()
     interventions: tuple[Intervention, ...] = ()
-    stopped: tuple[str, ...] = ()  # reached a stop of their plan
-    resumed: tuple[str, ...] = ()  # drove on from one
+    stopped: tuple[str, ...] = ()  # stand at a stop of their plan at the frame's end
     wrecks_removed: tuple[str, ...] = ()
 
     @classmethod
@@ -417,6 +416,7 @@ RESERVED = {
     "steps",
 } | {
     *("trace_hash", "timings", "comparable", "not_comparable_because", "collision_list"),
+    "interventions_by_reason",
     *("units", "better", "manifest"),
 }
 
@@ -433,6 +433,7 @@ class EpisodeResult(Identity):
     validity: tuple[str, ...]  # reasons why the result is not comparable; empty when it is
     mission_vehicle: str | None = None  # its id (of several: joined by ", "); None: none was on the road
     mission_guessed: bool = False  # nobody named it: its figures feed no gate
+    interventions_by_reason: dict[str, int] = field(default_factory=dict)  # the most frequent first
     manifest: dict[str, Any] = field(default_factory=dict)
 
     def value(self, name: str) -> float | int | bool | None:
@@ -450,6 +451,7 @@ class EpisodeResult(Identity):
             "timings": {name: round(value, 6) for name, value in self.timings.items()},
             "comparable": not self.validity,
             "not_comparable_because": list(self.validity),
+            "interventions_by_reason": dict(self.interventions_by_reason),
             "collision_list": [{k: _plain(v) for k, v in asdict(c).items()} for c in self.collisions],
             "units": {name: metric.unit for name, metric in self.metrics.items()},
             "better": {name: metric.better for name, metric in self.metrics.items()},

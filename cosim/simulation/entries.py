@@ -124,8 +124,10 @@ class EntryWatcher:
         away = self._road.lanes[lane].length - position + self._free[lane]  # m to the next line
         steps = 1
         if away > NEAR:
-            time = 0.5 * (math.sqrt(speed * speed + 2.0 * HARDEST * (away - NEAR)) - speed) / (0.5 * HARDEST)
-            steps = min(max(int(time / self._step), 1), LONGEST)
+            time = (
+                math.sqrt(speed * speed + 2.0 * HARDEST * (away - NEAR)) - speed
+            ) / HARDEST  # s, at the least
+            steps = max(int(min(time / self._step, LONGEST)), 1)
             av.trail.clear()
         else:
             self._remember(av.trail, odometer_of(name), speed)

@@ -114,6 +114,7 @@ class SumoSimulator:
         self._entries.reset()
         self._mission_found = not self._scenario.mission.guessed
         self._inserted = 0
+        self._stopped: set[str] = set()  # at a stop of their plan
         self._waited: set[str] = set()  # only where SUMO gives up: seen waiting, not inserted since
         self._happened: list[tuple[Any, ...]] = []  # per step since the last frame: the fields of Events
         steps = round(self._scenario.warmup / self._scenario.timing.step)
@@ -264,16 +265,17 @@ class SumoSimulator:
                 simulation.getEmergencyStoppingVehiclesIDList(),
                 self._entries.step(now, [i for i in departed if self._bodies[i].kind == Kind.AV]),
                 self._commander.observe(now),
-                simulation.getStopStartingVehiclesIDList(),
-                simulation.getStopEndingVehiclesIDList(),
             )
         )
+        self._stopped.update(simulation.getStopStartingVehiclesIDList())
+        self._stopped.difference_update(simulation.getStopEndingVehiclesIDList())
         if self._gives_up:
             self._waited.update(simulation.getPendingVehicles())
         self._drivers.step(now)
 
     def _snapshot(self) -> Snapshot:
-        events = Events(*(tuple(chain.from_iterable(field)) for field in zip(*self._happened, strict=True)))
+        happened = (tuple(chain.from_iterable(field)) for field in zip(*self._happened, strict=True))
+        events = Events(*happened, stopped=tuple(sorted(self._stopped)))
         self._happened.clear()
         snapshot = self._reader.read(self._bodies, events)
         if not self._mission_found:
@@ -283,8 +285,8 @@ class SumoSimulator:
         if self._wrecks is not None:
             self._wrecks.add(extra)
         if extra or self._removed:
-            happened = (*snapshot.events.collisions, *extra)
-            events = replace(snapshot.events, collisions=happened, wrecks_removed=tuple(self._removed))
+            collisions = (*snapshot.events.collisions, *extra)
+            events = replace(snapshot.events, collisions=collisions, wrecks_removed=tuple(self._removed))
             snapshot = replace(snapshot, events=events)
             self._removed = []
         return snapshot

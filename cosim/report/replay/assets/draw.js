@@ -75,7 +75,7 @@ function drawForecast(ctx, state, view, c, t) {
 
 // The polygons of an actor (shapes.py), `length` x `width` around the origin, in the colour of who drives.
 function drawShape(ctx, shape, length, width, colour, c) {
-  const fills = { body: colour, light: c.halo, dark: c.dark };
+  const fills = { body: colour, light: c.halo, dark: c.text };
   for (const [name, points] of shape) {
     ctx.fillStyle = fills[name];
     ctx.beginPath();

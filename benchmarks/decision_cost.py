@@ -236,9 +236,7 @@ def page(found: Mapping[str, Any], command: str) -> list[str]:
         parts = [f"{one[name] / one['avs']:.2f}" for name in PARTS]
         ratio = f"{one['decision per AV, times the reference']:.2f}"
         lines.append(
-            markdown_row(
-                [f"{one['avs']:.0f}", f"{one['vehicles']:.0f}", *parts, f"{ms:.2f}", target, ratio]
-            )
+            markdown_row([f"{one['avs']:.0f}", f"{one['vehicles']:.0f}", *parts, f"{ms:.2f}", target, ratio])
         )
     reference = statistics.median(one["reference"] for one in found["city"])
     lines += ["", f"The reference took {reference:.1f} ms.", ""]

@@ -26,7 +26,9 @@ class Standing(AvCounts):
             if link.signal >= 0:
                 self._signals[link.origin] = (*self._signals.get(link.origin, ()), link.signal)
         self._waiting: dict[str, float] = {}  # AV -> s, since when it stands without a reason
-        self._inside: dict[str, tuple[str, float]] = {}  # AV -> the junction on which it stands, since when (s)
+        self._inside: dict[
+            str, tuple[str, float]
+        ] = {}  # AV -> the junction on which it stands, since when (s)
         self._stuck: set[str] = set()
         self._blocked: set[tuple[str, str, float]] = set()
         self.add(first)
@@ -68,7 +70,9 @@ class Standing(AvCounts):
         """The rows among `standing` that have a reason to stand: they, or the head of their queue."""
         queued = np.flatnonzero((s.speed < STANDING) | (s.accel < BRAKES))
         _, leaders = gap_ahead(s, self._road.straight_on, queued, QUEUE)
-        ahead = dict(zip(queued.tolist(), leaders.tolist(), strict=True))  # row -> row of the next, -1 for none
+        ahead = dict(
+            zip(queued.tolist(), leaders.tolist(), strict=True)
+        )  # row -> row of the next, -1 for none
         planned = set(s.events.stopped)
         found: dict[int, bool] = {}
         for row in standing:

@@ -27,7 +27,11 @@ HOPS = 8  # lanes that one step may lead across
 EPSILON = 1e-6
 
 _sumo = libsumo._libsumo  # the compiled getters, as in cosim.simulation.convert
-lane_of, position_of, speed_of = _sumo.vehicle_getLaneID, _sumo.vehicle_getLanePosition, _sumo.vehicle_getSpeed
+lane_of, position_of, speed_of = (
+    _sumo.vehicle_getLaneID,
+    _sumo.vehicle_getLanePosition,
+    _sumo.vehicle_getSpeed,
+)
 odometer_of, accel_of = _sumo.vehicle_getDistance, _sumo.vehicle_getAcceleration
 
 
@@ -115,12 +119,14 @@ class EntryWatcher:
         position, speed = position_of(name), speed_of(name)
         entries: list[Entry] = []
         if lane != before and before >= 0 and at_once:
-            for passed in self._passed(before, lane):
-                entries.append(self._entry(name, av, passed, position, speed, now))
+            lines = self._passed(before, lane)
+            entries = [self._entry(name, av, passed, position, speed, now) for passed in lines]
         away = self._road.lanes[lane].length - position + self._free[lane]  # m to the next line
         steps = 1
         if away > NEAR:
-            time = (math.sqrt(speed * speed + 2.0 * HARDEST * (away - NEAR)) - speed) / HARDEST  # s, at the least
+            time = (
+                math.sqrt(speed * speed + 2.0 * HARDEST * (away - NEAR)) - speed
+            ) / HARDEST  # s, at the least
             steps = max(int(min(time / self._step, LONGEST)), 1)
             av.trail.clear()
         else:
@@ -138,7 +144,9 @@ class EntryWatcher:
         while trail[0][0] < odometer - 2.0 * LAST:
             trail.popleft()
 
-    def _entry(self, name: str, av: Watched, passed: Passed, position: float, speed: float, now: float) -> Entry:
+    def _entry(
+        self, name: str, av: Watched, passed: Passed, position: float, speed: float, now: float
+    ) -> Entry:
         link = self._road.links[passed.link]
         line = odometer_of(name) - passed.beyond - position  # the odometer at the line, m
         last = [v for at, v in av.trail if line - LAST - EPSILON <= at]
@@ -207,7 +215,7 @@ class EntryWatcher:
 
     @cached_property
     def _free(self) -> list[float]:
-        """[l] m from the end of a lane to the next line that matters, on the shortest way; inf without one."""
+        """[l] m from a lane's end to the next line that matters, on the shortest way; inf without one."""
         lanes, links = self._road.lanes, self._road.links
         shortest: dict[str, float] = {}  # edge -> m
         length: dict[str, float] = {}
@@ -216,7 +224,9 @@ class EntryWatcher:
             length[lane.edge] = min(length.get(lane.edge, math.inf), lane.length)
             for successor in lane.successors:
                 origins[lanes[successor].edge].add(lane.edge)
-        heap = [(0.0, lanes[k.origin].edge) for k, matters in zip(links, self._matters, strict=True) if matters]
+        heap = [
+            (0.0, lanes[k.origin].edge) for k, matters in zip(links, self._matters, strict=True) if matters
+        ]
         while heap:
             free, edge = heapq.heappop(heap)
             if edge in shortest:

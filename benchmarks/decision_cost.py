@@ -90,14 +90,14 @@ def _walk(draw: random.Random) -> list[str]:
 
 
 def reference_ms() -> float:
-    """Time of the fixed work: 100,000 additions in Python and products of 200 x 200 matrices in numpy."""
-    matrix = np.full((200, 200), 1e-3)
+    """Time of the fixed work, on one thread: 100,000 additions in Python, 400,000 sines in numpy."""
+    angles = np.linspace(0.0, 6.0, 100_000)
     began = time.perf_counter()
     total = 0
     for k in range(100_000):
         total += k
-    for _ in range(5):
-        matrix = matrix @ matrix
+    for _ in range(4):
+        np.sin(angles)
     return 1e3 * (time.perf_counter() - began)
 
 

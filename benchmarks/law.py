@@ -166,8 +166,8 @@ def _columns(cell: Cell, idm: Cell, free: bool) -> dict[str, tuple[str, bool | N
         "stuck": (cell.rate("avs_stuck"), not cell.total("avs_stuck")),
         "AV trips": (f"{trips:.0f} of {wanted:.0f}", asked and trips >= 0.95 * wanted),
         "distance of all": (f"{distance:.0f} of {other:.0f} m", asked and distance >= 0.95 * other),
-        "hard brakings": (
-            f"{hard:.0f} to {allowed:.0f}",
+        "hard brakings (figure)": (
+            f"{hard:.0f} to {allowed:.0f} ({_plain(cell.figure('hard_brakings_av'))})",
             asked and hard <= max(2.0 * allowed, 0.5 * episodes),
         ),
         "interventions": (_plain(cell.figure("interventions")), None),

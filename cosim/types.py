@@ -67,12 +67,23 @@ class Preset:
     ALL = (LAWFUL, UNGUARDED, GUARDED)
 
 
+class OnCollision:
+    """What a crash does to an episode (docs/definitions.md, Episode)."""
+
+    END = "end"  # the episode ends
+    CONTINUE = "continue"  # it goes on; the wrecks stand, and are taken off the road
+    ALL = (END, CONTINUE)
+
+
+INSERTION = "insertion"  # `Collision.kind`
+
+
 @dataclass(frozen=True, slots=True)
 class Collision:
-    """One pair of vehicles that touched, reported once per pair and episode.
+    """One pair of vehicles (or of a vehicle and a person) that touched, reported once per pair and episode.
 
-    `source` is "sumo" (SUMO reported it) or "box" (only our oriented-box check saw it);
-    `kind` is SUMO's word (collision, side, junction) or "overlap" for ours.
+    `source` is "sumo" (SUMO reported it) or "box" (only our oriented-box check saw it); `kind` is SUMO's word
+    (collision, side, junction), "overlap" for ours, or `INSERTION`: SUMO had just put one onto the other.
     """
 
     time: float  # s
@@ -87,6 +98,20 @@ class Collision:
     y: float  # m
     involves_mission: bool = False
     av_caused: bool = False  # an AV was the collider, or had just cut in
+
+    @property
+    def insertion(self) -> bool:
+        """Nobody's fault: it counts for nobody."""
+        return self.kind == INSERTION
+
+    @property
+    def involves_av(self) -> bool:
+        return not self.insertion and (self.collider_is_av or self.victim_is_av)
+
+    @property
+    def crash(self) -> bool:
+        """Whether C% of the papers counts it: a collision of an AV or of the mission vehicle."""
+        return self.involves_av or (self.involves_mission and not self.insertion)
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +151,7 @@ class Events:
     entries: tuple[Entry, ...] = ()
     interventions: tuple[Intervention, ...] = ()
     stopped: tuple[str, ...] = ()  # stand at a stop of their plan at the frame's end
+    wrecks_removed: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, frames: Sequence[Snapshot]) -> Events:

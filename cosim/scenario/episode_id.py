@@ -21,6 +21,7 @@ OPTIONAL = (
     "reward",
     "warmup",
     "mission",
+    "on_collision",
 )  # named only where they are asked for: older keys stay as they are
 KEY_LENGTH = 12  # hexadecimal digits of a cell: 48 bits, a collision among 10,000 cells has odds of 2e-7
 
@@ -49,6 +50,7 @@ class EpisodeId:
     outputs: tuple[str, ...] = ()  # SUMO's own outputs, by SUMO's names
     metrics: tuple[str, ...] = ()  # measured besides, FILE.py:NAME or MODULE:NAME
     reward: str | None = None  # paid and reported: a name of `cosim.rewards.REWARDS`, or code likewise
+    on_collision: str | None = None  # of `OnCollision`; None: the scenario's own
 
     @cached_property
     def cell(self) -> str:
@@ -104,5 +106,6 @@ class EpisodeId:
             duration=self.duration,
             warmup=self.warmup,
             mission=self.mission,
+            on_collision=self.on_collision,
             options=options,
         )

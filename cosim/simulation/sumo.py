@@ -20,7 +20,7 @@ from cosim.scenario.disabled_outputs import disable_outputs
 from cosim.scenario.sumo_outputs import sumo_options
 from cosim.scenario.sumocfg import time_of
 from cosim.simulation.assistance import Assistance
-from cosim.simulation.collisions import CollisionDetector
+from cosim.simulation.collisions import CollisionDetector, Wrecks
 from cosim.simulation.commands import Commander
 from cosim.simulation.convert import Body, SnapshotReader, read_road, struggling_lanes
 from cosim.simulation.drivers import Drivers
@@ -28,7 +28,7 @@ from cosim.simulation.entries import EntryWatcher
 from cosim.simulation.fleet import Fleet
 from cosim.simulation.stderr import SumoStderr
 from cosim.simulation.xerces import keep_initialized
-from cosim.types import Command, Events, Kind, Preset, Receipt, Snapshot
+from cosim.types import Command, Events, Kind, OnCollision, Preset, Receipt, Snapshot
 
 SUMO_ERRORS = (libsumo.TraCIException, libsumo.FatalTraCIError)
 
@@ -107,6 +107,9 @@ class SumoSimulator:
         self._bodies: dict[str, Body] = {}
         self._routes: dict[str, tuple[str, ...]] = {}
         self._detector = CollisionDetector()
+        goes_on = self._scenario.on_collision == OnCollision.CONTINUE
+        self._wrecks = Wrecks(self._commander, self._drivers) if goes_on else None
+        self._removed: list[str] = []  # wrecks since the last frame
         self._reader.bodies_changed()
         self._entries.reset()
         self._mission_found = not self._scenario.mission.guessed
@@ -248,9 +251,14 @@ class SumoSimulator:
             self._commander.drop(name)
             self._routes.pop(name, None)
         now = simulation.getTime()
+        self._detector.inserted((*departed, *simulation.getEndingTeleportIDList()), now)
+        collisions = self._detector.from_sumo(self._bodies, self._commander.lane_changes, now)
+        if self._wrecks is not None:
+            self._wrecks.add(collisions)
+            self._removed += self._wrecks.remove(now)
         self._happened.append(
             (
-                self._detector.from_sumo(self._bodies, self._commander.lane_changes, now),
+                collisions,
                 departed,
                 arrived,
                 simulation.getStartingTeleportIDList(),
@@ -274,9 +282,13 @@ class SumoSimulator:
             snapshot = self._find_mission(snapshot)
         self._detector.lane_changes(snapshot, self.road, self._commander)
         extra = self._detector.from_boxes(snapshot, self.road, self._bodies, self._commander.lane_changes)
-        if extra:
-            events = replace(events, collisions=(*events.collisions, *extra))
+        if self._wrecks is not None:
+            self._wrecks.add(extra)
+        if extra or self._removed:
+            collisions = (*snapshot.events.collisions, *extra)
+            events = replace(snapshot.events, collisions=collisions, wrecks_removed=tuple(self._removed))
             snapshot = replace(snapshot, events=events)
+            self._removed = []
         return snapshot
 
     def _goal(self) -> tuple[frozenset[int], frozenset[int]]:

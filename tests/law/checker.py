@@ -25,7 +25,7 @@ OPTIONS = {  # that make the floating-car data hold every step
     "device.fcd.period": "0",
 }
 COMFORTABLE = 3.0  # m/s2, with which who can stop has to stop for yellow
-HARD = 3.0  # m/s2
+HARD = 3.0 + 1e-3  # m/s2; who brakes with just 3 brakes comfortably, and outputs are rounded
 STOPPED = 0.5  # m/s, at most, before a stop line
 STOP_REACH = 10.0  # m before the line in which it has to be that slow
 FOE_REACH = 100.0  # m before a junction
@@ -333,7 +333,7 @@ class Checker:
                     break
                 if foe.deceleration[r] > HARD:
                     if not self._leader(foe, k, av.id):
-                        return f"{foe.id} braked with {foe.deceleration[r]:.1f} m/s2"
+                        return f"{foe.id} braked with {foe.deceleration[r]:.2f} m/s2"
                     break
         return ""
 

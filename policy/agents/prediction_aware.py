@@ -80,7 +80,8 @@ class PredictionAware:
             raise BadInput("the observation is not the one this agent needs", field="observation")
         if self._road is not context.road:
             self._road = context.road
-            self._raster = rasterize_road(context.road) if self.config.predicted_maps else None
+            version, predicted = self.observation.road_version, self.config.predicted_maps
+            self._raster = rasterize_road(context.road, version) if predicted else None
         self._context = context
         self._expected: tuple[tuple[str, ...], Traffic, KinematicForecast] | None = None
         self._asked: dict[str, tuple[MetaAction, float]] = {}  # lane changes commanded last, when (s)

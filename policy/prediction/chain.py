@@ -141,6 +141,7 @@ def _rendered(
 ) -> Bytes:
     """Maps [B,.,C,H,W] of the wanted frames, of every vehicle that each AV knows."""
     x, y, speed, heading = (a[:, wanted] for a in states)
+    raster.show(scene.histories[0].signals)  # as they are now: their future is not known
     rows, known, who = pictured(scene, x, y, speed, heading)
     if corrected is not None:
         share = corrected.share(scene.ego)[..., : states[0].shape[1]][..., wanted]  # [B,V,M]

@@ -12,7 +12,7 @@ from cosim.batch.spec import AXES, Spec
 from cosim.errors import BadInput
 from cosim.files import code
 from cosim.rewards import read as read_reward
-from cosim.scenario import Scenario, sumo_outputs
+from cosim.scenario import Scenario, chosen_preset, sumo_outputs
 from cosim.scenario.episode_id import EpisodeId
 from cosim.scenario.manifest import manifest
 from cosim.scenario.vet import vetted
@@ -66,17 +66,26 @@ class Plan:
 
 
 def cells(spec: Spec) -> Iterator[EpisodeId]:
-    """The case of every cell's first seed."""
+    """The case of every cell's first seed; each once, though one policy may have one preset only."""
+    yield from dict.fromkeys(_cells(spec))
+
+
+def _cells(spec: Spec) -> Iterator[EpisodeId]:
     for values in itertools.product(*(getattr(spec, axis) for axis in AXES)):
+        named = dict(zip(AXES.values(), values, strict=True))
+        named["preset"] = chosen_preset(named["what"], named["policy"], named["preset"])
         yield EpisodeId(
-            **dict(zip(AXES.values(), values, strict=True)),
+            **named,
             av_type=spec.av_type,
             av_ids=spec.av_ids,
             duration=spec.duration,
+            warmup=spec.warmup,
+            mission=spec.mission,
             seed=spec.seeds[0],
             outputs=spec.output,
             metrics=spec.metric,
             reward=spec.reward,
+            on_collision=spec.on_collision,
         )
 
 
@@ -102,6 +111,16 @@ def plan(cases: Iterable[EpisodeId], seeds: range, check_policy: CheckPolicy) ->
             worlds[world] = _read(world)
         found.append(Cell(replace(case, seed=seeds[0]), *worlds[world]))
     return Plan(tuple(found), seeds)
+
+
+def check_names(plan: Plan) -> None:
+    """Raises BadInput when two worlds of the plan would have one name in rows, reports and comparisons."""
+    places: dict[str, str] = {}
+    for cell in plan.cells:
+        name, what = cell.scenario.name, cell.case.what
+        if places.setdefault(name, what) != what:
+            problem = f"would be called {name}, as {places[name]} is: give the folder another name"
+            raise BadInput(problem, field="scenario", value=what)
 
 
 def _read(case: EpisodeId) -> tuple[Scenario, Mapping[str, Any], str | None]:

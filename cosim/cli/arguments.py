@@ -34,7 +34,7 @@ def _shared() -> dict[str, dict[str, Any]]:
     """Flag -> its settings. Made on demand: the names of behaviours are read from a file."""
     from cosim.scenario import BEHAVIORS
     from cosim.scenario.behaviors import DRIVER_MODELS
-    from cosim.types import Preset
+    from cosim.types import OnCollision, Preset
 
     return {
         "--scenario": {"metavar": "NAME|FILE", "help": "a world, its folder, or a .sumocfg"},
@@ -51,12 +51,26 @@ def _shared() -> dict[str, dict[str, Any]]:
         "--av-ids": {"metavar": "REGEX", "help": "AVs are the vehicles whose id matches"},
         "--svo": {"type": degrees, "metavar": "DEG", "help": "SVO angle, 0..90 (default 45)"},
         "--preset": {"choices": Preset.ALL, "help": "safety checks on the AVs (default: the scenario's)"},
+        "--on-collision": {
+            "choices": OnCollision.ALL,
+            "help": "of an AV or the mission vehicle (default: worlds end, your own .sumocfg continue)",
+        },
         "--seed": {"type": seed, "metavar": "N"},
         "--seeds": {"metavar": "A:B", "help": "seeds A, A+1, ... B-1"},
         "--duration": {
             "type": positive,
             "metavar": "S",
             "help": "counted s per episode (default: the scenario's)",
+        },
+        "--warmup": {
+            "type": seconds,
+            "metavar": "S",
+            "help": "s driven before the counted time begins (default: the scenario's; your files: 0)",
+        },
+        "--mission": {
+            "metavar": "ID|none|auto",
+            "help": "the mission vehicle: its id, a pattern of ids, none, or auto: guessed, and out of gates "
+            "(default: the scenario's; your files: auto)",
         },
         "--output": {
             "metavar": "NAME",
@@ -90,6 +104,11 @@ def share(text: str) -> float:
 def positive(text: str) -> float:
     """A positive number of seconds."""
     return _number(text, 0.1, 1e6, "a number of seconds from 0.1 to 1,000,000")
+
+
+def seconds(text: str) -> float:
+    """A number of seconds, 0 too."""
+    return _number(text, 0.0, 1e6, "a number of seconds from 0 to 1,000,000")
 
 
 def count(text: str) -> int:

@@ -43,7 +43,8 @@ def add(commands: arguments.SubCommands) -> None:
     arguments.add(axes, "--penetration", "--svo", "--preset", action="append")
     arguments.add(axes, "--output", "--metric", action="append")
     arguments.add(evaluate, "--seeds", help="seeds A, A+1, ... B-1 (default 200000:200001)")
-    arguments.add(evaluate, "--av-type", "--av-ids", "--duration", "--reward")
+    arguments.add(evaluate, "--av-type", "--av-ids", "--duration", "--warmup", "--mission")
+    arguments.add(evaluate, "--reward", "--on-collision")
     running = evaluate.add_argument_group("the work")
     arguments.add(running, "--out", "--resume")
     arguments.add(running, "--workers", help="processes (default: all cores)")
@@ -78,6 +79,8 @@ def work(args: argparse.Namespace) -> int:
         wanted = spec.read(None if args.spec is None else Path(args.spec), flags)
         cases, seeds = [*matrix.cells(wanted)], range(*wanted.seeds)
     plan = matrix.plan(cases, seeds, check)
+    if not args.resume:
+        matrix.check_names(plan)
     engine = _engine(args)
     if args.dry_run:
         return _dry_run(plan, engine, args)

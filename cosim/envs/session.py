@@ -77,6 +77,9 @@ def open(
     av_type: str | None = None,
     av_ids: str | None = None,
     duration: float | None = None,
+    warmup: float | None = None,
+    mission: str | None = None,
+    on_collision: str | None = None,
     options: Sequence[str] = (),
     seed: int | None = None,
     observation: ObservationConfig = COMPACT,
@@ -89,9 +92,11 @@ def open(
 ) -> Session:
     """Open the scenario `what`: a world's name or folder, a path to any .sumocfg, or a `Scenario`.
 
-    The same words mean the same as in `cosim run`; `svo` is in degrees (it weighs the reward). `seed` is the
-    first episode's. `reward`: a `cosim.rewards.Reward` (a `RewardConfig`, a function of your own), a name of
-    `REWARDS`, FILE.py:NAME or MODULE:NAME; without it P's. `metrics`: classes like those of `cosim.metrics`,
+    The same words mean the same as in `cosim run`: `penetration`, `av_type` and `av_ids` (or a `Fleet`) say
+    who is an AV, `duration` and `warmup` are in s, `mission` is a vehicle's id, a pattern, "none" or "auto";
+    `svo` is in degrees (it weighs the reward). A `Scenario` holds them: beside it they are refused. `seed` is
+    the first episode's. `reward`: a `cosim.rewards.Reward` (a `RewardConfig`, a function of your own), a name
+    of `REWARDS`, FILE.py:NAME or MODULE:NAME; without it P's. `metrics`: classes like those of `cosim.metrics`,
     or FILE.py:NAME, measured besides. `others` builds a policy for the AVs you do not command (without it
     SUMO's IDM drives them). What is no text must be importable: it runs in the simulation's process.
     `simulator` replaces SUMO, for tests (`cosim.simulation.fake`). `timeout`: the longest time in s without a
@@ -104,7 +109,14 @@ def open(
     if not 0.0 <= svo <= 90.0:
         raise BadInput("must be an angle from 0 to 90 degrees", field="svo", value=svo)
     scenario = what
-    if isinstance(scenario, str):
+    if not isinstance(scenario, str):
+        given = {"demand": demand or None, "behavior": behavior, "preset": preset, "fleet": fleet}
+        given |= {"penetration": penetration, "av_type": av_type, "av_ids": av_ids}
+        given |= {"duration": duration, "warmup": warmup, "mission": mission, "options": options or None}
+        for name, value in given.items():
+            if value is not None:
+                raise BadInput("is part of the Scenario that is given", field=name, value=value)
+    else:
         names = (demand,) if isinstance(demand, str) else tuple(demand)
         scenario = load(
             scenario,
@@ -114,6 +126,9 @@ def open(
             preset=preset,
             fleet=chosen_fleet(av_type, av_ids, penetration, fleet),
             duration=duration,
+            warmup=warmup,
+            mission=mission,
+            on_collision=on_collision,
             options=options,
         )
     if simulator is None:

@@ -22,15 +22,16 @@ class ConflictView:
     Vehicles on roads that cannot touch (a bridge and what passes below it) have none with each other.
     """
 
-    def __init__(self, road: RoadMap) -> None:
+    def __init__(self, road: RoadMap, guessed: bool = False) -> None:
         self._contact = road.contact
+        self._guessed = guessed
         self._snapshot: Snapshot | None = None
 
     def of(self, snapshot: Snapshot) -> Conflicts:
         """Conflicts of AVs and mission vehicles with any vehicle, up to `HORIZON` ahead."""
         if snapshot is not self._snapshot:
             roads = self._contact.numbers(snapshot.lane), self._contact.table
-            self._conflicts = conflicts(boxes(snapshot), watched(snapshot), HORIZON, roads)
+            self._conflicts = conflicts(boxes(snapshot), watched(snapshot, self._guessed), HORIZON, roads)
             self._snapshot = snapshot
         return self._conflicts
 
@@ -44,11 +45,12 @@ class MetricContext:
     mission_kind: str  # merge, exit, roundabout, intersection, auto or none
     goal: frozenset[int]  # lanes (indices into RoadMap.lanes) on which the mission has succeeded
     duration: float  # s, counted
+    mission_guessed: bool = False  # nobody named the mission vehicle: it counts in its own figures alone
 
     @cached_property
     def conflicts(self) -> ConflictView:
         """Shared by the metrics of one episode."""
-        return ConflictView(self.road)
+        return ConflictView(self.road, self.mission_guessed)
 
 
 class EpisodeMetric(Protocol):
@@ -64,9 +66,10 @@ class EpisodeMetric(Protocol):
         """Name -> figure, so far; NA is None."""
 
 
-def watched(snapshot: Snapshot) -> Bools:
-    """[n] the vehicles whose conflicts are counted: AVs and mission vehicles."""
-    return np.asarray((snapshot.kind == AV) | snapshot.mission)
+def watched(snapshot: Snapshot, guessed: bool = False) -> Bools:
+    """[n] the vehicles whose conflicts are counted: AVs and mission vehicles that are not `guessed`."""
+    avs = snapshot.kind == AV
+    return np.asarray(avs if guessed else avs | snapshot.mission)
 
 
 class Slots:

@@ -10,12 +10,14 @@ class MissionSuccess:
     """Success is being on a goal lane without a collision before it (definitions.md, Episode).
 
     With several mission vehicles all of them have to succeed, and the time is that of the last. NA without
-    a mission, without a goal, or while no mission vehicle has been seen.
+    a mission, without a goal, or while no mission vehicle has been seen; without a goal of its own (`auto`),
+    until one has been on a lane that ends or gives way.
     """
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._goal = context.goal
         self._applies = context.mission_kind != "none" and bool(context.goal)
+        self._auto, self._lanes = context.mission_kind == "auto", context.road.lanes
         self._begin = first.time
         self._reached: dict[str, float | None] = {}  # id -> s from the episode's start
         self._crashed: set[str] = set()
@@ -29,14 +31,20 @@ class MissionSuccess:
             self._crashed.update((collision.collider, collision.victim))
         self._standing.difference_update(snapshot.events.arrived)
         for row in snapshot.mission.nonzero()[0].tolist():
-            name = snapshot.ids[row]
+            name, lane = snapshot.ids[row], int(snapshot.lane[row])
+            if (
+                self._auto
+                and name not in self._reached
+                and (lane in self._goal or self._lanes[lane].internal)
+            ):
+                continue
             if self._reached.setdefault(name, None) is not None:
                 continue
             if snapshot.speed[row] <= STANDING:
                 self._standing.add(name)
             else:
                 self._standing.discard(name)
-            if name not in self._crashed and int(snapshot.lane[row]) in self._goal:
+            if name not in self._crashed and lane in self._goal:
                 self._reached[name] = snapshot.time - self._begin
 
     def result(self) -> dict[str, Metric]:

@@ -15,6 +15,7 @@ class PostEncroachment:
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._interval = context.timing.frame  # s
         self._contact = context.road.contact
+        self._guessed = context.mission_guessed
         self._slots = Slots()
         self._frames = int(np.ceil(LONGEST / self._interval)) + 1
         self._trail = np.full((self._frames, 64, 6), np.nan)  # x m, y m, cos, sin, m/s, road
@@ -39,7 +40,7 @@ class PostEncroachment:
         if slot is not self._known:  # a vehicle came or left
             self._sizes[slot, 0], self._sizes[slot, 1] = s.length, s.width
             self._known = slot
-        self._watched[slot] |= watched(s)
+        self._watched[slot] |= watched(s, self._guessed)
         vehicles = len(self._slots), self._sizes, self._watched
         found = encroachment(self._trail, self._newest, *vehicles, self._interval, self._contact.table)
         self._smallest = min(self._smallest, found)

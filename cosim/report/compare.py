@@ -25,6 +25,7 @@ from cosim.report.statistics import (
 )
 from cosim.report.thresholds import CHANGE, DIFFERENCE, Threshold, parse
 
+OF_THE_MISSION = frozenset({"mission_success", "mission_failed_at_end", "mission_time_s", "dt_mission_m"})
 PASSED, FAILED, SKIPPED = "passed", "failed", "skipped"
 
 
@@ -137,11 +138,20 @@ def compare(
     `across`: what A and B may differ in, e.g. ("svo_deg",). `seed` fixes the bootstrap.
 
     Raises:
-        BadInput: see `pair`; a threshold that cannot be read, or that applies to no group.
+        BadInput: see `pair`; a threshold that cannot be read, that applies to no group, or that is on a
+            figure of a guessed mission vehicle.
     """
     known = {**b.run.measures, **a.run.measures}
     thresholds = [parse(text, known) for text in fail_on]
     found, alone = pair(a, b, across)
+    guessed = sum(group.mission_guessed for group in found)
+    for threshold in thresholds:
+        if guessed and threshold.measure.column in OF_THE_MISSION:
+            problem = (
+                f"the mission vehicle of {guessed} pairs was guessed, and a guess feeds no gate: drive both "
+                "with --mission ID, or leave this threshold out"
+            )
+            raise BadInput(problem, field="--fail-on", value=threshold.text)
     groups = [Compared(group, PairedFigures(known, group.pairs, seed), seed) for group in found]
     checks = [Check(t, compared.group, *_judge(t, compared)) for compared in groups for t in thresholds]
     for threshold in thresholds:

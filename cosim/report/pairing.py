@@ -15,7 +15,7 @@ from cosim.errors import BadInput, hint
 from cosim.report import run_folder, wording
 from cosim.report.figures import Row
 from cosim.report.run_folder import Run
-from cosim.report.summary import GROUP, not_comparable
+from cosim.report.summary import GROUP, mission_guessed, not_comparable
 from cosim.workers.tasks import BAD_INPUT, OK
 
 PAIR = tuple(name for name in GROUP if name != "policy")
@@ -51,6 +51,11 @@ class Group:
     def not_comparable(self) -> int:
         """Pairs in which either episode says that it must not be compared."""
         return sum(not_comparable(a) or not_comparable(b) for a, b in self.pairs)
+
+    @property
+    def mission_guessed(self) -> int:
+        """Pairs in which either episode's mission vehicle was guessed."""
+        return sum(mission_guessed(a) or mission_guessed(b) for a, b in self.pairs)
 
     @property
     def identical(self) -> int:

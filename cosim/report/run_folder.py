@@ -15,6 +15,7 @@ from cosim.errors import BadInput
 from cosim.files import read_json
 from cosim.report.figures import Measure, Row, measures
 from cosim.report.summary import summarize
+from cosim.scenario import CONFIG, file_name
 from cosim.scenario.manifest import checked
 from cosim.workers.tasks import OK
 
@@ -84,13 +85,22 @@ def read(path: str | Path) -> Run:
     for name in NEEDED:
         if rows and name not in rows[0]:
             raise BadInput("has no such column: is it a run of `cosim evaluate`?", file=file, field=name)
-    manifest = folder / "manifest.json"
-    return Run(
-        folder, _named_alike(rows), checked(read_json(manifest), manifest) if manifest.is_file() else {}
-    )
+    file = folder / "manifest.json"
+    manifest = checked(read_json(file), file) if file.is_file() else {}
+    return Run(folder, _named_alike(rows, manifest.get("cells", {})), manifest)
 
 
-def _named_alike(rows: list[dict[str, Any]]) -> list[Row]:
-    """Episodes that failed have the policy's name as typed; give them the one that it gives itself."""
+def _named_alike(rows: list[dict[str, Any]], cells: Mapping[str, Any]) -> list[Row]:
+    """Episodes that failed have the policy's name as typed; give them the one that it gives itself. Earlier
+    runs named a .sumocfg without its folder; give it the name that it has now."""
     names = {row["cell"]: row["policy"] for row in rows if row["status"] == OK}
-    return [{**row, "policy": names.get(row["cell"], row["policy"])} for row in rows]
+    configs = {cell: str(about.get("case", {}).get("what", "")) for cell, about in cells.items()}
+    worlds = {cell: file_name(Path(what)) for cell, what in configs.items() if what.endswith(CONFIG)}
+    return [
+        {
+            **row,
+            "policy": names.get(row["cell"], row["policy"]),
+            "scenario": worlds.get(row["cell"], row["scenario"]),
+        }
+        for row in rows
+    ]

@@ -33,6 +33,7 @@ def summarize(
         "episodes": len(rows),
         "status": status_counts(rows),
         "not_comparable": sum(not_comparable(row) for row in rows),
+        "mission_guessed": sum(mission_guessed(row) for row in rows),
         "confidence": CONFIDENCE,
         "bootstrap_seed": seed,
         "groups": [{**identity, **group_figures(members, known, seed)} for identity, members in groups(rows)],
@@ -64,6 +65,7 @@ def group_figures(rows: Sequence[Row], known: Mapping[str, Measure], seed: int =
         "status": status_counts(rows),
         "not_comparable": sum(not_comparable(row) for row in ok),
         "not_comparable_because": reasons(ok),
+        "mission_guessed": sum(mission_guessed(row) for row in ok),
         "rates": rates,
         "means": {name: found for name, found in means.items() if name not in TIMINGS},
         "timings": {name: found for name, found in means.items() if name in TIMINGS},
@@ -106,6 +108,11 @@ def status_counts(rows: Sequence[Row]) -> dict[str, int]:
 def not_comparable(row: Row) -> bool:
     """Whether an episode says of itself that it must not be compared (`EpisodeResult.validity`)."""
     return row.get("status", OK) == OK and row.get("comparable") is False
+
+
+def mission_guessed(row: Row) -> bool:
+    """Whether nobody named the episode's mission vehicle."""
+    return bool(row.get("mission_guessed"))
 
 
 def reasons(rows: Sequence[Row]) -> dict[str, int]:

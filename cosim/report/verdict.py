@@ -12,6 +12,7 @@ from cosim.report import wording
 from cosim.report.compare import FAILED, PASSED, SKIPPED, Compared, Comparison, PairedFigure
 from cosim.report.figures import HEADLINE, Row
 from cosim.report.pairing import who
+from cosim.report.result import LAW
 
 _MARK = {PASSED: "pass", FAILED: "FAIL", SKIPPED: "n/a "}
 _EMOJI = {PASSED: "✅ pass", FAILED: "❌ **fail**", SKIPPED: "n/a"}
@@ -131,6 +132,7 @@ def _group_document(compared: Compared) -> dict[str, Any]:
         "pairs": len(group.pairs),
         "identical": group.identical,
         "not_comparable": group.not_comparable,
+        "mission_guessed": group.mission_guessed,
         "failed": [row["key"] for row in group.failed],
         "refused": [row["key"] for row in group.refused],
         "only_in_a": group.unpaired[0],
@@ -140,9 +142,11 @@ def _group_document(compared: Compared) -> dict[str, Any]:
 
 
 def _shown(comparison: Comparison, compared: Compared) -> list[PairedFigure]:
-    """Headline figures and those that a threshold asks for, as far as they apply."""
+    """Headline figures, those of the law that are not 0 and those that a threshold asks for, where they apply."""
     asked = [check.threshold.measure.name for check in comparison.checks]
-    names = [name for name in dict.fromkeys((*HEADLINE, *asked)) if name in compared.figures]
+    names = [name for name in dict.fromkeys((*HEADLINE, *LAW, *asked)) if name in compared.figures]
+    broken = {n for n in LAW if (f := compared.figures.get(n)) and (f.a.value > 0.0 or f.b.value > 0.0)}
+    names = [name for name in names if name not in LAW or name in broken or name in asked]
     return [compared.figures[name] for name in names if compared.figures[name].n]
 
 
@@ -171,6 +175,9 @@ def _notes(compared: Compared) -> list[str]:
     counted = {
         f"{group.identical} pairs drove exactly alike (same trace hash)": group.identical,
         f"{group.not_comparable} pairs hold an episode that says it is not comparable": group.not_comparable,
+        f"{group.mission_guessed} pairs have a guessed mission vehicle: its figures feed no gate": (
+            group.mission_guessed
+        ),
         f"{group.unpaired[0]} episodes of A have no partner and do not count": group.unpaired[0],
         f"{group.unpaired[1]} episodes of B have no partner and do not count": group.unpaired[1],
     }

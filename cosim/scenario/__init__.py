@@ -2,6 +2,7 @@
 
 import math
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,21 +14,36 @@ from cosim.files.xml_input import is_there, regular_file
 from cosim.files.yaml_input import NonNegative, Positive
 from cosim.scenario import sumocfg
 from cosim.scenario.behaviors import AS_IS, DRIVER_MODELS, LC2013, MIXED, load_behaviors
-from cosim.types import Identity, Preset, Timing
+from cosim.types import Identity, OnCollision, Preset, Timing
 
 BEHAVIORS = load_behaviors().names
+CONFIG = ".sumocfg"
 DEFINITION = "scenario.yaml"  # what makes a folder a world
 FOREIGN_DURATION = 60.0  # s, for a .sumocfg that names no end
-MISSIONS = ("merge", "exit", "roundabout", "intersection", "none", "auto")
+NONE, AUTO = "none", "auto"
+MISSIONS = ("merge", "exit", "roundabout", "intersection", NONE, AUTO)
 
 
 @dataclass(frozen=True, slots=True)
 class Mission:
-    """The vehicle that needs another driver's help. `auto`: found from the net while running."""
+    """The vehicle that needs another driver's help. Kind `auto` without `vehicles`: it is guessed from the
+    net while running, the first HV on a lane that ends or gives way."""
 
-    kind: str = "auto"
-    vehicles: str = ""  # regular expression on vehicle ids; full match
+    kind: str = AUTO
+    vehicles: str = ""  # a vehicle's id, or a regular expression on ids; full match
     goal: tuple[str, ...] = ()  # edges; being on one of them is success (off internal lanes)
+
+    @property
+    def guessed(self) -> bool:
+        return self.kind == AUTO and not self.vehicles
+
+    def includes(self, vehicle: str) -> bool:
+        """Whether the vehicle of this id is named as a mission vehicle."""
+        named = self.vehicles
+        return bool(named) and (vehicle == named or re.fullmatch(named, vehicle) is not None)
+
+
+ALWAYS = {"keep-lane": Preset.UNGUARDED}  # what it shows is what happens where nobody brakes
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +96,8 @@ class Scenario:
     warmup: float = 0.0  # s, not counted
     duration: float = 60.0  # s, counted
     timing: Timing = Timing()
-    preset: str = Preset.UNGUARDED
+    preset: str = Preset.LAWFUL
+    on_collision: str = OnCollision.END  # of an AV or of the mission vehicle
     mission: Mission = Mission()
     zones: tuple[Zone, ...] = ()
     fleet: Fleet = Fleet()
@@ -134,13 +151,16 @@ def load(
     preset: str | None = None,
     fleet: Fleet | None = None,
     duration: float | None = None,
+    warmup: float | None = None,
+    mission: str | None = None,
+    on_collision: str | None = None,
     options: Sequence[str] = (),
 ) -> Scenario:
     """The scenario `what` (a world's name or folder, a .sumocfg), with what the command line says otherwise.
 
     `demand`: names of the world's demands or files; `options`: SUMO options as typed after `--`, which win
-    over the file's. `duration` in s. Only this file's own syntax is checked: `cosim.scenario.vet` reads the
-    rest.
+    over the file's. `duration`, `warmup` in s. `mission`: a vehicle's id or a pattern of ids (full match),
+    "none" or "auto". Only this file's own syntax is checked: `cosim.scenario.vet` reads the rest.
 
     Raises:
         BadInput: names file (or option), field and value, with the nearest name where one is near.
@@ -159,6 +179,12 @@ def load(
         if not (math.isfinite(duration) and duration > 0.0):
             raise BadInput("must be a positive number of seconds", field="--duration", value=duration)
         scenario = replace(scenario, duration=float(duration))
+    if warmup is not None:
+        if not (math.isfinite(warmup) and warmup >= 0.0):
+            raise BadInput("must be a number of seconds from 0 on", field="--warmup", value=warmup)
+        scenario = replace(scenario, warmup=float(warmup))
+    if mission is not None:
+        scenario = replace(scenario, mission=_mission(scenario.mission, mission))
     if behavior is None:
         behavior = _default_behavior(scenario)
     return replace(
@@ -166,8 +192,20 @@ def load(
         behavior=one_of(behavior, BEHAVIORS, "--behavior"),
         driver_model=one_of(driver_model, DRIVER_MODELS, "--driver-model"),
         preset=one_of(scenario.preset if preset is None else preset, Preset.ALL, "--preset"),
+        on_collision=one_of(on_collision or scenario.on_collision, OnCollision.ALL, "--on-collision"),
         fleet=scenario.fleet if fleet is None else _checked_fleet(fleet),
     )
+
+
+def chosen_preset(what: str, policy: str, preset: str | None) -> str:
+    """The preset that an episode of scenario `what` is driven in by `policy`, where `preset` is asked for.
+
+    A policy of `ALWAYS` has one of its own; without a word a user's world decides, else it is `lawful`.
+    """
+    own = ALWAYS.get(policy) or preset
+    if own is None and what not in sumo_scenarios.names() and is_there(Path(what) / DEFINITION):
+        return _world(Path(os.path.abspath(what))).preset
+    return own or Preset.LAWFUL
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,7 +217,7 @@ class _WorldFile:
     duration: Positive = FOREIGN_DURATION
     warmup: NonNegative = 0.0
     timing: Timing = Timing()
-    preset: str = Preset.UNGUARDED
+    preset: str = Preset.LAWFUL
     demand: str = ""
     fleet: Fleet = Fleet()
     mission: Mission = Mission()
@@ -190,6 +228,12 @@ def place(what: str) -> str:
     """`what` as it is found from anywhere: a folder or file by its absolute path, a world's name as it is."""
     is_path = what not in sumo_scenarios.names() and is_there(Path(what))
     return os.path.abspath(what) if is_path else what
+
+
+def file_name(config: Path) -> str:
+    """The name of a user's .sumocfg: its folder's name and its own, "city/run" of any city/run.sumocfg."""
+    path = Path(os.path.abspath(config))
+    return "/".join(filter(None, (path.parent.name, path.name.removesuffix(CONFIG))))
 
 
 def _world(folder: Path) -> Scenario:
@@ -206,7 +250,7 @@ def _world(folder: Path) -> Scenario:
         raise BadInput(
             "a world that ships is called so: name yours otherwise", file=file, field="name", value=name
         )
-    config = sumocfg.read(folder / f"{name}.sumocfg")
+    config = sumocfg.read(folder / f"{name}{CONFIG}")
     demands = {_demand_name(path): path for path in sorted((folder / "demand").glob("*.rou.xml"))}
     if not demands:
         raise BadInput("holds no *.rou.xml", file=file, field="demand", value=str(folder / "demand"))
@@ -230,7 +274,8 @@ def _world(folder: Path) -> Scenario:
         warmup=top.warmup,
         duration=top.duration,
         timing=top.timing,
-        preset=one_of(top.preset, Preset.ALL, "preset", file),
+        # the files of our worlds, part of every shipped episode's key, say how those were driven
+        preset=Preset.LAWFUL if ships else one_of(top.preset, Preset.ALL, "preset", file),
         mission=top.mission,
         zones=tuple(replace(z, name=z.name or f"zone{i}") for i, z in enumerate(top.conflict_zones)),
         fleet=_checked_fleet(top.fleet, file, "fleet."),
@@ -240,7 +285,7 @@ def _world(folder: Path) -> Scenario:
 def _foreign(what: str) -> Scenario:
     """A user's .sumocfg: its own duration, types and options; our clocks."""
     path = Path(what)
-    if not is_there(path) and path.suffix != ".sumocfg":
+    if not is_there(path) and path.suffix != CONFIG:
         sumo_scenarios.folder(what)  # raises, with the nearest name
     if path.is_dir():
         raise BadInput(f"a world's folder holds {DEFINITION}", field="scenario", value=what)
@@ -248,7 +293,7 @@ def _foreign(what: str) -> Scenario:
     if config.end is not None and config.end <= config.begin:
         raise BadInput("ends before it begins", file=path, field="end", value=f"{config.end:g}")
     return Scenario(
-        name=path.name.removesuffix(".sumocfg"),
+        name=file_name(path),
         config=config.path,
         net=config.net,
         demand=config.routes,
@@ -257,6 +302,7 @@ def _foreign(what: str) -> Scenario:
         ignored=config.ignored,
         begin=config.begin,
         duration=FOREIGN_DURATION if config.end is None else config.end - config.begin,
+        on_collision=OnCollision.CONTINUE,
     )
 
 
@@ -318,6 +364,16 @@ def _default_behavior(scenario: Scenario) -> str:
     if scenario.demands is None or any(path not in scenario.demands.values() for path in scenario.demand):
         return AS_IS
     return "moderate" if scenario.demand_name == "contested" else MIXED
+
+
+def _mission(own: Mission, wanted: str) -> Mission:
+    """`--mission`: what a scenario's own becomes."""
+    if wanted in (NONE, AUTO):
+        return Mission(wanted)
+    if not wanted:
+        raise BadInput("name a vehicle, none or auto", field="--mission", value=wanted)
+    check_pattern(wanted, "--mission")
+    return replace(own, vehicles=wanted, kind=AUTO if own.kind == NONE else own.kind)
 
 
 def _check_timing(timing: Timing, file: object, field: str, value: object) -> None:

@@ -291,6 +291,31 @@ def test_pairs_that_must_not_be_compared_are_said(tmp_path: Path, capsys: pytest
     assert "1 pairs hold an episode that says it is not comparable" in out
 
 
+@pytest.mark.parametrize("threshold", ["mission_success_rate < -10pp", "dt_mission_m < -5%"])
+def test_a_guessed_mission_vehicle_feeds_no_gate(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], threshold: str
+) -> None:
+    columns = {"mission_guessed": [False, True, True], "mission_vehicle": ["m", "v3", "v4"]}
+    folder = write(tmp_path / "run", cell("idm", 3), cell("rash", 3, columns=columns))
+    code, _, said = run(capsys, f"{folder}:idm", f"{folder}:rash", "--fail-on", threshold)
+    assert code == 2
+    assert "the mission vehicle of 2 pairs was guessed" in said
+    assert "--mission ID" in said
+    code, out, _ = run(capsys, f"{folder}:idm", f"{folder}:rash", "--fail-on", "dt_av_m < -5%")
+    assert code == 0
+    assert "2 pairs have a guessed mission vehicle" in out
+
+
+def test_a_file_that_an_earlier_version_named_without_its_folder_is_the_same_world(tmp_path: Path) -> None:
+    before = {"scenario": ["run"] * 3}
+    one = write(tmp_path / "a", cell("idm", 3, what="/x/city/run.sumocfg", columns=before))
+    two = write(
+        tmp_path / "b", cell("idm", 3, what="/y/city/run.sumocfg", columns={"scenario": ["city/run"] * 3})
+    )
+    found = compare(side(str(one)), side(str(two)))
+    assert [len(compared.group.pairs) for compared in found.groups] == [3]
+
+
 # ---- files ----
 
 

@@ -180,6 +180,29 @@ def test_a_case_keeps_its_key_and_comes_back_from_its_document() -> None:
     assert case.cell == "a6779b4d52e4", "stores and manifests of earlier runs hold this hash"
 
 
+def test_warm_up_and_mission_are_part_of_the_cell_where_they_are_given() -> None:
+    plain, *others = (
+        next(iter(matrix.cells(of_flags(scenario=["merge"], **more))))
+        for more in ({}, {"warmup": 0.0}, {"warmup": 5.0}, {"mission": "none"})
+    )
+    assert not plain.document().keys() & {"warmup", "mission"}
+    assert len({plain.cell, *(case.cell for case in others)}) == 4
+    assert [EpisodeId.read(case.document()) for case in others] == others
+
+
+def test_two_worlds_of_one_name_are_refused_by_their_places(tmp_path: Path) -> None:
+    for place in ("a/city", "b/city", "b/town"):
+        (tmp_path / place).mkdir(parents=True)
+        (tmp_path / place / "bad.net.xml").write_text("<net></net>")
+        (tmp_path / place / "run.sumocfg").write_text(
+            '<configuration><net-file value="bad.net.xml"/></configuration>'
+        )
+    matrix.check_names(plan(of_file(tmp_path, "scenario: [a/city/run.sumocfg, b/town/run.sumocfg]\n")))
+    with pytest.raises(BadInput, match=r"a/city/run\.sumocfg") as caught:
+        matrix.check_names(plan(of_file(tmp_path, "scenario: ['*/city/run.sumocfg']\n")))
+    assert (caught.value.field, caught.value.value) == ("scenario", str(tmp_path / "b/city/run.sumocfg"))
+
+
 def test_the_spec_s_hash_does_not_hang_on_the_order_of_an_axis() -> None:
     one = plan(of_flags(scenario=["merge", "exit"], policy=["idm", "random"]))
     other = plan(of_flags(scenario=["exit", "merge"], policy=["random", "idm"]))

@@ -78,9 +78,10 @@ def drive(
     goal: frozenset[int] = frozenset(),
     events: Mapping[int, Events] | None = None,
     road: RoadMap | None = None,
+    guessed: bool = False,
 ) -> dict[str, float | int | bool | None]:
     """The figures of a scripted drive; `events`: frame number -> what happened before it."""
-    context = MetricContext(road or straight_road(), Timing(), mission, goal, seconds)
+    context = MetricContext(road or straight_road(), Timing(), mission, goal, seconds, guessed)
     metrics = Metrics()
     metrics.reset(frame(cars, 0.0), context)
     for k in range(1, round(seconds / FRAME) + 1):
@@ -198,6 +199,13 @@ def test_a_mission_vehicle_counts_in_conflicts_like_an_av() -> None:
     assert seen["min_ttc_s"] == pytest.approx(0.5)
 
 
+def test_a_guessed_mission_vehicle_counts_in_no_conflict_and_in_its_own_figures() -> None:
+    cars = {"m": steady(0.0, 20.0, mission=True), "hv": steady(50.0, 10.0)}
+    seen = drive(cars, 4.0, guessed=True)
+    assert (seen["min_ttc_s"], seen["max_drac_mps2"]) == (None, None)
+    assert seen["dt_mission_m"] == pytest.approx(80.0)
+
+
 def test_one_hard_stop_is_one_hard_braking_and_its_jerk_is_known() -> None:
     """6 m/s2 from 4 s to 6 s: one event; two jerks of 6/0.2 m/s3 among 49 frame triples."""
 
@@ -264,6 +272,15 @@ def test_the_mission_succeeds_when_the_goal_lane_is_reached_and_says_when() -> N
     assert seen["mission_success"] is True
     assert seen["mission_time_s"] == pytest.approx(4.0)
     assert seen["mission_failed_at_end"] is False
+
+
+def test_without_a_goal_of_its_own_a_mission_begins_on_a_lane_that_gives_way() -> None:
+    """Goal lanes are all but the one that gives way (2): driving on them from the start is no success."""
+    goal = frozenset({0, 1})
+    lanes = steady(0.0, 20.0, mission=True, lane=lambda t: 0 if t < 2.0 or t >= 4.0 - 1e-9 else 2)
+    seen = drive({"m": lanes}, mission="auto", goal=goal)
+    assert (seen["mission_success"], seen["mission_time_s"]) == (True, pytest.approx(4.0))
+    assert drive({"m": steady(0.0, 20.0, mission=True)}, mission="auto", goal=goal)["mission_success"] is None
 
 
 def test_a_mission_vehicle_that_stands_at_the_end_of_its_lane_has_failed() -> None:

@@ -8,7 +8,7 @@ import pytest
 import sumo_scenarios
 from cosim import scenario
 from cosim.errors import BadInput
-from cosim.scenario import Fleet, load, sumocfg
+from cosim.scenario import Fleet, Mission, load, sumocfg
 from cosim.types import Preset
 
 WORLD = """
@@ -71,7 +71,7 @@ def world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_a_foreign_configuration_keeps_its_traffic_and_loses_its_outputs(foreign: Path) -> None:
     s = load(str(foreign))
-    assert s.name == "user"
+    assert s.name == f"{foreign.parent.name}/user"
     assert s.net == foreign.parent / "in" / "a.net.xml"
     assert [p.name for p in s.demand] == ["b.rou.xml", "c.rou.xml"]
     assert [p.name for p in s.additional] == ["d.add.xml"]
@@ -87,6 +87,32 @@ def test_a_foreign_configuration_keeps_its_traffic_and_loses_its_outputs(foreign
     assert (s.behavior, s.demand_name, s.preset) == ("as-is", "as-is", Preset.UNGUARDED)
     assert s.timing.step == 0.1
     assert not s.built_in
+
+
+def test_two_files_of_one_name_are_two_worlds_by_their_folders(foreign: Path) -> None:
+    for city in ("north", "south"):
+        (foreign.parent / city).symlink_to(foreign.parent)
+    names = [load(str(foreign.parent / city / "user.sumocfg")).name for city in ("north", "south")]
+    assert names == ["north/user", "south/user"]
+
+
+def test_a_users_file_has_the_warm_up_and_the_mission_vehicle_that_are_asked_for(foreign: Path) -> None:
+    s = load(str(foreign), warmup=20, mission="cars.3")
+    assert (s.begin, s.warmup, s.duration) == (60.0, 20.0, 140.0)
+    assert s.mission == Mission("auto", "cars.3")
+    assert not s.mission.guessed
+    assert [name for name in ("cars.3", "carsX3", "cars.33") if s.mission.includes(name)] == [
+        "cars.3",
+        "carsX3",
+    ]
+    assert load(str(foreign)).mission.guessed
+    assert not load(str(foreign), mission="none").mission.guessed
+
+
+def test_the_mission_vehicle_of_a_world_may_be_another_and_keeps_its_goal(world: Path) -> None:  # noqa: ARG001
+    assert load("lane", mission="x").mission == Mission("merge", "x", ("main2",))
+    assert load("lane", mission="auto").mission == Mission("auto")
+    assert load("lane", warmup=0).warmup == 0.0
 
 
 def test_a_configuration_without_an_end_runs_a_minute(tmp_path: Path) -> None:
@@ -211,6 +237,10 @@ def test_a_wrong_field_of_scenario_yaml_is_named(world: Path, line: str, field: 
         ({"what": "lane", "preset": "gaurded"}, "--preset", "'guarded'"),
         ({"what": "lane", "duration": float("nan")}, "--duration", "positive"),
         ({"what": "lane", "duration": -1.0}, "--duration", "positive"),
+        ({"what": "lane", "warmup": float("inf")}, "--warmup", "from 0"),
+        ({"what": "lane", "warmup": -1.0}, "--warmup", "from 0"),
+        ({"what": "lane", "mission": "["}, "--mission", "regular expression"),
+        ({"what": "lane", "mission": ""}, "--mission", "name a vehicle"),
         ({"what": "lane", "fleet": Fleet(ids="[")}, "--av-ids", "regular expression"),
         ({"what": "lane", "fleet": Fleet(penetration=float("nan"))}, "--penetration", "between"),
         ({"what": "lane", "options": ["--seed", "3"]}, "--seed", "--seed"),

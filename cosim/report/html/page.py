@@ -16,7 +16,7 @@ from cosim.report.html import tables
 from cosim.report.html.blocks import Block, Difference, blocks
 from cosim.report.html.plots import plots
 from cosim.report.run_folder import Run
-from cosim.report.summary import not_comparable, reasons, status_counts
+from cosim.report.summary import mission_guessed, not_comparable, reasons, status_counts
 from cosim.workers.tasks import OK
 
 FILE = "report.html"
@@ -68,6 +68,7 @@ def html(run: Run, shown: str | None = None) -> str:
         findings=_findings(found, differences),
         shown=FINDINGS,
         figures=tables.figures(found, run.measures) if found else None,
+        law=tables.law(found, run.measures),
         sections=[_section(block, differences[k], k < PLOTTED) for k, block in enumerate(found)],
         plotted=PLOTTED,
         worst=[
@@ -117,6 +118,7 @@ def _verdict(run: Run, found: Sequence[Block]) -> dict[str, Any]:
         "episodes": _count(total, "episode"),
         "cells": _count(cells, "cell"),
         "not_comparable": odd,
+        "guessed": sum(mission_guessed(row) for row in run.rows),
     }
 
 

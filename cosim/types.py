@@ -189,7 +189,7 @@ class Snapshot:
     actor: npt.NDArray[np.int8] = field(default_factory=lambda: np.zeros(0, np.int8))
     # [s] ord() of each state (rRyYgGosu), in the order of RoadMap.signals
     signals: Bytes = field(default_factory=lambda: np.zeros(0, np.uint8))
-    # [s] s until the next phase of each signal's light, as it is planned now; empty where nobody asked
+    # [s] s until the next phase of each signal's light, as it is planned now; empty in recordings
     switches: Floats = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:

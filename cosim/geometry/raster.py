@@ -5,8 +5,9 @@ the ego's centre lies in the middle, looking towards rising columns. Pixels are 
 Version 2 of the road channel also draws the law: stop lines by what they ask for now, and crossings.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -55,17 +56,29 @@ class RoadRaster:
     y: float  # m, lower edge
     cell: float  # m
     bars: tuple["_Bar", ...] = ()  # stop lines with signals (version 2)
-    _shown: list[bytes] = field(default_factory=list, repr=False)  # the states that are drawn now
+    _shown: list[Bytes] = field(default_factory=list, repr=False)  # the states that are drawn now
 
     def show(self, signals: Bytes) -> None:
         """Draw the stop lines by the states of all signals [s] (`Snapshot.signals`); in version 1 nothing."""
-        states = signals.tobytes()
-        if not self.bars or [states] == self._shown:
+        if not self.bars:
             return
-        self._shown[:] = [states]
-        flat, letters = self.cells.reshape(-1), states.decode("latin-1")
+        flat, states = self.cells.reshape(-1), signals.tobytes().decode("latin-1")
+        bars: Iterable[_Bar] = self.bars
+        if self._shown and len(self._shown[0]) == len(signals):
+            changed = np.flatnonzero(self._shown[0] != signals).tolist()
+            bars = (bar for signal in changed for bar in self._bars_of.get(signal, ()))
+        for bar in bars:
+            flat[bar.cells] = np.maximum(bar.below, bar.value(states))
+        self._shown[:] = [signals]
+
+    @cached_property
+    def _bars_of(self) -> dict[int, list["_Bar"]]:
+        """Signal -> the stop lines that it governs."""
+        found: dict[int, list[_Bar]] = {}
         for bar in self.bars:
-            flat[bar.cells] = np.maximum(bar.below, bar.value(letters))
+            for signal in {signal for signal, _ in bar.ways}:
+                found.setdefault(signal, []).append(bar)
+        return found
 
 
 def rasterize_road(road: RoadMap, version: int = 1) -> RoadRaster:

@@ -147,7 +147,7 @@ class RuleBook:
             zebra = self._crossings[number]
             red = now.states[zebra.signal : zebra.signal + 1] == "r"
             near = (person for square in zebra.squares for person in now.persons.get(square, ()))
-            taken = now.taken[number] = any(zebra.holds(*person, red) for person in near)
+            taken = now.taken[number] = any(zebra.holds(person, red) for person in near)
         return taken
 
     def _survey(self, path: LanePath) -> _Way:
@@ -188,8 +188,9 @@ class _Zebra:
         columns, rows = (range(a, b + 1) for a, b in zip(low, high, strict=True))
         self.squares = [(column, row) for column in columns for row in rows]
 
-    def holds(self, x: float, y: float, heading: float, speed: float, red: bool) -> bool:
+    def holds(self, person: list[float], red: bool) -> bool:
         """Whether that person is on it or, unless its signal is `red`, waits at it or is about to enter."""
+        x, y, heading, speed = person
         for ax, ay, ux, uy, length, before, after in self._pieces:
             along, across = (x - ax) * ux + (y - ay) * uy, (y - ay) * ux - (x - ax) * uy
             if abs(across) > self._half or not -before <= along <= length + after:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from typing import NamedTuple
@@ -26,6 +27,7 @@ from cosim.types import (
     History,
     Metric,
     ObservationConfig,
+    OnCollision,
     Policy,
     PolicyContext,
     Receipt,
@@ -73,8 +75,8 @@ class Episode:
 
     `start` and `advance` return what every AV on the road observes; decisions given to `advance` are
     commanded, AVs without one are driven by SUMO. `terminated` after a collision of an AV or the mission
-    vehicle, `truncated` when the scenario's duration is over (definitions.md, Episode). `metrics` are
-    measured besides those of `cosim.metrics.METRICS`.
+    vehicle unless the scenario goes on, `truncated` when its duration is over (definitions.md, Episode).
+    `metrics` are measured besides those of `cosim.metrics.METRICS`.
     """
 
     def __init__(
@@ -104,6 +106,7 @@ class Episode:
         self.terminated = self.truncated = False
         self._begin = self.snapshot.time
         self._collisions: list[Collision] = []
+        self._interventions: Counter[str] = Counter()  # by reason
         self._missions: dict[str, None] = {}  # every mission vehicle seen, in order of appearance
         self._tally: dict[str, int] = dict.fromkeys(
             ("decisions", "vetoes", "fallbacks", "lane_changes", "blocked"), 0
@@ -144,9 +147,9 @@ class Episode:
         for frame in self.frames:
             self._metrics.add(frame)
             self._collisions += frame.events.collisions
-            self.terminated |= any(
-                c.collider_is_av or c.victim_is_av or c.involves_mission for c in frame.events.collisions
-            )
+            self._interventions.update(i.reason for i in frame.events.interventions)
+            if self.scenario.on_collision == OnCollision.END:
+                self.terminated |= any(c.crash for c in frame.events.collisions)
         self.truncated = not self.terminated and self.elapsed >= self.scenario.duration - 1e-6
         self._observe(self.frames)
         for hook in self._hooks:
@@ -161,6 +164,7 @@ class Episode:
             observation=self.observation,
             svo=svo,
             rng=generator(seed, "policy"),
+            preset=self.scenario.preset,
         )
 
     @property
@@ -200,6 +204,7 @@ class Episode:
             collisions=tuple(self._collisions),
             timings=dict(self.timings),
             validity=self._validity(metrics),
+            interventions_by_reason=dict(self._interventions.most_common()),
             mission_vehicle=", ".join(self._missions) or None,
             mission_guessed=bool(self._missions) and self.scenario.mission.guessed,
             manifest=manifest(self.scenario, self.seed),

@@ -16,7 +16,7 @@ from cosim.recording.recorder import DRAWN, Recorder
 from cosim.recording.replay_data import ReplayData, replay_data
 from cosim.rewards import Reward, RewardTerms, rewards
 from cosim.rewards import read as read_reward
-from cosim.scenario import Scenario
+from cosim.scenario import ALWAYS, Scenario
 from cosim.scenario.manifest import POLICY_FILES, digests
 from cosim.scenario.sumo_outputs import drafts
 from cosim.types import EpisodeResult, Metric, ObservationConfig, Policy, Simulator
@@ -52,6 +52,7 @@ class Host:
         reward: str | Reward | None = None,
     ) -> None:
         self.policy = make(policy) if isinstance(policy, str) else policy
+        scenario = replace(scenario, preset=ALWAYS.get(self.policy.name, scenario.preset))
         self.svo = svo
         wanted = observation or self.policy.observation
         measured = [read_metric(metric) for metric in metrics]

@@ -67,12 +67,23 @@ class Preset:
     ALL = (LAWFUL, UNGUARDED, GUARDED)
 
 
+class OnCollision:
+    """What a crash does to an episode (docs/definitions.md, Episode)."""
+
+    END = "end"  # the episode ends
+    CONTINUE = "continue"  # it goes on; the wrecks stand, and are taken off the road
+    ALL = (END, CONTINUE)
+
+
+INSERTION = "insertion"  # `Collision.kind`
+
+
 @dataclass(frozen=True, slots=True)
 class Collision:
-    """One pair of vehicles that touched, reported once per pair and episode.
+    """One pair of vehicles (or of a vehicle and a person) that touched, reported once per pair and episode.
 
-    `source` is "sumo" (SUMO reported it) or "box" (only our oriented-box check saw it);
-    `kind` is SUMO's word (collision, side, junction) or "overlap" for ours.
+    `source` is "sumo" (SUMO reported it) or "box" (only our oriented-box check saw it); `kind` is SUMO's word
+    (collision, side, junction), "overlap" for ours, or `INSERTION`: SUMO had just put one onto the other.
     """
 
     time: float  # s
@@ -88,6 +99,20 @@ class Collision:
     involves_mission: bool = False
     av_caused: bool = False  # an AV was the collider, or had just cut in
 
+    @property
+    def insertion(self) -> bool:
+        """Nobody's fault: it counts for nobody."""
+        return self.kind == INSERTION
+
+    @property
+    def involves_av(self) -> bool:
+        return not self.insertion and (self.collider_is_av or self.victim_is_av)
+
+    @property
+    def crash(self) -> bool:
+        """Whether C% of the papers counts it: a collision of an AV or of the mission vehicle."""
+        return self.involves_av or (self.involves_mission and not self.insertion)
+
 
 @dataclass(frozen=True, slots=True)
 class Entry:
@@ -101,7 +126,8 @@ class Entry:
     least_speed: float  # m/s, over the last 10 m before the line
     yellow_since: float = -1.0  # s, when the signal turned yellow; -1 where it is not
     yellow_distance: float = 0.0  # m to the line and
-    yellow_speed: float = 0.0  # m/s of the vehicle at that instant
+    yellow_speed: float = 0.0  # m/s of the vehicle at that instant; inf if it was not on the road yet
+    foes: tuple[tuple[str, int], ...] = ()  # who has the right of way within 100 m, each with its link
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,6 +150,8 @@ class Events:
     emergency_stopped: tuple[str, ...] = ()
     entries: tuple[Entry, ...] = ()
     interventions: tuple[Intervention, ...] = ()
+    stopped: tuple[str, ...] = ()  # stand at a stop of their plan at the frame's end
+    wrecks_removed: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, frames: Sequence[Snapshot]) -> Events:
@@ -302,6 +330,7 @@ class PolicyContext:
     observation: ObservationConfig
     svo: float  # rad, the social value orientation phi
     rng: np.random.Generator
+    preset: str = Preset.UNGUARDED
     share_intentions: bool = True  # V2V: AVs decide front to back and know the choices before theirs
 
 
@@ -387,6 +416,7 @@ RESERVED = {
     "steps",
 } | {
     *("trace_hash", "timings", "comparable", "not_comparable_because", "collision_list"),
+    "interventions_by_reason",
     *("units", "better", "manifest"),
 }
 
@@ -403,6 +433,7 @@ class EpisodeResult(Identity):
     validity: tuple[str, ...]  # reasons why the result is not comparable; empty when it is
     mission_vehicle: str | None = None  # its id (of several: joined by ", "); None: none was on the road
     mission_guessed: bool = False  # nobody named it: its figures feed no gate
+    interventions_by_reason: dict[str, int] = field(default_factory=dict)  # the most frequent first
     manifest: dict[str, Any] = field(default_factory=dict)
 
     def value(self, name: str) -> float | int | bool | None:
@@ -420,6 +451,7 @@ class EpisodeResult(Identity):
             "timings": {name: round(value, 6) for name, value in self.timings.items()},
             "comparable": not self.validity,
             "not_comparable_because": list(self.validity),
+            "interventions_by_reason": dict(self.interventions_by_reason),
             "collision_list": [{k: _plain(v) for k, v in asdict(c).items()} for c in self.collisions],
             "units": {name: metric.unit for name, metric in self.metrics.items()},
             "better": {name: metric.better for name, metric in self.metrics.items()},

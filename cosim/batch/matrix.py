@@ -12,7 +12,7 @@ from cosim.batch.spec import AXES, Spec
 from cosim.errors import BadInput
 from cosim.files import code
 from cosim.rewards import read as read_reward
-from cosim.scenario import Scenario, sumo_outputs
+from cosim.scenario import Scenario, chosen_preset, sumo_outputs
 from cosim.scenario.episode_id import EpisodeId
 from cosim.scenario.manifest import manifest
 from cosim.scenario.vet import vetted
@@ -66,10 +66,16 @@ class Plan:
 
 
 def cells(spec: Spec) -> Iterator[EpisodeId]:
-    """The case of every cell's first seed."""
+    """The case of every cell's first seed; each once, though one policy may have one preset only."""
+    yield from dict.fromkeys(_cells(spec))
+
+
+def _cells(spec: Spec) -> Iterator[EpisodeId]:
     for values in itertools.product(*(getattr(spec, axis) for axis in AXES)):
+        named = dict(zip(AXES.values(), values, strict=True))
+        named["preset"] = chosen_preset(named["what"], named["policy"], named["preset"])
         yield EpisodeId(
-            **dict(zip(AXES.values(), values, strict=True)),
+            **named,
             av_type=spec.av_type,
             av_ids=spec.av_ids,
             duration=spec.duration,
@@ -79,6 +85,7 @@ def cells(spec: Spec) -> Iterator[EpisodeId]:
             outputs=spec.output,
             metrics=spec.metric,
             reward=spec.reward,
+            on_collision=spec.on_collision,
         )
 
 

@@ -14,7 +14,7 @@ from cosim.workers.tasks import Outcome
 FIRST = ("key", "cell", "status", *IDENTITY)  # in every table; then the order of `cosim run --json`
 LAST = ("error", "stderr", "attempts")
 _NESTED = ("units", "better", "manifest")  # the same for all episodes of a cell: kept once, in the manifest
-_AS_TEXT = ("timings", "collision_list", "not_comparable_because")
+_AS_TEXT = ("timings", "collision_list", "not_comparable_because", "interventions_by_reason")
 
 
 def row(cell: Cell, case: EpisodeId, outcome: Outcome) -> dict[str, Any]:
@@ -30,7 +30,7 @@ def flat(document: Mapping[str, Any]) -> dict[str, Any]:
     """A document of `cosim run --json` as columns: timings one each, lists as JSON text."""
     found = {k: v for k, v in document.items() if k not in (*_NESTED, *_AS_TEXT)}
     found |= document["timings"]
-    return found | {name: json.dumps(document[name]) for name in _AS_TEXT}
+    return found | {name: json.dumps(document[name]) for name in _AS_TEXT if name in document}
 
 
 def columns(rows: Iterable[Mapping[str, Any]]) -> tuple[str, ...]:

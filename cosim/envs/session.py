@@ -79,6 +79,7 @@ def open(
     duration: float | None = None,
     warmup: float | None = None,
     mission: str | None = None,
+    on_collision: str | None = None,
     options: Sequence[str] = (),
     seed: int | None = None,
     observation: ObservationConfig = COMPACT,
@@ -128,6 +129,7 @@ def open(
             duration=duration,
             warmup=warmup,
             mission=mission,
+            on_collision=on_collision,
             options=options,
         )
     if simulator is None:

@@ -17,6 +17,7 @@ from cosim.metrics import MetricFactory
 from cosim.rewards import Reward, read
 from cosim.scenario import load
 from cosim.seeding import generator
+from cosim.types import Preset
 from cosim.workers.supervisor import Limits, Supervisor
 from cosim.workers.tasks import Task
 from policy.agents.approaches import AgentConfig
@@ -67,7 +68,9 @@ class Rollout(Hosts):
         """Where this lesson is driven: that of the last one, where it is the same."""
 
         def build() -> Host:
-            scenario = load(lesson.scenario, demand=[lesson.demand], behavior=lesson.behavior)
+            scenario = load(
+                lesson.scenario, demand=[lesson.demand], behavior=lesson.behavior, preset=Preset.UNGUARDED
+            )
             return Host(scenario, self.agent, 0.0, metrics=self._metrics)
 
         return self.host(lesson, build).episode

@@ -14,9 +14,14 @@ from cosim.metrics.events import TrafficEvents
 from cosim.metrics.hard_braking import HardBraking
 from cosim.metrics.headway import Headway
 from cosim.metrics.jerk import Jerk
+from cosim.metrics.law import StopLines
 from cosim.metrics.mission import MissionSuccess
+from cosim.metrics.persons import PersonConflicts
 from cosim.metrics.post_encroachment import PostEncroachment
+from cosim.metrics.speeding import Speeding
+from cosim.metrics.standing import Standing
 from cosim.metrics.time_to_collision import TimeToCollision
+from cosim.metrics.trips import Interventions, Trips
 from cosim.types import RESERVED, Kind, Metric, Snapshot
 
 __all__ = ["METRICS", "EpisodeMetric", "MetricContext", "MetricFactory", "Metrics", "joined", "read"]
@@ -34,6 +39,12 @@ METRICS: dict[str, type[EpisodeMetric]] = {
     "hard_braking": HardBraking,
     "jerk": Jerk,
     "headway": Headway,
+    "stop_lines": StopLines,
+    "speeding": Speeding,
+    "standing": Standing,
+    "trips": Trips,
+    "persons": PersonConflicts,
+    "interventions": Interventions,
 }
 
 

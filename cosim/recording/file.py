@@ -1,6 +1,8 @@
 """One episode as one Parquet file: a row per vehicle and frame, written whole or not at all."""
 
+import base64
 import json
+import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -15,14 +17,15 @@ import pyarrow.parquet as pq
 from cosim.errors import BadInput
 from cosim.files import cannot, whole
 from cosim.recording.recorder import Knowledge, Recorder
-from cosim.types import Collision, Events, Snapshot
+from cosim.types import Bytes, Collision, Entry, Events, Intervention, Snapshot
 
 FORMAT = "cosim-recording-1"
 # float64, so that a recording gives back exactly what was driven: histories built from it equal the policy's
 # bit for bit. float32 would be half as large (70 against 135 kB for 40 s of 30 vehicles), but turns headings
 # near +-pi by a whole circle and moves target speeds.
 REAL = ("x", "y", "heading", "speed", "accel", "length", "width", "lane_position")
-WHOLE: dict[str, Any] = {"kind": pa.int8(), "mission": pa.bool_(), "lane": pa.int32()}
+WHOLE: dict[str, Any] = {"kind": pa.int8(), "mission": pa.bool_(), "lane": pa.int32(), "actor": pa.int8()}
+HAPPENED: dict[str, Any] = {"collisions": Collision, "entries": Entry, "interventions": Intervention}
 SCHEMA = pa.schema(
     [
         ("frame", pa.int32()),  # index into the times of the file's metadata
@@ -47,6 +50,7 @@ class Recording:
     table: Mapping[str, npt.NDArray[Any]]  # column -> [L]
     routes: tuple[tuple[str, ...], ...]
     events: Mapping[int, Events]  # frame -> what happened, where anything did
+    signals: Bytes  # [T,s] the states of the signals, see `Snapshot.signals`
 
     def snapshots(self) -> list[Snapshot]:
         """Every frame, oldest first, vehicles sorted by id."""
@@ -68,6 +72,8 @@ class Recording:
                     kind=t["kind"][rows],
                     mission=t["mission"][rows],
                     lane=t["lane"][rows],
+                    actor=t["actor"][rows],
+                    signals=self.signals[k],
                     events=self.events.get(k, Events()),
                     **{name: t[name][rows].astype(np.float64) for name in REAL},
                 )
@@ -119,6 +125,8 @@ def write(path: Path, recorder: Recorder, case: Mapping[str, Any]) -> None:
         "ids": ids,
         "routes": list(routes),
         "events": events,
+        # one byte per frame and signal, compressed: most stay as they were in the frame before
+        "signals": base64.b64encode(zlib.compress(b"".join(s.signals.tobytes() for s in frames))).decode(),
     }
     table = pa.Table.from_arrays(arrays, schema=SCHEMA.with_metadata({"cosim": json.dumps(about)}))
     with cannot("write", file=path), whole(path) as draft:
@@ -147,6 +155,8 @@ def read(path: Path) -> Recording:
         name: (table[name].fill_null(fill[name]) if name in fill else table[name]).to_numpy()
         for name in table.column_names
     }
+    columns.setdefault("actor", np.zeros(len(table), np.int8))  # older recordings: cars
+    states = zlib.decompress(base64.b64decode(about["signals"])) if "signals" in about else b""
     return Recording(
         case=about["case"],
         times=np.array(about["times"], np.float64),
@@ -156,9 +166,12 @@ def read(path: Path) -> Recording:
         routes=tuple(tuple(route) for route in about["routes"]),
         events={
             int(k): Events(
-                **{name: tuple(values) for name, values in e.items()}
-                | {"collisions": tuple(Collision(**c) for c in e["collisions"])}
+                **{
+                    name: tuple(HAPPENED[name](**v) if name in HAPPENED else v for v in values)
+                    for name, values in e.items()
+                }
             )
             for k, e in about["events"].items()
         },
+        signals=np.frombuffer(states, np.uint8).reshape(len(about["times"]), -1),
     )

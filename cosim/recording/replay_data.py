@@ -1,7 +1,7 @@
 """A recorded episode as it is drawn: every vehicle's track, every decision and what became of it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -9,7 +9,7 @@ import numpy as np
 from cosim.recording.recorder import Choice, Recorder
 from cosim.road import RoadMap
 from cosim.scenario.behaviors import AS_IS
-from cosim.types import Collision, Floats, Forecast, Ints, Kind, Simulator
+from cosim.types import Actor, Bytes, Collision, Entry, Floats, Forecast, Intervention, Ints, Kind, Simulator
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class Track:
     id: str
     kind: Kind
     mission: bool
-    driver: str  # an HV's class of Table II, or "as-is"; for drawing only
+    driver: str  # an HV's class of Table II, or "as-is", "" of others; for drawing only
     length: float  # m
     width: float  # m
     first: int
@@ -29,6 +29,7 @@ class Track:
     speed: Floats  # [k] m/s
     accel: Floats  # [k] m/s2
     lane: Ints  # [k] index into the road's lanes, -1 off every lane
+    actor: Actor = Actor.CAR
 
 
 @dataclass(frozen=True)
@@ -46,11 +47,15 @@ class ReplayData:
     forecasts: tuple[Forecast | None, ...]  # [D] what the policy predicted then
     collisions: tuple[Collision, ...]
     goal: frozenset[int] = frozenset()  # lanes on which the mission is fulfilled
+    signals: Bytes = field(default_factory=lambda: np.zeros((0, 0), np.uint8))  # [T,s] as in `Snapshot`
+    entries: tuple[Entry, ...] = ()
+    interventions: tuple[Intervention, ...] = ()
 
 
 def replay_data(recorder: Recorder, simulator: Simulator, facts: Mapping[str, Any]) -> ReplayData:
     """The counted time of the recorded episode, driven on `simulator`."""
-    times = np.array([s.time for s in recorder.frames[recorder.first :]])
+    frames = recorder.frames[recorder.first :]
+    times = np.array([s.time for s in frames])
     # only SUMO's simulator knows them
     drivers: Mapping[str, str] = getattr(simulator, "driver_classes", dict)()
     return ReplayData(
@@ -65,12 +70,15 @@ def replay_data(recorder: Recorder, simulator: Simulator, facts: Mapping[str, An
         forecasts=tuple(recorder.forecasts),
         collisions=tuple(recorder.collisions),
         goal=simulator.goal_lanes,
+        signals=np.stack([s.signals for s in frames]),
+        entries=tuple(recorder.entries),
+        interventions=tuple(recorder.interventions),
     )
 
 
 def tracks(recorder: Recorder, drivers: Mapping[str, str]) -> list[Track]:
     """One for every stretch of frames in which a vehicle is on the road; `drivers`: each HV's class by id."""
-    body, motion = ("kind", "mission", "length", "width"), ("x", "y", "heading", "speed", "accel")
+    body, motion = ("kind", "mission", "length", "width", "actor"), ("x", "y", "heading", "speed", "accel")
     ids, frame, vehicle, table = recorder.vehicles(*body, *motion, "lane")
     counted = np.flatnonzero(frame >= recorder.first)
     gaps = np.flatnonzero((np.diff(vehicle[counted]) != 0) | (np.diff(frame[counted]) > 1)) + 1
@@ -78,11 +86,12 @@ def tracks(recorder: Recorder, drivers: Mapping[str, str]) -> list[Track]:
     for rows in np.split(counted, gaps) if len(counted) else ():
         name, first, last = ids[vehicle[rows[0]]], int(frame[rows[0]]), rows[-1]
         kind = Kind(int(table["kind"][last]))
-        driver = "" if kind == Kind.AV else drivers.get(name, AS_IS)
+        driver = drivers.get(name, AS_IS) if kind == Kind.HV else ""
         size = float(table["length"][last]), float(table["width"][last])
         # single precision: 1 mm in 10 km
         poses = {column: table[column][rows].astype(np.float32).astype(np.float64) for column in motion}
         lane = table["lane"][rows].astype(np.int64)
-        mission = bool(table["mission"][last])
-        found.append(Track(name, kind, mission, driver, *size, first - recorder.first, lane=lane, **poses))
+        mission, actor = bool(table["mission"][last]), Actor(int(table["actor"][last]))
+        begin = first - recorder.first
+        found.append(Track(name, kind, mission, driver, *size, begin, lane=lane, actor=actor, **poses))
     return found

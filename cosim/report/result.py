@@ -26,7 +26,19 @@ FIRST = {
     "vehicles_never_inserted": "",
 }
 
-
+# What an AV must not do (definitions.md, The law), in words: shown together, in red when it is not 0.
+LAW = {
+    "red_light_violations": "red lights",
+    "stop_sign_violations": "stop signs",
+    "right_of_way_violations": "right of way",
+    "person_conflicts": "person conflicts",
+    "junctions_blocked": "junctions blocked",
+    "avs_stuck": "AVs stuck",
+    "speeding_share": "speeding",
+    "worst_speeding_mps": "worst speeding",
+}
+LAW_IN_ANY_CASE = 3  # the first of them are said of one episode even when they are 0
+REASONS = 4  # of interventions, that are said
 GUESSED = "guessed: its figures feed no gate (--mission ID names it, --mission none does without)"
 
 
@@ -42,6 +54,7 @@ def table(result: EpisodeResult, *, first: bool = True) -> str:
         lines.append(f"  mission vehicle {result.mission_vehicle}" + f", {GUESSED}" * result.mission_guessed)
     shown = [name for name in FIRST if name in result.metrics] if first else result.metrics
     lines += [f"  {name:<24} {figure(result.metrics[name])}" for name in shown]
+    lines += law_lines(result)
     for c in result.collisions:
         who = f"{c.kind}, {'AV-caused' if c.av_caused else 'not AV-caused'}"
         lines.append(
@@ -53,6 +66,29 @@ def table(result: EpisodeResult, *, first: bool = True) -> str:
     times = ", ".join(f"{name.removesuffix('_s')} {value:.2f} s" for name, value in result.timings.items())
     lines.append(f"  time spent               {times}")
     return "\n".join(lines)
+
+
+def law_lines(result: EpisodeResult) -> list[str]:
+    """`law   0 red lights, ...` and, where the car corrected its agent, how often and why; none without AVs."""
+    known = {name: result.metrics[name] for name in LAW if name in result.metrics}
+    known = {name: metric for name, metric in known.items() if metric.value is not None}
+    said = [n for k, n in enumerate(LAW) if n in known and (k < LAW_IN_ANY_CASE or known[n].value)]
+    lines = []
+    if said:
+        words = ", ".join(
+            f"{100 * float(known[n].value or 0):.2g} % {LAW[n]}"
+            if n == "speeding_share"
+            else f"{LAW[n]} {figure(known[n])}"
+            if n == "worst_speeding_mps"
+            else f"{known[n].value} {LAW[n]}"
+            for n in said
+        )
+        lines.append(f"  {'law':<24} {words}")
+    if reasons := result.interventions_by_reason:
+        words = ", ".join(f"{count} {why}" for why, count in list(reasons.items())[:REASONS])
+        words += ", ..." * (len(reasons) > REASONS)
+        lines.append(f"  {'interventions':<24} {sum(reasons.values())} ({words})")
+    return lines
 
 
 def _clock(time: float, result: EpisodeResult) -> str:

@@ -12,6 +12,7 @@ from cosim.report import wording
 from cosim.report.compare import FAILED, PASSED, SKIPPED, Compared, Comparison, PairedFigure
 from cosim.report.figures import HEADLINE, Row
 from cosim.report.pairing import who
+from cosim.report.result import LAW
 
 _MARK = {PASSED: "pass", FAILED: "FAIL", SKIPPED: "n/a "}
 _EMOJI = {PASSED: "✅ pass", FAILED: "❌ **fail**", SKIPPED: "n/a"}
@@ -141,9 +142,11 @@ def _group_document(compared: Compared) -> dict[str, Any]:
 
 
 def _shown(comparison: Comparison, compared: Compared) -> list[PairedFigure]:
-    """Headline figures and those that a threshold asks for, as far as they apply."""
+    """Headline figures, those of the law that are not 0 and those that a threshold asks for, where they apply."""
     asked = [check.threshold.measure.name for check in comparison.checks]
-    names = [name for name in dict.fromkeys((*HEADLINE, *asked)) if name in compared.figures]
+    names = [name for name in dict.fromkeys((*HEADLINE, *LAW, *asked)) if name in compared.figures]
+    broken = {n for n in LAW if (f := compared.figures.get(n)) and (f.a.value > 0.0 or f.b.value > 0.0)}
+    names = [name for name in names if name not in LAW or name in broken or name in asked]
     return [compared.figures[name] for name in names if compared.figures[name].n]
 
 

@@ -14,7 +14,7 @@ from cosim.files.xml_input import is_there, regular_file
 from cosim.files.yaml_input import NonNegative, Positive
 from cosim.scenario import sumocfg
 from cosim.scenario.behaviors import AS_IS, DRIVER_MODELS, LC2013, MIXED, load_behaviors
-from cosim.types import Identity, Preset, Timing
+from cosim.types import Identity, OnCollision, Preset, Timing
 
 BEHAVIORS = load_behaviors().names
 CONFIG = ".sumocfg"
@@ -41,6 +41,9 @@ class Mission:
         """Whether the vehicle of this id is named as a mission vehicle."""
         named = self.vehicles
         return bool(named) and (vehicle == named or re.fullmatch(named, vehicle) is not None)
+
+
+ALWAYS = {"keep-lane": Preset.UNGUARDED}  # what it shows is what happens where nobody brakes
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +96,8 @@ class Scenario:
     warmup: float = 0.0  # s, not counted
     duration: float = 60.0  # s, counted
     timing: Timing = Timing()
-    preset: str = Preset.UNGUARDED
+    preset: str = Preset.LAWFUL
+    on_collision: str = OnCollision.END  # of an AV or of the mission vehicle
     mission: Mission = Mission()
     zones: tuple[Zone, ...] = ()
     fleet: Fleet = Fleet()
@@ -149,6 +153,7 @@ def load(
     duration: float | None = None,
     warmup: float | None = None,
     mission: str | None = None,
+    on_collision: str | None = None,
     options: Sequence[str] = (),
 ) -> Scenario:
     """The scenario `what` (a world's name or folder, a .sumocfg), with what the command line says otherwise.
@@ -187,8 +192,20 @@ def load(
         behavior=one_of(behavior, BEHAVIORS, "--behavior"),
         driver_model=one_of(driver_model, DRIVER_MODELS, "--driver-model"),
         preset=one_of(scenario.preset if preset is None else preset, Preset.ALL, "--preset"),
+        on_collision=one_of(on_collision or scenario.on_collision, OnCollision.ALL, "--on-collision"),
         fleet=scenario.fleet if fleet is None else _checked_fleet(fleet),
     )
+
+
+def chosen_preset(what: str, policy: str, preset: str | None) -> str:
+    """The preset that an episode of scenario `what` is driven in by `policy`, where `preset` is asked for.
+
+    A policy of `ALWAYS` has one of its own; without a word a user's world decides, else it is `lawful`.
+    """
+    own = ALWAYS.get(policy) or preset
+    if own is None and what not in sumo_scenarios.names() and is_there(Path(what) / DEFINITION):
+        return _world(Path(os.path.abspath(what))).preset
+    return own or Preset.LAWFUL
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,7 +217,7 @@ class _WorldFile:
     duration: Positive = FOREIGN_DURATION
     warmup: NonNegative = 0.0
     timing: Timing = Timing()
-    preset: str = Preset.UNGUARDED
+    preset: str = Preset.LAWFUL
     demand: str = ""
     fleet: Fleet = Fleet()
     mission: Mission = Mission()
@@ -257,7 +274,8 @@ def _world(folder: Path) -> Scenario:
         warmup=top.warmup,
         duration=top.duration,
         timing=top.timing,
-        preset=one_of(top.preset, Preset.ALL, "preset", file),
+        # the files of our worlds, part of every shipped episode's key, say how those were driven
+        preset=Preset.LAWFUL if ships else one_of(top.preset, Preset.ALL, "preset", file),
         mission=top.mission,
         zones=tuple(replace(z, name=z.name or f"zone{i}") for i, z in enumerate(top.conflict_zones)),
         fleet=_checked_fleet(top.fleet, file, "fleet."),
@@ -284,6 +302,7 @@ def _foreign(what: str) -> Scenario:
         ignored=config.ignored,
         begin=config.begin,
         duration=FOREIGN_DURATION if config.end is None else config.end - config.begin,
+        on_collision=OnCollision.CONTINUE,
     )
 
 

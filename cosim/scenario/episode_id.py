@@ -14,12 +14,14 @@ from cosim.errors import inside
 from cosim.files.yaml_input import dataclass_from, mapping
 from cosim.scenario import Scenario, chosen_fleet, load
 from cosim.scenario.behaviors import LC2013
+from cosim.types import Preset
 
 OPTIONAL = (
     "metrics",
     "reward",
     "warmup",
     "mission",
+    "on_collision",
 )  # named only where they are asked for: older keys stay as they are
 KEY_LENGTH = 12  # hexadecimal digits of a cell: 48 bits, a collision among 10,000 cells has odds of 2e-7
 
@@ -41,13 +43,14 @@ class EpisodeId:
     av_type: str | None = None
     av_ids: str | None = None
     svo_deg: float = 45.0  # degrees
-    preset: str | None = None  # None: the scenario's default
+    preset: str | None = None  # None: unguarded, in documents from before presets were always named
     duration: float | None = None  # s; None: the scenario's own
     warmup: float | None = None  # s driven before the counted time; None: the scenario's own
     mission: str | None = None  # id or pattern of the mission vehicle, none, auto; None: the scenario's own
     outputs: tuple[str, ...] = ()  # SUMO's own outputs, by SUMO's names
     metrics: tuple[str, ...] = ()  # measured besides, FILE.py:NAME or MODULE:NAME
     reward: str | None = None  # paid and reported: a name of `cosim.rewards.REWARDS`, or code likewise
+    on_collision: str | None = None  # of `OnCollision`; None: the scenario's own
 
     @cached_property
     def cell(self) -> str:
@@ -98,10 +101,11 @@ class EpisodeId:
             demand=self.demand,
             behavior=self.behavior,
             driver_model=self.driver_model,
-            preset=self.preset,
+            preset=self.preset or Preset.UNGUARDED,
             fleet=chosen_fleet(self.av_type, self.av_ids, self.penetration),
             duration=self.duration,
             warmup=self.warmup,
             mission=self.mission,
+            on_collision=self.on_collision,
             options=options,
         )

@@ -13,6 +13,7 @@ from cosim.files.yaml_input import mapping, value_of
 from cosim.scenario import Scenario
 from cosim.scenario.episode_id import EpisodeId
 from cosim.scenario.sumocfg import CLOCK, INPUTS, command_line, keeps
+from cosim.types import OnCollision
 
 POLICY_FILES = "policy_files"  # what decides how the policy drives: weights, or its own code
 _KINDS: Mapping[str, Any] = {  # what is read again of the documents of `cosim run` and `cosim evaluate`
@@ -33,6 +34,8 @@ def manifest(scenario: Scenario, seed: int) -> dict[str, Any]:
     return {
         "seed": seed,
         "preset": scenario.preset,
+        # named where it is not the worlds' own: episodes are told apart by this document, older ones too
+        **({"on_collision": goes_on} if (goes_on := scenario.on_collision) != OnCollision.END else {}),
         "driver_model": scenario.driver_model,
         "behavior": scenario.behavior,
         "fleet": scenario.fleet.describe(),

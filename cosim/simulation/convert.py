@@ -1,6 +1,7 @@
 """SUMO's conventions end here: front bumper and degrees clockwise from north become centre and radians."""
 
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -11,7 +12,7 @@ from cosim.errors import BadInput
 from cosim.road import ConflictZone, Crossing, Lane, Link, RoadMap, Rule
 from cosim.scenario import Zone
 from cosim.simulation.conventions import centres
-from cosim.types import Events, Kind, Snapshot
+from cosim.types import Actor, Bytes, Events, Kind, Snapshot
 
 # The compiled getters: libsumo's Python wrappers around them double the cost of a read. The version
 # is pinned; a test compares them with the public ones.
@@ -19,12 +20,32 @@ GETTERS = tuple(
     getattr(libsumo._libsumo, f"vehicle_get{name}")
     for name in ("Position", "Angle", "Speed", "Acceleration", "LaneID", "LanePosition")
 )
+# the same of persons, of whose acceleration SUMO says nothing
+PERSON_GETTERS = tuple(
+    getattr(libsumo._libsumo, f"person_get{name}", lambda _: 0.0)
+    for name in ("Position", "Angle", "Speed", "Acceleration", "LaneID", "LanePosition")
+)
+PERSON = "person:"  # a person's name in a snapshot: this and its id, which may be a vehicle's too
 GIVE_WAY = "mswZ"  # link states: minor, stop, all-way stop, zipper (SUMO, Networks/SUMO_Road_Networks)
 # link states at a stop line without signals (SUMO, Networks/SUMO_Road_Networks)
 RULES = {"m": Rule.YIELD, "s": Rule.STOP, "w": Rule.ALL_WAY_STOP, "=": Rule.EQUAL, "Z": Rule.ZIPPER}
 CROSSING = re.compile(r":.+_c\d+")  # netconvert's name for a pedestrian crossing
 CAR = "passenger"  # SUMO's class of cars, AVs among them
 MOTOR_CLASSES = frozenset({CAR, "private", "taxi", "bus", "truck", "trailer", "delivery", "motorcycle"})
+# SUMO's vehicle classes (Definition_of_Vehicles, Abstract Vehicle Class); all others are cars
+ACTORS = {
+    name: actor
+    for actor, names in {
+        Actor.TRUCK: "truck trailer delivery",
+        Actor.BUS: "bus coach",
+        Actor.MOTORCYCLE: "motorcycle moped",
+        Actor.BICYCLE: "bicycle scooter",
+        Actor.PERSON: "pedestrian wheelchair",
+        Actor.OTHER: "tram rail rail_urban rail_electric rail_fast subway cable_car ship aircraft drone "
+        "container",
+    }.items()
+    for name in names.split()
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +56,7 @@ class Body:
     mission: bool
     length: float  # m
     width: float  # m
+    actor: Actor = Actor.CAR
     guessed: bool = False  # a mission vehicle that nobody named
 
 
@@ -43,35 +65,43 @@ class SnapshotReader:
 
     def __init__(self, road: RoadMap) -> None:
         self._lane_index = road.index
+        self._lights = Counter(light for light, _ in road.signals)  # -> how many signals, in their order
         self._ids: tuple[str, ...] | None = None
-        self._static: tuple[np.ndarray, ...] = ()  # kind, mission, length m, width m [n] of `_ids`
+        # kind, mission, length m, width m, actor [n] of `_ids`
+        self._static: tuple[np.ndarray, ...] = ()
 
     def bodies_changed(self) -> None:
         """Build the constant columns anew at the next read (a new episode, a new mission vehicle)."""
         self._ids = None
 
     def read(self, bodies: dict[str, Body], events: Events) -> Snapshot:
-        """One snapshot of every vehicle on the road, sorted by id.
+        """One snapshot of every vehicle and every walking person on the road, sorted by id.
 
         Args:
-            bodies: what is constant of each vehicle that has departed, by id.
+            bodies: what is constant of each vehicle that has departed, by id; new persons are added.
             events: what happened since the last snapshot.
         """
-        ids = tuple(sorted(libsumo.vehicle.getIDList()))
+        persons = _walking() if libsumo.person.getIDCount() else {}
+        ids = tuple(sorted((*libsumo.vehicle.getIDList(), *persons)))
         if ids != self._ids:
-            present = [bodies[i] for i in ids]
+            present = [bodies.get(i) or bodies.setdefault(i, _person(persons[i])) for i in ids]
             self._static = (
                 np.array([b.kind for b in present], np.int8),
                 np.array([b.mission for b in present], np.bool_),
                 np.array([b.length for b in present], np.float64),
                 np.array([b.width for b in present], np.float64),
+                np.array([b.actor for b in present], np.int8),
             )
             self._ids = ids
-        kind, mission, length, width = self._static
-        position, angle, speed, accel, lane_id, lane_position = GETTERS
-        index = self._lane_index
-        front = np.array([position(i) for i in ids], np.float64).reshape(-1, 2)  # [n,2] m
-        x, y, heading = centres(front[:, 0], front[:, 1], np.array([angle(i) for i in ids]), 0.5 * length)
+        kind, mission, length, width, actor = self._static
+        position, angle, speed, accel, lane, lane_position = (
+            [vehicle(i) for i in ids]
+            if not persons
+            else [person(persons[i]) if i in persons else vehicle(i) for i in ids]
+            for vehicle, person in zip(GETTERS, PERSON_GETTERS, strict=True)
+        )
+        front = np.array(position, np.float64).reshape(-1, 2)  # [n,2] m
+        x, y, heading = centres(front[:, 0], front[:, 1], np.array(angle), 0.5 * length)
         return Snapshot(
             time=libsumo.simulation.getTime(),
             ids=ids,
@@ -80,14 +110,33 @@ class SnapshotReader:
             x=x,
             y=y,
             heading=heading,
-            speed=np.array([speed(i) for i in ids], np.float64),
-            accel=np.array([accel(i) for i in ids], np.float64),
+            speed=np.array(speed, np.float64),
+            accel=np.array(accel, np.float64),
             length=length,
             width=width,
-            lane=np.array([index.get(lane_id(i), -1) for i in ids], np.int32),
-            lane_position=np.array([lane_position(i) for i in ids], np.float64),
+            lane=np.array([self._lane_index.get(i, -1) for i in lane], np.int32),
+            lane_position=np.array(lane_position, np.float64),
             events=events,
+            actor=actor,
+            signals=self._signals(),
         )
+
+    def _signals(self) -> Bytes:
+        """[s] the state of every signal; a light may have states for more links than there are."""
+        get = libsumo.trafficlight
+        states = (get.getRedYellowGreenState(light)[:count] for light, count in self._lights.items())
+        return np.frombuffer("".join(states).encode(), np.uint8)
+
+
+def _walking() -> dict[str, str]:
+    """Name -> SUMO's id of everybody on foot: neither in a vehicle or waiting for one, nor busy elsewhere."""
+    get = libsumo.person
+    return {PERSON + i: i for i in get.getIDList() if get.getStage(i).type == libsumo.constants.STAGE_WALKING}
+
+
+def _person(person: str) -> Body:
+    get = libsumo.person
+    return Body(Kind.PERSON, False, get.getLength(person), get.getWidth(person), Actor.PERSON)
 
 
 def read_road(zones: Sequence[Zone], scenario_file: object) -> RoadMap:

@@ -9,9 +9,9 @@ from cosim.scenario import Scenario
 from cosim.scenario.behaviors import AS_IS
 from cosim.scenario.vet_rules import NOT_CARS
 from cosim.seeding import uniform
-from cosim.simulation.convert import Body
+from cosim.simulation.convert import ACTORS, Body
 from cosim.simulation.drivers import IDM_TYPE, Drivers
-from cosim.types import Kind
+from cosim.types import Actor, Kind
 
 # definitions.md, Vehicles: what an AV drives with while it has no command (egoistic IDM).
 AV_IDM = {"Tau": 0.8, "MinGap": 2.0, "Accel": 3.0, "Decel": 7.0}
@@ -20,7 +20,8 @@ AV_LANE_CHANGE = {
     "laneChangeModel.lcCooperativeSpeed": "0",
     "laneChangeModel.lcKeepRight": "0",
 }
-# What a vehicle of a user's file keeps: getters and setters of libsumo.vehicle, in this order.
+AV_TYPE = "cosim.av"  # the types of AVs in SUMO's outputs begin so, and nobody else's
+# What an AV of a user's file keeps: getters and setters of libsumo.vehicle, in this order.
 KEPT = ("Length", "Width", "MaxSpeed", "SpeedFactor", "VehicleClass")
 
 
@@ -31,25 +32,41 @@ class Fleet:
         self._scenario = scenario
         self._drivers = drivers
         self._av_parameters = av_parameters
+        self._av_types: dict[str, str] = {}  # a vehicle's own type -> the type of such an AV
 
     def depart(self, vehicle: str, seed: int) -> Body:
         """A vehicle departed: give it its driver; what it is."""
         get, s = libsumo.vehicle, self._scenario
         mission = s.mission.includes(vehicle)
         is_av = not mission and self._is_av(vehicle, seed)
-        if not s.built_in and (is_av or s.behavior != AS_IS):
-            factor = libsumo.vehicletype.getSpeedFactor(get.getTypeID(vehicle))
-            set_type(vehicle)
-            if is_av:
-                get.setSpeedFactor(vehicle, factor)  # its type's mean, not a draw about it
         if is_av:
+            self._take_av_type(vehicle)
             for name, value in AV_IDM.items():
                 getattr(get, f"set{name}")(vehicle, value)
             for key, text in {**AV_LANE_CHANGE, **self._av_parameters}.items():
                 get.setParameter(vehicle, key, text)
         elif s.behavior != AS_IS:
             self._drivers.apply(vehicle)
-        return Body(Kind.AV if is_av else Kind.HV, mission, get.getLength(vehicle), get.getWidth(vehicle))
+        size = get.getLength(vehicle), get.getWidth(vehicle)
+        actor = ACTORS.get(get.getVehicleClass(vehicle), Actor.CAR)
+        return Body(Kind.AV if is_av else Kind.HV, mission, *size, actor)
+
+    def _take_av_type(self, vehicle: str) -> None:
+        """In our worlds an AV drives as its type says; one of a user's file by IDM, with the size, class and
+        maximum speed that it has: `setType` replaces the car-following model, nothing else can."""
+        get, own = libsumo.vehicle, libsumo.vehicle.getTypeID(vehicle)
+        ours = self._scenario.built_in
+        name = self._av_types.get(own)
+        if name is None:
+            name = self._av_types[own] = f"{AV_TYPE}.{own}"
+            libsumo.vehicletype.copy(own if ours else IDM_TYPE, name)
+        if ours:
+            get.setType(vehicle, name)
+        else:
+            set_type(vehicle, name)
+            get.setSpeedFactor(
+                vehicle, libsumo.vehicletype.getSpeedFactor(own)
+            )  # its mean, not a draw about it
 
     def _is_av(self, vehicle: str, seed: int) -> bool:
         rule = self._scenario.fleet

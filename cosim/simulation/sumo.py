@@ -20,14 +20,15 @@ from cosim.scenario.disabled_outputs import disable_outputs
 from cosim.scenario.sumo_outputs import sumo_options
 from cosim.scenario.sumocfg import time_of
 from cosim.simulation.assistance import Assistance
-from cosim.simulation.collisions import CollisionDetector
+from cosim.simulation.collisions import CollisionDetector, Wrecks
 from cosim.simulation.commands import Commander
 from cosim.simulation.convert import Body, SnapshotReader, read_road, struggling_lanes
 from cosim.simulation.drivers import Drivers
+from cosim.simulation.entries import EntryWatcher
 from cosim.simulation.fleet import Fleet
 from cosim.simulation.stderr import SumoStderr
 from cosim.simulation.xerces import keep_initialized
-from cosim.types import Command, Events, Kind, Preset, Receipt, Snapshot
+from cosim.types import Command, Events, Kind, OnCollision, Preset, Receipt, Snapshot
 
 SUMO_ERRORS = (libsumo.TraCIException, libsumo.FatalTraCIError)
 
@@ -93,6 +94,7 @@ class SumoSimulator:
             self.close()
             raise
         self._reader = SnapshotReader(self.road)
+        self._entries = EntryWatcher(self.road, scenario.timing.step)
 
     def reset(self, seed: int) -> tuple[Snapshot, ...]:
         """Load the episode `seed` anew, drive the warm-up; the last `history` frames, newest last."""
@@ -105,9 +107,14 @@ class SumoSimulator:
         self._bodies: dict[str, Body] = {}
         self._routes: dict[str, tuple[str, ...]] = {}
         self._detector = CollisionDetector()
+        goes_on = self._scenario.on_collision == OnCollision.CONTINUE
+        self._wrecks = Wrecks(self._commander, self._drivers) if goes_on else None
+        self._removed: list[str] = []  # wrecks since the last frame
         self._reader.bodies_changed()
+        self._entries.reset()
         self._mission_found = not self._scenario.mission.guessed
         self._inserted = 0
+        self._stopped: set[str] = set()  # at a stop of their plan
         self._waited: set[str] = set()  # only where SUMO gives up: seen waiting, not inserted since
         self._happened: list[tuple[Any, ...]] = []  # per step since the last frame: the fields of Events
         steps = round(self._scenario.warmup / self._scenario.timing.step)
@@ -244,32 +251,44 @@ class SumoSimulator:
             self._commander.drop(name)
             self._routes.pop(name, None)
         now = simulation.getTime()
+        self._detector.inserted((*departed, *simulation.getEndingTeleportIDList()), now)
+        collisions = self._detector.from_sumo(self._bodies, self._commander.lane_changes, now)
+        if self._wrecks is not None:
+            self._wrecks.add(collisions)
+            self._removed += self._wrecks.remove(now)
         self._happened.append(
             (
-                self._detector.from_sumo(self._bodies, self._commander.lane_changes, now),
+                collisions,
                 departed,
                 arrived,
                 simulation.getStartingTeleportIDList(),
                 simulation.getEmergencyStoppingVehiclesIDList(),
-                (),
+                self._entries.step(now, [i for i in departed if self._bodies[i].kind == Kind.AV]),
                 self._commander.observe(now),
             )
         )
+        self._stopped.update(simulation.getStopStartingVehiclesIDList())
+        self._stopped.difference_update(simulation.getStopEndingVehiclesIDList())
         if self._gives_up:
             self._waited.update(simulation.getPendingVehicles())
         self._drivers.step(now)
 
     def _snapshot(self) -> Snapshot:
-        events = Events(*(tuple(chain.from_iterable(field)) for field in zip(*self._happened, strict=True)))
+        happened = (tuple(chain.from_iterable(field)) for field in zip(*self._happened, strict=True))
+        events = Events(*happened, stopped=tuple(sorted(self._stopped)))
         self._happened.clear()
         snapshot = self._reader.read(self._bodies, events)
         if not self._mission_found:
             snapshot = self._find_mission(snapshot)
         self._detector.lane_changes(snapshot, self.road, self._commander)
         extra = self._detector.from_boxes(snapshot, self.road, self._bodies, self._commander.lane_changes)
-        if extra:
-            events = replace(events, collisions=(*events.collisions, *extra))
+        if self._wrecks is not None:
+            self._wrecks.add(extra)
+        if extra or self._removed:
+            collisions = (*snapshot.events.collisions, *extra)
+            events = replace(snapshot.events, collisions=collisions, wrecks_removed=tuple(self._removed))
             snapshot = replace(snapshot, events=events)
+            self._removed = []
         return snapshot
 
     def _goal(self) -> tuple[frozenset[int], frozenset[int]]:

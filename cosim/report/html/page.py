@@ -68,6 +68,7 @@ def html(run: Run, shown: str | None = None) -> str:
         findings=_findings(found, differences),
         shown=FINDINGS,
         figures=tables.figures(found, run.measures) if found else None,
+        law=tables.law(found, run.measures),
         sections=[_section(block, differences[k], k < PLOTTED) for k, block in enumerate(found)],
         plotted=PLOTTED,
         worst=[

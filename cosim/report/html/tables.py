@@ -2,13 +2,14 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from cosim.report import wording
 from cosim.report.compare import PairedFigure
 from cosim.report.figures import HEADLINE, Measure
 from cosim.report.html.blocks import Block, Difference, Series
+from cosim.report.result import LAW
 from cosim.report.statistics import CONFIDENCE, Figure
 from cosim.report.summary import GROUP
 
@@ -30,6 +31,8 @@ TITLES = {
     "min_ttc_s": "min TTC",
     "hard_brakings_av": "hard brakings of AVs",
     "veto_rate": "vetoes",
+    **LAW,
+    "av_trips_completed": "AV trips completed",
 }
 
 
@@ -54,8 +57,7 @@ class Table:
 
 def figures(blocks: Sequence[Block], known: dict[str, Measure]) -> Table:
     """One row per cell of the run with its headline figures."""
-    series = [s for block in blocks for s in block.series]
-    varying = [n for n in GROUP if len({s.identity[n] for s in series}) > 1]
+    series, varying = _series(blocks)
     names = [n for n in HEADLINE if n in known]
     rows = [
         [_named(s, varying), _episodes(s), *(_figure(s.counts(n), known[n]) for n in names)] for s in series
@@ -67,6 +69,24 @@ def figures(blocks: Sequence[Block], known: dict[str, Measure]) -> Table:
         if series and n != "policy" and n not in varying and series[0].identity[n] is not None
     ]
     return Table(heads, rows, common)
+
+
+def law(blocks: Sequence[Block], known: dict[str, Measure]) -> Table | None:
+    """One row per cell with what its AVs did against the law, red where it is not 0; None where no row says."""
+    series, varying = _series(blocks)
+    names = [n for n in LAW if any(s.counts(n).get("n") for s in series)]
+    if not names:
+        return None
+    more = [n for n in ("interventions", "av_trips_completed") if n in known]
+    rows = [
+        [
+            _named(s, varying),
+            *(_against(_figure(s.counts(n), known[n]), s.counts(n)) for n in names),
+            *(_figure(s.counts(n), known[n]) for n in more),
+        ]
+        for s in series
+    ]
+    return Table(["policy", *(head(known[n]) for n in (*names, *more))], rows, [])
 
 
 def differences(found: Sequence[Difference]) -> Table | None:
@@ -118,6 +138,16 @@ def tone(figure: PairedFigure) -> str:
 
 
 # ---- inside ----
+
+
+def _series(blocks: Sequence[Block]) -> tuple[list[Series], list[str]]:
+    """All of them, and what of `GROUP` tells them apart."""
+    series = [s for block in blocks for s in block.series]
+    return series, [n for n in GROUP if len({s.identity[n] for s in series}) > 1]
+
+
+def _against(cell: Cell, counts: dict[str, Any]) -> Cell:
+    return replace(cell, tone="bad") if counts.get("value") else cell
 
 
 def _named(series: Series, varying: Sequence[str]) -> Cell:

@@ -1,0 +1,309 @@
+"""How well AVs keep the law in the worlds of tests/worlds, counted by figures and from SUMO's outputs.
+
+    python -m benchmarks.law [--worlds arterial ...] [--arms vfn-p ...] [--seeds 3] [--preset lawful] [--show]
+    python -m benchmarks.law --page --seeds 20
+
+The first prints, on seeds from 100,000; the second writes docs/results/law.md, on seeds from 200,000. `idm`
+is always driven beside the arms: what is asked of them is measured by it. The independent checker is
+tests/law/checker.py. With --runs DIR what was driven before is not driven again; the same command goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from benchmarks.tables import markdown_row, write_page
+from cosim.batch.episode_runner import EpisodeRunner
+from cosim.report import statistics
+from cosim.scenario import Scenario
+from cosim.scenario.episode_id import EpisodeId
+from cosim.scenario.vet import vetted
+from cosim.types import Preset
+from cosim.workers import tasks
+from cosim.workers.engines import LocalEngine
+from cosim.workers.progress import Progress
+from cosim.workers.tasks import Task
+from tests.law import checker
+from tests.worlds.build import NAMES, build
+
+TRYING, PAGE = 100_000, 200_000  # first seeds
+IDM = "idm"
+ARMS = ("vfn-p", "random")
+FREE = ("random",)  # arms of which neither distance nor trips nor brakings are asked
+SHARES = (0.2, 1.0)  # of AVs
+FIGURES = (  # of the rows, beside what the checker counts
+    *("red_light_violations", "stop_sign_violations", "right_of_way_violations", "speeding_share"),
+    *("worst_speeding_mps", "junctions_blocked", "avs_stuck", "av_trips_completed", "person_conflicts"),
+    *("interventions", "av_involved_collisions", "av_caused_collisions", "hard_brakings_av", "dt_mean_m"),
+)
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Case(EpisodeId):
+    """An episode whose floating-car data hold every simulation step."""
+
+    def scenario(self, options: Sequence[str] = ()) -> Scenario:
+        """The scenario with the options that the checker needs."""
+        words = [word for name, value in checker.OPTIONS.items() for word in (f"--{name}", value)]
+        return super().scenario((*words, *options))
+
+
+class Checked(EpisodeRunner):
+    """Hosted by the engine: drives, and has SUMO's outputs checked where they were written."""
+
+    def run(  # type: ignore[override]
+        self, case: Case, warnings: tuple[str, ...], keep: str | None, progress: tasks.Progress
+    ) -> Row:
+        """`law`: what the checker counted, `figures`: the document's; outputs stay in `keep`, if given."""
+        host = self.open(case, warnings)
+        with tempfile.TemporaryDirectory(prefix="cosim-law-") as scratch:
+            folder = Path(scratch) if keep is None else Path(keep) / case.key
+            document = host.run(case.seed, progress, outputs=checker.OUTPUTS, folder=folder).document()
+            law = checker.check(host.episode.scenario.net, folder)
+        return {
+            "world": host.episode.scenario.name,
+            "arm": case.policy,
+            "penetration": case.penetration,
+            "seed": case.seed,
+            "law": asdict(law),
+            "figures": {name: document.get(name) for name in FIGURES},
+            "ended": document["steps"] * host.episode.scenario.timing.decision,
+            "seconds": sum(document["timings"].values()) if document["timings"] else None,
+        }
+
+
+def cases(
+    worlds: Mapping[str, Path], arms: Sequence[str], shares: Sequence[float], seeds: range, preset: str
+) -> list[Case]:
+    """Every episode, `idm` first."""
+    return [
+        Case(str(worlds[world]), arm, seed, penetration=share, preset=preset)
+        for world, share, arm, seed in itertools.product(worlds, shares, dict.fromkeys((IDM, *arms)), seeds)
+    ]
+
+
+def driven(todo: Sequence[Case], workers: int, runs: Path | None, keep: Path | None) -> list[Row]:
+    """The rows of all cases; those that `runs` holds are not driven again."""
+    names = {case.key: f"{Path(case.what).stem}-{case.key}" for case in todo}  # the net's place may differ
+    held: dict[str, Row] = {}
+    if runs is not None and runs.is_file():
+        held = {row["key"]: row for row in map(json.loads, runs.read_text().splitlines())}
+    warned = {(c.what, c.penetration): vetted(c.scenario()).warnings for c in todo}
+    work = [
+        Task(case.key, case.cell, (case, warned[case.what, case.penetration], keep and str(keep)))
+        for case in todo
+        if names[case.key] not in held
+    ]
+    with (
+        Progress("law", "episodes") as progress,
+        closing(LocalEngine(Checked, workers=workers).run(work)) as all_,
+    ):
+        for number, outcome in enumerate(all_, 1):
+            progress(number, len(work))
+            if not outcome.ok:
+                case = next(case for case in todo if case.key == outcome.key)
+                where = f"{Path(case.what).stem}, {case.policy}, {case.penetration:.0%}, seed {case.seed}"
+                raise SystemExit(f"error: {where}: {outcome.error}\n{outcome.stderr or ''}")
+            row = outcome.value | {"key": names[outcome.key]}
+            held[row["key"]] = row
+            if runs is not None:
+                runs.parent.mkdir(parents=True, exist_ok=True)
+                with runs.open("a") as file:
+                    file.write(json.dumps(row) + "\n")
+    return [held[names[case.key]] for case in todo]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What one arm did in one world at one share of AVs."""
+
+    rows: list[Row]
+
+    def total(self, name: str) -> float:
+        """Over all episodes, as the checker counted."""
+        return float(sum(row["law"][name] for row in self.rows))
+
+    def figure(self, name: str) -> float | None:
+        """Over all episodes, as the rows say."""
+        known = [row["figures"][name] for row in self.rows if row["figures"].get(name) is not None]
+        return float(sum(known)) if known else None
+
+    def rate(self, name: str) -> str:
+        """Events an episode with the interval; bare where there were none."""
+        count = int(self.total(name))
+        return "0" if not count else f"{count}: {statistics.rate(count, len(self.rows)).text(2)}"
+
+
+# Column -> text of a cell, and whether what must hold does, beside idm's cell (None: nothing is asked).
+def _columns(cell: Cell, idm: Cell, free: bool) -> dict[str, tuple[str, bool | None]]:
+    episodes = len(cell.rows)
+    worst = max(row["law"]["worst_speeding_mps"] for row in cell.rows)
+    over = int(cell.total("speeding_steps"))
+    caused = int(cell.figure("av_caused_collisions") or 0)
+    trips, wanted = cell.total("av_trips_completed"), idm.total("av_trips_completed")
+    distance, other = cell.total("distance_mean_m") / episodes, idm.total("distance_mean_m") / episodes
+    hard, allowed = cell.total("hard_brakings_av"), idm.total("hard_brakings_av")
+    asked = None if free else True
+    return {
+        "red": (cell.rate("red_light_violations"), not cell.total("red_light_violations")),
+        "stop": (cell.rate("stop_sign_violations"), not cell.total("stop_sign_violations")),
+        "right of way": (
+            cell.rate("right_of_way_violations"),
+            cell.total("right_of_way_violations") <= idm.total("right_of_way_violations"),
+        ),
+        "steps too fast (worst)": (f"{over} ({worst:+.1f} m/s)", not over),
+        "AV collisions (caused)": (f"{int(cell.total('av_involved_collisions'))} ({caused})", not caused),
+        "stuck": (cell.rate("avs_stuck"), not cell.total("avs_stuck")),
+        "AV trips": (f"{trips:.0f} of {wanted:.0f}", asked and trips >= 0.95 * wanted),
+        "distance of all": (f"{distance:.0f} of {other:.0f} m", asked and distance >= 0.95 * other),
+        "hard brakings (figure)": (
+            f"{hard:.0f} to {allowed:.0f} ({_plain(cell.figure('hard_brakings_av'))})",
+            asked and hard <= max(2.0 * allowed, 0.5 * episodes),
+        ),
+        "interventions": (_plain(cell.figure("interventions")), None),
+        "blocked": (_plain(cell.figure("junctions_blocked")), None),
+        "persons": (_plain(cell.figure("person_conflicts")), None),
+        "figures agree": _agreement(cell),
+    }
+
+
+COUNTED_TWICE = (
+    *("red_light_violations", "stop_sign_violations", "right_of_way_violations"),
+    *("avs_stuck", "av_trips_completed", "av_involved_collisions"),
+)
+
+
+def differences(row: Row) -> dict[str, tuple[float, float]]:
+    """Figure -> (the checker's count, the row's), where they differ."""
+    law, figures = row["law"], row["figures"]
+    return {
+        name: (law[name], figures[name])
+        for name in COUNTED_TWICE
+        if figures.get(name) is not None and law[name] != figures[name]
+    }
+
+
+def _agreement(cell: Cell) -> tuple[str, bool | None]:
+    names = sorted({name for row in cell.rows for name in differences(row)})
+    if all(cell.figure(name) is None for name in COUNTED_TWICE[:1]):
+        return "-", None
+    return ("no: " + ", ".join(names) if names else "yes"), None
+
+
+def table(world: str, cells: Mapping[tuple[float, str], Cell]) -> list[str]:
+    """One world: a line an arm and share; what must hold and does not is bold."""
+    lines: list[str] = []
+    for (share, arm), cell in cells.items():
+        columns = _columns(cell, cells[share, IDM], arm in FREE)
+        if not lines:
+            lines = [f"## {world}", "", markdown_row(["AVs", "arm", *columns, "targets"])]
+            lines.append("|---" * (len(columns) + 3) + "|")
+        missed = [name for name, (_, holds) in columns.items() if holds is False]
+        verdict = "-" if arm == IDM else f"missed: {', '.join(missed)}" if missed else "met"
+        shown = [f"**{text}**" if holds is False and arm != IDM else text for text, holds in columns.values()]
+        lines.append(markdown_row([f"{share:.0%}", arm, *shown, verdict]))
+    return [*lines, ""]
+
+
+def tables(rows: Sequence[Row]) -> list[str]:
+    """Every world's."""
+    lines: list[str] = []
+    for world in dict.fromkeys(row["world"] for row in rows):
+        cells: dict[tuple[float, str], list[Row]] = {}
+        for row in rows:
+            if row["world"] == world:
+                cells.setdefault((row["penetration"], row["arm"]), []).append(row)
+        lines += table(world, {key: Cell(found) for key, found in cells.items()})
+    return lines
+
+
+def shown(rows: Sequence[Row]) -> list[str]:
+    """Each violation of each episode, and what figures and checker count differently."""
+    lines = []
+    for row in rows:
+        where = f"{row['world']} {row['arm']} {row['penetration']:.0%} {row['seed']}"
+        lines += [
+            f"{where}: {v['time']:g} s {v['kind']} {v['vehicle']} {v['link']} {v['what']}"
+            for v in row["law"]["violations"]
+        ]
+        for name, (counted, said) in differences(row).items():
+            lines.append(f"{where}: {name}: the checker counts {counted:g}, the figure says {said:g}")
+    return lines
+
+
+def page(rows: Sequence[Row], preset: str, seeds: range, command: str) -> list[str]:
+    """docs/results/law.md"""
+    return [
+        "# The law of the road",
+        "",
+        f"Made by `{command}`: the worlds of tests/worlds, which netconvert and netgenerate build, preset",
+        f"`{preset}`, {len(seeds)} seeds from {seeds.start:,}, the same for every arm. Counted from SUMO's",
+        "outputs by tests/law/checker.py, which shares no code with what drives; collisions caused,",
+        "interventions, junctions blocked and conflicts with persons are the rows' own figures",
+        "(docs/definitions.md). Events: how many, and how many an episode with the exact Poisson 95 %",
+        "interval. What is asked: no red light, no stop sign and no other vehicle's right of way taken (of",
+        "the last at most as many as `idm` beside it), no step of 0.1 s above the limit by more than 1 m/s,",
+        "no collision that an AV caused, nobody stuck; trips of AVs and distance of all at least 95 % of",
+        "`idm`'s, hard brakings of AVs at most twice `idm`'s or one in two episodes (these three not of",
+        "`random`). Missed targets are bold.",
+        "",
+        *tables(rows),
+    ]
+
+
+def _plain(value: float | None) -> str:
+    return "-" if value is None else f"{value:.0f}"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.law",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("--worlds", nargs="+", choices=NAMES, default=list(NAMES), metavar="NAME", help=", ".join(NAMES))
+    add("--arms", nargs="+", default=list(ARMS), metavar="POLICY", help=f"beside idm; {' '.join(ARMS)}")
+    add("--penetration", nargs="+", type=float, default=list(SHARES), metavar="X", help="share of AVs")
+    add("--seeds", type=int, default=3, metavar="N", help="how many")
+    add("--first", type=int, metavar="SEED", help=f"default {TRYING}; of the page {PAGE}")
+    add("--preset", choices=Preset.ALL, default=Preset.LAWFUL)
+    add("--workers", type=int, default=2, metavar="N")
+    add("--runs", type=Path, metavar="DIR", help="keep the rows there, and go on from them")
+    add("--keep", type=Path, metavar="DIR", help="keep SUMO's outputs there")
+    add("--show", action="store_true", help="list every violation")
+    add("--page", action="store_true", help="write the page")
+    add("--out", type=Path, default=Path("docs/results/law.md"), metavar="FILE.md")
+    args = parser.parse_args(arguments)
+    first = args.first or (PAGE if args.page else TRYING)
+    seeds = range(first, first + args.seeds)
+    place = args.runs or Path(tempfile.mkdtemp(prefix="cosim-law-"))
+    began = time.perf_counter()
+    worlds = build(place / "worlds", args.worlds)
+    todo = cases(worlds, args.arms, args.penetration, seeds, args.preset)
+    rows = driven(todo, args.workers, args.runs and args.runs / "episodes.jsonl", args.keep)
+    if args.show:
+        print("\n".join(shown(rows)))
+    if args.page:
+        said = f"python -m benchmarks.law --page --seeds {args.seeds}"
+        said += "" if args.preset == Preset.LAWFUL else f" --preset {args.preset}"
+        write_page(args.out, page(rows, args.preset, seeds, said))
+        print(args.out)
+    else:
+        print("\n".join(tables(rows)))
+        print(f"{len(rows)} episodes, {time.perf_counter() - began:.0f} s")
+
+
+if __name__ == "__main__":
+    main()

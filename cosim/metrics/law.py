@@ -1,0 +1,152 @@
+"""The law at stop lines: red lights, stop signs, the right of way (definitions.md, The law)."""
+
+from functools import cache
+
+from cosim.metrics.context import AV, MetricContext
+from cosim.road import Link, RoadMap, Rule
+from cosim.types import Entry, Metric, Snapshot
+
+COMFORTABLE = 3.0  # m/s2: who could stop at yellow with this must
+STOPPED = 0.5  # m/s, at most, within the last 10 m before a stop sign
+HARD = 3.0  # m/s2, the braking that nobody with the right of way is to be made to do
+LEADER = 30.0  # m: a vehicle that near ahead is what one brakes for
+SIGNS = (Rule.STOP, Rule.ALL_WAY_STOP)
+BY_TURNS = (Rule.EQUAL, Rule.ALL_WAY_STOP, Rule.ZIPPER)  # all wait for one another: only collisions count
+GOES = frozenset(map(ord, "GgoO"))  # states of a signal that lets go, or is off
+
+
+def ran_red(entry: Entry) -> bool:
+    """Whether it entered on red, or on yellow although it could have stopped comfortably."""
+    if entry.state in ("y", "Y"):
+        return entry.yellow_speed**2 / (2.0 * COMFORTABLE) <= entry.yellow_distance
+    return entry.state in ("r", "u")
+
+
+def ran_stop(entry: Entry, link: Link) -> bool:
+    """Whether it did not stop where a sign, or a signal's arrow, asks for a stop."""
+    asked = entry.state == "s" or (link.signal < 0 and link.rule in SIGNS)
+    return asked and entry.least_speed > STOPPED
+
+
+class AvCounts:
+    """Counts of what AVs do: NA while no AV has been seen."""
+
+    def reset(self, first: Snapshot, context: MetricContext) -> None:
+        self._avs = bool((first.kind == AV).any())
+
+    def add(self, snapshot: Snapshot) -> None:
+        self._avs = self._avs or bool((snapshot.kind == AV).any())
+
+    def count(self, value: float, unit: str, better: str = "lower") -> Metric:
+        return Metric(value if self._avs else None, unit, better)
+
+
+class StopLines(AvCounts):
+    """Entries of AVs that broke the law; those against the right of way are followed until the AV has left."""
+
+    def reset(self, first: Snapshot, context: MetricContext) -> None:
+        super().reset(first, context)
+        self._ways = Ways(context.road)
+        self._links = context.road.links
+        self._before, self._last = first, first
+        self._open: list[Entry] = []
+        self._red = self._stop = self._way = 0
+
+    def add(self, snapshot: Snapshot) -> None:
+        super().add(snapshot)
+        if self._open:
+            self._open = [entry for entry in self._open if self._goes_on(entry, snapshot)]
+        self._before, self._last = self._last, snapshot
+        for entry in snapshot.events.entries:
+            self._red += ran_red(entry)
+            self._stop += ran_stop(entry, self._links[entry.link])
+            if entry.foes and self._undecided(entry, snapshot):
+                self._open.append(entry)
+
+    def result(self) -> dict[str, Metric]:
+        return {
+            "red_light_violations": self.count(self._red, "entries"),
+            "stop_sign_violations": self.count(self._stop, "entries"),
+            "right_of_way_violations": self.count(self._way, "entries"),
+        }
+
+    def _goes_on(self, entry: Entry, now: Snapshot) -> bool:
+        """Whether the entry is still to be followed; counts it when a foe has begun to brake hard for it."""
+        if self._links[entry.link].rule not in BY_TURNS and any(
+            self._made_to_brake(foe, link, entry.vehicle, now) for foe, link in entry.foes
+        ):
+            self._way += 1
+            return False
+        return self._undecided(entry, now)
+
+    def _undecided(self, entry: Entry, now: Snapshot) -> bool:
+        """Whether the AV is still in the junction and has touched nobody; counts it when it has."""
+        foes = {foe for foe, _ in entry.foes}
+        for c in now.events.collisions:
+            pair = {c.collider, c.victim}
+            if c.time >= entry.time and entry.vehicle in pair and pair & foes:
+                self._way += 1
+                return False
+        row = now.row.get(entry.vehicle)
+        return row is not None and not self._ways.left(entry.link, now, row)
+
+    def _made_to_brake(self, foe: str, link: int, av: str, now: Snapshot) -> bool:
+        rows = [frame.row.get(foe) for frame in (self._before, self._last, now)]
+        if rows[1] is None or rows[2] is None or _braking(self._last, rows[1], now, rows[2]) <= HARD:
+            return False
+        if rows[0] is not None and _braking(self._before, rows[0], self._last, rows[1]) > HARD:
+            return False  # it braked so hard already
+        return not self._ways.excused(link, now, rows[2], now.row.get(av, -1))
+
+
+def _braking(earlier: Snapshot, row: int, later: Snapshot, then: int) -> float:
+    """Mean deceleration between two frames, m/s2."""
+    elapsed = later.time - earlier.time
+    return float(earlier.speed[row] - later.speed[then]) / elapsed if elapsed > 0.0 else 0.0
+
+
+class Ways:
+    """Where vehicles are on the way of a link: before its line, on its internal lanes, beyond it."""
+
+    def __init__(self, road: RoadMap) -> None:
+        self._road = road
+        self._inside = cache(self._internal)
+
+    def left(self, link: int, now: Snapshot, row: int) -> bool:
+        """Whether a vehicle that entered by the link is out of the junction, its rear bumper too."""
+        lane, lanes = int(now.lane[row]), self._road.lanes
+        if lane < 0 or lanes[lane].internal:
+            return lane not in self._inside(link)
+        beyond = lanes[lane].edge != lanes[self._road.links[link].target].edge
+        return beyond or bool(now.lane_position[row] >= now.length[row])
+
+    def excused(self, link: int, now: Snapshot, row: int, av: int) -> bool:
+        """Whether a vehicle on the way of `link` has another reason to brake than the one in row `av`."""
+        lane, inside = int(now.lane[row]), self._inside(link)
+        if lane in inside:
+            ahead = inside[inside.index(lane) :]
+        elif self._road.lanes[lane].edge == self._road.lanes[self._road.links[link].target].edge:
+            return True  # it is past the junction
+        else:
+            signal = self._road.links[link].signal
+            if 0 <= signal < len(now.signals) and int(now.signals[signal]) not in GOES:
+                return True
+            ahead = (lane, *inside) if lane == self._road.links[link].origin else (lane,)
+        start = -float(now.lane_position[row])  # m from its front bumper to the start of the lane
+        for k in ahead:
+            for other in (now.lane == k).nonzero()[0].tolist():
+                gap = start + float(now.lane_position[other] - now.length[other])
+                in_front = start + now.lane_position[other] > 0.0
+                if other not in (row, av) and in_front and gap <= LEADER:
+                    return True
+            start += self._road.lanes[k].length
+        return False
+
+    def _internal(self, link: int) -> tuple[int, ...]:
+        """The internal lanes of a link, in driving order."""
+        found: list[int] = []
+        lane, lanes = self._road.links[link].via, self._road.lanes
+        while lane >= 0 and lanes[lane].internal and lane not in found:
+            found.append(lane)
+            lane = next(iter(lanes[lane].successors), -1)
+        return tuple(found)

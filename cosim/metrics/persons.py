@@ -1,0 +1,64 @@
+"""Conflicts of AVs with persons: pairs that touched, nearly touched, or crossed shortly after one another."""
+
+from collections import deque
+
+import numpy as np
+
+from cosim.geometry import EVERYWHERE, Boxes, boxes, time_to_collision
+from cosim.geometry.kernels import encroachment
+from cosim.metrics.context import AV, MetricContext
+from cosim.metrics.law import AvCounts
+from cosim.types import Kind, Metric, Snapshot
+
+CRITICAL = 1.5  # s, time to collision
+ENCROACHED = 1.0  # s, post-encroachment time
+SPEEDS = 2.0  # the present ones, times this, bound those of the last second
+PERSON = int(Kind.PERSON)
+
+
+class PersonConflicts(AvCounts):
+    """Distinct pairs of an AV and a person (definitions.md, Figures)."""
+
+    def reset(self, first: Snapshot, context: MetricContext) -> None:
+        super().reset(first, context)
+        self._interval = context.timing.frame  # s
+        self._frames: deque[Snapshot] = deque(maxlen=int(np.ceil(ENCROACHED / self._interval)) + 2)
+        self._pairs: set[tuple[str, str]] = set()
+        self.add(first)
+
+    def add(self, snapshot: Snapshot) -> None:
+        super().add(snapshot)
+        s = snapshot
+        self._frames.append(s)
+        persons = np.flatnonzero(s.kind == PERSON)
+        avs = np.flatnonzero(s.kind == AV) if len(persons) else persons
+        if not len(avs):
+            return
+        mine, theirs = boxes(s, avs), boxes(s, persons)
+        columns = Boxes(*(np.asarray(v)[:, None] for v in mine))
+        critical = time_to_collision(columns, theirs, np.inf) < CRITICAL  # [a,p], touching is 0
+        # nobody further apart than this can have been where the other was in the time looked back at
+        away = np.hypot(s.x[avs, None] - s.x[persons], s.y[avs, None] - s.y[persons])
+        sizes = s.length[avs, None] + s.length[persons]
+        near = away < sizes + SPEEDS * (s.speed[avs, None] + s.speed[persons] + 1.0) * ENCROACHED
+        for i, j in np.argwhere(critical | near).tolist():
+            pair = s.ids[avs[i]], s.ids[persons[j]]
+            if pair not in self._pairs and (critical[i, j] or self._encroached(pair) < ENCROACHED):
+                self._pairs.add(pair)
+
+    def result(self) -> dict[str, Metric]:
+        return {"person_conflicts": self.count(len(self._pairs), "pairs")}
+
+    def _encroached(self, pair: tuple[str, str]) -> float:
+        """The pair's post-encroachment time that ends at the newest frame, s; inf for none."""
+        trail = np.full((len(self._frames), 2, 6), np.nan)
+        sizes = np.zeros((2, 2))
+        for k, frame in enumerate(self._frames):
+            for n, name in enumerate(pair):
+                if (row := frame.row.get(name)) is not None:
+                    heading = frame.heading[row]
+                    course = np.cos(heading), np.sin(heading), frame.speed[row], 0.0
+                    trail[k, n] = frame.x[row], frame.y[row], *course
+                    sizes[n] = frame.length[row], frame.width[row]
+        both = np.ones(2, np.bool_)
+        return float(encroachment(trail, len(trail) - 1, 2, sizes, both, self._interval, EVERYWHERE))

@@ -1,0 +1,92 @@
+"""Standing AVs: junctions that they block, and AVs that stand for long without a reason."""
+
+import numpy as np
+
+from cosim.geometry import gap_ahead
+from cosim.metrics.context import AV, MetricContext
+from cosim.metrics.law import AvCounts
+from cosim.types import Metric, Snapshot
+
+STANDING = 0.1  # m/s, SUMO's own threshold of a halting vehicle
+BLOCKS = 5.0  # s inside a junction
+STUCK = 60.0  # s
+QUEUE = 10.0  # m, gap to the vehicle ahead in a queue
+BRAKES = -0.1  # m/s2
+WAIT = frozenset(map(ord, "ruyY"))  # states of a signal that asks to wait
+
+
+class Standing(AvCounts):
+    """definitions.md, The law: `junctions_blocked` and `avs_stuck`."""
+
+    def reset(self, first: Snapshot, context: MetricContext) -> None:
+        super().reset(first, context)
+        self._road = context.road
+        self._signals: dict[int, tuple[int, ...]] = {}  # lane -> the signals of its links
+        for link in context.road.links:
+            if link.signal >= 0:
+                self._signals[link.origin] = (*self._signals.get(link.origin, ()), link.signal)
+        self._waiting: dict[str, float] = {}  # AV -> s, since when it stands without a reason
+        self._inside: dict[
+            str, tuple[str, float]
+        ] = {}  # AV -> the junction on which it stands, since when (s)
+        self._stuck: set[str] = set()
+        self._blocked: set[tuple[str, str, float]] = set()
+        self.add(first)
+
+    def add(self, snapshot: Snapshot) -> None:
+        super().add(snapshot)
+        s = snapshot
+        standing = np.flatnonzero((s.kind == AV) & (s.speed < STANDING)).tolist()
+        inside, waiting = self._inside, self._waiting
+        self._inside, self._waiting = {}, {}
+        reasons = self._reasons(s, standing) if standing else frozenset()
+        for row in standing:
+            name = s.ids[row]
+            self._waiting[name] = since = s.time if row in reasons else waiting.get(name, s.time)
+            if s.time - since > STUCK:
+                self._stuck.add(name)
+            if junction := self._blocks(int(s.lane[row])):
+                before = inside.get(name)
+                here = before if before and before[0] == junction else (junction, s.time)
+                self._inside[name] = here
+                if s.time - here[1] > BLOCKS:
+                    self._blocked.add((name, *here))
+
+    def result(self) -> dict[str, Metric]:
+        return {
+            "junctions_blocked": self.count(len(self._blocked), "times"),
+            "avs_stuck": self.count(len(self._stuck), "vehicles"),
+        }
+
+    def _blocks(self, number: int) -> str:
+        """The junction in which a vehicle on this lane stands in others' way, "" for none."""
+        lanes = self._road.lanes
+        if number < 0 or not lanes[number].internal:
+            return ""
+        lane = lanes[number]
+        return "" if any(lanes[k].internal for k in lane.successors) else lane.start
+
+    def _reasons(self, s: Snapshot, standing: list[int]) -> frozenset[int]:
+        """The rows among `standing` that have a reason to stand: they, or the head of their queue."""
+        queued = np.flatnonzero((s.speed < STANDING) | (s.accel < BRAKES))
+        _, leaders = gap_ahead(s, self._road.straight_on, queued, QUEUE)
+        ahead = dict(
+            zip(queued.tolist(), leaders.tolist(), strict=True)
+        )  # row -> row of the next, -1 for none
+        planned = set(s.events.stopped)
+        found: dict[int, bool] = {}
+        for row in standing:
+            queue = []
+            while row in ahead and row not in found:
+                queue.append(row)
+                found[row] = s.ids[row] in planned or self._at_signal(s, int(s.lane[row]))
+                if found[row]:
+                    break
+                row = ahead[row]
+            if found.get(row, False):
+                found.update(dict.fromkeys(queue, True))
+        return frozenset(row for row in standing if found[row])
+
+    def _at_signal(self, s: Snapshot, lane: int) -> bool:
+        """Whether a signal at the end of the lane asks to wait."""
+        return any(k < len(s.signals) and int(s.signals[k]) in WAIT for k in self._signals.get(lane, ()))

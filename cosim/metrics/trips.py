@@ -1,0 +1,42 @@
+"""What became of the AVs: trips driven to their end, and corrections by the car itself."""
+
+from cosim.metrics.context import AV, MetricContext
+from cosim.metrics.law import AvCounts
+from cosim.types import Metric, Snapshot
+
+
+class Trips(AvCounts):
+    """AVs that reached the end of their route without a collision before it (a wreck that is taken away has not)."""
+
+    def reset(self, first: Snapshot, context: MetricContext) -> None:
+        super().reset(first, context)
+        self._known = set(first.avs)
+        self._completed: set[str] = set()
+        self._crashed: set[str] = set()
+
+    def add(self, snapshot: Snapshot) -> None:
+        super().add(snapshot)
+        for collision in snapshot.events.collisions:
+            self._crashed.update((collision.collider, collision.victim))
+        if snapshot.events.arrived:
+            self._completed.update(self._known.intersection(snapshot.events.arrived) - self._crashed)
+        if snapshot.events.departed:
+            self._known.update(snapshot.avs)
+
+    def result(self) -> dict[str, Metric]:
+        return {"av_trips_completed": self.count(len(self._completed), "vehicles", "higher")}
+
+
+class Interventions(AvCounts):
+    """How often the car began to drive otherwise than its agent commanded (`Events.interventions`)."""
+
+    def reset(self, first: Snapshot, context: MetricContext) -> None:
+        super().reset(first, context)
+        self._begun = 0
+
+    def add(self, snapshot: Snapshot) -> None:
+        super().add(snapshot)
+        self._begun += len(snapshot.events.interventions)
+
+    def result(self) -> dict[str, Metric]:
+        return {"interventions": self.count(self._begun, "events")}

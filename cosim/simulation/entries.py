@@ -1,0 +1,310 @@
+"""Watches, in every simulation step, for AVs that pass a stop line: what only a step of 0.1 s can see.
+
+An AV is looked at in every step only where it may be within `NEAR` m of a line that matters (a signal, a stop
+sign, somebody with the right of way); further away the look is put off to the step in which it could at the
+earliest be there. Signals are read when SUMO says that they switch.
+"""
+
+import heapq
+import math
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from functools import cache, cached_property
+from typing import NamedTuple
+
+import libsumo
+
+from cosim.road import RoadMap, Rule
+from cosim.types import Entry
+
+LAST = 10.0  # m before the line over which the least speed is taken (docs/definitions.md, The law)
+FOES_WITHIN = 100.0  # m before its own line, within which a vehicle with the right of way counts
+NEAR = LAST + 2.0  # m
+HARDEST = 4.0  # m/s2: no AV gains speed faster
+LONGEST = 100  # steps until the next look, for whoever SUMO puts elsewhere (teleports)
+HOPS = 8  # lanes that one step may lead across
+EPSILON = 1e-6
+
+_sumo = libsumo._libsumo  # the compiled getters, as in cosim.simulation.convert
+lane_of, position_of, speed_of = (
+    _sumo.vehicle_getLaneID,
+    _sumo.vehicle_getLanePosition,
+    _sumo.vehicle_getSpeed,
+)
+odometer_of, accel_of = _sumo.vehicle_getDistance, _sumo.vehicle_getAcceleration
+
+
+class Passed(NamedTuple):
+    """A stop line passed: its link, and m from the line to the start of the lane the AV is on now."""
+
+    link: int
+    beyond: float
+
+
+@dataclass(slots=True)
+class Watched:
+    """What is known of one AV."""
+
+    looked: int = -2  # the step of the last look
+    lane: int = -1  # then
+    trail: deque[tuple[float, float]] = field(default_factory=deque)  # (odometer m, speed m/s) near a line
+
+
+@dataclass(slots=True)
+class Light:
+    """One traffic light: its state, and what was marked when each of its links turned yellow."""
+
+    state: str
+    yellow: dict[int, tuple[float, dict[str, tuple[float, float]]]] = field(default_factory=dict)
+
+
+class EntryWatcher:
+    """Yields an `Entry` for every AV that passes a stop line; `step` is the simulation step in s."""
+
+    def __init__(self, road: RoadMap, step: float) -> None:
+        self._road = road
+        self._step = step
+        self._matters = [
+            link.signal >= 0 or bool(link.foes) or link.rule in (Rule.STOP, Rule.ALL_WAY_STOP)
+            for link in road.links
+        ]
+        self.needed = any(self._matters)
+        self.reset()
+
+    def reset(self) -> None:
+        """A new episode is loaded."""
+        self._count = 0
+        self._avs: dict[str, Watched] = {}
+        self._due: defaultdict[int, list[str]] = defaultdict(list)  # step -> who is looked at in it
+        self._lights: dict[str, Light] = {}
+        self._switches: list[tuple[float, str]] = []  # (s, light), a heap
+        if self.needed:
+            for light in dict.fromkeys(name for name, _ in self._road.signals):
+                state = libsumo.trafficlight.getRedYellowGreenState(light)
+                self._lights[light] = Light(state)
+                heapq.heappush(self._switches, (-math.inf, light))
+
+    def step(self, now: float, departed: Iterable[str]) -> tuple[Entry, ...]:
+        """After a step that ended at `now` (s); `departed`: AVs inserted in it."""
+        if not self.needed:
+            return ()
+        self._count += 1
+        began = now - self._step
+        if self._switches and self._switches[0][0] <= began + EPSILON:
+            self._switch(began)
+        for name in departed:
+            self._avs[name] = Watched()
+            self._due[self._count].append(name)
+        entries: list[Entry] = []
+        for name in self._due.pop(self._count, ()):
+            try:
+                entries += self._look(name, now)
+            except libsumo.TraCIException:  # it left the road
+                del self._avs[name]
+        return tuple(entries)
+
+    # ---- inside ----
+
+    def _look(self, name: str, now: float) -> list[Entry]:
+        """Look at one AV, and say when next; its entries."""
+        av = self._avs[name]
+        lane = self._road.index.get(lane_of(name), -1)
+        before, at_once = av.lane, av.looked == self._count - 1
+        av.looked, av.lane = self._count, lane
+        if lane < 0:  # teleporting
+            av.trail.clear()
+            self._due[self._count + 1].append(name)
+            return []
+        position, speed = position_of(name), speed_of(name)
+        entries: list[Entry] = []
+        if lane != before and before >= 0 and at_once:
+            for passed in self._passed(before, lane):
+                entries.append(self._entry(name, av, passed, position, speed, now))
+        away = self._road.lanes[lane].length - position + self._free[lane]  # m to the next line
+        steps = 1
+        if away > NEAR:
+            time = (
+                math.sqrt(speed * speed + 2.0 * HARDEST * (away - NEAR)) - speed
+            ) / HARDEST  # s, at the least
+            steps = max(int(min(time / self._step, LONGEST)), 1)
+            av.trail.clear()
+        else:
+            self._remember(av.trail, odometer_of(name), speed)
+        self._due[self._count + steps].append(name)
+        return entries
+
+    @staticmethod
+    def _remember(trail: deque[tuple[float, float]], odometer: float, speed: float) -> None:
+        """Add the newest; forget what is more than 20 m behind; of a crawl keep one sample per 5 cm."""
+        if trail and odometer - trail[-1][0] < 0.05:
+            trail[-1] = trail[-1][0], min(trail[-1][1], speed)
+        else:
+            trail.append((odometer, speed))
+        while trail[0][0] < odometer - 2.0 * LAST:
+            trail.popleft()
+
+    def _entry(
+        self, name: str, av: Watched, passed: Passed, position: float, speed: float, now: float
+    ) -> Entry:
+        link = self._road.links[passed.link]
+        line = odometer_of(name) - passed.beyond - position  # the odometer at the line, m
+        last = [v for at, v in av.trail if line - LAST - EPSILON <= at]
+        state, yellow = "", (-1.0, 0.0, 0.0)
+        if link.signal >= 0:
+            light, index = self._road.signals[link.signal]
+            state = libsumo.trafficlight.getRedYellowGreenState(light)[index]
+            if state in "yY":
+                since, marks = self._lights[light].yellow.get(index, (now - self._step, {}))
+                odometer, then = marks.get(name, (line, math.inf))
+                yellow = since, line - odometer, then
+        foes = () if state == "G" else self._foes(passed.link, name)
+        return Entry(now, name, passed.link, state, speed, min(last, default=speed), *yellow, foes)
+
+    def _switch(self, began: float) -> None:
+        """Read the lights whose next switch was due when the step began (s)."""
+        marks: dict[str, tuple[float, float]] | None = None
+        while self._switches[0][0] <= began + EPSILON:
+            name = heapq.heappop(self._switches)[1]
+            light = self._lights[name]
+            old, light.state = light.state, libsumo.trafficlight.getRedYellowGreenState(name)
+            following = libsumo.trafficlight.getNextSwitch(name)
+            heapq.heappush(self._switches, (max(following, began + self._step), name))
+            if light.state == old:
+                continue
+            for index, (was, now) in enumerate(zip(old, light.state, strict=True)):
+                if now in "yY" and was not in "yY":
+                    marks = self._marks() if marks is None else marks
+                    light.yellow[index] = began, marks
+
+    def _marks(self) -> dict[str, tuple[float, float]]:
+        """Each AV's odometer (m) and speed (m/s) at the beginning of the step that has just been driven."""
+        found = {}
+        for name in self._avs:
+            try:
+                speed = speed_of(name)
+                odometer = odometer_of(name) - speed * self._step
+                found[name] = odometer, speed - accel_of(name) * self._step
+            except libsumo.TraCIException:
+                continue
+        return found
+
+    def _foes(self, entered: int, name: str) -> tuple[tuple[str, int], ...]:
+        """Vehicles with the right of way over a link: on a link's internal lanes, or on the way to it."""
+        found: dict[str, int] = {}
+        for foe in self._road.links[entered].foes:
+            link = self._road.links[foe]
+            if link.signal >= 0:
+                light, index = self._road.signals[link.signal]
+                if libsumo.trafficlight.getRedYellowGreenState(light)[index] in "ru":
+                    continue
+            inside, before = self._ways(foe)
+            for lane in inside:
+                found.update((other, foe) for other in libsumo.lane.getLastStepVehicleIDs(lane))
+            via = inside[0] if inside else self._road.lanes[link.target].id
+            for lane, reach in before:
+                for other in libsumo.lane.getLastStepVehicleIDs(lane):
+                    if position_of(other) >= reach and any(
+                        via in (way[0], way[4]) for way in libsumo.vehicle.getNextLinks(other)
+                    ):
+                        found.setdefault(other, foe)
+        found.pop(name, None)
+        return tuple(found.items())
+
+    # ---- tables of the road ----
+
+    @cached_property
+    def _free(self) -> list[float]:
+        """[l] m from the end of a lane to the next line that matters, on the shortest way; inf without one."""
+        lanes, links = self._road.lanes, self._road.links
+        shortest: dict[str, float] = {}  # edge -> m
+        length: dict[str, float] = {}
+        origins: defaultdict[str, set[str]] = defaultdict(set)  # edge -> the edges that lead to it
+        for lane in lanes:
+            length[lane.edge] = min(length.get(lane.edge, math.inf), lane.length)
+            for successor in lane.successors:
+                origins[lanes[successor].edge].add(lane.edge)
+        heap = [
+            (0.0, lanes[k.origin].edge) for k, matters in zip(links, self._matters, strict=True) if matters
+        ]
+        while heap:
+            free, edge = heapq.heappop(heap)
+            if edge in shortest:
+                continue
+            shortest[edge] = free
+            for origin in origins[edge]:
+                if origin not in shortest:
+                    heapq.heappush(heap, (free + length[edge], origin))
+        return [shortest.get(lane.edge, math.inf) for lane in lanes]
+
+    @cached_property
+    def _origins(self) -> list[list[int]]:
+        """[l] the lanes that lead to a lane."""
+        found: list[list[int]] = [[] for _ in self._road.lanes]
+        for k, lane in enumerate(self._road.lanes):
+            for successor in lane.successors:
+                found[successor].append(k)
+        return found
+
+    @cached_property
+    def _beside(self) -> dict[str, list[int]]:
+        """Edge -> its lanes."""
+        found: dict[str, list[int]] = {}
+        for k, lane in enumerate(self._road.lanes):
+            found.setdefault(lane.edge, []).append(k)
+        return found
+
+    @cached_property
+    def _passed(self) -> Callable[[int, int], tuple[Passed, ...]]:
+        """The stop lines that matter on the way from one lane to another (asked again, it is free)."""
+        return cache(self._lines_between)
+
+    @cached_property
+    def _ways(self) -> Callable[[int], tuple[tuple[str, ...], tuple[tuple[str, float], ...]]]:
+        """The internal lanes of a link; the lanes before it with the position (m) from which on one is
+        within `FOES_WITHIN` of its line (asked again, it is free)."""
+        return cache(self._way)
+
+    def _lines_between(self, first: int, last: int) -> tuple[Passed, ...]:
+        lanes, came = self._road.lanes, {first: first}
+        reached = [first]
+        for _ in range(HOPS):
+            following = []
+            for lane in reached:
+                for successor in (*lanes[lane].successors, *self._beside[lanes[lane].edge]):
+                    if successor not in came:
+                        came[successor] = lane
+                        following.append(successor)
+            reached = following
+            if last in came:
+                break
+        else:
+            return ()
+        found, beyond, lane = [], 0.0, last
+        while lane != first:
+            before = came[lane]
+            link = self._road.link_of.get((before, lane), -1)
+            if link >= 0 and self._matters[link]:
+                found.append(Passed(link, beyond))
+            if lanes[before].edge != lanes[lane].edge:
+                beyond += lanes[before].length
+            lane = before
+        return tuple(reversed(found))
+
+    def _way(self, number: int) -> tuple[tuple[str, ...], tuple[tuple[str, float], ...]]:
+        lanes, link = self._road.lanes, self._road.links[number]
+        inside, lane = [], link.via
+        while lane >= 0 and lanes[lane].internal and len(inside) < HOPS:
+            inside.append(lanes[lane].id)
+            lane = next(iter(lanes[lane].successors), -1)
+        left = {link.origin: FOES_WITHIN}  # lane -> m of it, from its end, that are within reach
+        waiting = [link.origin]
+        while waiting:
+            lane = waiting.pop()
+            for origin in self._origins[lane]:
+                more = left[lane] - lanes[lane].length
+                if more > max(left.get(origin, 0.0), 0.0):
+                    left[origin] = more
+                    waiting.append(origin)
+        before = tuple((lanes[k].id, lanes[k].length - reach) for k, reach in left.items())
+        return tuple(inside), before

@@ -294,6 +294,9 @@ class Command(NamedTuple):
     target_speed: float  # m/s
     lane_offset: int  # -1 right, 0 keep, +1 left
     hold: float  # s
+    limit: float = (
+        math.inf
+    )  # m/s, the most that the law allows, as far as the agent sees it (preset `lawful`)
 
 
 class Receipt(NamedTuple):

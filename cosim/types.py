@@ -213,8 +213,9 @@ class Snapshot:
         keep = np.flatnonzero(self.kind != int(Kind.PERSON))
         if len(keep) == self.n:
             return self
-        columns = {f.name: getattr(self, f.name) for f in fields(self)}
-        rows = {k: v[keep] for k, v in columns.items() if k != "signals" and isinstance(v, np.ndarray)}
+        names = {f.name for f in fields(self)} - {"signals", "switches"}  # which have no row per vehicle
+        columns = {name: getattr(self, name) for name in names}
+        rows: dict[str, Any] = {k: v[keep] for k, v in columns.items() if isinstance(v, np.ndarray)}
         return replace(self, ids=tuple(self.ids[k] for k in keep), **rows)
 
     @property

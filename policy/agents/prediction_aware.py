@@ -82,7 +82,8 @@ class PredictionAware:
             raise BadInput("the observation is not the one this agent needs", field="observation")
         if self._road is not context.road:
             self._road = context.road
-            self._raster = rasterize_road(context.road) if self.config.predicted_maps else None
+            version, predicted = self.observation.road_version, self.config.predicted_maps
+            self._raster = rasterize_road(context.road, version) if predicted else None
         self._context = context
         self._safety = replace(self.config.safety, crossing=context.preset != Preset.LAWFUL)
         self._expected: tuple[tuple[str, ...], Traffic, KinematicForecast] | None = None

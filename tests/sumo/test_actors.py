@@ -82,6 +82,9 @@ class Street:
         road = self._simulator.road
         return road.signals, road.crossings[0].signal
 
+    def edges(self) -> dict[str, int]:
+        return self._simulator.road.contact.edges
+
     def close(self) -> None:
         self._simulator.close()
 
@@ -147,6 +150,10 @@ def test_persons_walk_where_sumo_says(street: Worker) -> None:
         assert a.lane[i] < 0
     row = a.row["person:one"]
     assert (a.length[row], a.width[row]) == (0.215, 0.6)
+    edges = street.call("edges")
+    assert a.place[row] == -2 - edges["ab"], "on the sidewalk of the AVs' road"
+    assert a.place[a.row["one"]] == -2 - edges["ab"], "on its cycle lane"
+    assert a.place[a.row["bus"]] == a.lane[a.row["bus"]]
     waiting = frames[-1]
     assert waiting.speed[waiting.row["person:one"]] == 0.0, "who waits at a red crossing is on the road"
 

@@ -188,6 +188,9 @@ class Snapshot:
     events: Events = NO_EVENTS
     # [n] Actor; where nothing is given all are cars, persons apart
     actor: npt.NDArray[np.int8] = field(default_factory=lambda: np.zeros(0, np.int8))
+    # [n] for what can touch whom (`RoadMap.contact`): the lane; off every lane -2 - the edge's number in
+    # `RoadMap.contact.edges`, -1 where that is not known. Where nothing is given: `lane`
+    place: npt.NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
     # [s] ord() of each state (rRyYgGosu), in the order of RoadMap.signals
     signals: Bytes = field(default_factory=lambda: np.zeros(0, np.uint8))
     # [s] s until the next phase of each signal's light, as it is planned now; empty in recordings
@@ -197,6 +200,8 @@ class Snapshot:
         if len(self.actor) != len(self.kind):
             actor = np.where(self.kind == Kind.PERSON, Actor.PERSON, Actor.CAR).astype(np.int8)
             object.__setattr__(self, "actor", actor)
+        if len(self.place) != len(self.lane):
+            object.__setattr__(self, "place", self.lane)
 
     @cached_property
     def row(self) -> dict[str, int]:

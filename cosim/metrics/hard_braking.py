@@ -12,6 +12,7 @@ class HardBraking:
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._time = first.time
+        first = first.vehicles
         self._speeds = dict(zip(first.ids, first.speed.tolist(), strict=True))  # m/s in the frame before
         self._braking: frozenset[str] = frozenset()
         self._wrecks = set(first.events.wrecked)
@@ -19,7 +20,7 @@ class HardBraking:
         self._kinds = set(first.kind.tolist())  # of all vehicles seen so far
 
     def add(self, snapshot: Snapshot) -> None:
-        s, before = snapshot, self._speeds
+        s, before = snapshot.vehicles, self._speeds
         self._wrecks.update(s.events.wrecked)
         change = THRESHOLD * (s.time - self._time)  # m/s
         self._time = s.time

@@ -7,6 +7,7 @@ import libsumo
 
 from cosim.scenario import Scenario
 from cosim.scenario.behaviors import AS_IS
+from cosim.scenario.vet_rules import NOT_CARS
 from cosim.seeding import uniform
 from cosim.simulation.convert import ACTORS, Body
 from cosim.simulation.drivers import IDM_TYPE, Drivers
@@ -69,7 +70,8 @@ class Fleet:
         if rule.ids is not None:
             return re.fullmatch(rule.ids, vehicle) is not None
         if rule.penetration is not None:
-            return uniform(seed, "av", vehicle) < rule.penetration
+            drawn = uniform(seed, "av", vehicle) < rule.penetration
+            return drawn and libsumo.vehicle.getVehicleClass(vehicle) not in NOT_CARS
         if rule.type is not None:
             name: str = libsumo.vehicle.getTypeID(vehicle)
             return name == rule.type or name.startswith(f"{rule.type}@")

@@ -50,7 +50,7 @@ FORCED = {
 }
 # SUMO's message in the middle of a run, where it loads routes, about a vehicle that cannot depart as written.
 WRONG_DEMAND = re.compile(
-    r"[Ii]nvalid depart|Departure \w+ .*for vehicle|has no valid route|No connection between edge"
+    r"[Ii]nvalid depart|Departure \w+ .*for vehicle|has no valid route|No connection between edge|[Pp]erson '"
 )
 GIVES_UP = "max-depart-delay"  # SUMO drops vehicles that waited so long, without a message
 

@@ -56,10 +56,9 @@ def described(road: RoadMap, pairs: Sequence[tuple[float, int, int]], most: int 
     if not pairs:
         return ""
     named = [f"{road.lanes[a].id} and {road.lanes[b].id} ({d:.2f} m)" for d, a, b in pairs[:most]]
-    more = f" and {len(pairs) - most} more" if len(pairs) > most else ""
+    more = f" and {len(pairs) - most} more pairs" if len(pairs) > most else ""
     return (
-        f"{len(pairs)} pairs of lanes are less than {BROAD:g} m apart, so that vehicles overlap on them "
-        f"without a collision: {', '.join(named)}{more}"
+        f"less than {BROAD:g} m apart, so that vehicles overlap without a collision: {', '.join(named)}{more}"
     )
 
 

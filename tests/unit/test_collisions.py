@@ -262,11 +262,10 @@ def test_lanes_too_close_together_are_found_and_lanes_that_meet_are_not() -> Non
         )
     )
     assert heed_each_other(fork, 1, 2)
-    beside = RoadMap(
-        two_lanes(1.9, 1.9).lanes[:2],
-        links=(Link(0, 0, 0, -1, Rule.PRIORITY), Link(1, 1, 1, -1, Rule.YIELD, (0,))),
-    )
+    alone = tuple(replace(k, successors=()) for k in two_lanes(1.9, 1.9).lanes[:2])
+    links = (Link(0, 0, 0, -1, Rule.PRIORITY), Link(1, 1, 1, -1, Rule.YIELD, (0,)))
+    beside = RoadMap(alone, links=links)
     assert not heed_each_other(beside, 0, 1), "a junction's links say nothing of lanes outside"
-    inside = replace(beside, lanes=tuple(replace(k, internal=True, successors=()) for k in beside.lanes))
+    inside = RoadMap(tuple(replace(k, internal=True) for k in alone), links=links)
     assert heed_each_other(inside, 0, 1), "one has the right of way over the other"
     assert too_close(fork) == []

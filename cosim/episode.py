@@ -27,6 +27,7 @@ from cosim.types import (
     History,
     Metric,
     ObservationConfig,
+    OnCollision,
     Policy,
     PolicyContext,
     Receipt,
@@ -74,8 +75,8 @@ class Episode:
 
     `start` and `advance` return what every AV on the road observes; decisions given to `advance` are
     commanded, AVs without one are driven by SUMO. `terminated` after a collision of an AV or the mission
-    vehicle, `truncated` when the scenario's duration is over (definitions.md, Episode). `metrics` are
-    measured besides those of `cosim.metrics.METRICS`.
+    vehicle unless the scenario goes on, `truncated` when its duration is over (definitions.md, Episode).
+    `metrics` are measured besides those of `cosim.metrics.METRICS`.
     """
 
     def __init__(
@@ -147,9 +148,8 @@ class Episode:
             self._metrics.add(frame)
             self._collisions += frame.events.collisions
             self._interventions.update(i.reason for i in frame.events.interventions)
-            self.terminated |= any(
-                c.collider_is_av or c.victim_is_av or c.involves_mission for c in frame.events.collisions
-            )
+            if self.scenario.on_collision == OnCollision.END:
+                self.terminated |= any(c.crash for c in frame.events.collisions)
         self.truncated = not self.terminated and self.elapsed >= self.scenario.duration - 1e-6
         self._observe(self.frames)
         for hook in self._hooks:

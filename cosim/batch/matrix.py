@@ -85,6 +85,7 @@ def _cells(spec: Spec) -> Iterator[EpisodeId]:
             outputs=spec.output,
             metrics=spec.metric,
             reward=spec.reward,
+            on_collision=spec.on_collision,
         )
 
 

@@ -34,6 +34,7 @@ def planned(
     duration: float | None = None,
     warmup: float | None = None,
     mission: str | None = None,
+    on_collision: str | None = None,
 ) -> Plan:
     """Every combination; what is left out is the scenario's own. Raises BadInput."""
     spec = Spec(
@@ -46,6 +47,7 @@ def planned(
         duration=duration,
         warmup=warmup,
         mission=mission,
+        on_collision=on_collision,
     )
     plan = matrix.plan(dict.fromkeys(matrix.cells(spec)), seeds, check)
     for cell in plan.cells:

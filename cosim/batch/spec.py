@@ -19,7 +19,7 @@ from cosim.files.yaml_input import NonNegative, Positive, check_known, document,
 from cosim.scenario import BEHAVIORS, policy_name
 from cosim.scenario.behaviors import DRIVER_MODELS
 from cosim.seeding import FIRST_TEST_SEED
-from cosim.types import Preset
+from cosim.types import OnCollision, Preset
 
 MAX_SEED = 2**62
 MAX_EPISODES = 1_000_000  # more is a slip of the keyboard: 3 GB of rows
@@ -62,6 +62,7 @@ class Spec:
     mission: str | None = None  # a vehicle's id or a pattern of ids, none, auto; None: the scenario's own
     output: tuple[str, ...] = ()  # SUMO's outputs to keep, by SUMO's names
     metric: tuple[str, ...] = ()  # measured besides, FILE.py:NAME or MODULE:NAME, files absolute
+    on_collision: str | None = None  # of `OnCollision`; None: the scenario's own
     reward: str | None = None  # paid and reported: a name of `cosim.rewards.REWARDS`, or code likewise
 
     @property
@@ -182,6 +183,8 @@ def _checked(spec: Spec, file: object) -> Spec:
     for field, allowed in words:
         for word in filter(None, getattr(spec, field)):
             one_of(word, allowed, field, file)
+    if spec.on_collision is not None:
+        one_of(spec.on_collision, OnCollision.ALL, "on_collision", file)
     labels = [policy_name.label(text) for text in spec.policy]
     if twice := next((name for name in labels if labels.count(name) > 1), None):
         raise BadInput(f"two are called {twice}: label them, LABEL=...", file=file, field="policy")

@@ -34,7 +34,7 @@ def _shared() -> dict[str, dict[str, Any]]:
     """Flag -> its settings. Made on demand: the names of behaviours are read from a file."""
     from cosim.scenario import BEHAVIORS
     from cosim.scenario.behaviors import DRIVER_MODELS
-    from cosim.types import Preset
+    from cosim.types import OnCollision, Preset
 
     return {
         "--scenario": {"metavar": "NAME|FILE", "help": "a world, its folder, or a .sumocfg"},
@@ -51,6 +51,10 @@ def _shared() -> dict[str, dict[str, Any]]:
         "--av-ids": {"metavar": "REGEX", "help": "AVs are the vehicles whose id matches"},
         "--svo": {"type": degrees, "metavar": "DEG", "help": "SVO angle, 0..90 (default 45)"},
         "--preset": {"choices": Preset.ALL, "help": "safety checks on the AVs (default: the scenario's)"},
+        "--on-collision": {
+            "choices": OnCollision.ALL,
+            "help": "of an AV or the mission vehicle (default: worlds end, your own .sumocfg continue)",
+        },
         "--seed": {"type": seed, "metavar": "N"},
         "--seeds": {"metavar": "A:B", "help": "seeds A, A+1, ... B-1"},
         "--duration": {

@@ -44,7 +44,7 @@ def add(commands: arguments.SubCommands) -> None:
     arguments.add(axes, "--output", "--metric", action="append")
     arguments.add(evaluate, "--seeds", help="seeds A, A+1, ... B-1 (default 200000:200001)")
     arguments.add(evaluate, "--av-type", "--av-ids", "--duration", "--warmup", "--mission")
-    arguments.add(evaluate, "--reward")
+    arguments.add(evaluate, "--reward", "--on-collision")
     running = evaluate.add_argument_group("the work")
     arguments.add(running, "--out", "--resume")
     arguments.add(running, "--workers", help="processes (default: all cores)")

@@ -17,7 +17,7 @@ def add(commands: arguments.SubCommands) -> None:
     arguments.add(record, "--demand", "--behavior", "--policy", action="append", default=[])
     arguments.add(record, "--svo", default=45.0)
     arguments.add(record, "--seeds", type=arguments.seeds, required=True)
-    arguments.add(record, "--duration", "--warmup", "--mission", "--resume")
+    arguments.add(record, "--duration", "--warmup", "--mission", "--on-collision", "--resume")
     arguments.add(record, "--out", required=True)
     arguments.add(record, "--workers", default=1, help="processes (1)")
     record.set_defaults(work=work)
@@ -32,7 +32,12 @@ def work(args: argparse.Namespace) -> int:
     from cosim.errors import SimulationError
 
     policies = args.policy or ["idm"]
-    times = {"duration": args.duration, "warmup": args.warmup, "mission": args.mission}
+    times = {
+        "duration": args.duration,
+        "warmup": args.warmup,
+        "mission": args.mission,
+        "on_collision": args.on_collision,
+    }
     wanted = planned(args.scenario, args.demand, args.behavior, policies, args.seeds, args.svo, **times)
     failed = record(Path(args.out), wanted, workers=args.workers, resume=args.resume)
     print(f"{wanted.episodes - len(failed)} episodes in {args.out}")

@@ -43,7 +43,7 @@ def add(commands: arguments.SubCommands) -> None:
     arguments.add(run, "--policy", default="idm")
     arguments.add(run, "--svo", default=45.0)
     arguments.add(run, "--behavior", "--preset", "--duration", "--warmup", "--mission")
-    arguments.add(run, "--reward", "--out")
+    arguments.add(run, "--on-collision", "--reward", "--out")
     arguments.add(run, "--driver-model", default="lc2013", help="of the human drivers (default lc2013)")
     arguments.add(run.add_mutually_exclusive_group(), "--av-type", "--av-ids", "--penetration")
     arguments.add(run, "--seed", default=FIRST_TEST_SEED, help=f"default {FIRST_TEST_SEED}")
@@ -150,7 +150,7 @@ def work(args: argparse.Namespace) -> int:
 def case_of(args: argparse.Namespace) -> EpisodeId:
     """The episode that the flags describe; files by absolute path, so that it can be found again."""
     same = ("behavior", "driver_model", "penetration", "av_type", "av_ids", "duration", "seed")
-    same += ("warmup", "mission")
+    same += ("warmup", "mission", "on_collision")
     what, policy = place(args.what), read(args.policy).text
     return EpisodeId(
         what=what,

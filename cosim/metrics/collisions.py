@@ -1,26 +1,33 @@
-"""Collisions: C% of the papers (`crashed`), pairs that touched, and who was to blame."""
+"""Collisions: C% of the papers (`crashed`), who was in them, and who was to blame."""
 
 from cosim.metrics.context import MetricContext
 from cosim.types import Collision, Metric, Snapshot
 
 
 class Collisions:
-    """Every pair of vehicles counts once an episode; definitions.md, Episode."""
+    """Every pair counts once an episode; definitions.md, Episode."""
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._pairs: dict[frozenset[str], Collision] = {}
+        self._removed = 0
 
     def add(self, snapshot: Snapshot) -> None:
         for collision in snapshot.events.collisions:
             self._pairs.setdefault(frozenset((collision.collider, collision.victim)), collision)
+        self._removed += len(snapshot.events.wrecks_removed)
 
     def result(self) -> dict[str, Metric]:
         seen = self._pairs.values()
+        driven = [c for c in seen if not c.insertion]
+        counts = {
+            "collisions": len(seen),
+            "av_involved_collisions": sum(c.involves_av for c in driven),
+            "av_caused_collisions": sum(c.av_caused for c in driven),
+            "hv_hv_collisions": sum(not c.involves_av for c in driven),
+            "insertion_collisions": len(seen) - len(driven),
+        }
         return {
-            "crashed": Metric(bool(seen), "bool", "lower"),
-            "collisions": Metric(len(seen), "pairs", "lower"),
-            "av_caused_collisions": Metric(sum(c.av_caused for c in seen), "pairs", "lower"),
-            "hv_hv_collisions": Metric(
-                sum(not c.collider_is_av and not c.victim_is_av for c in seen), "pairs", "lower"
-            ),
+            "crashed": Metric(any(c.crash for c in driven), "bool", "lower"),
+            **{name: Metric(count, "pairs", "lower") for name, count in counts.items()},
+            "wrecks_removed": Metric(self._removed, "vehicles", "lower"),
         }

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cosim.episode import Episode, Hook, Step
-from cosim.types import Collision, Decision, Forecast, Ints, Policy, Snapshot
+from cosim.types import Collision, Decision, Entry, Forecast, Intervention, Ints, Policy, Snapshot
 
 DRAWN = 400_000  # vehicle frames of a drawing: about 2 MB of page
 
@@ -65,11 +65,15 @@ class Recorder(Hook):
         self.choices: list[dict[str, Choice]] = []
         self.forecasts: list[Forecast | None] = []
         self.collisions: list[Collision] = [*frames[-1].events.collisions]
+        self.entries: list[Entry] = []
+        self.interventions: list[Intervention] = []
         self._stride, self._driven, self._kept = 1, 0, sum(s.n for s in frames)
 
     def add(self, frame: Snapshot) -> None:
         """One more frame; every second one goes once there are too many, and the forecasts of its time."""
         self.collisions += frame.events.collisions
+        self.entries += frame.events.entries
+        self.interventions += frame.events.interventions
         self._driven += 1
         if self._driven % self._stride:
             return

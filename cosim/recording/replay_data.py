@@ -9,7 +9,7 @@ import numpy as np
 from cosim.recording.recorder import Choice, Recorder
 from cosim.road import RoadMap
 from cosim.scenario.behaviors import AS_IS
-from cosim.types import Actor, Bytes, Collision, Floats, Forecast, Ints, Kind, Simulator
+from cosim.types import Actor, Bytes, Collision, Entry, Floats, Forecast, Intervention, Ints, Kind, Simulator
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,9 @@ class ReplayData:
     forecasts: tuple[Forecast | None, ...]  # [D] what the policy predicted then
     collisions: tuple[Collision, ...]
     goal: frozenset[int] = frozenset()  # lanes on which the mission is fulfilled
-    # [T,s] the states of the signals, see `Snapshot.signals`
-    signals: Bytes = field(default_factory=lambda: np.zeros((0, 0), np.uint8))
+    signals: Bytes = field(default_factory=lambda: np.zeros((0, 0), np.uint8))  # [T,s] as in `Snapshot`
+    entries: tuple[Entry, ...] = ()
+    interventions: tuple[Intervention, ...] = ()
 
 
 def replay_data(recorder: Recorder, simulator: Simulator, facts: Mapping[str, Any]) -> ReplayData:
@@ -70,6 +71,8 @@ def replay_data(recorder: Recorder, simulator: Simulator, facts: Mapping[str, An
         collisions=tuple(recorder.collisions),
         goal=simulator.goal_lanes,
         signals=np.stack([s.signals for s in frames]),
+        entries=tuple(recorder.entries),
+        interventions=tuple(recorder.interventions),
     )
 
 
@@ -88,7 +91,7 @@ def tracks(recorder: Recorder, drivers: Mapping[str, str]) -> list[Track]:
         # single precision: 1 mm in 10 km
         poses = {column: table[column][rows].astype(np.float32).astype(np.float64) for column in motion}
         lane = table["lane"][rows].astype(np.int64)
-        mission = bool(table["mission"][last])
-        actor, begin = Actor(int(table["actor"][last])), first - recorder.first
+        mission, actor = bool(table["mission"][last]), Actor(int(table["actor"][last]))
+        begin = first - recorder.first
         found.append(Track(name, kind, mission, driver, *size, begin, lane=lane, actor=actor, **poses))
     return found

@@ -1,13 +1,16 @@
 """The road as a JSON document beside the recordings, so that maps can be drawn without SUMO."""
 
 import json
+from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from cosim.errors import BadInput
 from cosim.files import read_json
-from cosim.road import ConflictZone, Lane, RoadMap
+from cosim.road import ConflictZone, Crossing, Lane, Link, RoadMap, Rule
 
 FORMAT = "cosim-road-1"
 
@@ -19,6 +22,9 @@ def text(road: RoadMap) -> str:
         "lanes": [vars(lane) | {"shape": lane.shape.tolist()} for lane in road.lanes],
         "zones": [{"name": zone.name, "lanes": sorted(zone.lanes)} for zone in road.zones],
         "junctions": [outline.tolist() for outline in road.junctions],
+        "links": [asdict(link) for link in road.links],
+        "signals": road.signals,
+        "crossings": [asdict(c) | {"shape": c.shape.tolist()} for c in road.crossings],
     }
     return json.dumps(document, separators=(",", ":"), sort_keys=True)
 
@@ -29,11 +35,20 @@ def read_road(file: Path) -> RoadMap:
     try:
         if found["format"] != FORMAT:
             raise BadInput(f"not a road of format {FORMAT}", file=file, field="format")
-        lanes = tuple(
-            Lane(**{**lane, "shape": np.array(lane["shape"], float), "successors": tuple(lane["successors"])})
-            for lane in found["lanes"]
-        )
+        lanes = tuple(_read(Lane, lane) for lane in found["lanes"])
         zones = tuple(ConflictZone(zone["name"], frozenset(zone["lanes"])) for zone in found["zones"])
-        return RoadMap(lanes, zones, tuple(np.array(outline, float) for outline in found["junctions"]))
+        # older documents have no links
+        links = (_read(Link, k | {"rule": Rule(k["rule"])}) for k in found.get("links", ()))
+        crossings = (_read(Crossing, c) for c in found.get("crossings", ()))
+        outlines = tuple(np.array(outline, float) for outline in found["junctions"])
+        signals = tuple((light, index) for light, index in found.get("signals", ()))
+        return RoadMap(lanes, zones, outlines, tuple(links), signals, tuple(crossings))
     except (ValueError, KeyError, TypeError) as error:
         raise BadInput(f"not a recorded road: {error}", file=file) from None
+
+
+def _read(kind: type[Any], values: Mapping[str, Any]) -> Any:
+    """Its sequences are tuples, its shape an array."""
+    tuples = {name: tuple(value) for name, value in values.items() if isinstance(value, list)}
+    shape = {"shape": np.array(values["shape"], float)} if "shape" in values else {}
+    return kind(**{**values, **tuples, **shape})

@@ -138,6 +138,15 @@ class RoadMap:
         return bool(self.contact.touch(a, np.array([b]))[0])
 
     @cached_property
+    def before(self) -> tuple[tuple[int, ...], ...]:
+        """The lanes that lead directly into each lane."""
+        found: list[list[int]] = [[] for _ in self.lanes]
+        for k, lane in enumerate(self.lanes):
+            for following in lane.successors:
+                found[following].append(k)
+        return tuple(map(tuple, found))
+
+    @cached_property
     def straight_on(self) -> LaneGraph:
         """The straightest successor of every lane (another vehicle's route is unknown)."""
         steps = [self._successor(k, None, 0) for k in range(len(self.lanes))]

@@ -14,7 +14,7 @@ from cosim.files.xml_input import is_there, regular_file
 from cosim.files.yaml_input import NonNegative, Positive
 from cosim.scenario import sumocfg
 from cosim.scenario.behaviors import AS_IS, DRIVER_MODELS, LC2013, MIXED, load_behaviors
-from cosim.types import Identity, Preset, Timing
+from cosim.types import Identity, OnCollision, Preset, Timing
 
 BEHAVIORS = load_behaviors().names
 CONFIG = ".sumocfg"
@@ -97,6 +97,7 @@ class Scenario:
     duration: float = 60.0  # s, counted
     timing: Timing = Timing()
     preset: str = Preset.LAWFUL
+    on_collision: str = OnCollision.END  # of an AV or of the mission vehicle
     mission: Mission = Mission()
     zones: tuple[Zone, ...] = ()
     fleet: Fleet = Fleet()
@@ -152,6 +153,7 @@ def load(
     duration: float | None = None,
     warmup: float | None = None,
     mission: str | None = None,
+    on_collision: str | None = None,
     options: Sequence[str] = (),
 ) -> Scenario:
     """The scenario `what` (a world's name or folder, a .sumocfg), with what the command line says otherwise.
@@ -190,6 +192,7 @@ def load(
         behavior=one_of(behavior, BEHAVIORS, "--behavior"),
         driver_model=one_of(driver_model, DRIVER_MODELS, "--driver-model"),
         preset=one_of(scenario.preset if preset is None else preset, Preset.ALL, "--preset"),
+        on_collision=one_of(on_collision or scenario.on_collision, OnCollision.ALL, "--on-collision"),
         fleet=scenario.fleet if fleet is None else _checked_fleet(fleet),
     )
 
@@ -299,6 +302,7 @@ def _foreign(what: str) -> Scenario:
         ignored=config.ignored,
         begin=config.begin,
         duration=FOREIGN_DURATION if config.end is None else config.end - config.begin,
+        on_collision=OnCollision.CONTINUE,
     )
 
 

@@ -13,6 +13,7 @@ from cosim.files.yaml_input import mapping, value_of
 from cosim.scenario import Scenario
 from cosim.scenario.episode_id import EpisodeId
 from cosim.scenario.sumocfg import CLOCK, INPUTS, command_line, keeps
+from cosim.types import OnCollision
 
 POLICY_FILES = "policy_files"  # what decides how the policy drives: weights, or its own code
 _KINDS: Mapping[str, Any] = {  # what is read again of the documents of `cosim run` and `cosim evaluate`
@@ -33,10 +34,12 @@ def manifest(scenario: Scenario, seed: int) -> dict[str, Any]:
     return {
         "seed": seed,
         "preset": scenario.preset,
+        # named where they are not a world's own: episodes are told apart by this document, older ones too
+        **({"on_collision": goes_on} if (goes_on := scenario.on_collision) != OnCollision.END else {}),
+        **({} if scenario.built_in else {"mission": scenario.mission.vehicles or scenario.mission.kind}),
         "driver_model": scenario.driver_model,
         "behavior": scenario.behavior,
         "fleet": scenario.fleet.describe(),
-        "mission": scenario.mission.vehicles or scenario.mission.kind,
         "timing": {
             "step_s": scenario.timing.step,
             "frame_s": scenario.timing.frame,

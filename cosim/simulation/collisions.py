@@ -1,16 +1,28 @@
 """Finds collisions: SUMO's own list and our oriented-box check for AVs, once per pair, attributed."""
 
+from collections.abc import Iterable, Sequence
+
 import libsumo
 import numpy as np
 
-from cosim.geometry import boxes, overlapping_pairs
+from cosim.geometry import Boxes, boxes, overlap, overlapping_pairs
 from cosim.road import RoadMap
+from cosim.road.too_close import foot, heed_each_other
 from cosim.simulation.commands import Commander
+from cosim.simulation.conventions import centres
 from cosim.simulation.convert import Body
-from cosim.types import Collision, Kind, Snapshot
+from cosim.simulation.drivers import Drivers
+from cosim.types import INSERTION, Collision, Floats, Kind, Snapshot
 
 SIDE_BY_SIDE = np.radians(20.0)  # lanes whose directions differ by less do not cross
 CUT_IN_WINDOW = 3.0  # s: an AV that changed lanes so shortly before it was hit from behind had cut in
+JUST_INSERTED = 1.0  # s
+STANDS = 0.02  # m between two frames: SUMO's threshold of a halting vehicle, 0.1 m/s
+ON_CENTRE_LINE = 0.3  # m: a front bumper nearer to its lane's centre line is not changing lanes
+WRECK_STANDS = 5.0  # s, then it is taken off the road
+# SUMO's words for a vehicle that hits a person (MSLane::detectPedestrianJunctionCollision).
+OF_PERSONS = frozenset({"sharedLane", "crossing", "walkingarea", "junctionPedestrian"})
+PERSON = Body(Kind.PERSON, False, 0.0, 0.0)
 
 
 class CollisionDetector:
@@ -19,16 +31,24 @@ class CollisionDetector:
     def __init__(self) -> None:
         self._seen: set[frozenset[str]] = set()
         self._lanes: dict[str, int] = {}  # of every AV, in the last snapshot
+        self._inserted: dict[str, float] = {}  # vehicle -> s, of the last second
+        self._before: Snapshot | None = None  # the last one
+
+    def inserted(self, vehicles: Iterable[str], now: float) -> None:
+        """SUMO has put these onto the road in the step that just ended."""
+        recent = {name: t for name, t in self._inserted.items() if now - t <= JUST_INSERTED}
+        self._inserted = {**recent, **dict.fromkeys(vehicles, now)}
 
     def lane_changes(self, snapshot: Snapshot, road: RoadMap, commander: Commander) -> None:
         """Note for the attribution of cut-ins when an AV that SUMO drives has changed lanes, as the commander
         does for those it commands."""
+        before, self._lanes = self._lanes, {}
         for row in np.flatnonzero(snapshot.kind == Kind.AV):
             name, lane = snapshot.ids[row], int(snapshot.lane[row])
-            before = self._lanes.get(name, lane)
+            was = before.get(name, lane)
             self._lanes[name] = lane
-            on_lanes = lane != before and min(lane, before) >= 0 and name not in commander.controlled
-            if on_lanes and road.lanes[lane].edge == road.lanes[before].edge:
+            on_lanes = lane != was and min(lane, was) >= 0 and name not in commander.controlled
+            if on_lanes and road.lanes[lane].edge == road.lanes[was].edge:
                 commander.lane_changes[name] = snapshot.time
 
     def from_sumo(self, bodies: dict[str, Body], changes: dict[str, float], now: float) -> list[Collision]:
@@ -39,21 +59,28 @@ class CollisionDetector:
         found: list[Collision] = []
         touching = libsumo.simulation.getCollidingVehiclesNumber()  # costs less than the list
         for c in libsumo.simulation.getCollisions() if touching else ():
-            pair = frozenset((c.collider, c.victim))
-            if pair in self._seen or c.collider not in bodies or c.victim not in bodies:
+            person = c.type in OF_PERSONS
+            names = c.collider, f"person:{c.victim}" if person else c.victim
+            if frozenset(names) in self._seen or any(n not in bodies for n in names[: 1 if person else 2]):
                 continue
-            self._seen.add(pair)
+            self._seen.add(frozenset(names))
+            if person:
+                names = names if c.colliderSpeed > 0.1 else names[::-1]
+            else:
+                pair = _poses(names, bodies)
+                first = None if pair is None else mover(self._poses_before(names, pair, now), pair)
+                names = names[::-1] if first == 1 else names
             try:
                 x, y = libsumo.vehicle.getPosition(c.collider)[:2]
             except libsumo.TraCIException:
                 x = y = float("nan")
-            found.append(_collision(now, c.collider, c.victim, c.type, "sumo", c.lane, x, y, bodies, changes))
+            found.append(self._collision(now, names, c.type, "sumo", c.lane, x, y, bodies, changes))
         return found
 
     def from_boxes(
         self, snapshot: Snapshot, road: RoadMap, bodies: dict[str, Body], changes: dict[str, float]
     ) -> list[Collision]:
-        """Overlaps of an AV's box with another vehicle's that SUMO did not report (it reports 26 of 28).
+        """Overlaps of an AV's box with another's that SUMO did not report (it reports 26 of 28).
 
         `changes`: AV -> when it last changed lanes, s.
         """
@@ -61,28 +88,185 @@ class CollisionDetector:
         for i, j in overlapping_pairs(boxes(snapshot)):
             if snapshot.kind[i] != int(Kind.AV) and snapshot.kind[j] != int(Kind.AV):
                 continue
-            pair = frozenset((snapshot.ids[i], snapshot.ids[j]))
-            if pair in self._seen or not road.connected(int(snapshot.lane[i]), int(snapshot.lane[j])):
+            names = snapshot.ids[i], snapshot.ids[j]
+            if frozenset(names) in self._seen or not road.connected(
+                int(snapshot.lane[i]), int(snapshot.lane[j])
+            ):
                 continue
-            if _only_a_tail(snapshot, road, i, j):
+            if _only_a_tail(snapshot, road, i, j) or the_nets(snapshot, road, i, j):
                 continue
-            self._seen.add(pair)
-            dx, dy = snapshot.x[j] - snapshot.x[i], snapshot.y[j] - snapshot.y[i]
-            # the collider is the one that has the other ahead; when both have, the faster one
-            j_ahead_of_i = dx * np.cos(snapshot.heading[i]) + dy * np.sin(snapshot.heading[i])
-            i_ahead_of_j = -dx * np.cos(snapshot.heading[j]) - dy * np.sin(snapshot.heading[j])
-            faster = snapshot.speed[i] >= snapshot.speed[j]
-            first = faster if (j_ahead_of_i > 0) == (i_ahead_of_j > 0) else j_ahead_of_i > 0
-            a, b = (i, j) if first else (j, i)
+            self._seen.add(frozenset(names))
+            pair = boxes(snapshot, np.array([i, j]))
+            first = mover(self._poses_before(names, pair, snapshot.time), pair)
+            if first is None:  # neither more than the other
+                first = 0 if snapshot.speed[i] >= snapshot.speed[j] else 1
+            a = (i, j)[first]
             lane = road.lanes[snapshot.lane[a]].id if snapshot.lane[a] >= 0 else ""
             x, y = float(snapshot.x[a]), float(snapshot.y[a])
-            found.append(
-                _collision(
-                    snapshot.time, snapshot.ids[a], snapshot.ids[b], "overlap", "box", lane, x, y,
-                    bodies, changes,
-                )
-            )  # fmt: skip
+            names = names if first == 0 else names[::-1]
+            found.append(self._collision(snapshot.time, names, "overlap", "box", lane, x, y, bodies, changes))
+        self._before = snapshot
         return found
+
+    # ---- inside ----
+
+    def _poses_before(self, names: Sequence[str], pair: Boxes, now: float) -> Boxes:
+        """Where two were in the last frame; who was not there yet is moved back by its speed."""
+        s = self._before
+        elapsed = 0.0 if s is None else now - s.time
+        columns = [np.array(column, np.float64) for column in pair]
+        columns[0] -= elapsed * pair.speed * np.cos(pair.heading)
+        columns[1] -= elapsed * pair.speed * np.sin(pair.heading)
+        for k, name in enumerate(names):
+            if s is not None and (row := s.row.get(name)) is not None:
+                for column, before in zip(columns, boxes(s, np.array([row])), strict=True):
+                    column[k] = before[0]
+        return Boxes(*columns)
+
+    def _collision(
+        self,
+        now: float,
+        names: Sequence[str],
+        kind: str,
+        source: str,
+        lane: str,
+        x: float,
+        y: float,
+        bodies: dict[str, Body],
+        changes: dict[str, float],
+    ) -> Collision:
+        """`names`: collider and victim."""
+        hits, hit = (bodies.get(name, PERSON) for name in names)
+        cut_in = now - changes.get(names[1], -np.inf) <= CUT_IN_WINDOW
+        inserted = any(now - self._inserted.get(name, -np.inf) <= JUST_INSERTED for name in names)
+        return Collision(
+            time=now,
+            collider=names[0],
+            victim=names[1],
+            collider_is_av=hits.kind == Kind.AV,
+            victim_is_av=hit.kind == Kind.AV,
+            kind=INSERTION if inserted else kind,
+            source=source,
+            lane=lane,
+            x=x,
+            y=y,
+            involves_mission=any(body.mission and not body.guessed for body in (hits, hit)),
+            av_caused=not inserted and (hits.kind == Kind.AV or (hit.kind == Kind.AV and bool(cut_in))),
+        )
+
+
+class Wrecks:
+    """The vehicles of crashes in an episode that goes on: they stand at once, whoever drove them, and are
+    taken off the road after `WRECK_STANDS` s."""
+
+    def __init__(self, commander: Commander, drivers: Drivers) -> None:
+        self._commander, self._drivers = commander, drivers
+        self._since: dict[str, float] = {}  # wreck -> s, when it crashed
+        self._stopped: list[str] = []  # since the last `take`
+        self._removed: list[str] = []
+
+    def add(self, collisions: Sequence[Collision]) -> None:
+        """Stop the vehicles of these; SUMO's insertions onto one another are no crashes."""
+        on_road = frozenset(libsumo.vehicle.getIDList()) if collisions else frozenset()
+        for c in collisions:
+            for name in () if c.insertion else (c.collider, c.victim):
+                if name in on_road and name not in self._since:
+                    self._since[name] = c.time
+                    self._stopped.append(name)
+                    self._commander.wreck(name)
+                    self._drivers.drop(name)
+                    libsumo.vehicle.setSpeedMode(name, 0)  # at once, not within its deceleration
+                    libsumo.vehicle.setLaneChangeMode(name, 0)
+                    libsumo.vehicle.setSpeed(name, 0.0)
+
+    def remove(self, now: float) -> None:
+        """Take those off the road that have stood long enough."""
+        due = [name for name, since in self._since.items() if now - since >= WRECK_STANDS - 1e-6]
+        on_road = frozenset(libsumo.vehicle.getIDList()) if due else frozenset()
+        for name in due:
+            del self._since[name]
+            if name in on_road:
+                libsumo.vehicle.remove(name)
+                self._removed.append(name)
+
+    def take(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Who has become a wreck, and which wrecks were removed, since this was asked last."""
+        found = tuple(self._stopped), tuple(self._removed)
+        self._stopped.clear()
+        self._removed.clear()
+        return found
+
+
+def mover(before: Boxes, now: Boxes) -> int | None:
+    """Which of two vehicles, 0 or 1, moved into the other; None where neither did more than the other.
+
+    `before`, `now`: boxes [2] of the last frame and at contact. A vehicle that stands never did. Of two that
+    move it is the one whose box now overlaps the other's box of before, which the other has not brought
+    about. Where both do or neither does, it is the one that did more to close the gap that was the last to
+    close (of the gaps along the four edge normals; of boxes that overlapped before, the smallest overlap).
+    """
+    dx, dy = np.asarray(now.x - before.x), np.asarray(now.y - before.y)  # [2] m, own displacements
+    moved = np.hypot(dx, dy) >= STANDS
+    if not moved.any():
+        return None
+    if not moved.all():
+        return int(np.argmax(moved))
+    into = overlap(now, Boxes(*(np.flip(np.asarray(column)) for column in before)))  # [2]
+    if into[0] != into[1]:
+        return int(np.argmax(into))
+    heading = np.asarray(before.heading)
+    angles = np.concatenate([heading, heading + 0.5 * np.pi])  # of the four normals
+    normals = np.stack([np.cos(angles), np.sin(angles)], axis=1)  # [4,2]
+    apart = normals @ np.array([before.x[1] - before.x[0], before.y[1] - before.y[0]])  # [4] m
+    turned = angles[:, None] - heading
+    half = 0.5 * (np.abs(np.cos(turned)) * before.length + np.abs(np.sin(turned)) * before.width)  # [4,2]
+    gap = np.abs(apart) - half.sum(axis=1)
+    towards = np.sign(apart)[:, None] * (normals @ np.array([dx, dy])) * [1.0, -1.0]  # [4,2] m
+    closing = towards.sum(axis=1)
+    open_ = (gap > 0.0) & (closing > 0.0)
+    last = int(
+        np.argmax(np.where(open_, gap / np.where(open_, closing, 1.0), -np.inf) if open_.any() else gap)
+    )
+    a, b = towards[last]
+    return None if abs(a - b) < 1e-6 else int(b > a)
+
+
+def the_nets(snapshot: Snapshot, road: RoadMap, i: int, j: int) -> bool:
+    """Whether two vehicles overlap though each follows its own lane, on lanes whose drivers need not heed one
+    another (`heed_each_other`): the lanes lie too close together, and no driver can help it."""
+    ways = []
+    for row in (i, j):
+        lane = int(snapshot.lane[row])
+        if lane < 0:
+            return False
+        path = road.path(lane)
+        x, y, _ = path.pose(np.array([snapshot.lane_position[row] * path.scale]))
+        front = _end(snapshot, row, 0.5)
+        if np.hypot(front[0] - x[0], front[1] - y[0]) > ON_CENTRE_LINE:
+            return False
+        behind = snapshot.length[row] - snapshot.lane_position[row] * path.scale
+        ways.append(foot(road, lane, behind, _end(snapshot, row, -0.5)))
+    return not any(heed_each_other(road, a, b) for a in ways[0] for b in ways[1])
+
+
+def _end(snapshot: Snapshot, row: int, share: float) -> Floats:
+    """[2] m, the front (0.5) or the rear (-0.5) of a vehicle."""
+    along, heading = share * snapshot.length[row], snapshot.heading[row]
+    return np.array([snapshot.x[row] + along * np.cos(heading), snapshot.y[row] + along * np.sin(heading)])
+
+
+def _poses(names: Sequence[str], bodies: dict[str, Body]) -> Boxes | None:
+    """[2] where two vehicles are now; None when one has left the road."""
+    get = libsumo.vehicle
+    try:
+        front = np.array([get.getPosition(name)[:2] for name in names], np.float64)
+        angle = np.array([get.getAngle(name) for name in names], np.float64)
+        speed = np.array([get.getSpeed(name) for name in names], np.float64)
+    except libsumo.TraCIException:
+        return None
+    length = np.array([bodies[name].length for name in names])
+    width = np.array([bodies[name].width for name in names])
+    return Boxes(*centres(front[:, 0], front[:, 1], angle, 0.5 * length), length, width, speed)
 
 
 def _only_a_tail(snapshot: Snapshot, road: RoadMap, i: int, j: int) -> bool:
@@ -113,33 +297,3 @@ def _direction(road: RoadMap, snapshot: Snapshot, row: int) -> float:
     """The direction of a vehicle's lane at its front bumper, rad."""
     path = road.path(int(snapshot.lane[row]))
     return float(path.pose(np.array([snapshot.lane_position[row] * path.scale]))[2][0])
-
-
-def _collision(
-    now: float,
-    collider: str,
-    victim: str,
-    kind: str,
-    source: str,
-    lane: str,
-    x: float,
-    y: float,
-    bodies: dict[str, Body],
-    changes: dict[str, float],
-) -> Collision:
-    hits, hit = bodies[collider], bodies[victim]
-    cut_in = now - changes.get(victim, -np.inf) <= CUT_IN_WINDOW
-    return Collision(
-        time=now,
-        collider=collider,
-        victim=victim,
-        collider_is_av=hits.kind == Kind.AV,
-        victim_is_av=hit.kind == Kind.AV,
-        kind=kind,
-        source=source,
-        lane=lane,
-        x=x,
-        y=y,
-        involves_mission=any(body.mission and not body.guessed for body in (hits, hit)),
-        av_caused=hits.kind == Kind.AV or (hit.kind == Kind.AV and bool(cut_in)),
-    )

@@ -41,10 +41,13 @@ class Commander:
         self._step = step  # s
         self.controlled: dict[str, Controlled] = {}
         self.lane_changes: dict[str, float] = {}  # AV -> s, start of its last one (attribution of cut-ins)
+        self._wrecks: set[str] = set()
 
     def take(self, command: Command, now: float) -> Receipt:
         """Start one command at time `now` (s). A vehicle is taken over from SUMO at its first command."""
         name = command.vehicle
+        if name in self._wrecks:
+            return Receipt(name, False, "crashed")
         try:
             lane = libsumo.vehicle.getLaneID(name)
         except libsumo.TraCIException:
@@ -122,6 +125,11 @@ class Commander:
     def observe(self, now: float) -> list[Intervention]:
         """After every simulation step, at `now` (s): where the car began to drive otherwise than asked."""
         return []
+
+    def wreck(self, name: str) -> None:
+        """The vehicle crashed: it stands, and takes no more commands."""
+        self.drop(name)
+        self._wrecks.add(name)
 
     def drop(self, name: str) -> None:
         """The vehicle left the road."""

@@ -90,6 +90,11 @@ class Drivers:
         self.classes[vehicle] = driver.name
         return driver.name
 
+    def drop(self, vehicle: str) -> None:
+        """The vehicle crashed: it changes lanes no more."""
+        if self.mobil is not None:
+            self.mobil.drop(vehicle)
+
     def step(self, time: float) -> None:
         """After every SUMO step (`time` in s): MOBIL's decisions; LC2013 decides inside SUMO."""
         if self.mobil is not None:

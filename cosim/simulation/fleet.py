@@ -7,6 +7,7 @@ import libsumo
 
 from cosim.scenario import Scenario
 from cosim.scenario.behaviors import AS_IS
+from cosim.scenario.vet_rules import NOT_CARS
 from cosim.seeding import uniform
 from cosim.simulation.convert import ACTORS, Body
 from cosim.simulation.drivers import IDM_TYPE, Drivers
@@ -19,7 +20,8 @@ AV_LANE_CHANGE = {
     "laneChangeModel.lcCooperativeSpeed": "0",
     "laneChangeModel.lcKeepRight": "0",
 }
-# What a vehicle of a user's file keeps: getters and setters of libsumo.vehicle, in this order.
+AV_TYPE = "cosim.av"  # the types of AVs in SUMO's outputs begin so, and nobody else's
+# What a vehicle keeps when its type changes: getters and setters of libsumo.vehicle, in this order.
 KEPT = ("Length", "Width", "MaxSpeed", "SpeedFactor", "VehicleClass")
 
 
@@ -30,18 +32,15 @@ class Fleet:
         self._scenario = scenario
         self._drivers = drivers
         self._av_parameters = av_parameters
+        self._av_types: dict[str, str] = {}  # a vehicle's own type -> the type of such an AV
 
     def depart(self, vehicle: str, seed: int) -> Body:
         """A vehicle departed: give it its driver; what it is."""
         get, s = libsumo.vehicle, self._scenario
         mission = s.mission.includes(vehicle)
         is_av = not mission and self._is_av(vehicle, seed)
-        if not s.built_in and (is_av or s.behavior != AS_IS):
-            factor = libsumo.vehicletype.getSpeedFactor(get.getTypeID(vehicle))
-            set_type(vehicle)
-            if is_av:
-                get.setSpeedFactor(vehicle, factor)  # its type's mean, not a draw about it
         if is_av:
+            self._take_av_type(vehicle)
             for name, value in AV_IDM.items():
                 getattr(get, f"set{name}")(vehicle, value)
             for key, text in {**AV_LANE_CHANGE, **self._av_parameters}.items():
@@ -52,25 +51,40 @@ class Fleet:
         actor = ACTORS.get(get.getVehicleClass(vehicle), Actor.CAR)
         return Body(Kind.AV if is_av else Kind.HV, mission, *size, actor)
 
+    def _take_av_type(self, vehicle: str) -> None:
+        """In our worlds an AV drives as its type says, one of a user's file by IDM."""
+        own, ours = libsumo.vehicle.getTypeID(vehicle), self._scenario.built_in
+        name = self._av_types.get(own)
+        if name is None:
+            name = self._av_types[own] = f"{AV_TYPE}.{own}"
+            libsumo.vehicletype.copy(own if ours else IDM_TYPE, name)
+        if ours:
+            libsumo.vehicle.setType(vehicle, name)
+        else:
+            set_type(vehicle, name)
+            mean = libsumo.vehicletype.getSpeedFactor(own)  # not a draw about it
+            libsumo.vehicle.setSpeedFactor(vehicle, mean)
+
     def _is_av(self, vehicle: str, seed: int) -> bool:
         rule = self._scenario.fleet
         if rule.ids is not None:
             return re.fullmatch(rule.ids, vehicle) is not None
         if rule.penetration is not None:
-            return uniform(seed, "av", vehicle) < rule.penetration
+            drawn = uniform(seed, "av", vehicle) < rule.penetration
+            return drawn and libsumo.vehicle.getVehicleClass(vehicle) not in NOT_CARS
         if rule.type is not None:
             name: str = libsumo.vehicle.getTypeID(vehicle)
             return name == rule.type or name.startswith(f"{rule.type}@")
         return False
 
 
-def set_type(vehicle: str, name: str = IDM_TYPE) -> None:
-    """Give a vehicle another type, by default IDM; its size, class and maximum speed stay.
+def set_type(vehicle: str, name: str) -> None:
+    """Give a vehicle another type; its size, class and maximum speed stay.
 
     `setType` replaces the car-following model (Krauss in most files); nothing else can.
     """
     get = libsumo.vehicle
-    kept = {name: getattr(get, f"get{name}")(vehicle) for name in KEPT}
+    kept = {field: getattr(get, f"get{field}")(vehicle) for field in KEPT}
     get.setType(vehicle, name)
-    for name, value in kept.items():
-        getattr(get, f"set{name}")(vehicle, value)
+    for field, value in kept.items():
+        getattr(get, f"set{field}")(vehicle, value)

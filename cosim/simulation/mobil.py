@@ -231,6 +231,10 @@ class MobilDriving:
         self._drivers[vehicle] = (idm, mobil)
         self._due[int(phase * len(self._due))].append(vehicle)
 
+    def drop(self, vehicle: str) -> None:
+        """This one decides no more."""
+        self._due = [[name for name in turn if name != vehicle] for turn in self._due]
+
     def step(self) -> None:
         """Decide for the drivers whose turn it is."""
         if not self._due:

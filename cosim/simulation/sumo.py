@@ -20,7 +20,7 @@ from cosim.scenario.disabled_outputs import disable_outputs
 from cosim.scenario.sumo_outputs import sumo_options
 from cosim.scenario.sumocfg import time_of
 from cosim.simulation.assistance import Assistance
-from cosim.simulation.collisions import CollisionDetector
+from cosim.simulation.collisions import CollisionDetector, Wrecks
 from cosim.simulation.commands import Commander
 from cosim.simulation.convert import Body, SnapshotReader, read_road, struggling_lanes
 from cosim.simulation.drivers import Drivers
@@ -28,7 +28,7 @@ from cosim.simulation.entries import EntryWatcher
 from cosim.simulation.fleet import Fleet
 from cosim.simulation.stderr import SumoStderr
 from cosim.simulation.xerces import keep_initialized
-from cosim.types import Command, Events, Kind, Preset, Receipt, Snapshot
+from cosim.types import Command, Events, Kind, OnCollision, Preset, Receipt, Snapshot
 
 SUMO_ERRORS = (libsumo.TraCIException, libsumo.FatalTraCIError)
 
@@ -50,7 +50,7 @@ FORCED = {
 }
 # SUMO's message in the middle of a run, where it loads routes, about a vehicle that cannot depart as written.
 WRONG_DEMAND = re.compile(
-    r"[Ii]nvalid depart|Departure \w+ .*for vehicle|has no valid route|No connection between edge"
+    r"[Ii]nvalid depart|Departure \w+ .*for vehicle|has no valid route|No connection between edge|[Pp]erson '"
 )
 GIVES_UP = "max-depart-delay"  # SUMO drops vehicles that waited so long, without a message
 
@@ -107,6 +107,8 @@ class SumoSimulator:
         self._bodies: dict[str, Body] = {}
         self._routes: dict[str, tuple[str, ...]] = {}
         self._detector = CollisionDetector()
+        goes_on = self._scenario.on_collision == OnCollision.CONTINUE
+        self._wrecks = Wrecks(self._commander, self._drivers) if goes_on else None
         self._reader.bodies_changed()
         self._entries.reset()
         self._mission_found = not self._scenario.mission.guessed
@@ -248,9 +250,14 @@ class SumoSimulator:
             self._commander.drop(name)
             self._routes.pop(name, None)
         now = simulation.getTime()
+        self._detector.inserted((*departed, *simulation.getEndingTeleportIDList()), now)
+        collisions = self._detector.from_sumo(self._bodies, self._commander.lane_changes, now)
+        if self._wrecks is not None:
+            self._wrecks.add(collisions)
+            self._wrecks.remove(now)
         self._happened.append(
             (
-                self._detector.from_sumo(self._bodies, self._commander.lane_changes, now),
+                collisions,
                 departed,
                 arrived,
                 simulation.getStartingTeleportIDList(),
@@ -274,8 +281,13 @@ class SumoSimulator:
             snapshot = self._find_mission(snapshot)
         self._detector.lane_changes(snapshot, self.road, self._commander)
         extra = self._detector.from_boxes(snapshot, self.road, self._bodies, self._commander.lane_changes)
-        if extra:
-            events = replace(events, collisions=(*events.collisions, *extra))
+        wrecked = removed = ()
+        if self._wrecks is not None:
+            self._wrecks.add(extra)
+            wrecked, removed = self._wrecks.take()
+        if extra or wrecked or removed:
+            happened = (*snapshot.events.collisions, *extra)
+            events = replace(snapshot.events, collisions=happened, wrecked=wrecked, wrecks_removed=removed)
             snapshot = replace(snapshot, events=events)
         return snapshot
 

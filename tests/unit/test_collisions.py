@@ -1,20 +1,28 @@
-"""Who is to blame: the lane changes of AVs that SUMO drives."""
+"""What is a collision, and who is to blame for it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
+import pytest
 from policy_scenes import straight_road
 
-from cosim.simulation.collisions import CUT_IN_WINDOW, CollisionDetector, _collision
+from cosim.geometry import Boxes
+from cosim.road import RoadMap
+from cosim.road.lane import Lane
+from cosim.road.too_close import heed_each_other, too_close
+from cosim.simulation.collisions import CUT_IN_WINDOW, CollisionDetector, mover
 from cosim.simulation.commands import Commander, Controlled
 from cosim.simulation.convert import Body
-from cosim.types import NO_EVENTS, Kind, Snapshot
+from cosim.types import INSERTION, NO_EVENTS, Kind, Snapshot
 
 ROAD = straight_road(3)
 NAMES = ("av", "commanded", "hv")
 BODIES = {name: Body(Kind.HV if name == "hv" else Kind.AV, False, 5.0, 2.0) for name in NAMES}
+FRAME = 0.2  # s
+Pose = tuple[float, float, float, float]  # centre x m, y m, heading degrees, speed m/s
 
 
 def seen(time: float, lanes: Sequence[int]) -> Snapshot:
@@ -38,12 +46,220 @@ def test_a_lane_change_is_noted_of_an_av_that_sumo_drives_and_of_nobody_else() -
     assert commander.lane_changes == {"av": 0.4}
 
 
-def test_hit_from_behind_it_is_to_blame_while_the_window_lasts() -> None:
-    changes = {"av": 10.0, "hv": 10.0}
+# ---- who moved into whom ----
 
-    def caused(now: float, collider: str, victim: str) -> bool:
-        return _collision(now, collider, victim, "", "sumo", "", 0.0, 0.0, BODIES, changes).av_caused
 
-    assert caused(10.0 + CUT_IN_WINDOW, "hv", "av")
-    assert not caused(10.1 + CUT_IN_WINDOW, "hv", "av")
-    assert caused(99.0, "av", "hv")
+def drawn(*poses: Pose, length: float = 5.0, width: float = 2.0) -> Boxes:
+    """Two cars where they are."""
+    x, y, heading, speed = (np.array(column) for column in zip(*poses, strict=True))
+    size = np.ones(len(poses))
+    return Boxes(x, y, np.radians(heading), length * size, width * size, speed)
+
+
+def earlier(boxes: Boxes, seconds: float = FRAME) -> Boxes:
+    """Where they were."""
+    back = seconds * np.asarray(boxes.speed)
+    return boxes._replace(x=boxes.x - back * np.cos(boxes.heading), y=boxes.y - back * np.sin(boxes.heading))
+
+
+# Two cars at contact: the first one moved into the second.
+CONTACTS: dict[str, tuple[Pose, Pose]] = {
+    "rear-end": ((0.0, 0.0, 0.0, 20.0), (4.5, 0.0, 0.0, 10.0)),
+    "rear-end, the one ahead brakes to a crawl": ((0.0, 0.0, 0.0, 12.0), (4.9, 0.3, 0.0, 0.3)),
+    "crossing, nose into the side": ((0.0, 0.0, 0.0, 10.0), (3.3, 1.0, 90.0, 12.0)),
+    "crossing, into the side of one that crawls": ((0.0, 0.0, 0.0, 10.0), (3.3, 1.0, 90.0, 1.0)),
+    "crossing, into one that stands": ((3.3, 1.0, 90.0, 8.0), (3.0, 3.0, 0.0, 0.0)),
+    "side swipe, from the lane beside": ((0.0, 1.95, -10.0, 20.0), (1.0, 0.0, 0.0, 20.0)),
+    "head-on, the faster one": ((0.0, 0.0, 0.0, 15.0), (4.5, 0.2, 180.0, 5.0)),
+    "head-on, into one that stands": ((0.0, 0.0, 0.0, 5.0), (4.8, 0.2, 180.0, 0.0)),
+    "passing the nose of one that stands at a line": ((0.0, 0.0, 0.0, 14.0), (1.0, -3.2, 90.0, 0.0)),
+}
+
+
+@pytest.mark.parametrize("contact", CONTACTS, ids=str)
+def test_who_moved_into_the_other_is_the_collider(contact: str) -> None:
+    for order in (1, -1):
+        now = drawn(*CONTACTS[contact][::order])
+        assert mover(earlier(now), now) == (0 if order == 1 else 1)
+
+
+def test_two_that_stand_have_not_moved_into_one_another() -> None:
+    now = drawn((0.0, 0.0, 0.0, 0.0), (4.0, 0.0, 0.0, 0.0))
+    assert mover(now, now) is None
+
+
+def test_a_tail_that_swings_into_a_car_is_what_moved() -> None:
+    before, now = (
+        drawn((0.0, 0.0, 0.0, 5.0), (0.0, 2.05, 0.0, 5.0)),
+        drawn((1.0, 0.0, -6.0, 5.0), (1.0, 2.05, 0.0, 5.0)),
+    )
+    assert mover(before, now) == 0
+
+
+def scene(time: float, cars: dict[str, Pose], lanes: dict[str, int] | None = None) -> Snapshot:
+    """Cars of 5 x 2 m; those whose name begins with av are AVs. `lanes`: else off every lane."""
+    names = tuple(sorted(cars))
+    x, y, heading, speed = (np.array(column) for column in zip(*(cars[n] for n in names), strict=True))
+    n = np.ones(len(names))
+    return Snapshot(
+        time,
+        names,
+        np.array([Kind.AV if name.startswith("av") else Kind.HV for name in names], np.int8),
+        n < 0,
+        x,
+        y,
+        np.radians(heading),
+        speed,
+        0.0 * n,
+        5.0 * n,
+        2.0 * n,
+        np.array([(lanes or {}).get(name, -1) for name in names], np.int32),
+        x + 2.5,
+        NO_EVENTS,
+    )
+
+
+def bodies(*names: str) -> dict[str, Body]:
+    return {name: Body(Kind.AV if name.startswith("av") else Kind.HV, False, 5.0, 2.0) for name in names}
+
+
+def test_a_standing_av_whose_nose_is_in_a_passing_lane_is_not_to_blame() -> None:
+    """A car at a line, its nose 0.7 m into the lane that the other drives along."""
+    stands: Pose = (0.0, -2.8, 90.0, 0.0)
+    detector, known = CollisionDetector(), bodies("av0", "hv4")
+    detector.from_boxes(scene(1.0, {"av0": stands, "hv4": (-5.0, 0.0, 0.0, 14.0)}), ROAD, known, {})
+    (hit,) = detector.from_boxes(scene(1.2, {"av0": stands, "hv4": (-2.2, 0.0, 0.0, 14.0)}), ROAD, known, {})
+    assert (hit.collider, hit.victim, hit.av_caused) == ("hv4", "av0", False)
+    again = detector.from_boxes(scene(1.4, {"av0": stands, "hv4": (0.6, 0.0, 0.0, 14.0)}), ROAD, known, {})
+    assert again == [], "a pair counts once"
+
+
+def test_an_av_that_passes_too_close_to_a_standing_car_is_to_blame() -> None:
+    stands: Pose = (0.0, -2.8, 90.0, 0.0)
+    detector, known = CollisionDetector(), bodies("av4", "hv0")
+    detector.from_boxes(scene(1.0, {"hv0": stands, "av4": (-5.0, 0.0, 0.0, 14.0)}), ROAD, known, {})
+    (hit,) = detector.from_boxes(scene(1.2, {"hv0": stands, "av4": (-2.2, 0.0, 0.0, 14.0)}), ROAD, known, {})
+    assert (hit.collider, hit.victim, hit.av_caused) == ("av4", "hv0", True)
+
+
+@pytest.mark.parametrize(
+    ("since", "caused"), [(CUT_IN_WINDOW, True), (CUT_IN_WINDOW + 0.1, False)], ids=["cut in", "long ago"]
+)
+def test_hit_from_behind_an_av_is_to_blame_while_the_window_lasts(since: float, caused: bool) -> None:
+    detector, known, changes = CollisionDetector(), bodies("av", "hv"), {"av": 10.0, "hv": 10.0}
+    now = 10.0 + since
+    cars: dict[str, Pose] = {"av": (5.5, 0.0, 0.0, 10.0), "hv": (0.0, 0.0, 0.0, 20.0)}
+    detector.from_boxes(scene(now - FRAME, cars), ROAD, known, changes)
+    cars = {"av": (7.5, 0.0, 0.0, 10.0), "hv": (4.0, 0.0, 0.0, 20.0)}
+    (hit,) = detector.from_boxes(scene(now, cars), ROAD, known, changes)
+    assert (hit.collider, hit.victim, hit.av_caused) == ("hv", "av", caused)
+
+
+@pytest.mark.parametrize(("new", "age"), [("hv", 0.2), ("av", 1.0)])
+def test_a_car_that_sumo_puts_onto_another_is_nobody_s_fault(new: str, age: float) -> None:
+    detector, known = CollisionDetector(), bodies("av", "hv")
+    detector.inserted([new], 5.0)
+    cars: dict[str, Pose] = {"av": (3.0, 0.0, 0.0, 10.0), "hv": (0.0, 0.0, 0.0, 20.0)}
+    (hit,) = detector.from_boxes(scene(5.0 + age, cars), ROAD, known, {})
+    assert hit.kind == INSERTION
+    assert hit.insertion
+    assert (hit.av_caused, hit.involves_av, hit.crash) == (False, False, False)
+
+
+def test_a_second_and_more_after_its_insertion_a_car_is_like_any_other() -> None:
+    detector, known = CollisionDetector(), bodies("av", "hv")
+    detector.inserted(["av"], 5.0)
+    detector.inserted(["x"], 6.2)  # forgets who was inserted long ago
+    cars: dict[str, Pose] = {"av": (0.0, 0.0, 0.0, 20.0), "hv": (3.0, 0.0, 0.0, 10.0)}
+    (hit,) = detector.from_boxes(scene(6.2, cars), ROAD, known, {})
+    assert (hit.collider, hit.kind, hit.av_caused, hit.crash) == ("av", "overlap", True, True)
+
+
+# ---- lanes too close together ----
+
+
+def lane(name: str, points: Sequence[tuple[float, float]], successors: tuple[int, ...] = ()) -> Lane:
+    shape = np.array(points, np.float64)
+    length = float(np.hypot(*np.diff(shape, axis=0).T).sum())
+    inside, edge = name.startswith(":"), name.rpartition("_")[0]
+    return Lane(name, edge, int(name[-1]), shape, length, 3.2, 20.0, successors, internal=inside, start="J")
+
+
+def two_lanes(apart: float, end: float) -> RoadMap:
+    """Two lanes towards east, `apart` m from one another at x = 0 and `end` m at x = 100, then on as lanes of
+    their own."""
+    y = apart, end
+    return RoadMap(
+        (
+            lane("a_0", [(0.0, 0.0), (100.0, 0.0)], (2,)),
+            lane("a_1", [(0.0, y[0]), (100.0, y[1])], (3,)),
+            lane("b_0", [(100.0, 0.0), (200.0, 0.0)]),
+            lane("b_1", [(100.0, y[1]), (200.0, y[1])]),
+        )
+    )
+
+
+SIDE: dict[str, Pose] = {"av": (50.0, 0.0, 0.0, 10.0), "hv": (51.0, 1.9, 0.0, 10.0)}
+
+
+def test_two_on_their_own_centre_lines_that_lie_too_close_have_not_collided() -> None:
+    lanes, known = {"av": 0, "hv": 1}, bodies("av", "hv")
+    found = CollisionDetector().from_boxes(scene(1.0, SIDE, lanes), two_lanes(1.9, 1.9), known, {})
+    assert found == []
+    converging = two_lanes(3.2, 0.7)
+    hv: Pose = (51.0, 3.2 - 0.025 * 51.0, np.degrees(np.arctan(-0.025)), 10.0)
+    here = scene(1.0, {"av": SIDE["av"], "hv": hv}, lanes)
+    assert CollisionDetector().from_boxes(here, converging, known, {}) == []
+
+
+def test_one_that_has_left_its_centre_line_has_collided() -> None:
+    lanes, known = {"av": 0, "hv": 1}, bodies("av", "hv")
+    (hit,) = CollisionDetector().from_boxes(scene(1.0, SIDE, lanes), two_lanes(3.2, 3.2), known, {})
+    assert {hit.collider, hit.victim} == {"av", "hv"}
+
+
+def test_two_on_lanes_that_join_or_cross_or_follow_one_another_have_collided() -> None:
+    known = bodies("av", "hv")
+    apart = two_lanes(1.9, 1.9)
+    joined = replace(
+        apart, lanes=(apart.lanes[0], replace(apart.lanes[1], successors=(2,)), *apart.lanes[2:])
+    )
+    assert len(CollisionDetector().from_boxes(scene(1.0, SIDE, {"av": 0, "hv": 1}), joined, known, {})) == 1
+    crossing = RoadMap((lane("a_0", [(0.0, 0.0), (100.0, 0.0)]), lane("c_0", [(50.0, -50.0), (50.0, 50.0)])))
+    cars: dict[str, Pose] = {"av": (47.0, 0.0, 0.0, 10.0), "hv": (50.0, 0.0, 90.0, 10.0)}
+    here = replace(scene(1.0, cars, {"av": 0, "hv": 1}), lane_position=np.array([49.5, 52.5]))
+    assert len(CollisionDetector().from_boxes(here, crossing, known, {})) == 1
+    behind: dict[str, Pose] = {"av": (98.0, 0.0, 0.0, 10.0), "hv": (102.0, 0.0, 0.0, 5.0)}
+    here = replace(scene(1.0, behind, {"av": 0, "hv": 2}), lane_position=np.array([100.0, 4.5]))
+    assert len(CollisionDetector().from_boxes(here, apart, known, {})) == 1
+
+
+def test_whose_tail_is_on_a_crossing_lane_has_collided() -> None:
+    """The AV's front has left the junction, its tail has not."""
+    road = RoadMap(
+        (
+            lane(":J_0", [(0.0, 0.0), (20.0, 0.0)], (1,)),
+            lane("out_0", [(20.0, 0.0), (100.0, 0.0)]),
+            lane(":J_1", [(18.0, -20.0), (18.0, 20.0)]),
+        )
+    )
+    cars: dict[str, Pose] = {"av": (19.5, 0.0, 0.0, 5.0), "hv": (18.0, -2.5, 90.0, 10.0)}
+    here = replace(scene(1.0, cars, {"av": 1, "hv": 2}), lane_position=np.array([2.0, 20.0]))
+    (hit,) = CollisionDetector().from_boxes(here, road, bodies("av", "hv"), {})
+    assert hit.collider == "hv"
+
+
+def test_lanes_too_close_together_are_found_and_lanes_that_meet_are_not() -> None:
+    ((distance, a, b),) = too_close(two_lanes(3.2, 1.9))[:1]
+    assert (a, b) == (0, 1)
+    assert distance == pytest.approx(1.9)
+    assert too_close(two_lanes(3.2, 3.2)) == []
+    fork = RoadMap(
+        (
+            lane("a_0", [(0.0, 0.0), (20.0, 0.0)], (1, 2)),
+            lane(":J_0", [(20.0, 0.0), (40.0, 0.0)]),
+            lane(":J_1", [(20.0, 0.0), (40.0, 4.0)]),
+        )
+    )
+    assert heed_each_other(fork, 1, 2)
+    assert too_close(fork) == []

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from cosim.episode import Episode
@@ -15,10 +17,21 @@ from cosim.recording.folder import Folder
 from cosim.recording.recorder import Recorder
 from cosim.recording.roads import read_road, text
 from cosim.recording.views import histories, tracks, windows
-from cosim.road import ConflictZone, Lane, RoadMap
+from cosim.road import ConflictZone, Crossing, Lane, Link, RoadMap, Rule
 from cosim.scenario import Mission, load
 from cosim.simulation.fake import FakeSimulator, FakeVehicle
-from cosim.types import COMPACT, Collision, Decision, Events, History, MetaAction, Snapshot
+from cosim.types import (
+    COMPACT,
+    Actor,
+    Collision,
+    Decision,
+    Entry,
+    Events,
+    History,
+    Intervention,
+    MetaAction,
+    Snapshot,
+)
 
 
 def drive(simulator: FakeSimulator, recorder: Recorder) -> list[dict[str, History]]:
@@ -104,12 +117,34 @@ def test_events_come_back(tmp_path: Path) -> None:
     tape = Recorder()
     drive(world(), tape)
     hit = Collision(1.0, "av", "human", True, False, "overlap", "box", "road_0", 1.0, 2.0, True, True)
-    happened = Events((hit,), ("late",), ("early",), ("lost",), ("stopped",))
+    entry, corrected = Entry(0.7, "av", 3, "y", 9.0, 8.0), Intervention(0.5, "av", "red light")
+    happened = Events((hit,), ("late",), ("early",), ("lost",), ("stopped",), (entry,), (corrected,))
     tape.frames[3] = replace(tape.frames[3], events=happened)
     write(tmp_path / "x.parquet", tape, {})
     found = read(tmp_path / "x.parquet").snapshots()
     assert found[3].events == happened
     assert found[2].events == tape.frames[2].events
+
+
+def test_actors_and_signals_come_back(driven: Driven, tmp_path: Path) -> None:
+    _, tape, _, _ = driven
+    tape.frames = [
+        replace(f, actor=np.full(f.n, Actor.TRUCK, np.int8), signals=np.frombuffer(b"rG", np.uint8) + k % 2)
+        for k, f in enumerate(tape.frames)
+    ]
+    write(tmp_path / "x.parquet", tape, {})
+    for a, b in zip(read(tmp_path / "x.parquet").snapshots(), tape.frames, strict=True):
+        assert_same(a, b)
+
+
+def test_recordings_without_actors_and_signals_are_read(driven: Driven, tmp_path: Path) -> None:
+    table = pq.read_table(driven[0])
+    about = json.loads(table.schema.metadata[b"cosim"])
+    del about["signals"]
+    table = table.drop_columns("actor").replace_schema_metadata({"cosim": json.dumps(about)})
+    pq.write_table(table, tmp_path / "old.parquet")
+    for a, b in zip(read(tmp_path / "old.parquet").snapshots(), driven[1].frames, strict=True):
+        assert_same(a, b)
 
 
 def test_a_road_comes_back_exactly(tmp_path: Path) -> None:
@@ -121,6 +156,9 @@ def test_a_road_comes_back_exactly(tmp_path: Path) -> None:
         ),
         (ConflictZone("z", frozenset({1})),),
         (np.array([[0.0, 1.0], [2.0, 3.0], [4.0, 5.5]]),),
+        (Link(1, -1, 0, 0, Rule.STOP, (0,)),),
+        (("light", 0),),
+        (Crossing(":j_c0", shape, 4.0, (0, 1), 0),),
     )
     file = tmp_path / "road.json"
     file.write_text(text(road))
@@ -129,6 +167,12 @@ def test_a_road_comes_back_exactly(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.lanes[0].shape, shape)
     assert found.lanes[0].successors == (1,)
     assert found.zones == road.zones
+    assert (found.links, found.signals) == (road.links, road.signals)
+    assert found.links[0].rule is Rule.STOP
+    assert found.crossings[0].lanes == (0, 1)
+    older = {k: v for k, v in json.loads(text(road)).items() if k not in ("links", "signals", "crossings")}
+    file.write_text(json.dumps(older))
+    assert read_road(file).links == ()
     file.write_text("{}")
     with pytest.raises(BadInput, match="not a recorded road"):
         read_road(file)

@@ -19,7 +19,9 @@ import numpy.typing as npt
 
 from cosim.recording.recorder import Choice
 from cosim.recording.replay_data import ReplayData, Track
-from cosim.types import Floats, Forecast
+from cosim.report.replay.shapes import LEAST, NAMES, SHAPES
+from cosim.report.replay.signs import LAMPS, stop_lines, violations
+from cosim.types import Bytes, Floats, Forecast
 
 MARGIN = 500.0  # m around the traffic: roads further away are left out
 SCRIPTS = ("data.js", "view.js", "draw.js", "panel.js", "main.js")
@@ -73,8 +75,54 @@ def document(replay: ReplayData) -> dict[str, Any]:
             }
             for c in r.collisions
         ],
+        "shapes": _shapes(r),
+        **_signs(r, place, window),
+        "violations": [
+            [_ms(time), number[who], words.setdefault(what, len(words))]
+            for time, who, what in violations(r)
+            if who in number
+        ],
+        "interventions": [
+            [_ms(one.time), number[one.vehicle], words.setdefault(one.reason, len(words))]
+            for one in r.interventions
+            if one.vehicle in number
+        ],
         "words": [*words],
     }  # fmt: skip
+
+
+def _shapes(r: ReplayData) -> dict[int, list[Any]]:
+    """Of the actors there are -> [name, [least length m, least width m], [[colour, [[x, y], ...]], ...]]."""
+    return {
+        int(a): [NAMES[a], LEAST.get(a, (0.0, 0.0)), SHAPES[a]] for a in sorted({t.actor for t in r.tracks})
+    }
+
+
+def _signs(r: ReplayData, place: dict[int, int], window: tuple[Floats, Floats]) -> dict[str, Any]:
+    """Stop lines [lane, rule, signals], crossings [width cm, centre line, signal], and each signal they name.
+
+    A signal is [states, frames]: its states one after the other, and the frames in which they begin, in
+    differences. Signals change seldom.
+    """
+    lines = [line for line in stop_lines(r.road) if line.lane in place]
+    crossings = [c for c in r.road.crossings if _meets(c.shape, window)]
+    named = {s for line in lines for s in line.signals} | {c.signal for c in crossings}
+    shown = {s: k for k, s in enumerate(sorted(s for s in named if 0 <= s < r.signals.shape[1]))}
+    return {
+        "stop_lines": [
+            [place[line.lane], int(line.rule), [shown[s] for s in line.signals if s in shown]]
+            for line in lines
+        ],
+        "crossings": [[round(c.width * 100), _line(c.shape), shown.get(c.signal, -1)] for c in crossings],
+        "signals": [_signal(r.signals[:, s]) for s in shown],
+        "lamps": {state: f"#{bytes(colour).hex()}" for state, colour in LAMPS.items()},
+    }
+
+
+def _signal(states: Bytes) -> list[Any]:
+    """[T] -> [states, frames in differences]"""
+    begins = np.flatnonzero(np.diff(states.astype(np.int16), prepend=-1))
+    return [states[begins].tobytes().decode("ascii"), _differences(begins)]
 
 
 def _facts(r: ReplayData) -> dict[str, Any]:
@@ -92,10 +140,18 @@ def _facts(r: ReplayData) -> dict[str, Any]:
 
 
 def _vehicles(r: ReplayData, number: dict[str, int]) -> list[list[Any]]:
-    """[id, is AV, is mission, class, length cm, width cm] by number."""
+    """[id, kind, is mission, class, length cm, width cm, actor] by number."""
     last = {t.id: t for t in r.tracks}
     return [
-        [t.id, int(t.kind), int(t.mission), t.driver, round(t.length * 100), round(t.width * 100)]
+        [
+            t.id,
+            int(t.kind),
+            int(t.mission),
+            t.driver,
+            round(t.length * 100),
+            round(t.width * 100),
+            int(t.actor),
+        ]
         for t in (last[name] for name in number)
     ]
 

@@ -1,7 +1,7 @@
 """The road of one moment from above, drawn by Pillow twice as fine as it is shown."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from importlib import resources
 from typing import NamedTuple
@@ -11,17 +11,23 @@ from PIL import Image, ImageDraw, ImageFont
 
 from cosim.recording.recorder import Choice
 from cosim.recording.replay_data import ReplayData, Track
-from cosim.types import Floats, Kind, MetaAction
+from cosim.report.replay.shapes import BODY, BRAKES, DARK, LEAST, LIGHT, SENSOR, SHAPES, Shape
+from cosim.report.replay.signs import LAMPS, StopLine, heading_at_end, states_at, zebra
+from cosim.road import Rule
+from cosim.types import Actor, Floats, Kind, MetaAction
 
 FINE = 2  # drawn this much larger, then reduced: smooth edges
 ACROSS = 200.0  # m of road in the picture's width
 SIGMAS = 2.0  # half the width of a predicted interval, in standard deviations
 
 GROUND, ROAD, EDGE, JUNCTION = (238, 241, 244), (201, 206, 214), (255, 255, 255), (188, 194, 203)
+MARK = (255, 255, 255)  # paint on the road
 TEXT, BAD, WARN = (27, 33, 41), (200, 30, 30), (180, 83, 9)
+LAW, CORRECTION = (109, 40, 217), (14, 116, 144)
+HOUSING, SIGN = (32, 37, 43), (200, 30, 30)
 MISSION, AV = (184, 69, 155), (0, 114, 178)
 DRIVERS = {"conservative": (0, 158, 115), "moderate": (230, 159, 0), "aggressive": (213, 94, 0)}
-OTHER = (125, 133, 144)
+OTHER, PERSON = (125, 133, 144), (76, 52, 112)
 GLYPHS = {
     MetaAction.LANE_LEFT: "←",
     MetaAction.LANE_RIGHT: "→",
@@ -60,9 +66,11 @@ def poses_at(r: ReplayData, time: float) -> list[Pose]:
 
 
 def colour_of(track: Track) -> Colour:
-    """Mission vehicles first, then AVs, then HVs by class."""
+    """Mission vehicles first, then AVs, then HVs by class; persons have one of their own."""
     if track.mission:
         return MISSION
+    if track.kind == Kind.PERSON:
+        return PERSON
     return AV if track.kind == Kind.AV else DRIVERS.get(track.driver, OTHER)
 
 
@@ -116,6 +124,53 @@ class Strip:
                     width = max(round((lane.width - less) * self._scale), 1)
                     self._pen.line(self._pixels(lane.shape), fill=colour, width=width, joint="curve")
 
+    def signs(self, r: ReplayData, lines: Sequence[StopLine], time: float) -> None:
+        """Pedestrian crossings, stop lines with their signs, and signals in their colour at `time` s."""
+        states = states_at(r, time)
+        for crossing in r.road.crossings:
+            if self.sees(crossing.shape):
+                for stripe in zebra(crossing):
+                    self._pen.polygon(self._pixels(stripe), fill=MARK)
+                if 0 <= crossing.signal < len(states):
+                    for x, y in (crossing.shape[0], crossing.shape[-1]):
+                        self._lamp(_ellipse(np.array([x, y]), 0.5, 0.5, 0.0), states[crossing.signal])
+        for line in lines:
+            lane = r.road.lanes[line.lane]
+            end = lane.shape[-1]
+            if self.sees(end[None]):
+                self._stop_line(end, heading_at_end(lane.shape), 0.46 * lane.width, line, states)
+
+    def _stop_line(self, end: Floats, heading: float, side: float, line: StopLine, states: str) -> None:
+        """`end` [2] m, `side`: half the width of the lane, m."""
+
+        def paint(points: Sequence[tuple[float, float]], colour: Colour) -> None:
+            self._pen.polygon(
+                self._pixels(_placed(np.array(points), float(end[0]), float(end[1]), heading)), fill=colour
+            )
+
+        if line.signals or line.rule != Rule.YIELD:
+            paint(((-0.5, -side), (0.0, -side), (0.0, side), (-0.5, side)), MARK)
+        else:
+            for k in range(4):
+                y = side * (k / 2 - 1)
+                paint(((0.0, y), (0.0, y + 0.5 * side), (-1.1, y + 0.25 * side)), MARK)
+        if line.rule in (Rule.STOP, Rule.ALL_WAY_STOP) and not line.signals:
+            turns = np.pi * (np.arange(8) / 4 + 0.125)
+            for size, colour in ((1.0, MARK), (0.8, SIGN)):
+                octagon = np.stack([np.cos(turns), np.sin(turns)], 1) * size + (1.2, 0.0)
+                paint([(x, y) for x, y in octagon.tolist()], colour)
+            paint(((1.0, -0.5), (1.4, -0.5), (1.4, 0.5), (1.0, 0.5)), MARK)
+        lamps = [states[s] for s in line.signals if s < len(states)]
+        wide = 2.0 * side / max(len(lamps), 1)
+        for k, state in enumerate(lamps):
+            left = side - wide * k
+            corners = np.array([(0.15, left), (1.25, left), (1.25, left - wide), (0.15, left - wide)])
+            self._lamp(_placed(corners, float(end[0]), float(end[1]), heading), state)
+
+    def _lamp(self, outline: Floats, state: str) -> None:
+        points = self._pixels(outline)
+        self._pen.polygon(points, fill=LAMPS.get(state, OTHER), outline=HOUSING, width=FINE)
+
     def forecast(self, r: ReplayData, k: int) -> None:
         """Predicted paths, with an ellipse every second that holds the interval."""
         forecast = r.forecasts[k] if 0 <= k < len(r.forecasts) else None
@@ -136,22 +191,22 @@ class Strip:
                 self._pen.polygon(self._pixels(ring), fill=(*colour, 36), outline=(*colour, 130))
 
     def vehicle(self, p: Pose) -> None:
-        """The box, its windscreen, brake lights, and the sensor on an AV's roof."""
-        t, length, w = p.track, p.track.length, p.track.width
+        """Its shape; brake lights; the sensor on an AV's roof."""
+        t = p.track
+        parts = SHAPES[t.actor]
+        if p.accel < -1.0 and t.actor not in (Actor.PERSON, Actor.BICYCLE):
+            parts += BRAKES
+        self.shape(parts + SENSOR * (t.kind == Kind.AV), p, colour_of(t))
 
-        def box(back: float, front: float, side: float) -> list[tuple[float, float]]:
-            corners = np.array([[back, -side], [front, -side], [front, side], [back, side]])
-            return self._pixels(_placed(corners, p.x, p.y, p.heading))
-
-        self._pen.polygon(
-            box(-length / 2, length / 2, w / 2), fill=colour_of(t), outline=(255, 255, 255), width=FINE
-        )
-        self._pen.polygon(box(0.12 * length, 0.25 * length, 0.38 * w), fill=(255, 255, 255, 200))
-        if p.accel < -1.0:
-            self._pen.polygon(box(-length / 2, -0.4 * length, w / 2), fill=(255, 32, 32))
-        if t.kind == Kind.AV:
-            roof = _ellipse(np.zeros(2), 0.2 * w, 0.2 * w, 0.0) - (0.16 * length, 0.0)
-            self._pen.polygon(self._pixels(_placed(roof, p.x, p.y, p.heading)), fill=(255, 255, 255, 210))
+    def shape(self, parts: Shape, p: Pose, colour: Colour) -> None:
+        """Parts of a shape, at the size that is drawn at least."""
+        least = LEAST.get(p.track.actor, (0.0, 0.0))
+        size = max(p.track.length, least[0]), max(p.track.width, least[1])
+        fills: Mapping[str, Colour] = {BODY: colour, LIGHT: (255, 255, 255, 205), DARK: HOUSING}
+        for name, points in parts:
+            pixels = self._pixels(_placed(np.array(points) * size, p.x, p.y, p.heading))
+            rim = (255, 255, 255) if name == BODY else None
+            self._pen.polygon(pixels, fill=fills.get(name, (255, 32, 32)), outline=rim, width=FINE)
 
     def choice(self, p: Pose, c: Choice, others: Mapping[str, Pose]) -> None:
         """The command beside the car; a ring where it was vetoed, a line to who was blamed."""
@@ -167,6 +222,16 @@ class Strip:
         if glyph:
             x, y = self._pixel(p.x, p.y - p.track.width / 2 - 1.2)
             self._text(x, y, glyph, BAD if c.blocked else AV, 15, bold=True)
+
+    def broken(self, p: Pose, what: str) -> None:
+        """The law that it broke, beneath it."""
+        x, y = self._pixel(p.x, p.y - p.track.width / 2 - 2.6)
+        self._text(x, y, what, LAW, 12, bold=True)
+
+    def corrected(self, p: Pose) -> None:
+        """A square around an AV that its car corrected."""
+        side = 0.62 * p.track.length * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
+        self._pen.line(self._pixels(side + np.array([p.x, p.y])), fill=CORRECTION, width=2 * FINE)
 
     def name(self, p: Pose) -> None:
         """The vehicle's id above it."""
@@ -187,6 +252,20 @@ class Strip:
             (x, y), text, fill=colour, font=font(size * FINE, bold), anchor="mm",
             stroke_width=2 * FINE, stroke_fill=(255, 255, 255),
         )  # fmt: skip
+
+
+def icon(actor: Actor, colour: Colour, size: tuple[int, int] = (18, 12)) -> Image.Image:
+    """The shape of an actor for a legend, `size` pixels wide and high."""
+    fine, (wide, high) = 4, size
+    picture = Image.new("RGB", (wide * fine, high * fine), GROUND)
+    pen = ImageDraw.Draw(picture)
+    narrow = {Actor.PERSON: (0.5, 0.9), Actor.BICYCLE: (0.9, 0.6), Actor.MOTORCYCLE: (0.9, 0.6)}
+    along, across = narrow.get(actor, (1.0, 0.7))
+    fills: Mapping[str, Colour] = {BODY: colour, LIGHT: (255, 255, 255), DARK: HOUSING}
+    for name, points in SHAPES[actor]:
+        shape = np.array(points) * (along * wide, -across * high) + (0.5 * wide, 0.5 * high)
+        pen.polygon([(x, y) for x, y in (fine * shape).tolist()], fill=fills[name])
+    return picture.reduce(fine)
 
 
 def _placed(points: Floats, x: float, y: float, heading: float) -> Floats:

@@ -16,17 +16,37 @@ from PIL import Image, ImageDraw
 from cosim.files import whole
 from cosim.recording.recorder import Choice
 from cosim.recording.replay_data import ReplayData, Track
-from cosim.report.replay.strip import AV, BAD, TEXT, WARN, Colour, Pose, Strip, colour_of, font, poses_at
-from cosim.types import Kind, MetaAction
+from cosim.report.replay.shapes import NAMES
+from cosim.report.replay.signs import stop_lines, violations
+from cosim.report.replay.strip import (
+    AV,
+    BAD,
+    CORRECTION,
+    LAW,
+    OTHER,
+    PERSON,
+    TEXT,
+    WARN,
+    Colour,
+    Pose,
+    Strip,
+    colour_of,
+    font,
+    icon,
+    poses_at,
+)  # fmt: skip
+from cosim.types import Actor, Kind, MetaAction
 from cosim.workers.tasks import Progress
 
 WIDTH, HEIGHT = 1280, 400  # pixels
-PANEL = 124  # pixels of text beneath the road
+PANEL = 140  # pixels of text beneath the road
 RATE = 10  # pictures a second
 SMALL, LOW, CAPTION = 800, 112, 24  # pixels: width of a GIF, height of its road and of the line beneath
 STEP, SHOWN = 0.4, 0.2  # s from picture to picture of a GIF, and s that each is shown: twice as fast
 COLOURS = 64  # of a GIF
 SHOWN_CRASH = 4.0  # s that a collision stays marked
+SHOWN_EVENT = 2.0  # s that a correction or an offence stays marked
+SPLIT = 470  # pixel: the episode left of it, one AV's decision right of it
 QUIET, GOOD = (95, 107, 122), (21, 128, 61)
 ACTIONS = {
     MetaAction.LANE_LEFT: "lane left",
@@ -91,12 +111,13 @@ def _pictures(
 
 
 class _Camera:
-    """Whom the film follows, and where it looks while that vehicle is not on the road."""
+    """Whom the film follows, where it looks while that vehicle is not on the road, and what stands there."""
 
     def __init__(self, replay: ReplayData, follow: str | None) -> None:
         def rank(t: Track) -> tuple[bool, bool, bool]:
             return t.id != follow, not t.mission, t.kind != Kind.AV
 
+        self.lines, self.violations = stop_lines(replay.road), violations(replay)
         self.follow = min(replay.tracks, key=rank, default=None)
         self.x = self.y = 0.0  # m, the middle of the picture
         if self.follow is not None:
@@ -119,6 +140,7 @@ def picture_at(r: ReplayData, time: float, camera: _Camera, *, small: bool = Fal
     shown = camera.look(poses)
     strip = Strip(camera.x, camera.y, *((SMALL, LOW) if small else (WIDTH, HEIGHT - PANEL)))
     strip.road(r)
+    strip.signs(r, camera.lines, time)
     k = int(np.searchsorted(r.decided, time + 1e-6, side="right")) - 1
     choices: Mapping[str, Choice] = r.choices[k] if 0 <= k < len(r.choices) else {}
     by_name = {p.track.id: p for p in poses}
@@ -132,6 +154,13 @@ def picture_at(r: ReplayData, time: float, camera: _Camera, *, small: bool = Fal
             strip.choice(pose, choices[pose.track.id], by_name)
         if pose.track.mission or pose is shown:
             strip.name(pose)
+    seen = {p.track.id for p in near}
+    for at, who, what in camera.violations:
+        if who in seen and 0.0 <= time - at + 0.05 < SHOWN_EVENT:
+            strip.broken(by_name[who], what)
+    for one in r.interventions:
+        if one.vehicle in seen and 0.0 <= time - one.time + 0.05 < SHOWN_EVENT and not small:
+            strip.corrected(by_name[one.vehicle])
     for crash in r.collisions:
         if math.isfinite(crash.x) and 0.0 <= time - crash.time + 0.05 < SHOWN_CRASH:
             strip.crash(crash.x, crash.y)
@@ -154,14 +183,21 @@ class _Board:
         self._pen = ImageDraw.Draw(self.picture)
 
     def legend(self, r: ReplayData) -> None:
-        """Which colour is who, at the top."""
+        """Which colour is who, then which shape is what, at the top."""
         mission = "mission vehicle" + ", guessed" * bool(r.facts.get("mission_guessed"))
-        kinds = {mission if t.mission else _kind(t): colour_of(t) for t in r.tracks}
-        x = 14.0
-        for name, colour in sorted(kinds.items()):
-            self._pen.rounded_rectangle((x, 12, x + 18, 20), 2, fill=colour)
-            self._line(x + 23, 8, name, TEXT, 12)
-            x += 40 + self._pen.textlength(name, font(12))
+        cars = {mission if t.mission else _driver(t): (Actor.CAR, colour_of(t)) for t in r.tracks}
+        cars.pop("", None)  # of persons
+        others = sorted({t.actor for t in r.tracks} - {Actor.CAR})
+        shapes = {NAMES[a]: (a, PERSON if a == Actor.PERSON else OTHER) for a in others}
+        entries = {**dict(sorted(cars.items())), **shapes}
+        x, y = 14.0, 8.0
+        for name, (actor, colour) in entries.items():
+            wide = 40 + self._pen.textlength(name, font(12))
+            if x + wide > self.picture.width:
+                x, y = 14.0, y + 18.0
+            self.picture.paste(icon(actor, colour), (round(x), round(y) + 2))
+            self._line(x + 23, y, name, TEXT, 12)
+            x += wide
 
     def caption(self, r: ReplayData, time: float) -> None:
         """One line: who drives, what has come of it, when."""
@@ -192,18 +228,31 @@ class _Board:
         )
         self._line(14, line + 50, f"{time - r.begin:.1f} s of {r.times[-1] - r.begin:.0f} s", TEXT, 14)
         outcome, colour = _outcome(r, time)
-        self._line(14, line + 72, outcome, colour, 14)
+        self._wrapped(14, line + 72, outcome, colour, SPLIT - 24)
+        broken = [v for v in camera.violations if v[0] <= time + 0.05]
+        corrections = [one for one in r.interventions if one.time <= time + 0.05]
         if t := camera.follow:
             what = _kind(t) + ", mission vehicle" * t.mission
             where = f"{here[t.id].speed:.1f} m/s" if t.id in here else "not on the road"
-            self._line(14, line + 96, f"{t.id} ({what}): {where}", colour_of(t), 13)
+            self._wrapped(14, line + 104, f"{t.id} ({what}): {where}", colour_of(t), SPLIT - 24, most=1)
+        if corrections or broken:
+            counts = (f"law broken {len(broken)} times", f"AVs corrected {len(corrections)} times")
+            said = ", ".join(text for text, n in zip(counts, (broken, corrections), strict=True) if n)
+            self._line(14, line + 121, f"{said} so far", LAW if broken else CORRECTION, 12)
         if shown is not None:
-            self._decision(470, line, shown, choices.get(shown.track.id))
+            mine = [one for one in corrections if one.vehicle == shown.track.id]
+            reason = mine[-1].reason if mine and time - mine[-1].time < SHOWN_EVENT else None
+            self._decision(SPLIT, line, shown, choices.get(shown.track.id), reason)
 
-    def _decision(self, left: float, top: float, av_: Pose, c: Choice | None) -> None:
+    def _decision(self, left: float, top: float, av_: Pose, c: Choice | None, corrected: str | None) -> None:
+        """The command of one AV and why; `corrected`: why its car drives otherwise."""
         name = f"{av_.track.id}, {av_.speed:.1f} m/s: "
+        room = self.picture.width - 14 - left
+        why = f"corrected by the car: {corrected}"
         if c is None:
             self._line(left, top + 8, f"{name}driven by SUMO, no command", AV, 14)
+            if corrected:
+                self._wrapped(left, top + 28, why, CORRECTION, room)
             return
         d = c.decision
         self._line(left, top + 8, f"{name}{ACTIONS[d.action]}, target {c.target:.0f} m/s", AV, 14, bold=True)
@@ -211,9 +260,10 @@ class _Board:
             f"preferred action vetoed, blamed {d.blamed}": WARN if d.vetoed else None,
             "no action safe": BAD if d.fallback else None,
             f"command blocked: {c.blocked}": BAD if c.blocked else None,
+            why: CORRECTION if corrected else None,
         }
         words = {text: shade for text, shade in said.items() if shade} or {"command executed": QUIET}
-        self._line(left, top + 28, "; ".join(words), [*words.values()][-1], 13)
+        top += 16 * (self._wrapped(left, top + 28, "; ".join(words), [*words.values()][-1], room) - 1)
         named = (("Q", d.q), ("score s", d.safety_score), ("TTC s", d.ttc))
         rows = [(name, values) for name, values in named if values is not None]
         for a in MetaAction if rows else ():
@@ -226,14 +276,39 @@ class _Board:
         for k, (row, _) in enumerate(rows):
             self._line(left, top + 67 + 17 * k, row, QUIET, 13)
 
+    def _wrapped(self, x: float, y: float, text: str, colour: Colour, room: float, *, most: int = 2) -> int:
+        """Text within `room` pixels on `most` lines, the last one cut with dots; how many it took."""
+        lines = [""]
+        for word in text.split():
+            longer = f"{lines[-1]} {word}".strip()
+            if self._pen.textlength(longer, font(13)) <= room:
+                lines[-1] = longer
+            else:
+                lines.append(word)
+        lines = [line for line in lines if line]
+        shown = lines[:most]
+        if shown and (len(lines) > most or self._pen.textlength(shown[-1], font(13)) > room):
+            while shown[-1] and self._pen.textlength(f"{shown[-1]} ...", font(13)) > room:
+                shown[-1] = shown[-1][:-1]
+            shown[-1] += " ..."
+        for k, line in enumerate(shown):
+            self._line(x, y + 16 * k, line, colour)
+        return max(len(shown), 1)
+
     def _line(
         self, x: float, y: float, text: str, colour: Colour, size: int = 13, *, bold: bool = False
     ) -> None:
         self._pen.text((x, y), text, fill=colour, font=font(size, bold))
 
 
+def _driver(t: Track) -> str:
+    """Who drives; "" where nobody does."""
+    return "AV" if t.kind == Kind.AV else "" if t.kind == Kind.PERSON else f"human, {t.driver}"
+
+
 def _kind(t: Track) -> str:
-    return "AV" if t.kind == Kind.AV else f"human, {t.driver}"
+    parts = [_driver(t), NAMES[t.actor] if t.actor != Actor.CAR else ""]
+    return ", ".join(filter(None, parts))
 
 
 def _outcome(r: ReplayData, time: float) -> tuple[str, Colour]:

@@ -23,9 +23,11 @@ function read(raw) {
     const px = scaled(x, 0.01), py = scaled(y, 0.01);
     return { x: px, y: py, box: [Math.min(...px), Math.min(...py), Math.max(...px), Math.max(...py)] };
   };
-  const vehicles = raw.vehicles.map(([id, av, mission, driver, length, width], number) => ({
-    id, number, av: av === 1, mission: mission === 1, driver, length: length / 100, width: width / 100,
-    tracks: [], choices: [],
+  const shapes = new Map(Object.entries(raw.shapes).map(([actor, [name, least, parts]]) => [Number(actor), { name, least, parts }]));
+  const vehicles = raw.vehicles.map(([id, kind, mission, driver, length, width, actor], number) => ({
+    id, number, av: kind === 1, person: kind === 2, mission: mission === 1, driver, actor, what: shapes.get(actor).name,
+    length: Math.max(length / 100, shapes.get(actor).least[0]), width: Math.max(width / 100, shapes.get(actor).least[1]),
+    tracks: [], choices: [], corrections: [], violations: [],
   }));
   for (const [v, first, x, y, heading, speed, accel, lane] of raw.tracks) {
     vehicles[v].tracks.push({
@@ -33,6 +35,10 @@ function read(raw) {
       heading: scaled(heading, 0.001), speed: scaled(speed, 0.01), accel: scaled(accel, 0.01), lane: summed(lane),
     });
   }
+  const said = ([t, v, word]) => ({ t: t / 1000 - begin, text: raw.words[word], vehicle: vehicles[v] });
+  const corrections = raw.interventions.map(said), violations = raw.violations.map(said);
+  for (const one of corrections) one.vehicle.corrections.push(one);
+  for (const one of violations) one.vehicle.violations.push(one);
   const decided = raw.decided.map((t) => t / 1000 - begin);
   raw.choices.forEach((rows, k) => {
     for (const [v, action, target, flags, blamed, blocked, q, score, ttc, unsafe] of rows) {
@@ -48,14 +54,31 @@ function read(raw) {
   const times = summed(raw.times).map((t) => t / 1000 - begin);
   // a mission that was found, not named, may end almost anywhere: no use to mark that
   const open = raw.lanes.filter(([, , internal]) => internal === 0).length;
+  const lanes = raw.lanes.map(([id, width, internal, shape]) => ({ id, width: width / 100, internal: internal === 1, ...line(shape) }));
   return {
-    facts: raw.facts, times, end: times[times.length - 1], vehicles, decided, forecasts,
+    facts: raw.facts, shapes, lamps: raw.lamps, corrections, violations,
+    signals: raw.signals.map(([states, frames]) => ({ states, frames: summed(frames) })),
+    crossings: raw.crossings.map(([width, shape, signal]) => ({ width: width / 100, signal, ...line(shape) })),
+    stopLines: raw.stop_lines.map(([lane, rule, signals]) => ({ ...endOf(lanes[lane]), rule, signals })),
+    times, end: times[times.length - 1], vehicles, decided, forecasts,
     forecastInterval: raw.forecast_interval,
     byId: new Map(vehicles.map((v) => [v.id, v])),
-    lanes: raw.lanes.map(([id, width, internal, shape]) => ({ id, width: width / 100, internal: internal === 1, ...line(shape) })),
+    lanes,
     junctions: raw.junctions.map(line), goal: new Set(raw.goal.length > open / 2 && open > 6 ? [] : raw.goal), zones: new Set(raw.zones),
     collisions: raw.collisions.map((c) => ({ ...c, t: c.t / 1000 - begin })),
   };
+}
+
+// Where a lane ends, in which direction, and half its width between the edges.
+function endOf({ x, y, width }) {
+  const n = x.length - 1;
+  return { x: x[n], y: y[n], heading: Math.atan2(y[n] - y[n - 1], x[n] - x[n - 1]), side: 0.46 * width };
+}
+
+// The state of a signal (rRyYgGsuoO) at time t.
+function lampAt(data, signal, t) {
+  const { states, frames } = data.signals[signal];
+  return states[Math.max(atOrBefore(frames, Math.max(atOrBefore(data.times, t), 0)), 0)];
 }
 
 // The last index of an ascending array whose value is not above t; -1 before the first.
@@ -95,15 +118,26 @@ function choiceOf(data, vehicle, t) {
   return choice && choice.k === k ? choice : null;
 }
 
-// What there is to jump to: collisions, the mission's success, refused commands, vetoes where they begin.
+// Kinds of events, the gravest first: what the filter calls them, and their colour.
+const EVENTS = {
+  collision: ["collisions", "bad"], law: ["law broken", "law"], unsafe: ["no safe action", "aggressive"],
+  mission: ["mission", "good"], correction: ["corrections by the car", "correction"],
+  refused: ["commands refused", "quiet"], veto: ["vetoes", "warn"],
+};
+
+// What there is to jump to; vetoes and refusals where they begin.
 function eventsOf(data) {
   const found = data.collisions.map((c) => ({
-    t: c.t, kind: "bad", who: [c.collider, c.victim],
+    t: c.t, kind: "collision", who: [c.collider, c.victim],
     text: `${c.collider} hit ${c.victim} (${c.kind}${c.av_caused ? ", AV-caused" : ""})`,
   }));
+  for (const one of data.violations) found.push({ t: one.t, kind: "law", who: [one.vehicle.id], text: `${one.vehicle.id} ${one.text}` });
+  for (const one of data.corrections) {
+    found.push({ t: one.t, kind: "correction", who: [one.vehicle.id], text: `${one.vehicle.id}: corrected by the car, ${one.text}` });
+  }
   const figure = (name) => (data.facts.metrics.find(([n]) => n === name) || [])[1];
   if (figure("mission_time_s") != null) {
-    found.push({ t: figure("mission_time_s"), kind: "good", who: data.vehicles.filter((v) => v.mission).map((v) => v.id),
+    found.push({ t: figure("mission_time_s"), kind: "mission", who: data.vehicles.filter((v) => v.mission).map((v) => v.id),
       text: "mission fulfilled" });
   }
   for (const v of data.vehicles) {
@@ -111,12 +145,12 @@ function eventsOf(data) {
     for (const c of v.choices) {
       const goesOn = before && before.k === c.k - 1;
       if (c.blocked && !(goesOn && before.blocked === c.blocked)) {
-        found.push({ t: c.t, kind: "warn", who: [v.id], text: `${v.id}: ${ACTIONS[c.action]} blocked, ${c.blocked}` });
+        found.push({ t: c.t, kind: "refused", who: [v.id], text: `${v.id}: ${ACTIONS[c.action]} blocked, ${c.blocked}` });
       }
       if (c.fallback && !(goesOn && before.fallback)) {
-        found.push({ t: c.t, kind: "bad", who: [v.id], text: `${v.id}: no safe action, takes ${ACTIONS[c.action]}` });
+        found.push({ t: c.t, kind: "unsafe", who: [v.id], text: `${v.id}: no safe action, takes ${ACTIONS[c.action]}` });
       } else if (c.vetoed && !(goesOn && before.vetoed)) {
-        found.push({ t: c.t, kind: "warn", who: [v.id, c.blamed], text: `${v.id}: ${preferred(c)} vetoed, blamed ${c.blamed}` });
+        found.push({ t: c.t, kind: "veto", who: [v.id, c.blamed], text: `${v.id}: ${preferred(c)} vetoed, blamed ${c.blamed}` });
       }
       before = c;
     }

@@ -6,13 +6,14 @@ const VIEW_RANGE = 125; // m: what a chosen AV's own rows reach (contract)
 function colours() {
   const style = getComputedStyle(document.documentElement);
   const names = "ground road edge junction goal zone text quiet panel line pick halo av conservative moderate " +
-    "aggressive asis mission bad good warn";
+    "aggressive asis mission bad good warn person mark dark sign law correction";
   return Object.fromEntries(names.split(" ").map((n) => [n, style.getPropertyValue(`--${n}`).trim()]));
 }
 
 function colourOf(vehicle, c) {
   if (vehicle.mission) return c.mission;
   if (vehicle.av) return c.av;
+  if (vehicle.person) return c.person;
   return c[vehicle.driver] || c.asis;
 }
 
@@ -72,20 +73,83 @@ function drawForecast(ctx, state, view, c, t) {
   ctx.globalAlpha = 1;
 }
 
-function drawVehicle(ctx, vehicle, s, c, view, chosen) {
-  const l = Math.max(vehicle.length, 5 / view.scale), w = Math.max(vehicle.width, 3 / view.scale);
+// The polygons of an actor (shapes.py), `length` x `width` around the origin, in the colour of who drives.
+function drawShape(ctx, shape, length, width, colour, c) {
+  const fills = { body: colour, light: c.halo, dark: c.text };
+  for (const [name, points] of shape) {
+    ctx.fillStyle = fills[name];
+    ctx.beginPath();
+    for (const [x, y] of points) ctx.lineTo(x * length, y * width);
+    ctx.closePath(); ctx.fill();
+    if (name === "body") ctx.stroke();
+  }
+}
+
+function drawVehicle(ctx, vehicle, s, c, view, chosen, shapes) {
+  const slim = vehicle.person || vehicle.width < 1.2;
+  const l = Math.max(vehicle.length, (slim ? 4 : 5) / view.scale), w = Math.max(vehicle.width, 3 / view.scale);
   ctx.save();
   view.inMetres(ctx);
   ctx.translate(s.x, s.y); ctx.rotate(s.heading);
-  ctx.fillStyle = colourOf(vehicle, c);
   ctx.strokeStyle = chosen ? c.pick : c.ground; ctx.lineWidth = Math.max(chosen ? 0.35 : 0.12, (chosen ? 2 : 0.6) / view.scale);
-  ctx.beginPath(); ctx.roundRect(-l / 2, -w / 2, l, w, [0.15 * w, 0.35 * w, 0.35 * w, 0.15 * w]); ctx.fill(); ctx.stroke();
+  const shape = shapes.get(vehicle.actor).parts;
+  drawShape(ctx, view.scale > 2.2 ? shape : shape.filter(([name]) => name === "body"), l, w, colourOf(vehicle, c), c);
   if (view.scale > 2.2) {
-    ctx.fillStyle = c.halo; ctx.fillRect(0.12 * l, -0.38 * w, 0.13 * l, 0.76 * w); // windscreen: where the front is
-    if (s.accel < -1) { ctx.fillStyle = "#ff2020"; ctx.fillRect(-l / 2, -w / 2, 0.09 * l, w); } // brake lights
+    if (s.accel < -1 && !slim) { ctx.fillStyle = "#ff2020"; ctx.fillRect(-l / 2, -w / 2, Math.min(0.09 * l, 0.6), w); } // brake lights
     if (vehicle.av) { ctx.fillStyle = c.halo; ctx.beginPath(); ctx.arc(-0.16 * l, 0, 0.2 * w, 0, 7); ctx.fill(); } // sensor
   }
   ctx.restore();
+}
+
+const YIELD = 1, STOPS = [2, 3]; // rules (cosim/road/link.py)
+
+// A stop line, its sign and its lamps, at the end of a lane that leads to the right.
+function drawStopLine(ctx, rule, lamps, side, c, fine) {
+  ctx.fillStyle = c.mark;
+  if (lamps.length || rule !== YIELD) ctx.fillRect(-0.5, -side, 0.5, 2 * side);
+  else {
+    for (let k = 0; k < 4; k++) {
+      const y = side * (k / 2 - 1);
+      ctx.beginPath(); ctx.moveTo(0, y); ctx.lineTo(0, y + side / 2); ctx.lineTo(-1.1, y + side / 4); ctx.fill();
+    }
+  }
+  if (STOPS.includes(rule) && !lamps.length && fine) {
+    for (const [size, colour] of [[1, c.mark], [0.8, c.sign]]) {
+      ctx.fillStyle = colour; ctx.beginPath();
+      for (let k = 0; k < 8; k++) ctx.lineTo(size * Math.cos((k + 0.5) * Math.PI / 4) + 1.2, size * Math.sin((k + 0.5) * Math.PI / 4));
+      ctx.fill();
+    }
+    ctx.fillStyle = c.mark; ctx.fillRect(1, -0.5, 0.4, 1);
+  }
+  const wide = (2 * side) / lamps.length;
+  lamps.forEach((colour, k) => {
+    ctx.fillStyle = colour;
+    ctx.fillRect(0.15, side - (k + 1) * wide, 1.1, wide);
+    if (fine) ctx.strokeRect(0.15, side - (k + 1) * wide, 1.1, wide);
+  });
+}
+
+function drawSigns(ctx, data, view, c, t) {
+  const near = view.scale > 1.5;
+  if (view.scale < 0.4) return;
+  view.inMetres(ctx);
+  for (const crossing of near ? data.crossings : []) {
+    if (!view.sees(crossing.box)) continue;
+    ctx.strokeStyle = c.mark; ctx.lineWidth = crossing.width; ctx.setLineDash([0.5, 0.5]); ctx.lineDashOffset = -0.25;
+    trace(ctx, crossing); ctx.stroke(); ctx.setLineDash([]);
+    if (crossing.signal < 0) continue;
+    ctx.fillStyle = data.lamps[lampAt(data, crossing.signal, t)] || c.asis; ctx.strokeStyle = c.dark; ctx.lineWidth = 0.15;
+    for (const k of [0, crossing.x.length - 1]) { ctx.beginPath(); ctx.arc(crossing.x[k], crossing.y[k], 0.5, 0, 7); ctx.fill(); ctx.stroke(); }
+  }
+  for (const line of data.stopLines) {
+    if (!view.sees([line.x, line.y, line.x, line.y]) || (!near && !line.signals.length)) continue;
+    const lamps = line.signals.map((signal) => data.lamps[lampAt(data, signal, t)] || c.asis);
+    ctx.save(); ctx.translate(line.x, line.y); ctx.rotate(line.heading);
+    ctx.strokeStyle = c.dark; ctx.lineWidth = 0.15;
+    if (!near) ctx.scale(1.5 / view.scale, 1); // seen from afar, too
+    drawStopLine(ctx, line.rule, lamps, line.side, c, view.scale > 3);
+    ctx.restore();
+  }
 }
 
 function drawScene(ctx, state) {
@@ -93,15 +157,16 @@ function drawScene(ctx, state) {
   view.inPixels(ctx);
   ctx.fillStyle = c.ground; ctx.fillRect(0, 0, view.width, view.height);
   drawRoad(ctx, data, view, c);
+  drawSigns(ctx, data, view, c, t);
   if (state.predictions) drawForecast(ctx, state, view, c, t);
   state.shown = [];
   for (const vehicle of data.vehicles) {
     const s = stateOf(data, vehicle, t);
     if (s && view.sees([s.x - 8, s.y - 8, s.x + 8, s.y + 8])) state.shown.push([vehicle, s]);
   }
-  for (const [vehicle, s] of state.shown) drawVehicle(ctx, vehicle, s, c, view, vehicle === state.chosen);
+  for (const [vehicle, s] of state.shown) drawVehicle(ctx, vehicle, s, c, view, vehicle === state.chosen, data.shapes);
   view.inPixels(ctx);
-  for (const [vehicle, s] of state.shown) drawChoice(ctx, state, vehicle, s);
+  for (const [vehicle, s] of state.shown) { drawChoice(ctx, state, vehicle, s); drawLaw(ctx, state, vehicle, s); }
   for (const [vehicle, s] of state.shown) {
     if (vehicle === state.chosen || vehicle.mission || (state.labels && view.scale > 1.5)) {
       const up = (Math.abs(Math.sin(s.heading)) * vehicle.length + vehicle.width) * 0.5 * view.scale + 9;
@@ -134,6 +199,25 @@ function drawChoice(ctx, state, vehicle, s) {
     const below = (Math.abs(Math.sin(s.heading)) * vehicle.length + vehicle.width) * 0.5 * view.scale + 9;
     halo(ctx, glyph, px, py + below, choice.blocked ? c.bad : c.av, c);
   }
+}
+
+const SHOWN = 2; // s that a correction or an offence stays marked
+
+function lastOf(events, t, within = SHOWN) { // the last one that began at most so long ago
+  const found = events.findLast((e) => e.t <= t + 0.05);
+  return found && found.t > t - within ? found : null;
+}
+
+// A square where the car corrected its AV, and the words of an offence.
+function drawLaw(ctx, { view, c, t }, vehicle, s) {
+  const [px, py] = view.toPixels(s.x, s.y), broken = lastOf(vehicle.violations, t);
+  if (lastOf(vehicle.corrections, t)) {
+    const r = Math.max(0.62 * vehicle.length * view.scale, 6);
+    ctx.strokeStyle = c.correction; ctx.lineWidth = 2; ctx.strokeRect(px - r, py - r, 2 * r, 2 * r);
+  }
+  if (!broken) return;
+  ctx.font = "bold 12px system-ui, sans-serif"; ctx.textAlign = "center"; ctx.textBaseline = "middle";
+  halo(ctx, broken.text, px, py + 0.62 * vehicle.length * view.scale + 20, c.law, c);
 }
 
 function halo(ctx, text, x, y, colour, c) {

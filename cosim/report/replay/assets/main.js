@@ -1,6 +1,7 @@
 // Time, keys and pointer: what the user does, and one picture per animation frame.
 
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4, 8];
+const BIN = 4; // pixels of the time line that share a bar
 const KEYS = [["space", "play, pause"], ["\u2190 \u2192", "one frame (shift: 2 s)"], ["home end", "first, last moment"],
   ["[ ]", "event before, after"], ["< >", "slower, faster"], ["+ \u2212", "zoom (or the wheel)"], ["0", "the whole net"],
   ["f", "follow the chosen vehicle"], ["m", "choose the mission vehicle"], ["n p", "next, previous vehicle in view"],
@@ -11,7 +12,7 @@ function start(data) {
   const scene = $$("scene"), view = new View(scene), map = new View($$("map")), chart = new View($$("chart"));
   const timeline = new View($$("timeline"));
   const state = {
-    data, view, map, chart, t: 0, playing: false, rate: 1, chosen: null, following: false, labels: false,
+    data, view, map, chart, t: 0, playing: false, rate: 1, chosen: null, following: false, labels: false, hidden: new Set(),
     predictions: data.forecasts.some(Boolean), events: eventsOf(data), shown: [], c: null, dirty: true,
   };
   const net = bounds(data.lanes.length ? data.lanes : [{ box: [0, 0, 100, 100] }]);
@@ -35,7 +36,7 @@ function start(data) {
   }
   function theme(dark) { document.documentElement.classList.toggle("dark", dark); state.c = colours(); fillLegend(state); touch(); }
   function jump(direction) {
-    const wanted = $$("mine").checked && state.chosen ? state.events.filter((e) => e.who.includes(state.chosen.id)) : state.events;
+    const wanted = wantedEvents(state);
     const next = direction > 0 ? wanted.find((e) => e.t > state.t + 0.05) : wanted.filter((e) => e.t < state.t - 0.05).pop();
     if (next) state.seek(next.t);
   }
@@ -74,16 +75,33 @@ function start(data) {
     requestAnimationFrame(picture);
   }
 
+  function timeBins(px) { // column of the time line -> the events that fall into it
+    const bins = new Map();
+    for (const e of wantedEvents(state)) {
+      const bin = Math.floor(px(e.t) / BIN);
+      if (bins.has(bin)) bins.get(bin).push(e); else bins.set(bin, [e]);
+    }
+    return bins;
+  }
+
   function drawTimeline() {
     const ctx = $$("timeline").getContext("2d"), { c } = state, w = timeline.width, h = timeline.height;
     const px = (t) => 6 + (t / (data.end || 1)) * (w - 12);
     timeline.inPixels(ctx); ctx.clearRect(0, 0, w, h);
     ctx.fillStyle = c.line; ctx.fillRect(6, h - 12, w - 12, 4);
     ctx.fillStyle = c.av; ctx.fillRect(6, h - 12, px(state.t) - 6, 4);
-    for (const e of state.events) {
-      const tall = e.kind === "warn" ? 7 : 15, mine = !state.chosen || e.who.includes(state.chosen.id);
-      ctx.globalAlpha = mine ? 1 : 0.3; ctx.fillStyle = c[e.kind];
-      ctx.fillRect(px(e.t) - 1, h - 14 - tall, 2, tall);
+    const bins = timeBins(px), kinds = Object.keys(EVENTS);
+    const most = Math.max(...[...bins.values()].map((found) => found.length), 3);
+    for (const [bin, found] of bins) { // the gravest at the bottom; each kind is seen
+      let top = h - 14;
+      const room = (h - 16) * Math.max(Math.sqrt(found.length / most), 0.35), kindsHere = kinds.filter((kind) => found.some((e) => e.kind === kind));
+      for (const kind of kindsHere) {
+        const here = found.filter((e) => e.kind === kind), spare = Math.max(room - 3 * kindsHere.length, 0);
+        const tall = 3 + (spare * here.length) / found.length;
+        ctx.globalAlpha = kind === "collision" || kind === "law" || !state.chosen || here.some((e) => e.who.includes(state.chosen.id)) ? 1 : 0.4;
+        ctx.fillStyle = c[EVENTS[kind][1]]; ctx.fillRect(bin * BIN, top - tall, BIN - 1, tall - 0.5);
+        top -= tall;
+      }
     }
     ctx.globalAlpha = 1; ctx.fillStyle = c.pick;
     ctx.beginPath(); ctx.arc(px(state.t), h - 10, 6, 0, 7); ctx.fill();
@@ -125,7 +143,7 @@ function start(data) {
       const [vehicle, s] = found, choice = vehicle.av && choiceOf(data, vehicle, state.t);
       tip.textContent = `${vehicle.id}\n${describe(vehicle)}\n${s.speed.toFixed(1)} m/s` + (choice ? `, ${ACTIONS[choice.action]}` : "");
       const box = scene.getBoundingClientRect();
-      tip.style.left = `${Math.min(e.clientX - box.left + 14, view.width - 190)}px`; tip.style.top = `${e.clientY - box.top + 14}px`;
+      tip.style.left = `${Math.max(Math.min(e.clientX - box.left + 14, view.width - 210), 0)}px`; tip.style.top = `${e.clientY - box.top + 14}px`;
     }
   };
   scene.onpointerup = scene.onpointercancel = (e) => {
@@ -150,6 +168,12 @@ function start(data) {
   };
   const inside = (canvas, e) => { const box = canvas.getBoundingClientRect(); return [e.clientX - box.left, e.clientY - box.top]; };
   scrub($$("timeline"), (e) => state.seek(((inside($$("timeline"), e)[0] - 6) / (timeline.width - 12)) * data.end));
+  $$("timeline").addEventListener("pointermove", (e) => { // what happened beneath the pointer
+    const px = (t) => 6 + (t / (data.end || 1)) * (timeline.width - 12), bin = Math.floor(inside($$("timeline"), e)[0] / BIN);
+    const bins = timeBins(px), near = [0, -1, 1].map((k) => bins.get(bin + k)).find(Boolean) || [];
+    const lines = Object.entries(EVENTS).map(([kind, [name]]) => [name, near.filter((k) => k.kind === kind)]).filter(([, found]) => found.length);
+    $$("timeline").title = lines.map(([name, found]) => (found.length > 3 ? `${found.length} ${name}` : found.map((k) => `${k.t.toFixed(1)} s ${k.text}`).join("\n"))).join("\n");
+  });
   scrub($$("chart"), (e) => state.seek(((inside($$("chart"), e)[0] - 26) / (chart.width - 30)) * data.end));
   scrub($$("map"), (e) => { follow(false); [view.x, view.y] = map.toMetres(...inside($$("map"), e)); touch(); });
 
@@ -183,8 +207,8 @@ function start(data) {
   for (const rate of SPEEDS) $$("speed").append(new Option(`${rate} \u00d7`, rate));
   speed(1);
   $$("pick").append(new Option("nobody", ""));
-  const order = [...data.vehicles].sort((a, b) => b.mission - a.mission || b.av - a.av || a.id.localeCompare(b.id, "en", { numeric: true }));
-  for (const v of order) $$("pick").append(new Option(`${v.id} (${v.mission ? "mission" : v.av ? "AV" : v.driver})`, v.number));
+  const order = [...data.vehicles].sort((a, b) => b.mission - a.mission || b.av - a.av || a.person - b.person || a.id.localeCompare(b.id, "en", { numeric: true }));
+  for (const v of order) $$("pick").append(new Option(`${v.id} (${v.mission ? "mission" : v.av ? "AV" : v.person ? v.what : v.driver})`, v.number));
   const table = element("table");
   for (const [key, what] of KEYS) {
     const row = element("tr"), cell = element("td");
@@ -194,7 +218,7 @@ function start(data) {
   $$("keys").append(table);
   $$("predictions").parentElement.hidden = !state.predictions;
   $$("busy").hidden = true;
-  fillHead(data); fillFigures(data); fillEvents(state);
+  fillHead(data); fillFigures(data); fillKinds(state); fillEvents(state);
   theme(matchMedia("(prefers-color-scheme: dark)").matches);
   new ResizeObserver(resize).observe($$("stage"));
   resize();

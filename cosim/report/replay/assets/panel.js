@@ -8,8 +8,8 @@ function element(tag, text, className) {
 }
 
 function describe(vehicle) {
-  const who = vehicle.av ? "autonomous (AV)" : `human, ${vehicle.driver}`;
-  return vehicle.mission ? `${who}, mission vehicle` : who;
+  const who = vehicle.av ? "autonomous (AV)" : vehicle.person ? "" : `human, ${vehicle.driver}`;
+  return [who, vehicle.actor ? vehicle.what : "", vehicle.mission ? "mission vehicle" : ""].filter(Boolean).join(", ");
 }
 
 function number(value, digits, unit = "") {
@@ -42,11 +42,15 @@ function fillDetails(state) {
     `${s.accel.toFixed(1)} m/s\u00b2, lane ${lane}`));
   if (!chosen.av) return;
   const choice = choiceOf(data, chosen, t);
-  if (!choice) { box.append(element("p", "nobody commands it: SUMO's IDM drives", "quiet")); return; }
-  fillChoice(state, box, choice);
+  const last = lastOf(chosen.corrections, t, Infinity), corrected = lastOf(chosen.corrections, t);
+  const broken = lastOf(chosen.violations, t, Infinity);
+  if (last) box.append(element("p", `${corrected ? "" : "last "}corrected by the car at ${last.t.toFixed(1)} s: ${last.text}`, corrected ? "correction" : "quiet"));
+  if (broken) box.append(element("p", `${broken.text} at ${broken.t.toFixed(1)} s`, "law"));
+  if (choice) fillChoice(state, box, choice, corrected);
+  else box.append(element("p", "nobody commands it: SUMO's IDM drives", "quiet"));
 }
 
-function fillChoice(state, box, choice) {
+function fillChoice(state, box, choice, corrected) {
   box.append(paragraph(state, `decided at ${choice.t.toFixed(1)} s: `, element("b", ACTIONS[choice.action]),
     `, target ${choice.target.toFixed(1)} m/s`));
   if (choice.fallback) box.append(element("p", "no action was safe: the one with the highest safety score", "bad"));
@@ -54,8 +58,8 @@ function fillChoice(state, box, choice) {
     const line = paragraph(state, `${preferred(choice)} vetoed; blamed: `, link(state, choice.blamed));
     line.className = "warn"; box.append(line);
   }
-  box.append(choice.blocked ? element("p", `command blocked: ${choice.blocked}`, "bad")
-    : element("p", "command executed", "quiet"));
+  if (choice.blocked) box.append(element("p", `command blocked: ${choice.blocked}`, "bad"));
+  else if (!corrected) box.append(element("p", "command executed", "quiet"));
   if (!choice.q && !choice.score) return;
   const table = element("table"), head = element("tr");
   for (const name of ["action", "Q", "score s", "TTC s", ""]) head.append(element("th", name));
@@ -105,6 +109,8 @@ function drawChart(canvas, state) {
     }
     if (choice.vetoed) { ctx.fillStyle = choice.fallback ? c.bad : c.warn; ctx.fillRect(px(choice.t), bottom + 13, Math.max(px(hold) - px(0), 1.5), 4); }
   }
+  ctx.fillStyle = c.correction;
+  for (const one of chosen.corrections) ctx.fillRect(px(one.t) - 1, bottom + 13, 2, 6);
   ctx.strokeStyle = c.pick; ctx.lineWidth = 1;
   ctx.beginPath(); ctx.moveTo(px(state.t), 2); ctx.lineTo(px(state.t), bottom + 18); ctx.stroke();
 }
@@ -120,16 +126,22 @@ function fillLegend(state) {
     draw(ctx);
     box.append(canvas, element("span", text));
   };
-  const car = (colour, av) => (ctx) => {
-    ctx.fillStyle = colour; ctx.beginPath(); ctx.roundRect(3, 3, 24, 10, 3); ctx.fill();
-    ctx.fillStyle = c.halo; ctx.fillRect(18, 4, 3, 8);
-    if (av) { ctx.beginPath(); ctx.arc(11, 8, 2, 0, 7); ctx.fill(); }
+  const shape = (actor, colour, [length, width], av) => (ctx) => {
+    ctx.translate(15, 8); ctx.strokeStyle = c.ground; ctx.lineWidth = 0.5;
+    drawShape(ctx, data.shapes.get(actor).parts, length, width, colour, c);
+    if (av) { ctx.fillStyle = c.halo; ctx.beginPath(); ctx.arc(-4, 0, 2, 0, 7); ctx.fill(); }
   };
+  const first = Math.min(...data.shapes.keys()); // a car, where there is one
+  const car = (colour, av) => shape(first, colour, [24, 10], av);
   if (data.vehicles.some((v) => v.mission)) entry("mission vehicle", car(c.mission));
   if (data.vehicles.some((v) => v.av)) entry("AV (arrow: its command)", car(c.av, true));
-  const classes = new Set(data.vehicles.filter((v) => !v.av).map((v) => v.driver));
+  const classes = new Set(data.vehicles.filter((v) => !v.av && !v.person).map((v) => v.driver));
   for (const name of ["conservative", "moderate", "aggressive", "as-is"]) {
     if (classes.has(name)) entry(`human, ${name}`, car(name === "as-is" ? c.asis : c[name]));
+  }
+  const sizes = { 3: [22, 9], 4: [20, 9], 5: [10, 13] }; // pixels, of those that are small
+  for (const [actor, { name }] of data.shapes) {
+    if (actor) entry(name, shape(actor, actor === 5 ? c.person : c.asis, sizes[actor] || [28, 10]));
   }
   const ring = (colour) => (ctx) => {
     ctx.strokeStyle = colour; ctx.lineWidth = 2; ctx.beginPath(); ctx.arc(10, 8, 6, 0, 7); ctx.stroke();
@@ -143,6 +155,24 @@ function fillLegend(state) {
       ctx.globalAlpha = 0.3; ctx.beginPath(); ctx.ellipse(20, 8, 9, 5, 0, 0, 7); ctx.fill();
     });
   }
+  if (data.corrections.length) {
+    entry("its car corrected the AV", (ctx) => { ctx.strokeStyle = c.correction; ctx.lineWidth = 2; ctx.strokeRect(9, 2, 12, 12); });
+  }
+  const line = (rule, ...states) => (ctx) => {
+    ctx.translate(17, 8); ctx.scale(4, 4); ctx.strokeStyle = c.dark; ctx.lineWidth = 0.2;
+    ctx.fillStyle = c.road; ctx.fillRect(-5, -2, 9, 4);
+    drawStopLine(ctx, rule, states.map((state) => data.lamps[state]), 1.8, c, true);
+  };
+  const has = (test) => data.stopLines.some(test), bare = (rules) => has((s) => !s.signals.length && rules.includes(s.rule));
+  if (has((s) => s.signals.length)) {
+    entry("signals, one for each turn, the left one first (pale green: gives way; brown, grey: off)", line(0, "r", "y", "G"));
+  }
+  if (bare(STOPS)) entry("stop sign", line(STOPS[0]));
+  if (bare([YIELD])) entry("give way", line(YIELD));
+  if (data.crossings.length) entry("pedestrian crossing", (ctx) => {
+    ctx.fillStyle = c.road; ctx.fillRect(0, 0, 30, 16); ctx.fillStyle = c.mark;
+    for (let x = 2; x < 30; x += 6) ctx.fillRect(x, 1, 3, 14);
+  });
   if (data.collisions.length) entry("collision", (ctx) => {
     ctx.strokeStyle = c.bad; ctx.lineWidth = 2; ctx.beginPath(); ctx.arc(15, 8, 6, 0, 7);
     ctx.moveTo(11, 4); ctx.lineTo(19, 12); ctx.moveTo(11, 12); ctx.lineTo(19, 4); ctx.stroke();
@@ -152,14 +182,37 @@ function fillLegend(state) {
   if (data.goal.size) entry("lanes where the mission is fulfilled", patch(c.goal));
 }
 
-function fillEvents(state) {
-  const list = document.getElementById("events"), all = state.events, most = 400;
+// A button for each kind of events there is: shown or not, in the list, on the time line and for the keys.
+function fillKinds(state) {
+  const box = document.getElementById("kinds");
+  for (const [kind, [name, colour]] of Object.entries(EVENTS)) {
+    const count = state.events.filter((e) => e.kind === kind).length;
+    if (!count) continue;
+    const button = element("button", `${name} ${count}`, "on");
+    button.style.setProperty("--own", `var(--${colour})`);
+    button.setAttribute("aria-pressed", "true");
+    button.onclick = () => {
+      if (!state.hidden.delete(kind)) state.hidden.add(kind);
+      const on = !state.hidden.has(kind);
+      button.classList.toggle("on", on); button.setAttribute("aria-pressed", String(on));
+      fillEvents(state); state.seek(state.t);
+    };
+    box.append(button);
+  }
+}
+
+// Events of the kinds that are shown; of the chosen vehicle only where that is asked for.
+function wantedEvents(state) {
   const mine = document.getElementById("mine").checked && state.chosen;
-  const wanted = mine ? all.filter((e) => e.who.includes(state.chosen.id)) : all;
+  return state.events.filter((e) => !state.hidden.has(e.kind) && (!mine || e.who.includes(state.chosen.id)));
+}
+
+function fillEvents(state) {
+  const list = document.getElementById("events"), wanted = wantedEvents(state), most = 400;
   list.replaceChildren();
   for (const event of wanted.slice(0, most)) {
     const row = element("li");
-    row.append(element("time", `${event.t.toFixed(1)} s`), element("span", event.text, event.kind));
+    row.append(element("time", `${event.t.toFixed(1)} s`), element("span", event.text, EVENTS[event.kind][1]));
     row.onclick = () => {
       const who = event.who.map((id) => state.data.byId.get(id)).find((v) => v && v.av) || state.data.byId.get(event.who[0]);
       if (who) state.choose(who, true);
@@ -179,7 +232,7 @@ function fillFigures(data) {
   const rows = [...data.facts.metrics, ["seed", data.facts.seed, ""], ["svo", data.facts.svo_deg, "deg"]];
   for (const [name, value, unit] of rows) {
     const row = element("tr");
-    row.append(element("td", name), element("td", `${shown(value)} ${unit === "bool" ? "" : unit}`));
+    row.append(element("td", name), element("td", `${shown(value)} ${unit === "bool" || value === null ? "" : unit}`));
     table.append(row);
   }
   const row = element("tr"), cell = element("td", `trace ${data.facts.trace_hash}`);

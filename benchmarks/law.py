@@ -180,7 +180,7 @@ def _columns(cell: Cell, idm: Cell, free: bool) -> dict[str, tuple[str, bool | N
 
 COUNTED_TWICE = (
     *("red_light_violations", "stop_sign_violations", "right_of_way_violations"),
-    *("avs_stuck", "av_trips_completed", "av_involved_collisions", "hard_brakings_av", "worst_speeding_mps"),
+    *("avs_stuck", "av_trips_completed", "av_involved_collisions", "worst_speeding_mps"),
 )
 
 

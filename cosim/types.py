@@ -214,7 +214,11 @@ class Snapshot:
         if len(keep) == self.n:
             return self
         columns = {f.name: getattr(self, f.name) for f in fields(self)}
-        rows = {k: v[keep] for k, v in columns.items() if k != "signals" and isinstance(v, np.ndarray)}
+        rows = {
+            k: v[keep]
+            for k, v in columns.items()
+            if k not in ("signals", "switches") and isinstance(v, np.ndarray)
+        }
         return replace(self, ids=tuple(self.ids[k] for k in keep), **rows)
 
     @property

@@ -71,7 +71,7 @@ def zebra(crossing: Crossing) -> list[Floats]:
 
 
 def violations(r: ReplayData) -> list[tuple[float, str, str]]:
-    """(time s, AV, what it did) of every entry on red or yellow or past a stop sign that the figures count."""
+    """(time s, AV, what it did) of every entry on red or yellow or past a stop sign that figures count."""
     found = []
     for entry in r.entries:
         if ran_red(entry):

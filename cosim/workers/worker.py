@@ -28,7 +28,8 @@ from cosim.workers.memory import keep_freed_memory
 STDERR_KEPT = 4000  # characters of a process's stderr that the error of its crash holds
 
 _CONTEXT = multiprocessing.get_context("spawn")
-_STARTING = threading.Lock()
+_STARTING = threading.RLock()
+_BLAS_THREADS = "OPENBLAS_NUM_THREADS"  # numpy's BLAS reads it when it is loaded
 
 
 class Worker(contextlib.AbstractContextManager["Worker"]):
@@ -65,7 +66,7 @@ class Worker(contextlib.AbstractContextManager["Worker"]):
         resource_tracker.ensure_running()  # its start would unblock the signal again
         before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
         try:
-            with _script_left_out(factory, arguments):
+            with _one_blas_thread(), _script_left_out(factory, arguments):
                 self._process.start()
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
@@ -192,6 +193,20 @@ def _script_left_out(*needed: object) -> Iterator[None]:
         finally:
             for name, value in hidden.items():
                 setattr(main, name, value)
+
+
+@contextlib.contextmanager
+def _one_blas_thread() -> Iterator[None]:
+    """One thread for numpy's BLAS in a process started meanwhile, unless the user asked for more: for matrices
+    as small as ours a second one gains nothing, and where cores are shared both wait for one another."""
+    with _STARTING:
+        chosen = _BLAS_THREADS in os.environ
+        os.environ.setdefault(_BLAS_THREADS, "1")
+        try:
+            yield
+        finally:
+            if not chosen:
+                del os.environ[_BLAS_THREADS]
 
 
 def _serve(pipe: Connection, factory: Callable[..., Any], arguments: tuple[Any, ...], stderr: str) -> None:

@@ -8,7 +8,21 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from cosim.types import HEADING, KINEMATIC_FEATURES, SPEED, Bools, Floats, Floats32, History, Ints, X, Y
+from cosim.geometry.compiled import compiled
+from cosim.types import (
+    HEADING,
+    KINEMATIC_FEATURES,
+    LENGTH,
+    SPEED,
+    WIDTH,
+    Bools,
+    Floats,
+    Floats32,
+    History,
+    Ints,
+    X,
+    Y,
+)
 
 
 class Scene(NamedTuple):
@@ -98,24 +112,54 @@ def rows_ahead(scene: Scene, x: Floats, y: Floats, speed: Floats, heading: Float
 
 
 def pictured(
-    scene: Scene, x: Floats, y: Floats, speed: Floats, heading: Floats
+    scene: Scene, x: Floats, y: Floats, speed: Floats, heading: Floats, reach: float = np.inf
 ) -> tuple[Floats, Bools, Ints]:
-    """The same of every vehicle an AV knows, row 0 the ego: what its predicted maps are drawn from.
+    """The same of the vehicles an AV knows, row 0 the ego: what its predicted maps are drawn from.
 
-    Returns rows [B,M,V,8], who is known [B,V] and which vehicle of the scene each row is [B,V].
+    Left out is who stays further than `reach` m (and its own length) from the ego in every frame.
+
+    Returns rows [B,M,k,8], which of them hold a vehicle [B,k] and which vehicle of the scene each is [B,k].
     """
-    b, v = len(scene.agents), len(scene.vehicles)
-    who = np.tile(np.arange(v), (b, 1))
-    who[np.arange(b), scene.ego] = 0  # the ego and the first one change places
-    who[:, 0] = scene.ego
-    known = scene.valid[who, -1]
+    owned = np.ones((1, 1), np.bool_)
     if not scene.shared:
-        mine = np.zeros((b, v), np.bool_)
-        for k, row in enumerate(scene.row):
-            mine[k, row[row >= 0]] = True
-        known = known & np.take_along_axis(mine, who, 1)
-    base = np.repeat(-scene.pose[:, 2:3], v, 1)
+        owned = np.zeros((len(scene.agents), len(scene.vehicles)), np.bool_)
+        for mine, row in zip(owned, scene.row, strict=True):
+            mine[row[row >= 0]] = True
+    size = scene.state[:, -1, LENGTH] + scene.state[:, -1, WIDTH]
+    who, known = _near(scene.ego, scene.valid[:, -1], owned, x, y, size, reach)
+    base = np.repeat(-scene.pose[:, 2:3], who.shape[1], 1)
     return _rows(scene, who, known, base, (x, y, speed, heading)), known, who
+
+
+@compiled
+def _near(
+    ego: Ints,  # [B]
+    valid: Bools,  # [V]
+    owned: Bools,  # [B,V] whom each ego knows; [1,1]: all know all
+    x: Floats,  # [V,M] m
+    y: Floats,  # [V,M] m
+    size: Floats,  # [V] m
+    reach: float,  # m
+) -> tuple[Ints, Bools]:
+    """Whom each ego pictures [B,k], itself first and 0 beyond its last one, and where there is one [B,k]."""
+    count, vehicles, frames = ego.shape[0], x.shape[0], x.shape[1]
+    who, known = np.zeros((count, vehicles), np.int64), np.zeros((count, vehicles), np.bool_)
+    most = 1
+    for b in range(count):
+        e, n = ego[b], 1
+        who[b, 0], known[b, 0] = e, valid[e]
+        for j in range(1, vehicles):
+            v = 0 if j == e else j  # the ego and the first one change places
+            if not valid[v] or (owned.shape[1] > 1 and not owned[b, v]):
+                continue
+            limit = (reach + size[v]) ** 2
+            for k in range(frames):
+                if not (x[v, k] - x[e, k]) ** 2 + (y[v, k] - y[e, k]) ** 2 > limit:  # so is who is nan
+                    who[b, n], known[b, n] = v, True
+                    n += 1
+                    break
+        most = max(most, n)
+    return who[:, :most].copy(), known[:, :most].copy()
 
 
 def _rows(

@@ -119,11 +119,11 @@ class Corrected(NamedTuple):
     seen: Floats32  # [V,M] logits of `sureness`
     looking: Floats32  # [V,M]
 
-    def share(self, ego: Ints) -> Floats:
-        """[B,V,M] `sureness` of every vehicle in the picture of each AV; ego [B] are their places."""
-        logit = self.seen[None] + self.looking[ego][:, None] + 4.0
+    def share(self, who: Ints) -> Floats:
+        """[B,k,M] `sureness` of the vehicles who [B,k] in the picture of each AV, the AV itself first."""
+        logit = self.seen[who] + self.looking[who[:, 0]][:, None] + 4.0
         out: Floats = 1.0 / (1.0 + np.exp(-logit.astype(np.float64)))
-        out[np.arange(len(ego)), ego] = 1.0  # every AV is in the middle of its own picture
+        out[:, 0] = 1.0  # every AV is in the middle of its own picture
         return out
 
 

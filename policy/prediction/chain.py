@@ -139,12 +139,15 @@ def _rendered(
     observation: ObservationConfig,
     raster: RoadRaster,
 ) -> Bytes:
-    """Maps [B,.,C,H,W] of the wanted frames, of every vehicle that each AV knows."""
+    """Maps [B,.,C,H,W] of the wanted frames, of the vehicles that each AV knows."""
     x, y, speed, heading = (a[:, wanted] for a in states)
-    rows, known, who = pictured(scene, x, y, speed, heading)
+    raster.show(scene.histories[0].signals)  # as they are now: their future is not known
+    c = observation
+    corner = 0.5 * float(np.hypot(c.height * c.metres_across, c.width * c.metres_along))  # m
+    rows, known, who = pictured(scene, x, y, speed, heading, corner + 1.0)
     if corrected is not None:
-        share = corrected.share(scene.ego)[..., : states[0].shape[1]][..., wanted]  # [B,V,M]
-        rows = shade(rows, np.take_along_axis(share, who[..., None], 1).transpose(0, 2, 1))
+        share = corrected.share(who)[..., : states[0].shape[1]][..., wanted]  # [B,k,M]
+        rows = shade(rows, share.transpose(0, 2, 1))
     return render(rows, known, scene.pose, observation, raster)
 
 

@@ -8,7 +8,7 @@ from cosim.types import Entry, Metric, Snapshot
 
 COMFORTABLE = 3.0  # m/s2: who could stop at yellow with this must
 STOPPED = 0.5  # m/s, at most, within the last 10 m before a stop sign
-HARD = 3.0  # m/s2, the braking that nobody with the right of way is to be made to do
+HARD = 3.0 + 1e-3  # m/s2 (who brakes with just 3 brakes comfortably): nobody with the right of way is made to
 LEADER = 30.0  # m: a vehicle that near ahead is what one brakes for
 SIGNS = (Rule.STOP, Rule.ALL_WAY_STOP)
 BY_TURNS = (Rule.EQUAL, Rule.ALL_WAY_STOP, Rule.ZIPPER)  # all wait for one another: only collisions count

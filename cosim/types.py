@@ -132,6 +132,15 @@ class Entry:
 
 
 @dataclass(frozen=True, slots=True)
+class Offence:
+    """What one AV did against the law, once for each that the figures count."""
+
+    time: float  # s
+    vehicle: str
+    what: str  # in words, of which the vehicle is the subject
+
+
+@dataclass(frozen=True, slots=True)
 class Intervention:
     """The car began to drive otherwise than commanded (preset `lawful`)."""
 

@@ -29,13 +29,13 @@ from cosim.road import Crossing, Lane, Link, RoadMap, Rule
 from cosim.types import (
     Actor,
     Decision,
-    Entry,
     Forecast,
     History,
     Intervention,
     Kind,
     MetaAction,
     ObservationConfig,
+    Offence,
     PolicyContext,
 )
 from policy.agents.keep_lane import KeepLane
@@ -329,14 +329,9 @@ def at_signals(replay: ReplayData) -> ReplayData:
     states = np.array([list(b"rrr")] + [list(b"GrG")] * (len(replay.times) - 1), np.uint8)
     crossing = Crossing("c", np.array([(104.0, -4.0), (104.0, 4.0)]), 4.0, (0,), 1)
     road = RoadMap(CROSSROADS, links=(RIGHT, STRAIGHT, LEFT), crossings=(crossing,))
-    entries = (
-        Entry(1.0, "a", 1, "r", 9.0, 8.0),
-        Entry(1.5, "b", 1, "G", 9.0, 8.0),
-        Entry(2.0, "b", 1, "y", 9.0, 8.0, 0.5, 40.0, 9.0),
-        Entry(2.5, "b", 1, "y", 9.0, 8.0, 2.4, 4.0, 9.0),
-    )
+    offences = (Offence(1.0, "a", "ran a red light"), Offence(2.0, "nobody", "ran a red light"))
     corrections = (Intervention(1.2, "a", "red light"), Intervention(1.4, "nobody", "red light"))
-    return replace(replay, road=road, signals=states, entries=entries, interventions=corrections)
+    return replace(replay, road=road, signals=states, offences=offences, interventions=corrections)
 
 
 def test_lamps_stand_at_the_stop_line_from_the_left_turn_to_the_right_one() -> None:
@@ -395,12 +390,11 @@ def test_a_zebra_crossing_is_stripes_across_the_way_on_foot() -> None:
         assert np.ptp(stripe[:, 1]) == pytest.approx(0.5)
 
 
-def test_entries_that_the_figures_count_are_events_and_others_are_not(replay: ReplayData) -> None:
+def test_what_avs_did_against_the_law_are_events(replay: ReplayData) -> None:
     data = document(at_signals(replay))
     names, words = [v[0] for v in data["vehicles"]], data["words"]
     assert [(t, names[v], words[w]) for t, v, w in data["violations"]] == [
         (1000, "a", "ran a red light"),
-        (2000, "b", "ran a yellow light"),
     ]
 
 

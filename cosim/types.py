@@ -178,7 +178,7 @@ NO_EVENTS = Events()
 class Snapshot:
     """Everybody on the road at one moment, sorted by id: vehicles and persons (`person:ID`).
 
-    Shapes: all arrays [n], `signals` [s]. Units: m, s, rad (counter-clockwise from east), m/s, m/s2.
+    Shapes: all arrays [n], `signals` and `switches` [s]. Units: m, s, rad (counter-clockwise from east), m/s, m/s2.
     """
 
     time: float  # s
@@ -222,8 +222,10 @@ class Snapshot:
         keep = np.flatnonzero(self.kind != int(Kind.PERSON))
         if len(keep) == self.n:
             return self
-        columns = {f.name: getattr(self, f.name) for f in fields(self)}
-        rows = {k: v[keep] for k, v in columns.items() if k != "signals" and isinstance(v, np.ndarray)}
+        columns = {
+            f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("signals", "switches")
+        }
+        rows = {k: v[keep] for k, v in columns.items() if isinstance(v, np.ndarray)}
         return replace(self, ids=tuple(self.ids[k] for k in keep), **rows)
 
     @property

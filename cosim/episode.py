@@ -27,6 +27,7 @@ from cosim.types import (
     History,
     Metric,
     ObservationConfig,
+    Offence,
     OnCollision,
     Policy,
     PolicyContext,
@@ -128,6 +129,11 @@ class Episode:
         for hook in hooks:
             hook.on_start(self)
         return self.histories
+
+    @property
+    def offences(self) -> list[Offence]:
+        """What AVs did against the law so far, as the figures count it; by time."""
+        return self._metrics.offences
 
     def advance(self, decisions: Mapping[str, Decision]) -> dict[str, History]:
         """Carry the decisions out for one decision period."""

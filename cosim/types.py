@@ -132,6 +132,15 @@ class Entry:
 
 
 @dataclass(frozen=True, slots=True)
+class Offence:
+    """What one AV did against the law, once for each that the figures count."""
+
+    time: float  # s
+    vehicle: str
+    what: str  # in words, of which the vehicle is the subject
+
+
+@dataclass(frozen=True, slots=True)
 class Intervention:
     """The car began to drive otherwise than commanded (preset `lawful`)."""
 
@@ -169,7 +178,7 @@ NO_EVENTS = Events()
 class Snapshot:
     """Everybody on the road at one moment, sorted by id: vehicles and persons (`person:ID`).
 
-    Shapes: all arrays [n], `signals` [s]. Units: m, s, rad (counter-clockwise from east), m/s, m/s2.
+    Shapes: all arrays [n], `signals` and `switches` [s]. Units: m, s, rad (counter-clockwise from east), m/s, m/s2.
     """
 
     time: float  # s

@@ -163,6 +163,7 @@ class Events:
 
 
 NO_EVENTS = Events()
+OF_SIGNALS = ("signals", "switches")  # of a snapshot: [s], not [n]
 
 
 @dataclass(frozen=True)
@@ -214,7 +215,7 @@ class Snapshot:
         if len(keep) == self.n:
             return self
         columns = {f.name: getattr(self, f.name) for f in fields(self)}
-        rows = {k: v[keep] for k, v in columns.items() if k != "signals" and isinstance(v, np.ndarray)}
+        rows = {k: v[keep] for k, v in columns.items() if k not in OF_SIGNALS and isinstance(v, np.ndarray)}
         return replace(self, ids=tuple(self.ids[k] for k in keep), **rows)
 
     @property

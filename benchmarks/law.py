@@ -71,7 +71,7 @@ class Checked(EpisodeRunner):
             document = host.run(case.seed, progress, outputs=checker.OUTPUTS, folder=folder).document()
             law = checker.check(host.episode.scenario.net, folder)
         return {
-            "world": host.episode.scenario.name,
+            "world": Path(case.what).stem,
             "arm": case.policy,
             "penetration": case.penetration,
             "seed": case.seed,
@@ -179,17 +179,18 @@ def _columns(cell: Cell, idm: Cell, free: bool) -> dict[str, tuple[str, bool | N
 
 COUNTED_TWICE = (
     *("red_light_violations", "stop_sign_violations", "right_of_way_violations"),
-    *("avs_stuck", "av_trips_completed", "av_involved_collisions"),
+    *("avs_stuck", "av_trips_completed", "av_involved_collisions", "hard_brakings_av", "worst_speeding_mps"),
 )
 
 
 def differences(row: Row) -> dict[str, tuple[float, float]]:
     """Figure -> (the checker's count, the row's), where they differ."""
     law, figures = row["law"], row["figures"]
+    law = law | {"worst_speeding_mps": law["worst_speeding_in_frames_mps"]}
     return {
         name: (law[name], figures[name])
         for name in COUNTED_TWICE
-        if figures.get(name) is not None and law[name] != figures[name]
+        if figures.get(name) is not None and abs(law[name] - figures[name]) > 1e-3
     }
 
 

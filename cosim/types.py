@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from enum import IntEnum
 from functools import cached_property
 from typing import Any, NamedTuple, Protocol
@@ -21,8 +21,9 @@ from cosim.arrays import Bytes as Bytes
 from cosim.arrays import Floats as Floats
 from cosim.arrays import Floats32 as Floats32
 from cosim.arrays import Ints as Ints
-from cosim.errors import in_range
+from cosim.errors import BadInput, in_range
 from cosim.road import RoadMap, RouteAhead
+from cosim.road.rules import NO_RULES, RulesAhead
 
 
 class MetaAction(IntEnum):
@@ -151,7 +152,8 @@ class Events:
     entries: tuple[Entry, ...] = ()
     interventions: tuple[Intervention, ...] = ()
     stopped: tuple[str, ...] = ()  # stand at a stop of their plan at the frame's end
-    wrecks_removed: tuple[str, ...] = ()
+    wrecked: tuple[str, ...] = ()  # crashed in an episode that goes on: they stand
+    wrecks_removed: tuple[str, ...] = ()  # and were taken off the road
 
     @classmethod
     def of(cls, frames: Sequence[Snapshot]) -> Events:
@@ -188,6 +190,8 @@ class Snapshot:
     actor: npt.NDArray[np.int8] = field(default_factory=lambda: np.zeros(0, np.int8))
     # [s] ord() of each state (rRyYgGosu), in the order of RoadMap.signals
     signals: Bytes = field(default_factory=lambda: np.zeros(0, np.uint8))
+    # [s] s until the next phase of each signal's light, as it is planned now; empty in recordings
+    switches: Floats = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         if len(self.actor) != len(self.kind):
@@ -203,6 +207,16 @@ class Snapshot:
     def n(self) -> int:
         return len(self.ids)
 
+    @cached_property
+    def vehicles(self) -> Snapshot:
+        """The same without persons."""
+        keep = np.flatnonzero(self.kind != int(Kind.PERSON))
+        if len(keep) == self.n:
+            return self
+        columns = {f.name: getattr(self, f.name) for f in fields(self)}
+        rows = {k: v[keep] for k, v in columns.items() if k != "signals" and isinstance(v, np.ndarray)}
+        return replace(self, ids=tuple(self.ids[k] for k in keep), **rows)
+
     @property
     def avs(self) -> tuple[str, ...]:
         """Ids of the AVs."""
@@ -213,6 +227,9 @@ class Snapshot:
 # (x ahead, y to the left), so that one history is in one fixed frame and series are smooth.
 KINEMATIC_FEATURES = ("x", "y", "speed", "heading", "length", "width", "is_av", "is_mission")
 X, Y, SPEED, HEADING, LENGTH, WIDTH, IS_AV, IS_MISSION = range(len(KINEMATIC_FEATURES))
+
+
+NO_SIGNALS: Bytes = np.zeros(0, np.uint8)
 
 
 class History(NamedTuple):
@@ -233,6 +250,8 @@ class History(NamedTuple):
     lane_changing: int  # +1 / -1 while a change to the left / right is under way, else 0
     route: RouteAhead  # lane centre lines ahead, dead ends, distance to the conflict zone
     time: float  # s
+    rules: RulesAhead = NO_RULES  # signals, stop lines, right of way, crossings, limits on its own way
+    signals: Bytes = NO_SIGNALS  # [s] `Snapshot.signals`, for drawing maps of what comes
 
     @property
     def ego_speed(self) -> float:
@@ -300,9 +319,13 @@ class ObservationConfig:
     perception_range: float = 125.0  # m, what one AV's own sensors reach
     share_perception: bool = True  # V2V: an AV also gets what the other AVs perceive
     maps: bool = True  # False: no VelocityMaps are drawn (for policies that use none)
+    road_version: int = 1  # of the road channel: 2 draws the law too (stop lines, signals, crossings)
+    signal_timing: bool = False  # whether an AV is told when the next signal switches
 
     def __post_init__(self) -> None:
-        """Raises BadInput when a size or a range is none."""
+        """Raises BadInput when a size or a range is none, or the road channel's version is unknown."""
+        if self.road_version not in (1, 2):
+            raise BadInput("must be 1 or 2", field="road_version", value=self.road_version)
         sizes = "height width metres_across metres_along frames rows"
         in_range(self, positive=sizes, not_negative="row_range perception_range")
 

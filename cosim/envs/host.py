@@ -1,7 +1,7 @@
 """The simulation's side of a session: runs in the worker process, one decision at a time."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -169,8 +169,9 @@ class SessionHost(Host):
         )
 
     def _ended(self, avs: tuple[str, ...], after: Snapshot, events: Events) -> dict[str, str]:
-        crashed = {name for c in events.collisions for name in (c.collider, c.victim)}
-        mission = any(c.involves_mission for c in events.collisions)
+        crashes = [c for c in events.collisions if c.crash]
+        crashed = {name for c in crashes for name in (c.collider, c.victim)}
+        mission = self.episode.terminated and any(c.involves_mission for c in crashes)
         ended = {}
         for name in avs:
             if name in crashed:
@@ -195,9 +196,9 @@ def _common(observation: ObservationConfig, others: Policy) -> ObservationConfig
         return theirs
     if not theirs.maps:
         return observation
+    differ = [f.name for f in fields(theirs) if getattr(theirs, f.name) != getattr(observation, f.name)]
     raise BadInput(
-        f"the other AVs' policy '{others.name}' looks at {theirs.height} x {theirs.width} pixels and "
-        f"{theirs.frames} frames, the session at {observation.height} x {observation.width} and "
-        f"{observation.frames}: give both the same observation",
+        f"the other AVs' policy '{others.name}' observes otherwise than the session ({', '.join(differ)}): "
+        "give both the same observation",
         field="observation",
     )

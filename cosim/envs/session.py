@@ -92,16 +92,17 @@ def open(
 ) -> Session:
     """Open the scenario `what`: a world's name or folder, a path to any .sumocfg, or a `Scenario`.
 
-    The same words mean the same as in `cosim run`: `penetration`, `av_type` and `av_ids` (or a `Fleet`) say
-    who is an AV, `duration` and `warmup` are in s, `mission` is a vehicle's id, a pattern, "none" or "auto";
-    `svo` is in degrees (it weighs the reward). A `Scenario` holds them: beside it they are refused. `seed` is
-    the first episode's. `reward`: a `cosim.rewards.Reward` (a `RewardConfig`, a function of your own), a name
-    of `REWARDS`, FILE.py:NAME or MODULE:NAME; without it P's. `metrics`: classes like those of `cosim.metrics`,
-    or FILE.py:NAME, measured besides. `others` builds a policy for the AVs you do not command (without it
-    SUMO's IDM drives them). What is no text must be importable: it runs in the simulation's process.
-    `simulator` replaces SUMO, for tests (`cosim.simulation.fake`). `timeout`: the longest time in s without a
-    heartbeat before the process counts as hung. `worker=False` runs the simulation in this process, for
-    debugging: one at a time, and a crash of SUMO ends your process.
+    The same words mean the same as in `cosim run`: `penetration`, `av_type` and `av_ids` (or a `Fleet`)
+    say who is an AV, `duration` and `warmup` are in s, `mission` is a vehicle's id, a pattern, "none" or
+    "auto"; `svo` is in degrees (it weighs the reward). A `Scenario` holds them: beside it they are
+    refused. `seed` is the first episode's. `reward`: a `cosim.rewards.Reward` (a `RewardConfig`, a
+    function of your own), a name of `REWARDS`, FILE.py:NAME or MODULE:NAME; without it P's. `metrics`:
+    classes like those of `cosim.metrics`, or FILE.py:NAME, measured besides. `others` builds a policy for
+    the AVs you do not command (without it SUMO's IDM drives them). What is no text must be importable: it
+    runs in the simulation's process. `simulator` replaces SUMO, for tests (`cosim.simulation.fake`).
+    `timeout`: the longest time in s without a heartbeat before the process counts as hung. `worker=False`
+    runs the simulation in this process, for debugging: one at a time, and a crash of SUMO ends your
+    process.
 
     Raises:
         BadInput: naming file (or option), field and value.

@@ -10,6 +10,7 @@ import numpy.typing as npt
 from cosim.envs.session import StepResult
 from cosim.errors import one_of
 from cosim.observation.view import View
+from cosim.road.rules import GREEN, RED, YELLOW
 from cosim.seeding import TRAINING_SEEDS
 from cosim.types import KINEMATIC_FEATURES, Floats, Floats32, ObservationConfig
 
@@ -31,26 +32,37 @@ EGO_FEATURES = (
     "faster_ahead_left", "faster_ahead_keep", "faster_ahead_right",  # its speed less one's own
     "faster_behind_left", "faster_behind_keep", "faster_behind_right",
 )  # fmt: skip
+LIMITS = 3  # how many changes of the limit ahead
+LAW_FEATURES = (
+    "signal_red", "signal_yellow", "signal_green",  # 1 or 0 of the next signal; all 0: none, off, or an arrow
+    "signal_distance", "stop_distance", "yield_distance", "crossing_distance", "person_distance",
+    "switch_in",  # -1: not told
+    *(f"{what}_{k}" for k in range(1, LIMITS + 1) for what in ("limit_distance", "limit")),
+)  # fmt: skip
 SPEED = 25.0  # m/s that count as 1
 GAP = 50.0  # m that count as 1; NO_GAP is what an empty lane counts as
 NO_GAP = 100.0
 HALF_LANE = 1.6  # m to either side of a centre line
 FAR = 400.0  # m that count as 1, and beyond: no dead end, no conflict (cosim.road.PATH_HORIZON)
+PHASE = 60.0  # s that count as 1
 _SCALE = np.array([SCALE[name] for name in KINEMATIC_FEATURES], np.float32)  # [F]
 
-FLATTEN = ("kinematics",)
+FLATTEN = ("kinematics", "kinematics+law")
 RENDER_MODES = ("rgb_array",)
 
 
 def observation_space(config: ObservationConfig, flatten: str | None) -> Space:
-    """Dict(velocity_map, kinematics, valid, ego); with `flatten="kinematics"` one Box for an MLP."""
+    """Dict(velocity_map, kinematics, valid, ego, law); one Box for an MLP with `flatten`: "kinematics" leaves
+    the law out, "kinematics+law" has it."""
     n, r, f, e = config.frames, config.rows, len(KINEMATIC_FEATURES), len(EGO_FEATURES)
-    if flatten == "kinematics":
-        return cast(Space, gymnasium.spaces.Box(-BOUND, BOUND, (r * f + e,), np.float32))
+    if flatten is not None:
+        size = r * f + e + (len(LAW_FEATURES) if flatten == "kinematics+law" else 0)
+        return cast(Space, gymnasium.spaces.Box(-BOUND, BOUND, (size,), np.float32))
     spaces: dict[str, gymnasium.Space[object]] = {
         "kinematics": gymnasium.spaces.Box(-BOUND, BOUND, (n, r, f), np.float32),
         "valid": gymnasium.spaces.MultiBinary((n, r)),
         "ego": gymnasium.spaces.Box(-BOUND, BOUND, (e,), np.float32),
+        "law": gymnasium.spaces.Box(-1.0, BOUND, (len(LAW_FEATURES),), np.float32),
     }
     if config.maps:
         shape = (n, len(config.channels), config.height, config.width)
@@ -77,14 +89,16 @@ def training_seed(rng: np.random.Generator) -> int:
 
 def observation(view: View, config: ObservationConfig, flatten: str | None) -> Observation:
     """The View in the numbers of `observation_space`; `flatten` keeps the newest frame only."""
-    if flatten == "kinematics":
+    if flatten is not None:
         newest = kinematics(view.kinematics[-1])
         newest[~view.valid[-1]] = 0.0
-        return np.concatenate([newest.ravel(), ego(view)])
+        parts = [newest.ravel(), ego(view), *([law(view)] if flatten == "kinematics+law" else [])]
+        return np.concatenate(parts)
     result: dict[str, npt.NDArray[np.generic]] = {
         "kinematics": kinematics(view.kinematics),
         "valid": view.valid.astype(np.int8),
         "ego": ego(view),
+        "law": law(view),
     }
     if config.maps:
         result["velocity_map"] = view.velocity_map
@@ -103,6 +117,21 @@ def ego(view: View) -> Floats32:
     gaps, faster = neighbours(view)
     features = [*speeds, view.lane_changing, *distances, *(gaps / GAP).ravel(), *(faster / SPEED).ravel()]
     return np.asarray(np.clip(features, -BOUND, BOUND), np.float32)
+
+
+def law(view: View) -> Floats32:
+    """[L] LAW_FEATURES: what the law says on the AV's own way. No further change of the limit: the last limit
+    goes on, and begins FAR ahead."""
+    r = view.rules
+    signal = [bool(r.signal) and r.signal in states for states in (RED, YELLOW, GREEN)]
+    lines = [r.signal_distance, r.stop_distance, r.yield_distance, r.crossing_distance, r.person_distance]
+    limits = np.full((LIMITS, 2), [FAR, r.limits[-1, 1]])
+    ahead = r.limits[1 : 1 + LIMITS]
+    limits[: len(ahead)] = ahead
+    distances = np.minimum(lines, FAR) / FAR
+    switch = r.switch_in / PHASE if r.switch_in >= 0.0 else -1.0
+    features = [*signal, *distances, switch, *(limits / [FAR, SPEED]).ravel()]
+    return np.asarray(np.clip(features, -1.0, BOUND), np.float32)
 
 
 def neighbours(view: View) -> tuple[Floats, Floats]:

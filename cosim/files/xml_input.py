@@ -2,8 +2,9 @@
 
 SUMO itself answers a bad file with "Process Error", with gigabytes of memory or with SIGSEGV
 (docs/sumo.md); everything SUMO is handed therefore passes through `scan` first. The
-parser is expat with three refusals (entities, external references, foreign encodings) and
-caps on depth, token length and unpacked size; memory does not grow with the file.
+parser is expat with three refusals (entities, external references, encodings other than
+UTF-8 and Latin-1) and caps on depth, token length and unpacked size; memory does not grow
+with the file.
 """
 
 import codecs
@@ -20,6 +21,7 @@ from cosim.errors import BadInput
 MAX_DEPTH = 64  # SUMO's own files nest 6 deep; a million nested tags hang SUMO
 MAX_TOKEN = 64 << 20  # bytes between two parser events: expat buffers a tag until it is whole
 MAX_UNPACKED = 1 << 30  # bytes out of one .gz: a 3 GB bomb costs SUMO 4.2 GB of memory
+ENCODINGS = frozenset({"utf-8", "utf8", "us-ascii", "ascii", "iso-8859-1", "latin1"})  # that expat reads
 CHUNK = 1 << 18  # bytes
 
 Start = Callable[[str, dict[str, str], int], None]  # tag, attributes, line
@@ -172,7 +174,7 @@ def _refuse_entities(parser: expat.XMLParserType, path: Path) -> None:
         raise BadInput("external references are refused", file=path, field="entity", value=system or public)
 
     def declaration(_version: str, encoding: str | None, _standalone: int) -> None:
-        if encoding is not None and encoding.lower() not in ("utf-8", "utf8", "us-ascii", "ascii"):
+        if encoding is not None and encoding.lower() not in ENCODINGS:
             raise BadInput("is not UTF-8: save it as UTF-8", file=path, field="encoding", value=encoding)
 
     parser.EntityDeclHandler = entity

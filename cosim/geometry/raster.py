@@ -2,17 +2,20 @@
 
 Rows run across the road (row 0 furthest to the left), columns along it (column 0 furthest behind);
 the ego's centre lies in the middle, looking towards rising columns. Pixels are stored as uint8 (255 = 1).
+Version 2 of the road channel also draws the law: stop lines by what they ask for now, and crossings.
 """
 
-from dataclasses import dataclass
-from functools import lru_cache
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from cosim.geometry.compiled import compiled, compiled_fast
-from cosim.road import RoadMap
+from cosim.road import Lane, RoadMap, Rule
+from cosim.road.rules import RED, STOP_SIGNS, STOP_STATES, YELLOW, YIELD_STATES
 from cosim.types import (
     HEADING,
     IS_AV,
@@ -23,6 +26,7 @@ from cosim.types import (
     Bools,
     Bytes,
     Floats,
+    Ints,
     Kind,
     ObservationConfig,
     Snapshot,
@@ -36,22 +40,52 @@ PIXEL_LOWEST, PIXEL_SPAN, PIXEL_SPEED = 0.1, 0.9, 30.0
 ROAD_SURFACE = 128  # a lane's surface
 ROAD_LINE = 255  # within LINE_WIDTH of a lane's edge, so that neighbouring lanes can be distinguished
 LINE_WIDTH = 0.5  # m
+# Version 2 only, upon the surface: pedestrian crossings, and the last STOP_BAR m before a stop line.
+CROSSING, GIVE_WAY, STOP_SIGN, YELLOW_LINE, RED_LINE = 160, 176, 192, 208, 224
+STOP_BAR = 2.5  # m, so that a row of pixels of 2 m always meets it
 RASTER_CELL = 0.5  # m, the finest cell of the world raster (paper size has 0.5 m pixels)
 RASTER_CELLS = 64_000_000  # bytes at most; larger nets get coarser cells
 
 
 @dataclass(frozen=True)
 class RoadRaster:
-    """The whole net's surface, drawn once, sampled for every map."""
+    """The whole net's surface, drawn once, sampled for every map; in version 2 `show` draws the signals."""
 
-    cells: Bytes  # [rows, cols] 0, ROAD_SURFACE or ROAD_LINE; row = y, col = x
+    cells: Bytes  # [rows, cols] 0, ROAD_SURFACE or ROAD_LINE, in version 2 also the law's; row = y, col = x
     x: float  # m, left edge
     y: float  # m, lower edge
     cell: float  # m
+    bars: tuple["_Bar", ...] = ()  # stop lines with signals (version 2)
+    _shown: list[Bytes] = field(default_factory=list, repr=False)  # the states that are drawn now
+
+    def show(self, signals: Bytes) -> None:
+        """Draw the stop lines by the states of all signals [s] (`Snapshot.signals`); in version 1 nothing."""
+        if not self.bars:
+            return
+        flat, states = self.cells.reshape(-1), signals.tobytes().decode("latin-1")
+        bars: Iterable[_Bar] = self.bars
+        if self._shown and len(self._shown[0]) == len(signals):
+            changed = np.flatnonzero(self._shown[0] != signals).tolist()
+            bars = (bar for signal in changed for bar in self._bars_of.get(signal, ()))
+        for bar in bars:
+            flat[bar.cells] = np.maximum(bar.below, bar.value(states))
+        self._shown[:] = [signals]
+
+    @cached_property
+    def _bars_of(self) -> dict[int, list["_Bar"]]:
+        """Signal -> the stop lines that it governs."""
+        found: dict[int, list[_Bar]] = {}
+        for bar in self.bars:
+            for signal in {signal for signal, _ in bar.ways}:
+                found.setdefault(signal, []).append(bar)
+        return found
 
 
-def rasterize_road(road: RoadMap) -> RoadRaster:
-    """Draw every lane of the net into one raster (a second or less for a city of 1,000 lanes)."""
+def rasterize_road(road: RoadMap, version: int = 1) -> RoadRaster:
+    """Draw every lane of the net into one raster (a second or less for a city of 1,000 lanes).
+
+    `version`: `ObservationConfig.road_version`; 2 draws crossings and stop lines too.
+    """
     if not road.lanes:
         return RoadRaster(np.zeros((1, 1), np.uint8), 0.0, 0.0, 1.0)
     points = np.concatenate([lane.shape for lane in road.lanes])
@@ -61,7 +95,72 @@ def rasterize_road(road: RoadMap) -> RoadRaster:
     for value, inset in ((ROAD_LINE, 0.0), (ROAD_SURFACE, LINE_WIDTH)):
         for lane in road.lanes:
             _draw_lane(cells, lane.shape - low, lane.width / 2 - inset, cell, value)
-    return RoadRaster(cells, float(low[0]), float(low[1]), cell)
+    bars = _draw_law(cells, road, low, cell) if version > 1 else ()
+    raster = RoadRaster(cells, float(low[0]), float(low[1]), cell, bars)
+    raster.show(np.zeros(0, np.uint8))
+    return raster
+
+
+@dataclass(frozen=True)
+class _Bar:
+    """One lane's stop line with a signal: its cells, and what the ways that begin there ask for."""
+
+    cells: Ints  # [k] indices into the raster's cells, flat
+    below: Bytes  # [k] what is there without it
+    ways: tuple[tuple[int, int], ...]  # (index of the signal or -1, pixel value without one)
+
+    def value(self, states: str) -> int:
+        """The pixel value of what every way asks for; 0 for nothing."""
+        return min(_pixel(states[signal : signal + 1], rule) for signal, rule in self.ways)
+
+
+def _pixel(state: str, rule: int) -> int:
+    """The pixel of a stop line in this state ("" without a signal: by its rule); 0 where one may drive on."""
+    if not state:
+        return rule
+    letters = ((RED, RED_LINE), (YELLOW, YELLOW_LINE), (STOP_STATES, STOP_SIGN), (YIELD_STATES, GIVE_WAY))
+    return next((value for those, value in letters if state in those), 0)
+
+
+def _draw_law(cells: Bytes, road: RoadMap, low: Floats, cell: float) -> tuple[_Bar, ...]:
+    """Draw crossings and the stop lines without signals; the stop lines with one."""
+    flat = cells.reshape(-1)
+    for crossing in road.crossings:
+        first = np.floor((crossing.shape.min(0) - crossing.width - low) / cell).astype(int).clip(0)
+        last = np.ceil((crossing.shape.max(0) + crossing.width - low) / cell).astype(int)
+        window = cells[first[1] : last[1], first[0] : last[0]]
+        mask = np.zeros_like(window)
+        _draw_lane(mask, crossing.shape - low - first * cell, crossing.width / 2, cell, 1)
+        window[(mask > 0) & (window > 0)] = CROSSING
+    ways: dict[int, list[tuple[int, int]]] = {}
+    for link in road.links:
+        rule = 0 if link.rule == Rule.PRIORITY else STOP_SIGN if link.rule in STOP_SIGNS else GIVE_WAY
+        ways.setdefault(link.origin, []).append((link.signal, rule))
+    bars = []
+    for origin, here in ways.items():
+        place = _stop_line(road.lanes[origin], low, cell, cells.shape)
+        bar = _Bar(place, flat[place].copy(), tuple(here))
+        if any(signal >= 0 for signal, _ in here):
+            bars.append(bar)
+        else:
+            flat[place] = np.maximum(bar.below, bar.value(""))
+    return tuple(bars)
+
+
+def _stop_line(lane: Lane, low: Floats, cell: float, shape: tuple[int, ...]) -> Ints:
+    """Flat indices of the cells of a lane's last STOP_BAR m, between its edges."""
+    end, ahead = lane.shape[-1] - low, lane.shape[-1] - lane.shape[-2]
+    ux, uy = ahead / max(float(np.hypot(*ahead)), 1e-9)
+    half = max(lane.width / 2 - LINE_WIDTH, cell / 2)
+    reach = STOP_BAR + half
+    columns, rows = (
+        np.arange(max(int((e - reach) / cell), 0), min(int((e + reach) / cell) + 1, most))
+        for e, most in zip(end, shape[::-1], strict=True)
+    )
+    dx, dy = (columns + 0.5) * cell - end[0], ((rows + 0.5) * cell - end[1])[:, None]
+    along, across = dx * ux + dy * uy, dy * ux - dx * uy
+    row, column = np.nonzero((along > -max(STOP_BAR, cell)) & (along <= 0.0) & (abs(across) <= half))
+    return np.asarray(rows[row] * shape[1] + columns[column], np.int64)
 
 
 @lru_cache
@@ -93,10 +192,11 @@ def draw_snapshot(
         snapshot: the n vehicles.
         ego: [B] the egos' rows in the snapshot.
         seen: [B,n] which vehicles each ego perceives; the ego itself is always drawn.
-        raster: the road's surface (`rasterize_road`).
+        raster: the road's surface (`rasterize_road`); in version 2 with the snapshot's signals after this.
         config: size, scale and channels of a frame.
     """
     s = snapshot
+    raster.show(s.signals)
     vehicles = s.x, s.y, s.heading, s.speed, s.length, s.width, s.kind == int(Kind.AV), s.mission
     draw_scene(out, slots, ego, *vehicles, seen, *_view(raster, config))
 

@@ -9,8 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from cosim.geometry import Conflicts, boxes, conflicts
+from cosim.geometry.compiled import compiled
 from cosim.road import RoadMap
-from cosim.types import Bools, Ints, Kind, Metric, Snapshot, Timing
+from cosim.types import Bools, Floats, Ints, Kind, Metric, Snapshot, Timing
 
 AV = int(Kind.AV)  # comparing arrays with an IntEnum member costs five times as much
 HORIZON = 10.0  # s, further ahead straight-line extrapolation says nothing (docs/paper_map.md)
@@ -70,6 +71,16 @@ def watched(snapshot: Snapshot, guessed: bool = False) -> Bools:
     """[n] the vehicles whose conflicts are counted: AVs and mission vehicles that are not `guessed`."""
     avs = snapshot.kind == AV
     return np.asarray(avs if guessed else avs | snapshot.mission)
+
+
+@compiled
+def slow(kind: npt.NDArray[np.int8], speed: Floats, wanted: int, below: float) -> int:
+    """How many of a kind are slower than `below` m/s."""
+    found = 0
+    for k in range(len(kind)):
+        if kind[k] == wanted and speed[k] < below:
+            found += 1
+    return found
 
 
 class Slots:

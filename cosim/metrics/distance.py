@@ -22,10 +22,11 @@ class Distance:
         self._tally: Floats = np.zeros((64, 5))
         self._frame = 0
         self._time = first.time
-        self._started = first.n
+        self._started = first.vehicles.n
         self.add(first)
 
     def add(self, snapshot: Snapshot) -> None:
+        snapshot = snapshot.vehicles
         slot = self._slots.rows(snapshot.ids)
         self._tally = grown(self._tally, len(self._slots), 0.0)
         elapsed, self._time = snapshot.time - self._time, snapshot.time

@@ -7,17 +7,21 @@ THRESHOLD = 3.0  # m/s2, about 0.3 g: the usual bound of hard-braking events in 
 
 
 class HardBraking:
-    """An event begins at a frame whose mean deceleration exceeds the threshold, unless one goes on."""
+    """An event begins at a frame whose mean deceleration exceeds the threshold, unless one goes on; that
+    a wreck stands at once is none."""
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._time = first.time
+        first = first.vehicles
         self._speeds = dict(zip(first.ids, first.speed.tolist(), strict=True))  # m/s in the frame before
         self._braking: frozenset[str] = frozenset()
+        self._wrecks = set(first.events.wrecked)
         self._all = self._av = 0
         self._kinds = set(first.kind.tolist())  # of all vehicles seen so far
 
     def add(self, snapshot: Snapshot) -> None:
-        s, before = snapshot, self._speeds
+        s, before = snapshot.vehicles, self._speeds
+        self._wrecks.update(s.events.wrecked)
         change = THRESHOLD * (s.time - self._time)  # m/s
         self._time = s.time
         self._speeds = dict(zip(s.ids, s.speed.tolist(), strict=True))
@@ -25,7 +29,7 @@ class HardBraking:
         if change <= 0.0:
             return
         braking = frozenset(i for i, speed in self._speeds.items() if before.get(i, speed) - speed > change)
-        begun = braking - self._braking
+        begun = braking - self._braking - self._wrecks
         self._all += len(begun)
         self._av += sum(s.kind[s.row[name]] == Kind.AV for name in begun)
         self._braking = braking

@@ -5,7 +5,7 @@ import numpy.typing as npt
 
 from cosim.geometry.compiled import compiled
 from cosim.metrics.context import AV, MetricContext, Slots, grown
-from cosim.types import Floats, Ints, Metric, Snapshot
+from cosim.types import Floats, Ints, Kind, Metric, Snapshot
 
 
 class Jerk:
@@ -19,6 +19,7 @@ class Jerk:
         self._time = first.time
         self._sum = 0.0  # m/s3
         self._counted = 0
+        self._wrecks: set[str] = set()  # they stand at once, which is no driving
         self.add(first)
 
     def add(self, snapshot: Snapshot) -> None:
@@ -26,7 +27,11 @@ class Jerk:
         self._last = grown(self._last, len(self._slots), np.nan)
         elapsed, self._time = snapshot.time - self._time, snapshot.time
         self._frame += 1
-        total, counted = _jerks(snapshot.kind, snapshot.speed, slot, self._last, self._frame, elapsed)
+        self._wrecks.update(snapshot.events.wrecked)
+        kind = snapshot.kind
+        if self._wrecks:
+            kind = np.where([name in self._wrecks for name in snapshot.ids], Kind.HV, kind).astype(np.int8)
+        total, counted = _jerks(kind, snapshot.speed, slot, self._last, self._frame, elapsed)
         self._sum += total
         self._counted += counted
 

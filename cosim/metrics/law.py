@@ -42,7 +42,7 @@ class AvCounts:
 
 
 class StopLines(AvCounts):
-    """Entries of AVs that broke the law; those against the right of way are followed until the AV has left."""
+    """Entries of AVs that broke the law; those against the right of way are judged by what follows."""
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         super().reset(first, context)

@@ -6,7 +6,7 @@ import numpy as np
 
 from cosim.geometry import EVERYWHERE, Boxes, boxes, time_to_collision
 from cosim.geometry.kernels import encroachment
-from cosim.metrics.context import AV, MetricContext
+from cosim.metrics.context import AV, MetricContext, slow
 from cosim.metrics.law import AvCounts
 from cosim.types import Kind, Metric, Snapshot
 
@@ -30,10 +30,9 @@ class PersonConflicts(AvCounts):
         super().add(snapshot)
         s = snapshot
         self._frames.append(s)
-        persons = np.flatnonzero(s.kind == PERSON)
-        avs = np.flatnonzero(s.kind == AV) if len(persons) else persons
-        if not len(avs):
+        if not slow(s.kind, s.speed, PERSON, np.inf) or not slow(s.kind, s.speed, AV, np.inf):
             return
+        persons, avs = np.flatnonzero(s.kind == PERSON), np.flatnonzero(s.kind == AV)
         mine, theirs = boxes(s, avs), boxes(s, persons)
         columns = Boxes(*(np.asarray(v)[:, None] for v in mine))
         critical = time_to_collision(columns, theirs, np.inf) < CRITICAL  # [a,p], touching is 0

@@ -1,9 +1,11 @@
 """Standing AVs: junctions that they block, and AVs that stand for long without a reason."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from cosim.geometry import gap_ahead
-from cosim.metrics.context import AV, MetricContext
+from cosim.metrics.context import AV, MetricContext, slow
 from cosim.metrics.law import AvCounts
 from cosim.types import Metric, Snapshot
 
@@ -36,7 +38,8 @@ class Standing(AvCounts):
     def add(self, snapshot: Snapshot) -> None:
         super().add(snapshot)
         s = snapshot
-        standing = np.flatnonzero((s.kind == AV) & (s.speed < STANDING)).tolist()
+        any_stands = slow(s.kind, s.speed, AV, STANDING)
+        standing = np.flatnonzero((s.kind == AV) & (s.speed < STANDING)).tolist() if any_stands else ()
         inside, waiting = self._inside, self._waiting
         self._inside, self._waiting = {}, {}
         reasons = self._reasons(s, standing) if standing else frozenset()
@@ -66,7 +69,7 @@ class Standing(AvCounts):
         lane = lanes[number]
         return "" if any(lanes[k].internal for k in lane.successors) else lane.start
 
-    def _reasons(self, s: Snapshot, standing: list[int]) -> frozenset[int]:
+    def _reasons(self, s: Snapshot, standing: Sequence[int]) -> frozenset[int]:
         """The rows among `standing` that have a reason to stand: they, or the head of their queue."""
         queued = np.flatnonzero((s.speed < STANDING) | (s.accel < BRAKES))
         _, leaders = gap_ahead(s, self._road.straight_on, queued, QUEUE)

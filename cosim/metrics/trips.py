@@ -1,12 +1,12 @@
 """What became of the AVs: trips driven to their end, and corrections by the car itself."""
 
-from cosim.metrics.context import AV, MetricContext
+from cosim.metrics.context import MetricContext
 from cosim.metrics.law import AvCounts
 from cosim.types import Metric, Snapshot
 
 
 class Trips(AvCounts):
-    """AVs that reached the end of their route without a collision before it (a wreck that is taken away has not)."""
+    """AVs that reached the end of their route without a collision (wrecks that are taken off have not)."""
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         super().reset(first, context)

@@ -8,6 +8,7 @@ from cosim.geometry.raster import RoadRaster, draw_snapshot, rasterize_road
 from cosim.observation.kinematics import choose_rows, fill_rows, never_left_out, perceived
 from cosim.observation.past import KinematicPast, MapPast
 from cosim.road import RoadMap
+from cosim.road.rules import Moment, RuleBook
 from cosim.types import KINEMATIC_FEATURES, History, Ints, Kind, ObservationConfig, Snapshot
 
 RouteOf = Callable[[str], tuple[str, ...]]  # AV id -> edges ahead, the present one first
@@ -27,7 +28,9 @@ class Observer:
     def __init__(self, road: RoadMap, config: ObservationConfig) -> None:
         self._road = road
         self._config = config
-        self._raster: RoadRaster | None = rasterize_road(road) if config.maps else None
+        version = config.road_version
+        self._raster: RoadRaster | None = rasterize_road(road, version) if config.maps else None
+        self._rules = RuleBook(road)
         self._maps = MapPast(config) if config.maps else None
         self.reset()
 
@@ -76,11 +79,18 @@ class Observer:
         no_maps = np.zeros((c.frames, len(c.channels), 0, 0), np.uint8)
         result = {}
         names = (*s.ids, "")
+        now = self._moment(s, 0)
         for b, e in enumerate(self._egos):
             name = s.ids[e]
             if lanes[b, 0] < 0:  # off every lane: it cannot be commanded now
                 continue
             target, change = commanded(name)
+            place, length = float(positions[b, 0]), float(s.length[e])
+            ahead = self._road.ahead(int(lanes[b, 0]), place, length, route(name))
+            way = ahead.paths[1]
+            assert way is not None
+            if not c.share_perception and b:
+                now = self._moment(s, b)
             result[name] = History(
                 velocity_map=no_maps if self._maps is None else self._maps.view(name),
                 kinematics=kinematics[b],
@@ -91,9 +101,16 @@ class Observer:
                 pose=pose[b],
                 target_speed=float(s.speed[e]) if target is None else target,
                 lane_changing=change,
-                route=self._road.ahead(
-                    int(lanes[b, 0]), float(positions[b, 0]), float(s.length[e]), route(name)
-                ),
+                route=ahead,
                 time=s.time,
+                rules=self._rules.ahead(way, place * way.scale, now),
+                signals=s.signals,
             )
         return result
+
+    def _moment(self, s: Snapshot, b: int) -> Moment:
+        """The signals, and the persons whom ego `b` perceives (with V2V: whom all do)."""
+        who = np.flatnonzero((s.kind == int(Kind.PERSON)) & self._seen[b])
+        persons = np.stack([s.x, s.y, s.heading, s.speed], axis=1)[who] if len(who) else None
+        told = self._config.signal_timing and len(s.switches)
+        return Moment(s.signals, s.switches if told else None, persons)

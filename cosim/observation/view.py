@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cosim.road.rules import RulesAhead
 from cosim.types import LANE_OFFSET, Bools, Bytes, Floats, Floats32, History, MetaAction
 
 LOOK_AHEAD = np.arange(0.0, 101.0, 10.0)  # [P] m ahead of the centre: 4 s at 25 m/s, the horizon
@@ -36,6 +37,7 @@ class View(NamedTuple):
     centre_lines: Floats32  # [3,P,2] m in the AV's frame (x ahead, y left); 0 where there is no lane
     action_mask: Bools  # [A] False for a lane change towards no lane, or while one is under way
     time: float  # s
+    rules: RulesAhead  # the law on its own way: signals, stop lines, crossings, limits
 
     @property
     def ego_speed(self) -> float:
@@ -53,7 +55,10 @@ class Packed(NamedTuple):
     kinematics: Floats32  # [B,N,R,F]
     valid: Bools  # [B,N,R]
     ids: tuple[tuple[str, ...], ...]
-    numbers: Floats  # [B,11] pose 3, target speed, change, limit, dead ends 3, conflict, time
+    # [B,22] pose 3, target speed, change, limit, dead ends 3, conflict, time; of `rules` the signal's state
+    # (0: none), all other fields in their order, and how many rows of `limits`
+    numbers: Floats
+    limits: Floats  # [k,2] m, m/s: those of all AVs one after the other
     lanes: Bools  # [B,3]
     lines: Floats32  # [B,3,P,2]
 
@@ -83,6 +88,7 @@ class Packer:
                 *(*h.pose, h.target_speed, h.lane_changing, h.route.speed_limit),
                 *map(h.route.to_end, range(len(SIDES))),
                 *(h.route.conflict_distance, h.time),
+                *(ord(h.rules.signal or "\0"), *h.rules[1:-1], len(h.rules.limits)),
             )
             for h in everyone
         ]
@@ -94,7 +100,8 @@ class Packer:
             kinematics=np.stack([h.kinematics for h in everyone]) if everyone else empty.astype(np.float32),
             valid=np.stack([h.valid for h in everyone]) if everyone else empty.astype(np.bool_),
             ids=tuple(h.ids for h in everyone),
-            numbers=np.array(numbers, np.float64).reshape(-1, 11),
+            numbers=np.array(numbers, np.float64).reshape(-1, 22),
+            limits=np.concatenate([h.rules.limits for h in everyone]) if everyone else np.zeros((0, 2)),
             lanes=exists,
             lines=lines,
         )
@@ -113,10 +120,13 @@ class Unpacker:
         for name, fresh in zip(known, packed.maps, strict=True):
             maps[name] = np.concatenate([self._maps[name][len(fresh) :], fresh])
         self._maps = maps
-        return {name: self._view(packed, b, name) for b, name in enumerate(packed.avs)}
+        limits = np.split(packed.limits, packed.numbers[:, -1].astype(int).cumsum()[:-1])
+        return {name: self._view(packed, b, name, limits[b]) for b, name in enumerate(packed.avs)}
 
-    def _view(self, packed: Packed, b: int, name: str) -> View:
-        x, y, heading, target, change, limit, left, keep, right, conflict, time = packed.numbers[b].tolist()
+    def _view(self, packed: Packed, b: int, name: str, limits: Floats) -> View:
+        own, law = packed.numbers[b, :11].tolist(), packed.numbers[b, 11:-1].tolist()
+        x, y, heading, target, change, limit, left, keep, right, conflict, time = own
+        state, signal_distance, signal, switch, stop, all_way, give_way, link, crossing, person = law
         lanes = packed.lanes[b]
         mask = np.ones(len(MetaAction), np.bool_)
         for action, offset in LANE_OFFSET.items():
@@ -136,6 +146,10 @@ class Unpacker:
             centre_lines=packed.lines[b],
             action_mask=mask,
             time=time,
+            rules=RulesAhead(
+                *(chr(int(state)).strip("\0"), signal_distance, int(signal), switch, stop, bool(all_way)),
+                *(give_way, int(link), crossing, person, limits),
+            ),
         )
 
 

@@ -164,14 +164,19 @@ def read(path: Path) -> Recording:
         first=about["first"],
         table=columns,
         routes=tuple(tuple(route) for route in about["routes"]),
-        events={
-            int(k): Events(
-                **{
-                    name: tuple(HAPPENED[name](**v) if name in HAPPENED else v for v in values)
-                    for name, values in e.items()
-                }
-            )
-            for k, e in about["events"].items()
-        },
+        events={int(k): _events(e) for k, e in about["events"].items()},
         signals=np.frombuffer(states, np.uint8).reshape(len(about["times"]), -1),
     )
+
+
+def _events(document: Mapping[str, Any]) -> Events:
+    found = {name: _tuples(values) for name, values in document.items()}
+    for name, kind in HAPPENED.items():
+        made = ({field: _tuples(value) for field, value in one.items()} for one in found.get(name, ()))
+        found[name] = tuple(kind(**one) for one in made)
+    return Events(**found)
+
+
+def _tuples(value: Any) -> Any:
+    """JSON knows lists only."""
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value

@@ -142,7 +142,7 @@ def _group_document(compared: Compared) -> dict[str, Any]:
 
 
 def _shown(comparison: Comparison, compared: Compared) -> list[PairedFigure]:
-    """Headline figures, those of the law that are not 0 and those that a threshold asks for, where they apply."""
+    """Headline figures, those of the law that are not 0, and those a threshold asks for, where they apply."""
     asked = [check.threshold.measure.name for check in comparison.checks]
     names = [name for name in dict.fromkeys((*HEADLINE, *LAW, *asked)) if name in compared.figures]
     broken = {n for n in LAW if (f := compared.figures.get(n)) and (f.a.value > 0.0 or f.b.value > 0.0)}

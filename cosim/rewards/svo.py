@@ -19,7 +19,8 @@ _SPEED_CHANGES = (MetaAction.ACCELERATE, MetaAction.DECELERATE)
 class RewardP:
     """P, section IV-B, equation (6): what others gain counts less the farther away they are.
 
-    Neighbours are the vehicles of both snapshots within `config.perception_range` m of the AV in `after`.
+    Neighbours are the vehicles of both snapshots within `config.perception_range` m of the AV in `after`;
+    persons are none.
     An AV that is no longer on the road gets its crash and nothing else.
     """
 
@@ -28,7 +29,7 @@ class RewardP:
 
     def __call__(self, step: RewardStep) -> dict[str, RewardTerms]:
         """The terms of each of `step.avs`."""
-        config, after, svo = self.config, step.after, step.svo
+        config, after, svo = self.config, step.after.vehicles, step.svo
         crashed = {name for c in step.collisions for name in (c.collider, c.victim)}
         utility = vehicle_utility(step.before, after, crashed, config)  # [n]
         alive = [name for name in step.avs if name in after.row]

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from cosim.errors import inside
+from cosim.errors import BadInput, Range, inside
 from cosim.files.yaml_input import dataclass_from, mapping
 from cosim.scenario import Scenario, chosen_fleet, load
 from cosim.scenario.behaviors import LC2013
@@ -42,7 +42,7 @@ class EpisodeId:
     penetration: float | None = None  # share of AVs; None: the scenario's own fleet
     av_type: str | None = None
     av_ids: str | None = None
-    svo_deg: float = 45.0  # degrees
+    svo_deg: Annotated[float, Range(0.0, high=90.0)] = 45.0  # degrees
     preset: str | None = None  # None: unguarded, in documents from before presets were always named
     duration: float | None = None  # s; None: the scenario's own
     warmup: float | None = None  # s driven before the counted time; None: the scenario's own
@@ -77,14 +77,17 @@ class EpisodeId:
     def read(cls, document: object, file: Path | None = None, where: str = "case") -> EpisodeId:
         """The episode of a `document()` that `file` holds under the name `where`.
 
-        Raises BadInput: a field of another type.
+        Raises BadInput: a field is missing, of another type, or out of its bounds.
         """
         with inside(where, file):
             given = mapping(document)
-        values = {field.name: given[field.name] for field in fields(cls) if field.name in given}
-        dataclass_from(cls, values, file, where)
-        plain: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-        return cls(**plain)
+        names = [field.name for field in fields(cls) if given.get(field.name) is not None]
+        found = dataclass_from(cls, {name: given[name] for name in names}, file, where)
+        if found.seed < 0:
+            problem = "must be a whole number from 0 on"
+            raise BadInput(problem, file=file, field=f"{where}.seed", value=found.seed)
+        numbers = {name: given[name] for name in names if isinstance(given[name], int | float)}
+        return replace(found, **numbers)  # an angle of 45 stays 45: the cell is a hash of its text
 
     def with_seed(self, seed: int) -> EpisodeId:
         """Another episode of the same cell."""

@@ -34,12 +34,12 @@ def manifest(scenario: Scenario, seed: int) -> dict[str, Any]:
     return {
         "seed": seed,
         "preset": scenario.preset,
-        # named where it is not the worlds' own: episodes are told apart by this document, older ones too
+        # named where they are not a world's own: episodes are told apart by this document, older ones too
         **({"on_collision": goes_on} if (goes_on := scenario.on_collision) != OnCollision.END else {}),
+        **({} if scenario.built_in else {"mission": scenario.mission.vehicles or scenario.mission.kind}),
         "driver_model": scenario.driver_model,
         "behavior": scenario.behavior,
         "fleet": scenario.fleet.describe(),
-        "mission": scenario.mission.vehicles or scenario.mission.kind,
         "timing": {
             "step_s": scenario.timing.step,
             "frame_s": scenario.timing.frame,

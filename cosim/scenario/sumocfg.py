@@ -39,6 +39,10 @@ _SYNONYMS = {
     "save-config": "save-configuration",
 }
 _AS_OURS = {("step-length", "0.1"), ("collision.action", "warn")}  # nothing is lost with these
+# SUMO takes any root in a configuration; these are files of another kind, given by mistake.
+OTHER_ROOTS = frozenset(
+    {"net", "nodes", "edges", "connections", "types", "routes", "trips", "additional", "add"}
+)
 INPUTS = ("net-file", "route-files", "additional-files")
 CLOCK = ("begin", "end", "step-length")
 # Options whose value is a list of files to read; relative to the configuration's folder.
@@ -211,8 +215,14 @@ def _values(path: Path) -> dict[str, str]:
     """Every option with its value: `<name value="x"/>` or `<name v="x"/>`; SUMO's groups have none."""
     regular_file(path, file=path, field="scenario")
     values: dict[str, str] = {}
+    root = ""
 
     def start(tag: str, attributes: dict[str, str], line: int) -> None:
+        nonlocal root
+        if not root and tag in OTHER_ROOTS:
+            problem = "wrong root element, <configuration> is needed"
+            raise BadInput(problem, file=path, field="root", value=tag)
+        root = root or tag
         value = attributes.get("value", attributes.get("v"))
         if value is None:
             return
@@ -221,7 +231,7 @@ def _values(path: Path) -> dict[str, str]:
             raise BadInput(f"is given twice (line {line})", file=path, field=name, value=value)
         values[name] = value
 
-    scan(path, ("configuration", "sumoConfiguration"), start)
+    scan(path, (), start)
     return values
 
 

@@ -5,6 +5,7 @@ file is read once as a stream (memory does not grow with the demand's size, exce
 numbers are checked, and every name it refers to must exist. Files that have not changed are not read again.
 """
 
+import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -16,6 +17,8 @@ from cosim.scenario import Scenario
 from cosim.scenario.sumocfg import FILE_OPTIONS
 from cosim.scenario.vet_demand import Demand, read_demand
 from cosim.scenario.vet_net import Net, read_net
+from cosim.scenario.vet_rules import OFF_ROAD, some
+from cosim.scenario.vet_signals import check_lengths
 
 MAX_WARNINGS = 20  # of one kind
 MAX_INCLUDES = 64  # files; more is a cycle
@@ -55,6 +58,9 @@ def vet(scenario: Scenario) -> VetReport:
     _check_options(scenario)
     types = DEFAULT_TYPES.union(*(d.types for d in demands))
     _check_references(net, demands, types)
+    for demand in demands:
+        check_lengths(demand.path, demand.programs, net.signals)
+    _check_mission(scenario, demands)
     clashes = _check_drivers(demands)
     if scenario.fleet.type is not None and scenario.fleet.type not in types:
         where = ", ".join(path.name for path in scenario.demand) or "the demand"
@@ -64,7 +70,13 @@ def vet(scenario: Scenario) -> VetReport:
         edges=sum(1 for edge in net.lanes if not edge.startswith(":")),
         vehicles=sum(len(d.vehicles) for d in demands),
         flows=sum(len(d.flows) for d in demands),
-        warnings=(*(w for d in demands for w in d.warnings), *clashes, *_gaps(net, demands)),
+        warnings=(
+            *net.warnings,
+            *(w for d in demands for w in d.warnings),
+            *clashes,
+            *_gaps(net, demands),
+            *_unsupported(scenario, demands),
+        ),
         outputs=tuple(output for d in demands for output in d.outputs),
     )
 
@@ -146,18 +158,62 @@ def _check_drivers(demands: list[Demand]) -> list[str]:
 
 
 def _gaps(net: Net, demands: list[Demand]) -> list[str]:
-    """Where nobody can drive, which SUMO finds out only on the way or never: these are warnings."""
+    """Where nobody can drive or walk, which SUMO finds out only on the way or never: these are warnings."""
     found = []
-    if net.closed:
-        some = ", ".join(net.closed[:3]) + (", ..." if len(net.closed) > 3 else "")
-        found.append(f"{net.path}: the speed limit is 0 on {some}: a vehicle there stands for ever")
     for demand in demands:
         broken = [(pair, place) for pair, place in demand.steps.items() if pair not in net.links]
         for (a, b), place in broken[:3]:
             found.append(f"{demand.path}: impossible route ({place}): no connection from {a!r} to {b!r}")
         if len(broken) > 3:
             found.append(f"{demand.path}: {len(broken) - 3} further pairs of edges without a connection")
+        apart = [
+            (pair, place)
+            for pair, place in demand.walks.items()
+            if not set(net.ends.get(pair[0], ())) & set(net.ends.get(pair[1], ()))
+            and not any(edge.startswith(":") for edge in pair)
+        ]
+        for (a, b), place in apart[:3]:
+            found.append(
+                f"{demand.path}: a walk with a gap ({place}): SUMO moves the person from {a!r} to {b!r}"
+            )
     return found
+
+
+def _unsupported(scenario: Scenario, demands: list[Demand]) -> list[str]:
+    """What cosim does not know, though SUMO drives it (definitions.md, Not supported): these are warnings."""
+    found = []
+    for option in scenario.ignored:
+        name, _, value = option.partition("=")
+        if name == "lateral-resolution" and value.split()[0].strip() not in ("0", "0.0", "-1"):
+            found.append(
+                f"{scenario.config}: {name}={value}: without SUMO's sublane model the traffic is another"
+            )
+    used = {name for demand in demands for name in (*demand.used["vehicle type"], *demand.mixtures)}
+    off_road = {
+        name: kind for d in demands for name, kind in d.classes.items() if kind in OFF_ROAD and name in used
+    }
+    if off_road:
+        types = some([f"{name} ({kind})" for name, kind in sorted(off_road.items())])
+        found.append(
+            f"{scenario.config}: no road vehicles: {types}: each is taken to be one straight, stiff box"
+        )
+    return found
+
+
+def _check_mission(scenario: Scenario, demands: list[Demand]) -> None:
+    """Somebody has the name of the mission vehicle of a user's file, as far as names are known beforehand."""
+    mission = scenario.mission
+    wanted = mission.vehicles
+    if not wanted or scenario.built_in or any(demand.makes_vehicles for demand in demands):
+        return
+    vehicles = [name for demand in demands for name in demand.vehicles]
+    flows = {name for demand in demands for name in demand.flows}  # their vehicles are FLOW.0, FLOW.1, ...
+    unknown = wanted.rpartition(".")[0] in flows if re.fullmatch(r"[\w.:-]+", wanted) else bool(flows)
+    if not unknown and not any(map(mission.includes, vehicles)):
+        near = hint(wanted, [*vehicles[:5000], *(f"{flow}.0" for flow in flows)])
+        raise BadInput(
+            f"no such vehicle in the demand{near}", file=scenario.config, field="--mission", value=wanted
+        )
 
 
 def _stamp(path: Path) -> tuple[Path, int, int]:

@@ -19,12 +19,15 @@ from cosim.scenario.vet_rules import (
     Reader,
     words,
 )
+from cosim.scenario.vet_signals import SignalReader
 
-ROUTE_ROOTS = ("routes", "route-alternatives", "trips", "vehicles", "additional", "add")
-# SUMO takes any root in an additional file; these are kinds of their own, given by mistake.
-NOT_ADDITIONAL = frozenset(
+# SUMO takes any root; these are kinds of their own, given by mistake.
+OTHER_ROOTS = frozenset(
     {"net", "nodes", "edges", "connections", "types", "configuration", "sumoConfiguration", "html", "project"}
 )
+_STAGES = words("walk personTrip ride stop transport tranship access")
+_PERSONS = words("person personFlow container containerFlow")
+_STOPS = words("busStop trainStop containerStop chargingStation parkingArea")
 _DRIVERS = frozenset({"vehicle", "trip", "flow"})
 _MOVING = _DRIVERS | {"person", "personFlow", "container", "containerFlow"}
 _TRAVEL = _DRIVERS | {"route", "walk", "ride", "personTrip", "transport", "tranship", "stop"}
@@ -62,6 +65,11 @@ class Demand:
     # kind (edge, lane, junction, vehicle type, route) -> name -> where it is first used
     steps: dict[tuple[str, str], Place] = field(default_factory=dict)  # (edge, next edge) of whole routes
     includes: list[Path] = field(default_factory=list)
+    walks: dict[tuple[str, str], Place] = field(default_factory=dict)  # (edge, next edge) of walks
+    classes: dict[str, str] = field(default_factory=dict)  # vehicle type -> its class, where it is given
+    mixtures: set[str] = field(default_factory=set)  # types that are part of a distribution
+    programs: dict[tuple[str, str], int] = field(default_factory=dict)  # as `SignalReader.programs`
+    makes_vehicles: bool = False  # by calibrators, whose vehicles have names of SUMO's
     outputs: list[str] = field(default_factory=list)  # files SUMO would write, as written
     warnings: list[str] = field(default_factory=list)
 
@@ -71,12 +79,11 @@ def read_demand(path: Path, *, additional: bool) -> Demand:
 
     Raises:
         BadInput: what `cosim.files.xml_input.scan` refuses; NaN, infinite or negative numbers; unknown
-            lane-change attributes (with the nearest name); the same vehicle twice; a missing include.
+            lane-change attributes (with the nearest name); the same vehicle twice; a missing include; a
+            person without a plan, a walk from or to nowhere; malformed signal programs.
     """
     reader = _DemandReader(path, additional)
-    root = scan(path, () if additional else ROUTE_ROOTS, reader.start, reader.end)
-    if root in NOT_ADDITIONAL:
-        raise BadInput("wrong root element, <additional> is needed", file=path, field="root", value=root)
+    scan(path, (), reader.start, reader.end)
     return reader.finish()
 
 
@@ -91,8 +98,16 @@ class _DemandReader(Reader):
         self._seen_lists: set[str] = set()
         self._last_depart = 0.0  # s
         self._unsorted: list[str] = []
+        self._signals = SignalReader(path)
+        self._person: Place | None = None  # the person or container whose plan is being read
+        self._stages = 0  # of that plan so far
+        self._picked_up = False  # it departs in a vehicle, wherever that is
 
     def start(self, tag: str, attributes: dict[str, str], line: int) -> None:
+        if not self._owners and tag in OTHER_ROOTS:
+            wanted = "additional" if self._additional else "routes"
+            problem = f"wrong root element, <{wanted}> is needed"
+            raise BadInput(problem, file=self._path, field="root", value=tag)
         owner = attributes.get("id") or (self._owners[-1][1] if self._owners else "")
         is_type = tag == "vType" or tag.startswith("carFollowing-")
         rules = VEHICLE_TYPE if is_type else DEMAND.get(tag)
@@ -103,14 +118,28 @@ class _DemandReader(Reader):
                     self._unknown(tag, name, attributes[name], owner, line)
             if idle := sorted(SL2015_ONLY & attributes.keys()):
                 self._warn(f"vType {owner!r}: {', '.join(idle)} only work with SL2015, LC2013 drives here")
+            self.found.classes[owner] = attributes.get("vClass", "")
+            if self._owners and self._owners[-1][0] == "vTypeDistribution":
+                self.found.mixtures.add(owner)
         elif tag in _MOVING:
             self._driver(tag, attributes, owner, line)
+        elif tag in ("tlLogic", "phase"):
+            self._signals.start(tag, attributes, line)
+        elif tag == "vTypeDistribution":
+            self.found.mixtures.update(attributes.get("vTypes", "").split())
         elif tag == "include":
             self._include(attributes, line)
         if "id" in attributes and (is_type or tag == "vTypeDistribution"):
             self.found.types.add(attributes["id"])
         elif "id" in attributes and tag in ("route", "routeDistribution"):
             self.found.routes.add(attributes["id"])
+        elif tag == "calibrator":
+            self.found.makes_vehicles = True
+        if tag in _PERSONS:
+            self._person, self._stages = Place(self._path, f"{tag}.id", "", line), 0
+            self._picked_up = attributes.get("depart") == "triggered"
+        elif tag in _STAGES and self._person is not None:
+            self._stage(tag, attributes, owner, line)
         if tag in _TRAVEL:
             self._edges(tag, attributes, owner, line)
         if tag in _ON_A_LANE and "lane" in attributes:
@@ -122,9 +151,28 @@ class _DemandReader(Reader):
         self._owners.append((tag, owner))
 
     def end(self, tag: str) -> None:
-        self._owners.pop()
+        _, owner = self._owners.pop()
+        self._signals.end(tag)
+        if tag in _PERSONS and self._person is not None:
+            if not self._stages:
+                raise self._person.wrong("has no plan: a walk, ride or stop is needed", owner)
+            self._person = None
+
+    def _stage(self, tag: str, attributes: dict[str, str], owner: str, line: int) -> None:
+        """A stage of a plan: the first one says where it begins, each where it ends."""
+        self._stages += 1
+        if tag in ("stop", "access"):
+            return
+        if not attributes.get("edges", "x").strip():
+            self._refuse(tag, "edges", "", "is empty", owner, line)
+        given = {"edges", "route"} & attributes.keys()
+        if self._stages == 1 and not self._picked_up and not given | _named(attributes, "from"):
+            self._refuse(tag, "from", "", "is missing: the plan begins nowhere", owner, line)
+        if not given | _named(attributes, "to") | (_STOPS & attributes.keys()):
+            self._refuse(tag, "to", "", "is missing: it leads nowhere", owner, line)
 
     def finish(self) -> Demand:
+        self.found.programs = self._signals.programs
         if self._unsorted:
             some = ", ".join(self._unsorted[:3]) + (", ..." if len(self._unsorted) > 3 else "")
             self.found.warnings.append(
@@ -182,9 +230,10 @@ class _DemandReader(Reader):
             edges = value.split()
             for edge in edges:
                 self.found.used["edge"].setdefault(edge, place)
-            if name == "edges" and tag == "route":
+            if name == "edges" and tag in ("route", "walk"):
+                steps = self.found.steps if tag == "route" else self.found.walks
                 for pair in pairwise(edges):
-                    self.found.steps.setdefault(pair, place)
+                    steps.setdefault(pair, place)
 
     def _use(self, kind: str, used: str, tag: str, name: str, owner: str, line: int) -> None:
         self.found.used[kind].setdefault(used, Place(self._path, f"{tag}.{name}", owner, line))
@@ -201,3 +250,8 @@ class _DemandReader(Reader):
     def _warn(self, text: str) -> None:
         if len(self.found.warnings) < 20:  # a type may be written a thousand times
             self.found.warnings.append(f"{self._path}: {text}")
+
+
+def _named(attributes: Mapping[str, str], begin: str) -> set[str]:
+    """Attributes such as from, fromJunction, fromTaz."""
+    return {name for name in attributes if name.startswith(begin)}

@@ -2,13 +2,15 @@
 
 import re
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from cosim.errors import BadInput
 from cosim.files.xml_input import scan
-from cosim.scenario.vet_rules import NET, Reader
+from cosim.scenario.vet_hands import Hands
+from cosim.scenario.vet_rules import NET, Reader, some
+from cosim.scenario.vet_signals import PHASELESS, SignalReader, check_lengths
 
 _CROSSING = re.compile(r":(.+)_c\d+")  # netconvert's name for the crossings of a junction
 
@@ -21,7 +23,9 @@ class Net:
     lanes: Mapping[str, int]  # edge -> number of lanes; internal edges (":...") included
     junctions: frozenset[str]
     links: frozenset[tuple[str, str]]  # (edge, edge) pairs that a connection joins
-    closed: tuple[str, ...] = ()  # lanes with a speed limit of 0
+    ends: Mapping[str, tuple[str, str]] = field(default_factory=dict)  # edge -> junctions it joins
+    signals: Mapping[str, int] = field(default_factory=dict)  # tlLogic -> signals that its connections need
+    warnings: tuple[str, ...] = ()
 
     def has_lane(self, lane: str) -> bool:
         """Whether "edge_2" is a lane of this net."""
@@ -34,8 +38,10 @@ def read_net(path: Path) -> Net:
 
     Raises:
         BadInput: what `cosim.files.xml_input.scan` refuses; no `version` (SUMO crashes); NaN, infinite or
-            negative numbers; gaps in lane indices; connections to lanes that are not there; junctions
-            whose right-of-way table does not fit their connections (SUMO crashes too).
+            negative numbers; lanes without a speed limit or above 150 m/s; gaps in lane indices; connections
+            to lanes that are not there; junctions whose right-of-way table does not fit their connections
+            (SUMO crashes too); signals without a program or with a malformed one; lanes on the other side
+            than `lefthand` says.
     """
     reader = _NetReader(path)
     scan(path, ("net",), reader.start, reader.end)
@@ -56,12 +62,21 @@ class _NetReader(Reader):
         self._links: dict[tuple[str, str, str, str], tuple[int, str]] = {}  # -> line, via
         self._edge: str | None = None
         self._junction = ""
-        self._closed: list[str] = []  # lanes with a speed limit of 0
+        self._signals = SignalReader(path)
+        self._signalled: dict[str, dict[int, int]] = {}  # tlLogic -> its link indices -> line
+        self._lit: set[str] = set()  # junctions with a signalled connection
+        self._hands = Hands(path)
+        self._opposite: list[str] = []  # lanes from which a vehicle may overtake on the opposite side
 
     def start(self, tag: str, attributes: dict[str, str], line: int) -> None:
         if tag == "net":
             self._check_version(attributes)
         self._check(tag, attributes, NET.get(tag, {}), attributes.get("id", ""), line)
+        self._signals.start(tag, attributes, line)
+        if tag == "net":
+            self._hands.left = attributes.get("lefthand", "") in ("1", "true", "True")
+        elif tag == "neigh" and self._edge is not None:
+            self._opposite.append(self._edge)
         if tag == "request":
             self._request(attributes, line)
         elif tag == "lane":
@@ -78,8 +93,11 @@ class _NetReader(Reader):
             names = ("from", "to", "fromLane", "toLane")
             a, b, i, j = (self._need("connection", name, attributes, line) for name in names)
             self._links[a, b, i, j] = (line, attributes.get("via", ""))
+            if "tl" in attributes:
+                self._signal(a, attributes, line)
 
     def end(self, tag: str) -> None:
+        self._signals.end(tag)
         if tag == "edge" and self._edge is not None:
             if not self._lanes[self._edge]:
                 raise BadInput("has no lane", file=self._path, field="edge.id", value=self._edge)
@@ -92,7 +110,8 @@ class _NetReader(Reader):
             lanes=self._lanes,
             junctions=frozenset(self._junctions),
             links=frozenset((a, b) for a, b, _, _ in self._links),
-            closed=tuple(self._closed),
+            ends={edge: (start, self._ends[edge]) for edge, start in self._origins.items()},
+            signals={name: max(indices) + 1 for name, indices in self._signalled.items()},
         )
         counts = Counter[str]()
         for (a, b, i, j), (line, via) in self._links.items():
@@ -110,7 +129,45 @@ class _NetReader(Reader):
         self._check_junctions(counts, net)
         if not self._lanes:
             raise BadInput("holds no edge", file=self._path, field="net", value=0)
-        return net
+        self._check_signals(net)
+        warnings = (*self._unlit(), *self._hands.warnings(net.ends), *self._overtaking())
+        return replace(net, warnings=warnings)
+
+    def _signal(self, edge: str, attributes: dict[str, str], line: int) -> None:
+        index = int(float(self._need("connection", "linkIndex", attributes, line)))
+        name = attributes["tl"]
+        self._signalled.setdefault(name, {})[index] = line
+        if edge in self._ends:
+            self._lit.add(self._ends[edge])
+
+    def _check_signals(self, net: Net) -> None:
+        """Every signalled connection has a program, with a signal for it in every phase."""
+        known = {name for name, _ in self._signals.programs}
+        for name, indices in self._signalled.items():
+            if self._junctions.get(name) in PHASELESS:
+                continue  # SUMO makes a program for these
+            lowest = min(indices)
+            if name not in known:
+                self._refuse("connection", "tl", name, "no such tlLogic in the net", "", indices[lowest])
+            if lowest < 0:
+                self._refuse(
+                    "connection", "linkIndex", str(lowest), "must be at least 0", "", indices[lowest]
+                )
+        check_lengths(self._path, self._signals.programs, net.signals)
+
+    def _unlit(self) -> Iterator[str]:
+        """Junctions called signalled whose connections have no signal: SUMO drives them by right of way."""
+        through = {self._ends[a] for a, b, *_ in self._links if a in self._ends and not b.startswith(":")}
+        kinds = {name for name, kind in self._junctions.items() if kind.startswith("traffic_light")}
+        if dark := sorted((kinds & through) - self._lit):
+            yield f"{self._path}: no signal at {some(dark)} of type traffic_light: right of way rules there"
+
+    def _overtaking(self) -> Iterator[str]:
+        if edges := sorted({edge for edge in self._opposite if not edge.startswith(":")}):
+            yield (
+                f"{self._path}: overtaking on the opposite side is allowed on {some(edges)}: vehicles there "
+                "are taken to be on their own side"
+            )
 
     def _check_version(self, attributes: dict[str, str]) -> None:
         version = attributes.get("version")
@@ -152,8 +209,8 @@ class _NetReader(Reader):
         if len(attributes["shape"].split()) < 2:
             self._refuse("lane", "shape", attributes["shape"], "needs at least two points", lane, line)
         self._lanes[self._edge] = expected + 1
-        if float(attributes["speed"]) == 0.0:
-            self._closed.append(lane)
+        if not internal:
+            self._hands.lane(self._edge, attributes["shape"])
 
     def _request(self, attributes: dict[str, str], line: int) -> None:
         """A row of the right-of-way table: SUMO uses its entries as indices."""
@@ -166,11 +223,11 @@ class _NetReader(Reader):
 
     def _check_ends(self) -> None:
         """Every edge runs from a junction that is there to one that is there."""
-        for field, ends in (("edge.from", self._origins), ("edge.to", self._ends)):
+        for place, ends in (("edge.from", self._origins), ("edge.to", self._ends)):
             for edge, junction in ends.items():
                 if junction not in self._junctions:
                     problem_ = f"no such junction in the net (edge {edge})"
-                    raise BadInput(problem_, file=self._path, field=field, value=junction)
+                    raise BadInput(problem_, file=self._path, field=place, value=junction)
 
     def _check_inside(self) -> None:
         """A lane inside a junction that a connection uses must lead out of it: SUMO does not check it."""

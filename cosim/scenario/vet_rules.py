@@ -5,8 +5,9 @@ accepts NaN, infinities and negative speeds silently (docs/sumo.md). Words such 
 `departPos="random"` are legal where the schema has them; SUMO itself refuses other words.
 """
 
+import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, NoReturn
@@ -34,7 +35,7 @@ TIME = Number(0.0, time=True)
 WORD_OR_TIME = Number(0.0, words=True, time=True)
 WORD_OR_NON_NEGATIVE = Number(0.0, words=True)
 WORD_OR_FINITE = Number(words=True)
-LANE_SPEED = Number(0.0, high=1000.0)  # m/s: more is no speed, though SUMO 1.28 takes 1e308 silently
+LANE_SPEED = Number(0.0, above=True, high=150.0)  # m/s: no road is faster, though SUMO 1.28 takes 1e308
 
 _NOT_A_SHAPE = re.compile(r"[^0-9eE+\-., \t\r\n]")  # NaN and inf have letters that no coordinate has
 _CALL = re.compile(r"\s*[A-Za-z]\w*\((.*)\)\s*", re.DOTALL)
@@ -49,6 +50,12 @@ def words(names: str) -> frozenset[str]:
     return frozenset(names.split())
 
 
+# Vehicle classes that drive no road, and those whose drivers an AV does not replace.
+OFF_ROAD = words(
+    "rail rail_urban rail_electric rail_fast tram subway ship aircraft drone container cable_car"
+)
+NOT_CARS = OFF_ROAD | words("bicycle moped motorcycle scooter wheelchair pedestrian")
+
 _NET: Mapping[str, Mapping[str, Number]] = {
     "lane": {
         **_each(POSITIVE, "length width"),
@@ -62,7 +69,7 @@ _NET: Mapping[str, Mapping[str, Number]] = {
         **_each(INDEX, "fromLane toLane"),
         **_each(FINITE, "linkIndex contPos visibility speed length"),
     },
-    "phase": _each(TIME, "duration"),
+    "phase": _each(TIME, "duration minDur maxDur"),
     "tlLogic": _each(WORD_OR_FINITE, "offset"),
 }
 _SHAPES = _each(Number(shape=True), "shape customShape outlineShape")
@@ -172,6 +179,20 @@ DEMAND: Mapping[str, Mapping[str, Number]] = {
     "personTrip": _WALKING,
     "ride": _WALKING,
 }
+
+
+def some(names: Sequence[str]) -> str:
+    """The first three of many names."""
+    return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+
+
+def seconds(value: str | None) -> float:
+    """A time of SUMO's in s; NaN for none."""
+    try:
+        parts = [float(part) for part in (value or "").split(":")]
+    except ValueError:
+        return math.nan
+    return sum(part * 60.0**k for k, part in enumerate(reversed(parts)))
 
 
 def problem(value: str, rule: Number) -> str | None:

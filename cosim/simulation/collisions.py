@@ -67,10 +67,8 @@ class CollisionDetector:
             if person:
                 names = names if c.colliderSpeed > 0.1 else names[::-1]
             else:
-                now_there = _poses(names, bodies)
-                first = (
-                    None if now_there is None else mover(self._poses_before(names, now_there, now), now_there)
-                )
+                pair = _poses(names, bodies)
+                first = None if pair is None else mover(self._poses_before(names, pair, now), pair)
                 names = names[::-1] if first == 1 else names
             try:
                 x, y = libsumo.vehicle.getPosition(c.collider)[:2]
@@ -112,13 +110,13 @@ class CollisionDetector:
 
     # ---- inside ----
 
-    def _poses_before(self, names: Sequence[str], now_there: Boxes, now: float) -> Boxes:
+    def _poses_before(self, names: Sequence[str], pair: Boxes, now: float) -> Boxes:
         """Where two were in the last frame; who was not there yet is moved back by its speed."""
         s = self._before
         elapsed = 0.0 if s is None else now - s.time
-        columns = [np.array(column, np.float64) for column in now_there]
-        columns[0] -= elapsed * now_there.speed * np.cos(now_there.heading)
-        columns[1] -= elapsed * now_there.speed * np.sin(now_there.heading)
+        columns = [np.array(column, np.float64) for column in pair]
+        columns[0] -= elapsed * pair.speed * np.cos(pair.heading)
+        columns[1] -= elapsed * pair.speed * np.sin(pair.heading)
         for k, name in enumerate(names):
             if s is not None and (row := s.row.get(name)) is not None:
                 for column, before in zip(columns, boxes(s, np.array([row])), strict=True):
@@ -164,29 +162,39 @@ class Wrecks:
     def __init__(self, commander: Commander, drivers: Drivers) -> None:
         self._commander, self._drivers = commander, drivers
         self._since: dict[str, float] = {}  # wreck -> s, when it crashed
+        self._stopped: list[str] = []  # since the last `take`
+        self._removed: list[str] = []
 
-    def add(self, collisions: Iterable[Collision]) -> None:
+    def add(self, collisions: Sequence[Collision]) -> None:
         """Stop the vehicles of these; SUMO's insertions onto one another are no crashes."""
         on_road = frozenset(libsumo.vehicle.getIDList()) if collisions else frozenset()
         for c in collisions:
             for name in () if c.insertion else (c.collider, c.victim):
-                if name not in self._since and name in on_road:
+                if name in on_road and name not in self._since:
                     self._since[name] = c.time
+                    self._stopped.append(name)
                     self._commander.wreck(name)
                     self._drivers.drop(name)
                     libsumo.vehicle.setSpeedMode(name, 0)  # at once, not within its deceleration
                     libsumo.vehicle.setLaneChangeMode(name, 0)
                     libsumo.vehicle.setSpeed(name, 0.0)
 
-    def remove(self, now: float) -> tuple[str, ...]:
-        """Take those off the road that have stood long enough; their names."""
-        due = tuple(name for name, since in self._since.items() if now - since >= WRECK_STANDS - 1e-6)
+    def remove(self, now: float) -> None:
+        """Take those off the road that have stood long enough."""
+        due = [name for name, since in self._since.items() if now - since >= WRECK_STANDS - 1e-6]
         on_road = frozenset(libsumo.vehicle.getIDList()) if due else frozenset()
         for name in due:
             del self._since[name]
             if name in on_road:
                 libsumo.vehicle.remove(name)
-        return due
+                self._removed.append(name)
+
+    def take(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Who has become a wreck, and which wrecks were removed, since this was asked last."""
+        found = tuple(self._stopped), tuple(self._removed)
+        self._stopped.clear()
+        self._removed.clear()
+        return found
 
 
 def mover(before: Boxes, now: Boxes) -> int | None:

@@ -12,7 +12,7 @@ from cosim.errors import BadInput
 from cosim.road import ConflictZone, Crossing, Lane, Link, RoadMap, Rule
 from cosim.scenario import Zone
 from cosim.simulation.conventions import centres
-from cosim.types import Actor, Bytes, Events, Kind, Snapshot
+from cosim.types import Actor, Bytes, Events, Floats, Kind, Snapshot
 
 # The compiled getters: libsumo's Python wrappers around them double the cost of a read. The version
 # is pinned; a test compares them with the public ones.
@@ -20,10 +20,11 @@ GETTERS = tuple(
     getattr(libsumo._libsumo, f"vehicle_get{name}")
     for name in ("Position", "Angle", "Speed", "Acceleration", "LaneID", "LanePosition")
 )
-# the same of persons, of whose acceleration SUMO says nothing
-PERSON_GETTERS = tuple(
-    getattr(libsumo._libsumo, f"person_get{name}", lambda _: 0.0)
-    for name in ("Position", "Angle", "Speed", "Acceleration", "LaneID", "LanePosition")
+# The same of persons, of whose acceleration SUMO says nothing. No lane is theirs: they walk beside, along,
+# against and across those of vehicles.
+PERSON_GETTERS = (
+    *(getattr(libsumo._libsumo, f"person_get{name}") for name in ("Position", "Angle", "Speed")),
+    *(lambda _: 0.0, lambda _: "", lambda _: 0.0),
 )
 PERSON = "person:"  # a person's name in a snapshot: this and its id, which may be a vehicle's too
 GIVE_WAY = "mswZ"  # link states: minor, stop, all-way stop, zipper (SUMO, Networks/SUMO_Road_Networks)
@@ -119,6 +120,7 @@ class SnapshotReader:
             events=events,
             actor=actor,
             signals=self._signals(),
+            switches=self._switches(),
         )
 
     def _signals(self) -> Bytes:
@@ -126,6 +128,12 @@ class SnapshotReader:
         get = libsumo.trafficlight
         states = (get.getRedYellowGreenState(light)[:count] for light, count in self._lights.items())
         return np.frombuffer("".join(states).encode(), np.uint8)
+
+    def _switches(self) -> Floats:
+        """[s] s until the next phase of every signal's light."""
+        get, now = libsumo.trafficlight.getNextSwitch, libsumo.simulation.getTime()
+        left = np.array([get(light) for light in self._lights], np.float64) - now
+        return np.repeat(left, np.fromiter(self._lights.values(), np.int64))
 
 
 def _walking() -> dict[str, str]:

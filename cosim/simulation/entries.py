@@ -8,9 +8,10 @@ earliest be there. Signals are read when SUMO says that they switch.
 import heapq
 import math
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property
+from itertools import chain
 from typing import NamedTuple
 
 import libsumo
@@ -22,6 +23,7 @@ LAST = 10.0  # m before the line over which the least speed is taken (docs/defin
 FOES_WITHIN = 100.0  # m before its own line, within which a vehicle with the right of way counts
 NEAR = LAST + 2.0  # m
 HARDEST = 4.0  # m/s2: no AV gains speed faster
+STANDING = 0.05  # m/s: slower than that in the last 10 m makes no difference
 LONGEST = 100  # steps until the next look, for whoever SUMO puts elsewhere (teleports)
 HOPS = 8  # lanes that one step may lead across
 EPSILON = 1e-6
@@ -46,8 +48,8 @@ class Passed(NamedTuple):
 class Watched:
     """What is known of one AV."""
 
-    looked: int = -2  # the step of the last look
-    lane: int = -1  # then
+    lane: int = -1  # at the last look
+    near: bool = False  # to a line, then
     trail: deque[tuple[float, float]] = field(default_factory=deque)  # (odometer m, speed m/s) near a line
 
 
@@ -69,6 +71,7 @@ class EntryWatcher:
             link.signal >= 0 or bool(link.foes) or link.rule in (Rule.STOP, Rule.ALL_WAY_STOP)
             for link in road.links
         ]
+        self._lengths = [lane.length for lane in road.lanes]  # [l] m
         self.needed = any(self._matters)
         self.reset()
 
@@ -96,43 +99,46 @@ class EntryWatcher:
         for name in departed:
             self._avs[name] = Watched()
             self._due[self._count].append(name)
-        entries: list[Entry] = []
-        for name in self._due.pop(self._count, ()):
-            try:
-                entries += self._look(name, now)
-            except libsumo.TraCIException:  # it left the road
-                del self._avs[name]
-        return tuple(entries)
+        due = self._due.pop(self._count, None)
+        return tuple(chain.from_iterable(self._look(name, now) for name in due)) if due else ()
 
     # ---- inside ----
 
-    def _look(self, name: str, now: float) -> list[Entry]:
+    def _look(self, name: str, now: float) -> Sequence[Entry]:
         """Look at one AV, and say when next; its entries."""
         av = self._avs[name]
-        lane = self._road.index.get(lane_of(name), -1)
-        before, at_once = av.lane, av.looked == self._count - 1
-        av.looked, av.lane = self._count, lane
+        try:
+            lane = self._road.index.get(lane_of(name), -1)
+        except libsumo.TraCIException:  # it left the road
+            del self._avs[name]
+            return ()
+        before, av.lane = av.lane, lane
         if lane < 0:  # teleporting
-            av.trail.clear()
+            av.near = False
             self._due[self._count + 1].append(name)
-            return []
+            return ()
         position, speed = position_of(name), speed_of(name)
-        entries: list[Entry] = []
-        if lane != before and before >= 0 and at_once:
-            for passed in self._passed(before, lane):
-                entries.append(self._entry(name, av, passed, position, speed, now))
-        away = self._road.lanes[lane].length - position + self._free[lane]  # m to the next line
-        steps = 1
-        if away > NEAR:
-            time = (
-                math.sqrt(speed * speed + 2.0 * HARDEST * (away - NEAR)) - speed
-            ) / HARDEST  # s, at the least
-            steps = max(int(min(time / self._step, LONGEST)), 1)
-            av.trail.clear()
-        else:
+        entries: Sequence[Entry] = ()
+        if lane != before and av.near:
+            lines = self._passed(before, lane)
+            entries = [self._entry(name, av, passed, position, speed, now) for passed in lines]
+        away = self._lengths[lane] - position + self._free[lane]  # m to the next line
+        av.near = away <= NEAR
+        if av.near:
             self._remember(av.trail, odometer_of(name), speed)
+        elif av.trail:
+            av.trail.clear()
+        if not av.near or speed < STANDING:  # before then it is not near, or still stands where it is now
+            steps = self._steps(away - (0.0 if av.near else NEAR), speed)
+        else:
+            steps = 1
         self._due[self._count + steps].append(name)
         return entries
+
+    def _steps(self, distance: float, speed: float) -> int:
+        """In how many steps a vehicle can at the earliest have driven so many m, as quickly as it can."""
+        time = (math.sqrt(speed * speed + 2.0 * HARDEST * max(distance, 0.0)) - speed) / HARDEST  # s
+        return max(int(min(time / self._step, LONGEST)), 1)
 
     @staticmethod
     def _remember(trail: deque[tuple[float, float]], odometer: float, speed: float) -> None:
@@ -215,7 +221,7 @@ class EntryWatcher:
 
     @cached_property
     def _free(self) -> list[float]:
-        """[l] m from the end of a lane to the next line that matters, on the shortest way; inf without one."""
+        """[l] m from a lane's end to the next line that matters, on the shortest way; inf without one."""
         lanes, links = self._road.lanes, self._road.links
         shortest: dict[str, float] = {}  # edge -> m
         length: dict[str, float] = {}

@@ -7,6 +7,7 @@ import libsumo
 
 from cosim.scenario import Scenario
 from cosim.scenario.behaviors import AS_IS
+from cosim.scenario.vet_rules import NOT_CARS
 from cosim.seeding import uniform
 from cosim.simulation.convert import ACTORS, Body
 from cosim.simulation.drivers import IDM_TYPE, Drivers
@@ -20,7 +21,7 @@ AV_LANE_CHANGE = {
     "laneChangeModel.lcKeepRight": "0",
 }
 AV_TYPE = "cosim.av"  # the types of AVs in SUMO's outputs begin so, and nobody else's
-# What an AV of a user's file keeps: getters and setters of libsumo.vehicle, in this order.
+# What a vehicle keeps when its type changes: getters and setters of libsumo.vehicle, in this order.
 KEPT = ("Length", "Width", "MaxSpeed", "SpeedFactor", "VehicleClass")
 
 
@@ -51,41 +52,39 @@ class Fleet:
         return Body(Kind.AV if is_av else Kind.HV, mission, *size, actor)
 
     def _take_av_type(self, vehicle: str) -> None:
-        """In our worlds an AV drives as its type says; one of a user's file by IDM, with the size, class and
-        maximum speed that it has: `setType` replaces the car-following model, nothing else can."""
-        get, own = libsumo.vehicle, libsumo.vehicle.getTypeID(vehicle)
-        ours = self._scenario.built_in
+        """In our worlds an AV drives as its type says, one of a user's file by IDM."""
+        own, ours = libsumo.vehicle.getTypeID(vehicle), self._scenario.built_in
         name = self._av_types.get(own)
         if name is None:
             name = self._av_types[own] = f"{AV_TYPE}.{own}"
             libsumo.vehicletype.copy(own if ours else IDM_TYPE, name)
         if ours:
-            get.setType(vehicle, name)
+            libsumo.vehicle.setType(vehicle, name)
         else:
             set_type(vehicle, name)
-            get.setSpeedFactor(
-                vehicle, libsumo.vehicletype.getSpeedFactor(own)
-            )  # its mean, not a draw about it
+            mean = libsumo.vehicletype.getSpeedFactor(own)  # not a draw about it
+            libsumo.vehicle.setSpeedFactor(vehicle, mean)
 
     def _is_av(self, vehicle: str, seed: int) -> bool:
         rule = self._scenario.fleet
         if rule.ids is not None:
             return re.fullmatch(rule.ids, vehicle) is not None
         if rule.penetration is not None:
-            return uniform(seed, "av", vehicle) < rule.penetration
+            drawn = uniform(seed, "av", vehicle) < rule.penetration
+            return drawn and libsumo.vehicle.getVehicleClass(vehicle) not in NOT_CARS
         if rule.type is not None:
             name: str = libsumo.vehicle.getTypeID(vehicle)
             return name == rule.type or name.startswith(f"{rule.type}@")
         return False
 
 
-def set_type(vehicle: str, name: str = IDM_TYPE) -> None:
-    """Give a vehicle another type, by default IDM; its size, class and maximum speed stay.
+def set_type(vehicle: str, name: str) -> None:
+    """Give a vehicle another type; its size, class and maximum speed stay.
 
     `setType` replaces the car-following model (Krauss in most files); nothing else can.
     """
     get = libsumo.vehicle
-    kept = {name: getattr(get, f"get{name}")(vehicle) for name in KEPT}
+    kept = {field: getattr(get, f"get{field}")(vehicle) for field in KEPT}
     get.setType(vehicle, name)
-    for name, value in kept.items():
-        getattr(get, f"set{name}")(vehicle, value)
+    for field, value in kept.items():
+        getattr(get, f"set{field}")(vehicle, value)

@@ -50,7 +50,7 @@ FORCED = {
 }
 # SUMO's message in the middle of a run, where it loads routes, about a vehicle that cannot depart as written.
 WRONG_DEMAND = re.compile(
-    r"[Ii]nvalid depart|Departure \w+ .*for vehicle|has no valid route|No connection between edge"
+    r"[Ii]nvalid depart|Departure \w+ .*for vehicle|has no valid route|No connection between edge|[Pp]erson '"
 )
 GIVES_UP = "max-depart-delay"  # SUMO drops vehicles that waited so long, without a message
 
@@ -109,7 +109,6 @@ class SumoSimulator:
         self._detector = CollisionDetector()
         goes_on = self._scenario.on_collision == OnCollision.CONTINUE
         self._wrecks = Wrecks(self._commander, self._drivers) if goes_on else None
-        self._removed: list[str] = []  # wrecks since the last frame
         self._reader.bodies_changed()
         self._entries.reset()
         self._mission_found = not self._scenario.mission.guessed
@@ -255,7 +254,7 @@ class SumoSimulator:
         collisions = self._detector.from_sumo(self._bodies, self._commander.lane_changes, now)
         if self._wrecks is not None:
             self._wrecks.add(collisions)
-            self._removed += self._wrecks.remove(now)
+            self._wrecks.remove(now)
         self._happened.append(
             (
                 collisions,
@@ -282,13 +281,14 @@ class SumoSimulator:
             snapshot = self._find_mission(snapshot)
         self._detector.lane_changes(snapshot, self.road, self._commander)
         extra = self._detector.from_boxes(snapshot, self.road, self._bodies, self._commander.lane_changes)
+        wrecked = removed = ()
         if self._wrecks is not None:
             self._wrecks.add(extra)
-        if extra or self._removed:
-            collisions = (*snapshot.events.collisions, *extra)
-            events = replace(snapshot.events, collisions=collisions, wrecks_removed=tuple(self._removed))
+            wrecked, removed = self._wrecks.take()
+        if extra or wrecked or removed:
+            happened = (*snapshot.events.collisions, *extra)
+            events = replace(snapshot.events, collisions=happened, wrecked=wrecked, wrecks_removed=removed)
             snapshot = replace(snapshot, events=events)
-            self._removed = []
         return snapshot
 
     def _goal(self) -> tuple[frozenset[int], frozenset[int]]:

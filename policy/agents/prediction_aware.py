@@ -1,6 +1,7 @@
 """The prediction-aware agent: chain of predictions, value network, safety prioritizer (P, figure 2)."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -18,6 +19,7 @@ from cosim.types import (
     History,
     MetaAction,
     PolicyContext,
+    Preset,
 )
 from policy.agents.approaches import AgentConfig, compact, shipped
 from policy.checkpoint import load
@@ -80,8 +82,10 @@ class PredictionAware:
             raise BadInput("the observation is not the one this agent needs", field="observation")
         if self._road is not context.road:
             self._road = context.road
-            self._raster = rasterize_road(context.road) if self.config.predicted_maps else None
+            version, predicted = self.observation.road_version, self.config.predicted_maps
+            self._raster = rasterize_road(context.road, version) if predicted else None
         self._context = context
+        self._safety = replace(self.config.safety, crossing=context.preset != Preset.LAWFUL)
         self._expected: tuple[tuple[str, ...], Traffic, KinematicForecast] | None = None
         self._asked: dict[str, tuple[MetaAction, float]] = {}  # lane changes commanded last, when (s)
         self._memories: dict[VFN, FrameMemory | None] = {}
@@ -177,7 +181,7 @@ class PredictionAware:
             }
         now = dict(zip(scene.agents, scene.histories, strict=True))
         decisions = prioritize(
-            q, scene, inputs.traffic, context.road, c.safety, context.share_intentions, self._refused(now)
+            q, scene, inputs.traffic, context.road, self._safety, context.share_intentions, self._refused(now)
         )
         for name, decision in decisions.items():
             if decision.action in (MetaAction.LANE_LEFT, MetaAction.LANE_RIGHT):

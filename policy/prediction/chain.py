@@ -141,6 +141,7 @@ def _rendered(
 ) -> Bytes:
     """Maps [B,.,C,H,W] of the wanted frames, of the vehicles that each AV knows."""
     x, y, speed, heading = (a[:, wanted] for a in states)
+    raster.show(scene.histories[0].signals)  # as they are now: their future is not known
     c = observation
     corner = 0.5 * float(np.hypot(c.height * c.metres_across, c.width * c.metres_along))  # m
     rows, known, who = pictured(scene, x, y, speed, heading, corner + 1.0)

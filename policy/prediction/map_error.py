@@ -69,7 +69,7 @@ class MapPredictors:
         self, hpns: Mapping[str, HPN], predictor: Predictor, observation: ObservationConfig, road: RoadMap
     ) -> None:
         self._hpns, self._predictor, self._observation, self._road = hpns, predictor, observation, road
-        self._raster: RoadRaster = rasterize_road(road)
+        self._raster: RoadRaster = rasterize_road(road, observation.road_version)
         self._traffic = TrafficConfig()
 
     def predict(self, histories: Mapping[str, History]) -> Guess:

@@ -7,7 +7,7 @@ import numpy as np
 from cosim.geometry import Boxes, first_contacts
 from cosim.geometry.compiled import compiled
 from cosim.road import RoadMap
-from cosim.types import Bools, Floats, Ints, MetaAction
+from cosim.types import HEADING, Bools, Floats, Ints, MetaAction
 from policy.inputs.scene import Scene
 from policy.prediction.motion import Rollout, project_each
 from policy.prediction.traffic import Traffic
@@ -24,7 +24,14 @@ class Others(NamedTuple):
 
 
 def others_near(
-    b: int, me: int, scene: Scene, traffic: Traffic, road: RoadMap, reach: float, intended: Bools
+    b: int,
+    me: int,
+    scene: Scene,
+    traffic: Traffic,
+    road: RoadMap,
+    c: SafetyConfig,
+    intended: Bools,
+    way: tuple[int, ...] = (),
 ) -> Others:
     """The vehicles that an AV can touch: its own rows; with shared perception also its allies' rows.
 
@@ -32,18 +39,23 @@ def others_near(
         b: place of the AV among `scene.agents`.
         me: its place among `scene.vehicles`.
         scene, traffic, road: as in `policy.safety.prioritize`.
-        reach: m, with shared perception.
+        c: limits.
         intended: [V] whose rollout is a shared intention.
+        way: the lanes that the AV drives on to.
     """
     r = traffic.rollout
     if scene.shared:
         number = road.contact.numbers(scene.lane)
-        rows = _within(me, r.x[:, 0], r.y[:, 0], traffic.known, reach, number, road.contact.table)
+        rows = _within(me, r.x[:, 0], r.y[:, 0], traffic.known, c.reach, number, road.contact.table)
     else:
         rows = scene.row[b, 1:]
         rows = rows[rows >= 0]
         rows = rows[traffic.known[rows]]
         rows = rows[road.contact.touch(int(scene.lane[me]), scene.lane[rows])]
+    if not c.crossing:
+        turn = scene.state[rows, -1, HEADING] - scene.state[me, -1, HEADING]
+        same = np.abs((turn + np.pi) % (2 * np.pi) - np.pi) < c.same_way
+        rows = rows[same | np.isin(scene.lane[rows], way)]
     boxes = Boxes(r.x, r.y, r.heading, traffic.length, traffic.width, r.speed)
     return Others(rows, _only(boxes, rows), intended[rows])
 

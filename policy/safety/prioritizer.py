@@ -159,7 +159,7 @@ def evaluate(
     course = packed(tuple(way.path for way in ways))
     futures = roll_ego(history, course.paths, scene.state[me, -1], c)
     ego = Rollout(*(array[: len(ACTIONS)] for array in futures.under))
-    others = others_near(b, me, scene, traffic, road, c.reach, intended)
+    others = others_near(b, me, scene, traffic, road, c, intended, ways[KEEPING[0]].path.lanes)
     contact, limit, blamed = _met(history, ways, course, futures.stopping, ego, others, scene, me, c)
     for a in map(int, straddling(ego, c)):
         if 0.9 * c.safe_th < limit[a]:

@@ -2,7 +2,8 @@
 
 Reads the net and the outputs `fcd` (every simulation step, from the first), `tripinfo`, `vehroute` and
 `collision`. FCD stamps a step with the time at which it began; a signal's state in the step is that of its
-program at the stamp (tested against libsumo). Definitions: docs/definitions.md, the figures of the law.
+program at the stamp. Definitions: docs/definitions.md, The law. Lengths of vehicles are in none of the files:
+all are taken to be cars.
 """
 
 from __future__ import annotations
@@ -31,10 +32,12 @@ STOP_REACH = 10.0  # m before the line in which it has to be that slow
 FOE_REACH = 100.0  # m before a junction
 LEADER_REACH = 30.0  # m
 STANDING = 0.1  # m/s, at most
+SLOWING = 0.1  # m/s2
 PATIENCE = 60.0  # s
 QUEUE_GAP = 10.0  # m
 BODY = 5.0  # m, a car; FCD has no lengths
-RED, YELLOW, OFF = frozenset("ru"), frozenset("yY"), frozenset("oO")
+FRAME = 2  # steps, over which braking is measured
+RED, YELLOW, OFF, GREEN = frozenset("ru"), frozenset("yY"), frozenset("oO"), frozenset("Gg")
 
 
 def by_type(name: str) -> bool:
@@ -184,10 +187,10 @@ class Track:
         """m since the first row."""
         return np.concatenate([[0.0], np.cumsum(self.speed[1:] * self.step)])
 
-    @cached_property
-    def deceleration(self) -> Any:
-        """m/s2 within the step."""
-        return np.concatenate([[0.0], -np.diff(self.speed) / self.step])
+    def brakes(self, k: int) -> bool:
+        """Whether it brakes hard in the frame that ends with step `k`."""
+        row, before = self.row(k), self.row(k - FRAME)
+        return min(row, before) >= 0 and (self.speed[before] - self.speed[row]) / (FRAME * self.step) > HARD
 
     def row(self, k: int) -> int:
         """Its row at step `k`, -1 where it is not on the road."""
@@ -216,6 +219,7 @@ class Law:
     speeding_steps: int = 0  # above the limit by more than 1 m/s
     av_steps: int = 0
     worst_speeding_mps: float = 0.0  # most above the limit, 0 where never
+    worst_speeding_in_frames_mps: float = 0.0  # the same at the ends of frames alone
     avs_stuck: int = 0
     av_trips_completed: int = 0
     trips_completed: int = 0  # of all vehicles
@@ -227,20 +231,19 @@ class Law:
     violations: list[Violation] = field(default_factory=list)
 
 
-def check(net: Path, folder: Path, is_av: Callable[[str], bool] = by_type, frame: int = 1) -> Law:
+def check(net: Path, folder: Path, is_av: Callable[[str], bool] = by_type) -> Law:
     """Count what the `folder` of an episode's outputs holds.
 
     `is_av`: whether a vehicle type is an AV's; a vehicle that once has such a type is one all the time.
-    `frame`: every how many steps speeds are looked at, for the comparison with figures made of frames.
     """
-    return Checker(Net(net), folder, is_av, frame).run()
+    return Checker(Net(net), folder, is_av).run()
 
 
 class Checker:
     """One episode."""
 
-    def __init__(self, net: Net, folder: Path, is_av: Callable[[str], bool], frame: int) -> None:
-        self.net, self.folder, self.frame = net, folder, frame
+    def __init__(self, net: Net, folder: Path, is_av: Callable[[str], bool]) -> None:
+        self.net, self.folder = net, folder
         self.times: list[float] = []
         self.tracks: dict[str, Track] = {}
         self.on_lane: list[dict[str, list[tuple[float, str]]]] = []  # per step: lane -> (pos, vehicle)
@@ -261,15 +264,16 @@ class Checker:
             self._speeding(track)
             self._entries(track)
             self._stuck(track)
-            hard = track.deceleration > HARD
-            law.hard_brakings_av += int(np.sum(hard[1:] & ~hard[:-1]))
+            ends = range(track.first + _until_end(track.first), track.first + len(track.lane), FRAME)
+            hard = [track.brakes(k) for k in ends]
+            law.hard_brakings_av += sum(b and not a for a, b in itertools.pairwise(hard))
         arrived = [
             row.attrib["id"]
             for row in ET.parse(self.folder / "tripinfo.xml").getroot().iter("tripinfo")
             if float(row.attrib["arrival"]) >= 0.0 and not row.get("vaporized")
         ]
         law.trips_completed = len(arrived)
-        law.av_trips_completed = len(names.intersection(arrived))
+        law.av_trips_completed = len(names.intersection(arrived).difference(*self.touched))
         law.collisions = len(self.touched)
         law.av_involved_collisions = sum(bool(pair & names) for pair in self.touched)
         law.distance_mean_m = float(np.mean([t.driven[-1] for t in tracks.values()])) if tracks else 0.0
@@ -281,12 +285,13 @@ class Checker:
     def _speeding(self, av: Track) -> None:
         limits = np.array([self.net.lanes[lane].limit for lane in av.lane])
         excess = av.speed - limits
-        seen = (np.arange(len(excess)) + av.first + 1) % self.frame == 0
-        self.law.av_steps += int(np.sum(seen))
-        self.law.speeding_steps += int(np.sum(seen & (excess > 1.0)))
-        self.law.worst_speeding_mps = max([self.law.worst_speeding_mps, *excess[seen].tolist()])
-        worst = int(np.argmax(np.where(seen, excess, -np.inf)))
-        if seen[worst] and excess[worst] > 1.0:
+        law, worst = self.law, int(np.argmax(excess))
+        law.av_steps += len(excess)
+        law.speeding_steps += int(np.sum(excess > 1.0))
+        law.worst_speeding_mps = max(law.worst_speeding_mps, float(excess[worst]))
+        in_frames = excess[_until_end(av.first) :: FRAME]
+        law.worst_speeding_in_frames_mps = max([law.worst_speeding_in_frames_mps, *in_frames.tolist()])
+        if excess[worst] > 1.0:
             self._found("speeding", av, worst, None, f"{av.speed[worst]:.2f} m/s on {av.lane[worst]}")
 
     def _entries(self, av: Track) -> None:
@@ -299,7 +304,7 @@ class Checker:
                 if state in RED or (state in YELLOW and self._could_stop(av, link, time, line)):
                     self._found("red_light", av, row, link, state)
                     self.law.red_light_violations += 1
-                if not state and link.state in "sw":
+                if state == "s" or (link.signal is None and link.state in "sw"):
                     near = av.speed[:row][av.driven[:row] >= line - STOP_REACH]
                     least = near.min() if len(near) else av.speed[row - 1]
                     if least > STOPPED:
@@ -313,38 +318,37 @@ class Checker:
     def _could_stop(self, av: Track, link: Link, time: float, line: float) -> bool:
         """Whether it could when yellow began: at the end of the step before the first yellow one."""
         begin = self.net.since(link, time, YELLOW)
-        onset = int(np.searchsorted(self.times, begin - 1e-6)) - 1 - av.first
-        row = max(onset, 0)
-        return bool(line - av.driven[row] >= av.speed[row] ** 2 / (2.0 * COMFORTABLE))
+        row = av.row(int(np.searchsorted(self.times, begin - 1e-6)) - 1)
+        return row >= 0 and bool(line - av.driven[row] >= av.speed[row] ** 2 / (2.0 * COMFORTABLE))
 
     def _wronged(self, av: Track, row: int, link: Link, time: float) -> str:
         """The first foe with the right of way that the entry touched or made to brake hard; "" if none."""
         begin, end = av.first + row, self._left(av, row, link)
-        by_turns = link.state in "w=Z" and not self.net.state(link, time)
-        for foe in self._foes(av, begin, link, time):
-            until = [t for t in self.touched.get(frozenset((av.id, foe.id)), ()) if t >= time]
+        if self.net.state(link, time) == "G":
+            return ""
+        frames = range(begin + FRAME + _until_end(begin), end + 1, FRAME)  # the steps that end them
+        for foe, other in self._foes(av, begin, link, time):
+            until = [t for t in self.touched.get(frozenset((av.id, foe.id)), ()) if t >= time - 1e-6]
             if until and until[0] <= self.times[end] + 1e-6:
                 return f"{foe.id} touched"
-            if by_turns or foe.deceleration[foe.row(begin)] > HARD:
-                continue
-            for k in range(begin + 1, end + 1):
-                r = foe.row(k)
-                if r < 0:
-                    break
-                if foe.deceleration[r] > HARD:
-                    if not self._leader(foe, k, av.id):
-                        return f"{foe.id} braked with {foe.deceleration[r]:.2f} m/s2"
-                    break
+            if link.state in "w=Z" and link.signal is None:
+                continue  # by turns
+            for k in frames:
+                if foe.brakes(k) and not foe.brakes(k - FRAME) and not self._excused(foe, k, other, av.id):
+                    return f"{foe.id} braked hard until {self.times[k] + av.step:.1f} s"
         return ""
 
     def _left(self, av: Track, row: int, link: Link) -> int:
-        """The step at whose end the AV is out of the junction, or the last one it is seen at."""
-        for k in range(row, len(av.lane)):
-            if av.lane[k] not in link.via:
-                return av.first + k
+        """The step at the end of the first frame in which the AV is out of the junction, its rear bumper too,
+        or the last step that it is seen at."""
+        for k in range(av.first + row, av.first + len(av.lane)):
+            lane, r = av.lane[av.row(k)], av.row(k)
+            behind = _edge(lane) == _edge(link.target) and av.pos[r] < BODY
+            if lane not in link.via and not behind and (k + 1) % FRAME == 0:
+                return k
         return av.first + len(av.lane) - 1
 
-    def _foes(self, av: Track, k: int, link: Link, time: float) -> Iterator[Track]:
+    def _foes(self, av: Track, k: int, link: Link, time: float) -> Iterator[tuple[Track, Link]]:
         """Vehicles with the right of way that at step `k` are on their way, or within its reach."""
         for foe in self.tracks.values():
             row = foe.row(k)
@@ -352,8 +356,8 @@ class Checker:
                 continue
             for other in self._coming(foe, row, link.junction):
                 signal = self.net.state(other, time)
-                if other.index in link.yields and signal not in RED:
-                    yield foe
+                if other.index in link.yields & link.meets and signal not in RED:
+                    yield foe, other
                     break
 
     def _coming(self, foe: Track, row: int, junction: str) -> list[Link]:
@@ -379,21 +383,22 @@ class Checker:
             place += 1
         return []
 
-    def _leader(self, foe: Track, k: int, besides: str) -> bool:
-        """Whether somebody else is ahead of it on its lane or link, at most `LEADER_REACH` away."""
+    def _excused(self, foe: Track, k: int, link: Link, av: str) -> bool:
+        """Whether a foe on the way of `link` has another reason to brake: its signal, somebody else at most
+        `LEADER_REACH` ahead on its lane or link, or that it is past the junction."""
         row = foe.row(k)
-        lane, place, back = foe.lane[row], foe.place[row], foe.pos[row]
-        lanes = [lane]
-        if lane in self.net.of_via:
-            via = self.net.of_via[lane].via
-            lanes += via[via.index(lane) + 1 :]
-        elif place + 1 < len(foe.way):
-            links = self.net.of_edges[foe.way[place], foe.way[place + 1]]
-            lanes += next((link.via for link in links if link.origin == lane), ())
-        gone = -back
+        lane, gone = foe.lane[row], -foe.pos[row]
+        if _edge(lane) == _edge(link.target):
+            return True
+        if lane in link.via:
+            lanes = link.via[link.via.index(lane) :]
+        else:
+            if self.net.state(link, self.times[k]) not in GREEN | {""}:
+                return True
+            lanes = (lane, *link.via) if lane == link.origin else (lane,)
         for one in lanes:
             for pos, name in self.on_lane[k].get(one, ()):
-                if name not in (foe.id, besides) and 0.0 < gone + pos <= LEADER_REACH + BODY:
+                if name not in (foe.id, av) and 0.0 < gone + pos <= LEADER_REACH + BODY:
                     return True
             gone += self.net.lanes[one].length
         return False
@@ -422,7 +427,8 @@ class Checker:
             if name in seen or not 0.0 < pos - track.pos[row] <= QUEUE_GAP + BODY:
                 continue
             r = ahead.row(k)
-            if (ahead.speed[r] < STANDING or ahead.deceleration[r] > 0.0) and self._waits(ahead, k, seen):
+            slows = r > 0 and ahead.speed[r - 1] - ahead.speed[r] > SLOWING * track.step
+            if (ahead.speed[r] < STANDING or slows) and self._waits(ahead, k, seen):
                 return True
         return False
 
@@ -519,6 +525,11 @@ class Checker:
 
 def _edge(lane: str) -> str:
     return lane.rpartition("_")[0]
+
+
+def _until_end(step: int) -> int:
+    """Steps from `step` to the one with which its frame ends."""
+    return -(step + 1) % FRAME
 
 
 def _bits(row: str) -> frozenset[int]:

@@ -233,7 +233,7 @@ def test_a_bad_additional_file_is_refused(case: Case, text: str, field: str, val
         (b"not xml at all", "line", 1, "not well-formed"),
         (b"<routes><vehicle id='a'</routes>", "line", 1, "not well-formed"),
         (b"<routes>\n<vehicle id='\xe4'/></routes>", "byte", "0xe4", "not UTF-8 (line 2"),
-        (b"<?xml version='1.0' encoding='ISO-8859-1'?><routes/>", "encoding", "ISO-8859-1", "not UTF-8"),
+        (b"<?xml version='1.0' encoding='windows-1252'?><routes/>", "encoding", "windows-1252", "not UTF-8"),
         ("<routes/>".encode("utf-16"), "encoding", "UTF-16", "not UTF-8"),
         (b"<!DOCTYPE r [<!ENTITY a 'ha'>]><routes>&a;</routes>", "ENTITY", "a", "entities"),
         (b"<!DOCTYPE r [<!ENTITY % a SYSTEM 'file:///etc/passwd'>]><routes/>", "ENTITY", "a", "entities"),
@@ -376,14 +376,179 @@ def test_a_vehicle_named_like_one_of_a_flow_is_a_warning(case: Case, name: str, 
     assert all(f"'{name}' is the name of a vehicle of the flow 'f' too" in warning for warning in found)
 
 
-@pytest.mark.parametrize("speed", ["-1", "1e308", "1000.1", "nan"])
+@pytest.mark.parametrize("speed", ["-1", "0", "1e308", "150.1", "nan"])
 def test_a_lane_speed_that_is_none_is_refused(case: Case, speed: str) -> None:
     text = NET.replace('id="bc_1" index="1" speed="25"', f'id="bc_1" index="1" speed="{speed}"')
     refused(lambda: case(net=text), "n.net.xml", "lane.speed", speed, "must be")
 
 
-def test_lanes_with_a_speed_limit_of_0_are_a_warning_because_nobody_leaves_them(case: Case) -> None:
-    (warning,) = case(
-        net=NET.replace('id="bc_1" index="1" speed="25"', 'id="bc_1" index="1" speed="0"')
-    ).warnings
-    assert "n.net.xml: the speed limit is 0 on bc_1: a vehicle there stands for ever" in warning
+def test_latin_1_is_read_as_sumo_reads_it(case: Case) -> None:
+    text = "<?xml version='1.0' encoding='iso-8859-1'?>" + ROUTES.replace('id="t0"', 'id="t\xe4"')
+    assert case(routes=text.encode("latin-1")).vehicles == 3
+
+
+def test_any_root_that_is_no_other_kind_of_file_passes_as_in_sumo(case: Case) -> None:
+    demand = ROUTES.replace("<routes>", "<demand>").replace("</routes>", "</demand>")
+    assert case(routes=demand).vehicles == 3
+    refused(lambda: case(routes="<net/>"), "r.rou.xml", "root", "net", "<routes> is needed")
+
+
+# ---- signals ----
+
+LOGIC = """<tlLogic id="b" type="static" programID="0" offset="0">
+    <phase duration="30" state="Gr"/>
+    <phase duration="3" state="yr"/>
+    <phase duration="30" state="rG"/>
+  </tlLogic>
+  """
+
+
+def lit(logic: str = LOGIC) -> str:
+    """The net with signals at its junction."""
+    text = NET.replace('id="b" type="priority"', 'id="b" type="traffic_light"')
+    for lane in "01":
+        via = f'via=":b_0_{lane}"'
+        text = text.replace(via, f'{via} tl="b" linkIndex="{lane}"')
+    return text.replace('<junction id="a"', f'{logic}<junction id="a"')
+
+
+def test_sound_signals_pass(case: Case) -> None:
+    assert case(net=lit()).warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "field", "value", "word"),
+    [
+        (LOGIC, "", "connection.tl", "b", "no such tlLogic"),
+        ('state="yr"', 'state="yrr"', "phase.state", "yrr", "has 3 signals, the phases before it have 2"),
+        ('state="Gr"', 'state="Xr"', "phase.state", "Xr", "'X' is no state of a signal"),
+        ('state="Gr"', 'state=""', "phase.state", "", "missing"),
+        ('duration="3" ', 'duration="0" ', "phase.duration", "0", "more than 0"),
+        ('duration="3" ', "", "phase.duration", "", "missing"),
+        ('duration="3" ', 'duration="-3" ', "phase.duration", "-3", "at least 0"),
+        (LOGIC, '<tlLogic id="b" programID="0"/>', "tlLogic.id", "b", "no phase"),
+        (LOGIC, LOGIC + LOGIC, "tlLogic.programID", "0", "twice"),
+        ('tl="b" linkIndex="1"', 'tl="b" linkIndex="2"', "tlLogic.programID", "0", "connections need 3"),
+        ('tl="b" linkIndex="1"', 'tl="b" linkIndex="-1"', "connection.linkIndex", "-1", "at least 0"),
+        ('tl="b" linkIndex="1"', 'tl="b"', "connection.linkIndex", "", "missing"),
+    ],
+)
+def test_signals_that_are_missing_or_malformed_are_refused(
+    case: Case, old: str, new: str, field: str, value: str, word: str
+) -> None:
+    text = lit()
+    assert old in text
+    refused(lambda: case(net=text.replace(old, new, 1)), "n.net.xml", field, value, word)
+
+
+def test_a_program_of_an_additional_file_must_fit_the_net(case: Case) -> None:
+    short = LOGIC.replace("Gr", "G").replace("yr", "y").replace("rG", "r").replace('"0" off', '"own" off')
+    text = f"<additional>{short}</additional>"
+    refused(lambda: case(net=lit(), additional=text), "a.add.xml", "tlLogic.programID", "own", "need 2")
+
+
+def test_a_junction_that_is_called_signalled_and_has_no_signal_is_a_warning(case: Case) -> None:
+    text = NET.replace('id="b" type="priority"', 'id="b" type="traffic_light"')
+    (warning,) = case(net=text).warnings
+    assert "no signal at b of type traffic_light" in warning
+
+
+@pytest.mark.parametrize("kind", ["rail_signal", "rail_crossing"])
+def test_rail_signals_have_programs_of_sumos_own(case: Case, kind: str) -> None:
+    text = (
+        lit("").replace('type="traffic_light"', f'type="{kind}"').replace('linkIndex="1"', 'linkIndex="-1"')
+    )
+    assert case(net=text).warnings == ()
+
+
+# ---- hands ----
+
+
+def test_a_net_whose_lanes_lie_on_the_other_side_than_it_says_is_refused(case: Case) -> None:
+    text = NET.replace('version="1.20"', 'version="1.20" lefthand="true"')
+    word = "the net is left-hand and 2 of 2 roads lie as in right-hand traffic (ab, bc)"
+    refused(lambda: case(net=text), "n.net.xml", "net.lefthand", "true", word)
+
+
+def test_a_left_hand_net_is_a_net(case: Case) -> None:
+    text = NET.replace('version="1.20"', 'version="1.20" lefthand="true"').replace("-4.8", "4.8")
+    assert case(net=text.replace(",-1.6", ",1.6")).warnings == ()
+
+
+# ---- persons ----
+
+
+@pytest.mark.parametrize(
+    ("person", "field", "value", "word"),
+    [
+        ('<person id="p" depart="1"/>', "person.id", "p", "no plan"),
+        ('<personFlow id="p" begin="0" period="2"/>', "personFlow.id", "p", "no plan"),
+        ('<person id="p" depart="1"><walk/></person>', "walk.from", "", "begins nowhere"),
+        ('<person id="p" depart="1"><walk from="ab"/></person>', "walk.to", "", "leads nowhere"),
+        ('<person id="p" depart="1"><walk edges=" "/></person>', "walk.edges", "", "empty"),
+        ('<person id="p" depart="1"><ride from="ab" lines="1"/></person>', "ride.to", "", "leads nowhere"),
+        ('<person id="p" depart="1"><walk from="ab" to="zz"/></person>', "walk.to", "zz", "no such edge"),
+    ],
+)
+def test_a_person_without_a_way_is_refused(
+    case: Case, person: str, field: str, value: str, word: str
+) -> None:
+    text = ROUTES.replace("</routes>", f"{person}</routes>")
+    refused(lambda: case(routes=text), "r.rou.xml", field, value, word)
+
+
+def test_whole_plans_pass_and_a_walk_with_a_gap_is_a_warning(case: Case) -> None:
+    plans = (
+        '<person id="p" depart="1"><walk from="ab" to="bc"/><ride to="bc" lines="any"/></person>'
+        '<person id="q" depart="triggered"><ride to="bc" lines="v0"/><walk edges="bc ab"/></person>'
+    )
+    assert case(routes=ROUTES.replace("</routes>", f"{plans}</routes>")).warnings == ()
+    lane = '<lane id="xy_0" index="0" speed="9" length="9" shape="0,9 9,9"/>'
+    far = f'<edge id="xy" from="x" to="y">{lane}</edge>'
+    ends = '<junction id="x" type="dead_end" x="0" y="9"/><junction id="y" type="dead_end" x="9" y="9"/>'
+    net = NET.replace("</net>", f"{far}{ends}</net>")
+    walk = '<person id="p" depart="1"><walk edges="ab xy"/></person>'
+    (warning,) = case(net=net, routes=ROUTES.replace("</routes>", f"{walk}</routes>")).warnings
+    assert "a walk with a gap (p, line 8): SUMO moves the person from 'ab' to 'xy'" in warning
+
+
+# ---- not supported ----
+
+
+def test_what_is_not_supported_makes_the_result_not_comparable(case: Case) -> None:
+    tram = ROUTES.replace('<vType id="car"', '<vType id="t" vClass="tram"/><vType id="car"')
+    assert case(routes=tram).warnings == ()  # nobody drives one
+    (warning,) = case(routes=tram.replace('id="v0" type="car"', 'id="v0" type="t"')).warnings
+    assert "no road vehicles: t (tram)" in warning
+    mixture = tram.replace("<route id", '<vTypeDistribution id="m" vTypes="t car"/><route id', 1)
+    assert "no road vehicles: t (tram)" in case(routes=mixture).warnings[0]
+    neigh = NET.replace('shape="0,-1.6 500,-1.6"/>', 'shape="0,-1.6 500,-1.6"><neigh lane="bc_1"/></lane>', 1)
+    (warning,) = case(net=neigh).warnings
+    assert "overtaking on the opposite side is allowed on ab" in warning
+
+
+def test_the_sublane_model_that_is_set_aside_is_said(case: Case, tmp_path: Path) -> None:
+    case()
+    config = tmp_path / "c.sumocfg"
+    text = config.read_text()
+    for value, warned in (("0.8", True), ("-1", False)):
+        config.write_text(text.replace("</conf", f'<lateral-resolution value="{value}"/></conf'))
+        assert ["sublane" in warning for warning in vet(load(str(config))).warnings] == [True] * warned
+
+
+# ---- mission ----
+
+
+@pytest.mark.parametrize("name", ["v0", "t0", "f.7", "f.*", "v.", "f\\.3"])
+def test_a_mission_vehicle_that_the_demand_may_have_passes(case: Case, tmp_path: Path, name: str) -> None:
+    case()
+    assert vet(load(str(tmp_path / "c.sumocfg"), mission=name)).flows == 1
+
+
+@pytest.mark.parametrize(("name", "near"), [("v9", "'v1'"), ("f", "'f.0'"), ("g.1", "no such")])
+def test_a_mission_vehicle_that_nobody_is_is_refused(
+    case: Case, tmp_path: Path, name: str, near: str
+) -> None:
+    case()
+    config = tmp_path / "c.sumocfg"
+    refused(lambda: vet(load(str(config), mission=name)), "c.sumocfg", "--mission", name, near)

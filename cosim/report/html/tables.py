@@ -72,7 +72,7 @@ def figures(blocks: Sequence[Block], known: dict[str, Measure]) -> Table:
 
 
 def law(blocks: Sequence[Block], known: dict[str, Measure]) -> Table | None:
-    """One row per cell with what its AVs did against the law, red where it is not 0; None where no row says."""
+    """One row per cell with what its AVs did against the law, red where it is not 0; None without any."""
     series, varying = _series(blocks)
     names = [n for n in LAW if any(s.counts(n).get("n") for s in series)]
     if not names:

@@ -65,11 +65,14 @@ def find(folder: Path, episode: str | None) -> Recorded:
         return _of_batch(folder, episode)
     if CASE not in document:
         raise BadInput("was not written by this version of cosim run or evaluate", file=file)
+    driven = checked(read_json(result, ABSENT), result)
+    if "trace_hash" not in driven:
+        raise BadInput("is missing", file=result, field="trace_hash")
     recorded = Recorded(
         EpisodeId.read(document[CASE], file, CASE),
         tuple(document.get(OPTIONS, ())),
         document,
-        checked(read_json(result, ABSENT), result).get("trace_hash", ""),
+        driven["trace_hash"],
         folder,
     )
     if episode is not None and episode not in (recorded.case.key, str(recorded.case.seed)):

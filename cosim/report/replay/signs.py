@@ -6,14 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cosim.metrics.law import ran_red, ran_stop
 from cosim.recording.replay_data import ReplayData
 from cosim.road import Crossing, Link, RoadMap, Rule
-from cosim.types import Entry, Floats
+from cosim.types import Floats
 
 SIGNED = (Rule.STOP, Rule.ALL_WAY_STOP, Rule.YIELD)
-COMFORTABLE = 3.0  # m/s2: who could have stopped with this on yellow had to
-STANDING = 0.5  # m/s: who was never slower did not stop at a stop sign
-OFF = "oO"  # signal states in which signs count
 STRIPE = 0.5  # m: of a zebra crossing, and between two
 LAMPS = {  # signal state -> colour (SUMO, Simulation/Traffic_Lights): off is grey, off and blinking is brown
     "r": (224, 32, 32), "R": (224, 32, 32), "u": (242, 106, 27), "y": (245, 184, 0), "Y": (245, 184, 0),
@@ -72,30 +70,18 @@ def zebra(crossing: Crossing) -> list[Floats]:
     return found
 
 
-def violation(entry: Entry, link: Link) -> str | None:
-    """What the AV did that the signal or sign forbids, in words; None where it kept the law.
-
-    A red light; a yellow one before which it could have stopped with 3 m/s2; a stop sign passed without a
-    speed below 0.5 m/s within the last 10 m (docs/definitions.md).
-    """
-    if entry.state and entry.state in "ru":
-        return "ran a red light"
-    if entry.state and entry.state in "yY" and entry.yellow_since >= 0.0:
-        could = entry.yellow_speed**2 / (2.0 * COMFORTABLE) < entry.yellow_distance
-        return "ran a yellow light, though it could stop" if could else None
-    signed = link.rule in (Rule.STOP, Rule.ALL_WAY_STOP) and (not entry.state or entry.state in OFF)
-    if signed and entry.least_speed > STANDING:
-        return f"passed a stop sign at {entry.least_speed:.1f} m/s"
-    return None
-
-
 def violations(r: ReplayData) -> list[tuple[float, str, str]]:
-    """(time s, AV, what it did) of every entry that broke the law."""
-    return [
-        (entry.time, entry.vehicle, what)
-        for entry in r.entries
-        if entry.link < len(r.road.links) and (what := violation(entry, r.road.links[entry.link]))
-    ]
+    """(time s, AV, what it did) of every entry on red or yellow or past a stop sign that the figures count."""
+    found = []
+    for entry in r.entries:
+        if ran_red(entry):
+            what = f"ran a {'yellow' if entry.state in 'yY' else 'red'} light"
+        elif ran_stop(entry, r.road.links[entry.link]):
+            what = f"passed a stop sign at {entry.least_speed:.1f} m/s"
+        else:
+            continue
+        found.append((entry.time, entry.vehicle, what))
+    return found
 
 
 def _turn(road: RoadMap, link: Link) -> float:

@@ -157,9 +157,9 @@ class Strip:
         if line.rule in (Rule.STOP, Rule.ALL_WAY_STOP) and not line.signals:
             turns = np.pi * (np.arange(8) / 4 + 0.125)
             for size, colour in ((1.0, MARK), (0.8, SIGN)):
-                octagon = np.stack([np.cos(turns), np.sin(turns)], 1) * size - (2.0, 0.0)
+                octagon = np.stack([np.cos(turns), np.sin(turns)], 1) * size + (1.2, 0.0)
                 paint([(x, y) for x, y in octagon.tolist()], colour)
-            paint(((-2.2, -0.5), (-1.8, -0.5), (-1.8, 0.5), (-2.2, 0.5)), MARK)
+            paint(((1.0, -0.5), (1.4, -0.5), (1.4, 0.5), (1.0, 0.5)), MARK)
         lamps = [states[s] for s in line.signals if s < len(states)]
         wide = 2.0 * side / max(len(lamps), 1)
         for k, state in enumerate(lamps):

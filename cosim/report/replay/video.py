@@ -236,8 +236,9 @@ class _Board:
             where = f"{here[t.id].speed:.1f} m/s" if t.id in here else "not on the road"
             self._wrapped(14, line + 104, f"{t.id} ({what}): {where}", colour_of(t), SPLIT - 24, most=1)
         if corrections or broken:
-            said = f"AVs corrected {len(corrections)} times, law broken {len(broken)} times so far"
-            self._line(14, line + 121, said, LAW if broken else CORRECTION, 12)
+            counts = (f"law broken {len(broken)} times", f"AVs corrected {len(corrections)} times")
+            said = ", ".join(text for text, n in zip(counts, (broken, corrections), strict=True) if n)
+            self._line(14, line + 121, f"{said} so far", LAW if broken else CORRECTION, 12)
         if shown is not None:
             mine = [one for one in corrections if one.vehicle == shown.track.id]
             reason = mine[-1].reason if mine and time - mine[-1].time < SHOWN_EVENT else None

@@ -75,7 +75,7 @@ function drawForecast(ctx, state, view, c, t) {
 
 // The polygons of an actor (shapes.py), `length` x `width` around the origin, in the colour of who drives.
 function drawShape(ctx, shape, length, width, colour, c) {
-  const fills = { body: colour, light: c.halo, dark: c.dark };
+  const fills = { body: colour, light: c.halo, dark: c.text };
   for (const [name, points] of shape) {
     ctx.fillStyle = fills[name];
     ctx.beginPath();
@@ -116,10 +116,10 @@ function drawStopLine(ctx, rule, lamps, side, c, fine) {
   if (STOPS.includes(rule) && !lamps.length && fine) {
     for (const [size, colour] of [[1, c.mark], [0.8, c.sign]]) {
       ctx.fillStyle = colour; ctx.beginPath();
-      for (let k = 0; k < 8; k++) ctx.lineTo(size * Math.cos((k + 0.5) * Math.PI / 4) - 2, size * Math.sin((k + 0.5) * Math.PI / 4));
+      for (let k = 0; k < 8; k++) ctx.lineTo(size * Math.cos((k + 0.5) * Math.PI / 4) + 1.2, size * Math.sin((k + 0.5) * Math.PI / 4));
       ctx.fill();
     }
-    ctx.fillStyle = c.mark; ctx.fillRect(-2.2, -0.5, 0.4, 1);
+    ctx.fillStyle = c.mark; ctx.fillRect(1, -0.5, 0.4, 1);
   }
   const wide = (2 * side) / lamps.length;
   lamps.forEach((colour, k) => {

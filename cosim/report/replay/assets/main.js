@@ -98,7 +98,7 @@ function start(data) {
       for (const kind of kindsHere) {
         const here = found.filter((e) => e.kind === kind), spare = Math.max(room - 3 * kindsHere.length, 0);
         const tall = 3 + (spare * here.length) / found.length;
-        ctx.globalAlpha = !state.chosen || here.some((e) => e.who.includes(state.chosen.id)) ? 1 : 0.4;
+        ctx.globalAlpha = kind === "collision" || kind === "law" || !state.chosen || here.some((e) => e.who.includes(state.chosen.id)) ? 1 : 0.4;
         ctx.fillStyle = c[EVENTS[kind][1]]; ctx.fillRect(bin * BIN, top - tall, BIN - 1, tall - 0.5);
         top -= tall;
       }

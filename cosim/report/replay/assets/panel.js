@@ -232,7 +232,7 @@ function fillFigures(data) {
   const rows = [...data.facts.metrics, ["seed", data.facts.seed, ""], ["svo", data.facts.svo_deg, "deg"]];
   for (const [name, value, unit] of rows) {
     const row = element("tr");
-    row.append(element("td", name), element("td", `${shown(value)} ${unit === "bool" ? "" : unit}`));
+    row.append(element("td", name), element("td", `${shown(value)} ${unit === "bool" || value === null ? "" : unit}`));
     table.append(row);
   }
   const row = element("tr"), cell = element("td", `trace ${data.facts.trace_hash}`);

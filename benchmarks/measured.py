@@ -72,6 +72,12 @@ def agent(place: Place) -> list[list[str]]:
     return [["benchmarks.agent", *flags, "--config", *sizes, "--out", str(place.out / "agent.md")]]
 
 
+def decision_cost(place: Place) -> list[list[str]]:
+    """What a decision costs an AV in a city."""
+    flags = ["--avs", "2", "--decisions", "2"] if place.small else ["--real"]
+    return [["benchmarks.decision_cost", *flags, "--out", str(place.out / "decision_cost.md")]]
+
+
 def performance(place: Place) -> list[list[str]]:
     """What the loop, a batch and the Gaussian process cost."""
     where = str(place.work / "recordings")
@@ -128,6 +134,7 @@ def real_nets(place: Place) -> list[list[str]]:
 PAGES = (
     Page("agent", agent, ("agent.md",)),
     Page("prediction_speed", prediction_speed, ("prediction_speed.md",)),
+    Page("decision_cost", decision_cost, ("decision_cost.md",)),
     Page("performance", performance, ("performance.md",)),
     Page("startup", startup, ("startup.md",)),
     Page("reward_balance", reward_balance, ("reward_balance.md",)),

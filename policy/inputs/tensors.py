@@ -19,6 +19,7 @@ KINEMATIC_INPUTS = len(KINEMATIC_FEATURES) + 1  # the features and the mask
 APART_OF = ("av", "hv", "road", "mission")  # channels that `apart` reads
 APART = 5  # channels of `apart`: AV, HV, road, ego or mission vehicle, relative speed
 STILL = 255 * (PIXEL_LOWEST + PIXEL_SPAN / 2)  # pixel of a vehicle as fast as the ego
+_LEVEL = np.float32(1.0 / 255.0)
 BRISK = 255 * PIXEL_SPAN / (2 * PIXEL_SPEED) * 15.0  # what 15 m/s of relative speed add to it: 1 in `apart`
 
 
@@ -60,7 +61,11 @@ def svo_tensor(svo: float, agents: int, device: str = "cpu") -> torch.Tensor:
 
 def unit(maps: torch.Tensor) -> torch.Tensor:
     """Maps of any shape, uint8 pixels or float32 in [0,1] already -> float32 in [0,1]."""
-    return maps if maps.is_floating_point() else maps.to(torch.float32).mul_(1.0 / 255.0)
+    if maps.is_floating_point():
+        return maps
+    if maps.device.type != "cpu":
+        return maps.to(torch.float32).mul_(1.0 / 255.0)
+    return torch.from_numpy(np.multiply(maps.numpy(), _LEVEL, dtype=np.float32))  # in one pass over memory
 
 
 def pixels(maps: torch.Tensor) -> torch.Tensor:

@@ -8,8 +8,8 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from cosim.types import Bytes
-from policy.inputs.tensors import unit
+from cosim.types import Bytes, Floats32
+from policy.inputs.tensors import to_numpy, unit
 
 Strides = Literal["literal", "temporal"]
 Read = Callable[[torch.Tensor], torch.Tensor]  # maps [B,C,H,W] -> the channels that are convolved, float32
@@ -86,30 +86,28 @@ class FrameMemory:
 
     def __init__(self, extractor: Conv3dMaps, past: int, fresh: int) -> None:
         self._extractor, self._past, self._aged = extractor, past, max(past - fresh, 0)
-        self._kept: dict[str, tuple[Bytes, torch.Tensor]] = {}  # AV -> past maps, their features
+        self._row: dict[str, int] = {}  # AV -> its place in:
+        self._maps: Bytes = np.empty((0, past, 0), np.uint8)  # [B,T,C,H,W]
+        self._features: Floats32 = np.empty((0, past, 0), np.float32)  # [B,T,h,w,F]
 
     def frames(self, names: Sequence[str], maps: torch.Tensor) -> torch.Tensor:
         """maps [B,T,C,H,W] uint8 of the AVs `names`, the past ones first -> their features [B,T,F,h,w]."""
         old, n = self._aged, self._past
         pictures = maps.numpy()  # comparing and joining bytes is a tenth of the work in numpy
-        first = []  # [B] the first frame that is new
-        for name, mine in zip(names, pictures, strict=True):
-            seen = self._kept.get(name)
-            known = seen is not None and np.array_equal(seen[0][n - old :], mine[:old])
-            first.append(old if known else 0)
-        new = np.concatenate([mine[k:] for mine, k in zip(pictures, first, strict=True)])
-        made = self._extractor.frames(torch.from_numpy(new))
-        features, height, width = made.shape[1:]
-        z = made.new_empty(*maps.shape[:2], height, width, features).permute(0, 1, 4, 2, 3)  # channels last
-        at = 0
-        for b, (name, k) in enumerate(zip(names, first, strict=True)):
-            if k:
-                z[b, :k] = self._kept[name][1][n - k :]
-            count = maps.shape[1] - k
-            z[b, k:] = made[at : at + count]
-            at += count
-        self._kept = {name: (pictures[b, :n], z[b, :n]) for b, name in enumerate(names)}
-        return z
+        count, frames = pictures.shape[:2]
+        kept = np.zeros((count, frames), np.bool_)  # seen at the last decision
+        for mine, name, known in zip(pictures, names, kept, strict=True):
+            row = self._row.get(name)
+            known[:old] = row is not None and np.array_equal(self._maps[row, n - old : n], mine[:old])
+        new = ~kept
+        made = to_numpy(self._extractor.frames(torch.from_numpy(pictures[new])).permute(0, 2, 3, 1))
+        features: Floats32 = np.empty((count, frames, *made.shape[1:]), np.float32)
+        features[new] = made
+        before = [self._row[names[b]] for b in np.flatnonzero(kept[:, 0])] if old else []
+        features[kept] = self._features[before, n - old : n].reshape(-1, *made.shape[1:])
+        self._row = {name: b for b, name in enumerate(names)}
+        self._maps, self._features = pictures, features
+        return torch.from_numpy(features).permute(0, 1, 4, 2, 3)  # channels last
 
 
 class Conv2dMaps(nn.Module):

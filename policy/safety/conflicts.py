@@ -45,21 +45,33 @@ def others_near(
     """
     r = traffic.rollout
     if scene.shared:
-        x, y = r.x[:, 0], r.y[:, 0]
-        near = (x - x[me]) ** 2 + (y - y[me]) ** 2 < c.reach**2
-        near[me] = False
-        rows = (near & traffic.known).nonzero()[0]
+        number = road.contact.numbers(scene.lane)
+        rows = _within(me, r.x[:, 0], r.y[:, 0], traffic.known, c.reach, number, road.contact.table)
     else:
         rows = scene.row[b, 1:]
         rows = rows[rows >= 0]
         rows = rows[traffic.known[rows]]
-    rows = rows[road.contact.touch(int(scene.lane[me]), scene.lane[rows])]
+        rows = rows[road.contact.touch(int(scene.lane[me]), scene.lane[rows])]
     if not c.crossing:
         turn = scene.state[rows, -1, HEADING] - scene.state[me, -1, HEADING]
         same = np.abs((turn + np.pi) % (2 * np.pi) - np.pi) < c.same_way
         rows = rows[same | np.isin(scene.lane[rows], way)]
     boxes = Boxes(r.x, r.y, r.heading, traffic.length, traffic.width, r.speed)
     return Others(rows, _only(boxes, rows), intended[rows])
+
+
+@compiled
+def _within(me: int, x: Floats, y: Floats, known: Bools, reach: float, number: Ints, touch: Bools) -> Ints:
+    """The known ones of V vehicles x, y [V] less than `reach` m from `me` whose roads touch its own."""
+    out = np.empty(len(x), np.int64)
+    count = 0
+    for v in range(len(x)):
+        if v == me or not known[v] or not touch[number[me], number[v]]:
+            continue
+        if (x[v] - x[me]) ** 2 + (y[v] - y[me]) ** 2 < reach**2:
+            out[count] = v
+            count += 1
+    return out[:count]
 
 
 def first_contact(ego: Rollout, length: float, width: float, others: Others, c: SafetyConfig) -> Floats:
@@ -116,11 +128,39 @@ def neighbours(
     soon = min(5, x.shape[1] - 1)  # 1 s ahead: who drifts in is in
     theirs, offset = project_each(*paths, same, x[:, 0], y[:, 0])
     _, later = project_each(*paths, same, x[:, soon], y[:, soon])
-    turn = np.abs((headings[:, 0] - heading + np.pi) % (2 * np.pi) - np.pi)
-    in_lane = (turn < c.same_way) & (np.minimum(np.abs(offset), np.abs(later)) < c.lane_half)
-    distance = theirs - arc[:, None]
-    gap = np.abs(distance) - 0.5 * (length + lengths)
-    return Neighbours(in_lane, gap, in_lane & (distance > 0), in_lane & (distance < 0) & (gap > 0))
+    stand = _stand(
+        *(theirs, offset, later, arc, heading, length), headings[:, 0], lengths, c.same_way, c.lane_half
+    )
+    return Neighbours(*stand)
+
+
+@compiled
+def _stand(
+    theirs: Floats,  # [A,O] m, place along each path
+    offset: Floats,  # [A,O] m beside it, now
+    later: Floats,  # [A,O] m beside it, soon
+    arc: Floats,  # [A] m, the ego's place
+    heading: float,
+    length: float,
+    headings: Floats,  # [O] rad
+    lengths: Floats,  # [O] m
+    same_way: float,
+    lane_half: float,
+) -> tuple[Bools, Floats, Bools, Bools]:
+    """The fields of `Neighbours`."""
+    shape = theirs.shape
+    in_lane, gap = np.empty(shape, np.bool_), np.empty(shape)
+    ahead, behind = np.empty(shape, np.bool_), np.empty(shape, np.bool_)
+    for o in range(shape[1]):
+        along = abs((headings[o] - heading + np.pi) % (2 * np.pi) - np.pi) < same_way
+        for a in range(shape[0]):
+            beside = min(abs(offset[a, o]), abs(later[a, o]))
+            distance = theirs[a, o] - arc[a]
+            gap[a, o] = abs(distance) - 0.5 * (length + lengths[o])
+            in_lane[a, o] = along and beside < lane_half
+            ahead[a, o] = in_lane[a, o] and distance > 0
+            behind[a, o] = in_lane[a, o] and distance < 0 and gap[a, o] > 0
+    return in_lane, gap, ahead, behind
 
 
 def gap_margin(

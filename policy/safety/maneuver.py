@@ -132,7 +132,13 @@ def roll_braked(
     for row, a in zip(speeds, actions, strict=True):
         target = next_target(history.target_speed, float(now[2]), a, limit)
         row[:] = braked_from(row, target, held, c.frames, limit, c.dt, c.reaction)
-    return _roll(history, pack([path] * len(actions)), now, speeds, c)
+    return _roll(history, _repeated(path, len(actions)), now, speeds, c)
+
+
+@lru_cache(maxsize=1024)
+def _repeated(path: LanePath, times: int) -> Paths:
+    """The same path so many times."""
+    return pack([path] * times)
 
 
 def _roll(history: History, paths: Paths, now: Floats, speeds: Floats, c: SafetyConfig) -> Rollout:

@@ -215,12 +215,15 @@ class Snapshot:
     @cached_property
     def vehicles(self) -> Snapshot:
         """The same without persons."""
-        keep = np.flatnonzero(self.kind != int(Kind.PERSON))
-        if len(keep) == self.n:
-            return self
-        columns = {f.name: getattr(self, f.name) for f in fields(self)}
-        rows = {k: v[keep] for k, v in columns.items() if k != "signals" and isinstance(v, np.ndarray)}
-        return replace(self, ids=tuple(self.ids[k] for k in keep), **rows)
+        kept = np.flatnonzero(self.kind != int(Kind.PERSON))
+        return self if len(kept) == self.n else self.only(kept)
+
+    def only(self, rows: npt.NDArray[np.integer]) -> Snapshot:
+        """The same with only these of its rows [k], in this order."""
+        of_signals = "signals", "switches"
+        columns = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in of_signals}
+        kept = {name: v[rows] for name, v in columns.items() if isinstance(v, np.ndarray)}
+        return replace(self, ids=tuple(self.ids[k] for k in rows), **kept)
 
     @property
     def avs(self) -> tuple[str, ...]:

@@ -5,7 +5,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -258,10 +258,7 @@ class _Counter:
         self._jumps += len(jumped)
         if not jumped:
             return s
-        kept = np.delete(np.arange(s.n), jumped)
-        every: dict[str, Any] = {f.name: getattr(s, f.name) for f in fields(s)}
-        rest: dict[str, Any] = {k: v[kept] for k, v in every.items() if isinstance(v, np.ndarray)}
-        return replace(s, ids=tuple(s.ids[k] for k in kept), **rest)
+        return s.only(np.delete(np.arange(s.n), jumped))
 
     def _doubt(self, before: Snapshot, after: Snapshot) -> None:
         """Longitudes and latitudes hardly change while the speeds are those of cars."""

@@ -132,6 +132,15 @@ class Entry:
 
 
 @dataclass(frozen=True, slots=True)
+class Offence:
+    """What one AV did against the law, once for each that the figures count."""
+
+    time: float  # s
+    vehicle: str
+    what: str  # in words, of which the vehicle is the subject
+
+
+@dataclass(frozen=True, slots=True)
 class Intervention:
     """The car began to drive otherwise than commanded (preset `lawful`)."""
 
@@ -169,7 +178,7 @@ NO_EVENTS = Events()
 class Snapshot:
     """Everybody on the road at one moment, sorted by id: vehicles and persons (`person:ID`).
 
-    Shapes: all arrays [n], `signals` [s]. Units: m, s, rad (counter-clockwise from east), m/s, m/s2.
+    Shapes: all arrays [n], `signals` and `switches` [s]. Units: m, s, rad (counter-clockwise from east), m/s, m/s2.
     """
 
     time: float  # s
@@ -220,9 +229,9 @@ class Snapshot:
 
     def only(self, rows: npt.NDArray[np.integer]) -> Snapshot:
         """The same with only these of its rows [k], in this order."""
-        of_signals = "signals", "switches"
-        columns = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in of_signals}
-        kept = {name: v[rows] for name, v in columns.items() if isinstance(v, np.ndarray)}
+        names = {f.name for f in fields(self)} - {"signals", "switches"}  # which have no row per vehicle
+        columns = {name: getattr(self, name) for name in names}
+        kept: dict[str, Any] = {k: v[rows] for k, v in columns.items() if isinstance(v, np.ndarray)}
         return replace(self, ids=tuple(self.ids[k] for k in rows), **kept)
 
     @property
@@ -302,6 +311,9 @@ class Command(NamedTuple):
     target_speed: float  # m/s
     lane_offset: int  # -1 right, 0 keep, +1 left
     hold: float  # s
+    limit: float = (
+        math.inf
+    )  # m/s, the most that the law allows, as far as the agent sees it (preset `lawful`)
 
 
 class Receipt(NamedTuple):

@@ -148,6 +148,17 @@ class RoadMap:
         return tuple(map(tuple, found))
 
     @cached_property
+    def links_through(self) -> dict[int, tuple[int, ...]]:
+        """Lane inside a junction -> the links (indices) that lead over it."""
+        found: dict[int, tuple[int, ...]] = {}
+        for number, link in enumerate(self.links):
+            lane = link.via
+            while lane >= 0 and self.lanes[lane].internal:
+                found[lane] = (*found.get(lane, ()), number)
+                lane = next(iter(self.lanes[lane].successors), -1)
+        return found
+
+    @cached_property
     def straight_on(self) -> LaneGraph:
         """The straightest successor of every lane (another vehicle's route is unknown)."""
         steps = [self._successor(k, None, 0) for k in range(len(self.lanes))]

@@ -178,7 +178,8 @@ NO_EVENTS = Events()
 class Snapshot:
     """Everybody on the road at one moment, sorted by id: vehicles and persons (`person:ID`).
 
-    Shapes: all arrays [n], `signals` and `switches` [s]. Units: m, s, rad (counter-clockwise from east), m/s, m/s2.
+    Shapes: all arrays [n], `signals` and `switches` [s]. Units: m, s, rad (counter-clockwise from east), m/s,
+    m/s2.
     """
 
     time: float  # s
@@ -224,13 +225,15 @@ class Snapshot:
     @cached_property
     def vehicles(self) -> Snapshot:
         """The same without persons."""
-        keep = np.flatnonzero(self.kind != int(Kind.PERSON))
-        if len(keep) == self.n:
-            return self
+        kept = np.flatnonzero(self.kind != int(Kind.PERSON))
+        return self if len(kept) == self.n else self.only(kept)
+
+    def only(self, rows: npt.NDArray[np.integer]) -> Snapshot:
+        """The same with only these of its rows [k], in this order."""
         names = {f.name for f in fields(self)} - {"signals", "switches"}  # which have no row per vehicle
         columns = {name: getattr(self, name) for name in names}
-        rows: dict[str, Any] = {k: v[keep] for k, v in columns.items() if isinstance(v, np.ndarray)}
-        return replace(self, ids=tuple(self.ids[k] for k in keep), **rows)
+        kept: dict[str, Any] = {k: v[rows] for k, v in columns.items() if isinstance(v, np.ndarray)}
+        return replace(self, ids=tuple(self.ids[k] for k in rows), **kept)
 
     @property
     def avs(self) -> tuple[str, ...]:

@@ -5,7 +5,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -270,9 +270,7 @@ class _Counter:
         kept = np.array([row for row, name in enumerate(s.ids) if name not in self._jumped], np.int64)
         if len(kept) == s.n:
             return s
-        every: dict[str, Any] = {f.name: getattr(s, f.name) for f in fields(s) if f.name != "signals"}
-        rest: dict[str, Any] = {k: v[kept] for k, v in every.items() if isinstance(v, np.ndarray)}
-        return replace(s, ids=tuple(s.ids[k] for k in kept), **rest)
+        return s.only(kept)
 
     def _doubt(self, before: Snapshot, after: Snapshot) -> None:
         """Longitudes and latitudes hardly change while the speeds are those of cars."""

@@ -63,6 +63,7 @@ class Recording:
         for k, time in enumerate(self.times):
             rows = order[cuts[k] : cuts[k + 1]]
             who = t["vehicle"][rows]
+            numbers: dict[str, Any] = {name: t[name][rows].astype(np.float64) for name in REAL}
             if not np.array_equal(who, before):  # the same tuple while nobody comes or goes
                 names, before = tuple([self.ids[i] for i in who]), who
             frames.append(
@@ -75,7 +76,7 @@ class Recording:
                     actor=t["actor"][rows],
                     signals=self.signals[k],
                     events=self.events.get(k, Events()),
-                    **{name: t[name][rows].astype(np.float64) for name in REAL},
+                    **numbers,
                 )
             )
         return frames

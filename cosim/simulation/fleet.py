@@ -11,7 +11,7 @@ from cosim.scenario.vet_rules import NOT_CARS
 from cosim.seeding import uniform
 from cosim.simulation.convert import ACTORS, Body
 from cosim.simulation.drivers import IDM_TYPE, Drivers
-from cosim.types import Actor, Kind
+from cosim.types import Actor, Kind, Preset
 
 # definitions.md, Vehicles: what an AV drives with while it has no command (egoistic IDM).
 AV_IDM = {"Tau": 0.8, "MinGap": 2.0, "Accel": 3.0, "Decel": 7.0}

@@ -310,7 +310,7 @@ def test_links_give_way_to_those_of_the_right_of_way_table(law_worlds: dict[str,
 def test_where_sumo_drives_nobody_passes_on_red_or_through_a_stop_sign(
     law_worlds: dict[str, Path],
 ) -> None:
-    episodes = cases(law_worlds, ["idm"], (0.2, 1.0), range(FIRST, FIRST + 1), Preset.UNGUARDED)
+    episodes = cases(law_worlds, ["idm"], (0.2, 1.0), range(FIRST, FIRST + 1), Preset.LAWFUL)
 
     rows = driven(episodes, 2, None, None)
 

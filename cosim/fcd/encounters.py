@@ -107,7 +107,7 @@ class Encounters:
         return [asdict(e) for e in sorted([*self._closed, *rest], key=lambda e: (e.begin_s, e.ego, e.foe))]
 
     def _meet(self, s: Snapshot, i: int, j: int, ttc: float) -> None:
-        if i == j or not self._road.connected(int(s.lane[i]), int(s.lane[j])):
+        if i == j or not self._road.connected(int(s.place[i]), int(s.place[j])):
             return
         ego, foe = s.ids[i], s.ids[j]
         if (foe, ego) in self._open:  # both are watched: the pair is listed once

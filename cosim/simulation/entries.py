@@ -203,8 +203,8 @@ class EntryWatcher:
         found: dict[str, int] = {}
         edges = {self._road.lanes[self._road.links[foe].origin].edge for foe in first}
         for foe in first:
-            for lane in self._inside(foe):
-                found.update((other, foe) for other in libsumo.lane.getLastStepVehicleIDs(lane))
+            for inner in self._inside(foe):
+                found.update((other, foe) for other in libsumo.lane.getLastStepVehicleIDs(inner))
         for lane, position in self._before(entered):
             for other in libsumo.lane.getLastStepVehicleIDs(self._road.lanes[lane].id):
                 if other not in found and position_of(other) >= position:
@@ -334,7 +334,8 @@ class EntryWatcher:
         return tuple(reversed(found))
 
     def _internal(self, number: int) -> tuple[str, ...]:
-        found, lane, lanes = [], self._road.links[number].via, self._road.lanes
+        found: list[str] = []
+        lane, lanes = self._road.links[number].via, self._road.lanes
         while lane >= 0 and lanes[lane].internal and len(found) < HOPS:
             found.append(lanes[lane].id)
             lane = next(iter(lanes[lane].successors), -1)

@@ -226,7 +226,7 @@ class Snapshot:
         columns = {
             f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("signals", "switches")
         }
-        rows = {k: v[keep] for k, v in columns.items() if isinstance(v, np.ndarray)}
+        rows: dict[str, Any] = {k: v[keep] for k, v in columns.items() if isinstance(v, np.ndarray)}
         return replace(self, ids=tuple(self.ids[k] for k in keep), **rows)
 
     @property

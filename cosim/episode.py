@@ -31,6 +31,7 @@ from cosim.types import (
     OnCollision,
     Policy,
     PolicyContext,
+    Preset,
     Receipt,
     Simulator,
     Snapshot,
@@ -140,7 +141,8 @@ class Episode:
         self._tally["decisions"] += len(decisions)
         self._tally["vetoes"] += sum(d.vetoed for d in decisions.values())
         self._tally["fallbacks"] += sum(d.fallback for d in decisions.values())
-        commands = to_commands(decisions, self.histories, self.scenario.timing.decision)
+        lawful = self.scenario.preset == Preset.LAWFUL
+        commands = to_commands(decisions, self.histories, self.scenario.timing.decision, lawful)
         began = time.perf_counter()
         receipts, self.frames = self.simulator.advance(commands)
         self.timings["simulation_s"] += time.perf_counter() - began

@@ -28,23 +28,24 @@ class Standing(AvCounts):
             if link.signal >= 0:
                 self._signals[link.origin] = (*self._signals.get(link.origin, ()), link.signal)
         self._waiting: dict[str, float] = {}  # AV -> s, since when it stands without a reason
-        self._inside: dict[
-            str, tuple[str, float]
-        ] = {}  # AV -> the junction on which it stands, since when (s)
+        self._inside: dict[str, tuple[str, float]] = {}  # AV -> the junction in which it stands, since (s)
         self._stuck: set[str] = set()
+        self._wrecks: set[str] = set()
         self._blocked: set[tuple[str, str, float]] = set()
         self.add(first)
 
     def add(self, snapshot: Snapshot) -> None:
         super().add(snapshot)
         s = snapshot
+        self._wrecks.update(s.events.wrecked)
         any_stands = slow(s.kind, s.speed, AV, STANDING)
         standing = np.flatnonzero((s.kind == AV) & (s.speed < STANDING)).tolist() if any_stands else ()
         inside, waiting = self._inside, self._waiting
         self._inside, self._waiting = {}, {}
         reasons = self._reasons(s, standing) if standing else frozenset()
         for row in standing:
-            name = s.ids[row]
+            if (name := s.ids[row]) in self._wrecks:
+                continue
             self._waiting[name] = since = s.time if row in reasons else waiting.get(name, s.time)
             if s.time - since > STUCK and name not in self._stuck:
                 self._stuck.add(name)

@@ -90,7 +90,7 @@ class CollisionDetector:
                 continue
             names = snapshot.ids[i], snapshot.ids[j]
             if frozenset(names) in self._seen or not road.connected(
-                int(snapshot.lane[i]), int(snapshot.lane[j])
+                int(snapshot.place[i]), int(snapshot.place[j])
             ):
                 continue
             if _only_a_tail(snapshot, road, i, j) or the_nets(snapshot, road, i, j):

@@ -54,7 +54,7 @@ class Recorder(Hook):
         )
         for frame in step.frames:
             self.add(frame)
-        self.offences = episode.offences
+        self.offences[:] = episode.offences
         self._know(episode)
 
     def begin(self, frames: Sequence[Snapshot]) -> None:

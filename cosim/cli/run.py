@@ -149,8 +149,8 @@ def work(args: argparse.Namespace) -> int:
 
 def case_of(args: argparse.Namespace) -> EpisodeId:
     """The episode that the flags describe; files by absolute path, so that it can be found again."""
-    same = ("behavior", "driver_model", "penetration", "av_type", "av_ids", "duration", "seed")
-    same += ("warmup", "mission", "on_collision")
+    same = ["behavior", "driver_model", "penetration", "av_type", "av_ids", "duration", "seed"]
+    same += ["warmup", "mission", "on_collision"]
     what, policy = place(args.what), read(args.policy).text
     return EpisodeId(
         what=what,

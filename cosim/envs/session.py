@@ -111,7 +111,12 @@ def open(
         raise BadInput("must be an angle from 0 to 90 degrees", field="svo", value=svo)
     scenario = what
     if not isinstance(scenario, str):
-        given = {"demand": demand or None, "behavior": behavior, "preset": preset, "fleet": fleet}
+        given: dict[str, Any] = {
+            "demand": demand or None,
+            "behavior": behavior,
+            "preset": preset,
+            "fleet": fleet,
+        }
         given |= {"penetration": penetration, "av_type": av_type, "av_ids": av_ids}
         given |= {"duration": duration, "warmup": warmup, "mission": mission, "options": options or None}
         for name, value in given.items():

@@ -90,7 +90,7 @@ FILES: dict[str, tuple[Damage, str, str, str, str]] = {
         "-3",
         "more than 0",
     ),
-    "negative speed": (swap(NET, r'speed="[\d.]+"', 'speed="-3"'), NET, "lane.speed", "-3", "at least 0"),
+    "negative speed": (swap(NET, r'speed="[\d.]+"', 'speed="-3"'), NET, "lane.speed", "-3", "more than 0"),
     "NaN speed": (swap(NET, r'speed="[\d.]+"', 'speed="NaN"'), NET, "lane.speed", "NaN", "finite"),
     "NaN shape": (swap(NET, r'shape="[\d.-]+', 'shape="nan'), NET, "shape", "nan", "finite"),
     "lane gap": (
@@ -280,7 +280,7 @@ def test_the_sound_scenario_runs_packed_as_well(config: Path, capfd: pytest.Capt
     packed.write_bytes(gzip.compress((config.parent / NET).read_bytes()))
     config.write_text(CONFIG.replace(NET, packed.name))
     assert main(["run", str(config), "--json"]) == 0
-    assert '"scenario": "mine"' in capfd.readouterr().out
+    assert '/mine", "demand"' in capfd.readouterr().out
 
 
 def test_a_net_that_kills_sumo_leaves_a_live_process_and_exit_2(config: Path) -> None:

@@ -4,11 +4,13 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import libsumo
 import numpy as np
 
 from cosim.errors import BadInput
+from cosim.files.xml_input import scan
 from cosim.road import ConflictZone, Crossing, Lane, Link, RoadMap, Rule
 from cosim.scenario import Zone
 from cosim.simulation.conventions import centres
@@ -66,6 +68,7 @@ class SnapshotReader:
 
     def __init__(self, road: RoadMap) -> None:
         self._lane_index = road.index
+        self._edges = road.contact.edges
         self._lights = Counter(light for light, _ in road.signals)  # -> how many signals, in their order
         self._ids: tuple[str, ...] | None = None
         # kind, mission, length m, width m, actor [n] of `_ids`
@@ -101,6 +104,13 @@ class SnapshotReader:
             else [person(persons[i]) if i in persons else vehicle(i) for i in ids]
             for vehicle, person in zip(GETTERS, PERSON_GETTERS, strict=True)
         )
+        on = np.array([self._lane_index.get(i, -1) for i in lane], np.int32)
+        off = np.flatnonzero(on < 0)
+        place = on.copy() if len(off) else on
+        for k in off:
+            person = persons.get(ids[k])
+            edge = lane[k].rpartition("_")[0] if person is None else libsumo.person.getRoadID(person)
+            place[k] = -2 - self._edges.get(edge, -1)
         front = np.array(position, np.float64).reshape(-1, 2)  # [n,2] m
         x, y, heading = centres(front[:, 0], front[:, 1], np.array(angle), 0.5 * length)
         return Snapshot(
@@ -115,10 +125,11 @@ class SnapshotReader:
             accel=np.array(accel, np.float64),
             length=length,
             width=width,
-            lane=np.array([self._lane_index.get(i, -1) for i in lane], np.int32),
+            lane=on,
             lane_position=np.array(lane_position, np.float64),
             events=events,
             actor=actor,
+            place=place,
             signals=self._signals(),
             switches=self._switches(),
         )
@@ -188,7 +199,8 @@ def read_road(zones: Sequence[Zone], scenario_file: object) -> RoadMap:
         if not j.startswith(":") and len(shape := libsumo.junction.getShape(j)) > 2
     )
     links, signals = _links(lanes, place)
-    road = RoadMap(tuple(lanes), found, outlines, links, signals, _crossings(place, signals))
+    crossings = _crossings(place, signals)
+    road = RoadMap(tuple(lanes), found, outlines, links, signals, crossings, _closed(lanes))
     return road if found else replace(road, zones=(_struggling_zone(road),))
 
 
@@ -203,26 +215,62 @@ def _links(
         for index, ways in enumerate(lights.getControlledLinks(light)):
             signal_of.update(((way[0], way[1]), len(signals)) for way in ways)
             signals.append((light, index))
-    links, foes = [], []
+    requests, links = _requests(), []
+    row_of: dict[str, int] = {}  # the last lane of a link inside its junction -> the link
+    yields: list[tuple[str, ...]] = []  # per link: such lanes of the links that go first
     for lane in lanes:
         for target, _, _, _, via, state, *_ in () if lane.internal else get.getLinks(lane.id):
             if target not in place:
                 continue
             signal = signal_of.get((lane.id, target), -1)
-            before = frozenset(get.getFoes(lane.id, target))
-            crossed = frozenset(get.getInternalFoes(via)) if via else frozenset()
+            last = via
+            while last and (inner := next((way[4] for way in get.getLinks(last) if way[0] == target), "")):
+                last = inner
+            before, met = requests.get(last, ((), ()))
             rule = RULES.get(state, Rule.PRIORITY) if signal < 0 else Rule.YIELD if before else Rule.PRIORITY
+            row_of[last] = len(links)
+            yields.append(tuple(name for name in before if name in met))
             links.append(Link(place[lane.id], place.get(via, -1), place[target], signal, rule))
-            foes.append((before, crossed))
-    by_name = [(lanes[k.origin].id, lanes[k.via].id if k.via >= 0 else "") for k in links]
-    at: dict[str, list[int]] = {}
-    for number, (origin, _) in enumerate(by_name):
-        at.setdefault(origin, []).append(number)
-    found = [
-        tuple(n for name in sorted(before) for n in at.get(name, ()) if by_name[n][1] in crossed)
-        for before, crossed in foes
-    ]
+    found = [tuple(row_of[name] for name in names if name in row_of) for names in yields]
     return tuple(replace(k, foes=f) for k, f in zip(links, found, strict=True)), tuple(signals)
+
+
+def _closed(lanes: Sequence[Lane]) -> tuple[Lane, ...]:
+    """A lane of every edge that has none for motor vehicles: footpaths, cycleways, rails."""
+    get, known = libsumo.lane, {lane.edge for lane in lanes}
+    found = []
+    for edge in libsumo.edge.getIDList():
+        if edge in known:
+            continue
+        name = f"{edge}_0"
+        shape = np.array(get.getShape(name), np.float64)[:, :2]
+        size = get.getLength(name), get.getWidth(name), get.getMaxSpeed(name)
+        ends = libsumo.edge.getFromJunction(edge), libsumo.edge.getToJunction(edge)
+        internal = edge.startswith(":")
+        found.append(Lane(name, edge, 0, shape, *size, internal=internal, start=ends[0], end=ends[1]))
+    return tuple(found)
+
+
+def _requests() -> dict[str, tuple[tuple[str, ...], tuple[str, ...]]]:
+    """Of the loaded net's right-of-way tables, which libsumo gives per lane only: the last lane of a link
+    inside its junction -> those of the links that go first, and those of the links that it meets."""
+    found: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {}
+    inside: list[str] = []
+
+    def start(tag: str, attributes: dict[str, str], _line: int) -> None:
+        if tag == "junction":
+            inside[:] = attributes.get("intLanes", "").split()
+        elif tag == "request" and int(attributes["index"]) < len(inside):
+            before, met = (
+                tuple(
+                    name for name, bit in zip(inside, reversed(attributes[row]), strict=False) if bit == "1"
+                )
+                for row in ("response", "foes")
+            )
+            found[inside[int(attributes["index"])]] = before, met
+
+    scan(Path(libsumo.simulation.getOption("net-file")), ("net",), start)
+    return found
 
 
 def _crossings(place: Mapping[str, int], signals: Sequence[tuple[str, int]]) -> tuple[Crossing, ...]:

@@ -372,14 +372,17 @@ class Checker:
                 return [link]
             place += 1
             ahead += self.net.lanes[f"{foe.way[place]}_0"].length if place < len(foe.way) else 0.0
+        lanes = {lane if not lane.startswith(":") else self.net.of_via[lane].target}
         while ahead <= FOE_REACH and place + 1 < len(foe.way):
             links = self.net.of_edges[foe.way[place], foe.way[place + 1]]
+            links = [link for link in links if link.origin in lanes] or links  # or it has to change lanes
             if not links:
                 return []
             if links[0].junction == junction:
-                return [link for link in links if link.origin == lane] or links
+                return links
             inside = sum(self.net.lanes[via].length for via in links[0].via)
             ahead += inside + self.net.lanes[links[0].target].length
+            lanes = {link.target for link in links}
             place += 1
         return []
 

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 from benchmarks.law import Case, cases, differences, driven
+from cosim.simulation.net import NetReader
 from cosim.types import Preset
+from cosim.workers.worker import Worker
 from tests.law.checker import Law, Net, Program, check
 from tests.worlds.build import NAMES
 
@@ -281,6 +283,28 @@ def test_every_link_of_every_world_has_its_row_in_the_table(law_worlds: dict[str
         assert len(set(places)) == len(places), configuration
         known = [(link.signal[1], link.index) for link in net.links if link.signal is not None]
         assert all(a == b for a, b in known), configuration  # a signal of one junction counts alike
+
+
+@pytest.mark.parametrize("world", ["arterial", "crossing_signals", "priority", "roundabout2"])
+def test_links_give_way_to_those_of_the_right_of_way_table(law_worlds: dict[str, Path], world: str) -> None:
+    net = Net(law_worlds[world].with_name("net.net.xml"))
+    reader = Worker(NetReader, law_worlds[world].with_name("net.net.xml"))
+    try:
+        road = reader.call("road")
+    finally:
+        reader.close()
+    name = [f"{road.lanes[link.origin].id} {road.lanes[link.target].id}" for link in road.links]
+    wanted = {
+        f"{link.origin} {link.target}": {
+            f"{other.origin} {other.target}"
+            for other in net.links
+            if other.junction == link.junction and other.index in link.yields & link.meets
+        }
+        for link in net.links
+    }
+
+    assert {name[k]: {name[foe] for foe in link.foes} for k, link in enumerate(road.links)} == wanted
+    assert any(wanted.values())
 
 
 def test_where_sumo_drives_nobody_passes_on_red_or_through_a_stop_sign(

@@ -103,7 +103,7 @@ class FrameMemory:
         made = to_numpy(self._extractor.frames(torch.from_numpy(pictures[new])).permute(0, 2, 3, 1))
         features: Floats32 = np.empty((count, frames, *made.shape[1:]), np.float32)
         features[new] = made
-        before = [self._row[names[b]] for b in np.flatnonzero(kept[:, 0])] if old else []
+        before = [self._row[name] for name, known in zip(names, kept[:, 0], strict=True) if known]
         features[kept] = self._features[before, n - old : n].reshape(-1, *made.shape[1:])
         self._row = {name: b for b, name in enumerate(names)}
         self._maps, self._features = pictures, features

@@ -2,12 +2,12 @@
 
     python -m benchmarks.decision_cost [--avs 25 50 100] [--decisions 40] [--real] [--out FILE.md] [--profile]
 
-A grid of signalised junctions is built by netgenerate, and one vehicle in five is an AV: each drives a random
-walk of `WALK` edges, so that all of them stay on the road. SUMO drives everybody and `vfn-p` decides beside it
-(nothing is carried out), so that the traffic is the same whatever the policy is. Medians over decisions, wall
-time in a process of its own. `--real`: A10KW of the `eclipse-sumo` package, driven by `vfn-p` for as long as at
-most 100 AVs are on the road. `--profile`: cProfile's table instead. Ratios are to a fixed piece of work that
-is timed between decisions.
+A grid of signalised junctions is built by netgenerate, and one vehicle in five is an AV: each drives a
+random walk of `WALK` edges, so that all of them stay on the road. SUMO drives everybody and `vfn-p` decides
+beside it (nothing is carried out), so that the traffic is the same whatever the policy is. Medians over
+decisions, in a process of its own. `--real`: A10KW of the `eclipse-sumo` package, driven by `vfn-p` for as
+long as at most 100 AVs are on the road. `--profile`: cProfile's table instead. Ratios are to a fixed piece of
+work that is timed between decisions.
 """
 
 from __future__ import annotations
@@ -36,7 +36,6 @@ from cosim.host import Host
 from cosim.scenario import Fleet, Scenario, load
 from cosim.scenario.vet import vetted
 from cosim.seeding import TUNING_SEEDS
-from cosim.types import Preset
 from cosim.workers.memory import keep_freed_memory
 from cosim.workers.worker import Worker
 
@@ -84,7 +83,7 @@ def _walk(draw: random.Random) -> list[str]:
     edges: list[str] = []
     while len(edges) < WALK:
         around = [(at[0] + dx, at[1] + dy) for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1))]
-        to = draw.choice([n for n in around if n != before and 0 <= min(n) and max(n) < GRID])
+        to = draw.choice([n for n in around if n != before and min(n) >= 0 and max(n) < GRID])
         edges.append("".join(f"{chr(65 + x)}{y}" for x, y in (at, to)))
         before, at = at, to
     return edges
@@ -210,7 +209,7 @@ def city(avs: int, decisions: int, *, profile: bool = False) -> Any:
 
 def real() -> dict[str, float]:
     """A10KW at a share of AVs of one in `SHARE`, driven by the policy."""
-    scenario = vetted(load(str(a10kw()), fleet=Fleet(penetration=1 / SHARE), preset=Preset.UNGUARDED))
+    scenario = vetted(load(str(a10kw()), fleet=Fleet(penetration=1 / SHARE)))
     with Worker(Real, scenario) as worker:
         found: dict[str, float] = worker.call("drive", TUNING_SEEDS.start, MOST_AVS)
     return found
@@ -227,8 +226,8 @@ def page(found: Mapping[str, Any], command: str) -> list[str]:
         f"`{POLICY}` on one thread, in a grid of {GRID} x {GRID} signalised junctions {BLOCK:g} m apart, two",
         f"lanes a way, one vehicle in {SHARE} an AV. Medians over decisions, ms **per AV**, of wall time;",
         "`decision` is prediction, values and prioritizer, what `policy.decide` does, also as a share of the",
-        "reference (a fixed piece of work timed between decisions) and in processor time, which other work on",
-        "the machine hardly changes: the target is for that.",
+        "reference (a fixed piece of work timed between decisions) and in processor time, which other work",
+        "on the machine hardly changes: the target is for that.",
         "",
         markdown_row(heads),
         "|---" * len(heads) + "|",
@@ -245,8 +244,8 @@ def page(found: Mapping[str, Any], command: str) -> list[str]:
         lines += [
             "## A real interchange",
             "",
-            f"A10KW of the `eclipse-sumo` package, one vehicle in {SHARE} an AV, driven by `{POLICY}` from an",
-            f"empty road until more than {MOST_AVS} AVs are on it (at least 1 times real time wanted):",
+            f"A10KW of the `eclipse-sumo` package, one vehicle in {SHARE} an AV, driven by `{POLICY}` from",
+            f"an empty road until more than {MOST_AVS} AVs are on it (at least 1 times real time wanted):",
             "",
             markdown_row(list(found["real"])),
             "|---" * len(found["real"]) + "|",

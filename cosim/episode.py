@@ -27,9 +27,11 @@ from cosim.types import (
     History,
     Metric,
     ObservationConfig,
+    Offence,
     OnCollision,
     Policy,
     PolicyContext,
+    Preset,
     Receipt,
     Simulator,
     Snapshot,
@@ -128,13 +130,19 @@ class Episode:
             hook.on_start(self)
         return self.histories
 
+    @property
+    def offences(self) -> list[Offence]:
+        """What AVs did against the law so far, as the figures count it; by time."""
+        return self._metrics.offences
+
     def advance(self, decisions: Mapping[str, Decision]) -> dict[str, History]:
         """Carry the decisions out for one decision period."""
         self._trace(decisions)
         self._tally["decisions"] += len(decisions)
         self._tally["vetoes"] += sum(d.vetoed for d in decisions.values())
         self._tally["fallbacks"] += sum(d.fallback for d in decisions.values())
-        commands = to_commands(decisions, self.histories, self.scenario.timing.decision)
+        lawful = self.scenario.preset == Preset.LAWFUL
+        commands = to_commands(decisions, self.histories, self.scenario.timing.decision, lawful)
         began = time.perf_counter()
         receipts, self.frames = self.simulator.advance(commands)
         self.timings["simulation_s"] += time.perf_counter() - began

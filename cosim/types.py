@@ -132,6 +132,15 @@ class Entry:
 
 
 @dataclass(frozen=True, slots=True)
+class Offence:
+    """What one AV did against the law, once for each that the figures count."""
+
+    time: float  # s
+    vehicle: str
+    what: str  # in words, of which the vehicle is the subject
+
+
+@dataclass(frozen=True, slots=True)
 class Intervention:
     """The car began to drive otherwise than commanded (preset `lawful`)."""
 
@@ -169,7 +178,7 @@ NO_EVENTS = Events()
 class Snapshot:
     """Everybody on the road at one moment, sorted by id: vehicles and persons (`person:ID`).
 
-    Shapes: all arrays [n], `signals` [s]. Units: m, s, rad (counter-clockwise from east), m/s, m/s2.
+    Shapes: all arrays [n], `signals` and `switches` [s]. Units: m, s, rad (counter-clockwise from east), m/s, m/s2.
     """
 
     time: float  # s
@@ -188,6 +197,9 @@ class Snapshot:
     events: Events = NO_EVENTS
     # [n] Actor; where nothing is given all are cars, persons apart
     actor: npt.NDArray[np.int8] = field(default_factory=lambda: np.zeros(0, np.int8))
+    # [n] for what can touch whom (`RoadMap.contact`): the lane; off every lane -2 - the edge's number in
+    # `RoadMap.contact.edges`, -1 where that is not known. Where nothing is given: `lane`
+    place: npt.NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
     # [s] ord() of each state (rRyYgGosu), in the order of RoadMap.signals
     signals: Bytes = field(default_factory=lambda: np.zeros(0, np.uint8))
     # [s] s until the next phase of each signal's light, as it is planned now; empty in recordings
@@ -197,6 +209,8 @@ class Snapshot:
         if len(self.actor) != len(self.kind):
             actor = np.where(self.kind == Kind.PERSON, Actor.PERSON, Actor.CAR).astype(np.int8)
             object.__setattr__(self, "actor", actor)
+        if len(self.place) != len(self.lane):
+            object.__setattr__(self, "place", self.lane)
 
     @cached_property
     def row(self) -> dict[str, int]:
@@ -213,12 +227,9 @@ class Snapshot:
         keep = np.flatnonzero(self.kind != int(Kind.PERSON))
         if len(keep) == self.n:
             return self
-        columns = {f.name: getattr(self, f.name) for f in fields(self)}
-        rows = {
-            k: v[keep]
-            for k, v in columns.items()
-            if k not in ("signals", "switches") and isinstance(v, np.ndarray)
-        }
+        names = {f.name for f in fields(self)} - {"signals", "switches"}  # which have no row per vehicle
+        columns = {name: getattr(self, name) for name in names}
+        rows: dict[str, Any] = {k: v[keep] for k, v in columns.items() if isinstance(v, np.ndarray)}
         return replace(self, ids=tuple(self.ids[k] for k in keep), **rows)
 
     @property
@@ -298,6 +309,9 @@ class Command(NamedTuple):
     target_speed: float  # m/s
     lane_offset: int  # -1 right, 0 keep, +1 left
     hold: float  # s
+    limit: float = (
+        math.inf
+    )  # m/s, the most that the law allows, as far as the agent sees it (preset `lawful`)
 
 
 class Receipt(NamedTuple):

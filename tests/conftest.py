@@ -44,6 +44,7 @@ def start(tmp_path: Path) -> Iterator[Start]:
         scenario: Scenario = replace(
             load("merge"),
             demand=(demand,),
+            preset="unguarded",
             warmup=0.1,
             behavior="as-is",
             mission=Mission(kind="none"),

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from benchmarks.unled import Unled
 from cosim.errors import BadInput
-from cosim.types import COMPACT, Policy, PolicyContext
+from cosim.types import Policy, PolicyContext
 from policy import checkpoint
 from policy.agents import APPROACHES, make
 from policy.agents.approaches import AgentConfig, compact, shipped
@@ -21,7 +21,8 @@ from policy.networks.vfn import VFN, VfnConfig
 from policy.safety import SafetyConfig
 
 PERCEPTION = 125.0  # m, what an AV's own sensors reach (definitions.md)
-NEWER = ("road_version", "signal_timing")  # options of the observation that shipped episodes do not name
+# options that shipped episodes do not name: their defaults are what was done without them
+NEWER = {"observation": ("road_version", "signal_timing"), "safety": ("crossing",)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,8 +112,10 @@ def fingerprint(agent: Agent, untrained: bool = False) -> dict[str, Any]:
     needed = ("predictor",) if agent.preference else ("vfn", "hpn", "predictor")
     weights = {name: sha256(path) for name in needed if (path := _file(c, name))}
     plain = json.loads(json.dumps(asdict(replace(c, vfn_weights=None, hpn_weights=None))))
-    seen = plain["observation"]
-    plain["observation"] = {k: v for k, v in seen.items() if k not in NEWER or v != getattr(COMPACT, k)}
+    defaults = json.loads(json.dumps(asdict(AgentConfig())))
+    for part, names in NEWER.items():
+        given, usual = plain[part], defaults[part]
+        plain[part] = {k: v for k, v in given.items() if k not in names or v != usual[k]}
     setting = {"preference": agent.preference} if agent.preference else {}
     return {"config": plain, "weights": weights, "v2v": agent.share_intentions, **setting}
 

@@ -54,6 +54,7 @@ class Check:
 def add(commands: arguments.SubCommands) -> None:
     """Register the command and its flags."""
     doctor = commands.add_parser("doctor", help="check this installation and say how to fix it")
+    doctor.add_argument("scenario", nargs="?", metavar="WHAT", help="look at this one's net instead")
     arguments.add(doctor, "--json")
     doctor.set_defaults(work=work)
 
@@ -61,7 +62,7 @@ def add(commands: arguments.SubCommands) -> None:
 def work(args: argparse.Namespace) -> int:
     """Print every check, as lines or as one JSON document; 0 when none failed, else 3."""
     checks: list[Check] = []
-    for check in examine(os.environ):
+    for check in examine(os.environ) if args.scenario is None else [lanes(args.scenario)]:
         checks.append(check)
         if not args.json:
             print(check.line(), flush=True)
@@ -201,6 +202,23 @@ def worlds() -> Check:
 
     names = ", ".join(sumo_scenarios.names())
     return Check("scenarios", OK, names) if names else Check("scenarios", FAIL, "none found", INSTALL)
+
+
+def lanes(what: str) -> Check:
+    """Whether a scenario's lanes are far enough apart for the vehicles on them. Raises BadInput."""
+    from cosim.road.too_close import described, too_close
+    from cosim.scenario import load
+    from cosim.scenario.vet import vetted
+    from cosim.simulation.net import NetReader
+    from cosim.workers.worker import Worker
+
+    worker = Worker(NetReader, vetted(load(what)).net)
+    try:
+        road = worker.call("road")
+    finally:
+        worker.close()
+    found = described(road, too_close(road))
+    return Check("lanes", WARN, found) if found else Check("lanes", OK, "far enough apart")
 
 
 def one_second() -> Check:

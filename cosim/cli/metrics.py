@@ -40,7 +40,7 @@ def add(commands: arguments.SubCommands) -> None:
     more = {
         "--net": ("NET", "the .net.xml: bridges and lane successions"),
         "--mission": ("REGEX", "measure these too, as mission vehicles"),
-        "--conflicts": ("CSV", "write every single conflict there: who, when, where, how close"),
+        "--conflicts": ("CSV", "write every conflict there: who, when, where, how close, of which type"),
     }
     arguments.texts(metrics, more)
     metrics.add_argument(

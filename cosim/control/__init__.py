@@ -6,6 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from cosim.geometry.compiled import compiled
+from cosim.road.rules import RulesAhead
 from cosim.types import LANE_OFFSET, Command, Decision, Floats, History, MetaAction
 
 SPEED_STEP = 5.0  # m/s between grid levels: one step of Decelerate must really brake
@@ -16,6 +17,9 @@ MAX_DECEL = 8.0  # m/s2
 MAX_ACCEL = 3.0  # m/s2
 COMFORT = 3.0  # m/s2: the most that preset `lawful` accelerates or brakes on an agent's wish
 JERK = 5.0  # m/s3, how fast that changes (ISO 15622: adaptive cruise control at low speeds)
+APPROACH = 2.0  # m/s2, with which stop lines and lower limits are approached
+STOPS_BEFORE = 1.0  # m from a stop line
+CREEP = 2.0  # m/s
 COMFORT_TIME = 1.0  # s, with which a target speed is tracked comfortably
 LANE_CHANGE_TIME = 2.0  # s, the same as SUMO's --lanechange.duration
 _ACTIONS, _ACCELERATE, _DECELERATE = len(MetaAction), int(MetaAction.ACCELERATE), int(MetaAction.DECELERATE)
@@ -182,15 +186,30 @@ def braked_from(
     return out
 
 
+def lawful_speed(rules: RulesAhead) -> float:
+    """The highest speed in m/s from which `APPROACH` m/s2 obey all that a car sees of the law ahead.
+
+    Limits (junction lanes too), red and yellow lights, stop signs and crossings with persons; never below
+    `CREEP`: how the last metres are driven, and whether a line may be passed, is the car's to say.
+    """
+    allowed = np.sqrt(rules.limits[:, 1] ** 2 + 2.0 * APPROACH * rules.limits[:, 0]).min()
+    at = [rules.stop_distance, rules.person_distance]
+    if rules.signal and rules.signal in "ruyY":
+        at.append(rules.signal_distance)
+    stop = math.sqrt(2.0 * APPROACH * max(min(at) - STOPS_BEFORE, 0.0))
+    return float(min(allowed, max(stop, CREEP)))
+
+
 def to_commands(
-    decisions: Mapping[str, Decision], histories: Mapping[str, History], hold: float
+    decisions: Mapping[str, Decision], histories: Mapping[str, History], hold: float, lawful: bool = False
 ) -> list[Command]:
     """One command per decided AV.
 
     Args:
         decisions: AV id -> what its policy chose.
-        histories: AV id -> its history, for its target speed, speed and speed limit (m/s).
+        histories: AV id -> its history, for its target speed, speed, speed limit (m/s) and the law ahead.
         hold: s until the next decision.
+        lawful: whether commands keep what is seen of the law ahead (preset `lawful`).
     """
     commands = []
     for vehicle, decision in decisions.items():
@@ -198,5 +217,6 @@ def to_commands(
         target = next_target(
             history.target_speed, history.ego_speed, decision.action, history.route.speed_limit
         )
-        commands.append(Command(vehicle, target, LANE_OFFSET.get(decision.action, 0), hold))
+        limit = lawful_speed(history.rules) if lawful else math.inf
+        commands.append(Command(vehicle, target, LANE_OFFSET.get(decision.action, 0), hold, limit))
     return commands

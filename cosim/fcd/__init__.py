@@ -24,7 +24,10 @@ from cosim.types import Kind, Metric, Snapshot, Timing
 
 FIGURES = ("time_to_collision", "post_encroachment", "drac", "hard_braking", "jerk", "headway")
 CONFLICTS = ("time_to_collision", "drac")  # figures of single frames, which a jump would make up
-SIDEWAYS = 5.0  # m/s: nobody moves faster to the side, but for SUMO's lane changes that take no time
+SIDEWAYS = 2.5  # m/s: nobody moves faster to the side, but for SUMO's lane changes that take no time
+STRAIGHT = math.radians(5.0)  # who turns less has not come to the side by a bend
+LANE = 2.5  # m: onto another edge, less is a step between the two edges' lanes
+SETTLED = 2.0  # s that a lane change takes elsewhere: so long what it leads to is none of a driver's doing
 FRAME = Timing().frame  # s: finer data are thinned to it, so that figures compare with an episode's
 DRIVEN = 200.0  # m that all vehicles have driven before the positions are checked
 WHOLE_LANE = 1e6  # m, of a lane whose length is not known
@@ -134,6 +137,7 @@ class _Counter:
         self._laneless = self._rows = 0  # vehicle frames
         self._strange: Counter[str] = Counter()  # lanes that the road lacks
         self._jumps = 0  # lane changes from one frame to the next
+        self._jumped: dict[str, float] = {}  # vehicle -> s, the last one, while it has not settled
         self._driven = self._moved = 0.0  # m, by the speeds and by the positions
 
     def see(self, step: Step) -> None:
@@ -223,7 +227,8 @@ class _Counter:
         return known
 
     def _count(self, snapshot: Snapshot) -> None:
-        seen = self._without_jumps(snapshot)
+        self._note_jumps(snapshot)
+        seen = self._settled(snapshot)
         for name, metric in self._metrics.items():
             frame = seen if name in CONFLICTS else snapshot
             if self._frames:
@@ -231,7 +236,7 @@ class _Counter:
             else:
                 metric.reset(frame, self._context)
         if self._encounters is not None:
-            self._encounters.add(snapshot, seen)
+            self._encounters.add(snapshot, self._jumped)
         if self._newest is None:
             self._began = snapshot.time
         elif self._driven < DRIVEN:
@@ -239,27 +244,33 @@ class _Counter:
         self._frames += 1
         self._newest = snapshot
 
-    def _without_jumps(self, snapshot: Snapshot) -> Snapshot:
-        """The frame without the vehicles that have just been put on a neighbouring lane (`SIDEWAYS`)."""
+    def _note_jumps(self, snapshot: Snapshot) -> None:
+        """Who has just been put on another lane (`SIDEWAYS`); forget those who have settled there."""
         s, before = snapshot, self._newest
+        self._jumped = {name: t for name, t in self._jumped.items() if s.time - t < SETTLED - 1e-9}
         if before is None or s.n == 0:
-            return s
+            return
         both = [(before.row[name], row) for row, name in enumerate(s.ids) if name in before.row]
         then, now = np.array(both, np.int64).reshape(-1, 2).T  # [c] rows of who is in both frames
         x, y = s.x[now] - before.x[then], s.y[now] - before.y[then]
         aside = np.abs(np.cos(s.heading[now]) * y - np.sin(s.heading[now]) * x)  # [c] m
-        fast = np.flatnonzero(aside > SIDEWAYS * (s.time - before.time))
-        ways = [(int(before.lane[then[k]]), int(s.lane[now[k]]), int(now[k])) for k in fast]
-        jumped = [
-            row
-            for a, b, row in ways
-            if a != b and min(a, b) >= 0 and edge_of(self._road, a) == edge_of(self._road, b)
-        ]
-        self._jumps += len(jumped)
-        if not jumped:
+        turned = np.abs(np.remainder(s.heading[now] - before.heading[then] + np.pi, 2.0 * np.pi) - np.pi)
+        for k in np.flatnonzero(aside > SIDEWAYS * (s.time - before.time)):
+            a, b = int(before.lane[then[k]]), int(s.lane[now[k]])
+            if a == b or min(a, b) < 0:
+                continue
+            whole = turned[k] < STRAIGHT and aside[k] > LANE
+            if whole or edge_of(self._road, a) == edge_of(self._road, b):
+                self._jumped[s.ids[now[k]]] = s.time
+                self._jumps += 1
+
+    def _settled(self, snapshot: Snapshot) -> Snapshot:
+        """The frame without the vehicles that have jumped in the last `SETTLED` s."""
+        s = snapshot
+        kept = np.array([row for row, name in enumerate(s.ids) if name not in self._jumped], np.int64)
+        if len(kept) == s.n:
             return s
-        kept = np.delete(np.arange(s.n), jumped)
-        every: dict[str, Any] = {f.name: getattr(s, f.name) for f in fields(s)}
+        every: dict[str, Any] = {f.name: getattr(s, f.name) for f in fields(s) if f.name != "signals"}
         rest: dict[str, Any] = {k: v[kept] for k, v in every.items() if isinstance(v, np.ndarray)}
         return replace(s, ids=tuple(s.ids[k] for k in kept), **rest)
 
@@ -319,7 +330,7 @@ class _Counter:
             f"{self._laneless} vehicle frames have no lane position: no headway there": bool(self._laneless),
             f"{self._strange.total()} vehicle frames on lanes that --net lacks: {lanes}": bool(lanes),
             f"{self._jumps} lane changes that took no time (lanechange.duration 0): no time to collision and "
-            "no DRAC of that vehicle in that frame": bool(self._jumps),
+            f"no DRAC of that vehicle for {SETTLED:g} s": bool(self._jumps),
             f"steps of {self._interval:g} s are thinned to frames of {apart:g} s": self._stride > 1,
             f"frames every {apart:g} s: brief events are missed, jerk is damped": apart > FRAME + 1e-9,
         }

@@ -1,6 +1,7 @@
 """Single conflicts behind the figures: who met whom, when, where, and how close it came."""
 
 import math
+from collections.abc import Collection
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -41,6 +42,7 @@ class Encounter:
     foe_speed_mps: float
     max_drac_mps2: float  # largest of the encounter; 0 where they only overlapped
     type: str = ""  # following, lane change, merging, crossing or oncoming, when it was closest
+    lane_jump: bool = False  # then one of them had just changed lanes in no time (not in headline figures)
     pet_s: float = math.nan  # post-encroachment time of crossing or merging paths; NaN: none up to 5 s
 
 
@@ -82,9 +84,10 @@ class Encounters:
         self._closed: list[Encounter] = []
         self._interval, self._time = math.nan, math.nan  # s between frames, of the newest
 
-    def add(self, snapshot: Snapshot, seen: Snapshot | None = None) -> None:
-        """The next frame; `seen`: the frame without the vehicles that can meet no other in it."""
-        s = snapshot if seen is None else seen
+    def add(self, snapshot: Snapshot, jumped: Collection[str] = ()) -> None:
+        """The next frame; `jumped`: who has just changed lanes in no time."""
+        s = snapshot
+        self._jumped = jumped
         self._interval, self._time = snapshot.time - self._time, snapshot.time
         rows = np.flatnonzero(watched(s))
         if len(rows) and s.n > 1:
@@ -107,7 +110,7 @@ class Encounters:
         return [asdict(e) for e in sorted([*self._closed, *rest], key=lambda e: (e.begin_s, e.ego, e.foe))]
 
     def _meet(self, s: Snapshot, i: int, j: int, ttc: float) -> None:
-        if i == j or not self._road.connected(int(s.lane[i]), int(s.lane[j])):
+        if i == j or not self._road.connected(int(s.place[i]), int(s.place[j])):
             return
         ego, foe = s.ids[i], s.ids[j]
         if (foe, ego) in self._open:  # both are watched: the pair is listed once
@@ -133,6 +136,7 @@ class Encounters:
             ego_speed_mps=float(s.speed[i]),
             foe_speed_mps=float(s.speed[j]),
             max_drac_mps2=hardest,
+            lane_jump=ego in self._jumped or foe in self._jumped,
             type=self._type(int(s.lane[i]), int(s.lane[j]), float(s.heading[i] - s.heading[j])),
         )
         if known is None:

@@ -14,7 +14,7 @@ from cosim.metrics.events import TrafficEvents
 from cosim.metrics.hard_braking import HardBraking
 from cosim.metrics.headway import Headway
 from cosim.metrics.jerk import Jerk
-from cosim.metrics.law import StopLines
+from cosim.metrics.law import AvCounts, StopLines
 from cosim.metrics.mission import MissionSuccess
 from cosim.metrics.persons import PersonConflicts
 from cosim.metrics.post_encroachment import PostEncroachment
@@ -22,7 +22,7 @@ from cosim.metrics.speeding import Speeding
 from cosim.metrics.standing import Standing
 from cosim.metrics.time_to_collision import TimeToCollision
 from cosim.metrics.trips import Interventions, Trips
-from cosim.types import RESERVED, Kind, Metric, Snapshot
+from cosim.types import RESERVED, Kind, Metric, Offence, Snapshot
 
 __all__ = ["METRICS", "EpisodeMetric", "MetricContext", "MetricFactory", "Metrics", "joined", "read"]
 
@@ -67,6 +67,12 @@ class Metrics:
         self.had_avs = self.had_avs or bool((snapshot.kind == Kind.AV).any())
         for metric in self._metrics:
             metric.add(snapshot)
+
+    @property
+    def offences(self) -> list[Offence]:
+        """What AVs did against the law so far, by time."""
+        found = [o for metric in self._metrics if isinstance(metric, AvCounts) for o in metric.offences]
+        return sorted(found, key=lambda o: o.time)
 
     def result(self) -> dict[str, Metric]:
         """Name -> figure with unit and better direction, in the table's order. Raises as `joined`."""

@@ -31,7 +31,7 @@ class ConflictView:
     def of(self, snapshot: Snapshot) -> Conflicts:
         """Conflicts of AVs and mission vehicles with any vehicle, up to `HORIZON` ahead."""
         if snapshot is not self._snapshot:
-            roads = self._contact.numbers(snapshot.lane), self._contact.table
+            roads = self._contact.numbers(snapshot.place), self._contact.table
             self._conflicts = conflicts(boxes(snapshot), watched(snapshot, self._guessed), HORIZON, roads)
             self._snapshot = snapshot
         return self._conflicts

@@ -4,11 +4,11 @@ from functools import cache
 
 from cosim.metrics.context import AV, MetricContext
 from cosim.road import Link, RoadMap, Rule
-from cosim.types import Entry, Metric, Snapshot
+from cosim.types import Entry, Metric, Offence, Snapshot
 
 COMFORTABLE = 3.0  # m/s2: who could stop at yellow with this must
 STOPPED = 0.5  # m/s, at most, within the last 10 m before a stop sign
-HARD = 3.0  # m/s2, the braking that nobody with the right of way is to be made to do
+HARD = 3.0 + 1e-3  # m/s2 (who brakes with just 3 brakes comfortably): nobody with the right of way is made to
 LEADER = 30.0  # m: a vehicle that near ahead is what one brakes for
 SIGNS = (Rule.STOP, Rule.ALL_WAY_STOP)
 BY_TURNS = (Rule.EQUAL, Rule.ALL_WAY_STOP, Rule.ZIPPER)  # all wait for one another: only collisions count
@@ -29,10 +29,11 @@ def ran_stop(entry: Entry, link: Link) -> bool:
 
 
 class AvCounts:
-    """Counts of what AVs do: NA while no AV has been seen."""
+    """Counts of what AVs do: NA while no AV has been seen. `offences`: what replays tell of them."""
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._avs = bool((first.kind == AV).any())
+        self.offences: list[Offence] = []
 
     def add(self, snapshot: Snapshot) -> None:
         self._avs = self._avs or bool((snapshot.kind == AV).any())
@@ -58,8 +59,13 @@ class StopLines(AvCounts):
             self._open = [entry for entry in self._open if self._goes_on(entry, snapshot)]
         self._before, self._last = self._last, snapshot
         for entry in snapshot.events.entries:
-            self._red += ran_red(entry)
-            self._stop += ran_stop(entry, self._links[entry.link])
+            if ran_red(entry):
+                self._red += 1
+                light = "yellow" if entry.state in "yY" else "red"
+                self._tell(entry, entry.time, f"ran a {light} light")
+            if ran_stop(entry, self._links[entry.link]):
+                self._stop += 1
+                self._tell(entry, entry.time, f"passed a stop sign at {entry.least_speed:.1f} m/s")
             if entry.foes and self._undecided(entry, snapshot):
                 self._open.append(entry)
 
@@ -72,11 +78,12 @@ class StopLines(AvCounts):
 
     def _goes_on(self, entry: Entry, now: Snapshot) -> bool:
         """Whether the entry is still to be followed; counts it when a foe has begun to brake hard for it."""
-        if self._links[entry.link].rule not in BY_TURNS and any(
-            self._made_to_brake(foe, link, entry.vehicle, now) for foe, link in entry.foes
-        ):
-            self._way += 1
-            return False
+        if self._links[entry.link].rule not in BY_TURNS:
+            for foe, link in entry.foes:
+                if self._made_to_brake(foe, link, entry.vehicle, now):
+                    self._way += 1
+                    self._tell(entry, now.time, f"made {foe} brake, who had the right of way")
+                    return False
         return self._undecided(entry, now)
 
     def _undecided(self, entry: Entry, now: Snapshot) -> bool:
@@ -86,9 +93,13 @@ class StopLines(AvCounts):
             pair = {c.collider, c.victim}
             if c.time >= entry.time and entry.vehicle in pair and pair & foes:
                 self._way += 1
+                self._tell(entry, now.time, f"touched {min(pair & foes)}, who had the right of way")
                 return False
         row = now.row.get(entry.vehicle)
         return row is not None and not self._ways.left(entry.link, now, row)
+
+    def _tell(self, entry: Entry, time: float, what: str) -> None:
+        self.offences.append(Offence(time, entry.vehicle, what))
 
     def _made_to_brake(self, foe: str, link: int, av: str, now: Snapshot) -> bool:
         rows = [frame.row.get(foe) for frame in (self._before, self._last, now)]

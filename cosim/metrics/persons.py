@@ -22,6 +22,7 @@ class PersonConflicts(AvCounts):
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         super().reset(first, context)
         self._interval = context.timing.frame  # s
+        self._contact = context.road.contact
         self._frames: deque[Snapshot] = deque(maxlen=int(np.ceil(ENCROACHED / self._interval)) + 2)
         self._pairs: set[tuple[str, str]] = set()
         self.add(first)
@@ -40,7 +41,9 @@ class PersonConflicts(AvCounts):
         away = np.hypot(s.x[avs, None] - s.x[persons], s.y[avs, None] - s.y[persons])
         sizes = s.length[avs, None] + s.length[persons]
         near = away < sizes + SPEEDS * (s.speed[avs, None] + s.speed[persons] + 1.0) * ENCROACHED
-        for i, j in np.argwhere(critical | near).tolist():
+        number, table = self._contact.numbers(s.place), self._contact.table
+        touch = table[number[avs, None], number[persons]]
+        for i, j in np.argwhere((critical | near) & touch).tolist():
             pair = s.ids[avs[i]], s.ids[persons[j]]
             if pair not in self._pairs and (critical[i, j] or self._encroached(pair) < ENCROACHED):
                 self._pairs.add(pair)

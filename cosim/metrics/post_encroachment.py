@@ -35,7 +35,7 @@ class PostEncroachment:
         self._watched = grown(self._watched, len(self._slots), False)
         self._trail = grown(self._trail, len(self._slots), np.nan, axis=1)
         self._newest = (self._newest + 1) % self._frames
-        number = self._contact.numbers(s.lane)
+        number = self._contact.numbers(s.place)
         record(self._trail, self._newest, slot, s.x, s.y, s.heading, s.speed, number)
         if slot is not self._known:  # a vehicle came or left
             self._sizes[slot, 0], self._sizes[slot, 1] = s.length, s.width

@@ -7,7 +7,7 @@ import numpy as np
 from cosim.geometry import gap_ahead
 from cosim.metrics.context import AV, MetricContext, slow
 from cosim.metrics.law import AvCounts
-from cosim.types import Metric, Snapshot
+from cosim.types import Metric, Offence, Snapshot
 
 STANDING = 0.1  # m/s, SUMO's own threshold of a halting vehicle
 BLOCKS = 5.0  # s inside a junction
@@ -28,32 +28,35 @@ class Standing(AvCounts):
             if link.signal >= 0:
                 self._signals[link.origin] = (*self._signals.get(link.origin, ()), link.signal)
         self._waiting: dict[str, float] = {}  # AV -> s, since when it stands without a reason
-        self._inside: dict[
-            str, tuple[str, float]
-        ] = {}  # AV -> the junction on which it stands, since when (s)
+        self._inside: dict[str, tuple[str, float]] = {}  # AV -> the junction in which it stands, since (s)
         self._stuck: set[str] = set()
+        self._wrecks: set[str] = set()
         self._blocked: set[tuple[str, str, float]] = set()
         self.add(first)
 
     def add(self, snapshot: Snapshot) -> None:
         super().add(snapshot)
         s = snapshot
+        self._wrecks.update(s.events.wrecked)
         any_stands = slow(s.kind, s.speed, AV, STANDING)
         standing = np.flatnonzero((s.kind == AV) & (s.speed < STANDING)).tolist() if any_stands else ()
         inside, waiting = self._inside, self._waiting
         self._inside, self._waiting = {}, {}
         reasons = self._reasons(s, standing) if standing else frozenset()
         for row in standing:
-            name = s.ids[row]
+            if (name := s.ids[row]) in self._wrecks:
+                continue
             self._waiting[name] = since = s.time if row in reasons else waiting.get(name, s.time)
-            if s.time - since > STUCK:
+            if s.time - since > STUCK and name not in self._stuck:
                 self._stuck.add(name)
+                self.offences.append(Offence(s.time, name, f"stood for {STUCK:.0f} s without a reason"))
             if junction := self._blocks(int(s.lane[row])):
                 before = inside.get(name)
                 here = before if before and before[0] == junction else (junction, s.time)
                 self._inside[name] = here
-                if s.time - here[1] > BLOCKS:
+                if s.time - here[1] > BLOCKS and (name, *here) not in self._blocked:
                     self._blocked.add((name, *here))
+                    self.offences.append(Offence(s.time, name, f"blocked junction {junction}"))
 
     def result(self) -> dict[str, Metric]:
         return {

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cosim.episode import Episode, Hook, Step
-from cosim.types import Collision, Decision, Entry, Forecast, Intervention, Ints, Policy, Snapshot
+from cosim.types import Collision, Decision, Forecast, Intervention, Ints, Offence, Policy, Snapshot
 
 DRAWN = 400_000  # vehicle frames of a drawing: about 2 MB of page
 
@@ -54,6 +54,7 @@ class Recorder(Hook):
         )
         for frame in step.frames:
             self.add(frame)
+        self.offences = episode.offences
         self._know(episode)
 
     def begin(self, frames: Sequence[Snapshot]) -> None:
@@ -65,14 +66,13 @@ class Recorder(Hook):
         self.choices: list[dict[str, Choice]] = []
         self.forecasts: list[Forecast | None] = []
         self.collisions: list[Collision] = [*frames[-1].events.collisions]
-        self.entries: list[Entry] = []
+        self.offences: list[Offence] = []
         self.interventions: list[Intervention] = []
         self._stride, self._driven, self._kept = 1, 0, sum(s.n for s in frames)
 
     def add(self, frame: Snapshot) -> None:
         """One more frame; every second one goes once there are too many, and the forecasts of its time."""
         self.collisions += frame.events.collisions
-        self.entries += frame.events.entries
         self.interventions += frame.events.interventions
         self._driven += 1
         if self._driven % self._stride:

@@ -9,7 +9,18 @@ import numpy as np
 from cosim.recording.recorder import Choice, Recorder
 from cosim.road import RoadMap
 from cosim.scenario.behaviors import AS_IS
-from cosim.types import Actor, Bytes, Collision, Entry, Floats, Forecast, Intervention, Ints, Kind, Simulator
+from cosim.types import (
+    Actor,
+    Bytes,
+    Collision,
+    Floats,
+    Forecast,
+    Intervention,
+    Ints,
+    Kind,
+    Offence,
+    Simulator,
+)
 
 
 @dataclass(frozen=True)
@@ -48,7 +59,7 @@ class ReplayData:
     collisions: tuple[Collision, ...]
     goal: frozenset[int] = frozenset()  # lanes on which the mission is fulfilled
     signals: Bytes = field(default_factory=lambda: np.zeros((0, 0), np.uint8))  # [T,s] as in `Snapshot`
-    entries: tuple[Entry, ...] = ()
+    offences: tuple[Offence, ...] = ()
     interventions: tuple[Intervention, ...] = ()
 
 
@@ -71,7 +82,7 @@ def replay_data(recorder: Recorder, simulator: Simulator, facts: Mapping[str, An
         collisions=tuple(recorder.collisions),
         goal=simulator.goal_lanes,
         signals=np.stack([s.signals for s in frames]),
-        entries=tuple(recorder.entries),
+        offences=tuple(recorder.offences),
         interventions=tuple(recorder.interventions),
     )
 

@@ -20,6 +20,7 @@ def text(road: RoadMap) -> str:
     document = {
         "format": FORMAT,
         "lanes": [vars(lane) | {"shape": lane.shape.tolist()} for lane in road.lanes],
+        "closed": [vars(lane) | {"shape": lane.shape.tolist()} for lane in road.closed],
         "zones": [{"name": zone.name, "lanes": sorted(zone.lanes)} for zone in road.zones],
         "junctions": [outline.tolist() for outline in road.junctions],
         "links": [asdict(link) for link in road.links],
@@ -42,7 +43,8 @@ def read_road(file: Path) -> RoadMap:
         crossings = (_read(Crossing, c) for c in found.get("crossings", ()))
         outlines = tuple(np.array(outline, float) for outline in found["junctions"])
         signals = tuple((light, index) for light, index in found.get("signals", ()))
-        return RoadMap(lanes, zones, outlines, tuple(links), signals, tuple(crossings))
+        closed = tuple(_read(Lane, lane) for lane in found.get("closed", ()))
+        return RoadMap(lanes, zones, outlines, tuple(links), signals, tuple(crossings), closed)
     except (ValueError, KeyError, TypeError) as error:
         raise BadInput(f"not a recorded road: {error}", file=file) from None
 

@@ -99,6 +99,7 @@ class RoadMap:
         tuple[str, int], ...
     ] = ()  # (traffic light, its link index) of every entry of `Snapshot.signals`
     crossings: tuple[Crossing, ...] = ()
+    closed: tuple[Lane, ...] = ()  # a lane of every edge that is closed to motor vehicles: where others are
     _paths: dict[tuple[int, tuple[str, ...] | None], LanePath] = field(default_factory=dict, repr=False)
     index: dict[str, int] = field(default_factory=dict, repr=False)
 
@@ -131,10 +132,10 @@ class RoadMap:
     @cached_property
     def contact(self) -> Contact:
         """Which lanes' vehicles can touch: roads on a bridge and below it do not."""
-        return Contact(self.lanes)
+        return Contact(self.lanes, self.closed)
 
     def connected(self, a: int, b: int) -> bool:
-        """Whether vehicles on lanes `a` and `b` can touch; -1 (off every lane) touches all."""
+        """Whether vehicles on lanes or places (`Snapshot.place`) `a` and `b` can touch; -1 touches all."""
         return bool(self.contact.touch(a, np.array([b]))[0])
 
     @cached_property
@@ -145,6 +146,17 @@ class RoadMap:
             for following in lane.successors:
                 found[following].append(k)
         return tuple(map(tuple, found))
+
+    @cached_property
+    def links_through(self) -> dict[int, tuple[int, ...]]:
+        """Lane inside a junction -> the links (indices) that lead over it."""
+        found: dict[int, tuple[int, ...]] = {}
+        for number, link in enumerate(self.links):
+            lane = link.via
+            while lane >= 0 and self.lanes[lane].internal:
+                found[lane] = (*found.get(lane, ()), number)
+                lane = next(iter(self.lanes[lane].successors), -1)
+        return found
 
     @cached_property
     def straight_on(self) -> LaneGraph:

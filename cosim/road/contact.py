@@ -9,33 +9,40 @@ from cosim.arrays import Bools, Ints
 from cosim.road.lane import Lane
 
 REACH = 100.0  # m of road between two edges, within which vehicles on them may meet
-OFF = -1  # the lane of a vehicle that is off every lane: it may be anywhere
 
 
 class Contact:
-    """Answers for lanes (indices into RoadMap.lanes), worked out per pair of edges when first asked.
+    """Answers for places: lanes (indices into RoadMap.lanes), and -2 - k on edge k of `edges`, on no lane.
 
     Vehicles can touch when one's edge is reached from the other's within `REACH` m of road (either way), and
-    when one of them is off every lane. `table` [S,S] holds the answers for the edges met so far; `numbers`
-    gives each lane's place in it.
+    when one of them is off every edge. Edges that are closed to motor vehicles (`closed`: a lane of each) can
+    be reached, but lead nowhere: nobody gets from a bridge to the road below it by a footpath. `table` [S,S]
+    holds the answers for the edges met so far; `numbers` gives each place's row in it.
     """
 
-    def __init__(self, lanes: tuple[Lane, ...]) -> None:
-        self._lanes = lanes
-        edges: dict[str, int] = {}
-        numbered = [edges.setdefault(lane.edge, len(edges)) for lane in lanes]
-        self._edge: Ints = np.array([*numbered, len(edges)], np.int64)  # [l+1], the last for OFF
-        self._number: Ints = np.full(len(edges) + 1, -1, np.int64)  # of every edge, -1 not met yet
-        self._members: list[int] = []  # a lane of every edge met
+    def __init__(self, lanes: tuple[Lane, ...], closed: tuple[Lane, ...] = ()) -> None:
+        first: dict[str, Lane] = {}
+        for lane in (*lanes, *closed):
+            first.setdefault(lane.edge, lane)
+        self.edges: dict[str, int] = {edge: k for k, edge in enumerate(first)}
+        self._lanes, self._closed = (*lanes, *closed), frozenset(lane.edge for lane in closed)
+        self._first = tuple(first.values())
+        count = len(first)
+        numbered = [self.edges[lane.edge] for lane in lanes]
+        # [l + count + 1] negative places count from the end: -1 is OFF, -2 the edge 0, -3 the edge 1
+        self._edge: Ints = np.array([*numbered, *reversed(range(count)), count], np.int64)
+        self._number: Ints = np.full(count + 1, -1, np.int64)  # of every edge, -1 not met yet
+        self._members: list[int] = []  # the edges met
         self.table: Bools = np.zeros((16, 16), np.bool_)
 
-    def numbers(self, lane: npt.NDArray[np.integer]) -> Ints:
-        """[n] lanes -> [n] rows of `table` (which may grow: read it afterwards)."""
-        found: Ints = self._number[self._edge[lane]]
+    def numbers(self, place: npt.NDArray[np.integer]) -> Ints:
+        """[n] places -> [n] rows of `table` (which may grow: read it afterwards)."""
+        edge = self._edge[place]
+        found: Ints = self._number[edge]
         if len(found) and found.min() < 0:
             for k in np.flatnonzero(found < 0):
-                self._meet(int(lane[k]))
-            found = self._number[self._edge[lane]]
+                self._meet(int(edge[k]))
+            found = self._number[edge]
         return found
 
     def touch(self, lane: int, others: npt.NDArray[np.integer]) -> Bools:
@@ -43,17 +50,17 @@ class Contact:
         rows = self.numbers(np.append(others, lane))
         return np.asarray(self.table[rows[-1], rows[:-1]])
 
-    def _meet(self, lane: int) -> None:
-        edge = self._edge[lane]
+    def _meet(self, edge: int) -> None:
         if self._number[edge] >= 0:
             return
-        near = None if lane == OFF else self._edges_near(self._lanes[lane])  # None: all
+        everywhere = len(self._first)  # the edge of OFF
+        near = None if edge == everywhere else self._edges_near(self._first[edge])  # None: all
         new = self._number[edge] = len(self._members)
-        self._members.append(lane)
+        self._members.append(edge)
         if new == len(self.table):
             self.table = np.pad(self.table, (0, new))
         for k, other in enumerate(self._members):
-            touch = near is None or other == OFF or self._lanes[other].edge in near
+            touch = near is None or other == everywhere or self._first[other].edge in near
             self.table[new, k] = self.table[k, new] = touch
 
     @cached_property
@@ -73,6 +80,8 @@ class Contact:
             junction = waiting.pop()
             for other in self._at.get(junction, ()):
                 found.add(other.edge)
+                if other.edge in self._closed:
+                    continue
                 far = other.end if other.start == junction else other.start
                 distance = seen[junction] + other.length
                 if distance < min(REACH, seen.get(far, np.inf)):

@@ -1,6 +1,7 @@
 """Lanes so close together that vehicles on them overlap though each follows its own: a fault of the net."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from itertools import combinations
 
 import numpy as np
 
@@ -13,9 +14,12 @@ SPACING = 2.0  # m between the points compared
 
 def heed_each_other(road: RoadMap, a: int, b: int) -> bool:
     """Whether drivers on lanes `a` and `b` (indices) have to heed one another: one lane, or one after the
-    other, or two that part, join or cross."""
+    other, or two that part, join or cross, or of which one has the right of way over the other."""
     near = [{lane, *road.lanes[lane].successors, *road.before[lane]} for lane in (a, b)]
-    return not near[0].isdisjoint(near[1]) or _cross(road.lanes[a].shape, road.lanes[b].shape)
+    if not near[0].isdisjoint(near[1]) or _cross(road.lanes[a].shape, road.lanes[b].shape):
+        return True
+    ways = [road.links_through.get(lane, ()) for lane in (a, b)]
+    return any(m in road.links[k].foes or k in road.links[m].foes for k in ways[0] for m in ways[1])
 
 
 def foot(road: RoadMap, lane: int, behind: float, rear: Floats) -> list[int]:
@@ -35,34 +39,39 @@ def foot(road: RoadMap, lane: int, behind: float, rear: Floats) -> list[int]:
 
 
 def too_close(road: RoadMap) -> list[tuple[float, int, int]]:
-    """Pairs of lanes (indices) on which vehicles of `BROAD` m side by side overlap though their drivers need
-    not heed each other, with the distance of their centre lines in m, the closest first."""
-    found: dict[tuple[int, int], float] = {}
-    points = {k: _points(lane.shape) for k, lane in enumerate(road.lanes)}
+    """Pairs of lanes (indices) of one edge on which vehicles of `BROAD` m side by side overlap though their
+    drivers need not heed each other, with the distance of their centre lines in m, the closest first."""
+    found = []
     for a, b in _neighbours(road):
-        if (a, b) in found or heed_each_other(road, a, b):
-            continue
-        p, q = points[a], points[b]
-        distance = float(np.hypot(*(p[:, None] - q[None]).transpose(2, 0, 1)).min())
-        if distance < BROAD:
-            found[a, b] = distance
-    return sorted((d, a, b) for (a, b), d in found.items())
+        if not heed_each_other(road, a, b):
+            p, q = _points(road.lanes[a].shape), _points(road.lanes[b].shape)
+            distance = float(np.hypot(*(p[:, None] - q[None]).transpose(2, 0, 1)).min())
+            if distance < BROAD:
+                found.append((distance, a, b))
+    return sorted(found)
+
+
+def described(road: RoadMap, pairs: Sequence[tuple[float, int, int]], most: int = 3) -> str:
+    """`too_close` in one line that names `most` pairs; "" where there is none."""
+    if not pairs:
+        return ""
+    named = [f"{road.lanes[a].id} and {road.lanes[b].id} ({d:.2f} m)" for d, a, b in pairs[:most]]
+    more = f" and {len(pairs) - most} more pairs" if len(pairs) > most else ""
+    return (
+        f"less than {BROAD:g} m apart, so that vehicles overlap without a collision: {', '.join(named)}{more}"
+    )
 
 
 # ---- inside ----
 
 
 def _neighbours(road: RoadMap) -> Iterator[tuple[int, int]]:
-    """Pairs of lanes beside one another on an edge, or of one junction."""
+    """Pairs of lanes of one edge, inside a junction or not."""
     edges: dict[str, list[int]] = {}
-    junctions: dict[str, set[int]] = {}
     for k, lane in enumerate(road.lanes):
         edges.setdefault(lane.edge, []).append(k)
-        if lane.internal:
-            junctions.setdefault(lane.start, set()).add(k)
-    for lanes in (*edges.values(), *junctions.values()):
-        each = sorted(lanes)
-        yield from ((a, b) for n, a in enumerate(each) for b in each[n + 1 :])
+    for each in edges.values():
+        yield from combinations(each, 2)
 
 
 def _points(shape: Floats) -> Floats:

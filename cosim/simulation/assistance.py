@@ -24,11 +24,12 @@ from cosim.simulation.fleet import set_type
 from cosim.types import Intervention, Preset
 
 AV_TYPE = "cosim.av.lawful"  # sumo_scenarios/types.add.xml: an IDM that brakes comfortably
-CORRECTED = 1.0  # m/s2 below the wish: from there on the car drives otherwise than commanded
+CORRECTED = 1.0  # m/s2 more braking than asked for: from there on the car drives otherwise than commanded
+STALLED = 0.2, 1.5  # m/s2, or so little acceleration where so much was asked for
 RESPITE = 2.0  # s without a correction: the next one is a new one
 HARD = 3.5  # m/s2: harder braking is an emergency's
 KEEPS_MOVING = 5.0  # m/s: no slower wish is followed inside a junction
-NOTICE = 100.0  # m: signals and stop lines further ahead are no reason yet
+NOTICE = 150.0  # m: signals and stop lines further ahead are no reason yet
 SERVES = 60.0, 100.0  # m that a lane must serve the route at least, and more for every lane to change back
 ASKS = 0.4  # s between looks for who needs a gap
 GAP = 2.0, 1.0  # m and s: the gap given to who changes lanes
@@ -72,7 +73,7 @@ class Assistance(Commander):
             slower = allowed < state.wish - 1e-3
             if not state.ours:
                 state.accel = (speed - state.speed) / self._step
-            target = state.target
+            target = min(state.target, state.limit)
             if get.getRoadID(name).startswith(":"):
                 target = max(target, KEEPS_MOVING)
             target = min(target, get.getAllowedSpeed(name))
@@ -92,7 +93,7 @@ class Assistance(Commander):
         self._begun = []
         for name, state in self.controlled.items():
             accel = (get.getSpeed(name) - state.speed) / self._step
-            if accel < state.raw - CORRECTED and accel < 0.5 * COMFORT:
+            if accel < min(state.raw, 0.0) - CORRECTED or (state.raw > STALLED[1] and accel < STALLED[0]):
                 if now - state.corrected > RESPITE:
                     begun.append(Intervention(now, name, _reason(name, accel)))
                 state.corrected = now
@@ -104,6 +105,10 @@ class Assistance(Commander):
             self._asked = now
             self._ask()
         return begun
+
+    def heads_for(self, name: str) -> float | None:
+        """SUMO's driver heads for the limit."""
+        return float(libsumo.vehicle.getAllowedSpeed(name))
 
     # ---- inside ----
 
@@ -179,7 +184,7 @@ def _reason(name: str, accel: float) -> str:
     get = libsumo.vehicle
     words = "emergency: " if accel < -HARD else ""
     speed = get.getSpeed(name)
-    reach = min(speed * speed / (2.0 * COMFORT) + 2.0 * speed + 10.0, NOTICE)  # m
+    reach = min(0.5 * speed * speed + 2.0 * speed + 10.0, NOTICE)  # m, from where an IDM begins to brake
     leader = get.getLeader(name, reach)
     gap = leader[1] if leader and leader[0] else math.inf
     for _, _, distance, state in get.getNextTLS(name)[:1]:

@@ -90,7 +90,7 @@ class CollisionDetector:
                 continue
             names = snapshot.ids[i], snapshot.ids[j]
             if frozenset(names) in self._seen or not road.connected(
-                int(snapshot.lane[i]), int(snapshot.lane[j])
+                int(snapshot.place[i]), int(snapshot.place[j])
             ):
                 continue
             if _only_a_tail(snapshot, road, i, j) or the_nets(snapshot, road, i, j):
@@ -120,7 +120,7 @@ class CollisionDetector:
         for k, name in enumerate(names):
             if s is not None and (row := s.row.get(name)) is not None:
                 for column, before in zip(columns, boxes(s, np.array([row])), strict=True):
-                    column[k] = before[0]
+                    column[k] = np.asarray(before)[0]
         return Boxes(*columns)
 
     def _collision(
@@ -217,7 +217,7 @@ def mover(before: Boxes, now: Boxes) -> int | None:
     heading = np.asarray(before.heading)
     angles = np.concatenate([heading, heading + 0.5 * np.pi])  # of the four normals
     normals = np.stack([np.cos(angles), np.sin(angles)], axis=1)  # [4,2]
-    apart = normals @ np.array([before.x[1] - before.x[0], before.y[1] - before.y[0]])  # [4] m
+    apart = normals @ np.diff([before.x, before.y])[:, 0]  # [4] m
     turned = angles[:, None] - heading
     half = 0.5 * (np.abs(np.cos(turned)) * before.length + np.abs(np.sin(turned)) * before.width)  # [4,2]
     gap = np.abs(apart) - half.sum(axis=1)

@@ -1,5 +1,6 @@
 """Commands become libsumo calls, each with a receipt that says whether it was carried out, and why not."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -24,6 +25,7 @@ class Controlled:
     """The state of one commanded AV."""
 
     target: float  # m/s
+    limit: float = math.inf  # m/s, of the law ahead
     change: int = 0  # the last lane change: +1 left, -1 right
     change_until: float = -1.0  # s, when it ends
     requested: float = -1.0  # m/s, the last speed handed to SUMO
@@ -55,7 +57,7 @@ class Commander:
         state = self.controlled.get(name)
         if state is None:
             state = self.controlled[name] = self._take_over(name)
-        state.target = command.target_speed
+        state.target, state.limit = command.target_speed, command.limit
         if command.lane_offset == 0:
             return Receipt(name, True)
         why = (
@@ -79,6 +81,10 @@ class Commander:
         state.change = offset
         state.change_until = now + LANE_CHANGE_TIME
         self.lane_changes[name] = now
+
+    def heads_for(self, name: str) -> float | None:
+        """The target speed in m/s of a vehicle that is not commanded yet; None: none is known."""
+        return None
 
     def _take_over(self, name: str) -> Controlled:
         libsumo.vehicle.setSpeedMode(name, SPEED_MODE[self._preset])

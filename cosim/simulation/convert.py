@@ -68,6 +68,7 @@ class SnapshotReader:
 
     def __init__(self, road: RoadMap) -> None:
         self._lane_index = road.index
+        self._edges = road.contact.edges
         self._lights = Counter(light for light, _ in road.signals)  # -> how many signals, in their order
         self._ids: tuple[str, ...] | None = None
         # kind, mission, length m, width m, actor [n] of `_ids`
@@ -103,6 +104,13 @@ class SnapshotReader:
             else [person(persons[i]) if i in persons else vehicle(i) for i in ids]
             for vehicle, person in zip(GETTERS, PERSON_GETTERS, strict=True)
         )
+        on = np.array([self._lane_index.get(i, -1) for i in lane], np.int32)
+        off = np.flatnonzero(on < 0)
+        place = on.copy() if len(off) else on
+        for k in off:
+            person = persons.get(ids[k])
+            edge = lane[k].rpartition("_")[0] if person is None else libsumo.person.getRoadID(person)
+            place[k] = -2 - self._edges.get(edge, -1)
         front = np.array(position, np.float64).reshape(-1, 2)  # [n,2] m
         x, y, heading = centres(front[:, 0], front[:, 1], np.array(angle), 0.5 * length)
         return Snapshot(
@@ -117,10 +125,11 @@ class SnapshotReader:
             accel=np.array(accel, np.float64),
             length=length,
             width=width,
-            lane=np.array([self._lane_index.get(i, -1) for i in lane], np.int32),
+            lane=on,
             lane_position=np.array(lane_position, np.float64),
             events=events,
             actor=actor,
+            place=place,
             signals=self._signals(),
             switches=self._switches(),
         )
@@ -190,7 +199,8 @@ def read_road(zones: Sequence[Zone], scenario_file: object) -> RoadMap:
         if not j.startswith(":") and len(shape := libsumo.junction.getShape(j)) > 2
     )
     links, signals = _links(lanes, place)
-    road = RoadMap(tuple(lanes), found, outlines, links, signals, _crossings(place, signals))
+    crossings = _crossings(place, signals)
+    road = RoadMap(tuple(lanes), found, outlines, links, signals, crossings, _closed(lanes))
     return road if found else replace(road, zones=(_struggling_zone(road),))
 
 
@@ -224,6 +234,22 @@ def _links(
             links.append(Link(place[lane.id], place.get(via, -1), place[target], signal, rule))
     found = [tuple(row_of[name] for name in names if name in row_of) for names in yields]
     return tuple(replace(k, foes=f) for k, f in zip(links, found, strict=True)), tuple(signals)
+
+
+def _closed(lanes: Sequence[Lane]) -> tuple[Lane, ...]:
+    """A lane of every edge that has none for motor vehicles: footpaths, cycleways, rails."""
+    get, known = libsumo.lane, {lane.edge for lane in lanes}
+    found = []
+    for edge in libsumo.edge.getIDList():
+        if edge in known:
+            continue
+        name = f"{edge}_0"
+        shape = np.array(get.getShape(name), np.float64)[:, :2]
+        size = get.getLength(name), get.getWidth(name), get.getMaxSpeed(name)
+        ends = libsumo.edge.getFromJunction(edge), libsumo.edge.getToJunction(edge)
+        internal = edge.startswith(":")
+        found.append(Lane(name, edge, 0, shape, *size, internal=internal, start=ends[0], end=ends[1]))
+    return tuple(found)
 
 
 def _requests() -> dict[str, tuple[tuple[str, ...], tuple[str, ...]]]:

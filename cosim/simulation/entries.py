@@ -11,7 +11,7 @@ from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property
-from itertools import chain
+from itertools import chain, pairwise
 from typing import NamedTuple
 
 import libsumo
@@ -197,25 +197,47 @@ class EntryWatcher:
 
     def _foes(self, entered: int, name: str) -> tuple[tuple[str, int], ...]:
         """Vehicles with the right of way over a link: on a link's internal lanes, or on the way to it."""
+        first = [foe for foe in self._road.links[entered].foes if not self._red(foe)]
+        if not first:
+            return ()
         found: dict[str, int] = {}
-        for foe in self._road.links[entered].foes:
-            link = self._road.links[foe]
-            if link.signal >= 0:
-                light, index = self._road.signals[link.signal]
-                if libsumo.trafficlight.getRedYellowGreenState(light)[index] in "ru":
-                    continue
-            inside, before = self._ways(foe)
-            for lane in inside:
+        edges = {self._road.lanes[self._road.links[foe].origin].edge for foe in first}
+        for foe in first:
+            for lane in self._inside(foe):
                 found.update((other, foe) for other in libsumo.lane.getLastStepVehicleIDs(lane))
-            via = inside[0] if inside else self._road.lanes[link.target].id
-            for lane, reach in before:
-                for other in libsumo.lane.getLastStepVehicleIDs(lane):
-                    if position_of(other) >= reach and any(
-                        via in (way[0], way[4]) for way in libsumo.vehicle.getNextLinks(other)
-                    ):
-                        found.setdefault(other, foe)
+        for lane, position in self._before(entered):
+            for other in libsumo.lane.getLastStepVehicleIDs(self._road.lanes[lane].id):
+                if other not in found and position_of(other) >= position:
+                    taken = self._taken(other, lane, edges)
+                    found.update((other, foe) for foe in first if foe in taken)
         found.pop(name, None)
         return tuple(found.items())
+
+    def _red(self, number: int) -> bool:
+        link = self._road.links[number]
+        if link.signal < 0:
+            return False
+        light, index = self._road.signals[link.signal]
+        return libsumo.trafficlight.getRedYellowGreenState(light)[index] in "ru"
+
+    def _taken(self, name: str, lane: int, edges: set[str]) -> Sequence[int]:
+        """The links that a vehicle on `lane` may take where its route next leaves one of `edges`.
+
+        They go on from the lanes that it can be on without a change; all of them, where there are none.
+        """
+        route = libsumo.vehicle.getRoute(name)
+        place = libsumo.vehicle.getRouteIndex(name)
+        at = {lane}
+        while self._road.lanes[lane].internal:  # the lane it comes out on
+            at = set(self._road.lanes[lane].successors)
+            lane = next(iter(at), lane)
+        for here, then in pairwise(route[place + (self._road.lanes[lane].edge != route[place]) :]):
+            options = self._between.get((here, then), ())
+            taken = [k for k in options if self._road.links[k].origin in at] or options
+            if here in edges:
+                return taken
+            at = {self._road.links[k].target for k in taken}
+        return ()
 
     # ---- tables of the road ----
 
@@ -266,10 +288,24 @@ class EntryWatcher:
         return cache(self._lines_between)
 
     @cached_property
-    def _ways(self) -> Callable[[int], tuple[tuple[str, ...], tuple[tuple[str, float], ...]]]:
-        """The internal lanes of a link; the lanes before it with the position (m) from which on one is
-        within `FOES_WITHIN` of its line (asked again, it is free)."""
-        return cache(self._way)
+    def _inside(self) -> Callable[[int], tuple[str, ...]]:
+        """A link's internal lanes."""
+        return cache(self._internal)
+
+    @cached_property
+    def _before(self) -> Callable[[int], tuple[tuple[int, float], ...]]:
+        """The lanes before the lines of a link's foes; on each the position (m) from which on one is within
+        `FOES_WITHIN` of the line."""
+        return cache(self._lanes_before)
+
+    @cached_property
+    def _between(self) -> dict[tuple[str, str], list[int]]:
+        """(edge, edge) -> the links from one to the other."""
+        found: dict[tuple[str, str], list[int]] = {}
+        for k, link in enumerate(self._road.links):
+            edges = self._road.lanes[link.origin].edge, self._road.lanes[link.target].edge
+            found.setdefault(edges, []).append(k)
+        return found
 
     def _lines_between(self, first: int, last: int) -> tuple[Passed, ...]:
         lanes, came = self._road.lanes, {first: first}
@@ -297,20 +333,29 @@ class EntryWatcher:
             lane = before
         return tuple(reversed(found))
 
-    def _way(self, number: int) -> tuple[tuple[str, ...], tuple[tuple[str, float], ...]]:
-        lanes, link = self._road.lanes, self._road.links[number]
-        inside, lane = [], link.via
-        while lane >= 0 and lanes[lane].internal and len(inside) < HOPS:
-            inside.append(lanes[lane].id)
+    def _internal(self, number: int) -> tuple[str, ...]:
+        found, lane, lanes = [], self._road.links[number].via, self._road.lanes
+        while lane >= 0 and lanes[lane].internal and len(found) < HOPS:
+            found.append(lanes[lane].id)
             lane = next(iter(lanes[lane].successors), -1)
-        left = {link.origin: FOES_WITHIN}  # lane -> m of it, from its end, that are within reach
-        waiting = [link.origin]
+        return tuple(found)
+
+    def _lanes_before(self, number: int) -> tuple[tuple[int, float], ...]:
+        lanes, links = self._road.lanes, self._road.links
+        left: dict[str, float] = {}  # edge -> m of it, from its end, that are within reach
+        waiting = [(lanes[links[foe].origin].edge, FOES_WITHIN) for foe in links[number].foes]
         while waiting:
-            lane = waiting.pop()
-            for origin in self._origins[lane]:
-                more = left[lane] - lanes[lane].length
-                if more > max(left.get(origin, 0.0), 0.0):
-                    left[origin] = more
-                    waiting.append(origin)
-        before = tuple((lanes[k].id, lanes[k].length - reach) for k, reach in left.items())
-        return tuple(inside), before
+            edge, reach = waiting.pop()
+            if reach <= left.get(edge, 0.0):
+                continue
+            left[edge] = reach
+            for lane in self._beside[edge]:
+                more = reach - lanes[lane].length
+                waiting += [(lanes[origin].edge, more) for origin in self._origins[lane]]
+        inside = lanes[links[number].via].start if links[number].via >= 0 else ""
+        return tuple(
+            (lane, lanes[lane].length - reach)
+            for edge, reach in left.items()
+            for lane in self._beside[edge]
+            if not (lanes[lane].internal and lanes[lane].start == inside)
+        )

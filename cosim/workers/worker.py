@@ -197,8 +197,8 @@ def _script_left_out(*needed: object) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _one_blas_thread() -> Iterator[None]:
-    """One thread for numpy's BLAS in a process started meanwhile, unless the user asked for more: for matrices
-    as small as ours a second one gains nothing, and where cores are shared both wait for one another."""
+    """One thread for numpy's BLAS in a process started meanwhile, unless the user says otherwise: a second
+    one gains nothing on matrices as small as ours, and where cores are shared they wait for one another."""
     with _STARTING:
         chosen = _BLAS_THREADS in os.environ
         os.environ.setdefault(_BLAS_THREADS, "1")

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from cosim.geometry import Boxes, first_contacts
 from cosim.geometry.compiled import compiled
@@ -53,9 +54,7 @@ def others_near(
         rows = rows[traffic.known[rows]]
         rows = rows[road.contact.touch(int(scene.lane[me]), scene.lane[rows])]
     if not c.crossing:
-        turn = scene.state[rows, -1, HEADING] - scene.state[me, -1, HEADING]
-        same = np.abs((turn + np.pi) % (2 * np.pi) - np.pi) < c.same_way
-        rows = rows[same | np.isin(scene.lane[rows], way)]
+        rows = _along(rows, me, scene.state[:, -1, HEADING], scene.lane, np.array(way, np.int64), c.same_way)
     boxes = Boxes(r.x, r.y, r.heading, traffic.length, traffic.width, r.speed)
     return Others(rows, _only(boxes, rows), intended[rows])
 
@@ -72,6 +71,20 @@ def _within(me: int, x: Floats, y: Floats, known: Bools, reach: float, number: I
             out[count] = v
             count += 1
     return out[:count]
+
+
+@compiled
+def _along(
+    rows: Ints, me: int, heading: Floats, lane: npt.NDArray[np.int32], way: Ints, same_way: float
+) -> Ints:
+    """Which of the rows [O] drive as `me` does, or on a lane of its way; heading [V] rad, lane [V]."""
+    chosen = np.zeros(len(rows), np.bool_)
+    for k, v in enumerate(rows):
+        turn = heading[v] - heading[me]
+        chosen[k] = abs((turn + np.pi) % (2 * np.pi) - np.pi) < same_way
+        for one in way:
+            chosen[k] |= lane[v] == one
+    return rows[chosen]
 
 
 def first_contact(ego: Rollout, length: float, width: float, others: Others, c: SafetyConfig) -> Floats:

@@ -12,6 +12,7 @@ from cosim.control import (
     next_target,
     speeds_ahead,
 )
+from cosim.geometry.compiled import compiled
 from cosim.road import LanePath, RoadMap
 from cosim.types import Bools, Floats, History, Ints, MetaAction
 from policy.prediction.motion import Paths, Rollout, pack, project, roll_one
@@ -150,15 +151,31 @@ def _roll(history: History, paths: Paths, now: Floats, speeds: Floats, c: Safety
 
 def straddling(ego: Rollout, c: SafetyConfig) -> Ints:
     """Under which actions the ego would come to a stop across two lanes."""
-    slow = ego.speed < 1.0
-    if not slow.any():
-        return np.zeros(0, np.int64)
-    return np.flatnonzero((slow & (np.abs(ego.rear) > c.straddle)).any(1))
+    return _straddling(ego.speed, ego.rear, c.straddle)
+
+
+@compiled
+def _straddling(speed: Floats, rear: Floats, beside: float) -> Ints:
+    found = np.zeros(speed.shape[0], np.bool_)
+    for a in range(speed.shape[0]):
+        for t in range(speed.shape[1]):
+            found[a] |= speed[a, t] < 1.0 and abs(rear[a, t]) > beside
+    return np.flatnonzero(found)
 
 
 def at_lane_end(ego: Rollout, course: Ways, c: SafetyConfig) -> dict[int, float]:
     """When (s) each action reaches the end of its lane, for those that do: an obstacle stands there."""
-    if not course.dead_end.any():
-        return {}
-    over = (ego.arc + 0.5 > course.length[:, None]) & course.dead_end[:, None]
-    return {int(a): c.dt * int(np.argmax(over[a])) for a in np.flatnonzero(over.any(1))}
+    frames = _frames_to(ego.arc, course.length, course.dead_end).tolist()
+    return {a: c.dt * t for a, t in enumerate(frames) if t >= 0}
+
+
+@compiled
+def _frames_to(arc: Floats, length: Floats, dead_end: Bools) -> Ints:
+    """[A] the first frame in which each front is at the end of its dead end, -1 for never; arc [A,T+1] m."""
+    out = np.full(arc.shape[0], -1)
+    for a in np.flatnonzero(dead_end):
+        for t in range(arc.shape[1]):
+            if arc[a, t] + 0.5 > length[a]:
+                out[a] = t
+                break
+    return out

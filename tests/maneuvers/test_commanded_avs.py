@@ -136,8 +136,9 @@ def test_unguarded_a_change_into_a_neighbour_crashes_guarded_it_is_refused(start
 
 
 def test_cutting_in_close_before_a_faster_car_is_the_av_s_fault(start: Start) -> None:
-    cars = [vehicle("a", "av", 112.0, lane=0, speed=10.0), vehicle("h", "hv", 102.0, lane=1, speed=25.0)]
+    cars = [vehicle("a", "av", 112.0, lane=0, speed=10.0), vehicle("h", "hv", 90.0, lane=1, speed=25.0)]
     worker = start(cars)
+    drive(worker, [Command("a", 10.0, 0, HOLD)], 2)
     _, frames = drive(worker, [Command("a", 10.0, 1, HOLD)], 6)
     crash = collisions(frames)[0]
     assert {crash.collider, crash.victim} == {"a", "h"}
@@ -145,8 +146,9 @@ def test_cutting_in_close_before_a_faster_car_is_the_av_s_fault(start: Start) ->
 
 
 def test_a_cut_in_stays_the_av_s_fault_when_it_is_handed_back_to_sumo(start: Start) -> None:
-    cars = [vehicle("a", "av", 112.0, lane=0, speed=10.0), vehicle("h", "hv", 102.0, lane=1, speed=25.0)]
+    cars = [vehicle("a", "av", 112.0, lane=0, speed=10.0), vehicle("h", "hv", 90.0, lane=1, speed=25.0)]
     worker = start(cars)
+    drive(worker, [Command("a", 10.0, 0, HOLD)], 2)
     _, first = drive(worker, [Command("a", 10.0, 1, HOLD)])
     _, frames = drive(worker, [], 5)
     crash = collisions(first + frames)[0]

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import base64
+import gzip
 import json
+import re
 import shutil
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -81,7 +85,7 @@ def test_a_file_that_has_changed_is_named(run: Path, capsys: pytest.CaptureFixtu
 def test_a_setting_that_has_changed_is_named(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     changed(run, preset="guarded")
     assert main(["replay", str(run)]) == 2
-    assert "preset: is 'unguarded' now, it was 'guarded' when it was driven" in capsys.readouterr().err
+    assert "preset: is 'lawful' now, it was 'guarded' when it was driven" in capsys.readouterr().err
 
 
 def test_other_versions_are_only_warned_of(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -194,3 +198,46 @@ def test_a_run_can_draw_its_replay_at_once(tmp_path: Path, capsys: pytest.Captur
     assert {p.name for p in out.iterdir()} >= {"replay.html", "replay.mp4", "result.json"}
     assert main(["run", "merge", "--replay"]) == 2
     assert "--replay: needs a run folder to write into: --out DIR" in capsys.readouterr().err
+
+
+def page_of(run: Path) -> dict[str, Any]:
+    """The document inside a run folder's page."""
+    match = re.search(r'<script id="data"[^>]*>(.*?)</script>', (run / "replay.html").read_text(), re.DOTALL)
+    assert match is not None
+    found: dict[str, Any] = json.loads(gzip.decompress(base64.b64decode(match[1])))
+    return found
+
+
+def test_the_page_tells_every_offence_that_the_figures_count(
+    tmp_path: Path, law_worlds: dict[str, Path]
+) -> None:
+    out = tmp_path / "run"
+    arguments = ["run", str(law_worlds["mixed_types"]), "--policy", "keep-lane", "--penetration", "0.5"]
+    arguments += ["--seed", "200001", "--duration", "40", "--replay", "--out", str(out)]
+    assert main(arguments) == 0
+    page, result = page_of(out), json.loads((out / "result.json").read_text())
+    said = Counter("light" in page["words"][word] for _, _, word in page["violations"])
+    counted = [result[f"{name}_violations"] for name in ("red_light", "stop_sign", "right_of_way")]
+    assert counted[0] > 0
+    assert said[True] == counted[0]
+    assert said[False] == counted[1] + counted[2] + result["junctions_blocked"] + result["avs_stuck"]
+    assert len(page["stop_lines"]) == 32
+    assert all(line[2] for line in page["stop_lines"])
+    assert {len(states) == len(frames) for states, frames in page["signals"]} == {True}
+    assert max(len(states) for states, _ in page["signals"]) > 1
+    assert len(page["shapes"]) > 1
+    assert (out / "replay.mp4").stat().st_size > 10_000
+
+
+def test_the_page_tells_persons_crossings_and_corrections(
+    tmp_path: Path, law_worlds: dict[str, Path]
+) -> None:
+    out = tmp_path / "run"
+    arguments = ["run", str(law_worlds["crossing_signals"]), "--policy", "random", "--penetration", "0.5"]
+    arguments += ["--preset", "lawful", "--seed", "200001", "--duration", "40", "--replay", "--out", str(out)]
+    assert main(arguments) == 0
+    page, result = page_of(out), json.loads((out / "result.json").read_text())
+    assert len(page["interventions"]) == result["interventions"] > 0
+    assert len(page["crossings"]) == 4
+    assert all(signal >= 0 for _, _, signal in page["crossings"])
+    assert any(kind == 2 for _, kind, *_ in page["vehicles"])

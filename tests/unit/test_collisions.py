@@ -10,7 +10,7 @@ import pytest
 from policy_scenes import straight_road
 
 from cosim.geometry import Boxes
-from cosim.road import RoadMap
+from cosim.road import Link, RoadMap, Rule
 from cosim.road.lane import Lane
 from cosim.road.too_close import heed_each_other, too_close
 from cosim.simulation.collisions import CUT_IN_WINDOW, CollisionDetector, mover
@@ -262,4 +262,10 @@ def test_lanes_too_close_together_are_found_and_lanes_that_meet_are_not() -> Non
         )
     )
     assert heed_each_other(fork, 1, 2)
+    alone = tuple(replace(k, successors=()) for k in two_lanes(1.9, 1.9).lanes[:2])
+    links = (Link(0, 0, 0, -1, Rule.PRIORITY), Link(1, 1, 1, -1, Rule.YIELD, (0,)))
+    beside = RoadMap(alone, links=links)
+    assert not heed_each_other(beside, 0, 1), "a junction's links say nothing of lanes outside"
+    inside = RoadMap(tuple(replace(k, internal=True) for k in alone), links=links)
+    assert heed_each_other(inside, 0, 1), "one has the right of way over the other"
     assert too_close(fork) == []

@@ -151,13 +151,30 @@ def test_a_lane_change_that_takes_no_time_makes_no_conflict_at_that_moment(fcd: 
     found = analyse(fcd("".join(map(frame, range(6)))), critical=1.5)
     assert value(found, "min_ttc_s") is None
     assert value(found, "max_drac_mps2") == 0.0
-    assert found.encounters == ()
+    assert [(row["ego"], row["foe"], row["lane_jump"]) for row in found.encounters] == [("a", "b", True)]
     assert any(note.startswith("1 lane changes that took no time") for note in found.notes)
+    usual = following(11).replace("slow", "b").replace("fast", "a")
+    assert [row["lane_jump"] for row in analyse(fcd(usual), critical=10.0).encounters] == [False]
     slowly = "".join(
         step(0.2 * k, car("a", 100.0 + 4.0 * k, 20.0), car("b", 140.0, 10.0, y=4.8 - 0.32 * k))
         for k in range(9)
     )
     assert not any("took no time" in note for note in analyse(fcd(slowly)).notes)
+
+
+@pytest.mark.parametrize("interval", [0.2, 1.0])
+def test_what_follows_a_jump_in_two_seconds_is_no_headline(fcd: Any, interval: float) -> None:
+    """A car at 10 m/s is put 20 m in front of one at 20 m/s: 1.3 s and less to the collision."""
+
+    def frame(t: float) -> str:
+        jumper = car("b", 128.0 + 10.0 * t, 10.0, y=1.6 if t > 0.5 else 4.8)
+        jumper = jumper if t > 0.5 else jumper.replace("road_0", "road_1")
+        return step(t, car("a", 100.0 + 20.0 * t, 20.0), jumper)
+
+    found = analyse(fcd("".join(frame(interval * k) for k in range(round(2.0 / interval) + 1))), critical=1.5)
+    assert value(found, "min_ttc_s") is None
+    assert [row["lane_jump"] for row in found.encounters] == [True]
+    assert any(note.startswith("1 lane changes that took no time") for note in found.notes)
 
 
 def test_heading_north_is_no_other_thing_than_heading_east(fcd: Any) -> None:

@@ -21,9 +21,23 @@ from cosim.episode import Episode, run_episode
 from cosim.recording.recorder import Recorder
 from cosim.recording.replay_data import ReplayData, replay_data
 from cosim.report.replay.page import document, page
+from cosim.report.replay.signs import LAMPS, states_at, stop_lines, zebra
 from cosim.report.replay.strip import Strip, poses_at
-from cosim.report.replay.video import CAPTION, HEIGHT, LOW, SMALL, WIDTH, animation, film
-from cosim.types import Decision, Forecast, History, MetaAction, ObservationConfig, PolicyContext
+from cosim.report.replay.video import CAPTION, HEIGHT, LOW, SMALL, WIDTH, animation, film, picture_at
+from cosim.report.replay.video import _Camera as Camera
+from cosim.road import Crossing, Lane, Link, RoadMap, Rule
+from cosim.types import (
+    Actor,
+    Decision,
+    Forecast,
+    History,
+    Intervention,
+    Kind,
+    MetaAction,
+    ObservationConfig,
+    Offence,
+    PolicyContext,
+)
 from policy.agents.keep_lane import KeepLane
 from tests.contracts.fake_worlds import platoon, scenario, wall
 
@@ -293,3 +307,148 @@ def test_an_empty_world_can_be_drawn() -> None:
     data = document(replay_data(recorder, world, {}))
     assert data["tracks"] == []
     assert math.isclose(data["begin"], 0.0)
+
+
+def lane(name: str, *points: tuple[float, float]) -> Lane:
+    shape = np.array(points, float)
+    return Lane(name, name, 0, shape, float(np.hypot(*(shape[-1] - shape[0]))), 3.2, 13.9)
+
+
+# from the west end at (100, 1.6): to the north, straight on, to the south
+CROSSROADS = (
+    lane("west", (0, 1.6), (100, 1.6)),
+    lane("north", (108, 10), (108, 100)),
+    lane("east", (116, 1.6), (200, 1.6)),
+    lane("south", (104, -10), (104, -100)),
+)
+RIGHT, STRAIGHT, LEFT = (Link(0, -1, target, 2 - k, Rule.YIELD) for k, target in enumerate((3, 2, 1)))
+
+
+def at_signals(replay: ReplayData) -> ReplayData:
+    """The platoon's episode on a road with three signals and a crossing; the first frame is red."""
+    states = np.array([list(b"rrr")] + [list(b"GrG")] * (len(replay.times) - 1), np.uint8)
+    crossing = Crossing("c", np.array([(104.0, -4.0), (104.0, 4.0)]), 4.0, (0,), 1)
+    road = RoadMap(CROSSROADS, links=(RIGHT, STRAIGHT, LEFT), crossings=(crossing,))
+    offences = (Offence(1.0, "a", "ran a red light"), Offence(2.0, "nobody", "ran a red light"))
+    corrections = (Intervention(1.2, "a", "red light"), Intervention(1.4, "nobody", "red light"))
+    return replace(replay, road=road, signals=states, offences=offences, interventions=corrections)
+
+
+def test_lamps_stand_at_the_stop_line_from_the_left_turn_to_the_right_one() -> None:
+    road = RoadMap(CROSSROADS, links=(RIGHT, STRAIGHT, LEFT))
+    (line,) = stop_lines(road)
+    assert (line.lane, line.signals) == (0, (0, 1, 2))
+
+
+@pytest.mark.parametrize(
+    ("rules", "drawn"),
+    [
+        ((Rule.YIELD, Rule.YIELD), Rule.YIELD),
+        ((Rule.YIELD, Rule.PRIORITY), None),  # one way need not give way: no line across the lane
+        ((Rule.STOP, Rule.YIELD), Rule.STOP),
+        ((Rule.ALL_WAY_STOP, Rule.ALL_WAY_STOP), Rule.ALL_WAY_STOP),
+        ((Rule.EQUAL, Rule.ZIPPER), None),
+    ],
+)
+def test_a_line_is_drawn_where_the_lane_has_a_sign(rules: tuple[Rule, ...], drawn: Rule | None) -> None:
+    links = tuple(Link(0, -1, k + 1, -1, rule) for k, rule in enumerate(rules))
+    assert [line.rule for line in stop_lines(RoadMap(CROSSROADS, links=links))] == [drawn] * (
+        drawn is not None
+    )
+
+
+def test_the_page_stores_the_changes_of_signals_not_their_frames(replay: ReplayData) -> None:
+    data = document(at_signals(replay))
+    assert data["signals"] == [["rG", [0, 1]], ["r", [0]], ["rG", [0, 1]]]
+    assert data["stop_lines"] == [[0, int(Rule.YIELD), [0, 1, 2]]]
+    assert [(width, signal) for width, _, signal in data["crossings"]] == [(400, 1)]
+
+
+def test_a_page_without_signals_has_none(replay: ReplayData) -> None:
+    data = document(replay)
+    assert (data["signals"], data["stop_lines"], data["crossings"]) == ([], [], [])
+
+
+def test_a_lamp_shows_the_state_of_its_time(replay: ReplayData) -> None:
+    found = at_signals(replay)
+    assert states_at(found, 0.1) == "rrr"
+    assert states_at(found, 0.2) == "GrG"
+    assert states_at(replay, 0.0) == ""
+    for time, state in ((0.0, "r"), (1.0, "G")):
+        strip = Strip(100.0, 1.6, 1280, 260)
+        strip.road(found)
+        strip.signs(found, stop_lines(found.road), time)
+        left_turn = np.asarray(strip.finished())[130 - 6, 640 + 4]  # 1.1 m left of the middle, past the line
+        assert left_turn == pytest.approx(np.array(LAMPS[state]), abs=3)
+
+
+def test_a_zebra_crossing_is_stripes_across_the_way_on_foot() -> None:
+    stripes = zebra(Crossing("c", np.array([(0.0, 0.0), (0.0, 8.0)]), 4.0, ()))
+    assert len(stripes) == 8
+    for stripe in stripes:
+        assert np.ptp(stripe[:, 0]) == pytest.approx(4.0)
+        assert np.ptp(stripe[:, 1]) == pytest.approx(0.5)
+
+
+def test_what_avs_did_against_the_law_are_events(replay: ReplayData) -> None:
+    data = document(at_signals(replay))
+    names, words = [v[0] for v in data["vehicles"]], data["words"]
+    assert [(t, names[v], words[w]) for t, v, w in data["violations"]] == [
+        (1000, "a", "ran a red light"),
+    ]
+
+
+def test_corrections_are_events_with_their_reason(replay: ReplayData) -> None:
+    data = document(at_signals(replay))
+    names, words = [v[0] for v in data["vehicles"]], data["words"]
+    assert [(t, names[v], words[w]) for t, v, w in data["interventions"]] == [(1200, "a", "red light")]
+
+
+def test_the_film_marks_a_correction_while_it_is_new(replay: ReplayData) -> None:
+    found = at_signals(replay)
+    silent = replace(found, interventions=())
+    camera = Camera(found, "a")
+    marked = [np.asarray(picture_at(found, t, camera)) for t in (1.0, 1.4, 3.9)]
+    plain = [np.asarray(picture_at(silent, t, camera)) for t in (1.0, 1.4, 3.9)]
+    road = slice(0, HEIGHT - 140)
+    assert [bool((a[road] != b[road]).any()) for a, b in zip(marked, plain, strict=True)] == [
+        False,
+        True,
+        False,
+    ]
+
+
+def test_long_reasons_stay_within_the_picture(replay: ReplayData) -> None:
+    long = replace(at_signals(replay), interventions=(Intervention(1.2, "a", "because of this " * 40),))
+    picture = np.asarray(picture_at(long, 1.4, Camera(long, "a")))
+    assert (picture[HEIGHT - 130 :, WIDTH - 13 :] == 255).all()
+
+
+def test_actors_are_told_apart_by_their_shape(replay: ReplayData) -> None:
+    (track,) = [t for t in replay.tracks if t.id == "human"]
+    drawn = set()
+    for actor in Actor:
+        strip = Strip(track.x[0], track.y[0], 640, 200)
+        strip.vehicle(poses_at(replace(replay, tracks=(replace(track, actor=actor),)), 0.0)[0])
+        drawn.add(np.asarray(strip.finished()).tobytes())
+    assert len(drawn) == len(Actor)
+
+
+def test_a_person_has_neither_driver_nor_brake_lights() -> None:
+    world, recorder = platoon(), Recorder()
+    (first,) = world.reset(0)
+    kind = np.where(first.row["human"] == np.arange(first.n), Kind.PERSON, first.kind).astype(np.int8)
+    recorder.begin([replace(first, kind=kind, actor=np.zeros(0, np.int8))])
+    found = replay_data(recorder, world, {})
+    (person,) = [t for t in found.tracks if t.id == "human"]
+    assert (person.kind, person.actor, person.driver) == (Kind.PERSON, Actor.PERSON, "")
+    data = document(found)
+    assert data["vehicles"][[v[0] for v in data["vehicles"]].index("human")][1:4] == [int(Kind.PERSON), 0, ""]
+    assert {int(a) for a in data["shapes"]} == {Actor.CAR, Actor.PERSON}
+    pose = next(p for p in poses_at(found, 0.0) if p.track is person)
+    pictures = []
+    for accel in (0.0, -2.0):
+        strip = Strip(pose.x, pose.y, 640, 200)
+        strip.vehicle(pose._replace(accel=accel))
+        pictures.append(np.asarray(strip.finished()))
+    assert (pictures[0] == pictures[1]).all()

@@ -85,6 +85,28 @@ def test_roads_at_different_heights_do_not_touch() -> None:
     assert list(road.contact.touch(0, np.array([0, 1, 2, -1]))) == [True, False, True, True]
 
 
+def test_a_person_below_a_bridge_touches_nobody_on_it() -> None:
+    level = np.array([[-500.0, 0.0], [500.0, 0.0]])
+
+    def lane(edge: str, start: str, end: str) -> Lane:
+        return Lane(f"{edge}_0", edge, 0, level, 1000.0, 3.2, 25.0, start=start, end=end)
+
+    # a footpath along the road below, stairs from there to the bridge, and a path in the woods
+    below, above = lane("low", "w", "e"), lane("high", "s", "n")
+    paths = lane("path", "w", "e"), lane("stairs", "e", "n"), lane("woods", "x", "y")
+    road = RoadMap((below, above), closed=paths)
+    path, stairs, woods, sidewalk = (-2 - road.contact.edges[e] for e in ("path", "stairs", "woods", "low"))
+    assert not road.connected(1, path)
+    assert not road.connected(1, sidewalk)
+    assert not road.connected(0, 1), "nobody drives up the stairs"
+    assert road.connected(0, path)
+    assert road.connected(0, sidewalk)
+    assert road.connected(0, stairs)
+    assert road.connected(1, stairs)
+    assert not road.connected(0, woods)
+    assert road.connected(woods, -1)
+
+
 def test_other_drivers_are_taken_to_go_straight_on() -> None:
     east = np.array([[0.0, 0.0], [50.0, 0.0]])
     lanes = (

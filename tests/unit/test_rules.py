@@ -184,6 +184,13 @@ def test_persons_out_of_sight_are_not_known() -> None:
     assert look(street(), seen, near).rules.person_distance == np.inf
 
 
+def test_a_snapshot_without_its_persons_has_the_same_signals() -> None:
+    seen = snapshot("rGr", ((106.0, 0.0, 0.0, 1.0),), (7.5, 3.0, 7.5))
+    assert seen.vehicles.ids == ("av",)
+    assert np.array_equal(seen.vehicles.signals, seen.signals)
+    assert np.array_equal(seen.vehicles.switches, seen.switches)
+
+
 def test_a_lane_that_leads_elsewhere_says_nothing_of_lines_beyond_its_end() -> None:
     observer = Observer(street(), MAPLESS)
     observer.add(snapshot("rrr"))

@@ -120,7 +120,7 @@ def everything(block: Block) -> Table:
 
 def head(measure: Measure) -> str:
     """The short name of a measure with the direction that is better."""
-    arrow = {"higher": " ↑", "lower": " ↓"}.get(measure.better, "")
+    arrow = {"higher": "\N{NO-BREAK SPACE}↑", "lower": "\N{NO-BREAK SPACE}↓"}.get(measure.better, "")
     return TITLES.get(measure.name, measure.name) + arrow
 
 

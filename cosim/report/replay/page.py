@@ -20,7 +20,7 @@ import numpy.typing as npt
 from cosim.recording.recorder import Choice
 from cosim.recording.replay_data import ReplayData, Track
 from cosim.report.replay.shapes import LEAST, NAMES, SHAPES
-from cosim.report.replay.signs import LAMPS, stop_lines, violations
+from cosim.report.replay.signs import LAMPS, stop_lines
 from cosim.types import Bytes, Floats, Forecast
 
 MARGIN = 500.0  # m around the traffic: roads further away are left out
@@ -78,9 +78,9 @@ def document(replay: ReplayData) -> dict[str, Any]:
         "shapes": _shapes(r),
         **_signs(r, place, window),
         "violations": [
-            [_ms(time), number[who], words.setdefault(what, len(words))]
-            for time, who, what in violations(r)
-            if who in number
+            [_ms(one.time), number[one.vehicle], words.setdefault(one.what, len(words))]
+            for one in r.offences
+            if one.vehicle in number
         ],
         "interventions": [
             [_ms(one.time), number[one.vehicle], words.setdefault(one.reason, len(words))]

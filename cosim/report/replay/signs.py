@@ -1,4 +1,4 @@
-"""What stands where a lane enters a junction: stop line, sign, signals; and which entries broke the law."""
+"""What stands where a lane enters a junction: stop line, sign, signals, and pedestrian crossings."""
 
 import math
 from itertools import pairwise
@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosim.metrics.law import ran_red, ran_stop
 from cosim.recording.replay_data import ReplayData
 from cosim.road import Crossing, Link, RoadMap, Rule
 from cosim.types import Floats
@@ -67,20 +66,6 @@ def zebra(crossing: Crossing) -> list[Floats]:
         for begin in np.arange(0.5 * STRIPE, length, 2.0 * STRIPE):
             p, q = a + begin * along, a + min(begin + STRIPE, length) * along
             found.append(np.array([p - across, q - across, q + across, p + across]))
-    return found
-
-
-def violations(r: ReplayData) -> list[tuple[float, str, str]]:
-    """(time s, AV, what it did) of every entry on red or yellow or past a stop sign that the figures count."""
-    found = []
-    for entry in r.entries:
-        if ran_red(entry):
-            what = f"ran a {'yellow' if entry.state in 'yY' else 'red'} light"
-        elif ran_stop(entry, r.road.links[entry.link]):
-            what = f"passed a stop sign at {entry.least_speed:.1f} m/s"
-        else:
-            continue
-        found.append((entry.time, entry.vehicle, what))
     return found
 
 

@@ -159,7 +159,6 @@ class Strip:
             for size, colour in ((1.0, MARK), (0.8, SIGN)):
                 octagon = np.stack([np.cos(turns), np.sin(turns)], 1) * size + (1.2, 0.0)
                 paint([(x, y) for x, y in octagon.tolist()], colour)
-            paint(((1.0, -0.5), (1.4, -0.5), (1.4, 0.5), (1.0, 0.5)), MARK)
         lamps = [states[s] for s in line.signals if s < len(states)]
         wide = 2.0 * side / max(len(lamps), 1)
         for k, state in enumerate(lamps):

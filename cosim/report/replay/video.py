@@ -17,7 +17,7 @@ from cosim.files import whole
 from cosim.recording.recorder import Choice
 from cosim.recording.replay_data import ReplayData, Track
 from cosim.report.replay.shapes import NAMES
-from cosim.report.replay.signs import stop_lines, violations
+from cosim.report.replay.signs import stop_lines
 from cosim.report.replay.strip import (
     AV,
     BAD,
@@ -117,7 +117,7 @@ class _Camera:
         def rank(t: Track) -> tuple[bool, bool, bool]:
             return t.id != follow, not t.mission, t.kind != Kind.AV
 
-        self.lines, self.violations = stop_lines(replay.road), violations(replay)
+        self.lines = stop_lines(replay.road)
         self.follow = min(replay.tracks, key=rank, default=None)
         self.x = self.y = 0.0  # m, the middle of the picture
         if self.follow is not None:
@@ -155,12 +155,12 @@ def picture_at(r: ReplayData, time: float, camera: _Camera, *, small: bool = Fal
         if pose.track.mission or pose is shown:
             strip.name(pose)
     seen = {p.track.id for p in near}
-    for at, who, what in camera.violations:
-        if who in seen and 0.0 <= time - at + 0.05 < SHOWN_EVENT:
-            strip.broken(by_name[who], what)
-    for one in r.interventions:
-        if one.vehicle in seen and 0.0 <= time - one.time + 0.05 < SHOWN_EVENT and not small:
-            strip.corrected(by_name[one.vehicle])
+    for one in r.offences:
+        if one.vehicle in seen and 0.0 <= time - one.time + 0.05 < SHOWN_EVENT:
+            strip.broken(by_name[one.vehicle], one.what)
+    for correction in () if small else r.interventions:
+        if correction.vehicle in seen and 0.0 <= time - correction.time + 0.05 < SHOWN_EVENT:
+            strip.corrected(by_name[correction.vehicle])
     for crash in r.collisions:
         if math.isfinite(crash.x) and 0.0 <= time - crash.time + 0.05 < SHOWN_CRASH:
             strip.crash(crash.x, crash.y)
@@ -229,7 +229,7 @@ class _Board:
         self._line(14, line + 50, f"{time - r.begin:.1f} s of {r.times[-1] - r.begin:.0f} s", TEXT, 14)
         outcome, colour = _outcome(r, time)
         self._wrapped(14, line + 72, outcome, colour, SPLIT - 24)
-        broken = [v for v in camera.violations if v[0] <= time + 0.05]
+        broken = [one for one in r.offences if one.time <= time + 0.05]
         corrections = [one for one in r.interventions if one.time <= time + 0.05]
         if t := camera.follow:
             what = _kind(t) + ", mission vehicle" * t.mission

@@ -119,7 +119,6 @@ function drawStopLine(ctx, rule, lamps, side, c, fine) {
       for (let k = 0; k < 8; k++) ctx.lineTo(size * Math.cos((k + 0.5) * Math.PI / 4) + 1.2, size * Math.sin((k + 0.5) * Math.PI / 4));
       ctx.fill();
     }
-    ctx.fillStyle = c.mark; ctx.fillRect(1, -0.5, 0.4, 1);
   }
   const wide = (2 * side) / lamps.length;
   lamps.forEach((colour, k) => {

@@ -120,7 +120,7 @@ def driven(todo: Sequence[Case], workers: int, runs: Path | None, keep: Path | N
             if runs is not None:
                 runs.parent.mkdir(parents=True, exist_ok=True)
                 with runs.open("a") as file:
-                    file.write(json.dumps(row) + "\n")
+                    file.write(json.dumps(row, default=float) + "\n")
     return [held[names[case.key]] for case in todo]
 
 

@@ -215,7 +215,8 @@ def _links(
         for index, ways in enumerate(lights.getControlledLinks(light)):
             signal_of.update(((way[0], way[1]), len(signals)) for way in ways)
             signals.append((light, index))
-    requests, links = _requests(), []
+    requests = _requests()
+    links: list[Link] = []
     row_of: dict[str, int] = {}  # the last lane of a link inside its junction -> the link
     yields: list[tuple[str, ...]] = []  # per link: such lanes of the links that go first
     for lane in lanes:

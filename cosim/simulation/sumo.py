@@ -150,7 +150,7 @@ class SumoSimulator:
         return edges[index:] if index else edges
 
     def commanded(self, vehicle: str) -> tuple[float | None, int]:
-        """Target speed in m/s (None while SUMO drives; in `lawful` what it heads for) and lane change under way."""
+        """Target speed in m/s (None where none is known) and the lane change under way."""
         state = self._commander.controlled.get(vehicle)
         if state is None:
             return self._commander.heads_for(vehicle), 0

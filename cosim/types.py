@@ -178,8 +178,8 @@ NO_EVENTS = Events()
 class Snapshot:
     """Everybody on the road at one moment, sorted by id: vehicles and persons (`person:ID`).
 
-        Shapes: all arrays [n], `signals` and `switches` [s]. Units: m, s, rad (counter-clockwise from east), m/s,
-    m/s2.
+        Shapes: all arrays [n], `signals` and `switches` [s]. Units: m, s, rad (counter-clockwise from
+    east), m/s, m/s2.
     """
 
     time: float  # s

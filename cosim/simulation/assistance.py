@@ -28,12 +28,14 @@ CORRECTED = 1.0  # m/s2 more braking than asked for: from there on the car drive
 STALLED = 0.2, 1.5  # m/s2, or so little acceleration where so much was asked for
 RESPITE = 2.0  # s without a correction: the next one is a new one
 HARD = 3.5  # m/s2: harder braking is an emergency's
-KEEPS_MOVING = 5.0  # m/s: no slower wish is followed inside a junction
+KEEPS_MOVING = 3.0  # m/s: no slower wish is followed inside a junction, nor for longer than `PATIENCE`
 NOTICE = 150.0  # m: signals and stop lines further ahead are no reason yet
 SERVES = 60.0, 100.0  # m that a lane must serve the route at least, and more for every lane to change back
 ASKS = 0.4  # s between looks for who needs a gap
 GAP = 2.0, 1.0  # m and s: the gap given to who changes lanes
-YIELDING = 2.0  # m/s2: braking for somebody else's lane change
+YIELDING = 2.0, 30.0  # m/s2 and m: how hard an AV brakes for who asked, and how far from the junction
+STANDS = 0.1  # m/s
+PATIENCE = 10.0  # s
 
 STRATEGIC, BLOCKED = 8, 512 + 1024 + 2048 + 4096 + 8192  # bits of SUMO's lane-change state
 RED, YELLOW = frozenset("ru"), frozenset("yY")
@@ -51,6 +53,8 @@ class Assisted(Controlled):
     lateral: float = 0.0  # m, on its lane
     corrected: float = -math.inf  # s, when the car last drove otherwise
     gap_for: str = ""  # who asked for a gap
+    idled: float = 0.0  # s, for which the agent has asked for less than `KEEPS_MOVING`
+    waits_since: float = math.inf  # s, when it came to stand
 
 
 class Assistance(Commander):
@@ -74,8 +78,9 @@ class Assistance(Commander):
             if not state.ours:
                 state.accel = (speed - state.speed) / self._step
             target = min(state.target, state.limit)
-            if get.getRoadID(name).startswith(":"):
-                target = max(target, KEEPS_MOVING)
+            state.idled = state.idled + self._step if state.target < KEEPS_MOVING else 0.0
+            if state.idled > PATIENCE or get.getRoadID(name).startswith(":"):
+                target = max(target, min(KEEPS_MOVING, state.limit))
             target = min(target, get.getAllowedSpeed(name))
             state.raw, state.accel = wished_accel(speed, target, state.accel, self._step)
             if state.gap_for:
@@ -97,13 +102,17 @@ class Assistance(Commander):
                 if now - state.corrected > RESPITE:
                     begun.append(Intervention(now, name, _reason(name, accel)))
                 state.corrected = now
+            if get.getSpeed(name) > STANDS:
+                state.waits_since = math.inf
+            elif state.waits_since == math.inf:
+                state.waits_since = now
             lateral = get.getLateralLanePosition(name)
             drift, state.lateral = lateral - state.lateral, lateral
             if 0.05 < abs(drift) < 1.0 and not state.changing(now):  # SUMO changes lanes for the route
                 self._changes(name, state, 1 if drift > 0.0 else -1, now)
         if now - self._asked > ASKS - 1e-6:
             self._asked = now
-            self._ask()
+            self._ask(now)
         return begun
 
     def heads_for(self, name: str) -> float | None:
@@ -133,35 +142,50 @@ class Assistance(Commander):
                 self._begun.append(Intervention(libsumo.simulation.getTime(), name, why))
         return why
 
-    def _ask(self) -> None:
-        """Every AV that must change lanes and cannot asks the AV behind the gap to give way (V2V)."""
+    def _ask(self, now: float) -> None:
+        """Who must change lanes and cannot, or waits long at a line, asks an AV to make room (V2V)."""
         get = libsumo.vehicle
         for state in self.controlled.values():
             state.gap_for = ""
-        for name in self.controlled:
+        for name, state in self.controlled.items():
             for side in (1, -1):
                 wanted = get.getLaneChangeState(name, side)[0]
-                if not (wanted & STRATEGIC and wanted & BLOCKED):
-                    continue
-                for other, _ in get.getNeighbors(name, 0 if side > 0 else 1):  # followers on that side
-                    asked = self.controlled.get(other)
-                    if asked is not None and not self.controlled[name].gap_for:
-                        asked.gap_for = name
+                if wanted & STRATEGIC and wanted & BLOCKED:
+                    # of two that block one another the one that asks first goes first
+                    followers = get.getNeighbors(name, 0 if side > 0 else 1)
+                    self._give([other for other, _ in followers], name)
+            if now - state.waits_since > PATIENCE:
+                foes = get.getJunctionFoes(name, NOTICE)
+                # of a foe: 0 its id, 2 m to the place where the ways meet, 7 whether it goes first
+                near = sorted((foe[2], foe[0]) for foe in foes if foe[7])
+                able = (foe for way, foe in near if way > self._stopping(foe))
+                self._give([next(able, "")], name)
+
+    def _give(self, asked: list[str], name: str) -> None:
+        for other in asked:
+            if other in self.controlled and not self.controlled[name].gap_for:
+                self.controlled[other].gap_for = name
+
+    def _stopping(self, name: str) -> float:
+        """m in which an AV slows down comfortably for who asked; inf for who is no AV."""
+        if name not in self.controlled:
+            return math.inf
+        return libsumo.vehicle.getSpeed(name) ** 2 / (2.0 * YIELDING[0]) + YIELDING[1]
 
     def _yielding(self, name: str, speed: float, state: Assisted) -> float:
-        """The acceleration in m/s2 that opens a gap behind who asked for one."""
-        get = libsumo.vehicle
+        """The acceleration in m/s2 that opens a gap for who asked for one."""
+        get, brakes = libsumo.vehicle, YIELDING[0]
         try:
-            if get.getRoadID(name) != get.getRoadID(state.gap_for):
-                return COMFORT
+            if get.getRoadID(name) != get.getRoadID(state.gap_for):  # it waits at a junction
+                return -brakes
             ahead = get.getLanePosition(state.gap_for) - get.getLength(state.gap_for)
             gap = ahead - get.getLanePosition(name)
             theirs = get.getSpeed(state.gap_for)
         except libsumo.TraCIException:  # it has left
             return COMFORT
-        least, headway = GAP
-        slower = theirs + 0.5 * (gap - least - headway * speed)  # m/s
-        return max((max(slower, 1.0) - speed) / 1.0, -YIELDING)
+        room, headway = GAP
+        slower = max(theirs + 0.5 * (gap - room - headway * speed), 1.0)  # m/s
+        return max(slower - speed, -brakes)
 
 
 def _leaves_route(name: str, lane: str, offset: int) -> str | None:

@@ -64,6 +64,9 @@ class Fleet:
             set_type(vehicle, name)
             mean = libsumo.vehicletype.getSpeedFactor(own)  # not a draw about it
             libsumo.vehicle.setSpeedFactor(vehicle, mean)
+            limit = libsumo.lane.getMaxSpeed(libsumo.vehicle.getLaneID(vehicle))
+            if self._scenario.preset == Preset.LAWFUL and libsumo.vehicle.getSpeed(vehicle) > limit:
+                libsumo.vehicle.setPreviousSpeed(vehicle, limit)  # its file asks for more
 
     def _is_av(self, vehicle: str, seed: int) -> bool:
         rule = self._scenario.fleet

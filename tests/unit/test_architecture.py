@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-# These time one by one what the loop does: bare libsumo, the simulator and the observer; what makes a decision.
+# These time, one by one, the parts of the loop, of the simulator and of a decision.
 MEASURE_PARTS = {"benchmarks/loop.py", "benchmarks/decision_cost.py"}
 
 

@@ -61,7 +61,7 @@ class Assisted(Controlled):
 class Assistance(Commander):
     """Drives every commanded AV of preset `lawful`."""
 
-    controlled: dict[str, Assisted]
+    controlled: dict[str, Assisted]  # type: ignore[assignment]  # `_take_over` makes all of them
 
     def __init__(self, step: float) -> None:
         super().__init__(Preset.LAWFUL, step)
@@ -171,7 +171,7 @@ class Assistance(Commander):
         """m in which an AV slows down comfortably for who asked; inf for who is no AV."""
         if name not in self.controlled:
             return math.inf
-        return libsumo.vehicle.getSpeed(name) ** 2 / (2.0 * YIELDING[0]) + ROOM
+        return float(libsumo.vehicle.getSpeed(name)) ** 2 / (2.0 * YIELDING[0]) + ROOM
 
     def _yielding(self, name: str, speed: float, state: Assisted) -> float:
         """The acceleration in m/s2 that opens a gap for who asked for one."""
@@ -186,7 +186,7 @@ class Assistance(Commander):
             return COMFORT
         room, headway = GAP
         slower = max(theirs + 0.5 * (gap - room - headway * speed), 1.0)  # m/s
-        return max(slower - speed, -brakes)
+        return float(max(slower - speed, -brakes))
 
 
 def _leaves_route(name: str, lane: str, offset: int) -> str | None:

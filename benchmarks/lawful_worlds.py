@@ -99,9 +99,9 @@ def main() -> None:
         [
             "# Our worlds in preset `lawful`",
             "",
-            f"`vfn-p` with the weights that ship, `dense`, mixed drivers (`lc2013`), seeds {seeds}; the same",
-            "seeds in `unguarded` (shipped episodes). There AVs drive up to the limit + 2 m/s, in `lawful` up to",
-            "the limit: where the road is free that alone is a shorter way. Targets: no crash, a third of the",
+            f"`vfn-p` with the weights that ship, `dense`, mixed drivers (`lc2013`), seeds {seeds}, as in",
+            "`unguarded` (shipped episodes). There AVs drive up to the limit + 2 m/s, in `lawful` to the",
+            "limit: where the road is free that alone is a shorter way. Targets: no crash, a third of the",
             "hard brakings at most, the distance of all not below (interval).",
             "",
             markdown_row(COLUMNS),

@@ -6,7 +6,7 @@ import hashlib
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from typing import NamedTuple
 
@@ -62,6 +62,38 @@ class Step(NamedTuple):
         return Events.of(self.frames)
 
 
+class Observed(Mapping[str, History]):
+    """What every AV observes now, worked out by `look` when it is first asked for: SUMO's driver never asks.
+
+    Raises RuntimeError when it is first asked for after the next decision was carried out.
+    """
+
+    def __init__(self, look: Callable[[], dict[str, History]]) -> None:
+        self._look: Callable[[], dict[str, History]] | None = look
+        self._found: dict[str, History] | None = None
+
+    def expire(self) -> None:
+        """The simulation goes on: what nobody has looked at by now cannot be seen any more."""
+        self._look = None
+
+    @property
+    def _all(self) -> dict[str, History]:
+        if self._found is None:
+            if self._look is None:
+                raise RuntimeError("what the AVs observed was not looked at before the simulation went on")
+            self._found = self._look()
+        return self._found
+
+    def __getitem__(self, av: str) -> History:
+        return self._all[av]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._all)
+
+    def __len__(self) -> int:
+        return len(self._all)
+
+
 class Hook:
     """Sees an episode while it is driven, and changes nothing; override what is needed."""
 
@@ -94,7 +126,7 @@ class Episode:
         self._observer = Observer(simulator.road, observation)
         self._metrics = Metrics(metrics)
 
-    def start(self, seed: int, hooks: Sequence[Hook] = ()) -> dict[str, History]:
+    def start(self, seed: int, hooks: Sequence[Hook] = ()) -> Observed:
         """Begin the episode `seed`: warm-up driven, clock at 0; `hooks` see it until the next start."""
         began = time.perf_counter()
         frames = self.simulator.reset(seed)
@@ -135,7 +167,7 @@ class Episode:
         """What AVs did against the law so far, as the figures count it; by time."""
         return self._metrics.offences
 
-    def advance(self, decisions: Mapping[str, Decision]) -> dict[str, History]:
+    def advance(self, decisions: Mapping[str, Decision]) -> Observed:
         """Carry the decisions out for one decision period."""
         self._trace(decisions)
         self._tally["decisions"] += len(decisions)
@@ -143,6 +175,7 @@ class Episode:
         self._tally["fallbacks"] += sum(d.fallback for d in decisions.values())
         lawful = self.scenario.preset == Preset.LAWFUL
         commands = to_commands(decisions, self.histories, self.scenario.timing.decision, lawful)
+        self.histories.expire()
         began = time.perf_counter()
         receipts, self.frames = self.simulator.advance(commands)
         self.timings["simulation_s"] += time.perf_counter() - began
@@ -225,10 +258,14 @@ class Episode:
         for frame in frames:
             self._observer.add(frame)
             self._missions.update(dict.fromkeys(frame.ids[k] for k in frame.mission.nonzero()[0]))
-        self.histories: dict[str, History] = self._observer.histories(
-            self.simulator.route, self.simulator.commanded
-        )
+        self.histories = Observed(self._look)
         self.timings["observation_s"] += time.perf_counter() - began
+
+    def _look(self) -> dict[str, History]:
+        began = time.perf_counter()
+        found = self._observer.histories(self.simulator.route, self.simulator.commanded)
+        self.timings["observation_s"] += time.perf_counter() - began
+        return found
 
     def _trace(self, decisions: Mapping[str, Decision]) -> None:
         s, update = self.snapshot, self._hash.update
@@ -270,9 +307,10 @@ def run_episode(
     policy.reset(episode.context(seed, svo))
     histories = episode.start(seed, hooks)
     while not episode.over:
-        before = time.perf_counter()
+        before, observed = time.perf_counter(), episode.timings["observation_s"]
         decisions = policy.decide(histories)
-        episode.timings["decision_s"] += time.perf_counter() - before
+        observed -= episode.timings["observation_s"]
+        episode.timings["decision_s"] += time.perf_counter() - before + observed
         histories = episode.advance(decisions)
         if progress is not None:
             progress(episode.elapsed, episode.scenario.duration)

@@ -286,17 +286,79 @@ def watched_conflicts(
 
 
 @compiled
+def _cells(x: Floats, y: Floats, rows: Ints, side: float) -> tuple[Ints, Ints, Floats, Ints]:
+    """Sort places into the cells of a square grid.
+
+    Args:
+        x, y: m.
+        rows: [k] which of them.
+        side: m, of a cell at least; there are never more than a few cells per place.
+
+    Returns:
+        the rows by cell [k], in a cell in their order; where each cell's begin in it [cells + 1];
+        the grid's (west m, south m, side m); its (columns, lines).
+    """
+    west, east, south, north = np.inf, -np.inf, np.inf, -np.inf
+    for i in rows:
+        west, east, south, north = min(west, x[i]), max(east, x[i]), min(south, y[i]), max(north, y[i])
+    if not east - west + north - south < np.inf:  # nobody is there, or somewhere unknown: one cell
+        west, south, side = 0.0, 0.0, np.inf
+        columns, lines = 1, 1
+    else:
+        most = 2.0 * np.sqrt(len(rows)) + 1.0
+        side = max(side, (east - west) / most, (north - south) / most)
+        columns, lines = int((east - west) / side) + 1, int((north - south) / side) + 1
+    begin = np.zeros(columns * lines + 1, np.int64)
+    cell = np.empty(len(rows), np.int64)
+    for k in range(len(rows)):
+        column, line = _cell(x[rows[k]] - west, side, columns), _cell(y[rows[k]] - south, side, lines)
+        cell[k] = line * columns + column
+        begin[cell[k] + 1] += 1
+    for k in range(1, len(begin)):
+        begin[k] += begin[k - 1]
+    order, next_ = np.empty(len(rows), np.int64), begin.copy()
+    for k in range(len(rows)):
+        order[next_[cell[k]]] = rows[k]
+        next_[cell[k]] += 1
+    return order, begin, np.array([west, south, side]), np.array([columns, lines])
+
+
+@compiled
+def _cell(away: float, side: float, count: int) -> int:
+    """The column or line of a grid, so many m from its edge; the nearest one for who is outside."""
+    if not away > 0.0 or side == np.inf:
+        return 0
+    return min(int(min(away / side, 1e9)), count - 1)
+
+
+@compiled
 def pairs_overlap(table: Floats) -> Ints:
     """See `cosim.geometry.overlapping_pairs`."""
     n = len(table)
-    out = np.empty((n * (n - 1) // 2, 2), dtype=np.int64)
+    out = np.empty((64, 2), dtype=np.int64)
     found = 0
+    largest = 0.0  # m, a box's reach from its centre
+    for i in range(n):
+        largest = max(largest, 0.5 * (table[i, 4] + table[i, 5]))
+    order, begin, (west, south, side), (columns, lines) = _cells(
+        table[:, 0], table[:, 1], np.arange(n), 2.0 * largest + 1.0
+    )
     for i in range(n):
         a = _box(table, i)
-        for j in range(i + 1, n):
-            if _overlap(a, _box(table, j)):
-                out[found, 0], out[found, 1] = i, j
-                found += 1
+        reach, first = largest + 0.5 * (a[4] + a[5]), found
+        left, right = _cell(a[0] - reach - west, side, columns), _cell(a[0] + reach - west, side, columns)
+        low, high = _cell(a[1] - reach - south, side, lines), _cell(a[1] + reach - south, side, lines)
+        for line in range(low, high + 1):
+            for j in order[begin[line * columns + left] : begin[line * columns + right + 1]]:
+                if j > i and _overlap(a, _box(table, j)):
+                    if found == len(out):
+                        out = np.concatenate((out, np.empty_like(out)))
+                    k = found
+                    while k > first and out[k - 1, 1] > j:
+                        out[k, 1] = out[k - 1, 1]
+                        k -= 1
+                    out[found, 0], out[k, 1] = i, j
+                    found += 1
     return out[:found].copy()
 
 
@@ -312,6 +374,11 @@ def lane_gaps(
 ) -> tuple[Floats, Ints]:
     gaps = np.full(len(rows), np.inf)
     leaders = np.full(len(rows), -1, dtype=np.int64)
+    first = np.full(len(following), -1, np.int64)  # on each lane its first row, and behind each row the next
+    behind = np.full(len(lane), -1, np.int64)
+    for j in range(len(lane) - 1, -1, -1):
+        if lane[j] >= 0:
+            behind[j], first[lane[j]] = first[lane[j]], j
     for k in range(len(rows)):
         i = rows[k]
         if lane[i] < 0:
@@ -319,11 +386,13 @@ def lane_gaps(
         here = int(lane[i])
         travelled = -position[i]  # m from the front bumper to the start of `here`
         while here >= 0 and travelled <= reach and leaders[k] < 0:
-            for j in range(len(lane)):
+            j = first[here]
+            while j >= 0:
                 ahead = travelled + position[j]
-                if lane[j] == here and j != i and ahead > 0.0 and ahead - length[j] < min(gaps[k], reach):
+                if j != i and ahead > 0.0 and ahead - length[j] < min(gaps[k], reach):
                     gaps[k] = ahead - length[j]
                     leaders[k] = j
+                j = behind[j]
             travelled += lane_length[here]
             here = following[here]
     return gaps, leaders
@@ -370,6 +439,36 @@ def record(
 
 
 @compiled
+def _lag(
+    trail: Floats, newest: int, a: int, b: int, sizes: Floats, interval: float, touch: Bools
+) -> float:
+    """Post-encroachment time (s, inf for none) of b, now, after a, as in `encroachment`."""
+    frames = trail.shape[0]
+    x, y, c, s, v, road = trail[newest, b]
+    now = (x, y, c, s, sizes[b, 0], sizes[b, 1], v)
+    for age in range(1, frames):
+        k = (newest - age) % frames
+        if np.isnan(trail[k, a, 0]) or trail[k, a, 2] * c + trail[k, a, 3] * s > FOLLOWING_COSINE:
+            continue
+        xa, ya, ca, sa, va, other = trail[k, a]
+        then = (xa, ya, ca, sa, sizes[a, 0], sizes[a, 1], va)
+        if not _overlap(then, now) or not touch[int(road), int(other)]:
+            continue
+        _, leave = _contact(then, now, -va * ca, -va * sa)  # when a has left where b is now
+        before = (newest - 1) % frames
+        entry = interval  # when, since the frame before, b reached where a was
+        if not np.isnan(trail[before, b, 0]):
+            xb, yb, cb, sb, vb, _ = trail[before, b]
+            came = (xb, yb, cb, sb, sizes[b, 0], sizes[b, 1], vb)
+            first, last = _contact(then, came, vb * cb, vb * sb)
+            if first < last:
+                entry = min(max(first, 0.0), interval)
+        lag = (age - 1) * interval + entry - min(max(leave, 0.0), interval)
+        return max(lag, 0.0)
+    return np.inf
+
+
+@compiled
 def encroachment(
     trail: Floats, newest: int, m: int, sizes: Floats, relevant: Bools, interval: float, touch: Bools
 ) -> float:
@@ -380,41 +479,34 @@ def encroachment(
     [>=m,2] length and width in m; pairs without a `relevant` [>=m] vehicle are left out, and those whose
     roads do not `touch` [S,S]; `interval` s between frames. See `post_encroachment_time`.
     """
-    frames = trail.shape[0]
     bounds, course = _trail_bounds(trail, newest, m)
+    present = np.flatnonzero(~np.isnan(trail[newest, :m, 0]))
+    order, begin, (west, south, side), (columns, lines) = _cells(
+        trail[newest, :, 0], trail[newest, :, 1], present, 20.0
+    )
+    largest = 0.0  # m, a box's reach from its centre
+    for a in range(m):
+        largest = max(largest, 0.5 * (sizes[a, 0] + sizes[a, 1]))
     best = np.inf
-    for b in range(m):
-        if np.isnan(trail[newest, b, 0]):
-            continue
-        x, y, c, s, v, road = trail[newest, b]
-        now = (x, y, c, s, sizes[b, 0], sizes[b, 1], v)
-        for a in range(m):
-            reach = 0.5 * (sizes[a, 0] + sizes[a, 1] + sizes[b, 0] + sizes[b, 1])
-            if a == b or not (relevant[a] or relevant[b]):
-                continue
-            if course[a, 0] * c + course[a, 1] * s > _SAME_COURSE_COSINE:
-                continue
-            beside = x < bounds[a, 0] - reach or x > bounds[a, 1] + reach
-            if beside or y < bounds[a, 2] - reach or y > bounds[a, 3] + reach:
-                continue
-            for age in range(1, frames):
-                k = (newest - age) % frames
-                if np.isnan(trail[k, a, 0]) or trail[k, a, 2] * c + trail[k, a, 3] * s > FOLLOWING_COSINE:
+    for a in range(m):
+        if not bounds[a, 0] <= bounds[a, 1]:
+            continue  # it was not there before
+        margin = 0.5 * (sizes[a, 0] + sizes[a, 1]) + largest + 1.0  # m, more than any reach below
+        left = _cell(bounds[a, 0] - margin - west, side, columns)
+        right = _cell(bounds[a, 1] + margin - west, side, columns)
+        low = _cell(bounds[a, 2] - margin - south, side, lines)
+        high = _cell(bounds[a, 3] + margin - south, side, lines)
+        for line in range(low, high + 1):
+            for b in order[begin[line * columns + left] : begin[line * columns + right + 1]]:
+                if a == b or not (relevant[a] or relevant[b]):
                     continue
-                xa, ya, ca, sa, va, other = trail[k, a]
-                then = (xa, ya, ca, sa, sizes[a, 0], sizes[a, 1], va)
-                if not _overlap(then, now) or not touch[int(road), int(other)]:
+                x, y, c, s = trail[newest, b, :4]
+                if course[a, 0] * c + course[a, 1] * s > _SAME_COURSE_COSINE:
                     continue
-                _, leave = _contact(then, now, -va * ca, -va * sa)  # when a has left where b is now
-                before = (newest - 1) % frames
-                entry = interval  # when, since the frame before, b reached where a was
-                if not np.isnan(trail[before, b, 0]):
-                    xb, yb, cb, sb, vb, _ = trail[before, b]
-                    came = (xb, yb, cb, sb, sizes[b, 0], sizes[b, 1], vb)
-                    first, last = _contact(then, came, vb * cb, vb * sb)
-                    if first < last:
-                        entry = min(max(first, 0.0), interval)
-                lag = (age - 1) * interval + entry - min(max(leave, 0.0), interval)
-                best = min(best, max(lag, 0.0))
-                break
+                reach = 0.5 * (sizes[a, 0] + sizes[a, 1] + sizes[b, 0] + sizes[b, 1])
+                beside = x < bounds[a, 0] - reach or x > bounds[a, 1] + reach
+                if beside or y < bounds[a, 2] - reach or y > bounds[a, 3] + reach:
+                    continue
+                lag = _lag(trail, newest, a, b, sizes, interval, touch)
+                best = min(best, lag)
     return best

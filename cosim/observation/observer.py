@@ -9,7 +9,7 @@ from cosim.observation.kinematics import choose_rows, fill_rows, never_left_out,
 from cosim.observation.past import KinematicPast, MapPast
 from cosim.road import RoadMap
 from cosim.road.rules import Moment, RuleBook
-from cosim.types import KINEMATIC_FEATURES, History, Ints, Kind, ObservationConfig, Snapshot
+from cosim.types import KINEMATIC_FEATURES, Bools, History, Ints, Kind, ObservationConfig, Snapshot
 
 RouteOf = Callable[[str], tuple[str, ...]]  # AV id -> edges ahead, the present one first
 CommandOf = Callable[[str], tuple[float | None, int]]  # AV id -> target speed m/s, lane change under way
@@ -46,12 +46,10 @@ class Observer:
         self._past.add(snapshot)
         self._newest = snapshot
         self._egos: Ints = np.flatnonzero(snapshot.kind == int(Kind.AV))
-        c = self._config
-        self._seen = perceived(snapshot, self._egos, c.perception_range, c.share_perception)
         if self._maps is None or self._raster is None:
             return
         block, slots = self._maps.next_frame(tuple(snapshot.ids[i] for i in self._egos))
-        draw_snapshot(block, slots, snapshot, self._egos, self._seen, self._raster, c)
+        draw_snapshot(block, slots, snapshot, self._egos, self._perceived(), self._raster, self._config)
 
     def histories(self, route: RouteOf, commanded: CommandOf) -> dict[str, History]:
         """One History per AV on the road, at the newest frame (AVs off every lane are left out).
@@ -63,12 +61,12 @@ class Observer:
         s, c = self._newest, self._config
         if s is None or not len(self._egos):
             return {}
-        count = len(self._egos)
+        count, seen = len(self._egos), self._perceived()
         rows = np.empty((count, c.rows), np.int64)
         none = np.zeros((count, s.n), np.bool_)
-        if choose_rows(s.x, s.y, self._egos, self._seen, c.row_range, none, rows):
+        if choose_rows(s.x, s.y, self._egos, seen, c.row_range, none, rows):
             first = never_left_out(s, self._road.straight_on, self._egos, c.row_range)
-            choose_rows(s.x, s.y, self._egos, self._seen, c.row_range, first, rows)
+            choose_rows(s.x, s.y, self._egos, seen, c.row_range, first, rows)
         kinematics = np.zeros((count, c.frames, c.rows, len(KINEMATIC_FEATURES)), np.float32)
         valid = np.zeros((count, c.frames, c.rows), np.bool_)
         fixed = np.stack([s.length, s.width, s.kind == int(Kind.AV), s.mission], axis=1).astype(np.float64)
@@ -79,7 +77,7 @@ class Observer:
         no_maps = np.zeros((c.frames, len(c.channels), 0, 0), np.uint8)
         result = {}
         names = (*s.ids, "")
-        now = self._moment(s, 0)
+        now = self._moment(s, seen[0])
         for b, e in enumerate(self._egos):
             name = s.ids[e]
             if lanes[b, 0] < 0:  # off every lane: it cannot be commanded now
@@ -90,7 +88,7 @@ class Observer:
             way = ahead.paths[1]
             assert way is not None
             if not c.share_perception and b:
-                now = self._moment(s, b)
+                now = self._moment(s, seen[b])
             result[name] = History(
                 velocity_map=no_maps if self._maps is None else self._maps.view(name),
                 kinematics=kinematics[b],
@@ -108,9 +106,15 @@ class Observer:
             )
         return result
 
-    def _moment(self, s: Snapshot, b: int) -> Moment:
-        """The signals, and the persons whom ego `b` perceives (with V2V: whom all do)."""
-        who = np.flatnonzero((s.kind == int(Kind.PERSON)) & self._seen[b])
+    def _perceived(self) -> Bools:
+        """[B,n] which vehicles each AV perceives in the newest frame."""
+        assert self._newest is not None
+        c = self._config
+        return perceived(self._newest, self._egos, c.perception_range, c.share_perception)
+
+    def _moment(self, s: Snapshot, seen: Bools) -> Moment:
+        """The signals, and the persons among the `seen` [n] (with V2V: whom all AVs perceive)."""
+        who = np.flatnonzero((s.kind == int(Kind.PERSON)) & seen)
         persons = np.stack([s.x, s.y, s.heading, s.speed], axis=1)[who] if len(who) else None
         told = self._config.signal_timing and len(s.switches)
         return Moment(s.signals, s.switches if told else None, persons)

@@ -155,9 +155,7 @@ class Assistance(Commander):
                     # of two that block one another the one that asks first goes first
                     followers = get.getNeighbors(name, 0 if side > 0 else 1)
                     self._give([other for other, _ in followers], name)
-            if (now - state.waits_since) % (
-                2.0 * PATIENCE
-            ) > PATIENCE:  # asks, then lets others pass
+            if (now - state.waits_since) % (2.0 * PATIENCE) > PATIENCE:  # asks, then lets others pass
                 foes = get.getJunctionFoes(name, NOTICE)
                 # of a foe: 0 its id, 2 m to the place where the ways meet, 7 whether it goes first
                 near = sorted((foe[2], foe[0]) for foe in foes if foe[7])

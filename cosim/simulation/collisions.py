@@ -71,7 +71,7 @@ class CollisionDetector:
                 pair = _poses(names, bodies)
                 # of two AVs that drive SUMO's order stays: to blame is an AV either way
                 avs = all(bodies[name].kind == Kind.AV for name in names)
-                if pair is not None and not (avs and (pair.speed > HALTING).all()):
+                if pair is not None and not (avs and np.min(pair.speed) > HALTING):
                     first = mover(self._poses_before(names, pair, now), pair)
                     names = names[::-1] if first == 1 else names
             try:

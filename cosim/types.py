@@ -504,5 +504,6 @@ class EpisodeResult(Identity):
 
 
 def _plain(value: Any) -> Any:
-    """The value itself, None for a number that JSON cannot hold."""
+    """The value as JSON holds it: Python's own number, None for one that is not finite."""
+    value = value.item() if isinstance(value, np.generic) else value
     return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -19,7 +19,7 @@ from cosim.files.xml_input import Progress
 from cosim.metrics import METRICS, MetricContext
 from cosim.metrics.post_encroachment import LONGEST
 from cosim.road import Lane, RoadMap
-from cosim.simulation.conventions import centres
+from cosim.simulation.conventions import centres, type_names
 from cosim.types import Kind, Metric, Snapshot, Timing
 
 FIGURES = ("time_to_collision", "post_encroachment", "drac", "hard_braking", "jerk", "headway")
@@ -51,7 +51,7 @@ class Roles:
             return Kind.AV, False
         if self.mission is not None and self.mission.fullmatch(vehicle):
             return Kind.HV, True
-        is_av = vehicle_type.partition("@")[0] == self.av_type
+        is_av = self.av_type in type_names(vehicle_type)
         if self.av_ids is not None:
             is_av = self.av_ids.fullmatch(vehicle) is not None
         return (Kind.AV if is_av else Kind.HV), False

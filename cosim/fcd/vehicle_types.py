@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from cosim.errors import BadInput
 from cosim.files.xml_input import scan
+from cosim.simulation.conventions import type_names
 
 
 class Size(NamedTuple):
@@ -62,10 +63,8 @@ def read_sizes(files: Iterable[Path]) -> dict[str, Size]:
 
 
 def size_of(vehicle_type: str, sizes: Mapping[str, Size]) -> Size | None:
-    """The size of a type as SUMO writes it: `type@vehicle` is one vehicle's own copy, `type/class` ours."""
-    type_of_copy = vehicle_type.partition("@")[0]
-    names = (vehicle_type, type_of_copy, type_of_copy.partition("/")[0])
-    return next((sizes[name] for name in names if name in sizes), None)
+    """The size of a type as SUMO writes it (`type_names`)."""
+    return next((sizes[name] for name in type_names(vehicle_type) if name in sizes), None)
 
 
 def _metres(attributes: Mapping[str, str], name: str, default: float, path: Path, line: int) -> float:

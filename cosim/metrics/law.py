@@ -136,8 +136,8 @@ class Ways:
         lane, inside = int(now.lane[row]), self._inside(link)
         if lane in inside:
             ahead = inside[inside.index(lane) :]
-        elif self._road.lanes[lane].edge == self._road.lanes[self._road.links[link].target].edge:
-            return True  # it is past the junction
+        elif lane < 0 or self._road.lanes[lane].edge == self._road.lanes[self._road.links[link].target].edge:
+            return True  # off every lane, or past the junction
         else:
             signal = self._road.links[link].signal
             if 0 <= signal < len(now.signals) and int(now.signals[signal]) not in GOES:

@@ -32,11 +32,7 @@ class MissionSuccess:
         self._standing.difference_update(snapshot.events.arrived)
         for row in snapshot.mission.nonzero()[0].tolist():
             name, lane = snapshot.ids[row], int(snapshot.lane[row])
-            if (
-                self._auto
-                and name not in self._reached
-                and (lane in self._goal or self._lanes[lane].internal)
-            ):
+            if self._auto and name not in self._reached and not self._struggles(lane):
                 continue
             if self._reached.setdefault(name, None) is not None:
                 continue
@@ -46,6 +42,10 @@ class MissionSuccess:
                 self._standing.discard(name)
             if name not in self._crashed and lane in self._goal:
                 self._reached[name] = snapshot.time - self._begin
+
+    def _struggles(self, lane: int) -> bool:
+        """Whether it ends or gives way (off every lane, -1, nobody is asked to)."""
+        return lane >= 0 and lane not in self._goal and not self._lanes[lane].internal
 
     def result(self) -> dict[str, Metric]:
         success = failed = when = None

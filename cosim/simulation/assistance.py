@@ -23,7 +23,7 @@ from cosim.simulation.commands import (
 from cosim.simulation.fleet import set_type
 from cosim.types import Intervention, Preset
 
-AV_TYPE = "cosim.av.lawful"  # sumo_scenarios/types.add.xml: an IDM that brakes comfortably
+LAWFUL_TYPE = "cosim.av.lawful"  # sumo_scenarios/types.add.xml: an IDM that brakes comfortably
 CORRECTED = 1.0  # m/s2 more braking than asked for: from there on the car drives otherwise than commanded
 STALLED = 0.2, 1.5  # m/s2, or so little acceleration where so much was asked for
 RESPITE = 2.0  # s without a correction: the next one is a new one
@@ -124,7 +124,7 @@ class Assistance(Commander):
 
     def _take_over(self, name: str) -> Assisted:
         get = libsumo.vehicle
-        set_type(name, AV_TYPE)
+        set_type(name, _lawful(get.getTypeID(name)))
         get.setSpeedFactor(name, min(get.getSpeedFactor(name), 1.0))
         get.setSpeedMode(name, SPEED_MODE[self._preset])
         get.setLaneChangeMode(name, LANE_CHANGE_MODE[self._preset])
@@ -187,6 +187,14 @@ class Assistance(Commander):
         room, headway = GAP
         slower = max(theirs + 0.5 * (gap - room - headway * speed), 1.0)  # m/s
         return float(max(slower - speed, -brakes))
+
+
+def _lawful(own: str) -> str:
+    """The type of a commanded AV whose own one is this; outputs name both (`type_names`)."""
+    name = f"{own.partition('@')[0].partition('/')[0]}/{Preset.LAWFUL}"
+    if name not in libsumo.vehicletype.getIDList():
+        libsumo.vehicletype.copy(LAWFUL_TYPE, name)
+    return name
 
 
 def _leaves_route(name: str, lane: str, offset: int) -> str | None:

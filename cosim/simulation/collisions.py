@@ -17,7 +17,8 @@ from cosim.types import INSERTION, Collision, Floats, Kind, Snapshot
 SIDE_BY_SIDE = np.radians(20.0)  # lanes whose directions differ by less do not cross
 CUT_IN_WINDOW = 3.0  # s: an AV that changed lanes so shortly before it was hit from behind had cut in
 JUST_INSERTED = 1.0  # s
-STANDS = 0.02  # m between two frames: SUMO's threshold of a halting vehicle, 0.1 m/s
+HALTING = 0.1  # m/s, SUMO's threshold of a halting vehicle
+STANDS = 0.02  # m between two frames, at that speed
 ON_CENTRE_LINE = 0.3  # m: a front bumper nearer to its lane's centre line is not changing lanes
 WRECK_STANDS = 5.0  # s, then it is taken off the road
 # SUMO's words for a vehicle that hits a person (MSLane::detectPedestrianJunctionCollision).
@@ -65,11 +66,14 @@ class CollisionDetector:
                 continue
             self._seen.add(frozenset(names))
             if person:
-                names = names if c.colliderSpeed > 0.1 else names[::-1]
+                names = names if c.colliderSpeed > HALTING else names[::-1]
             else:
                 pair = _poses(names, bodies)
-                first = None if pair is None else mover(self._poses_before(names, pair, now), pair)
-                names = names[::-1] if first == 1 else names
+                # of two AVs that drive SUMO's order stays: to blame is an AV either way
+                avs = all(bodies[name].kind == Kind.AV for name in names)
+                if pair is not None and not (avs and np.min(pair.speed) > HALTING):
+                    first = mover(self._poses_before(names, pair, now), pair)
+                    names = names[::-1] if first == 1 else names
             try:
                 x, y = libsumo.vehicle.getPosition(c.collider)[:2]
             except libsumo.TraCIException:

@@ -1,9 +1,12 @@
-"""Converts SUMO's positions and angles of vehicles to ours; needs no SUMO: file readers use it too."""
+"""Converts SUMO's positions, angles and types of vehicles to ours; needs no SUMO: file readers use it too."""
 
 import numpy as np
 import numpy.typing as npt
 
 from cosim.types import Floats
+
+# The types of AVs in SUMO's outputs begin so, and nobody else's: then follows the name of their own type.
+AV_TYPE = "cosim.av."
 
 
 def centres(
@@ -15,3 +18,11 @@ def centres(
     """
     heading = (np.radians(90.0 - angle) + np.pi) % (2 * np.pi) - np.pi
     return front_x - half_length * np.cos(heading), front_y - half_length * np.sin(heading), heading
+
+
+def type_names(vehicle_type: str) -> tuple[str, ...]:
+    """The type as SUMO writes it, then what it was made of: `type@vehicle` is one vehicle's own copy,
+    `type/class` one of ours, `cosim.av.type` that of an AV."""
+    of_copy = vehicle_type.partition("@")[0]
+    ours = of_copy.partition("/")[0]
+    return vehicle_type, of_copy, ours, ours.removeprefix(AV_TYPE)

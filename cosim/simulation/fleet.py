@@ -9,6 +9,7 @@ from cosim.scenario import Scenario
 from cosim.scenario.behaviors import AS_IS
 from cosim.scenario.vet_rules import NOT_CARS
 from cosim.seeding import uniform
+from cosim.simulation.conventions import AV_TYPE
 from cosim.simulation.convert import ACTORS, Body
 from cosim.simulation.drivers import IDM_TYPE, Drivers
 from cosim.types import Actor, Kind, Preset
@@ -20,7 +21,6 @@ AV_LANE_CHANGE = {
     "laneChangeModel.lcCooperativeSpeed": "0",
     "laneChangeModel.lcKeepRight": "0",
 }
-AV_TYPE = "cosim.av"  # the types of AVs in SUMO's outputs begin so, and nobody else's
 # What a vehicle keeps when its type changes: getters and setters of libsumo.vehicle, in this order.
 KEPT = ("Length", "Width", "MaxSpeed", "SpeedFactor", "VehicleClass")
 
@@ -56,7 +56,7 @@ class Fleet:
         own, ours = libsumo.vehicle.getTypeID(vehicle), self._scenario.built_in
         name = self._av_types.get(own)
         if name is None:
-            name = self._av_types[own] = f"{AV_TYPE}.{own}"
+            name = self._av_types[own] = AV_TYPE + own
             libsumo.vehicletype.copy(own if ours else IDM_TYPE, name)
         if ours:
             libsumo.vehicle.setType(vehicle, name)

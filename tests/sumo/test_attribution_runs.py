@@ -51,7 +51,7 @@ def test_the_command_writes_table_page_and_picture(
     text = (tmp_path / "attribution.md").read_text()
     assert text in capsys.readouterr().out
     assert text.startswith("# Which inputs the value networks use\n\n- `vfn`: inputs that change no choice")
-    assert "preset `unguarded`" in text
+    assert "preset `lawful`" in text
     assert "2 episodes a policy" in text
     assert (tmp_path / "attribution.png").stat().st_size > 1000
 

@@ -72,7 +72,8 @@ def test_the_fcd_file_yields_the_figures_of_the_episode(
 
 
 def test_a_collision_ends_the_files_where_it_ends_the_episode(tmp_path: Path) -> None:
-    with Worker(Host, load("merge", demand=["contested"]), "random", math.pi / 4) as worker:
+    scenario = load("merge", demand=["contested"], preset="unguarded")
+    with Worker(Host, scenario, "random", math.pi / 4) as worker:
         result = worker.call("run", 200_031, outputs=("fcd", "collision"), folder=tmp_path)
     assert result.value("crashed") is True
     steps = ElementTree.parse(tmp_path / "fcd.xml").getroot()

@@ -143,12 +143,13 @@ def test_weights_that_are_no_value_networks_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_class_a_factory_and_a_function_of_ones_own_drive(code: Path, tmp_path: Path) -> None:
-    results = [run(f"{code}:{name}", tmp_path / name) for name in ("Holds", "factory", "looks")]
+    unguarded = ("--preset", "unguarded")  # as keep-lane always is
+    results = [run(f"{code}:{name}", tmp_path / name, *unguarded) for name in ("Holds", "factory", "looks")]
     ours = run("keep-lane", tmp_path / "ours")
     assert [r["policy"] for r in results] == ["Holds", "factory", "looks"]
     assert results[0]["trace_hash"] == results[1]["trace_hash"] == ours["trace_hash"]
     assert make(f"{code}:looks").observation == COMPACT  # maps, unless it says otherwise: SUMO drives here
-    assert results[2]["trace_hash"] == run("idm", tmp_path / "idm")["trace_hash"]
+    assert results[2]["trace_hash"] == run("idm", tmp_path / "idm", *unguarded)["trace_hash"]
 
 
 @pytest.mark.parametrize(

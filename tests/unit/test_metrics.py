@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 from cosim.metrics import METRICS, MetricContext, Metrics
 from cosim.metrics.post_encroachment import PostEncroachment
 from cosim.road import Lane, RoadMap
-from cosim.types import Collision, Events, Kind, Metric, Snapshot, Timing
+from cosim.types import Collision, EpisodeResult, Events, Identity, Kind, Metric, Snapshot, Timing
 
 FRAME = 0.2  # s
 
@@ -405,3 +406,14 @@ def test_every_figure_has_a_unit_and_a_direction() -> None:
     for name, metric in seen.items():
         assert metric.unit, name
         assert metric.better in ("higher", "lower", ""), name
+
+
+def test_a_document_is_plain_json_whatever_numbers_a_metric_returns() -> None:
+    identity = Identity("merge", "free", "idm", None, "mixed", "lc2013", None, "lawful", 45.0, 0)
+    figures = {"a": np.int64(3), "b": np.float64(0.5), "c": np.bool_(True), "d": np.inf, "e": None}
+    metrics = {name: Metric(value, "", "") for name, value in figures.items()}  # type: ignore[arg-type]
+    result = EpisodeResult(
+        **asdict(identity), steps=1, trace_hash="", metrics=metrics, collisions=(), timings={}, validity=()
+    )
+    document = json.loads(json.dumps(result.document()))
+    assert [document[name] for name in figures] == [3, 0.5, True, None, None]

@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import libsumo
 import numpy as np
 
 from benchmarks.tables import markdown_row, write_page
@@ -45,6 +46,8 @@ PENETRATION = 0.2
 SEEDS = {"idm": 10, "vfn-p": 2}  # of A10KW; the other nets are driven by idm on one seed
 SETTLED = 60.0  # s: the memory is read from then on
 FEW = 100  # AVs on the road, up to which the simulation is to be no slower than real time
+STANDING = 0.1  # m/s, SUMO's own threshold of a halting vehicle
+QUEUE = 30.0  # m: further ahead nobody is a leader of a queue
 LISTED = 5  # of each kind of overlap and of offence, the worst or first of a net
 TRAFFIC = {
     "inserted": "vehicles_inserted",
@@ -179,6 +182,45 @@ def depth(pair: Boxes) -> float:
     return float((half.sum(axis=1) - np.abs(apart)).min())
 
 
+class Queues(Hook):
+    """Where the queues of AVs that stand without a reason begin, as SUMO's leaders on their routes tell."""
+
+    def on_start(self, episode: Episode) -> None:
+        self.heads: Counter[str] = Counter()
+        self._known: set[str] = set()
+
+    def on_step(self, episode: Episode, step: Step) -> None:
+        for offence in episode.offences if np.any(step.after.speed < STANDING) else ():
+            if offence.what.startswith("stood") and offence.vehicle not in self._known:
+                self._known.add(offence.vehicle)
+                self.heads[self._head(offence.vehicle, step.after)] += 1
+
+    @staticmethod
+    def _head(name: str, s: Snapshot) -> str:
+        """Who is at the head of its queue, and what it waits for."""
+        get, seen = libsumo.vehicle, {name}
+        if name not in s.row:
+            return "has left the road"
+        head = name
+        while (leader := get.getLeader(head, QUEUE)) and leader[0] and leader[0] not in seen:
+            head = leader[0]
+            seen.add(head)
+        who = "it" if head == name else "an AV" if s.kind[s.row[head]] == Kind.AV else "an HV"
+        lights, links = get.getNextTLS(head)[:1], get.getNextLinks(head)[:1]
+        lane = get.getLaneIndex(head)
+        if leader and leader[0]:
+            return "a ring of vehicles that wait for one another"
+        if get.getSpeed(head) > STANDING:
+            return f"{who} moves"
+        if lights and lights[0][2] < QUEUE and lights[0][3] in "ruyY":
+            return f"{who} stands at a red light"
+        if any(best[3] for k, best in enumerate(get.getBestLanes(head)) if k == lane):
+            return f"{who} cannot change to the lane of its route"
+        if links and not links[0][1]:
+            return f"{who} waits for the right of way"
+        return f"{who} waits in a junction or for a place behind it"
+
+
 class Driver:
     """Hosted in a process of its own, since a net may end SUMO and with it the process."""
 
@@ -190,13 +232,14 @@ class Driver:
     def drive(self) -> dict[str, Any]:
         """The episode's document, with what it cost, its overlaps and offences, and what is wrong with the
         net's lanes."""
-        cost, overlaps = Cost(), Overlaps()
-        document = self._host.run(self._run.seed, hooks=[cost, overlaps]).document()
+        cost, overlaps, queues = Cost(), Overlaps(), Queues()
+        document = self._host.run(self._run.seed, hooks=[cost, overlaps, queues]).document()
         road: RoadMap = self._host.simulator.road
         return {
             **document,
             **cost.document(),
             "overlaps": list(overlaps.found.values()),
+            "heads": dict(queues.heads.most_common()),
             "offences": [(o.time, o.vehicle, o.what) for o in self._host.episode.offences],
             "lanes": described(road, too_close(road)),
         }
@@ -275,15 +318,15 @@ def page(runs: Sequence[Run], found: Sequence[dict[str, Any] | str | None], comm
         f"(`pip install cosim-sumo[tools]`), driven as they stand, {PENETRATION:.0%} of the vehicles AVs.",
         f"A10KW is a motorway interchange with bridges; driven so far: {', '.join(big)}.",
         f"Memory: of the simulation's process, after {SETTLED:g} s and at the end.",
-        "Time factors: simulated s per s of the processor, and per s that passed (other programs may have run);",
-        f"also over the steps with at most {FEW} AVs on the road.",
+        "Time factor: simulated s per s that passed, other programs on the machine included; over the steps",
+        f"with at most {FEW} AVs on the road first per s of the processor, then per s that passed.",
         "",
         "## Traffic, collisions and cost",
         "",
     ]
     heads = ["net", "policy", "seed", "preset", "simulated", "AVs", "most at once"]
     rows = []
-    for run, one in driven:
+    for _, one in driven:
         first, last = one["memory"]
         cells = [one["preset"], f"{_simulated(one):,.0f} s", f"{one['avs']:,}", f"{one['most_avs']}"]
         rows.append([*cells, *_figures(one, TRAFFIC), f"{first:.0f}, {last:.0f}", *_factors(one)])
@@ -354,12 +397,13 @@ def _overlaps(driven: Sequence[tuple[Run, dict[str, Any]]]) -> list[str]:
         "",
         "## Overlaps that are no collisions",
         "",
-        "Pairs with an AV whose boxes overlap, which SUMO does not report and the figures do not count, each at",
-        f"its deepest. {TAIL.capitalize()}: SUMO moves the front of a vehicle that changes lanes sideways at a",
-        "constant rate however slowly it drives, and draws its tail behind; laid along their lanes, with their",
-        "fronts where they are, the two are apart (askew: the larger angle between a vehicle and its lane; apart:",
-        f"the gap of the two so laid). {NET.capitalize()}: each is on the centre line of its own lane, of lanes",
-        "whose drivers need not heed one another.",
+        "Pairs with an AV whose boxes overlap, which SUMO does not report and the figures do not count, each",
+        f"at its deepest. {TAIL.capitalize()}: SUMO moves the front of a vehicle that changes lanes",
+        "sideways at a constant rate however slowly it drives, and draws its tail behind; laid along their",
+        "lanes, with their fronts where they are, the two are apart (askew: the larger angle between a",
+        "vehicle and its lane; apart: the gap of the two so laid).",
+        f"{NET.capitalize()}: each is on the centre line of its own lane, of lanes whose drivers need not heed",
+        "one another.",
         "",
         *_row("net", "policy", "why", "pairs", "depth, m", "askew, degrees", "apart, m", "slower one, m/s"),
     ]
@@ -393,7 +437,7 @@ def _overlap(o: dict[str, Any]) -> str:
     """One overlap in words."""
     each = zip(o["av"], o["names"], o["length"], o["lanes"], o["speed"], o["askew"], strict=True)
     who = [
-        f"{'AV' if av else 'HV'} `{name}` ({length:.1f} m) on `{lane}` at {speed:.1f} m/s, {askew:.0f} degrees askew"
+        f"{'AV' if av else 'HV'} `{name}` ({length:.1f} m), `{lane}`, {speed:.1f} m/s, {askew:.0f} degrees"
         for av, name, length, lane, speed, askew in each
     ]
     return f"{o['time']:,.1f} s, {o['depth']:.2f} m deep, {o['frames']} frames: {'; '.join(who)}"
@@ -410,6 +454,10 @@ def _offences(driven: Sequence[tuple[Run, dict[str, Any]]]) -> list[str]:
         ]
         if len(told) > LISTED:
             lines.append(f"- {run.config.stem}, {run.policy}, seed {run.seed}: {len(told) - LISTED} more")
+        if heads := one.get("heads"):
+            begin = "; ".join(f"{head} ({n})" for head, n in heads.items())
+            name = f"{run.config.stem}, {run.policy}, seed {run.seed}"
+            lines.append(f"- {name}: the queues of those that stood begin where {begin}")
     return lines if len(lines) > 3 else [*lines, "None."]
 
 

@@ -402,8 +402,8 @@ def _overlaps(driven: Sequence[tuple[Run, dict[str, Any]]]) -> list[str]:
         "sideways at a constant rate however slowly it drives, and draws its tail behind; laid along their",
         "lanes, with their fronts where they are, the two are apart (askew: the larger angle between a",
         "vehicle and its lane; apart: the gap of the two so laid).",
-        f"{NET.capitalize()}: each is on the centre line of its own lane, of lanes whose drivers need not heed",
-        "one another.",
+        f"{NET.capitalize()}: each is on the centre line of its own lane, of lanes whose drivers need not",
+        "heed one another.",
         "",
         *_row("net", "policy", "why", "pairs", "depth, m", "askew, degrees", "apart, m", "slower one, m/s"),
     ]

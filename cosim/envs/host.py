@@ -19,6 +19,7 @@ from cosim.types import (
     Decision,
     EpisodeResult,
     Events,
+    History,
     Kind,
     MetaAction,
     ObservationConfig,
@@ -88,7 +89,8 @@ class SessionHost(Host):
         left = {name: h for name, h in episode.histories.items() if name not in actions}
         decisions |= self.policy.decide(left)
         # sorted: SUMO takes commands in the order given, which must not hang on a caller's dict order
-        seen = episode.advance({name: decisions[name] for name in episode.histories if name in decisions})
+        chosen = {name: decisions[name] for name in episode.histories if name in decisions}
+        seen: Mapping[str, History] = episode.advance(chosen)
         assert episode.step is not None
         before, after, events = episode.step.before, episode.step.after, episode.step.events
         earned = self._earnings.pay(episode.step, before.avs)

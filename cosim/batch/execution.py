@@ -58,7 +58,8 @@ def begin(plan: Plan, store: Store, document: Mapping[str, Any]) -> None:
 def check_same(plan: Plan, store: Store) -> None:
     """Raises BadInput unless the store was begun with this very plan, on the same files and versions."""
     if store.spec_hash() != plan.spec_hash:
-        raise BadInput("holds the run of another spec: name another folder", field="--resume")
+        problem = "holds the run of another spec: name another folder, or no spec to go on with its own"
+        raise BadInput(problem, field="--resume")
     known = store.cells()
     for cell in plan.cells:
         _compare(known[cell.name]["manifest"], cell.manifest, cell, "since the run began")

@@ -1,7 +1,7 @@
 """Which episode of A belongs to which of B: the same traffic, driven by another policy or another version.
 
-A pair is one episode of each side that agree in all of `PAIR` and in the seed; a group is the pairs that
-agree in `PAIR`. Nothing is pooled over groups.
+A pair is one episode of each side that agree in all of `PAIR`, in `SETTINGS` and in the seed; a group is the
+pairs that agree in `PAIR`. Nothing is pooled over groups.
 """
 
 import itertools
@@ -14,7 +14,7 @@ from typing import Any
 from cosim.errors import BadInput, hint
 from cosim.report import run_folder, wording
 from cosim.report.figures import Row
-from cosim.report.run_folder import Run
+from cosim.report.run_folder import SETTINGS, Run
 from cosim.report.summary import GROUP, mission_guessed, not_comparable
 from cosim.workers.tasks import BAD_INPUT, OK
 
@@ -113,14 +113,16 @@ def pair(a: Side, b: Side, across: Sequence[str] = ()) -> tuple[list[Group], tup
         raise BadInput(problem + "; choose with DIR:POLICY")
     fields = tuple(name for name in PAIR if name not in across) + ("policy",) * by_policy
     same_folder = a.run.path.resolve() == b.run.path.resolve()
-    all_a, all_b = (_cells(one, fields, across, same_folder) for one in (a, b))
+    known = not same_folder and all(one.run.manifest.get("cells") for one in (a, b))
+    settings = SETTINGS if known else ()
+    all_a, all_b = (_cells(one, fields, across, same_folder, settings) for one in (a, b))
     groups = []
     for key, cells_a in all_a.items():
         for rows_a, rows_b in itertools.product(cells_a.values(), all_b.get(key, {}).values()):
             if pairs := [(rows_a[s], rows_b[s]) for s in sorted(rows_a.keys() & rows_b.keys())]:
                 groups.append(_group(pairs, fields, (len(rows_a), len(rows_b))))
     if not groups:
-        raise BadInput(_why_none(all_a, all_b, fields))
+        raise BadInput(_why_none(all_a, all_b, fields + settings))
     only_a, only_b = (
         [
             _name(next(iter(rows.values())))
@@ -151,8 +153,14 @@ def _clear_policies(a: Side, b: Side) -> bool:
 _Cells = dict[_Key, dict[_Key, dict[int, Row]]]
 
 
-def _cells(one: Side, fields: tuple[str, ...], across: Sequence[str], same_folder: bool) -> _Cells:
-    """Rows by pairing key, then by the values of `across`, then by seed.
+def _cells(
+    one: Side,
+    fields: tuple[str, ...],
+    across: Sequence[str],
+    same_folder: bool,
+    settings: tuple[str, ...],
+) -> _Cells:
+    """Rows by pairing key (`fields`, then `settings`), then by the values of `across`, then by seed.
 
     Raises BadInput when two rows would be one.
     """
@@ -160,7 +168,8 @@ def _cells(one: Side, fields: tuple[str, ...], across: Sequence[str], same_folde
     for row in one.run.rows:
         if one.policy is not None and row["policy"] != one.policy:
             continue
-        key: _Key = tuple(row.get(name) for name in fields)
+        driven = one.run.settings(row) if settings else {}
+        key: _Key = (*(row.get(name) for name in fields), *(driven[name] for name in settings))
         if same_folder:  # then files are distinguished even where their names are equal
             case = {k: v for k, v in one.run.case(row).items() if k not in (*across, "outputs")}
             key += (json.dumps(case, sort_keys=True),)

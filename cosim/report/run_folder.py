@@ -17,8 +17,10 @@ from cosim.report.figures import Measure, Row, measures
 from cosim.report.summary import summarize
 from cosim.scenario import CONFIG, file_name
 from cosim.scenario.manifest import checked
+from cosim.types import OnCollision
 from cosim.workers.tasks import OK
 
+SETTINGS = ("duration", "warmup", "mission", "on_collision")
 NEEDED = ("key", "cell", "status", "scenario", "demand", "policy", "seed")
 
 
@@ -50,8 +52,22 @@ class Run:
 
     def case(self, row: Row) -> dict[str, Any]:
         """What was asked for (`EpisodeId`), without policy and seed; {} where not known."""
-        cell = self.manifest.get("cells", {}).get(row["cell"], {})
-        return {k: v for k, v in cell.get("case", {}).items() if k not in ("policy", "seed")}
+        return {k: v for k, v in self._cell(row).get("case", {}).items() if k not in ("policy", "seed")}
+
+    def settings(self, row: Row) -> dict[str, Any]:
+        """What no column says of how an episode was driven (`SETTINGS`); s, and the mission as asked for."""
+        driven, asked = self._cell(row).get("manifest", {}), self.case(row)
+        times = driven.get("timing", {})
+        return {
+            "duration": times.get("duration_s", asked.get("duration")),
+            "warmup": times.get("warmup_s", asked.get("warmup")),
+            "mission": asked.get("mission"),
+            "on_collision": driven.get("on_collision", asked.get("on_collision") or OnCollision.END),
+        }
+
+    def _cell(self, row: Row) -> Mapping[str, Any]:
+        found: Mapping[str, Any] = self.manifest.get("cells", {}).get(row["cell"], {})
+        return found
 
 
 def export(folder: Path, rows: Sequence[Row], manifest: Mapping[str, Any], planned: int) -> dict[str, Any]:

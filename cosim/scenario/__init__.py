@@ -258,6 +258,7 @@ def _world(folder: Path) -> Scenario:
     one_of(top.mission.kind, MISSIONS, "mission.kind", file)
     check_pattern(top.mission.vehicles, "mission.vehicles", file)
     _check_timing(top.timing, file, "timing.step", top.timing.step)
+    preset = one_of(top.preset, Preset.ALL, "preset", file)
     return Scenario(
         name=name,
         title=top.title,
@@ -275,7 +276,7 @@ def _world(folder: Path) -> Scenario:
         duration=top.duration,
         timing=top.timing,
         # the files of our worlds, part of every shipped episode's key, say how those were driven
-        preset=Preset.LAWFUL if ships else one_of(top.preset, Preset.ALL, "preset", file),
+        preset=Preset.LAWFUL if ships else preset,
         mission=top.mission,
         zones=tuple(replace(z, name=z.name or f"zone{i}") for i, z in enumerate(top.conflict_zones)),
         fleet=_checked_fleet(top.fleet, file, "fleet."),

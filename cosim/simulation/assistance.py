@@ -33,7 +33,8 @@ NOTICE = 150.0  # m: signals and stop lines further ahead are no reason yet
 SERVES = 60.0, 100.0  # m that a lane must serve the route at least, and more for every lane to change back
 ASKS = 0.4  # s between looks for who needs a gap
 GAP = 2.0, 1.0  # m and s: the gap given to who changes lanes
-YIELDING = 2.0, 30.0  # m/s2 and m: how hard an AV brakes for who asked, and how far from the junction
+YIELDING = 2.0, 3.0  # m/s2 and m/s: how hard, and down to what, an AV slows for who asked
+ROOM = 30.0  # m from the junction at least, in which it still slows down
 STANDS = 0.1  # m/s
 PATIENCE = 10.0  # s
 
@@ -60,7 +61,7 @@ class Assisted(Controlled):
 class Assistance(Commander):
     """Drives every commanded AV of preset `lawful`."""
 
-    controlled: dict[str, Assisted]
+    controlled: dict[str, Assisted]  # type: ignore[assignment]  # `_take_over` makes all of them
 
     def __init__(self, step: float) -> None:
         super().__init__(Preset.LAWFUL, step)
@@ -154,7 +155,7 @@ class Assistance(Commander):
                     # of two that block one another the one that asks first goes first
                     followers = get.getNeighbors(name, 0 if side > 0 else 1)
                     self._give([other for other, _ in followers], name)
-            if now - state.waits_since > PATIENCE:
+            if (now - state.waits_since) % (2.0 * PATIENCE) > PATIENCE:  # asks, then lets others pass
                 foes = get.getJunctionFoes(name, NOTICE)
                 # of a foe: 0 its id, 2 m to the place where the ways meet, 7 whether it goes first
                 near = sorted((foe[2], foe[0]) for foe in foes if foe[7])
@@ -170,14 +171,14 @@ class Assistance(Commander):
         """m in which an AV slows down comfortably for who asked; inf for who is no AV."""
         if name not in self.controlled:
             return math.inf
-        return libsumo.vehicle.getSpeed(name) ** 2 / (2.0 * YIELDING[0]) + YIELDING[1]
+        return float(libsumo.vehicle.getSpeed(name)) ** 2 / (2.0 * YIELDING[0]) + ROOM
 
     def _yielding(self, name: str, speed: float, state: Assisted) -> float:
         """The acceleration in m/s2 that opens a gap for who asked for one."""
-        get, brakes = libsumo.vehicle, YIELDING[0]
+        get, (brakes, least) = libsumo.vehicle, YIELDING
         try:
             if get.getRoadID(name) != get.getRoadID(state.gap_for):  # it waits at a junction
-                return -brakes
+                return max(least - speed, -brakes)
             ahead = get.getLanePosition(state.gap_for) - get.getLength(state.gap_for)
             gap = ahead - get.getLanePosition(name)
             theirs = get.getSpeed(state.gap_for)
@@ -185,7 +186,7 @@ class Assistance(Commander):
             return COMFORT
         room, headway = GAP
         slower = max(theirs + 0.5 * (gap - room - headway * speed), 1.0)  # m/s
-        return max(slower - speed, -brakes)
+        return float(max(slower - speed, -brakes))
 
 
 def _leaves_route(name: str, lane: str, offset: int) -> str | None:

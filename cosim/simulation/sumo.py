@@ -274,20 +274,21 @@ class SumoSimulator:
 
     def _snapshot(self) -> Snapshot:
         happened = (tuple(chain.from_iterable(field)) for field in zip(*self._happened, strict=True))
-        events = Events(*happened, stopped=tuple(sorted(self._stopped)))
+        events = replace(Events(*happened), stopped=tuple(sorted(self._stopped)))
         self._happened.clear()
         snapshot = self._reader.read(self._bodies, events)
         if not self._mission_found:
             snapshot = self._find_mission(snapshot)
         self._detector.lane_changes(snapshot, self.road, self._commander)
         extra = self._detector.from_boxes(snapshot, self.road, self._bodies, self._commander.lane_changes)
-        wrecked = removed = ()
+        wrecked: tuple[str, ...] = ()
+        removed: tuple[str, ...] = ()
         if self._wrecks is not None:
             self._wrecks.add(extra)
             wrecked, removed = self._wrecks.take()
         if extra or wrecked or removed:
-            happened = (*snapshot.events.collisions, *extra)
-            events = replace(snapshot.events, collisions=happened, wrecked=wrecked, wrecks_removed=removed)
+            found = (*snapshot.events.collisions, *extra)
+            events = replace(snapshot.events, collisions=found, wrecked=wrecked, wrecks_removed=removed)
             snapshot = replace(snapshot, events=events)
         return snapshot
 

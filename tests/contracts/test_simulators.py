@@ -54,7 +54,7 @@ class TestSumo(SimulatorContract):
             ]
             demand.write_text(TYPES + "\n".join(vehicles) + "</routes>")
             scenario = replace(
-                load("merge"),
+                load("merge", preset="unguarded"),
                 demand=(demand,),
                 warmup=0.4,
                 behavior="as-is",

@@ -12,7 +12,7 @@ from cosim.cli.doctor import FAIL, OK, WARN
 
 
 def test_a_sound_installation_passes_with_a_simulated_second(capsys: pytest.CaptureFixture[str]) -> None:
-    assert doctor.work(Namespace(json=True)) == 0
+    assert doctor.work(Namespace(json=True, scenario=None)) == 0
     report = json.loads(capsys.readouterr().out)
     checks = {check["name"]: check for check in report["checks"]}
     assert report["failed"] == 0
@@ -26,7 +26,7 @@ def test_one_failure_makes_the_exit_code_3(
 ) -> None:
     checks = [doctor.Check("a", OK, "1"), doctor.Check("b", FAIL, "gone", "fetch it")]
     monkeypatch.setattr(doctor, "examine", lambda _: iter(checks))
-    assert doctor.work(Namespace(json=False)) == 3
+    assert doctor.work(Namespace(json=False, scenario=None)) == 3
     assert capsys.readouterr().out == "ok   a: 1\nFAIL b: gone (fetch it)\n"
 
 

@@ -53,7 +53,7 @@ def test_the_document_has_every_promised_figure() -> None:
     found = document("merge", "--policy", "idm", "--duration", "8")
     assert [key for key in REQUIRED.split() if key not in found] == []
     assert found["steps"] == 20
-    assert found["preset"] == "unguarded"
+    assert found["preset"] == "lawful"
     assert found["units"]["dt_mean_m"] == "m"
     assert 8 * 5 < found["dt_mean_m"] < 8 * 30
     assert found["timings"]["decision_s"] < found["timings"]["simulation_s"]
@@ -81,7 +81,7 @@ def test_a_users_scenario_runs_unmodified(a10kw: str) -> None:
     found = document(
         a10kw, "--penetration", "0.2", "--policy", "idm", "--duration", "200", "--seed", "200000"
     )
-    assert found["scenario"] == "A10KW"
+    assert found["scenario"] == "game/A10KW"
     assert found["behavior"] == "as-is"
     assert found["vehicles_inserted"] > 400
     assert found["hv_hv_collisions"] == 0

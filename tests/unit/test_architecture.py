@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-MEASURES_PARTS = "benchmarks/loop.py"  # times bare libsumo, the simulator and the observer one by one
+# These time, one by one, the parts of the loop, of the simulator and of a decision.
+MEASURE_PARTS = {"benchmarks/loop.py", "benchmarks/decision_cost.py"}
 
 
 def calls() -> Iterator[tuple[str, str]]:
@@ -33,11 +34,11 @@ def callers() -> dict[str, set[str]]:
 
 
 def test_only_the_loop_and_the_session_advance_an_episode(callers: dict[str, set[str]]) -> None:
-    assert callers["advance"] - {MEASURES_PARTS} == {"cosim/episode.py", "cosim/envs/host.py"}
+    assert callers["advance"] - MEASURE_PARTS == {"cosim/episode.py", "cosim/envs/host.py"}
 
 
 def test_one_place_assembles_simulator_and_episode(callers: dict[str, set[str]]) -> None:
-    assert callers["SumoSimulator"] - {MEASURES_PARTS} == {"cosim/host.py"}
+    assert callers["SumoSimulator"] - MEASURE_PARTS == {"cosim/host.py"}
     assert callers["Episode"] == {"cosim/host.py"}
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from junitparser import Error, Failure, JUnitXml, Skipped
@@ -145,10 +146,33 @@ def test_demands_of_one_name_in_two_folders_are_not_mixed_up(tmp_path: Path) -> 
 
 
 def test_cells_that_cannot_be_distinguished_are_refused(tmp_path: Path) -> None:
-    a = write(tmp_path / "a", cell("idm", 2), cell("idm", 2, duration=20.0))
-    b = write(tmp_path / "b", cell("idm", 2))
+    here, there = (cell("idm", 2, demand=(f"{place}/rush.rou.xml",)) for place in ("here", "there"))
+    a, b = write(tmp_path / "a", here, there), write(tmp_path / "b", here)
     with pytest.raises(BadInput, match="two cells would be one"):
         compare(side(str(a)), side(str(b)))
+
+
+@pytest.mark.parametrize(
+    ("field", "of_a", "of_b"),
+    [
+        ("duration", 60.0, 30.0),
+        ("warmup", 5.0, 0.0),
+        ("mission", "m1", "none"),
+        ("on_collision", "end", "continue"),
+        ("preset", "lawful", "unguarded"),
+    ],
+)
+def test_runs_that_were_driven_otherwise_are_not_compared(
+    tmp_path: Path, field: str, of_a: object, of_b: object
+) -> None:
+    values: tuple[dict[str, Any], ...] = ({field: of_a}, {field: of_b}, {field: of_a})
+    a, b, like_a = (
+        write(tmp_path / str(k), cell(policy, 3, **value))
+        for k, (policy, value) in enumerate(zip(("idm", "rash", "rash"), values, strict=True))
+    )
+    with pytest.raises(BadInput, match=f"{field} is {of_a} in A, {of_b} in B"):
+        compare(side(str(a)), side(str(b)), [])
+    assert compare(side(str(a)), side(str(like_a)), []).exit_code == 0
 
 
 def test_svo_may_differ_when_asked(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from cosim.batch import matrix
 from cosim.batch.spec import FIELDS, Spec, read
 from cosim.errors import BadInput
 from cosim.scenario.episode_id import EpisodeId
+from cosim.types import Preset
 from policy.agents import check_name
 
 ROUTES = """<routes><vType id="hv"/><vType id="av"/><route id="main" edges="main_in main_acc main_out"/>
@@ -177,7 +178,10 @@ def test_a_case_keeps_its_key_and_comes_back_from_its_document() -> None:
     assert EpisodeId.read(case.document()) == case
     assert case.key == f"{case.cell}-3"
     assert case.with_seed(4).cell == case.cell
-    assert case.cell == "a6779b4d52e4", "stores and manifests of earlier runs hold this hash"
+    assert case.preset == Preset.LAWFUL
+    unnamed = EpisodeId.read({**case.document(), "preset": None})
+    assert unnamed.cell == "a6779b4d52e4", "stores and manifests of earlier runs hold this hash"
+    assert unnamed.scenario().preset == Preset.UNGUARDED, "the default of that time"
 
 
 def test_warm_up_and_mission_are_part_of_the_cell_where_they_are_given() -> None:

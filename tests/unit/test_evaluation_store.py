@@ -22,6 +22,7 @@ from cosim.batch.spec import Spec
 from cosim.batch.store import Store
 from cosim.errors import BadInput, CosimError
 from cosim.scenario.episode_id import EpisodeId
+from cosim.types import Preset
 from cosim.workers.tasks import Outcome, Task
 from policy.agents import check_name
 
@@ -136,6 +137,22 @@ def test_another_spec_or_another_version_of_a_file_is_refused_on_resume(
         cell = replace(plan.cells[0], manifest={**plan.cells[0].manifest, "files": files})
         with pytest.raises(BadInput, match=r"files\.merge\.sumocfg: is another one since the run began"):
             batch.check_same(replace(plan, cells=(cell, plan.cells[1])), store)
+
+
+def test_a_run_of_the_time_when_no_preset_was_named_goes_on_in_its_own(
+    plan: matrix.Plan, tmp_path: Path
+) -> None:
+    unnamed = [replace(cell.case, preset=None) for cell in plan.cells]
+    with Store.in_folder(tmp_path) as store:
+        batch.begin(matrix.plan(unnamed, plan.seeds, check_name), store, {})
+        with pytest.raises(BadInput, match="run of another spec"):
+            batch.check_same(plan, store)
+    cases, seeds = batch.asked(tmp_path, None)
+    found = matrix.plan(cases, seeds, check_name)
+    with Store.in_folder(tmp_path) as store:
+        batch.check_same(found, store)
+    assert [cell.case for cell in found.cells] == unnamed
+    assert {cell.scenario.preset for cell in found.cells} == {Preset.UNGUARDED}
 
 
 def test_a_worker_that_sees_other_versions_than_the_planner_stops_the_run(

@@ -84,7 +84,7 @@ def test_a_foreign_configuration_keeps_its_traffic_and_loses_its_outputs(foreign
     for name in ("tripinfo-output", "fcd-output", "remote-port", "seed", "step-length", "collision.action"):
         assert f"{name}=" in ignored
     assert (s.begin, s.duration, s.warmup) == (60.0, 140.0, 0.0)
-    assert (s.behavior, s.demand_name, s.preset) == ("as-is", "as-is", Preset.UNGUARDED)
+    assert (s.behavior, s.demand_name, s.preset) == ("as-is", "as-is", Preset.LAWFUL)
     assert s.timing.step == 0.1
     assert not s.built_in
 

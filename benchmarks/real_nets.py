@@ -45,6 +45,7 @@ FIRST_SEED = 200000
 PENETRATION = 0.2
 SEEDS = {"idm": 10, "vfn-p": 2}  # of A10KW; the other nets are driven by idm on one seed
 SETTLED = 60.0  # s: the memory is read from then on
+EVERY = 300.0  # s between the memory's readings that are kept
 FEW = 100  # AVs on the road, up to which the simulation is to be no slower than real time
 STANDING = 0.1  # m/s, SUMO's own threshold of a halting vehicle
 QUEUE = 30.0  # m: further ahead nobody is a leader of a queue
@@ -99,6 +100,7 @@ class Cost(Hook):
     def on_start(self, episode: Episode) -> None:
         self._avs: set[str] = set()
         self._most = 0
+        self.curve: list[tuple[int, int, int]] = []  # s, vehicles and persons on the road, MB
         self._few = [0.0, 0.0, 0.0]  # s simulated, passed, of the processor, while few AVs were on the road
         self._before = time.perf_counter(), time.process_time()
 
@@ -108,6 +110,8 @@ class Cost(Hook):
             self.last = pages * os.sysconf("SC_PAGE_SIZE") / 1e6
             if math.isnan(self.first) or episode.elapsed < SETTLED + DECISION:
                 self.first = self.last
+            if episode.elapsed % EVERY < DECISION - 1e-6:
+                self.curve.append((round(episode.elapsed), step.after.n, round(self.last)))
         avs = step.after.avs
         self._avs.update(avs)
         self._most = max(self._most, len(avs))
@@ -121,6 +125,7 @@ class Cost(Hook):
         """As JSON holds it."""
         return {
             "memory": (self.first, self.last),
+            "memory_curve": self.curve,
             "avs": len(self._avs),
             "most_avs": self._most,
             "few_avs": self._few,

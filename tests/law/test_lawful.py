@@ -1,0 +1,103 @@
+"""Preset `lawful`: the car keeps the law whoever commands it, and says where it drove otherwise."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cosim.control import COMFORT, JERK, lawful_speed, wished_accel
+from cosim.host import Host
+from cosim.road.rules import RulesAhead
+from cosim.scenario import chosen_fleet, load
+from cosim.types import (
+    Decision,
+    EpisodeResult,
+    History,
+    MetaAction,
+    ObservationConfig,
+    PolicyContext,
+    Preset,
+)
+from cosim.workers.worker import Worker
+
+SEED = 100_000
+STEP = 0.1  # s
+
+
+class Always:
+    """Asks every AV for the same, whatever comes."""
+
+    observation = ObservationConfig(maps=False)
+    av_parameters: Mapping[str, str] = {}
+    label = ""
+
+    def __init__(self, action: MetaAction) -> None:
+        self.name, self.action = action.name.lower(), action
+
+    def reset(self, context: PolicyContext) -> None:
+        pass
+
+    def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
+        return {av: Decision(self.action) for av in histories}
+
+
+def drive(what: Path | str, policy: object, preset: str = Preset.LAWFUL, share: float = 1.0) -> EpisodeResult:
+    scenario = load(str(what), preset=preset, fleet=chosen_fleet(None, None, share), duration=60.0)
+    with Worker(Host, scenario, policy, math.pi / 4) as worker:
+        result: EpisodeResult = worker.call("run", SEED)
+    return result
+
+
+@pytest.mark.parametrize("world", ["grid_signals", "all_way_stop", "crossing_unsignalled", "lane_drop"])
+def test_whoever_always_accelerates_breaks_no_law_in_lawful(law_worlds: dict[str, Path], world: str) -> None:
+    result = drive(law_worlds[world], Always(MetaAction.ACCELERATE))
+
+    broken = ("red_light_violations", "stop_sign_violations", "av_involved_collisions", "avs_stuck")
+    assert [result.value(name) for name in broken] == [0, 0, 0, 0]
+    assert (result.value("worst_speeding_mps") or 0.0) < 1.0
+    assert (result.value("interventions") or 0) > 0
+    assert sum(result.interventions_by_reason.values()) == result.value("interventions")
+
+
+def test_the_same_agent_unguarded_runs_red_lights(law_worlds: dict[str, Path]) -> None:
+    result = drive(law_worlds["grid_signals"], Always(MetaAction.ACCELERATE), Preset.UNGUARDED)
+
+    assert (result.value("red_light_violations") or 0) > 0
+    assert result.value("interventions") == 0
+
+
+def test_nobody_stands_for_ever_though_the_agent_only_brakes(law_worlds: dict[str, Path]) -> None:
+    result = drive(law_worlds["lane_drop"], Always(MetaAction.DECELERATE))
+
+    assert result.value("avs_stuck") == 0
+    assert (result.value("dt_av_m") or 0.0) > 50.0
+
+
+def test_keep_lane_always_drives_unguarded() -> None:
+    assert drive("merge", "keep-lane").preset == Preset.UNGUARDED
+
+
+def test_what_the_agent_wishes_is_comfortable_and_its_jerk_bounded() -> None:
+    speed, accel, course = 25.0, 0.0, [0.0]
+    for _ in range(120):
+        asked, accel = wished_accel(speed, 0.0, accel, STEP)
+        speed = max(speed + accel * STEP, 0.0)
+        course.append(accel)
+        assert -COMFORT <= asked <= COMFORT
+    assert np.abs(np.diff(course)).max() <= JERK * STEP + 1e-9
+    assert np.abs(course).max() <= COMFORT
+    assert speed < 0.5
+
+
+def test_the_lawful_speed_falls_towards_a_red_light_and_a_lower_limit() -> None:
+    def at(distance: float) -> float:
+        return lawful_speed(RulesAhead(signal="r", signal_distance=distance, limits=np.array([[0.0, 14.0]])))
+
+    assert at(200.0) == 14.0
+    assert at(60.0) > at(30.0) > at(10.0) > at(2.0) > 0.0
+    turning = RulesAhead(limits=np.array([[0.0, 14.0], [20.0, 5.0]]))
+    assert 5.0 < lawful_speed(turning) < 14.0

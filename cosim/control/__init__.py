@@ -214,9 +214,10 @@ def to_commands(
     commands = []
     for vehicle, decision in decisions.items():
         history = histories[vehicle]
-        target = next_target(
-            history.target_speed, history.ego_speed, decision.action, history.route.speed_limit
-        )
-        limit = lawful_speed(history.rules) if lawful else math.inf
+        limit, highest = math.inf, history.route.speed_limit
+        if lawful:  # a slow lane inside a junction lowers no wish for the road behind it
+            limit, ahead = lawful_speed(history.rules), float(history.rules.limits[:, 1].max())
+            highest = ahead if math.isfinite(ahead) else highest
+        target = next_target(history.target_speed, history.ego_speed, decision.action, highest)
         commands.append(Command(vehicle, target, LANE_OFFSET.get(decision.action, 0), hold, limit))
     return commands

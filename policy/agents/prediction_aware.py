@@ -85,7 +85,7 @@ class PredictionAware:
             version, predicted = self.observation.road_version, self.config.predicted_maps
             self._raster = rasterize_road(context.road, version) if predicted else None
         self._context = context
-        self._safety = replace(self.config.safety, crossing=context.preset != Preset.LAWFUL)
+        self._safety = replace(self.config.safety, assisted=context.preset == Preset.LAWFUL)
         self._expected: tuple[tuple[str, ...], Traffic, KinematicForecast] | None = None
         self._asked: dict[str, tuple[MetaAction, float]] = {}  # lane changes commanded last, when (s)
         self._memories: dict[VFN, FrameMemory | None] = {}

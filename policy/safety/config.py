@@ -34,9 +34,9 @@ class SafetyConfig:
     straddle: float = 1.0  # m beside the centre line: a car whose rear stands there blocks two lanes
     lane_half: float = 1.6  # m from a centre line within which a vehicle is in that lane
     same_way: float = 1.05  # rad, headings closer than this (60 degrees) drive the same way
-    crossing: bool = (
-        True  # whether vehicles on crossing ways count; in preset `lawful` the car gives way itself
-    )
+    # whether the car itself gives way, keeps its distance and its route (preset `lawful`): then vehicles on
+    # crossing ways, cars ahead in the own lane and the ends of lanes make nothing unsafe
+    assisted: bool = False
     resume_below: float = 0.5  # of the speed limit: slower commands are not kept among equal values
     # among equally valued actions: keep going, else give way, else evade
     ties: tuple[MetaAction, ...] = (

@@ -53,7 +53,7 @@ def others_near(
         rows = rows[rows >= 0]
         rows = rows[traffic.known[rows]]
         rows = rows[road.contact.touch(int(scene.lane[me]), scene.lane[rows])]
-    if not c.crossing:
+    if c.assisted:
         rows = _along(rows, me, scene.state[:, -1, HEADING], scene.lane, np.array(way, np.int64), c.same_way)
     boxes = Boxes(r.x, r.y, r.heading, traffic.length, traffic.width, r.speed)
     return Others(rows, _only(boxes, rows), intended[rows])

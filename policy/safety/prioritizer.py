@@ -165,7 +165,8 @@ def evaluate(
         if 0.9 * c.safe_th < limit[a]:
             limit[a] = 0.9 * c.safe_th
             blamed[a] = blamed[a] or STRADDLING
-    for a, reached in at_lane_end(ego, course, c).items():
+    ends = at_lane_end(ego, course, c) if not c.assisted else {}
+    for a, reached in ends.items():
         if reached < contact[a]:
             contact[a], blamed[a] = reached, LANE_END
     steps, weight, total = _weights(c)
@@ -206,6 +207,8 @@ def _met(
     times = first_contact(ego, length, width, others, c)  # [A,O] s
     times[near.behind] = np.inf  # followers brake: a change asks by `gap_margin` whether they must
     held, ahead = times[KEEPING], near.ahead[KEEPING]
+    if c.assisted:
+        times[KEEPING] = held = np.where(ahead, np.inf, held)
     if c.brake_after < c.frames * c.dt and np.isfinite(held[ahead]).any():
         braked = roll_braked(history, ways[KEEPING[0]].path, now, ego, KEEPING, c)
         late = first_contact(braked, length, width, others, c)
@@ -214,6 +217,8 @@ def _met(
     contact = times[np.arange(count), first]
     changes = np.array([way.changes for way in ways])
     limit, tightest = gap_margin(stopping, float(now[2]), changes, near, others, c)
+    if c.assisted:
+        limit[KEEPING] = np.inf
     blamed: list[str | None] = [None] * count
     for a in range(count):
         if contact[a] > c.horizon + c.critical_th and limit[a] < c.safe_th:

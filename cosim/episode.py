@@ -163,6 +163,11 @@ class Episode:
         return self.histories
 
     @property
+    def collisions(self) -> tuple[Collision, ...]:
+        """So far."""
+        return tuple(self._collisions)
+
+    @property
     def offences(self) -> list[Offence]:
         """What AVs did against the law so far, as the figures count it; by time."""
         return self._metrics.offences

@@ -97,7 +97,7 @@ class CollisionDetector:
                 int(snapshot.place[i]), int(snapshot.place[j])
             ):
                 continue
-            if _only_a_tail(snapshot, road, i, j) or the_nets(snapshot, road, i, j):
+            if only_a_tail(snapshot, road, i, j) or the_nets(snapshot, road, i, j):
                 continue
             self._seen.add(frozenset(names))
             pair = boxes(snapshot, np.array([i, j]))
@@ -273,7 +273,7 @@ def _poses(names: Sequence[str], bodies: dict[str, Body]) -> Boxes | None:
     return Boxes(*centres(front[:, 0], front[:, 1], angle, 0.5 * length), length, width, speed)
 
 
-def _only_a_tail(snapshot: Snapshot, road: RoadMap, i: int, j: int) -> bool:
+def only_a_tail(snapshot: Snapshot, road: RoadMap, i: int, j: int) -> bool:
     """Whether two cars in lanes side by side touch only because one of them stands askew.
 
     SUMO's front moves sideways at 1.6 m/s however slowly the car drives, and its tail follows over the
@@ -284,7 +284,7 @@ def _only_a_tail(snapshot: Snapshot, road: RoadMap, i: int, j: int) -> bool:
     a, b = int(snapshot.lane[i]), int(snapshot.lane[j])
     if a < 0 or b < 0 or a == b:
         return False
-    along = np.array([_direction(road, snapshot, row) for row in (i, j)])  # [2] rad, of the lanes
+    along = np.array([direction(road, snapshot, row) for row in (i, j)])  # [2] rad, of the lanes
     if abs((along[0] - along[1] + np.pi) % (2 * np.pi) - np.pi) > SIDE_BY_SIDE:
         return False
     rows = np.array([i, j])
@@ -297,7 +297,7 @@ def _only_a_tail(snapshot: Snapshot, road: RoadMap, i: int, j: int) -> bool:
     return not len(overlapping_pairs(laid))
 
 
-def _direction(road: RoadMap, snapshot: Snapshot, row: int) -> float:
+def direction(road: RoadMap, snapshot: Snapshot, row: int) -> float:
     """The direction of a vehicle's lane at its front bumper, rad."""
     path = road.path(int(snapshot.lane[row]))
     return float(path.pose(np.array([snapshot.lane_position[row] * path.scale]))[2][0])

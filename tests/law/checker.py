@@ -110,8 +110,8 @@ class Net:
         onward = {(a, c.attrib["to"], c.attrib["toLane"]): c for c, a in rows if a.startswith(":")}
         self.links: list[Link] = []
         for c, origin in rows:
-            edge = c.attrib["from"]
-            if edge.startswith(":") or c.attrib["to"].startswith(":"):  # inside; a sidewalk to its corner
+            begins = c.attrib["from"]
+            if begins.startswith(":") or c.attrib["to"].startswith(":"):  # inside; a sidewalk to its corner
                 continue
             via: list[str] = []
             after = c.get("via")
@@ -124,7 +124,7 @@ class Net:
                     origin,
                     f"{c.attrib['to']}_{c.attrib['toLane']}",
                     tuple(via),
-                    self.ends[edge],
+                    self.ends[begins],
                     c.attrib["state"],
                     None if tl is None else (tl, int(c.attrib["linkIndex"])),
                 )

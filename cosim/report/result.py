@@ -72,7 +72,9 @@ def law_lines(result: EpisodeResult) -> list[str]:
     """`law   0 red lights, ...` and, where the car corrected its agent, how often and why."""
     known = {name: result.metrics[name] for name in LAW if name in result.metrics}
     known = {name: metric for name, metric in known.items() if metric.value is not None}
-    said = [n for k, n in enumerate(LAW) if n in known and (k < LAW_IN_ANY_CASE or known[n].value)]
+    said = [
+        n for k, n in enumerate(LAW) if n in known and (k < LAW_IN_ANY_CASE or round(known[n].value or 0, 3))
+    ]
     lines = []
     if said:
         words = ", ".join(

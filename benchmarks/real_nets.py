@@ -44,6 +44,7 @@ DECISION = Timing().decision  # s
 FIRST_SEED = 200000
 PENETRATION = 0.2
 SEEDS = {"idm": 10, "vfn-p": 2}  # of A10KW; the other nets are driven by idm on one seed
+LONGEST = 10_000.0  # s: of demonstrations that go on for days
 SETTLED = 60.0  # s: the memory is read from then on
 EVERY = 300.0  # s between the memory's readings that are kept
 FEW = 100  # AVs on the road, up to which the simulation is to be no slower than real time
@@ -230,7 +231,10 @@ class Driver:
     """Hosted in a process of its own, since a net may end SUMO and with it the process."""
 
     def __init__(self, run: Run) -> None:
-        scenario = load(str(run.config), fleet=Fleet(penetration=PENETRATION), duration=run.duration)
+        fleet = Fleet(penetration=PENETRATION)
+        self._end = load(str(run.config), fleet=fleet).duration
+        duration = min(run.duration or self._end, self._end, LONGEST)
+        scenario = load(str(run.config), fleet=fleet, duration=duration)
         self._run = run
         self._host = Host(vetted(scenario), run.policy, svo=math.radians(45.0))
 
@@ -242,6 +246,7 @@ class Driver:
         road: RoadMap = self._host.simulator.road
         return {
             **document,
+            "end": self._end,
             **cost.document(),
             "overlaps": list(overlaps.found.values()),
             "heads": dict(queues.heads.most_common()),
@@ -276,8 +281,9 @@ def drive(run: Run, runs: Path, held: bool) -> dict[str, Any] | str | None:
     file = runs / run.name
     if file.exists():
         return read_json(file)
-    if held:
-        return None
+    if held:  # what was driven of it, if only its beginning was
+        parts = [read_json(part) for part in runs.glob(run.name.replace(".json", "-*s.json"))]
+        return max(parts, key=_simulated, default=None)
     try:
         worker = Worker(Driver, run, timeout=3600.0, name="real-nets")
         try:
@@ -313,7 +319,7 @@ def explained(collision: dict[str, Any]) -> str:
 def page(runs: Sequence[Run], found: Sequence[dict[str, Any] | str | None], command: str) -> list[str]:
     """The Markdown page."""
     driven = [(run, one) for run, one in zip(runs, found, strict=True) if isinstance(one, dict)]
-    count = Counter((run.config.stem, run.policy) for run, _ in driven)
+    count = Counter((r.config.stem, r.policy) for r, one in driven if _simulated(one) >= _end(one))
     wanted_ = Counter((run.config.stem, run.policy) for run in runs)
     big = [f"`{p}` on {count[net, p]} of {n} seeds" for (net, p), n in wanted_.items() if n > 1]
     lines = [
@@ -321,7 +327,7 @@ def page(runs: Sequence[Run], found: Sequence[dict[str, Any] | str | None], comm
         "",
         f"Made by `{command}`: the games of the `eclipse-sumo` package",
         f"(`pip install cosim-sumo[tools]`), driven as they stand, {PENETRATION:.0%} of the vehicles AVs.",
-        f"A10KW is a motorway interchange with bridges; driven so far: {', '.join(big)}.",
+        f"A10KW is a motorway interchange with bridges; driven to its end with {', '.join(big)}.",
         f"Memory: of the simulation's process, after {SETTLED:g} s and at the end.",
         "Time factor: simulated s per s that passed, other programs on the machine included; over the steps",
         f"with at most {FEW} AVs on the road first per s of the processor, then per s that passed.",
@@ -333,7 +339,12 @@ def page(runs: Sequence[Run], found: Sequence[dict[str, Any] | str | None], comm
     rows = []
     for _, one in driven:
         first, last = one["memory"]
-        cells = [one["preset"], f"{_simulated(one):,.0f} s", f"{one['avs']:,}", f"{one['most_avs']}"]
+        cells = [
+            one["preset"],
+            f"{_simulated(one):,.0f} of {_end(one):,.0f} s",
+            f"{one['avs']:,}",
+            f"{one['most_avs']}",
+        ]
         rows.append([*cells, *_figures(one, TRAFFIC), f"{first:.0f}, {last:.0f}", *_factors(one)])
     few = f"at most {FEW} AVs"
     lines += _table([*heads, *TRAFFIC, "memory, MB", "time factor", few], driven, rows)
@@ -371,6 +382,11 @@ def page(runs: Sequence[Run], found: Sequence[dict[str, Any] | str | None], comm
 
 def _simulated(one: dict[str, Any]) -> float:
     return float(one["steps"] * DECISION)
+
+
+def _end(one: dict[str, Any]) -> float:
+    """s, of the scenario as it is written."""
+    return float(one.get("end", _simulated(one)))
 
 
 def _figures(one: dict[str, Any], columns: dict[str, str]) -> list[str]:
@@ -450,7 +466,18 @@ def _overlap(o: dict[str, Any]) -> str:
 
 def _offences(driven: Sequence[tuple[Run, dict[str, Any]]]) -> list[str]:
     """What AVs did against the law, the first of each run."""
-    lines = ["", "## Offences of AVs", ""]
+    lines = [
+        "",
+        "## Offences of AVs",
+        "",
+        "The figure follows a queue as far as vehicles stand within 10 m of one another on the straightest",
+        "lanes ahead. SUMO's drivers also queue around corners, and stop before a junction that they could",
+        "not clear: those count as standing without a reason. Below, for each run, where SUMO's own leaders",
+        "lead from them. The lights of A10KW, bs3d and bs3Dosm are a player's to switch: they have phases of",
+        "1,000 s and longer.",
+        "",
+    ]
+    empty = len(lines)
     for run, one in driven:
         told = one["offences"]
         lines += [
@@ -463,7 +490,7 @@ def _offences(driven: Sequence[tuple[Run, dict[str, Any]]]) -> list[str]:
             begin = "; ".join(f"{head} ({n})" for head, n in heads.items())
             name = f"{run.config.stem}, {run.policy}, seed {run.seed}"
             lines.append(f"- {name}: the queues of those that stood begin where {begin}")
-    return lines if len(lines) > 3 else [*lines, "None."]
+    return lines if len(lines) > empty else [*lines, "None."]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -47,6 +47,7 @@ SEEDS = {"idm": 10, "vfn-p": 2}  # of A10KW; the other nets are driven by idm on
 LONGEST = 10_000.0  # s: of demonstrations that go on for days
 SETTLED = 60.0  # s: the memory is read from then on
 EVERY = 300.0  # s between the memory's readings that are kept
+CURVE = 12  # of these at most on the page
 FEW = 100  # AVs on the road, up to which the simulation is to be no slower than real time
 STANDING = 0.1  # m/s, SUMO's own threshold of a halting vehicle
 QUEUE = 30.0  # m: further ahead nobody is a leader of a queue
@@ -350,6 +351,10 @@ def page(runs: Sequence[Run], found: Sequence[dict[str, Any] | str | None], comm
     lines += _table([*heads, *TRAFFIC, "memory, MB", "time factor", few], driven, rows)
     lines += ["", "## The law and the trips of AVs", ""]
     lines += _table([*heads[:3], *LAW], driven, [_figures(one, LAW) for _, one in driven])
+    lines += ["", f"## Memory every {EVERY:g} s, MB (on the road then)", ""]
+    for run, one in driven:
+        curve = ", ".join(f"{mb} ({n})" for _, n, mb in one.get("memory_curve", ())[:CURVE])
+        lines += [f"- {run.config.stem}, {run.policy}, seed {run.seed}: {curve}"] if curve else []
     lines += ["", "## Every collision", ""]
     collisions = [
         f"- {run.config.stem}, {run.policy}, seed {run.seed}: {explained(c)}"

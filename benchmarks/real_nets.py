@@ -44,8 +44,10 @@ DECISION = Timing().decision  # s
 FIRST_SEED = 200000
 PENETRATION = 0.2
 SEEDS = {"idm": 10, "vfn-p": 2}  # of A10KW; the other nets are driven by idm on one seed
+LONGEST = 10_000.0  # s: of demonstrations that go on for days
 SETTLED = 60.0  # s: the memory is read from then on
 EVERY = 300.0  # s between the memory's readings that are kept
+CURVE = 12  # of these at most on the page
 FEW = 100  # AVs on the road, up to which the simulation is to be no slower than real time
 STANDING = 0.1  # m/s, SUMO's own threshold of a halting vehicle
 QUEUE = 30.0  # m: further ahead nobody is a leader of a queue
@@ -72,6 +74,13 @@ LAW = {
     "persons": "person_conflicts",
     "AV trips": "av_trips_completed",
     "interventions": "interventions",
+}
+LOOKED_AT = {  # (net, collider, victim) -> what the pictures show
+    ("fkk_in", "1_horizontal.0", "2_left.0"): (
+        "the net's: the car stands where `:gneJ21_12_0` ends, the place inside the junction at which the net"
+        " lets it wait, and the 2.6 m wide articulated lorry, a stiff box of 16 m here, grazes its corner by"
+        " 0.2 m while both are on their own centre lines"
+    ),
 }
 TAIL, NET = "one stands askew", "the lanes lie too close"  # why boxes overlap that have not collided
 
@@ -230,7 +239,10 @@ class Driver:
     """Hosted in a process of its own, since a net may end SUMO and with it the process."""
 
     def __init__(self, run: Run) -> None:
-        scenario = load(str(run.config), fleet=Fleet(penetration=PENETRATION), duration=run.duration)
+        fleet = Fleet(penetration=PENETRATION)
+        self._end = load(str(run.config), fleet=fleet).duration
+        duration = min(run.duration or self._end, self._end, LONGEST)
+        scenario = load(str(run.config), fleet=fleet, duration=duration)
         self._run = run
         self._host = Host(vetted(scenario), run.policy, svo=math.radians(45.0))
 
@@ -242,6 +254,7 @@ class Driver:
         road: RoadMap = self._host.simulator.road
         return {
             **document,
+            "end": self._end,
             **cost.document(),
             "overlaps": list(overlaps.found.values()),
             "heads": dict(queues.heads.most_common()),
@@ -276,8 +289,9 @@ def drive(run: Run, runs: Path, held: bool) -> dict[str, Any] | str | None:
     file = runs / run.name
     if file.exists():
         return read_json(file)
-    if held:
-        return None
+    if held:  # what was driven of it, if only its beginning was
+        parts = [read_json(part) for part in runs.glob(run.name.replace(".json", "-*s.json"))]
+        return max(parts, key=_simulated, default=None)
     try:
         worker = Worker(Driver, run, timeout=3600.0, name="real-nets")
         try:
@@ -307,13 +321,13 @@ def explained(collision: dict[str, Any]) -> str:
             "an AV's, which had just cut in" if cut_in else f"that of the {collider.split()[0]} that moved"
         )
     where = f"`{collision['lane']}`" if collision["lane"] else "off the lanes"
-    return f"{collision['time']:,.1f} s, {where}: {what}; seen by {seen}; {whose}"
+    return f"{collision['time']:,.1f} s, {where}: {what}; seen by {seen}; counted as {whose}"
 
 
 def page(runs: Sequence[Run], found: Sequence[dict[str, Any] | str | None], command: str) -> list[str]:
     """The Markdown page."""
     driven = [(run, one) for run, one in zip(runs, found, strict=True) if isinstance(one, dict)]
-    count = Counter((run.config.stem, run.policy) for run, _ in driven)
+    count = Counter((r.config.stem, r.policy) for r, one in driven if _simulated(one) >= _end(one))
     wanted_ = Counter((run.config.stem, run.policy) for run in runs)
     big = [f"`{p}` on {count[net, p]} of {n} seeds" for (net, p), n in wanted_.items() if n > 1]
     lines = [
@@ -321,7 +335,7 @@ def page(runs: Sequence[Run], found: Sequence[dict[str, Any] | str | None], comm
         "",
         f"Made by `{command}`: the games of the `eclipse-sumo` package",
         f"(`pip install cosim-sumo[tools]`), driven as they stand, {PENETRATION:.0%} of the vehicles AVs.",
-        f"A10KW is a motorway interchange with bridges; driven so far: {', '.join(big)}.",
+        f"A10KW is a motorway interchange with bridges; driven to its end with {', '.join(big)}.",
         f"Memory: of the simulation's process, after {SETTLED:g} s and at the end.",
         "Time factor: simulated s per s that passed, other programs on the machine included; over the steps",
         f"with at most {FEW} AVs on the road first per s of the processor, then per s that passed.",
@@ -333,15 +347,24 @@ def page(runs: Sequence[Run], found: Sequence[dict[str, Any] | str | None], comm
     rows = []
     for _, one in driven:
         first, last = one["memory"]
-        cells = [one["preset"], f"{_simulated(one):,.0f} s", f"{one['avs']:,}", f"{one['most_avs']}"]
+        cells = [
+            one["preset"],
+            f"{_simulated(one):,.0f} of {_end(one):,.0f} s",
+            f"{one['avs']:,}",
+            f"{one['most_avs']}",
+        ]
         rows.append([*cells, *_figures(one, TRAFFIC), f"{first:.0f}, {last:.0f}", *_factors(one)])
     few = f"at most {FEW} AVs"
     lines += _table([*heads, *TRAFFIC, "memory, MB", "time factor", few], driven, rows)
     lines += ["", "## The law and the trips of AVs", ""]
     lines += _table([*heads[:3], *LAW], driven, [_figures(one, LAW) for _, one in driven])
+    lines += ["", f"## Memory every {EVERY:g} s, MB (on the road then)", ""]
+    for run, one in driven:
+        curve = ", ".join(f"{mb} ({n})" for _, n, mb in one.get("memory_curve", ())[:CURVE])
+        lines += [f"- {run.config.stem}, {run.policy}, seed {run.seed}: {curve}"] if curve else []
     lines += ["", "## Every collision", ""]
     collisions = [
-        f"- {run.config.stem}, {run.policy}, seed {run.seed}: {explained(c)}"
+        f"- {run.config.stem}, {run.policy}, seed {run.seed}: {explained(c)}{_seen(run, c)}"
         for run, one in driven
         for c in one["collision_list"]
     ]
@@ -369,8 +392,18 @@ def page(runs: Sequence[Run], found: Sequence[dict[str, Any] | str | None], comm
     ]
 
 
+def _seen(run: Run, collision: dict[str, Any]) -> str:
+    seen = LOOKED_AT.get((run.config.stem, collision["collider"], collision["victim"]))
+    return f". Looked at: {seen}" if seen else ""
+
+
 def _simulated(one: dict[str, Any]) -> float:
     return float(one["steps"] * DECISION)
+
+
+def _end(one: dict[str, Any]) -> float:
+    """s, of the scenario as it is written."""
+    return float(one.get("end", _simulated(one)))
 
 
 def _figures(one: dict[str, Any], columns: dict[str, str]) -> list[str]:
@@ -408,7 +441,7 @@ def _overlaps(driven: Sequence[tuple[Run, dict[str, Any]]]) -> list[str]:
         "lanes, with their fronts where they are, the two are apart (askew: the larger angle between a",
         "vehicle and its lane; apart: the gap of the two so laid).",
         f"{NET.capitalize()}: each is on the centre line of its own lane, of lanes whose drivers need not",
-        "heed one another.",
+        "heed one another, or one is behind the other on a lane that is drawn shorter than it is.",
         "",
         *_row("net", "policy", "why", "pairs", "depth, m", "askew, degrees", "apart, m", "slower one, m/s"),
     ]
@@ -450,7 +483,18 @@ def _overlap(o: dict[str, Any]) -> str:
 
 def _offences(driven: Sequence[tuple[Run, dict[str, Any]]]) -> list[str]:
     """What AVs did against the law, the first of each run."""
-    lines = ["", "## Offences of AVs", ""]
+    lines = [
+        "",
+        "## Offences of AVs",
+        "",
+        "The figure follows a queue as far as vehicles stand within 10 m of one another on the straightest",
+        "lanes ahead. SUMO's drivers also queue around corners, and stop before a junction that they could",
+        "not clear: those count as standing without a reason. Below, for each run, where SUMO's own leaders",
+        "lead from them. The lights of A10KW, bs3d and bs3Dosm are a player's to switch: they have phases of",
+        "1,000 s and longer.",
+        "",
+    ]
+    empty = len(lines)
     for run, one in driven:
         told = one["offences"]
         lines += [
@@ -463,7 +507,7 @@ def _offences(driven: Sequence[tuple[Run, dict[str, Any]]]) -> list[str]:
             begin = "; ".join(f"{head} ({n})" for head, n in heads.items())
             name = f"{run.config.stem}, {run.policy}, seed {run.seed}"
             lines.append(f"- {name}: the queues of those that stood begin where {begin}")
-    return lines if len(lines) > 3 else [*lines, "None."]
+    return lines if len(lines) > empty else [*lines, "None."]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -20,6 +20,7 @@ JUST_INSERTED = 1.0  # s
 HALTING = 0.1  # m/s, SUMO's threshold of a halting vehicle
 STANDS = 0.02  # m between two frames, at that speed
 ON_CENTRE_LINE = 0.3  # m: a front bumper nearer to its lane's centre line is not changing lanes
+DRAWN_WHOLE = 0.99  # m of a lane's shape per m of its length; nets have lanes with less
 WRECK_STANDS = 5.0  # s, then it is taken off the road
 # SUMO's words for a vehicle that hits a person (MSLane::detectPedestrianJunctionCollision).
 OF_PERSONS = frozenset({"sharedLane", "crossing", "walkingarea", "junctionPedestrian"})
@@ -237,8 +238,9 @@ def mover(before: Boxes, now: Boxes) -> int | None:
 
 def the_nets(snapshot: Snapshot, road: RoadMap, i: int, j: int) -> bool:
     """Whether two vehicles overlap though each follows its own lane, on lanes whose drivers need not heed one
-    another (`heed_each_other`): the lanes lie too close together, and no driver can help it."""
-    ways = []
+    another (`heed_each_other`): the lanes lie too close together, and no driver can help it; or one behind
+    the other on a lane that is drawn shorter than it is, with a gap between them by its length."""
+    ways, drawn_shorter = [], False
     for row in (i, j):
         lane = int(snapshot.lane[row])
         if lane < 0:
@@ -250,7 +252,11 @@ def the_nets(snapshot: Snapshot, road: RoadMap, i: int, j: int) -> bool:
             return False
         behind = snapshot.length[row] - snapshot.lane_position[row] * path.scale
         ways.append(foot(road, lane, behind, _end(snapshot, row, -0.5)))
-    return not any(heed_each_other(road, a, b) for a in ways[0] for b in ways[1])
+        if snapshot.lane[i] == snapshot.lane[j] and path.scale < DRAWN_WHOLE:
+            last, first = sorted((i, j), key=lambda k: float(snapshot.lane_position[k]))
+            rear = snapshot.lane_position[first] - snapshot.length[first]
+            drawn_shorter = bool(rear > snapshot.lane_position[last])
+    return drawn_shorter or not any(heed_each_other(road, a, b) for a in ways[0] for b in ways[1])
 
 
 def _end(snapshot: Snapshot, row: int, share: float) -> Floats:

@@ -10,11 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cosim.geometry import (
+    EVERYWHERE,
     Boxes,
     conflicts,
     deceleration_to_avoid_crash,
     gap_ahead,
     headway,
+    kernels,
     overlap,
     overlapping_pairs,
     post_encroachment_time,
@@ -330,3 +332,28 @@ def test_following_and_parallel_driving_have_no_pet() -> None:
     assert post_encroachment_time(drive(car(0, 3.2, 0, 20), 0.2, 8.0), leader, 0.2) == np.inf
     beyond = drive(car(0, -230, 90, 20), 0.2, 16.0)  # crosses more than 5 s later
     assert post_encroachment_time(drive(car(-50, 0, 0, 20), 0.2, 16.0), beyond, 0.2) == np.inf
+
+
+def test_the_smallest_encroachment_of_a_wide_crowd_is_that_of_its_worst_pair() -> None:
+    rng = np.random.default_rng(200_001)
+    n, frames, interval = 60, 26, 0.2
+    drift = interval * np.arange(1 - frames, 1)[:, None]  # [T,1] s
+    x, y, heading = rng.uniform(-300, 300, n), rng.uniform(-300, 300, n), rng.uniform(-3, 3, n)
+    speed = rng.uniform(0, 30, n)
+    course = np.cos(heading), np.sin(heading)
+    trail = np.stack(
+        np.broadcast_arrays(
+            x + drift * speed * course[0], y + drift * speed * course[1], *course, speed, np.zeros(n)
+        ),
+        axis=-1,
+    )  # [T,n,6]
+    sizes = np.tile([5.0, 2.0], (n, 1))
+    relevant = rng.random(n) < 0.3
+
+    def smallest(rows: list[int]) -> float:
+        parts = np.ascontiguousarray(trail[:, rows]), frames - 1, len(rows), sizes[rows], relevant[rows]
+        return float(kernels.encroachment(*parts, interval, EVERYWHERE))
+
+    pairs = [smallest([a, b]) for a in range(n) for b in range(a)]
+    assert sum(lag < 5.0 for lag in pairs) > 1
+    assert smallest(list(range(n))) == min(pairs)

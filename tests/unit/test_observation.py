@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from cosim.episode import Observed
 from cosim.geometry.raster import ROAD_LINE, ROAD_SURFACE, rasterize_road
 from cosim.observation.observer import Observer
 from cosim.simulation.fake import FakeSimulator, FakeVehicle, straight_road
@@ -201,3 +202,21 @@ def test_hundreds_of_vehicles_come_and_go() -> None:
         observer.add(s)
         histories = observer.histories(lambda _: ("road",), lambda _: (None, 0))
         assert len(histories) == int((s.kind == Kind.AV).sum())
+
+
+def test_what_avs_observe_is_worked_out_once_and_not_after_the_simulation_went_on() -> None:
+    looks: list[dict[str, History]] = []
+
+    def now() -> dict[str, History]:
+        looks.append({"v0": look(scene(x=[0.0], y=[0.0]))})
+        return looks[-1]
+
+    seen, unseen = Observed(now), Observed(now)
+    assert not looks
+    assert list(seen) == ["v0"]
+    assert len(seen) == len(looks) == 1
+    seen.expire()
+    unseen.expire()
+    assert seen["v0"] is looks[0]["v0"]
+    with pytest.raises(RuntimeError, match="before the simulation went on"):
+        len(unseen)

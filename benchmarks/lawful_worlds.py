@@ -1,9 +1,10 @@
 """Preset `lawful` against `unguarded` in our five worlds: crashes, hard brakings, distances.
 
-    python -m benchmarks.lawful_worlds [--episodes 100] [--out runs/lawful] [--workers 2]
+    python -m benchmarks.lawful_worlds [--episodes 100] [--runs runs/lawful] [--workers 2] [--out PAGE]
 
 `vfn-p` and `idm` drive `dense` from test seed 200,000 on; the same command goes on where it stopped. The
-episodes of `vfn-p` in `unguarded` ship (docs/results/episodes). Writes docs/results/lawful_worlds.md.
+episodes of `vfn-p` in `unguarded` ship (docs/results/episodes). Writes
+docs/results/lawful_worlds.md.
 """
 
 import argparse
@@ -81,21 +82,23 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--episodes", type=int, default=100)
-    parser.add_argument("--out", type=Path, default=Path("runs/lawful"))
+    parser.add_argument("--worlds", nargs="+", default=sumo_scenarios.names(), choices=sumo_scenarios.names())
+    parser.add_argument("--runs", type=Path, default=Path("runs/lawful"), help="where episodes are kept")
+    parser.add_argument("--out", type=Path, default=PAGE)
     parser.add_argument("--workers", default="2")
     args = parser.parse_args()
     seeds = f"{FIRST_TEST_SEED}:{FIRST_TEST_SEED + args.episodes}"
-    worlds = [word for name in sumo_scenarios.names() for word in ("--scenario", name)]
+    worlds = [word for name in args.worlds for word in ("--scenario", name)]
     which = ["--demand", "dense", "--policy", POLICY, "--preset", Preset.LAWFUL, "--seeds", seeds]
-    running = ["--resume", "--workers", args.workers, "--out", str(args.out)]
+    running = ["--resume", "--workers", args.workers, "--out", str(args.runs)]
     code = cosim(["evaluate", *worlds, *which, *running])
     if code:
         raise SystemExit(code)
-    lawful = by_seed(args.out, POLICY, Preset.LAWFUL)
+    lawful = by_seed(args.runs, POLICY, Preset.LAWFUL)
     before = by_seed(SHIPPED, POLICY, Preset.UNGUARDED)
     rows = [line(world, lawful[world], before[world]) for world in lawful]
     write_page(
-        PAGE,
+        args.out,
         [
             "# Our worlds in preset `lawful`",
             "",
@@ -112,7 +115,7 @@ def main() -> None:
             "intervals (95 %).",
         ],
     )
-    print(PAGE.read_text())
+    print(args.out.read_text())
 
 
 if __name__ == "__main__":

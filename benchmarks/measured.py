@@ -131,7 +131,24 @@ def real_nets(place: Place) -> list[list[str]]:
     return [["benchmarks.real_nets", *limit, "--out", str(place.out / "real_nets.md")]]
 
 
+def law(place: Place) -> list[list[str]]:
+    """How well AVs keep the law in the worlds of tests/worlds."""
+    flags = ["--seeds", "20", "--runs", str(place.work / "law_runs")]
+    if place.small:
+        flags = ["--worlds", "arterial", "--arms", "random", "--penetration", "0.2", "--seeds", "1"]
+    return [["benchmarks.law", "--page", *flags, "--out", str(place.out / "law.md")]]
+
+
+def lawful_worlds(place: Place) -> list[list[str]]:
+    """Our worlds in preset lawful."""
+    flags = ["--worlds", "merge", "--episodes", "1"] if place.small else []
+    kept = ["--runs", str(place.work / "lawful_runs"), "--out", str(place.out / "lawful_worlds.md")]
+    return [["benchmarks.lawful_worlds", *flags, *kept]]
+
+
 PAGES = (
+    Page("law", law, ("law.md",)),
+    Page("lawful_worlds", lawful_worlds, ("lawful_worlds.md",)),
     Page("agent", agent, ("agent.md",)),
     Page("prediction_speed", prediction_speed, ("prediction_speed.md",)),
     Page("decision_cost", decision_cost, ("decision_cost.md",)),

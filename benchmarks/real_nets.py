@@ -81,6 +81,10 @@ LOOKED_AT = {  # (net, collider, victim) -> what the pictures show
         " lets it wait, and the 2.6 m wide articulated lorry, a stiff box of 16 m here, grazes its corner by"
         " 0.2 m while both are on their own centre lines"
     ),
+    ("grid6", "bottomTop2.17", "topBottom.17"): (
+        "the net's: the junction `gneJ17` is of SUMO's type unregulated, nobody heeds anybody there, and the"
+        " two drive into one another at 12 and 14 m/s where their ways cross"
+    ),
 }
 TAIL, NET = "one stands askew", "the lanes lie too close"  # why boxes overlap that have not collided
 

@@ -218,6 +218,16 @@ def test_one_that_has_left_its_centre_line_has_collided() -> None:
     assert {hit.collider, hit.victim} == {"av", "hv"}
 
 
+def test_one_behind_the_other_on_a_lane_drawn_shorter_than_it_is_has_not_collided() -> None:
+    whole = lane("a_0", [(0.0, 0.0), (80.0, 0.0)])
+    queue: dict[str, Pose] = {"av": (37.5, 0.0, 0.0, 0.0), "hv": (42.3, 0.0, 0.0, 0.0)}
+    known, on = bodies("av", "hv"), {"av": 0, "hv": 0}
+    here = replace(scene(1.0, queue, on), lane_position=np.array([50.0, 56.0]))  # 40 m and 44.8 m as drawn
+    assert CollisionDetector().from_boxes(here, RoadMap((replace(whole, length=100.0),)), known, {}) == []
+    touching = replace(here, lane_position=np.array([40.0, 44.8]))
+    assert len(CollisionDetector().from_boxes(touching, RoadMap((whole,)), known, {})) == 1
+
+
 def test_two_on_lanes_that_join_or_cross_or_follow_one_another_have_collided() -> None:
     known = bodies("av", "hv")
     apart = two_lanes(1.9, 1.9)

@@ -241,10 +241,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     words = sys.argv[1:] if arguments is None else arguments
     lines = page(found, " ".join(["python -m benchmarks.agent", *words]))
-    if args.out is None:
-        print("\n".join(lines))
-    else:
-        write_page(args.out, lines)
+    write_page(args.out, lines)
 
 
 if __name__ == "__main__":

@@ -276,10 +276,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(json.dumps(found))
         return
     lines = page(found, " ".join(["python -m benchmarks.decision_cost", *words]))
-    if args.out is None:
-        print("\n".join(lines))
-    else:
-        write_page(args.out, lines)
+    write_page(args.out, lines)
 
 
 if __name__ == "__main__":

@@ -263,10 +263,7 @@ def main() -> None:
         print(json.dumps(result))
         return
     lines = page(result, " ".join(["python -m benchmarks.prediction_maps", *sys.argv[1:]]))
-    if args.out is None:
-        print("\n".join(lines))
-    else:
-        write_page(args.out, lines)
+    write_page(args.out, lines)
 
 
 if __name__ == "__main__":

@@ -190,8 +190,11 @@ def picture(
     drawn.savefig(path, dpi=DPI)
 
 
-def write_page(path: Path, lines: Sequence[str]) -> None:
-    """The Markdown page, whole or not at all."""
+def write_page(path: Path | None, lines: Sequence[str]) -> None:
+    """The Markdown page, whole or not at all; printed where there is no path."""
+    if path is None:
+        print("\n".join(lines))
+        return
     path.parent.mkdir(parents=True, exist_ok=True)
     with whole(path) as draft:
         draft.write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")

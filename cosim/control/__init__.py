@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from cosim.geometry.compiled import compiled
-from cosim.road.rules import RulesAhead
+from cosim.road.rules import RED, YELLOW, RulesAhead
 from cosim.types import LANE_OFFSET, Command, Decision, Floats, History, MetaAction
 
 SPEED_STEP = 5.0  # m/s between grid levels: one step of Decelerate must really brake
@@ -194,7 +194,7 @@ def lawful_speed(rules: RulesAhead) -> float:
     """
     allowed = np.sqrt(rules.limits[:, 1] ** 2 + 2.0 * APPROACH * rules.limits[:, 0]).min()
     at = [rules.stop_distance, rules.person_distance]
-    if rules.signal and rules.signal in "ruyY":
+    if rules.signal and rules.signal in RED + YELLOW:
         at.append(rules.signal_distance)
     stop = math.sqrt(2.0 * APPROACH * max(min(at) - STOPS_BEFORE, 0.0))
     return float(min(allowed, max(stop, CREEP)))

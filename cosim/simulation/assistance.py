@@ -12,18 +12,12 @@ from dataclasses import dataclass
 import libsumo
 
 from cosim.control import COMFORT, wished_accel
-from cosim.simulation.commands import (
-    LANE_CHANGE_MODE,
-    SPEED_MODE,
-    SUMO_LANE_CHANGE_MODE,
-    SUMO_SPEED_MODE,
-    Commander,
-    Controlled,
-)
+from cosim.road.rules import RED, YELLOW
+from cosim.simulation.commands import Commander, Controlled
 from cosim.simulation.fleet import set_type
 from cosim.types import Intervention, Preset
 
-LAWFUL_TYPE = "cosim.av.lawful"  # sumo_scenarios/types.add.xml: an IDM that brakes comfortably
+LAWFUL_TYPE = "cosim.av.lawful"  # sumo_scenarios/types.add.xml: an extended IDM that brakes comfortably
 CORRECTED = 1.0  # m/s2 more braking than asked for: from there on the car drives otherwise than commanded
 STALLED = 0.2, 1.5  # m/s2, or so little acceleration where so much was asked for
 RESPITE = 2.0  # s without a correction: the next one is a new one
@@ -39,7 +33,6 @@ STANDS = 0.1  # m/s
 PATIENCE = 10.0  # s
 
 STRATEGIC, BLOCKED = 8, 512 + 1024 + 2048 + 4096 + 8192  # bits of SUMO's lane-change state
-RED, YELLOW = frozenset("ru"), frozenset("yY")
 
 
 @dataclass(slots=True)
@@ -98,12 +91,13 @@ class Assistance(Commander):
         get, begun = libsumo.vehicle, self._begun
         self._begun = []
         for name, state in self.controlled.items():
-            accel = (get.getSpeed(name) - state.speed) / self._step
+            speed = get.getSpeed(name)
+            accel = (speed - state.speed) / self._step
             if accel < min(state.raw, 0.0) - CORRECTED or (state.raw > STALLED[1] and accel < STALLED[0]):
                 if now - state.corrected > RESPITE:
                     begun.append(Intervention(now, name, _reason(name, accel)))
                 state.corrected = now
-            if get.getSpeed(name) > STANDS:
+            if speed > STANDS:
                 state.waits_since = math.inf
             elif state.waits_since == math.inf:
                 state.waits_since = now
@@ -126,14 +120,10 @@ class Assistance(Commander):
         get = libsumo.vehicle
         set_type(name, _lawful(get.getTypeID(name)))
         get.setSpeedFactor(name, min(get.getSpeedFactor(name), 1.0))
-        get.setSpeedMode(name, SPEED_MODE[self._preset])
-        get.setLaneChangeMode(name, LANE_CHANGE_MODE[self._preset])
         return Assisted(0.0, speed=get.getSpeed(name), lateral=get.getLateralLanePosition(name))
 
     def _hand_back(self, name: str) -> None:
-        libsumo.vehicle.setSpeed(name, -1.0)
-        libsumo.vehicle.setSpeedMode(name, SUMO_SPEED_MODE)
-        libsumo.vehicle.setLaneChangeMode(name, SUMO_LANE_CHANGE_MODE)
+        """It keeps its comfortable driver."""
 
     def _forbidden(self, name: str, lane: str, offset: int) -> str | None:
         why = super()._forbidden(name, lane, offset)
@@ -221,7 +211,7 @@ def _reason(name: str, accel: float) -> str:
     leader = get.getLeader(name, reach)
     gap = leader[1] if leader and leader[0] else math.inf
     for _, _, distance, state in get.getNextTLS(name)[:1]:
-        if distance < min(reach, gap) and state in RED | YELLOW:
+        if distance < min(reach, gap) and state in RED + YELLOW:
             return words + ("red light" if state in RED else "yellow light")
     if gap < reach:
         return f"{words}vehicle ahead"

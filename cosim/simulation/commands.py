@@ -57,6 +57,8 @@ class Commander:
         state = self.controlled.get(name)
         if state is None:
             state = self.controlled[name] = self._take_over(name)
+            libsumo.vehicle.setSpeedMode(name, SPEED_MODE[self._preset])
+            libsumo.vehicle.setLaneChangeMode(name, LANE_CHANGE_MODE[self._preset])
         state.target, state.limit = command.target_speed, command.limit
         if command.lane_offset == 0:
             return Receipt(name, True)
@@ -72,9 +74,7 @@ class Commander:
         return Receipt(name, True)
 
     def _hand_back(self, name: str) -> None:
-        libsumo.vehicle.setSpeed(name, -1.0)
-        libsumo.vehicle.setSpeedMode(name, SUMO_SPEED_MODE)
-        libsumo.vehicle.setLaneChangeMode(name, SUMO_LANE_CHANGE_MODE)
+        """Take back what `_take_over` gave."""
         libsumo.vehicle.setDecel(name, AV_IDM["Decel"])
 
     def _changes(self, name: str, state: Controlled, offset: int, now: float) -> None:
@@ -87,8 +87,7 @@ class Commander:
         return None
 
     def _take_over(self, name: str) -> Controlled:
-        libsumo.vehicle.setSpeedMode(name, SPEED_MODE[self._preset])
-        libsumo.vehicle.setLaneChangeMode(name, LANE_CHANGE_MODE[self._preset])
+        """Give the car what it needs to carry commands out."""
         libsumo.vehicle.setDecel(name, MAX_DECEL)
         return Controlled(0.0)
 
@@ -101,6 +100,9 @@ class Commander:
         names = {c.vehicle for c in commanded}
         for name in [n for n in self.controlled if n not in names]:
             del self.controlled[name]
+            libsumo.vehicle.setSpeed(name, -1.0)
+            libsumo.vehicle.setSpeedMode(name, SUMO_SPEED_MODE)
+            libsumo.vehicle.setLaneChangeMode(name, SUMO_LANE_CHANGE_MODE)
             self._hand_back(name)
 
     def confirm(self, receipts: Sequence[Receipt], commands: Sequence[Command]) -> tuple[Receipt, ...]:

@@ -150,6 +150,18 @@ class Intervention:
 
 
 @dataclass(frozen=True, slots=True)
+class HumanError:
+    """A human driver, or a person on foot, began to err (docs/definitions.md, Human errors)."""
+
+    time: float  # s
+    who: str
+    kind: str  # one of sumo_scenarios/errors.yaml
+    until: float  # s, when it ends as planned
+    what: str  # in words, of which the driver is the subject
+    near: str = ""  # whom it meets first: the vehicle behind, beside or with the right of way
+
+
+@dataclass(frozen=True, slots=True)
 class Events:
     """What happened since the last snapshot; ids in SUMO's order."""
 
@@ -163,6 +175,7 @@ class Events:
     stopped: tuple[str, ...] = ()  # stand at a stop of their plan at the frame's end
     wrecked: tuple[str, ...] = ()  # crashed in an episode that goes on: they stand
     wrecks_removed: tuple[str, ...] = ()  # and were taken off the road
+    errors: tuple[HumanError, ...] = ()
 
     @classmethod
     def of(cls, frames: Sequence[Snapshot]) -> Events:

@@ -36,7 +36,8 @@ class Kind:
 
 @dataclass(frozen=True, slots=True)
 class Inattention(Kind):
-    """It keeps its speed and its lane and sees nobody. A trial: a second in which it follows somebody."""
+    """It keeps its speed and its lane and sees nobody. A trial: a second of driving within 100 m behind
+    somebody."""
 
     duration: Span = (1.0, 3.0)  # s
 

@@ -22,7 +22,6 @@ SAFE_SPEED, MAX_ACCEL, MAX_DECEL, RIGHT_OF_WAY, RED_LIGHT = 1, 2, 4, 8, 16
 IGNORES_JUNCTION = 32  # also those who are inside the junction already
 BLIND = 0  # neither speed nor lane-change mode heeds anybody; its own lane changes are off
 
-FOLLOWING = 3.0  # s: at a shorter time headway a driver follows (HCM 2000, percent time-spent-following)
 MOVES = 1.0  # m/s: slower than that nobody errs by driving on
 SLOW = 3.0  # m/s, at most, of who waits at a line
 AT_LINE = 15.0  # m before the line within which it waits
@@ -250,7 +249,7 @@ class HumanErrors:
     def _inattention(self, who: str, now: float) -> Erring | None:
         leader = libsumo.vehicle.getLeader(who, WITHIN)
         speed = speed_of(who)
-        if not leader or not leader[0] or speed < MOVES or leader[1] > FOLLOWING * speed:
+        if not leader or not leader[0] or speed < MOVES:
             return None
         length = self._drawn(self._kinds["inattention"].duration, "inattention", who, now, "duration")
         erring = self._begins("inattention", who, now, length, f"sees nobody for {length:.1f} s", leader[0])

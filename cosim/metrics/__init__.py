@@ -16,6 +16,7 @@ from cosim.metrics.headway import Headway
 from cosim.metrics.jerk import Jerk
 from cosim.metrics.law import AvCounts, StopLines
 from cosim.metrics.mission import MissionSuccess
+from cosim.metrics.near_misses import Exposure
 from cosim.metrics.persons import PersonConflicts
 from cosim.metrics.post_encroachment import PostEncroachment
 from cosim.metrics.speeding import Speeding
@@ -45,6 +46,7 @@ METRICS: dict[str, type[EpisodeMetric]] = {
     "trips": Trips,
     "persons": PersonConflicts,
     "interventions": Interventions,
+    "exposure": Exposure,
 }
 
 

@@ -13,6 +13,7 @@ from cosim.metrics.drac import DecelerationRate
 from cosim.metrics.events import TrafficEvents
 from cosim.metrics.hard_braking import HardBraking
 from cosim.metrics.headway import Headway
+from cosim.metrics.human_errors import HumanErrors
 from cosim.metrics.jerk import Jerk
 from cosim.metrics.law import AvCounts, StopLines
 from cosim.metrics.mission import MissionSuccess
@@ -47,6 +48,7 @@ METRICS: dict[str, type[EpisodeMetric]] = {
     "persons": PersonConflicts,
     "interventions": Interventions,
     "exposure": Exposure,
+    "human_errors": HumanErrors,
 }
 
 

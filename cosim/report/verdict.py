@@ -133,6 +133,7 @@ def _group_document(compared: Compared) -> dict[str, Any]:
         "identical": group.identical,
         "not_comparable": group.not_comparable,
         "mission_guessed": group.mission_guessed,
+        "human_errors": dict(zip(("a", "b", "both"), group.errors_begun, strict=True)),
         "failed": [row["key"] for row in group.failed],
         "refused": [row["key"] for row in group.refused],
         "only_in_a": group.unpaired[0],
@@ -186,6 +187,10 @@ def _notes(compared: Compared) -> list[str]:
         f"{group.unpaired[1]} episodes of B have no partner and do not count": group.unpaired[1],
     }
     notes += [note for note, count in counted.items() if count]
+    begun_a, begun_b, both = group.errors_begun
+    if either := begun_a + begun_b - both:
+        words = f"human errors: {begun_a} in A, {begun_b} in B"
+        notes.append(f"{words}; {100 * both / either:.0f} % of all began in both, in the same second")
     for row in [*group.failed, *group.refused][:_SHOWN]:
         notes.append(f"{row['status']} {row['key']} ({row['policy']}, seed {row['seed']}): {_reason(row)}")
     hidden = len(group.failed) + len(group.refused) - _SHOWN

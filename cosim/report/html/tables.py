@@ -20,6 +20,7 @@ TITLES = {
     "behavior": "behaviour",
     "penetration": "penetration",
     "preset": "preset",
+    "errors": "human errors",
     "svo_deg": "SVO",
     "driver_model": "drivers",
     "collision_rate": "collisions",

@@ -129,8 +129,8 @@ def _facts(r: ReplayData) -> dict[str, Any]:
     """What stands at the head of the page and in its table of figures."""
     units = r.facts.get("units", {})
     names = (
-        "scenario demand policy policy_label behavior driver_model preset svo_deg seed steps trace_hash "
-        "not_comparable_because mission_vehicle mission_guessed"
+        "scenario demand policy policy_label behavior driver_model preset errors svo_deg seed steps "
+        "trace_hash not_comparable_because mission_vehicle mission_guessed"
     )
     return {
         **{name: r.facts.get(name) for name in names.split()},

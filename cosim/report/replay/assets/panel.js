@@ -255,6 +255,7 @@ function fillHead(data) {
   const figure = (name) => (f.metrics.find(([n]) => n === name) || [])[1];
   if (f.policy_label) chip(f.policy_label, "warn");
   chip(`seed ${f.seed}`); chip(f.preset); chip(`humans ${f.behavior}, ${f.driver_model}`); chip(`svo ${f.svo_deg}\u00b0`);
+  if (f.errors) chip(`human errors ${f.errors}`);
   if (figure("crashed") != null) chip(figure("crashed") ? `${figure("collisions")} collision(s)` : "no collision", figure("crashed") ? "bad" : "good");
   if (figure("mission_success") != null) chip(figure("mission_success") ? "mission fulfilled" : "mission not fulfilled", figure("mission_success") ? "good" : "bad");
   if (f.mission_vehicle) chip(`mission vehicle ${f.mission_vehicle}${f.mission_guessed ? ", guessed" : ""}`, f.mission_guessed ? "warn" : "");

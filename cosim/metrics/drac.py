@@ -14,7 +14,7 @@ class DecelerationRate:
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._conflicts = context.conflicts
-        self._near_misses = NearMisses("drac", context.meeting)
+        self._near_misses = NearMisses("drac", context.courses)
         self._largest: float | None = None
         self.add(first)
 

@@ -11,7 +11,7 @@ class TimeToCollision:
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._conflicts = context.conflicts
-        self._near_misses = NearMisses("ttc", context.meeting)
+        self._near_misses = NearMisses("ttc", context.courses)
         self._smallest = HORIZON
         self._critical = self._counted = 0  # vehicle-frames
         self.add(first)

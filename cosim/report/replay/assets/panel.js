@@ -161,7 +161,7 @@ function fillLegend(state) {
     });
   }
   if (data.errors.length) entry("a human errs; line to whom it meets first", (ctx) => {
-    ctx.strokeStyle = c.error; ctx.lineWidth = 1.5; ctx.setLineDash([2, 3]); ctx.beginPath(); ctx.moveTo(10, 8); ctx.lineTo(29, 8); ctx.stroke();
+    ctx.strokeStyle = c.error; ctx.lineWidth = 1.5; ctx.setLineDash([2, 3]); ctx.beginPath(); ctx.moveTo(10, 8); ctx.lineTo(29, 8); ctx.stroke(); ctx.setLineDash([]);
     triangle(ctx, 10, 8, 7, c);
   });
   if (data.corrections.length) {

@@ -12,8 +12,9 @@ SETTLED = 2.0  # s after which a way that is still open counts as taken
 
 @dataclass(slots=True)
 class Meeting:
-    """One encounter of a pair."""
+    """One encounter."""
 
+    pair: tuple[str, str]
     last: float  # s, its last grave frame
     with_av: bool
     counts: bool = False
@@ -45,7 +46,7 @@ class NearMisses:
                 continue
             pair = s.ids[i], s.ids[j]
             if pair not in self._now or s.time - self._now[pair].last > APART + 1e-9:
-                self._now[pair] = Meeting(s.time, AV in kinds)
+                self._now[pair] = Meeting(pair, s.time, AV in kinds)
                 self._met.append(self._now[pair])
             meeting = self._now[pair]
             meeting.last, meeting.counts = s.time, meeting.counts or ways is None
@@ -64,12 +65,15 @@ class NearMisses:
                 if meeting.counts:
                     meeting.open.clear()
 
+    @property
+    def counted(self) -> list[Meeting]:
+        """The near-misses so far, in the order they began."""
+        return [meeting for meeting in self._met if meeting.counts or meeting.open]
+
     def result(self) -> dict[str, Metric]:
-        counted = [meeting for meeting in self._met if meeting.counts or meeting.open]
-        counts = {
-            "": (len(counted), self._vehicles),
-            "av_": (sum(meeting.with_av for meeting in counted), self._avs),
-        }
+        found = self.counted
+        with_av = sum(meeting.with_av for meeting in found)
+        counts = {"": (len(found), self._vehicles), "av_": (with_av, self._avs)}
         return {
             f"{who}near_misses_{self._measure}": Metric(count if seen else None, "encounters", "lower")
             for who, (count, seen) in counts.items()

@@ -28,7 +28,7 @@ class PostEncroachment:
         self._newest = -1
         self._known: Ints | None = None
         self._smallest = np.inf
-        self._near_misses = NearMisses("pet")
+        self.near_misses = NearMisses("pet")
         self.add(first)
 
     def add(self, snapshot: Snapshot) -> None:
@@ -53,7 +53,7 @@ class PostEncroachment:
         self._smallest = min(self._smallest, smallest)
         self._lanes[self._newest] = -1
         self._lanes[self._newest, slot] = s.lane
-        self._near_misses.add(s, self._met(s, slot, pairs))
+        self.near_misses.add(s, self._met(s, slot, pairs))
 
     def _met(self, s: Snapshot, slot: Ints, pairs: Ints) -> Ints:
         """[q,2] rows of those `pairs` [p,2] of places who are both on the road and have not been on one lane
@@ -77,4 +77,4 @@ class PostEncroachment:
 
     def result(self) -> dict[str, Metric]:
         value = float(self._smallest) if self._smallest <= LONGEST else None
-        return {"min_pet_s": Metric(value, "s", "higher"), **self._near_misses.result()}
+        return {"min_pet_s": Metric(value, "s", "higher"), **self.near_misses.result()}

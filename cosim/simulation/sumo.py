@@ -20,6 +20,7 @@ from cosim.scenario.disabled_outputs import disable_outputs
 from cosim.scenario.sumo_outputs import sumo_options
 from cosim.scenario.sumocfg import time_of
 from cosim.simulation.assistance import Assistance
+from cosim.simulation.backend import sumo
 from cosim.simulation.collisions import CollisionDetector, Wrecks
 from cosim.simulation.commands import Commander
 from cosim.simulation.convert import Body, SnapshotReader, read_road, struggling_lanes
@@ -29,8 +30,6 @@ from cosim.simulation.fleet import Fleet
 from cosim.simulation.stderr import SumoStderr
 from cosim.simulation.xerces import keep_initialized
 from cosim.types import Command, Events, Kind, OnCollision, Preset, Receipt, Snapshot
-
-SUMO_ERRORS = (libsumo.TraCIException, libsumo.FatalTraCIError)
 
 # Ours, where a user's file does not say otherwise. A teleport would let a vehicle appear on the road.
 DEFAULTS = {
@@ -130,7 +129,7 @@ class SumoSimulator:
         """Hold the commands for one decision; one snapshot per frame. Raises SimulationError."""
         frames = []
         with self._stderr:
-            now = libsumo.simulation.getTime()
+            now = sumo.simulation.getTime()
             self._commander.release(commands)
             receipts = tuple(self._commander.take(c, now) for c in commands)
             for k in range(1, self._steps_per_decision + 1):
@@ -143,10 +142,10 @@ class SumoSimulator:
 
     def route(self, vehicle: str) -> tuple[str, ...]:
         """The edges still ahead, the present one first."""
-        index = max(libsumo.vehicle.getRouteIndex(vehicle), 0)
+        index = max(sumo.vehicle.getRouteIndex(vehicle), 0)
         edges = self._routes.get(vehicle)
         if edges is None:
-            edges = self._routes[vehicle] = tuple(libsumo.vehicle.getRoute(vehicle))
+            edges = self._routes[vehicle] = tuple(sumo.vehicle.getRoute(vehicle))
         return edges[index:] if index else edges
 
     def commanded(self, vehicle: str) -> tuple[float | None, int]:
@@ -154,12 +153,12 @@ class SumoSimulator:
         state = self._commander.controlled.get(vehicle)
         if state is None:
             return self._commander.heads_for(vehicle), 0
-        return state.target, state.changing(libsumo.simulation.getTime())
+        return state.target, state.changing(sumo.simulation.getTime())
 
     def counts(self) -> dict[str, int]:
         """Vehicles since the start: `inserted`, and `waiting`: due and not inserted, whether SUMO has dropped
         them (`max-depart-delay`) or not."""
-        waiting = self._waited.union(libsumo.simulation.getPendingVehicles())
+        waiting = self._waited.union(sumo.simulation.getPendingVehicles())
         return {"inserted": self._inserted, "waiting": len(waiting)}
 
     def write_outputs(self, files: Mapping[str, Path]) -> None:
@@ -199,7 +198,7 @@ class SumoSimulator:
                     libsumo.start(["sumo", *arguments])
                     self._started = True
                     keep_initialized()
-        except SUMO_ERRORS as error:
+        except sumo.errors as error:
             self._started = libsumo.isLoaded()
             raise self._explain(error, starting=True) from None
 
@@ -235,10 +234,10 @@ class SumoSimulator:
         return SimulationError(f"{self._scenario.config}: SUMO failed: {words}{warned}")
 
     def _step(self) -> None:
-        simulation = libsumo.simulation
+        simulation = sumo.simulation
         try:
-            libsumo.simulationStep()
-        except SUMO_ERRORS as error:
+            sumo.simulationStep()
+        except sumo.errors as error:
             raise self._explain(error) from None
         departed = simulation.getDepartedIDList()
         self._inserted += len(departed)

@@ -49,6 +49,11 @@ class Assisted(Controlled):
     idled: float = 0.0  # s, for which the agent has asked for less than `KEEPS_MOVING`
     waits_since: float = math.inf  # s, when it came to stand
 
+    @property
+    def asked(self) -> float:
+        """As of every commanded AV."""
+        return self.wish if self.ours else math.inf
+
 
 class Assistance(Commander):
     """Drives every commanded AV of preset `lawful`."""

@@ -35,8 +35,8 @@ class Backend:
         self.bind(libsumo)
 
     def bind(self, source: Any) -> None:
-        """Call `source` from now on: libsumo, or a connection of `cosim.simulation.client`."""
-        self._is_libsumo = source is libsumo
+        """Call `source` from now on: libsumo, or a `cosim.simulation.client.Client`."""
+        self.source = source
         for name in NAMES:
             setattr(self, name, getattr(source, name))
 
@@ -47,7 +47,7 @@ class Backend:
 
     def getter(self, domain: str, name: str) -> Callable[[str], Any]:
         """`DOMAIN.getNAME`: the compiled one, since libsumo's Python wrappers double the cost of a read."""
-        if self._is_libsumo:
+        if self.source is libsumo:
             found: Callable[[str], Any] = getattr(libsumo._libsumo, f"{domain}_get{name}")
         else:
             found = getattr(getattr(self, domain), f"get{name}")

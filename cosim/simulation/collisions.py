@@ -8,7 +8,7 @@ from cosim.geometry import Boxes, boxes, overlap, overlapping_pairs
 from cosim.road import RoadMap
 from cosim.road.too_close import foot, heed_each_other
 from cosim.simulation.backend import sumo
-from cosim.simulation.commands import Commander
+from cosim.simulation.commands import Commander, hand_back
 from cosim.simulation.conventions import centres
 from cosim.simulation.convert import Body
 from cosim.simulation.drivers import Drivers
@@ -193,6 +193,11 @@ class Wrecks:
             if name in on_road:
                 sumo.vehicle.remove(name)
                 self._removed.append(name)
+
+    def release(self) -> None:
+        """Let those that stand go: SUMO drives them."""
+        for name in self._since.keys() & set(sumo.vehicle.getIDList()):
+            hand_back(name)
 
     def take(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Who has become a wreck, and which wrecks were removed, since this was asked last."""

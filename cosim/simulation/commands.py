@@ -17,6 +17,7 @@ SPEED_MODE = {Preset.UNGUARDED: 6, Preset.GUARDED: 31, Preset.LAWFUL: 31}
 LANE_CHANGE_MODE = {Preset.UNGUARDED: 0, Preset.GUARDED: 512, Preset.LAWFUL: 513}
 SUMO_SPEED_MODE, SUMO_LANE_CHANGE_MODE = 31, 1621  # SUMO's defaults
 SETTLED = 1e-3  # m/s: closer to its target an AV needs no new command
+OVERRULED = 0.05  # m/s: further from the commanded speed another program has set one
 
 
 @dataclass(slots=True)
@@ -29,6 +30,11 @@ class Controlled:
     change_until: float = -1.0  # s, when it ends
     requested: float = -1.0  # m/s, the last speed handed to SUMO
 
+    @property
+    def asked(self) -> float:
+        """The speed in m/s that the last step was to end with, at most; inf where SUMO drove it."""
+        return self.requested
+
     def changing(self, now: float) -> int:
         """The lane change under way at time `now` (s): +1 left, -1 right, 0 none."""
         return self.change if now < self.change_until - 1e-9 else 0
@@ -36,6 +42,8 @@ class Controlled:
 
 class Commander:
     """Holds every commanded AV at its target speed, step by step, and starts lane changes."""
+
+    shared = False  # whether other programs command vehicles too
 
     def __init__(self, preset: str, step: float) -> None:
         self._preset = preset
@@ -99,14 +107,15 @@ class Commander:
         names = {c.vehicle for c in commanded}
         for name in [n for n in self.controlled if n not in names]:
             del self.controlled[name]
-            sumo.vehicle.setSpeed(name, -1.0)
-            sumo.vehicle.setSpeedMode(name, SUMO_SPEED_MODE)
-            sumo.vehicle.setLaneChangeMode(name, SUMO_LANE_CHANGE_MODE)
+            hand_back(name)
             self._hand_back(name)
 
     def confirm(self, receipts: Sequence[Receipt], commands: Sequence[Command]) -> tuple[Receipt, ...]:
-        """After the hold: a lane change that did not begin was refused by SUMO's safety checks."""
+        """After the hold: a lane change that did not begin was refused by SUMO's safety checks; a speed that
+        is not the commanded one was set by another program."""
         confirmed = list(receipts)
+        if self.shared:
+            confirmed = [self._overruled(receipt) for receipt in receipts]
         for k, (receipt, command) in enumerate(zip(receipts, commands, strict=True)):
             if not command.lane_offset or not receipt.executed:
                 continue
@@ -118,6 +127,15 @@ class Commander:
                 self.lane_changes.pop(name, None)
                 confirmed[k] = Receipt(name, False, f"refused by SUMO's lane-change safety ({self._preset})")
         return tuple(confirmed)
+
+    def _overruled(self, receipt: Receipt) -> Receipt:
+        name, state = receipt.vehicle, self.controlled.get(receipt.vehicle)
+        if not receipt.executed or not state or name not in sumo.vehicle.getIDList():
+            return receipt
+        more = sumo.vehicle.getSpeed(name) - state.asked  # m/s
+        if more > OVERRULED or (self._preset == Preset.UNGUARDED and more < -OVERRULED):
+            return Receipt(name, False, "another program set its speed")
+        return receipt
 
     def drive(self) -> None:
         """Before every simulation step: track the target speeds."""
@@ -142,6 +160,13 @@ class Commander:
         """The vehicle left the road."""
         self.controlled.pop(name, None)
         self.lane_changes.pop(name, None)
+
+
+def hand_back(name: str) -> None:
+    """Let SUMO's own driver drive a vehicle again."""
+    sumo.vehicle.setSpeed(name, -1.0)
+    sumo.vehicle.setSpeedMode(name, SUMO_SPEED_MODE)
+    sumo.vehicle.setLaneChangeMode(name, SUMO_LANE_CHANGE_MODE)
 
 
 def _forbidden(name: str, lane: str, offset: int) -> str | None:

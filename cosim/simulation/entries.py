@@ -2,7 +2,7 @@
 
 An AV is looked at in every step only where it may be within `NEAR` m of a line that matters (a signal, a stop
 sign, somebody with the right of way); further away the look is put off to the step in which it could at the
-earliest be there. Signals are read when SUMO says that they switch.
+earliest be there. Signals are read when SUMO says that they switch; in every step where others switch them.
 """
 
 import heapq
@@ -53,10 +53,14 @@ class Light:
 
 
 class EntryWatcher:
-    """Yields an `Entry` for every AV that passes a stop line; `step` is the simulation step in s."""
+    """Yields an `Entry` for every AV that passes a stop line; `step` is the simulation step in s.
 
-    def __init__(self, road: RoadMap, step: float) -> None:
+    `shared`: whether other programs switch signals too.
+    """
+
+    def __init__(self, road: RoadMap, step: float, shared: bool = False) -> None:
         self._road = road
+        self._shared = shared
         self._step = step
         self._matters = [
             link.signal >= 0 or bool(link.foes) or link.rule in (Rule.STOP, Rule.ALL_WAY_STOP)
@@ -168,7 +172,7 @@ class EntryWatcher:
             name = heapq.heappop(self._switches)[1]
             light = self._lights[name]
             old, light.state = light.state, sumo.trafficlight.getRedYellowGreenState(name)
-            following = sumo.trafficlight.getNextSwitch(name)
+            following = began if self._shared else sumo.trafficlight.getNextSwitch(name)
             heapq.heappush(self._switches, (max(following, began + self._step), name))
             if light.state == old:
                 continue

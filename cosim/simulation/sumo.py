@@ -62,6 +62,9 @@ class SumoSimulator:
     `history` frames are returned by `reset`, so that an agent starts with a full past.
     """
 
+    _SHARED = False  # whether other programs change things too
+    _FLEET = Fleet
+
     def __init__(
         self, scenario: Scenario, *, av_parameters: Mapping[str, str] | None = None, history: int = 10
     ) -> None:
@@ -85,24 +88,24 @@ class SumoSimulator:
         self._steps_per_decision = round(timing.decision / timing.step)
         patience = time_of(dict(scenario.options).get(GIVES_UP, "-1"), scenario.config, GIVES_UP)  # s
         self._gives_up = 0.0 <= patience < scenario.warmup + scenario.duration
+        self.road: RoadMap
         try:
-            self._load(seed=0)
-            self.road: RoadMap = read_road(scenario.zones, scenario.config)
-            self.goal_lanes, self._struggling = self._goal()
+            self._open()
         except BaseException:
             self.close()
             raise
         self._reader = SnapshotReader(self.road)
-        self._entries = EntryWatcher(self.road, scenario.timing.step)
+        self._entries = EntryWatcher(self.road, scenario.timing.step, self._SHARED)
 
     def reset(self, seed: int) -> tuple[Snapshot, ...]:
         """Load the episode `seed` anew, drive the warm-up; the last `history` frames, newest last."""
         self._load(seed)
         self._seed = seed
         self._drivers = Drivers(self._scenario.behavior, self._scenario.driver_model, seed)
-        self._fleet = Fleet(self._scenario, self._drivers, self._av_parameters)
+        self._fleet = self._FLEET(self._scenario, self._drivers, self._av_parameters)
         preset, step = self._scenario.preset, self._scenario.timing.step
         self._commander = Assistance(step) if preset == Preset.LAWFUL else Commander(preset, step)
+        self._commander.shared = self._SHARED
         self._bodies: dict[str, Body] = {}
         self._routes: dict[str, tuple[str, ...]] = {}
         self._detector = CollisionDetector()
@@ -168,6 +171,9 @@ class SumoSimulator:
     def finish_outputs(self) -> None:
         """End SUMO, which makes its files whole, and ask for no more; the next `reset` starts it again."""
         self._outputs = {}
+        self._stop()
+
+    def _stop(self) -> None:
         if self._started:
             self._started = False
             with self._stderr:
@@ -187,6 +193,15 @@ class SumoSimulator:
         self._stderr.close()
         self._scratch.cleanup()
         _in_use = False
+
+    def _open(self) -> None:
+        """Read what stays the same in all episodes."""
+        self._load(seed=0)
+        self._read_net()
+
+    def _read_net(self) -> None:
+        self.road = read_road(self._scenario.zones, self._scenario.config)
+        self.goal_lanes, self._struggling = self._goal()
 
     def _load(self, seed: int) -> None:
         arguments = self._arguments(seed)
@@ -233,12 +248,16 @@ class SumoSimulator:
             return BadInput(f"SUMO refuses it: {words}{warned}", file=files)
         return SimulationError(f"{self._scenario.config}: SUMO failed: {words}{warned}")
 
-    def _step(self) -> None:
-        simulation = sumo.simulation
+    def _simulate(self) -> None:
+        """One step of SUMO's own."""
         try:
             sumo.simulationStep()
         except sumo.errors as error:
             raise self._explain(error) from None
+
+    def _step(self) -> None:
+        simulation = sumo.simulation
+        self._simulate()
         departed = simulation.getDepartedIDList()
         self._inserted += len(departed)
         self._waited.difference_update(departed)

@@ -1,0 +1,284 @@
+"""A connection to a SUMO that somebody else started: traci's calls, with what every step needs subscribed.
+
+A call over the socket costs a hundred times what libsumo's does. So SUMO sends with every step what is asked of
+every vehicle, signal and of the simulation; what is asked of AVs alone it sends of those of whom it was asked
+once; and commands to vehicles wait until the next call that needs an answer, to go in one message.
+"""
+
+import contextlib
+import time
+from collections.abc import Callable
+from typing import Any
+
+from traci import constants as tc
+from traci.connection import Connection
+from traci.exceptions import FatalTraCIError, TraCIException
+from traci.storage import Storage
+
+from cosim.errors import BadInput, SimulationError
+
+RETRY = 0.2  # s between attempts to connect
+EVERYWHERE = 1e6  # m around a junction
+
+# Getters of libsumo and traci -> SUMO's variable (https://sumo.dlr.de/docs/TraCI), by whom they are asked of.
+VEHICLES = {
+    "getPosition": tc.VAR_POSITION,
+    "getAngle": tc.VAR_ANGLE,
+    "getSpeed": tc.VAR_SPEED,
+    "getAcceleration": tc.VAR_ACCELERATION,
+    "getLaneID": tc.VAR_LANE_ID,
+    "getLanePosition": tc.VAR_LANEPOSITION,
+}
+AVS = {
+    "getAllowedSpeed": tc.VAR_ALLOWED_SPEED,
+    "getSpeedWithoutTraCI": tc.VAR_SPEED_WITHOUT_TRACI,
+    "getLateralLanePosition": tc.VAR_LANEPOSITION_LAT,
+    "getDistance": tc.VAR_DISTANCE,
+    "getRoadID": tc.VAR_ROAD_ID,
+    "getRouteIndex": tc.VAR_ROUTE_INDEX,
+}
+LIGHTS = {
+    "getRedYellowGreenState": tc.TL_RED_YELLOW_GREEN_STATE,
+    "getNextSwitch": tc.TL_NEXT_SWITCH,
+}
+SIMULATION = {
+    "getTime": tc.VAR_TIME,
+    "getDepartedIDList": tc.VAR_DEPARTED_VEHICLES_IDS,
+    "getArrivedIDList": tc.VAR_ARRIVED_VEHICLES_IDS,
+    "getStartingTeleportIDList": tc.VAR_TELEPORT_STARTING_VEHICLES_IDS,
+    "getEndingTeleportIDList": tc.VAR_TELEPORT_ENDING_VEHICLES_IDS,
+    "getCollidingVehiclesNumber": tc.VAR_COLLIDING_VEHICLES_NUMBER,
+    "getEmergencyStoppingVehiclesIDList": tc.VAR_EMERGENCYSTOPPING_VEHICLES_IDS,
+    "getStopStartingVehiclesIDList": tc.VAR_STOP_STARTING_VEHICLES_IDS,
+    "getStopEndingVehiclesIDList": tc.VAR_STOP_ENDING_VEHICLES_IDS,
+    "getPendingVehicles": tc.VAR_PENDING_VEHICLES,
+}
+# Commands that change nothing of the above before the next step; after any other one SUMO is asked anew.
+LATER = {"setSpeed", "setSpeedMode", "setLaneChangeMode", "changeLaneRelative"}
+
+
+class Client:
+    """One client among others of a running SUMO; an interface for `cosim.simulation.backend`.
+
+    Args:
+        host, port: where SUMO listens; tried for `timeout` s.
+        order: the place among its clients, different for each: higher ones act later, and win a conflict.
+        timeout: s that SUMO may take to answer (it waits for all other clients).
+
+    Raises BadInput where nobody listens. Every call raises FatalTraCIError once the connection is lost.
+    """
+
+    TraCIException, FatalTraCIError, constants = TraCIException, FatalTraCIError, tc
+
+    def __init__(self, host: str, port: int, order: int, timeout: float) -> None:
+        self.place = f"{host}:{port}"
+        self._connection = _connect(host, port, timeout)
+        try:
+            self._connection.setOrder(order)
+            self.version: str = self._connection.getVersion()[1]
+        except (TraCIException, FatalTraCIError) as error:
+            raise SimulationError(f"{self.place}: {error}") from None
+        c = self._connection
+        self.edge, self.junction, self.lane, self.person = c.edge, c.junction, c.lane, c.person
+        self.vehicletype = c.vehicletype
+        self.simulation, self.trafficlight = _Simulation(c.simulation), _Lights(c.trafficlight)
+        self.vehicle = _Vehicles(c)
+
+    def simulationStep(self) -> None:
+        """Send the commands, wait for everybody else, drive one step."""
+        self._connection.flush()
+        self._connection.simulationStep()
+        self.vehicle.stepped()
+
+    def close(self) -> None:
+        """Leave: SUMO goes on with the others."""
+        with contextlib.suppress(TraCIException, FatalTraCIError, OSError):
+            self._connection.flush()
+            self.vehicle.unsubscribe()
+            self._connection.close()
+
+
+class _Connection(Connection):  # type: ignore[misc]  # traci is not typed
+    """traci's connection with a limit on every answer; commands to vehicles wait for `flush`."""
+
+    def __init__(self, host: str, port: int, timeout: float) -> None:
+        self._waits = False
+        super().__init__(host, port, None, None, False)
+        self._timeout = timeout
+        self._socket.settimeout(timeout)
+
+    def flush(self) -> None:
+        """Send the commands that wait. One to a vehicle that somebody else has removed counts for nothing."""
+        if self._queue:
+            try:
+                self._sendExact()
+            except TraCIException as error:
+                if "is not known" not in str(error):
+                    raise
+
+    def _sendCmd(self, cmdID: int, *words: Any) -> Any:
+        self._waits = cmdID == tc.CMD_SET_VEHICLE_VARIABLE
+        if not self._waits:
+            self.flush()
+        try:
+            return super()._sendCmd(cmdID, *words)
+        finally:
+            self._waits = False
+
+    def _sendExact(self) -> Any:
+        if self._waits:
+            return None
+        try:
+            return super()._sendExact()
+        except OSError:
+            self._lose("SUMO has gone")
+
+    def _recvExact(self) -> Any:
+        try:
+            size = int.from_bytes(self._read(4), "big") - 4
+            return Storage(self._read(size))
+        except TimeoutError:
+            self._lose(f"no answer for {self._timeout:g} s: SUMO waits for all of its clients")
+        except OSError:
+            self._lose("SUMO has gone")
+
+    def _read(self, size: int) -> bytes:
+        whole = bytearray()
+        while len(whole) < size:
+            part = self._socket.recv(min(size - len(whole), 1 << 20))
+            if not part:
+                raise ConnectionError
+            whole += part
+        return bytes(whole)
+
+    def _lose(self, why: str) -> None:
+        if self._socket is not None:
+            self._socket.close()
+        self._socket, self._queue, self._string = None, [], b""
+        raise FatalTraCIError(why)
+
+
+def _connect(host: str, port: int, timeout: float) -> _Connection:
+    until = time.monotonic() + timeout
+    while True:
+        try:
+            return _Connection(host, port, timeout)
+        except ConnectionRefusedError:
+            if time.monotonic() > until:
+                raise BadInput(
+                    f"no SUMO listens there (tried for {timeout:g} s); one that drives already takes nobody "
+                    "in: it waits at its start for --num-clients",
+                    value=f"{host}:{port}",
+                ) from None
+            time.sleep(RETRY)
+        except OSError as error:
+            raise BadInput(f"cannot connect: {error.strerror or error}", value=f"{host}:{port}") from None
+
+
+class _Domain:
+    """One of traci's domains: a getter of what is subscribed answers from what came with the last step."""
+
+    def __init__(self, domain: Any) -> None:
+        self._domain = domain
+        self._came: dict[str, dict[int, Any]] = domain.getAllSubscriptionResults()  # traci keeps this object
+
+    def __getattr__(self, name: str) -> Any:
+        found = getattr(self._domain, name)
+        setattr(self, name, found)
+        return found
+
+
+class _Simulation(_Domain):
+    def __init__(self, domain: Any) -> None:
+        super().__init__(domain)
+        domain.subscribe(list(SIMULATION.values()))
+        for name, variable in SIMULATION.items():
+            setattr(self, name, self._getter(variable))
+
+    def _getter(self, variable: int) -> Callable[[], Any]:
+        return lambda: self._came[""][variable]
+
+
+class _Lights(_Domain):
+    def __init__(self, domain: Any) -> None:
+        super().__init__(domain)
+        for light in domain.getIDList():
+            domain.subscribe(light, list(LIGHTS.values()))
+        for name, variable in LIGHTS.items():
+            setattr(self, name, self._getter(variable))
+
+    def _getter(self, variable: int) -> Callable[[str], Any]:
+        return lambda light: self._came[light][variable]
+
+
+class _Vehicles(_Domain):
+    def __init__(self, connection: _Connection) -> None:
+        super().__init__(connection.vehicle)
+        self._simulation, self._junctions = connection.simulation, connection.junction
+        self._junction: str = self._junctions.getIDList()[0]
+        self._domain.subscribe("", [tc.TRACI_ID_LIST])
+        self._junctions.subscribeContext(
+            self._junction, tc.CMD_GET_VEHICLE_VARIABLE, EVERYWHERE, list(VEHICLES.values())
+        )
+        self._everybody: dict[str, dict[int, Any]] = {}  # vehicle -> variable -> value
+        self._avs: set[str] = set()  # who was asked of
+        for name, variable in VEHICLES.items():
+            setattr(self, name, self._getter(name, variable))
+        for name, variable in AVS.items():
+            setattr(self, name, self._avs_getter(name, variable))
+        self.stepped()
+
+    def stepped(self) -> None:
+        """A step was driven."""
+        self._everybody = self._junctions.getContextSubscriptionResults(self._junction)
+
+    def unsubscribe(self) -> None:
+        """SUMO would send it to the other clients for ever."""
+        self._junctions.unsubscribeContext(self._junction, tc.CMD_GET_VEHICLE_VARIABLE, EVERYWHERE)
+
+    def getIDList(self) -> Any:
+        """Everybody on the road."""
+        came = self._came.get("")
+        return self._domain.getIDList() if came is None else came[tc.TRACI_ID_LIST]
+
+    def __getattr__(self, name: str) -> Any:
+        call = getattr(self._domain, name)
+        if name.startswith(("set", "remove")) and name not in LATER:
+
+            def found(vehicle: str, *values: Any) -> None:
+                call(vehicle, *values)
+                self._everybody.pop(vehicle, None)
+                self._came.pop(vehicle, None)
+                if name == "remove":
+                    self._came.pop("", None)
+
+        else:
+            found = call
+        setattr(self, name, found)
+        return found
+
+    def _getter(self, name: str, variable: int) -> Callable[[str], Any]:
+        ask = getattr(self._domain, name)
+
+        def get(vehicle: str) -> Any:
+            try:
+                return self._everybody[vehicle][variable]
+            except KeyError:
+                return ask(vehicle)
+
+        return get
+
+    def _avs_getter(self, name: str, variable: int) -> Callable[[str], Any]:
+        ask = getattr(self._domain, name)
+
+        def get(vehicle: str) -> Any:
+            try:
+                return self._came[vehicle][variable]
+            except KeyError:
+                if vehicle in self._avs:  # it was changed since the last step
+                    return ask(vehicle)
+                self._domain.subscribe(vehicle, list(AVS.values()))
+                self._avs.add(vehicle)
+                return self._came[vehicle][variable]
+
+        return get

@@ -26,8 +26,8 @@ def add(commands: arguments.SubCommands) -> None:
     join = commands.add_parser(
         "join",
         help="drive vehicles of a SUMO that somebody else started",
-        description="Join a SUMO that waits for TraCI clients (sumo --remote-port PORT --num-clients N), drive "
-        "some of its vehicles as AVs, and hand them back. Ctrl-C leaves it in order.",
+        description="Join a SUMO that waits for TraCI clients (sumo --remote-port PORT --num-clients N), "
+        "drive some of its vehicles as AVs, and hand them back. Ctrl-C leaves it in order.",
     )
     join.add_argument("place", metavar="HOST:PORT", type=_place, help="where it listens")
     arguments.add(join, "--policy", default="idm")

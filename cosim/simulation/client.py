@@ -1,11 +1,12 @@
 """A connection to a SUMO that somebody else started: traci's calls, with what every step needs subscribed.
 
-A call over the socket costs a hundred times what libsumo's does. So SUMO sends with every step what is asked of
-every vehicle, signal and of the simulation; what is asked of AVs alone it sends of those of whom it was asked
-once; and commands to vehicles wait until the next call that needs an answer, to go in one message.
+A call over the socket costs a hundred times what libsumo's does. So SUMO sends with every step what is asked
+of every vehicle, of signals and of the simulation; what is asked of AVs alone it sends of those of whom it was
+asked once; and commands to vehicles wait until the next call that needs an answer, to go in one message.
 """
 
 import contextlib
+import io
 import time
 from collections.abc import Callable
 from typing import Any
@@ -87,7 +88,8 @@ class Client:
     def simulationStep(self) -> None:
         """Send the commands, wait for everybody else, drive one step."""
         self._connection.flush()
-        self._connection.simulationStep()
+        with contextlib.redirect_stdout(io.StringIO()):  # traci says there what it misses of who was removed
+            self._connection.simulationStep()
         self.vehicle.stepped()
 
     def close(self) -> None:

@@ -1,8 +1,8 @@
 """A connection to a SUMO that somebody else started: traci's calls, with what every step needs subscribed.
 
 A call over the socket costs a hundred times what libsumo's does. So SUMO sends with every step what is asked
-of every vehicle, of signals and of the simulation; what is asked of AVs alone it sends of those of whom it was
-asked once; and commands to vehicles wait until the next call that needs an answer, to go in one message.
+of every vehicle, of signals and of the simulation; what is asked of AVs alone it sends of those of whom it
+was asked once; and commands to vehicles wait until the next call that needs an answer, to go in one message.
 """
 
 import contextlib

@@ -9,8 +9,8 @@ import contextlib
 import io
 import struct
 import time
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, NoReturn
 
 from traci import constants as tc
 from traci.connection import Connection
@@ -88,7 +88,13 @@ class Client:
         c = self._connection
         self.edge, self.junction, self.lane, self.person = c.edge, c.junction, c.lane, c.person
         self.vehicletype = c.vehicletype
-        self.simulation, self.trafficlight = _Simulation(c.simulation), _Lights(c.trafficlight)
+        c.simulation.subscribe(list(SIMULATION.values()))
+        for light in c.trafficlight.getIDList():
+            c.trafficlight.subscribe(light, list(LIGHTS.values()))
+        self.simulation, self.trafficlight = (
+            _Domain(c.simulation, SIMULATION),
+            _Domain(c.trafficlight, LIGHTS),
+        )
         self.vehicle = _Vehicles(c)
 
     def simulationStep(self) -> None:
@@ -96,13 +102,17 @@ class Client:
         self._connection.flush()
         with contextlib.redirect_stdout(io.StringIO()):  # traci says there what it misses of who was removed
             self._connection.simulationStep()
+        if not self.simulation.came:  # no word of what was subscribed
+            raise FatalTraCIError("its owner has loaded another simulation")
+        here, came = self.vehicle.stepped(), self.simulation.came[""]
+        departed = came[tc.VAR_DEPARTED_VEHICLES_IDS]
+        came[tc.VAR_DEPARTED_VEHICLES_IDS] = tuple(name for name in departed if name in here)
 
     def close(self) -> None:
         """Leave: SUMO goes on with the others."""
-        with contextlib.suppress(TraCIException, FatalTraCIError, OSError):
-            self._connection.flush()
-            self.vehicle.unsubscribe()
-            self._connection.close()
+        for last in (self._connection.flush, self.vehicle.unsubscribe, self._connection.close):
+            with contextlib.suppress(TraCIException, FatalTraCIError):
+                last()
 
 
 class _Connection(Connection):  # type: ignore[misc]  # traci is not typed
@@ -163,6 +173,9 @@ class _Connection(Connection):  # type: ignore[misc]  # traci is not typed
             self._lose(f"no answer for {self._timeout:g} s: SUMO waits for all of its clients")
         except OSError:
             self._lose("SUMO has gone")
+        except BaseException:  # interrupted: what comes next would be this answer
+            self._drop()
+            raise
 
     def _read(self, size: int) -> bytes:
         whole = bytearray()
@@ -173,11 +186,14 @@ class _Connection(Connection):  # type: ignore[misc]  # traci is not typed
             whole += part
         return bytes(whole)
 
-    def _lose(self, why: str) -> None:
+    def _lose(self, why: str) -> NoReturn:
+        self._drop()
+        raise FatalTraCIError(why) from None
+
+    def _drop(self) -> None:
         if self._socket is not None:
             self._socket.close()
         self._socket, self._queue, self._string = None, [], b""
-        raise FatalTraCIError(why)
 
 
 def _connect(host: str, port: int, timeout: float) -> _Connection:
@@ -214,62 +230,54 @@ def _rows(content: bytes, at: int, count: int) -> tuple[dict[str, Row], int]:
 class _Domain:
     """One of traci's domains: a getter of what is subscribed answers from what came with the last step."""
 
-    def __init__(self, domain: Any) -> None:
+    def __init__(self, domain: Any, subscribed: Mapping[str, int]) -> None:
         self._domain = domain
-        self._came: dict[str, dict[int, Any]] = domain.getAllSubscriptionResults()  # traci keeps this object
+        self.came: dict[str, dict[int, Any]] = domain.getAllSubscriptionResults()  # traci keeps this object
+        for name, variable in subscribed.items():
+            setattr(self, name, self._getter(name, variable))
 
     def __getattr__(self, name: str) -> Any:
         found = getattr(self._domain, name)
         setattr(self, name, found)
         return found
 
-
-class _Simulation(_Domain):
-    def __init__(self, domain: Any) -> None:
-        super().__init__(domain)
-        domain.subscribe(list(SIMULATION.values()))
-        for name, variable in SIMULATION.items():
-            setattr(self, name, self._getter(variable))
-
-    def _getter(self, variable: int) -> Callable[[], Any]:
-        return lambda: self._came[""][variable]
-
-
-class _Lights(_Domain):
-    def __init__(self, domain: Any) -> None:
-        super().__init__(domain)
-        for light in domain.getIDList():
-            domain.subscribe(light, list(LIGHTS.values()))
-        for name, variable in LIGHTS.items():
-            setattr(self, name, self._getter(variable))
-
-    def _getter(self, variable: int) -> Callable[[str], Any]:
-        return lambda light: self._came[light][variable]
+    def _getter(self, name: str, variable: int) -> Callable[..., Any]:
+        return lambda of="": self.came[of][variable]
 
 
 class _Vehicles(_Domain):
+    """Those of `AVS` are subscribed of who is asked about."""
+
     def __init__(self, connection: _Connection) -> None:
-        super().__init__(connection.vehicle)
+        super().__init__(connection.vehicle, AVS)
         self._connection, self._junctions = connection, connection.junction
         self._junction: str = self._junctions.getIDList()[0]
-        self._domain.subscribe("", [tc.TRACI_ID_LIST])
         self._junctions.subscribeContext(
             self._junction, tc.CMD_GET_VEHICLE_VARIABLE, EVERYWHERE, list(VEHICLES.values())
         )
-        self._avs: set[str] = set()  # who was asked of
+        self._ids: tuple[str, ...] | None = None
+        self._avs: set[str] = set()  # who was asked about
         for column, name in enumerate(VEHICLES):
-            setattr(self, name, self._getter(name, column))
-        for name, variable in AVS.items():
-            setattr(self, name, self._avs_getter(name, variable))
+            setattr(self, name, self._row_getter(name, column))
+
+    def stepped(self) -> set[str]:
+        """A step was driven: who is on the road now that it is our turn (others may have removed some)."""
+        self._ids = self._domain.getIDList()
+        here = set(self._ids)
+        for vehicle in self._connection.everybody.keys() - here:
+            del self._connection.everybody[vehicle]
+            self.came.pop(vehicle, None)
+        return here
 
     def unsubscribe(self) -> None:
         """SUMO would send it to the other clients for ever."""
         self._junctions.unsubscribeContext(self._junction, tc.CMD_GET_VEHICLE_VARIABLE, EVERYWHERE)
 
-    def getIDList(self) -> Any:
+    def getIDList(self) -> tuple[str, ...]:
         """Everybody on the road."""
-        came = self._came.get("")
-        return self._domain.getIDList() if came is None else came[tc.TRACI_ID_LIST]
+        if self._ids is None:
+            self._ids = tuple(self._domain.getIDList())
+        return self._ids
 
     def __getattr__(self, name: str) -> Any:
         call = getattr(self._domain, name)
@@ -278,16 +286,15 @@ class _Vehicles(_Domain):
             def found(vehicle: str, *values: Any) -> None:
                 call(vehicle, *values)
                 self._connection.everybody.pop(vehicle, None)
-                self._came.pop(vehicle, None)
-                if name == "remove":
-                    self._came.pop("", None)
+                self.came.pop(vehicle, None)
+                self._ids = None
 
         else:
             found = call
         setattr(self, name, found)
         return found
 
-    def _getter(self, name: str, column: int) -> Callable[[str], Any]:
+    def _row_getter(self, name: str, column: int) -> Callable[[str], Any]:
         ask, connection = getattr(self._domain, name), self._connection
 
         def get(vehicle: str) -> Any:
@@ -298,17 +305,17 @@ class _Vehicles(_Domain):
 
         return get
 
-    def _avs_getter(self, name: str, variable: int) -> Callable[[str], Any]:
+    def _getter(self, name: str, variable: int) -> Callable[..., Any]:
         ask = getattr(self._domain, name)
 
         def get(vehicle: str) -> Any:
             try:
-                return self._came[vehicle][variable]
+                return self.came[vehicle][variable]
             except KeyError:
                 if vehicle in self._avs:  # it was changed since the last step
                     return ask(vehicle)
                 self._domain.subscribe(vehicle, list(AVS.values()))
                 self._avs.add(vehicle)
-                return self._came[vehicle][variable]
+                return self.came[vehicle][variable]
 
         return get

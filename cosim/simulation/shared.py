@@ -36,7 +36,6 @@ class SharedSimulator(SumoSimulator):
     """What both ways have in common: it ends when somebody else says so."""
 
     _SHARED = True
-    _STANDS = ""  # what it means that time does not go on
     _LOST = ""  # what it means that SUMO fails; "": what the client says
     _over = False  # nothing more can be asked of SUMO
     _pending: Sequence[str] = ()  # vehicles that waited at the last step
@@ -61,8 +60,11 @@ class SharedSimulator(SumoSimulator):
         except sumo.TraCIException as error:
             raise self._explain(error) from None
         if sumo.simulation.getTime() <= before:
-            self._end(self._STANDS)
+            self._end("the last TraCI program has left")
         self._pending = sumo.simulation.getPendingVehicles()
+        here = set(sumo.vehicle.getIDList())
+        for name in [name for name in self._commander.controlled if name not in here]:
+            self._commander.drop(name)  # another program has removed it
 
     def _end(self, why: str) -> NoReturn:
         self._over = True
@@ -75,7 +77,6 @@ class ServingSimulator(SharedSimulator):
     `reset` waits until all of them have connected: in a process that somebody watches.
     """
 
-    _STANDS = "the last TraCI program has left"
     _LOST = "a TraCI program broke its connection off"
 
     def __init__(self, scenario: Scenario, port: int, clients: int, **settings: Any) -> None:
@@ -131,7 +132,6 @@ class TraciSimulator(SharedSimulator):
     """
 
     _FLEET = LentFleet
-    _STANDS = "its owner has loaded another simulation"
 
     def __init__(self, scenario: Scenario, client: Client, **settings: Any) -> None:
         self._client = client

@@ -284,6 +284,8 @@ class _Vehicles(_Domain):
         if name.startswith(("set", "remove")) and name not in LATER:
 
             def found(vehicle: str, *values: Any) -> None:
+                if name == "remove" and vehicle in self._avs:  # else each client is told that it is missed
+                    self._domain.unsubscribe(vehicle)
                 call(vehicle, *values)
                 self._connection.everybody.pop(vehicle, None)
                 self.came.pop(vehicle, None)

@@ -143,9 +143,11 @@ class Commander:
         for name, state in self.controlled.items():
             speed = vehicle.getSpeed(name)
             wanted = tracked_speed(speed, state.target, self._step)
-            if abs(wanted - state.requested) > SETTLED:
-                vehicle.setSpeed(name, wanted)
+            news = abs(wanted - state.requested) > SETTLED
+            if news:
                 state.requested = wanted
+            if news or self.shared:  # another program may have set one
+                vehicle.setSpeed(name, state.requested)
 
     def observe(self, now: float) -> list[Intervention]:
         """After every simulation step, at `now` (s): where the car began to drive otherwise than asked."""

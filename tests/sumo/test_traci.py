@@ -164,13 +164,11 @@ def test_a_signal_that_another_program_switches_is_switched_for_our_agents(
 def test_of_two_speeds_the_one_set_later_holds_and_the_other_is_said_to_be_refused(
     world: str, started: Started
 ) -> None:
-    straight = ("--policy", "keep-lane")
-    drives = both_ways(started, world, 100, "slow", *straight)
-    alone = document(started.cosim("run", world, "--seed", str(SEED), *DRIVE, *straight))
-    served, joined = map(document, drives)
-    assert joined["trace_hash"] == alone["trace_hash"], "of order 9 we act after others"
-    assert served["dt_av_m"] < alone["dt_av_m"], "who connects to us acts after us"
-    assert served["commands_blocked"] > alone["commands_blocked"]
+    served, joined = map(document, both_ways(started, world, 100, "slow", "--policy", "keep-lane"))
+    assert served["dt_av_m"] < 0.8 * joined["dt_av_m"], (
+        "who connects to us acts after us, of order 9 we act last"
+    )
+    assert served["commands_blocked"] > joined["commands_blocked"] + 10
 
 
 @pytest.mark.parametrize("deed", ["close", "die"])

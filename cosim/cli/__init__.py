@@ -15,6 +15,7 @@ COMMANDS = (
     "metrics",
     "train",
     "fit-predictors",
+    "serve",
     "bench",
     "scenarios",
     "doctor",

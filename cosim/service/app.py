@@ -26,6 +26,7 @@ from cosim.service.monitor import Figures
 from cosim.service.problems import Refused
 from cosim.service.requests import RunRequest
 from cosim.service.routes_runs import runs_router
+from cosim.service.routes_uploads import uploads_router
 from cosim.service.runs import Runs, shown
 from cosim.service.settings import Settings
 from cosim.service.uploads import Uploads
@@ -88,6 +89,7 @@ def create(settings: Settings) -> FastAPI:
     _answer_problems(app, settings)
     app.include_router(_about(figures))
     app.include_router(runs_router(runs, uploads))
+    app.include_router(uploads_router(uploads, runs, settings))
     app.add_middleware(Gate, settings=settings, figures=figures)
     return app
 

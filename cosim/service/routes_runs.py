@@ -10,13 +10,14 @@ from fastapi.responses import FileResponse
 from pydantic import BaseModel
 
 from cosim.service.documents import Estimate, FileEntry, Progressing, Rows, RunDocument, RunList
+from cosim.service.ids import PATTERN
 from cosim.service.jobs import STATUSES, Job
 from cosim.service.problems import Conflict, NotFound
 from cosim.service.requests import EXAMPLE, LONGEST, RunRequest, flags, plain
 from cosim.service.runs import REPORT, SUMMARY, Runs
 from cosim.service.uploads import Uploads
 
-RunId = Annotated[str, Path(pattern="^[0-9a-f]{12}$", examples=["3f2a9c10b7de"])]
+RunId = Annotated[str, Path(pattern=PATTERN, examples=["3f2a9c10b7de"])]
 Requested = Annotated[RunRequest, Body(openapi_examples={"two policies": {"value": EXAMPLE}})]
 Side = Annotated[str, Query(pattern=r"^[0-9a-f]{12}(:[\w.+-]{1,100})?$", description="RUN or RUN:POLICY")]
 Texts = Annotated[list[Annotated[str, Query(max_length=LONGEST)]], Query(max_length=20)]

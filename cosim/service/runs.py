@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import re
-import secrets
 import shutil
 import threading
 import time
@@ -25,23 +23,19 @@ from cosim.errors import BadInput, CosimError
 from cosim.scenario.sumo_outputs import DRAFT
 from cosim.service.clerk import Clerks
 from cosim.service.confined import ConfinedRunner, Room, room
+from cosim.service.ids import ID, new_id
 from cosim.service.jobs import CANCELLED, FAILED, FINISHED, QUEUED, RUNNING, Job, Jobs, now
 from cosim.service.problems import Conflict, NotFound, Unavailable
 from cosim.service.settings import Settings
 from cosim.workers.engines import Engine, cores
 from cosim.workers.pool import Cancelled, Pool, PoolEngine
 from cosim.workers.ray_engine import RayEngine
+from cosim.workers.supervisor import Limits as WorkerLimits
 
 ACTIVE = 8  # runs that are driven at once on the processes of this machine
-ID = re.compile(r"[0-9a-f]{12}")
 REPORT, SUMMARY = "report.html", "summary.json"
 OUTPUTS = "outputs"  # the folder of SUMO's own
 log = logging.getLogger("cosim.service")
-
-
-def new_id() -> str:
-    """A fresh id of a run, an upload or a session."""
-    return secrets.token_hex(6)
 
 
 class Drive:
@@ -173,6 +167,10 @@ class Runs:
         found: dict[str, Any] = self._clerks.call("compare", a, b, list(fail_on), list(across))
         return found
 
+    def that_use(self, upload: str) -> str | None:
+        """A run that waits or is driven with this upload."""
+        return next((job.run for job in self._jobs.open() if upload in job.uploads), None)
+
     def report(self, run: str) -> None:
         """Write the report of a run that has finished, unless it is there."""
         if SUMMARY in self.files(run) and REPORT not in self.files(run):
@@ -245,10 +243,13 @@ class Runs:
         arguments: tuple[Any, ...] = ()
         if confined is not None:
             factory, arguments = ConfinedRunner, (confined,)
+        once = None if confined is None else WorkerLimits(step=60.0, start=120.0, crashes=1)
         if self.pool is not None:
-            return self.pool.engine(factory, arguments)
+            return self.pool.engine(factory, arguments, limits=once)
         settings = self._settings
-        return RayEngine(factory, arguments, workers=settings.workers, address=settings.ray_address)
+        return RayEngine(
+            factory, arguments, workers=settings.workers, limits=once, address=settings.ray_address
+        )
 
     def _work(self) -> None:
         """A thread: one run after the other."""

@@ -31,6 +31,7 @@ class Server:
             str(data),
             *flags,
         ]
+        self.data = data
         self.log = data.parent / f"{data.name}.log"
         self._file = self.log.open("a")
         self._from = self.log.stat().st_size

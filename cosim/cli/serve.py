@@ -14,8 +14,8 @@ def add(commands: arguments.SubCommands) -> None:
         help="serve runs and sessions over HTTP",
         description="Serve runs and sessions over HTTP until it is ended (Ctrl-C, SIGTERM). What is queued "
         "or running then goes on after the next start with the same --data. Bound to another address "
-        "than loopback it asks for a bearer token: the variable COSIM_TOKEN, or else what DIR/token holds, which "
-        "is made at the first start.",
+        "than loopback it asks for a bearer token: the variable COSIM_TOKEN, or else what DIR/token "
+        "holds, which is made at the first start.",
     )
     texts = {
         "--host": ("HOST", "address to bind (default 127.0.0.1)"),

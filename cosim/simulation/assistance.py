@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import libsumo
 
-from cosim.control import COMFORT, wished_accel
+from cosim.control import COMFORT, COMFORT_TIME, wished_accel
 from cosim.road.rules import RED, YELLOW
 from cosim.simulation.commands import Commander, Controlled
 from cosim.simulation.fleet import set_type
@@ -71,7 +71,7 @@ class Assistance(Commander):
             slower = allowed < state.wish - 1e-3
             if not state.ours:
                 state.accel = (speed - state.speed) / self._step
-            target = min(state.target, state.limit)
+            target = min(state.goal(speed, COMFORT_TIME), state.limit)
             state.idled = state.idled + self._step if state.target < KEEPS_MOVING else 0.0
             if state.idled > PATIENCE or get.getRoadID(name).startswith(":"):
                 target = max(target, min(KEEPS_MOVING, state.limit))

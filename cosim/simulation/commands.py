@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import libsumo
 
-from cosim.control import LANE_CHANGE_TIME, MAX_DECEL, tracked_speed
+from cosim.control import LANE_CHANGE_TIME, MAX_DECEL, TIME_CONSTANT, tracked_speed
 from cosim.simulation.convert import may_change
 from cosim.simulation.fleet import AV_IDM
 from cosim.types import Command, Intervention, Preset, Receipt
@@ -29,6 +29,11 @@ class Controlled:
     change: int = 0  # the last lane change: +1 left, -1 right
     change_until: float = -1.0  # s, when it ends
     requested: float = -1.0  # m/s, the last speed handed to SUMO
+    asks: float | None = None  # m/s2, in place of the target speed
+
+    def goal(self, speed: float, time: float) -> float:
+        """The speed in m/s to be tracked with the time constant `time` (s) at `speed` (m/s)."""
+        return self.target if self.asks is None else speed + self.asks * time
 
     def changing(self, now: float) -> int:
         """The lane change under way at time `now` (s): +1 left, -1 right, 0 none."""
@@ -59,7 +64,7 @@ class Commander:
             state = self.controlled[name] = self._take_over(name)
             libsumo.vehicle.setSpeedMode(name, SPEED_MODE[self._preset])
             libsumo.vehicle.setLaneChangeMode(name, LANE_CHANGE_MODE[self._preset])
-        state.target, state.limit = command.target_speed, command.limit
+        state.target, state.limit, state.asks = command.target_speed, command.limit, command.accel
         if command.lane_offset == 0:
             return Receipt(name, True)
         why = (
@@ -125,7 +130,7 @@ class Commander:
         vehicle = libsumo.vehicle
         for name, state in self.controlled.items():
             speed = vehicle.getSpeed(name)
-            wanted = tracked_speed(speed, state.target, self._step)
+            wanted = tracked_speed(speed, state.goal(speed, TIME_CONSTANT), self._step)
             if abs(wanted - state.requested) > SETTLED:
                 vehicle.setSpeed(name, wanted)
                 state.requested = wanted

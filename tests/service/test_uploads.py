@@ -57,9 +57,13 @@ def link(name: str) -> zipfile.ZipInfo:
 
 def test_an_uploaded_scenario_is_driven(server: Server) -> None:
     more = b'<tripinfo-output value="/tmp/stolen.xml"/>'
-    detector = b'<additional><inductionLoop id="d" lane="main_in_0" pos="5" period="1" file="/tmp/stolen"/></additional>'
+    detector = b'<inductionLoop id="d" lane="main_in_0" pos="5" period="1" file="/tmp/stolen"/>'
     additional = b'<additional-files value="d.add.xml"/>'
-    files = {**GOOD, "run.sumocfg": CONFIG % (b"3", more + additional), "d.add.xml": detector}
+    files = {
+        **GOOD,
+        "run.sumocfg": CONFIG % (b"3", more + additional),
+        "d.add.xml": b"<additional>" + detector + b"</additional>",
+    }
     upload = send(server, files).json()
     assert upload["about"]["options_not_passed_on"] == ["tripinfo-output=/tmp/stolen.xml"]
     name = f"upload:{upload['id']}"

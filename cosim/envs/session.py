@@ -271,6 +271,11 @@ class Session(contextlib.AbstractContextManager["Session"]):
     def __exit__(self, *error: object) -> None:
         self.close()
 
+    @property
+    def begun(self) -> bool:
+        """Whether an episode has."""
+        return self._views is not None
+
     # ---- inside ----
 
     def _call(self, method: str, *arguments: Any) -> Any:

@@ -26,8 +26,10 @@ from cosim.service.monitor import Figures
 from cosim.service.problems import Refused
 from cosim.service.requests import RunRequest
 from cosim.service.routes_runs import runs_router
+from cosim.service.routes_sessions import sessions_router
 from cosim.service.routes_uploads import uploads_router
 from cosim.service.runs import Runs, shown
+from cosim.service.sessions import Sessions
 from cosim.service.settings import Settings
 from cosim.service.uploads import Uploads
 from cosim.types import Preset
@@ -44,10 +46,12 @@ def create(settings: Settings) -> FastAPI:
     limits = settings.limits
     clerks = Clerks(settings.runs, settings.database, limits.cells, limits.check)
     runs = Runs(settings, jobs, clerks, lambda number: figures.episodes.inc(number))
+    sessions = Sessions(settings, clerks, lambda seconds: figures.steps.observe(seconds))
     pool = runs.pool
     figures = Figures(
         {
             "cosim_runs": ("runs by status", "status", jobs.counts),
+            "cosim_sessions": ("sessions", "state", lambda: {"open": sessions.number}),
             "cosim_workers": (
                 "processes of runs",
                 "state",
@@ -59,8 +63,10 @@ def create(settings: Settings) -> FastAPI:
     @contextlib.asynccontextmanager
     async def life(_: FastAPI) -> AsyncIterator[None]:
         runs.start()
+        sessions.start()
         log.info("ready", extra={"host": settings.host, "port": settings.port, "data": str(settings.data)})
         yield
+        sessions.close()
         runs.close()
         clerks.close()
         jobs.close()
@@ -90,6 +96,7 @@ def create(settings: Settings) -> FastAPI:
     app.include_router(_about(figures))
     app.include_router(runs_router(runs, uploads))
     app.include_router(uploads_router(uploads, runs, settings))
+    app.include_router(sessions_router(sessions, uploads))
     app.add_middleware(Gate, settings=settings, figures=figures)
     return app
 

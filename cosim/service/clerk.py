@@ -13,7 +13,9 @@ from cosim.batch.matrix import Plan
 from cosim.batch.store import Store
 from cosim.errors import BadInput, SimulationTimeout
 from cosim.policies import check
+from cosim.scenario import Scenario
 from cosim.scenario.episode_id import EpisodeId
+from cosim.scenario.vet import vetted
 from cosim.workers.worker import Worker
 
 
@@ -41,6 +43,12 @@ class Clerk:
     def plan(self, cases: Sequence[EpisodeId], seeds: range) -> Plan:
         """The plan of a run that was begun."""
         return matrix.plan(cases, seeds, check)
+
+    def session(self, flags: Mapping[str, Any]) -> tuple[Scenario, EpisodeId]:
+        """What a session is opened on. Raises BadInput, as `cosim run` does."""
+        (case,) = matrix.cells(spec.read(None, flags))
+        check(case.policy)
+        return vetted(case.scenario()), case
 
     def finish(self, run: str, plan: Plan) -> None:
         """Write the tables, the manifest and the summary of a run."""

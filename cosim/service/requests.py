@@ -5,9 +5,9 @@ import re
 import typing
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, WithJsonSchema, create_model
+from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictInt, WithJsonSchema, create_model
 
 import sumo_scenarios
 from cosim.batch.spec import FIELDS, Spec
@@ -94,13 +94,44 @@ else:
     RunRequest.__doc__ = "The matrix of a run: the fields of `cosim evaluate`, by the same names and rules."
 
 
-def flags(request: BaseModel, find: Find) -> tuple[dict[str, Any], list[str]]:
+# A session has one value of each axis; its seeds, reward and outputs are its own.
+_ONE = {
+    name: (Annotated[Any, WithJsonSchema(_schema(name, _kinds[name])["anyOf"][0])], field)
+    for name, (_, field) in _fields.items()
+    if name not in ("seeds", "reward", "output", "metric")
+}
+SESSION_EXAMPLE: dict[str, Any] = {"scenario": "merge", "demand": "contested", "svo": 45, "policy": "idm"}
+
+
+class _Session(BaseModel):
+    model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [SESSION_EXAMPLE]})
+
+    seed: StrictInt | None = Field(None, ge=0, lt=2**62, description="of the first episode")
+    reward: Literal[tuple(REWARDS)] = Field("p", description="what AVs are paid")  # type: ignore[valid-type]
+    maps: StrictBool = Field(True, description="whether VelocityMaps are drawn")
+    idle_s: float | None = Field(
+        None, gt=0.0, le=1e6, allow_inf_nan=False, description="ends by itself after so long"
+    )
+
+
+if TYPE_CHECKING:
+    SessionRequest = _Session
+else:
+    SessionRequest = create_model("SessionRequest", __base__=_Session, **_ONE)
+    SessionRequest.__doc__ = "What a session drives; `policy` commands the AVs that the caller does not."
+
+
+def flags(
+    request: BaseModel, find: Find, leave: Iterable[str] = ("name",)
+) -> tuple[dict[str, Any], list[str]]:
     """The flags of `cosim.batch.spec.read`, every file a file of an upload; and the uploads' ids.
+
+    `leave`: fields of the request that are no flags.
 
     Raises BadInput: a path, code or a glob where a name is wanted, an upload that is not there.
     """
     given = request.model_dump(exclude_unset=True)
-    given.pop("name", None)
+    given = {name: value for name, value in given.items() if name not in leave}
     plain(given)
     uploads: list[str] = []
     found = {name: _axis(name, value, find, uploads) for name, value in given.items()}

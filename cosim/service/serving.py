@@ -11,6 +11,8 @@ from cosim.service.app import create
 from cosim.service.monitor import log_json
 from cosim.service.settings import TOKEN, DataFolder, Settings
 
+KEEP_ALIVE = 120  # s: a driver may think for a while between two decisions
+
 
 def serve(data: str, *, host: str, port: int, said: TextIO, **settings: Any) -> int:
     """Serve until Ctrl-C or SIGTERM; where to is told on `said` before.
@@ -32,7 +34,12 @@ def serve(data: str, *, host: str, port: int, said: TextIO, **settings: Any) -> 
             )
             print(f"cosim: http://{shown}:{port} ({asks})", file=said, flush=True)
             config = uvicorn.Config(
-                app, log_config=None, access_log=False, server_header=False, timeout_graceful_shutdown=5
+                app,
+                log_config=None,
+                access_log=False,
+                server_header=False,
+                timeout_keep_alive=KEEP_ALIVE,
+                timeout_graceful_shutdown=5,
             )
             uvicorn.Server(config).run(sockets=[listening])
     return 0

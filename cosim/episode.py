@@ -289,7 +289,8 @@ class Episode:
         for array in (s.x, s.y, s.speed, s.heading):
             update(np.ascontiguousarray(array, np.float64).tobytes())
         update(s.lane.tobytes())
-        update(repr(sorted((name, int(d.action)) for name, d in decisions.items())).encode())
+        asked = [(n, int(d.action), *(() if d.accel is None else (d.accel,))) for n, d in decisions.items()]
+        update(repr(sorted(asked)).encode())
 
     def _validity(self, metrics: Mapping[str, Metric]) -> tuple[str, ...]:
         """Why this result must not be compared with others; empty when it may be."""

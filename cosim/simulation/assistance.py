@@ -9,7 +9,7 @@ given (V2V), because SUMO's cooperation ends where a speed is commanded.
 import math
 from dataclasses import dataclass
 
-from cosim.control import COMFORT, wished_accel
+from cosim.control import COMFORT, COMFORT_TIME, wished_accel
 from cosim.road.rules import RED, YELLOW
 from cosim.simulation.backend import sumo
 from cosim.simulation.commands import Commander, Controlled
@@ -75,7 +75,7 @@ class Assistance(Commander):
             slower = allowed < state.wish - 1e-3
             if not state.ours:
                 state.accel = (speed - state.speed) / self._step
-            target = min(state.target, state.limit)
+            target = min(state.goal(speed, COMFORT_TIME), state.limit)
             state.idled = state.idled + self._step if state.target < KEEPS_MOVING else 0.0
             inside = get.getRoadID(name).startswith(":")
             state.crosses = CROSSES if inside and state.gives_way else state.crosses - self._step

@@ -10,7 +10,7 @@ from junitparser import Error, Failure, JUnitXml, Skipped, TestCase, TestSuite
 from cosim.files import whole
 from cosim.report import wording
 from cosim.report.compare import FAILED, PASSED, SKIPPED, Compared, Comparison, PairedFigure
-from cosim.report.figures import HEADLINE, Row
+from cosim.report.figures import HEADLINE, INCIDENCES, Row
 from cosim.report.pairing import who
 from cosim.report.result import LAW
 
@@ -143,11 +143,15 @@ def _group_document(compared: Compared) -> dict[str, Any]:
 
 
 def _shown(comparison: Comparison, compared: Compared) -> list[PairedFigure]:
-    """Headline figures, those of the law that are not 0, and those a threshold asks for, where they apply."""
+    """Headline figures, those of the law and of near-misses that are not 0, and those a threshold asks for,
+    where they apply."""
     asked = [check.threshold.measure.name for check in comparison.checks]
-    names = [name for name in dict.fromkeys((*HEADLINE, *LAW, *asked)) if name in compared.figures]
-    broken = {n for n in LAW if (f := compared.figures.get(n)) and (f.a.value > 0.0 or f.b.value > 0.0)}
-    names = [name for name in names if name not in LAW or name in broken or name in asked]
+    names = [
+        name for name in dict.fromkeys((*HEADLINE, *INCIDENCES, *LAW, *asked)) if name in compared.figures
+    ]
+    rare = {*INCIDENCES, *LAW} - {*asked}
+    happened = {n for n in rare if (f := compared.figures.get(n)) and (f.a.value > 0.0 or f.b.value > 0.0)}
+    names = [name for name in names if name not in rare or name in happened]
     return [compared.figures[name] for name in names if compared.figures[name].n]
 
 
@@ -155,7 +159,7 @@ def _cells(figure: PairedFigure) -> tuple[str, str, str, str]:
     """Name, A, B, B - A, with intervals and counts."""
     m = figure.measure
     arrow = {"higher": " ↑", "lower": " ↓"}.get(m.better, "")
-    counts = [f", {hits}/{figure.n}" for hits in figure.hits] if figure.hits else ["", ""]
+    counts = [f", {count}" if count else "" for count in figure.counts]
     difference = wording.interval(figure.difference, m, signed=True)
     if figure.p is not None:
         difference += f", {wording.p_value(figure.p)}"

@@ -72,6 +72,7 @@ def document(replay: ReplayData) -> dict[str, Any]:
             {
                 "t": _ms(c.time), "collider": c.collider, "victim": c.victim, "kind": c.kind, "lane": c.lane,
                 "x": _finite(c.x), "y": _finite(c.y), "av_caused": c.av_caused,
+                "human_error": c.human_error_involved,
             }
             for c in r.collisions
         ],
@@ -86,6 +87,12 @@ def document(replay: ReplayData) -> dict[str, Any]:
             [_ms(one.time), number[one.vehicle], words.setdefault(one.reason, len(words))]
             for one in r.interventions
             if one.vehicle in number
+        ],
+        "errors": [
+            [_ms(one.time), _ms(one.until), number[one.who],
+             *(words.setdefault(text, len(words)) for text in (one.kind, one.what, one.near))]
+            for one in r.errors
+            if one.who in number
         ],
         "words": [*words],
     }  # fmt: skip

@@ -123,7 +123,7 @@ class HumanErrors:
         for name in [*self._erring]:
             try:
                 self._go_on(name, now)
-            except libsumo.TraCIException:  # taken off the road, neither arrived nor crashed
+            except sumo.TraCIException:  # taken off the road, neither arrived nor crashed
                 self.drop(name)
         if self._next is not None and now >= self._next - 1e-6:
             self._next += 1.0
@@ -144,7 +144,7 @@ class HumanErrors:
 
     def _trials(self, now: float) -> None:
         """Those of one second."""
-        second, on_road = round(now), frozenset(libsumo.vehicle.getIDList())
+        second, on_road = round(now), frozenset(sumo.vehicle.getIDList())
         for name in self._streams.keys() - on_road:
             self.drop(name)
         names = [*self._streams]

@@ -121,7 +121,10 @@ class HumanErrors:
     def step(self, now: float) -> None:
         """After a simulation step that ended at `now` (s)."""
         for name in [*self._erring]:
-            self._go_on(name, now)
+            try:
+                self._go_on(name, now)
+            except sumo.TraCIException:  # taken off the road, neither arrived nor crashed
+                self.drop(name)
         if self._next is not None and now >= self._next - 1e-6:
             self._next += 1.0
             self._trials(now)
@@ -141,7 +144,9 @@ class HumanErrors:
 
     def _trials(self, now: float) -> None:
         """Those of one second."""
-        second = round(now)
+        second, on_road = round(now), frozenset(sumo.vehicle.getIDList())
+        for name in self._streams.keys() - on_road:
+            self.drop(name)
         names = [*self._streams]
         if names and self._every_second:
             drawn = uniforms(np.array([*self._streams.values()]), second)  # [n,k]

@@ -69,7 +69,8 @@ def work(args: argparse.Namespace) -> int:
     fleet = chosen_fleet(args.av_type, args.av_ids, args.penetration) or Fleet()
     with _run_folder(args.out) as folder:
         driver = make(policy)  # before SUMO has to wait for it
-        client = Client(*args.place, args.order, args.timeout)
+        host_name, port = args.place
+        client = Client(host_name, port, args.order, args.timeout)
         try:
             scenario, seed = theirs(client, args.net)
             host = Host(
@@ -87,12 +88,13 @@ def work(args: argparse.Namespace) -> int:
         progress = Progress(f"{scenario.name} {label(policy)}", "s")
         try:
             with _leaving(simulator):
-                drive = host.run_recorded if args.replay else host.run
-                driven: Any = drive(seed if args.seed is None else args.seed, progress)
+                drive: Any = host.run_recorded if args.replay else host.run
+                driven = drive(seed if args.seed is None else args.seed, progress)
         finally:
             progress.done()
             host.close()
-        show(args, *(driven if args.replay else (driven, None)), folder)
+        result, replay = driven if args.replay else (driven, None)
+        show(args, result, replay, folder)
     return 130 if simulator.leave else 0
 
 

@@ -118,6 +118,10 @@ class Client:
 class _Connection(Connection):  # type: ignore[misc]  # traci is not typed
     """traci's connection with a limit on every answer; commands to vehicles wait for `flush`."""
 
+    _socket: Any
+    _queue: list[int]
+    _string: bytes
+
     def __init__(self, host: str, port: int, timeout: float) -> None:
         self._waits = False
         self.everybody: dict[str, Row] = {}  # what came of every vehicle with the last step

@@ -3,8 +3,8 @@
     python -m benchmarks.joining [--rounds 5] [--seconds 20] [--out docs/results/joining.md]
 
 The motorway interchange that SUMO's package ships (A10KW), with 200 vehicles. SUMO runs in a process of its
-own, as does every other program; the ways take turns. Wants a machine with nothing else to do; what else it does
-leaves the ratio by processor time alone, since the processes wait for one another.
+own, as does every other program; the ways take turns. Wants a machine with nothing else to do: what else it
+does leaves only the ratio by processor time alone.
 """
 
 from __future__ import annotations
@@ -160,11 +160,11 @@ def page(found: dict[str, list[Drive]], command: str) -> list[str]:
     return [
         "# How fast cosim drives in somebody else's SUMO",
         "",
-        f"Made by `{command}`: `cosim join` ([traci.md](../traci.md)) on",
-        f"A10KW, the motorway interchange that SUMO's package ships, from {WARMUP:g} s on. Every AV is commanded at",
-        "every decision, at random, without a network. SUMO, our agents and the other program are a process each and",
-        "wait for one another, so that on a machine with nothing else to do both ratios are nearly the same.",
-        "Medians (range).",
+        f"Made by `{command}`: `cosim join` ([traci.md](../traci.md))",
+        f"on A10KW, the motorway interchange that SUMO's package ships, from {WARMUP:g} s on. All AVs are",
+        "commanded at every decision, at random, without a network. SUMO, our agents and the other program",
+        "are a process each and wait for one another: where the machine has nothing else to do both ratios",
+        "are nearly the same. Medians (range).",
         "",
         markdown_row(["", "vehicles", "AVs", "times real time", "by processor time", "target"]),
         "|---|---|---|---|---|---|",

@@ -9,7 +9,7 @@ import contextlib
 import io
 import struct
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NoReturn
 
 from traci import constants as tc
@@ -123,7 +123,7 @@ class _Connection(Connection):  # type: ignore[misc]  # traci is not typed
     _string: bytes
 
     def __init__(self, host: str, port: int, timeout: float) -> None:
-        self._waits = False
+        self._waits = self._gathers = False
         self.everybody: dict[str, Row] = {}  # what came of every vehicle with the last step
         super().__init__(host, port, None, None, False)
         self._timeout = timeout
@@ -138,8 +138,34 @@ class _Connection(Connection):  # type: ignore[misc]  # traci is not typed
                 if "is not known" not in str(error):
                     raise
 
+    def ask(self, command: int, variable: int, form: str, asked: Sequence[tuple[Any, ...]]) -> list[Any]:
+        """The same getter of many in one message, each with (object, parameters in `form`): the values."""
+        self.flush()
+        self._gathers = True
+        try:
+            for name, *parameters in asked:
+                self._sendCmd(command, variable, name, form, *parameters)
+        finally:
+            self._gathers = False
+        message, self._string, self._queue = self._string, b"", []
+        try:
+            self._socket.sendall(struct.pack("!i", len(message) + 4) + message)
+        except OSError:
+            self._lose("SUMO has gone")
+        answer, values = self._recvExact(), []
+        for _ in asked:
+            _, _, failed = answer.read("!BBB")
+            words = answer.readString()
+            if failed:
+                raise TraCIException(words)
+            answer.readLength()
+            answer.read("!BB")
+            answer.readString()
+            values.append(self._subscriptionMapping[command].parse(variable, answer))
+        return values
+
     def _sendCmd(self, cmdID: int, *words: Any) -> Any:
-        self._waits = cmdID == tc.CMD_SET_VEHICLE_VARIABLE
+        self._waits = self._gathers or cmdID == tc.CMD_SET_VEHICLE_VARIABLE
         if not self._waits:
             self.flush()
         try:
@@ -261,6 +287,7 @@ class _Vehicles(_Domain):
         )
         self._ids: tuple[str, ...] | None = None
         self._avs: set[str] = set()  # who was asked about
+        self._changes: dict[tuple[str, int], tuple[int, int]] = {}  # (AV, side) -> lane-change state
         for column, name in enumerate(VEHICLES):
             setattr(self, name, self._row_getter(name, column))
 
@@ -268,6 +295,7 @@ class _Vehicles(_Domain):
         """A step was driven: who is on the road now that it is our turn (others may have removed some)."""
         self._ids = self._domain.getIDList()
         here = set(self._ids)
+        self._changes.clear()
         for vehicle in self._connection.everybody.keys() - here:
             del self._connection.everybody[vehicle]
             self.came.pop(vehicle, None)
@@ -282,6 +310,14 @@ class _Vehicles(_Domain):
         if self._ids is None:
             self._ids = tuple(self._domain.getIDList())
         return self._ids
+
+    def getLaneChangeState(self, vehicle: str, side: int) -> tuple[int, int]:
+        """SUMO's, asked of all AVs at once, on both sides."""
+        if (vehicle, side) not in self._changes:
+            asked = [(one, k) for one in {vehicle, *(self._avs & set(self.getIDList()))} for k in (1, -1)]
+            states = self._connection.ask(tc.CMD_GET_VEHICLE_VARIABLE, tc.CMD_CHANGELANE, "i", asked)
+            self._changes.update(zip(asked, states, strict=True))
+        return self._changes[vehicle, side]
 
     def __getattr__(self, name: str) -> Any:
         call = getattr(self._domain, name)

@@ -26,6 +26,7 @@ from cosim.types import (
     EpisodeResult,
     Events,
     History,
+    HumanError,
     Metric,
     ObservationConfig,
     Offence,
@@ -144,6 +145,7 @@ class Episode:
         self._begin = self.snapshot.time
         self._collisions: list[Collision] = []
         self._interventions: Counter[str] = Counter()  # by reason
+        self._errors: list[HumanError] = []
         self._missions: dict[str, None] = {}  # every mission vehicle seen, in order of appearance
         self._tally: dict[str, int] = dict.fromkeys(
             ("decisions", "vetoes", "fallbacks", "lane_changes", "blocked"), 0
@@ -201,6 +203,7 @@ class Episode:
             self._metrics.add(frame)
             self._collisions += frame.events.collisions
             self._interventions.update(i.reason for i in frame.events.interventions)
+            self._errors += frame.events.errors
             if self.scenario.on_collision == OnCollision.END:
                 self.terminated |= any(c.crash for c in frame.events.collisions)
         self.truncated = not self.terminated and self.elapsed >= self.scenario.duration - 1e-6
@@ -258,6 +261,7 @@ class Episode:
             timings=dict(self.timings),
             validity=self._validity(metrics),
             interventions_by_reason=dict(self._interventions.most_common()),
+            errors_begun=tuple(self._errors),
             mission_vehicle=", ".join(self._missions) or None,
             mission_guessed=bool(self._missions) and self.scenario.mission.guessed,
             manifest=manifest(self.scenario, self.seed),
@@ -285,7 +289,8 @@ class Episode:
         for array in (s.x, s.y, s.speed, s.heading):
             update(np.ascontiguousarray(array, np.float64).tobytes())
         update(s.lane.tobytes())
-        update(repr(sorted((name, int(d.action)) for name, d in decisions.items())).encode())
+        asked = [(n, int(d.action), *(() if d.accel is None else (d.accel,))) for n, d in decisions.items()]
+        update(repr(sorted(asked)).encode())
 
     def _validity(self, metrics: Mapping[str, Metric]) -> tuple[str, ...]:
         """Why this result must not be compared with others; empty when it may be."""

@@ -7,6 +7,7 @@ Letters in shapes: `n` vehicles, `N` past frames, `M` predicted frames, `C, H, W
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from enum import IntEnum
@@ -37,6 +38,18 @@ class MetaAction(IntEnum):
 
 
 LANE_OFFSET = {MetaAction.LANE_LEFT: 1, MetaAction.LANE_RIGHT: -1}  # as SUMO counts: left is up
+
+
+class ContinuousAction(NamedTuple):
+    """What an agent may ask of one AV in place of a meta-action, for one decision."""
+
+    accel: float  # m/s2, within what the car can do (`cosim.control`) and, in `lawful`, what it does of it
+    lane_offset: int = 0  # +1 begins a change to the left, -1 to the right
+
+    @property
+    def lane_change(self) -> MetaAction:
+        """The meta-action of the same lane change; IDLE without one."""
+        return {1: MetaAction.LANE_LEFT, -1: MetaAction.LANE_RIGHT}.get(self.lane_offset, MetaAction.IDLE)
 
 
 class Kind(IntEnum):
@@ -99,6 +112,8 @@ class Collision:
     y: float  # m
     involves_mission: bool = False
     av_caused: bool = False  # an AV was the collider, or had just cut in
+    # one of both, or the vehicle just ahead of one, was erring or had been shortly before (HumanError)
+    human_error_involved: bool = False
 
     @property
     def insertion(self) -> bool:
@@ -301,6 +316,7 @@ class Decision(NamedTuple):
     blamed: str | None = None  # which vehicle made the preferred action unsafe, or another reason in brackets
     vetoed: bool = False  # the preferred action was masked
     fallback: bool = False  # every action was unsafe: the highest score was taken
+    accel: float | None = None  # m/s2, in place of a target speed: `action` says the lane change alone
 
 
 class Forecast(NamedTuple):
@@ -328,6 +344,7 @@ class Command(NamedTuple):
     limit: float = (
         math.inf
     )  # m/s, the most that the law allows, as far as the agent sees it (preset `lawful`)
+    accel: float | None = None  # m/s2, held until the next decision; `target_speed` is where it leads to
 
 
 class Receipt(NamedTuple):
@@ -452,6 +469,7 @@ class Identity:
     driver_model: str
     penetration: float | None  # share of AVs, where that chooses them
     preset: str
+    errors: str | None = field(default=None, kw_only=True)  # a level, or a file's stem and digest; None: none
     svo_deg: float
     seed: int
 
@@ -473,7 +491,7 @@ RESERVED = {
     "steps",
 } | {
     *("trace_hash", "timings", "comparable", "not_comparable_because", "collision_list"),
-    "interventions_by_reason",
+    *("interventions_by_reason", "human_errors_by_kind", "human_error_list"),
     *("units", "better", "manifest"),
 }
 
@@ -491,6 +509,7 @@ class EpisodeResult(Identity):
     mission_vehicle: str | None = None  # its id (of several: joined by ", "); None: none was on the road
     mission_guessed: bool = False  # nobody named it: its figures feed no gate
     interventions_by_reason: dict[str, int] = field(default_factory=dict)  # the most frequent first
+    errors_begun: tuple[HumanError, ...] = ()
     manifest: dict[str, Any] = field(default_factory=dict)
 
     def value(self, name: str) -> float | int | bool | None:
@@ -509,6 +528,8 @@ class EpisodeResult(Identity):
             "comparable": not self.validity,
             "not_comparable_because": list(self.validity),
             "interventions_by_reason": dict(self.interventions_by_reason),
+            "human_errors_by_kind": dict(Counter(e.kind for e in self.errors_begun).most_common()),
+            "human_error_list": [[e.kind, e.who, round(e.time, 3)] for e in self.errors_begun],
             "collision_list": [{k: _plain(v) for k, v in asdict(c).items()} for c in self.collisions],
             "units": {name: metric.unit for name, metric in self.metrics.items()},
             "better": {name: metric.better for name, metric in self.metrics.items()},

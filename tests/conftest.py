@@ -11,6 +11,7 @@ import pytest
 from cosim.scenario import Fleet, Mission, Scenario, load
 from cosim.simulation.sumo import SumoSimulator
 from cosim.workers.worker import Worker
+from tests.service.servers import Server
 from tests.worlds.build import build
 
 TYPES = """<routes>
@@ -35,10 +36,11 @@ def vehicle(name: str, kind: str, x: float, lane: int = 0, speed: float = 20.0, 
 
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Start]:
-    """`start(vehicles, preset=...)`: a worker that holds a SumoSimulator with just these vehicles."""
+    """`start(vehicles, preset=...)`: a worker that holds a SumoSimulator (or another `simulator`) with just
+    these vehicles."""
     workers: list[Worker] = []
 
-    def begin(vehicles: list[str], **changes: object) -> Worker:
+    def begin(vehicles: list[str], simulator: type = SumoSimulator, **changes: object) -> Worker:
         demand = tmp_path / f"demand{len(workers)}.rou.xml"
         demand.write_text(TYPES + "\n".join(vehicles) + "</routes>")
         scenario: Scenario = replace(
@@ -52,7 +54,7 @@ def start(tmp_path: Path) -> Iterator[Start]:
             options=(("insertion-checks", "none"), ("extrapolate-departpos", "false")),
         )
         scenario = replace(scenario, **changes)  # type: ignore[arg-type]
-        worker = Worker(SumoSimulator, scenario, timeout=60.0)
+        worker = Worker(simulator, scenario, timeout=60.0)
         workers.append(worker)
         worker.call("reset", 0)
         return worker
@@ -60,6 +62,13 @@ def start(tmp_path: Path) -> Iterator[Start]:
     yield begin
     for worker in workers:
         worker.close()
+
+
+@pytest.fixture(scope="session")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """`cosim serve` with two workers, without a token; for tests that leave it as they found it."""
+    with Server(tmp_path_factory.mktemp("service") / "data", "--workers", "2") as running:
+        yield running
 
 
 @pytest.fixture(scope="session")

@@ -16,6 +16,7 @@ COMMANDS = (
     "metrics",
     "train",
     "fit-predictors",
+    "serve",
     "bench",
     "scenarios",
     "doctor",

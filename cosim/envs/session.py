@@ -10,6 +10,8 @@ import pickle
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast
 
+import numpy as np
+
 from cosim.errors import BadInput, hint
 from cosim.observation.view import Unpacker, View
 from cosim.rewards import Reward, RewardTerms, read
@@ -18,6 +20,7 @@ from cosim.seeding import TRAINING_SEEDS
 from cosim.types import (
     COMPACT,
     Bytes,
+    ContinuousAction,
     EpisodeResult,
     Events,
     MetaAction,
@@ -33,6 +36,7 @@ if TYPE_CHECKING:
     from cosim.metrics import MetricFactory
     from cosim.road import RoadMap
 
+Action = int | ContinuousAction | tuple[float, int]
 TIMEOUT = 120.0  # s without an answer; the first step of a machine compiles the kernels
 TERMINAL = ("collision", "collision of the mission vehicle")  # all else that ends it cuts it short
 
@@ -80,6 +84,7 @@ def open(
     warmup: float | None = None,
     mission: str | None = None,
     on_collision: str | None = None,
+    errors: str | None = None,
     options: Sequence[str] = (),
     seed: int | None = None,
     observation: ObservationConfig = COMPACT,
@@ -94,7 +99,8 @@ def open(
 
     The same words mean the same as in `cosim run`: `penetration`, `av_type` and `av_ids` (or a `Fleet`)
     say who is an AV, `duration` and `warmup` are in s, `mission` is a vehicle's id, a pattern, "none" or
-    "auto"; `svo` is in degrees (it weighs the reward). A `Scenario` holds them: beside it they are
+    "auto"; `errors` are those of human drivers; `svo` is in degrees (it weighs the reward). A `Scenario`
+    holds them: beside it they are
     refused. `seed` is the first episode's. `reward`: a `cosim.rewards.Reward` (a `RewardConfig`, a
     function of your own), a name of `REWARDS`, FILE.py:NAME or MODULE:NAME; without it P's. `metrics`:
     classes like those of `cosim.metrics`, or FILE.py:NAME, measured besides. `others` builds a policy for
@@ -119,6 +125,7 @@ def open(
         }
         given |= {"penetration": penetration, "av_type": av_type, "av_ids": av_ids}
         given |= {"duration": duration, "warmup": warmup, "mission": mission, "options": options or None}
+        given |= {"on_collision": on_collision, "errors": errors}
         for name, value in given.items():
             if value is not None:
                 raise BadInput("is part of the Scenario that is given", field=name, value=value)
@@ -135,6 +142,7 @@ def open(
             warmup=warmup,
             mission=mission,
             on_collision=on_collision,
+            errors=errors,
             options=options,
         )
     if simulator is None:
@@ -198,17 +206,18 @@ class Session(contextlib.AbstractContextManager["Session"]):
 
     def act(
         self,
-        actions: Mapping[str, int | None],
+        actions: Mapping[str, Action | None],
         *,
         see: Sequence[str] | None = None,
     ) -> StepResult:
-        """Carry out one meta-action per AV for one decision (0.4 s).
+        """Carry out one action per AV for one decision (0.4 s): a meta-action, or a `ContinuousAction`
+        (acceleration in m/s2, lane offset +1, 0 or -1; a pair of numbers will do).
 
         An AV without an action, or with None, is driven by `others`, or else by SUMO.
         `see`: the AVs whose observation you want (all by default; fewer are faster).
 
         Raises:
-            BadInput: an id that is not an AV on the road, something that is no meta-action, no episode.
+            BadInput: an id that is not an AV on the road, something that is no action, no episode.
             SimulationError, SimulationCrashed: SUMO failed, its process ended or hung.
         """
         if self._views is None:
@@ -266,6 +275,11 @@ class Session(contextlib.AbstractContextManager["Session"]):
     def __exit__(self, *error: object) -> None:
         self.close()
 
+    @property
+    def begun(self) -> bool:
+        """Whether an episode has."""
+        return self._views is not None
+
     # ---- inside ----
 
     def _call(self, method: str, *arguments: Any) -> Any:
@@ -288,20 +302,34 @@ class Session(contextlib.AbstractContextManager["Session"]):
         self.elapsed = reply.elapsed
         self.over = reply.terminated or reply.truncated
 
-    def _checked(self, actions: Mapping[str, int | None]) -> dict[str, int]:
-        found = {}
+    def _checked(self, actions: Mapping[str, Action | None]) -> dict[str, int | ContinuousAction]:
+        found: dict[str, int | ContinuousAction] = {}
         for name, action in actions.items():
             if action is None:
                 continue
             if name not in self.avs:
                 problem = f"no AV of that name is on the road{hint(name, self.avs)}"
                 raise BadInput(problem, field="actions", value=name)
+            if np.ndim(cast(Any, action)):
+                found[name] = _continuous(name, action)
+                continue
             try:
                 found[name] = int(MetaAction(operator.index(action)))
             except (TypeError, ValueError):
                 known = ", ".join(f"{a.value} {a.name}" for a in MetaAction)
                 raise BadInput(f"is no meta-action ({known})", field=name, value=action) from None
         return found
+
+
+def _continuous(name: str, action: Any) -> ContinuousAction:
+    try:
+        accel, offset = map(float, action)
+    except (TypeError, ValueError):
+        accel, offset = math.nan, math.nan
+    if not math.isfinite(accel) or offset not in (-1.0, 0.0, 1.0):
+        problem = "is no continuous action (acceleration in m/s2, lane offset +1, 0 or -1)"
+        raise BadInput(problem, field=name, value=action)
+    return ContinuousAction(accel, int(offset))
 
 
 class _InProcess:

@@ -6,7 +6,7 @@ import numpy as np
 
 from cosim.geometry import Boxes, boxes, overlap, overlapping_pairs
 from cosim.road import RoadMap
-from cosim.road.too_close import foot, heed_each_other
+from cosim.road.too_close import along_one_another, foot, heed_each_other, walks_beside
 from cosim.simulation.backend import sumo
 from cosim.simulation.commands import Commander, hand_back
 from cosim.simulation.conventions import centres
@@ -170,19 +170,22 @@ class Wrecks:
         self._stopped: list[str] = []  # since the last `take`
         self._removed: list[str] = []
 
-    def add(self, collisions: Sequence[Collision]) -> None:
-        """Stop the vehicles of these; SUMO's insertions onto one another are no crashes."""
+    def add(self, collisions: Sequence[Collision]) -> list[str]:
+        """Stop the vehicles of these, and name them; SUMO's insertions onto one another are no crashes."""
+        new = []
         on_road = frozenset(sumo.vehicle.getIDList()) if collisions else frozenset()
         for c in collisions:
             for name in () if c.insertion else (c.collider, c.victim):
                 if name in on_road and name not in self._since:
                     self._since[name] = c.time
-                    self._stopped.append(name)
+                    new.append(name)
                     self._commander.wreck(name)
                     self._drivers.drop(name)
                     sumo.vehicle.setSpeedMode(name, 0)  # at once, not within its deceleration
                     sumo.vehicle.setLaneChangeMode(name, 0)
                     sumo.vehicle.setSpeed(name, 0.0)
+        self._stopped += new
+        return new
 
     def remove(self, now: float) -> None:
         """Take those off the road that have stood long enough."""
@@ -243,11 +246,14 @@ def mover(before: Boxes, now: Boxes) -> int | None:
 
 def the_nets(snapshot: Snapshot, road: RoadMap, i: int, j: int) -> bool:
     """Whether two vehicles overlap though each follows its own lane, on lanes whose drivers need not heed one
-    another (`heed_each_other`): the lanes lie too close together, and no driver can help it; or one behind
-    the other on a lane that is drawn shorter than it is, with a gap between them by its length."""
-    ways, drawn_shorter = [], False
+    another (`heed_each_other`): the lanes lie too close together, and no driver can help it; or past one that
+    waits where the net lets it wait inside a junction, or past a person on a walking area; or one behind the
+    other on a lane that is drawn shorter than it is, with a gap between them by its length."""
+    ways, drawn_shorter, waits = [], False, False
     for row in (i, j):
         lane = int(snapshot.lane[row])
+        if walks_beside(road, int(snapshot.place[row])):
+            continue
         if lane < 0:
             return False
         path = road.path(lane)
@@ -257,11 +263,13 @@ def the_nets(snapshot: Snapshot, road: RoadMap, i: int, j: int) -> bool:
             return False
         behind = snapshot.length[row] - snapshot.lane_position[row] * path.scale
         ways.append(foot(road, lane, behind, _end(snapshot, row, -0.5)))
+        waits |= snapshot.speed[row] < HALTING and road.waits_inside(lane)
         if snapshot.lane[i] == snapshot.lane[j] and path.scale < DRAWN_WHOLE:
             last, first = sorted((i, j), key=lambda k: float(snapshot.lane_position[k]))
             rear = snapshot.lane_position[first] - snapshot.length[first]
             drawn_shorter = bool(rear > snapshot.lane_position[last])
-    return drawn_shorter or not any(heed_each_other(road, a, b) for a in ways[0] for b in ways[1])
+    heeds = along_one_another if waits else heed_each_other
+    return drawn_shorter or len(ways) == 1 or not any(heeds(road, a, b) for a in ways[0] for b in ways[1])
 
 
 def _end(snapshot: Snapshot, row: int, share: float) -> Floats:

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from cosim.control import LANE_CHANGE_TIME, MAX_DECEL, tracked_speed
+from cosim.control import LANE_CHANGE_TIME, MAX_DECEL, TIME_CONSTANT, tracked_speed
 from cosim.simulation.backend import sumo
 from cosim.simulation.convert import may_change
 from cosim.simulation.fleet import AV_IDM
@@ -29,6 +29,11 @@ class Controlled:
     change: int = 0  # the last lane change: +1 left, -1 right
     change_until: float = -1.0  # s, when it ends
     requested: float = -1.0  # m/s, the last speed handed to SUMO
+    asks: float | None = None  # m/s2, in place of the target speed
+
+    def goal(self, speed: float, time: float) -> float:
+        """The speed in m/s to be tracked with the time constant `time` (s) at `speed` (m/s)."""
+        return self.target if self.asks is None else speed + self.asks * time
 
     @property
     def asked(self) -> float:
@@ -66,7 +71,7 @@ class Commander:
             state = self.controlled[name] = self._take_over(name)
             sumo.vehicle.setSpeedMode(name, SPEED_MODE[self._preset])
             sumo.vehicle.setLaneChangeMode(name, LANE_CHANGE_MODE[self._preset])
-        state.target, state.limit = command.target_speed, command.limit
+        state.target, state.limit, state.asks = command.target_speed, command.limit, command.accel
         if command.lane_offset == 0:
             return Receipt(name, True)
         why = (
@@ -142,7 +147,7 @@ class Commander:
         vehicle = sumo.vehicle
         for name, state in self.controlled.items():
             speed = vehicle.getSpeed(name)
-            wanted = tracked_speed(speed, state.target, self._step)
+            wanted = tracked_speed(speed, state.goal(speed, TIME_CONSTANT), self._step)
             news = abs(wanted - state.requested) > SETTLED
             if news:
                 state.requested = wanted

@@ -39,6 +39,11 @@ AVS = {
     "getRoadID": tc.VAR_ROAD_ID,
     "getRouteIndex": tc.VAR_ROUTE_INDEX,
 }
+# Asked of all AVs at once when one is asked about: variable, the form of its parameters, all of them.
+AT_TIMES: Mapping[str, tuple[int, str, Sequence[tuple[int, ...]]]] = {
+    "getLaneChangeState": (tc.CMD_CHANGELANE, "i", ((1,), (-1,))),
+    "getNextLinks": (tc.VAR_NEXT_LINKS, "", ((),)),
+}
 LIGHTS = {
     "getRedYellowGreenState": tc.TL_RED_YELLOW_GREEN_STATE,
     "getNextSwitch": tc.TL_NEXT_SWITCH,
@@ -287,15 +292,19 @@ class _Vehicles(_Domain):
         )
         self._ids: tuple[str, ...] | None = None
         self._avs: set[str] = set()  # who was asked about
-        self._changes: dict[tuple[str, int], tuple[int, int]] = {}  # (AV, side) -> lane-change state
+        self._told: dict[
+            tuple[Any, ...], Any
+        ] = {}  # (variable, AV, parameters) -> value, since the last step
         for column, name in enumerate(VEHICLES):
             setattr(self, name, self._row_getter(name, column))
+        for name, (variable, form, parameters) in AT_TIMES.items():
+            setattr(self, name, self._common_getter(variable, form, parameters))
 
     def stepped(self) -> set[str]:
         """A step was driven: who is on the road now that it is our turn (others may have removed some)."""
         self._ids = self._domain.getIDList()
         here = set(self._ids)
-        self._changes.clear()
+        self._told.clear()
         for vehicle in self._connection.everybody.keys() - here:
             del self._connection.everybody[vehicle]
             self.came.pop(vehicle, None)
@@ -310,14 +319,6 @@ class _Vehicles(_Domain):
         if self._ids is None:
             self._ids = tuple(self._domain.getIDList())
         return self._ids
-
-    def getLaneChangeState(self, vehicle: str, side: int) -> tuple[int, int]:
-        """SUMO's, asked of all AVs at once, on both sides."""
-        if (vehicle, side) not in self._changes:
-            asked = [(one, k) for one in {vehicle, *(self._avs & set(self.getIDList()))} for k in (1, -1)]
-            states = self._connection.ask(tc.CMD_GET_VEHICLE_VARIABLE, tc.CMD_CHANGELANE, "i", asked)
-            self._changes.update(zip(asked, states, strict=True))
-        return self._changes[vehicle, side]
 
     def __getattr__(self, name: str) -> Any:
         call = getattr(self._domain, name)
@@ -335,6 +336,20 @@ class _Vehicles(_Domain):
             found = call
         setattr(self, name, found)
         return found
+
+    def _common_getter(
+        self, variable: int, form: str, every: Sequence[tuple[int, ...]]
+    ) -> Callable[..., Any]:
+        def get(vehicle: str, *parameters: int) -> Any:
+            key = (variable, vehicle, *parameters)
+            if key not in self._told:
+                avs = {vehicle, *(self._avs & set(self.getIDList()))}
+                asked = [(one, *values) for one in avs for values in every]
+                found = self._connection.ask(tc.CMD_GET_VEHICLE_VARIABLE, variable, form, asked)
+                self._told.update(((variable, *one), v) for one, v in zip(asked, found, strict=True))
+            return self._told[key]
+
+        return get
 
     def _row_getter(self, name: str, column: int) -> Callable[[str], Any]:
         ask, connection = getattr(self._domain, name), self._connection

@@ -276,7 +276,9 @@ def test_past_one_that_waits_inside_a_junction_where_the_net_lets_it_nobody_coll
 
 @pytest.mark.parametrize(("edge", "hits"), [(":J_w0", 0), (":J_c0", 1)])
 def test_a_person_is_hit_on_a_crossing_and_not_on_a_walking_area(edge: str, hits: int) -> None:
-    road = RoadMap((lane("a_0", [(0.0, 0.0), (100.0, 0.0)]),), closed=(lane(f"{edge}_0", [(50, 1), (50, 9)]),))
+    road = RoadMap(
+        (lane("a_0", [(0.0, 0.0), (100.0, 0.0)]),), closed=(lane(f"{edge}_0", [(50, 1), (50, 9)]),)
+    )
     cars: dict[str, Pose] = {"av": (50.0, 0.0, 0.0, 10.0), "person:p": (50.0, 1.5, 0.0, 0.0)}
     here = scene(1.0, cars, {"av": 0})
     here = replace(

@@ -62,7 +62,7 @@ class AllRed:
 '''
 DRIVE = ("--penetration", "0.3", "--policy", "random", "--duration", "20", "--json")
 SEED = 5
-LIMIT = 90  # s, of every wait
+LIMIT = 300  # s, of every wait: kernels may have to be compiled first
 
 Command = list[str]
 

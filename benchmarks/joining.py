@@ -125,8 +125,8 @@ def drive(way: Way, seconds: float, work: Path) -> Drive:
     commands = [[binary, "-c", str(GAME / "A10KW.sumocfg"), *options, "--collision.check-junctions"]]
     if way.other:
         commands.append([sys.executable, "-c", way.other, str(port), str(settings)])
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    programs = [subprocess.Popen(command, **quiet) for command in commands]
+    nowhere = subprocess.DEVNULL
+    programs = [subprocess.Popen(command, stdout=nowhere, stderr=nowhere) for command in commands]
     try:
         client = Client("localhost", port, ORDER, LIMIT)
         theirs_, seed = theirs(client)

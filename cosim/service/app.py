@@ -68,7 +68,6 @@ def create(settings: Settings) -> FastAPI:
         yield
         sessions.close()
         runs.close()
-        clerks.close()
         jobs.close()
         log.info("ended")
 

@@ -24,7 +24,7 @@ from cosim.service import landlock
 from cosim.service.settings import Limits, Settings
 
 if TYPE_CHECKING:
-    from cosim.envs.host import SessionHost
+    from cosim.envs.host import Reply, SessionHost
     from cosim.scenario.episode_id import EpisodeId
     from cosim.workers.tasks import Progress
 
@@ -156,7 +156,15 @@ def confined_host(room: Room, *arguments: Any) -> SessionHost:
     allow_processor_time(room.limits.cpu)
     from cosim.envs.session import build_host
 
-    return build_host(*arguments)
+    host = build_host(*arguments)
+    begin = host.reset
+
+    def reset(seed: int) -> Reply:
+        allow_processor_time(room.limits.cpu)
+        return begin(seed)
+
+    setattr(host, "reset", reset)  # noqa: B010 - what the worker calls
+    return host
 
 
 class _memory_is_limited:

@@ -89,6 +89,7 @@ class Runs:
         self._plans: dict[str, Plan] = {}  # of runs that wait, as they were checked
         self._drives: dict[str, Drive] = {}
         self._closed = False
+        self._reporting = threading.Lock()
         self._threads: list[threading.Thread] = []
         self.pool: Pool | None = None
         if settings.engine == "local":
@@ -177,8 +178,9 @@ class Runs:
 
     def report(self, run: str) -> None:
         """Write the report of a run that has finished, unless it is there."""
-        if SUMMARY in self.files(run) and REPORT not in self.files(run):
-            self._clerks.call("report", run)
+        with self._reporting:  # two at once would write the same draft
+            if SUMMARY in self.files(run) and REPORT not in self.files(run):
+                self._clerks.call("report", run)
 
     def drive(self, run: str) -> Drive | None:
         """What is known of a run that is driven now."""

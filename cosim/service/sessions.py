@@ -13,7 +13,7 @@ from typing import Any
 
 from cosim.envs.host import Reply
 from cosim.envs.session import Session, StepResult, build_host
-from cosim.errors import SimulationError
+from cosim.errors import BadInput, SimulationError
 from cosim.observation.view import Packer, View
 from cosim.policies import make
 from cosim.scenario import Scenario
@@ -154,11 +154,17 @@ class Sessions:
             scenario, case = self._clerks.call("session", flags)
             found = self._begin(request, scenario, case, uploads, observation, seed, reward, idle)
             self._open[found.id] = found
+        except SimulationError as error:
+            raise BadInput(f"the simulation cannot begin: {error}", field="scenario") from None
         finally:
             with self._lock:
                 self._opening -= 1
         log.info("session opened", extra={"session": found.id, "scenario": scenario.name})
         return found
+
+    def that_uses(self, upload: str) -> str | None:
+        """A session that is open on this upload."""
+        return next((one.id for one in self.all() if upload in one.uploads), None)
 
     def get(self, session: str) -> Open:
         """One of them. Raises NotFound."""

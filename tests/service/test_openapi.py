@@ -26,6 +26,11 @@ CHECKS = [
 ]
 
 
+@schemathesis.serializer("application/zip")
+def _bytes(_: object, value: object) -> bytes:
+    return value if isinstance(value, bytes) else str(value).encode()
+
+
 @pytest.fixture(scope="module")
 def ids(server: Server) -> Iterator[dict[str, str]]:
     """Path parameter -> a real value of it."""

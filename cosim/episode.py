@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cosim.control import to_commands
+from cosim.errors import SimulationEnded
 from cosim.metrics import MetricContext, MetricFactory, Metrics, joined
 from cosim.observation.observer import Observer
 from cosim.scenario import Scenario
@@ -25,6 +26,7 @@ from cosim.types import (
     EpisodeResult,
     Events,
     History,
+    HumanError,
     Metric,
     ObservationConfig,
     Offence,
@@ -109,7 +111,8 @@ class Episode:
 
     `start` and `advance` return what every AV on the road observes; decisions given to `advance` are
     commanded, AVs without one are driven by SUMO. `terminated` after a collision of an AV or the mission
-    vehicle unless the scenario goes on, `truncated` when its duration is over (definitions.md, Episode).
+    vehicle unless the scenario goes on, `truncated` when its duration is over (definitions.md, Episode), or
+    when another program has ended the simulation.
     `metrics` are measured besides those of `cosim.metrics.METRICS`.
     """
 
@@ -138,9 +141,11 @@ class Episode:
         self.frames: tuple[Snapshot, ...] = frames
         self.step: Step | None = None  # the last one
         self.terminated = self.truncated = False
+        self._ended = ""  # why the simulation ended before its time
         self._begin = self.snapshot.time
         self._collisions: list[Collision] = []
         self._interventions: Counter[str] = Counter()  # by reason
+        self._errors: list[HumanError] = []
         self._missions: dict[str, None] = {}  # every mission vehicle seen, in order of appearance
         self._tally: dict[str, int] = dict.fromkeys(
             ("decisions", "vetoes", "fallbacks", "lane_changes", "blocked"), 0
@@ -182,7 +187,11 @@ class Episode:
         commands = to_commands(decisions, self.histories, self.scenario.timing.decision, lawful)
         self.histories.expire()
         began = time.perf_counter()
-        receipts, self.frames = self.simulator.advance(commands)
+        try:
+            receipts, self.frames = self.simulator.advance(commands)
+        except SimulationEnded as error:
+            self.truncated, self._ended = True, str(error)
+            return self.histories
         self.timings["simulation_s"] += time.perf_counter() - began
         self.step = step = Step(self.snapshot, decisions, tuple(commands), receipts, self.frames)
         self.snapshot = step.after
@@ -194,6 +203,7 @@ class Episode:
             self._metrics.add(frame)
             self._collisions += frame.events.collisions
             self._interventions.update(i.reason for i in frame.events.interventions)
+            self._errors += frame.events.errors
             if self.scenario.on_collision == OnCollision.END:
                 self.terminated |= any(c.crash for c in frame.events.collisions)
         self.truncated = not self.terminated and self.elapsed >= self.scenario.duration - 1e-6
@@ -251,6 +261,7 @@ class Episode:
             timings=dict(self.timings),
             validity=self._validity(metrics),
             interventions_by_reason=dict(self._interventions.most_common()),
+            errors_begun=tuple(self._errors),
             mission_vehicle=", ".join(self._missions) or None,
             mission_guessed=bool(self._missions) and self.scenario.mission.guessed,
             manifest=manifest(self.scenario, self.seed),
@@ -284,6 +295,8 @@ class Episode:
     def _validity(self, metrics: Mapping[str, Metric]) -> tuple[str, ...]:
         """Why this result must not be compared with others; empty when it may be."""
         reasons = list(self.scenario.warnings)
+        if self._ended:
+            reasons.append(f"ended after {self.elapsed:g} s of {self.scenario.duration:g} s: {self._ended}")
         waiting = metrics["vehicles_never_inserted"].value or 0
         inserted = metrics["vehicles_inserted"].value or 0
         if inserted == 0:

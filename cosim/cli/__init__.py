@@ -7,6 +7,7 @@ for is imported, and what a command needs is imported inside `work`.
 
 COMMANDS = (
     "run",
+    "join",
     "evaluate",
     "compare",
     "replay",

@@ -55,6 +55,10 @@ def _shared() -> dict[str, dict[str, Any]]:
             "choices": OnCollision.ALL,
             "help": "of an AV or the mission vehicle (default: worlds end, your own .sumocfg continue)",
         },
+        "--errors": {
+            "metavar": "LEVEL|FILE",
+            "help": "of human drivers: none (default), field, stress, or a YAML file (docs/human_errors.md)",
+        },
         "--seed": {"type": seed, "metavar": "N"},
         "--seeds": {"metavar": "A:B", "help": "seeds A, A+1, ... B-1"},
         "--duration": {
@@ -114,6 +118,12 @@ def seconds(text: str) -> float:
 def count(text: str) -> int:
     """A whole number of 1 or more."""
     return _whole(text, 1, "a whole number from 1 to 2^62")
+
+
+def port(text: str) -> int:
+    """A number of a TCP port."""
+    _number(text, 1, 65535, "a port from 1 to 65535")
+    return _whole(text, 1, "a port from 1 to 65535")
 
 
 def seed(text: str) -> int:

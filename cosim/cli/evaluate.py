@@ -40,7 +40,7 @@ def add(commands: arguments.SubCommands) -> None:
         help="a name, or a file or glob (.rou.xml, .trips.xml, flows, .gz); A,B is one demand of two files",
     )
     arguments.add(axes, "--policy", "--behavior", "--driver-model", action="append")
-    arguments.add(axes, "--penetration", "--svo", "--preset", action="append")
+    arguments.add(axes, "--penetration", "--svo", "--preset", "--errors", action="append")
     arguments.add(axes, "--output", "--metric", action="append")
     arguments.add(evaluate, "--seeds", help="seeds A, A+1, ... B-1 (default 200000:200001)")
     arguments.add(evaluate, "--av-type", "--av-ids", "--duration", "--warmup", "--mission")

@@ -13,9 +13,11 @@ from cosim.metrics.drac import DecelerationRate
 from cosim.metrics.events import TrafficEvents
 from cosim.metrics.hard_braking import HardBraking
 from cosim.metrics.headway import Headway
+from cosim.metrics.human_errors import HumanErrors
 from cosim.metrics.jerk import Jerk
 from cosim.metrics.law import AvCounts, StopLines
 from cosim.metrics.mission import MissionSuccess
+from cosim.metrics.near_misses import Exposure
 from cosim.metrics.persons import PersonConflicts
 from cosim.metrics.post_encroachment import PostEncroachment
 from cosim.metrics.speeding import Speeding
@@ -45,6 +47,8 @@ METRICS: dict[str, type[EpisodeMetric]] = {
     "trips": Trips,
     "persons": PersonConflicts,
     "interventions": Interventions,
+    "exposure": Exposure,
+    "human_errors": HumanErrors,
 }
 
 

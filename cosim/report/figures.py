@@ -5,6 +5,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
+
 from cosim.report.result import FIRST
 from cosim.types import RESERVED, TIMINGS
 
@@ -15,13 +18,15 @@ SHARE = "share"  # unit of what is shown in per cent and compared in percentage 
 
 @dataclass(frozen=True, slots=True)
 class Measure:
-    """A figure by name: the share of episodes in which `column` is true or above 0, or the column's mean."""
+    """A figure by name: the share of episodes in which `column` is true or above 0, the column's mean, or its
+    sum over that of the column `per`."""
 
     name: str
     column: str
     unit: str  # SHARE for a rate, "" where the run does not say
     better: str  # "higher", "lower" or ""
     is_rate: bool = False
+    per: str = ""  # the column of the exposure that events are counted in
 
     @property
     def is_share(self) -> bool:
@@ -30,8 +35,18 @@ class Measure:
 
     def values(self, rows: Sequence[Row]) -> list[float]:
         """The figure in each row, nan for NA; of a rate 1.0 or 0.0."""
-        found = [math.nan if row.get(self.column) is None else float(row[self.column]) for row in rows]
+        if self.per:
+            return [k / t if t > 0.0 else math.nan for k, t in zip(*self.tally(rows), strict=True)]
+        found = _column(rows, self.column)
         return [float(x > 0) if self.is_rate and not math.isnan(x) else x for x in found]
+
+    def tally(self, rows: Sequence[Row]) -> npt.NDArray[np.float64]:
+        """[2,n] events and exposure (in units of `per`) of each row, nan for NA."""
+        return np.array([_column(rows, self.column), _column(rows, self.per)])
+
+
+def _column(rows: Sequence[Row], name: str) -> list[float]:
+    return [math.nan if row.get(name) is None else float(row[name]) for row in rows]
 
 
 # Shares of episodes, by the name that thresholds and tables use.
@@ -46,13 +61,21 @@ RATES: dict[str, Measure] = {
     )
 }
 
+# Events per vehicle time: all of them over all of it (docs/definitions.md, Near-misses).
+INCIDENCES: dict[str, Measure] = {
+    name: Measure(name, f"{who}near_misses_{kind}", f"per {hour}", "lower", per=hours)
+    for who, hour, hours in (("av_", "AV-hour", "av_hours"), ("", "vehicle-hour", "vehicle_hours"))
+    for kind in ("ttc", "drac", "pet")
+    for name in (f"{who}near_misses_{kind}_per_{hour.lower().replace('-', '_')}",)
+}
+
 HEADLINE = tuple(filter(None, FIRST.values()))  # what reports and comparisons show first
 
 
 def measures(
     rows: Iterable[Row], units: Mapping[str, str] | None = None, better: Mapping[str, str] | None = None
 ) -> dict[str, Measure]:
-    """Every figure these rows hold, by name: rates, then means, then timings.
+    """Every figure these rows hold, by name: rates, then events per exposure, then means, then timings.
 
     `units` and `better` say by column what `cosim run --json` says of its metrics. Columns of yes and no
     give rates, of numbers means; so a metric that is new has its figure without being listed here.
@@ -63,6 +86,7 @@ def measures(
         for column, value in row.items():
             kinds.setdefault(column, set()).update(() if value is None else (type(value),))
     rates = {m.name: m for m in RATES.values() if m.column in kinds}
+    incidences = {m.name: m for m in INCIDENCES.values() if {m.column, m.per} <= kinds.keys()}
     rated = {m.column for m in rates.values() if kinds[m.column] <= {bool}}
     means = {}
     for column in [c for c in kinds if c not in RESERVED | rated]:
@@ -72,4 +96,4 @@ def measures(
         elif column in units or (kinds[column] and kinds[column] <= {int, float}):
             means[column] = Measure(column, column, units.get(column, ""), better.get(column, ""))
     timings = {column: Measure(column, column, "s", "lower") for column in TIMINGS if column in kinds}
-    return rates | means | timings
+    return rates | incidences | means | timings

@@ -7,8 +7,10 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from cosim.report.figures import Measure, Row, measures
-from cosim.report.statistics import CONFIDENCE, mean, rule_of_three, share
+from cosim.report.statistics import CONFIDENCE, mean, pooled_rate, rule_of_three, share
 from cosim.types import IDENTITY, TIMINGS
 from cosim.workers.tasks import OK, STATUSES
 
@@ -58,7 +60,8 @@ def group_figures(rows: Sequence[Row], known: Mapping[str, Measure], seed: int =
     """Counts, rates, means and timings of episodes of one group."""
     ok = [row for row in rows if row.get("status", OK) == OK]
     rates = {m.name: rate_document(m, ok) for m in known.values() if m.is_rate}
-    means = {m.name: mean_document(m, ok, seed) for m in known.values() if not m.is_rate}
+    incidences = {m.name: incidence_document(m, ok) for m in known.values() if m.per}
+    means = {m.name: mean_document(m, ok, seed) for m in known.values() if not (m.is_rate or m.per)}
     return {
         "episodes": len(rows),
         "ok": len(ok),
@@ -67,6 +70,7 @@ def group_figures(rows: Sequence[Row], known: Mapping[str, Measure], seed: int =
         "not_comparable_because": reasons(ok),
         "mission_guessed": sum(mission_guessed(row) for row in ok),
         "rates": rates,
+        "incidences": incidences,
         "means": {name: found for name, found in means.items() if name not in TIMINGS},
         "timings": {name: found for name, found in means.items() if name in TIMINGS},
     }
@@ -83,6 +87,21 @@ def rate_document(measure: Measure, rows: Sequence[Row]) -> dict[str, Any]:
         "n": len(values),
         "na": len(rows) - len(values),
         "rule_of_three": rule_of_three(len(values)) if never else None,
+        "better": measure.better,
+    }
+
+
+def incidence_document(measure: Measure, rows: Sequence[Row]) -> dict[str, Any]:
+    """Events of all rows over their exposure, with the Poisson interval."""
+    tally = measure.tally(rows)
+    events, exposure = tally[:, ~np.isnan(tally).any(0)]
+    return {
+        **pooled_rate(events, exposure).document(),
+        "events": int(events.sum()) if len(events) else None,
+        "exposure": float(exposure.sum()) if len(events) else None,
+        "n": len(events),
+        "na": len(rows) - len(events),
+        "unit": measure.unit,
         "better": measure.better,
     }
 

@@ -45,9 +45,17 @@ def interval(figure: Figure, measure: Measure, *, signed: bool = False) -> str:
 
 
 def sample(counts: Mapping[str, Any]) -> str:
-    """`3/40` of a rate, `n 40` of a mean, with the NA beside them."""
+    """`3/40` of a rate, `12 in 3.4 h` of an incidence, `n 40` of a mean, with the NA beside them."""
+    if counts.get("events") is not None:
+        text = events(counts["events"], counts["exposure"])
+        return f"{text}, {counts['na']} NA" if counts.get("na") else text
     text = f"{counts['hits']}/{counts['n']}" if counts.get("hits") is not None else f"n {counts['n']}"
     return f"{text}, {counts['na']} NA" if counts.get("na") else text
+
+
+def events(count: int, hours: float) -> str:
+    """`12 in 3.4 h`"""
+    return f"{count} in {_digits(hours, False)} h"
 
 
 def p_value(p: float) -> str:
@@ -63,6 +71,7 @@ def group(identity: Mapping[str, Any], *, policy: bool = True) -> str:
         "policy": "{}",
         "behavior": "{}",
         "preset": "{}",
+        "errors": "errors {}",
         "svo_deg": "svo {:g}",
         "penetration": "penetration {:g}",
         "driver_model": "{}",

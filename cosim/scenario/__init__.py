@@ -12,8 +12,9 @@ from cosim.errors import BadInput, check_pattern, hint, one_of
 from cosim.files import yaml_input
 from cosim.files.xml_input import is_there, regular_file
 from cosim.files.yaml_input import NonNegative, Positive
-from cosim.scenario import sumocfg
+from cosim.scenario import human_errors, sumocfg
 from cosim.scenario.behaviors import AS_IS, DRIVER_MODELS, LC2013, MIXED, load_behaviors
+from cosim.scenario.human_errors import Errors
 from cosim.types import Identity, OnCollision, Preset, Timing
 
 BEHAVIORS = load_behaviors().names
@@ -104,6 +105,7 @@ class Scenario:
     demand_name: str = "as-is"
     behavior: str = AS_IS
     driver_model: str = LC2013
+    errors: Errors | None = None  # of human drivers and persons; None: nobody errs
     demands: Mapping[str, Path] | None = None  # name -> file, of a world
     title: str = ""
     definition: Path | None = None  # the scenario.yaml of a world
@@ -129,6 +131,7 @@ class Scenario:
             driver_model=self.driver_model,
             penetration=self.fleet.penetration,
             preset=self.preset,
+            errors=None if self.errors is None else self.errors.name,
             svo_deg=svo_deg,
             seed=seed,
         )
@@ -139,6 +142,8 @@ class Scenario:
         ours = [sumo_scenarios.TYPES] if self.definition is None else [self.definition]
         if self.behavior != AS_IS:
             ours.append(sumo_scenarios.BEHAVIORS)
+        if self.errors is not None:
+            ours.append(self.errors.file)
         return (self.config, self.net, *self.demand, *self.additional, *ours)
 
 
@@ -154,13 +159,15 @@ def load(
     warmup: float | None = None,
     mission: str | None = None,
     on_collision: str | None = None,
+    errors: str | None = None,
     options: Sequence[str] = (),
 ) -> Scenario:
     """The scenario `what` (a world's name or folder, a .sumocfg), with what the command line says otherwise.
 
     `demand`: names of the world's demands or files; `options`: SUMO options as typed after `--`, which win
     over the file's. `duration`, `warmup` in s. `mission`: a vehicle's id or a pattern of ids (full match),
-    "none" or "auto". Only this file's own syntax is checked: `cosim.scenario.vet` reads the rest.
+    "none" or "auto". `errors`: of human drivers, a level or a file (`cosim.scenario.human_errors`). Only this
+    file's own syntax is checked: `cosim.scenario.vet` reads the rest.
 
     Raises:
         BadInput: names file (or option), field and value, with the nearest name where one is near.
@@ -184,7 +191,7 @@ def load(
             raise BadInput("must be a number of seconds from 0 on", field="--warmup", value=warmup)
         scenario = replace(scenario, warmup=float(warmup))
     if mission is not None:
-        scenario = replace(scenario, mission=_mission(scenario.mission, mission))
+        scenario = replace(scenario, mission=chosen_mission(scenario.mission, mission))
     if behavior is None:
         behavior = _default_behavior(scenario)
     return replace(
@@ -193,7 +200,8 @@ def load(
         driver_model=one_of(driver_model, DRIVER_MODELS, "--driver-model"),
         preset=one_of(scenario.preset if preset is None else preset, Preset.ALL, "--preset"),
         on_collision=one_of(on_collision or scenario.on_collision, OnCollision.ALL, "--on-collision"),
-        fleet=scenario.fleet if fleet is None else _checked_fleet(fleet),
+        fleet=scenario.fleet if fleet is None else checked_fleet(fleet),
+        errors=human_errors.read(errors),
     )
 
 
@@ -257,7 +265,7 @@ def _world(folder: Path) -> Scenario:
     demand = one_of(top.demand or next(iter(demands)), demands, "demand", file)
     one_of(top.mission.kind, MISSIONS, "mission.kind", file)
     check_pattern(top.mission.vehicles, "mission.vehicles", file)
-    _check_timing(top.timing, file, "timing.step", top.timing.step)
+    check_timing(top.timing, file, "timing.step", top.timing.step)
     preset = one_of(top.preset, Preset.ALL, "preset", file)
     return Scenario(
         name=name,
@@ -279,7 +287,7 @@ def _world(folder: Path) -> Scenario:
         preset=Preset.LAWFUL if ships else preset,
         mission=top.mission,
         zones=tuple(replace(z, name=z.name or f"zone{i}") for i, z in enumerate(top.conflict_zones)),
-        fleet=_checked_fleet(top.fleet, file, "fleet."),
+        fleet=checked_fleet(top.fleet, file, "fleet."),
     )
 
 
@@ -341,7 +349,7 @@ def _with_sumo_options(scenario: Scenario, chosen: Mapping[str, str]) -> Scenari
     timing = scenario.timing
     if "step-length" in chosen:
         timing = replace(timing, step=sumocfg.time_of(chosen["step-length"], place, "--step-length"))
-        _check_timing(timing, place, "--step-length", chosen["step-length"])
+        check_timing(timing, place, "--step-length", chosen["step-length"])
     files = {
         name: sumocfg.files(chosen[name], here, place, f"--{name}")
         for name in sumocfg.INPUTS
@@ -367,7 +375,7 @@ def _default_behavior(scenario: Scenario) -> str:
     return "moderate" if scenario.demand_name == "contested" else MIXED
 
 
-def _mission(own: Mission, wanted: str) -> Mission:
+def chosen_mission(own: Mission, wanted: str) -> Mission:
     """`--mission`: what a scenario's own becomes."""
     if wanted in (NONE, AUTO):
         return Mission(wanted)
@@ -377,7 +385,7 @@ def _mission(own: Mission, wanted: str) -> Mission:
     return replace(own, vehicles=wanted, kind=AUTO if own.kind == NONE else own.kind)
 
 
-def _check_timing(timing: Timing, file: object, field: str, value: object) -> None:
+def check_timing(timing: Timing, file: object, field: str, value: object) -> None:
     """Each clock must be a whole number of the one below it (definitions.md, Time)."""
     for name, long, short in (
         ("frame", timing.frame, timing.step),
@@ -389,7 +397,7 @@ def _check_timing(timing: Timing, file: object, field: str, value: object) -> No
             raise BadInput(problem, file=file, field=field, value=value)
 
 
-def _checked_fleet(fleet: Fleet, file: object = None, prefix: str = "--av-") -> Fleet:
+def checked_fleet(fleet: Fleet, file: object = None, prefix: str = "--av-") -> Fleet:
     if fleet.ids is not None:
         check_pattern(fleet.ids, f"{prefix}ids", file)
     share = fleet.penetration

@@ -9,27 +9,25 @@ given (V2V), because SUMO's cooperation ends where a speed is commanded.
 import math
 from dataclasses import dataclass
 
-import libsumo
-
 from cosim.control import COMFORT, COMFORT_TIME, wished_accel
 from cosim.road.rules import RED, YELLOW
+from cosim.simulation.backend import sumo
 from cosim.simulation.commands import Commander, Controlled
 from cosim.simulation.fleet import set_type
 from cosim.types import Intervention, Preset
 
-LAWFUL_TYPE = "cosim.av.lawful"  # sumo_scenarios/types.add.xml: an extended IDM that brakes comfortably
+LAWFUL_TYPE = "cosim.av.lawful"  # sumo_scenarios/types.add.xml: an IDM that brakes comfortably
 CORRECTED = 1.0  # m/s2 more braking than asked for: from there on the car drives otherwise than commanded
 STALLED = 0.2, 1.5  # m/s2, or so little acceleration where so much was asked for
 RESPITE = 2.0  # s without a correction: the next one is a new one
 HARD = 3.5  # m/s2: harder braking is an emergency's
 KEEPS_MOVING = 3.0  # m/s: no slower wish is followed inside a junction, nor for longer than `PATIENCE`
+CROSSES = 5.0  # s behind a junction in which it had to give way: inside and so long it takes its gap swiftly
 NOTICE = 150.0  # m: signals and stop lines further ahead are no reason yet
 SERVES = 60.0, 100.0  # m that a lane must serve the route at least, and more for every lane to change back
-ASKS = 0.4  # s between looks for who needs a gap
+LOOKS = 0.4  # s between looks at right of way and blocked lane changes
 GAP = 2.0, 1.0  # m and s: the gap given to who changes lanes
-YIELDING = 2.0, 3.0  # m/s2 and m/s: how hard, and down to what, an AV slows for who asked
-ROOM = 30.0  # m from the junction at least, in which it still slows down
-STANDS = 0.1  # m/s
+YIELDING = 2.0, 1.0  # m/s2 and m/s: how hard, and down to what, an AV slows for who asked
 PATIENCE = 10.0  # s
 
 STRATEGIC, BLOCKED = 8, 512 + 1024 + 2048 + 4096 + 8192  # bits of SUMO's lane-change state
@@ -47,8 +45,14 @@ class Assisted(Controlled):
     lateral: float = 0.0  # m, on its lane
     corrected: float = -math.inf  # s, when the car last drove otherwise
     gap_for: str = ""  # who asked for a gap
+    gives_way: bool = False  # at the next junction, or in this one
+    crosses: float = 0.0  # s left of `CROSSES`
     idled: float = 0.0  # s, for which the agent has asked for less than `KEEPS_MOVING`
-    waits_since: float = math.inf  # s, when it came to stand
+
+    @property
+    def asked(self) -> float:
+        """As of every commanded AV."""
+        return self.wish if self.ours else math.inf
 
 
 class Assistance(Commander):
@@ -58,12 +62,12 @@ class Assistance(Commander):
 
     def __init__(self, step: float) -> None:
         super().__init__(Preset.LAWFUL, step)
-        self._asked = -math.inf  # s
+        self._looked = -math.inf  # s
         self._begun: list[Intervention] = []
 
     def drive(self) -> None:
         """Before every simulation step: the agent's wish where it is the slower one, else SUMO's driver."""
-        get = libsumo.vehicle
+        get = sumo.vehicle
         for name, state in self.controlled.items():
             speed = get.getSpeed(name)
             # what SUMO's driver did in the last step, or would have done
@@ -73,7 +77,11 @@ class Assistance(Commander):
                 state.accel = (speed - state.speed) / self._step
             target = min(state.goal(speed, COMFORT_TIME), state.limit)
             state.idled = state.idled + self._step if state.target < KEEPS_MOVING else 0.0
-            if state.idled > PATIENCE or get.getRoadID(name).startswith(":"):
+            inside = get.getRoadID(name).startswith(":")
+            state.crosses = CROSSES if inside and state.gives_way else state.crosses - self._step
+            if state.crosses > 0.0:
+                target = state.limit
+            elif inside or state.idled > PATIENCE:
                 target = max(target, min(KEEPS_MOVING, state.limit))
             target = min(target, get.getAllowedSpeed(name))
             state.raw, state.accel = wished_accel(speed, target, state.accel, self._step)
@@ -88,7 +96,7 @@ class Assistance(Commander):
 
     def observe(self, now: float) -> list[Intervention]:
         """After every simulation step, at `now` (s): where the car began to drive otherwise than asked."""
-        get, begun = libsumo.vehicle, self._begun
+        get, begun = sumo.vehicle, self._begun
         self._begun = []
         for name, state in self.controlled.items():
             speed = get.getSpeed(name)
@@ -97,27 +105,23 @@ class Assistance(Commander):
                 if now - state.corrected > RESPITE:
                     begun.append(Intervention(now, name, _reason(name, accel)))
                 state.corrected = now
-            if speed > STANDS:
-                state.waits_since = math.inf
-            elif state.waits_since == math.inf:
-                state.waits_since = now
             lateral = get.getLateralLanePosition(name)
             drift, state.lateral = lateral - state.lateral, lateral
             if 0.05 < abs(drift) < 1.0 and not state.changing(now):  # SUMO changes lanes for the route
                 self._changes(name, state, 1 if drift > 0.0 else -1, now)
-        if now - self._asked > ASKS - 1e-6:
-            self._asked = now
-            self._ask(now)
+        if now - self._looked > LOOKS - 1e-6:
+            self._looked = now
+            self._look()
         return begun
 
     def heads_for(self, name: str) -> float | None:
         """SUMO's driver heads for the limit."""
-        return float(libsumo.vehicle.getAllowedSpeed(name))
+        return float(sumo.vehicle.getAllowedSpeed(name))
 
     # ---- inside ----
 
     def _take_over(self, name: str) -> Assisted:
-        get = libsumo.vehicle
+        get = sumo.vehicle
         set_type(name, _lawful(get.getTypeID(name)))
         get.setSpeedFactor(name, min(get.getSpeedFactor(name), 1.0))
         return Assisted(0.0, speed=get.getSpeed(name), lateral=get.getLateralLanePosition(name))
@@ -130,71 +134,62 @@ class Assistance(Commander):
         if why is None:
             why = _leaves_route(name, lane, offset)
             if why is not None:
-                self._begun.append(Intervention(libsumo.simulation.getTime(), name, why))
+                self._begun.append(Intervention(sumo.simulation.getTime(), name, why))
         return why
 
-    def _ask(self, now: float) -> None:
-        """Who must change lanes and cannot, or waits long at a line, asks an AV to make room (V2V)."""
-        get = libsumo.vehicle
+    def _look(self) -> None:
+        """Who has to give way; and who must change lanes and cannot asks the AV behind to make room (V2V)."""
+        get = sumo.vehicle
         for state in self.controlled.values():
             state.gap_for = ""
         for name, state in self.controlled.items():
+            if not get.getRoadID(name).startswith(":"):
+                links = get.getNextLinks(name)
+                state.gives_way = bool(links) and not links[0][1]
             for side in (1, -1):
                 wanted = get.getLaneChangeState(name, side)[0]
                 if wanted & STRATEGIC and wanted & BLOCKED:
                     # of two that block one another the one that asks first goes first
                     followers = get.getNeighbors(name, 0 if side > 0 else 1)
                     self._give([other for other, _ in followers], name)
-            if (now - state.waits_since) % (2.0 * PATIENCE) > PATIENCE:  # asks, then lets others pass
-                foes = get.getJunctionFoes(name, NOTICE)
-                # of a foe: 0 its id, 2 m to the place where the ways meet, 7 whether it goes first
-                near = sorted((foe[2], foe[0]) for foe in foes if foe[7])
-                able = (foe for way, foe in near if way > self._stopping(foe))
-                self._give([next(able, "")], name)
 
     def _give(self, asked: list[str], name: str) -> None:
         for other in asked:
             if other in self.controlled and not self.controlled[name].gap_for:
                 self.controlled[other].gap_for = name
 
-    def _stopping(self, name: str) -> float:
-        """m in which an AV slows down comfortably for who asked; inf for who is no AV."""
-        if name not in self.controlled:
-            return math.inf
-        return float(libsumo.vehicle.getSpeed(name)) ** 2 / (2.0 * YIELDING[0]) + ROOM
-
     def _yielding(self, name: str, speed: float, state: Assisted) -> float:
         """The acceleration in m/s2 that opens a gap for who asked for one."""
-        get, (brakes, least) = libsumo.vehicle, YIELDING
+        get, (brakes, least) = sumo.vehicle, YIELDING
         try:
-            if get.getRoadID(name) != get.getRoadID(state.gap_for):  # it waits at a junction
-                return max(least - speed, -brakes)
             ahead = get.getLanePosition(state.gap_for) - get.getLength(state.gap_for)
             gap = ahead - get.getLanePosition(name)
             theirs = get.getSpeed(state.gap_for)
-        except libsumo.TraCIException:  # it has left
+        except sumo.TraCIException:  # it has left
             return COMFORT
         room, headway = GAP
-        slower = max(theirs + 0.5 * (gap - room - headway * speed), 1.0)  # m/s
+        if gap < max(speed**2 - theirs**2, 0.0) / (2.0 * brakes):
+            return COMFORT  # it is beside, or too near: it goes first, whoever follows it gives way
+        slower = max(theirs + 0.5 * (gap - room - headway * speed), least)  # m/s
         return float(max(slower - speed, -brakes))
 
 
 def _lawful(own: str) -> str:
     """The type of a commanded AV whose own one is this; outputs name both (`type_names`)."""
     name = f"{own.partition('@')[0].partition('/')[0]}/{Preset.LAWFUL}"
-    if name not in libsumo.vehicletype.getIDList():
-        libsumo.vehicletype.copy(LAWFUL_TYPE, name)
+    if name not in sumo.vehicletype.getIDList():
+        sumo.vehicletype.copy(LAWFUL_TYPE, name)
     return name
 
 
 def _leaves_route(name: str, lane: str, offset: int) -> str | None:
     """Why the lane at `offset` does not serve the route long enough to change to it; None if it does."""
-    best = libsumo.vehicle.getBestLanes(name)
+    best = sumo.vehicle.getBestLanes(name)
     here = int(lane.rpartition("_")[2])
     if not 0 <= here + offset < len(best):
         return None
     now, then = best[here], best[here + offset]
-    at = libsumo.vehicle.getLanePosition(name)
+    at = sumo.vehicle.getLanePosition(name)
     least, more = SERVES
     away = abs(then[3])
     if away <= abs(now[3]) or then[1] - at > least + more * away:
@@ -204,7 +199,7 @@ def _leaves_route(name: str, lane: str, offset: int) -> str | None:
 
 def _reason(name: str, accel: float) -> str:
     """Why the car drives slower than the agent wishes, or brakes harder (`accel` m/s2)."""
-    get = libsumo.vehicle
+    get = sumo.vehicle
     words = "emergency: " if accel < -HARD else ""
     speed = get.getSpeed(name)
     reach = min(0.5 * speed * speed + 2.0 * speed + 10.0, NOTICE)  # m, from where an IDM begins to brake
@@ -217,9 +212,9 @@ def _reason(name: str, accel: float) -> str:
         return f"{words}vehicle ahead"
     links = get.getNextLinks(name)
     for link in links[:1]:
-        at = libsumo.lane.getLength(get.getLaneID(name)) - get.getLanePosition(name)
+        at = sumo.lane.getLength(get.getLaneID(name)) - get.getLanePosition(name)
         if at < reach and not link[1]:
             return words + ("stop sign" if link[5] in "sw" else "right of way")
-        if at < reach and link[4] and libsumo.lane.getMaxSpeed(link[4]) < speed + 1.0:
+        if at < reach and link[4] and sumo.lane.getMaxSpeed(link[4]) < speed + 1.0:
             return f"{words}speed limit"
     return f"{words}lane ends" if not links else f"{words}junction or speed limit"

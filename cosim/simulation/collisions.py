@@ -2,13 +2,13 @@
 
 from collections.abc import Iterable, Sequence
 
-import libsumo
 import numpy as np
 
 from cosim.geometry import Boxes, boxes, overlap, overlapping_pairs
 from cosim.road import RoadMap
-from cosim.road.too_close import foot, heed_each_other
-from cosim.simulation.commands import Commander
+from cosim.road.too_close import along_one_another, foot, heed_each_other, walks_beside
+from cosim.simulation.backend import sumo
+from cosim.simulation.commands import Commander, hand_back
 from cosim.simulation.conventions import centres
 from cosim.simulation.convert import Body
 from cosim.simulation.drivers import Drivers
@@ -59,8 +59,8 @@ class CollisionDetector:
         `changes`: AV -> when it last changed lanes, s.
         """
         found: list[Collision] = []
-        touching = libsumo.simulation.getCollidingVehiclesNumber()  # costs less than the list
-        for c in libsumo.simulation.getCollisions() if touching else ():
+        touching = sumo.simulation.getCollidingVehiclesNumber()  # costs less than the list
+        for c in sumo.simulation.getCollisions() if touching else ():
             person = c.type in OF_PERSONS
             names = c.collider, f"person:{c.victim}" if person else c.victim
             if frozenset(names) in self._seen or any(n not in bodies for n in names[: 1 if person else 2]):
@@ -76,8 +76,8 @@ class CollisionDetector:
                     first = mover(self._poses_before(names, pair, now), pair)
                     names = names[::-1] if first == 1 else names
             try:
-                x, y = libsumo.vehicle.getPosition(c.collider)[:2]
-            except libsumo.TraCIException:
+                x, y = sumo.vehicle.getPosition(c.collider)[:2]
+            except sumo.TraCIException:
                 x = y = float("nan")
             found.append(self._collision(now, names, c.type, "sumo", c.lane, x, y, bodies, changes))
         return found
@@ -170,29 +170,37 @@ class Wrecks:
         self._stopped: list[str] = []  # since the last `take`
         self._removed: list[str] = []
 
-    def add(self, collisions: Sequence[Collision]) -> None:
-        """Stop the vehicles of these; SUMO's insertions onto one another are no crashes."""
-        on_road = frozenset(libsumo.vehicle.getIDList()) if collisions else frozenset()
+    def add(self, collisions: Sequence[Collision]) -> list[str]:
+        """Stop the vehicles of these, and name them; SUMO's insertions onto one another are no crashes."""
+        new = []
+        on_road = frozenset(sumo.vehicle.getIDList()) if collisions else frozenset()
         for c in collisions:
             for name in () if c.insertion else (c.collider, c.victim):
                 if name in on_road and name not in self._since:
                     self._since[name] = c.time
-                    self._stopped.append(name)
+                    new.append(name)
                     self._commander.wreck(name)
                     self._drivers.drop(name)
-                    libsumo.vehicle.setSpeedMode(name, 0)  # at once, not within its deceleration
-                    libsumo.vehicle.setLaneChangeMode(name, 0)
-                    libsumo.vehicle.setSpeed(name, 0.0)
+                    sumo.vehicle.setSpeedMode(name, 0)  # at once, not within its deceleration
+                    sumo.vehicle.setLaneChangeMode(name, 0)
+                    sumo.vehicle.setSpeed(name, 0.0)
+        self._stopped += new
+        return new
 
     def remove(self, now: float) -> None:
         """Take those off the road that have stood long enough."""
         due = [name for name, since in self._since.items() if now - since >= WRECK_STANDS - 1e-6]
-        on_road = frozenset(libsumo.vehicle.getIDList()) if due else frozenset()
+        on_road = frozenset(sumo.vehicle.getIDList()) if due else frozenset()
         for name in due:
             del self._since[name]
             if name in on_road:
-                libsumo.vehicle.remove(name)
+                sumo.vehicle.remove(name)
                 self._removed.append(name)
+
+    def release(self) -> None:
+        """Let those that stand go: SUMO drives them."""
+        for name in self._since.keys() & set(sumo.vehicle.getIDList()):
+            hand_back(name)
 
     def take(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Who has become a wreck, and which wrecks were removed, since this was asked last."""
@@ -238,11 +246,14 @@ def mover(before: Boxes, now: Boxes) -> int | None:
 
 def the_nets(snapshot: Snapshot, road: RoadMap, i: int, j: int) -> bool:
     """Whether two vehicles overlap though each follows its own lane, on lanes whose drivers need not heed one
-    another (`heed_each_other`): the lanes lie too close together, and no driver can help it; or one behind
-    the other on a lane that is drawn shorter than it is, with a gap between them by its length."""
-    ways, drawn_shorter = [], False
+    another (`heed_each_other`): the lanes lie too close together, and no driver can help it; or past one that
+    waits where the net lets it wait inside a junction, or past a person on a walking area; or one behind the
+    other on a lane that is drawn shorter than it is, with a gap between them by its length."""
+    ways, drawn_shorter, waits = [], False, False
     for row in (i, j):
         lane = int(snapshot.lane[row])
+        if walks_beside(road, int(snapshot.place[row])):
+            continue
         if lane < 0:
             return False
         path = road.path(lane)
@@ -252,11 +263,13 @@ def the_nets(snapshot: Snapshot, road: RoadMap, i: int, j: int) -> bool:
             return False
         behind = snapshot.length[row] - snapshot.lane_position[row] * path.scale
         ways.append(foot(road, lane, behind, _end(snapshot, row, -0.5)))
+        waits |= snapshot.speed[row] < HALTING and road.waits_inside(lane)
         if snapshot.lane[i] == snapshot.lane[j] and path.scale < DRAWN_WHOLE:
             last, first = sorted((i, j), key=lambda k: float(snapshot.lane_position[k]))
             rear = snapshot.lane_position[first] - snapshot.length[first]
             drawn_shorter = bool(rear > snapshot.lane_position[last])
-    return drawn_shorter or not any(heed_each_other(road, a, b) for a in ways[0] for b in ways[1])
+    heeds = along_one_another if waits else heed_each_other
+    return drawn_shorter or len(ways) == 1 or not any(heeds(road, a, b) for a in ways[0] for b in ways[1])
 
 
 def _end(snapshot: Snapshot, row: int, share: float) -> Floats:
@@ -267,12 +280,12 @@ def _end(snapshot: Snapshot, row: int, share: float) -> Floats:
 
 def _poses(names: Sequence[str], bodies: dict[str, Body]) -> Boxes | None:
     """[2] where two vehicles are now; None when one has left the road."""
-    get = libsumo.vehicle
+    get = sumo.vehicle
     try:
         front = np.array([get.getPosition(name)[:2] for name in names], np.float64)
         angle = np.array([get.getAngle(name) for name in names], np.float64)
         speed = np.array([get.getSpeed(name) for name in names], np.float64)
-    except libsumo.TraCIException:
+    except sumo.TraCIException:
         return None
     length = np.array([bodies[name].length for name in names])
     width = np.array([bodies[name].width for name in names])

@@ -23,7 +23,7 @@ SIGMAS = 2.0  # half the width of a predicted interval, in standard deviations
 GROUND, ROAD, EDGE, JUNCTION = (238, 241, 244), (201, 206, 214), (255, 255, 255), (188, 194, 203)
 MARK = (255, 255, 255)  # paint on the road
 TEXT, BAD, WARN = (27, 33, 41), (200, 30, 30), (180, 83, 9)
-LAW, CORRECTION = (109, 40, 217), (14, 116, 144)
+LAW, CORRECTION, ERROR = (109, 40, 217), (14, 116, 144), (124, 90, 18)
 HOUSING, SIGN = (32, 37, 43), (200, 30, 30)
 MISSION, AV = (184, 69, 155), (0, 114, 178)
 DRIVERS = {"conservative": (0, 158, 115), "moderate": (230, 159, 0), "aggressive": (213, 94, 0)}
@@ -232,10 +232,21 @@ class Strip:
         side = 0.62 * p.track.length * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
         self._pen.line(self._pixels(side + np.array([p.x, p.y])), fill=CORRECTION, width=2 * FINE)
 
-    def name(self, p: Pose) -> None:
-        """The vehicle's id above it."""
+    def erring(self, p: Pose, other: Pose | None) -> None:
+        """A triangle on who errs, and a line to whom it meets first."""
+        x, y = self._pixel(p.x, p.y)
+        if other is not None:
+            self._pen.line([(x, y), self._pixel(other.x, other.y)], fill=(*ERROR, 170), width=FINE)
+        r, w = 8.0 * FINE, 1.0 * FINE
+        corners = [(x, y - r), (x + r, y + 0.8 * r), (x - r, y + 0.8 * r)]
+        self._pen.polygon(corners, fill=MARK, outline=ERROR, width=2 * FINE)
+        self._pen.rectangle((x - w, y - 0.35 * r, x + w, y + 0.2 * r), fill=ERROR)
+        self._pen.rectangle((x - w, y + 0.35 * r, x + w, y + 0.35 * r + 2 * w), fill=ERROR)
+
+    def name(self, p: Pose, words: str = "", colour: Colour = TEXT) -> None:
+        """The vehicle's id, or other words, above it."""
         x, y = self._pixel(p.x, p.y + p.track.width / 2 + 1.3)
-        self._text(x, y, p.track.id, TEXT, 11)
+        self._text(x, y, words or p.track.id, colour, 11)
 
     def crash(self, x: float, y: float) -> None:
         """A cross in a ring."""

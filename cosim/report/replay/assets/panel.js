@@ -40,6 +40,11 @@ function fillDetails(state) {
   const lane = s.lane >= 0 ? data.lanes[s.lane].id : "off every lane";
   box.append(element("p", `${s.speed.toFixed(1)} m/s (${(3.6 * s.speed).toFixed(0)} km/h), ` +
     `${s.accel.toFixed(1)} m/s\u00b2, lane ${lane}`));
+  const error = erring(chosen, t), was = lastOf(chosen.errors, t, Infinity);
+  if (error || was) {
+    const one = error || was;
+    box.append(element("p", `${error ? "" : "last error: "}${one.kind} ${one.t > 0 ? `at ${one.t.toFixed(1)} s` : "from the warm-up"}: it ${one.text}`, error ? "error" : "quiet"));
+  }
   if (!chosen.av) return;
   const choice = choiceOf(data, chosen, t);
   const last = lastOf(chosen.corrections, t, Infinity), corrected = lastOf(chosen.corrections, t);
@@ -155,6 +160,10 @@ function fillLegend(state) {
       ctx.globalAlpha = 0.3; ctx.beginPath(); ctx.ellipse(20, 8, 9, 5, 0, 0, 7); ctx.fill();
     });
   }
+  if (data.errors.length) entry("a human errs; line to whom it meets first", (ctx) => {
+    ctx.strokeStyle = c.error; ctx.lineWidth = 1.5; ctx.setLineDash([2, 3]); ctx.beginPath(); ctx.moveTo(10, 8); ctx.lineTo(29, 8); ctx.stroke(); ctx.setLineDash([]);
+    triangle(ctx, 10, 8, 7, c);
+  });
   if (data.corrections.length) {
     entry("its car corrected the AV", (ctx) => { ctx.strokeStyle = c.correction; ctx.lineWidth = 2; ctx.strokeRect(9, 2, 12, 12); });
   }
@@ -246,6 +255,7 @@ function fillHead(data) {
   const figure = (name) => (f.metrics.find(([n]) => n === name) || [])[1];
   if (f.policy_label) chip(f.policy_label, "warn");
   chip(`seed ${f.seed}`); chip(f.preset); chip(`humans ${f.behavior}, ${f.driver_model}`); chip(`svo ${f.svo_deg}\u00b0`);
+  if (f.errors) chip(`human errors ${f.errors}`);
   if (figure("crashed") != null) chip(figure("crashed") ? `${figure("collisions")} collision(s)` : "no collision", figure("crashed") ? "bad" : "good");
   if (figure("mission_success") != null) chip(figure("mission_success") ? "mission fulfilled" : "mission not fulfilled", figure("mission_success") ? "good" : "bad");
   if (f.mission_vehicle) chip(`mission vehicle ${f.mission_vehicle}${f.mission_guessed ? ", guessed" : ""}`, f.mission_guessed ? "warn" : "");

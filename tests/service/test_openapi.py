@@ -62,7 +62,7 @@ def test_nothing_that_the_document_allows_is_a_server_error(
 
         @given(case=operation.as_strategy())
         @settings(
-            max_examples=8,
+            max_examples=5,
             deadline=None,
             derandomize=True,
             database=None,

@@ -64,7 +64,9 @@ class Room:
         python = [Path(path) for path in (sys.prefix, sys.base_prefix) if path != "/"]
         imports = [Path(path) for path in sys.path if os.path.isabs(path)]
         installed = [path for path in imports if path.name in ("site-packages", "dist-packages")]
-        versions = [found for path in imports for found in path.glob("*.egg-info")]
+        versions = [
+            found for path in imports for kind in ("egg", "dist") for found in path.glob(f"*.{kind}-info")
+        ]
         landlock.restrict(
             [*map(Path, (*_SYSTEM, *self.reads)), *python, *installed, *versions, *packages],
             [Path(scratch), *map(Path, (*_DEVICES, *self.writes))],

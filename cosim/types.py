@@ -460,10 +460,13 @@ IDENTITY = tuple(field.name for field in fields(Identity))
 TIMINGS = ("reset_s", "simulation_s", "observation_s", "decision_s", "total_s")  # wall time, never repeatable
 # What stands beside the figures in documents and rows: no figure may be called so.
 MISSION = ("mission_vehicle", "mission_guessed")
+WEIGHT = "weight"  # of an episode whose errors were drawn from tilted rates (docs/estimate.md)
+TILT = (WEIGHT, "log_ratio", "tilted")
 RESERVED = {
     *IDENTITY,
     *TIMINGS,
     *MISSION,
+    *TILT,
     "key",
     "cell",
     "status",

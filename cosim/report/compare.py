@@ -11,7 +11,7 @@ import numpy as np
 
 from cosim.errors import BadInput
 from cosim.report import wording
-from cosim.report.figures import Measure, Row
+from cosim.report.figures import Frequency, Measure, Row
 from cosim.report.pairing import Group, Side, pair, title
 from cosim.report.statistics import (
     Figure,
@@ -20,8 +20,10 @@ from cosim.report.statistics import (
     mean,
     paired_change,
     paired_mean,
+    paired_rates,
     paired_share,
     share,
+    weighted_rate,
 )
 from cosim.report.thresholds import CHANGE, DIFFERENCE, Threshold, parse
 
@@ -42,6 +44,7 @@ class PairedFigure:
     na_on_both: int  # of these
     hits: tuple[int, int] | None = None  # episodes of A and of B in which it happened, of a rate
     p: float | None = None  # exact McNemar, of a rate
+    change: Figure | None = None  # b / a - 1, of events per exposure
 
     def document(self) -> dict[str, Any]:
         """Plain JSON values."""
@@ -163,10 +166,16 @@ def compare(
 
 def paired(measure: Measure, pairs: Sequence[tuple[Row, Row]], seed: int = 0) -> PairedFigure:
     """One measure over the pairs; those in which it is NA on either side are left out, and counted."""
-    values = np.array([measure.values([pair[k] for pair in pairs]) for k in (0, 1)])  # [2,pairs]
+    sides = [[pair[k] for pair in pairs] for k in (0, 1)]
+    values = np.array([measure.values(rows) for rows in sides])  # [2,pairs]
     missing = np.isnan(values)
     x, y = values[:, ~missing.any(0)]
     n, na, neither = len(x), len(pairs) - len(x), int(missing.all(0).sum())
+    if isinstance(measure, Frequency):
+        a, b = (measure.parts(rows)[:, ~missing.any(0)] for rows in sides)
+        difference, change = paired_rates(a, b)
+        of_each = weighted_rate(*a), weighted_rate(*b)
+        return PairedFigure(measure, *of_each, difference, n, na, neither, change=change)
     if not measure.is_rate:
         difference = paired_mean(x, y, seed)
         return PairedFigure(measure, mean(x, seed), mean(y, seed), difference, n, na, neither)
@@ -188,10 +197,11 @@ def _judge(threshold: Threshold, compared: Compared) -> tuple[str, str, str]:
         return FAILED, "no pair of episodes finished on both sides", ""
     if found.na_on_both == len(pairs):
         return SKIPPED, f"{measure.name} is NA in all {len(pairs)} pairs", ""
-    x, y = (measure.values([both[k] for both in pairs]) for k in (0, 1))
+    sides = [[both[k] for both in pairs] for k in (0, 1)]
+    x, y = map(measure.values, sides)
     count = f"{found.n} pairs" + (f", NA in {found.na} more" if found.na else "")
     if threshold.kind == CHANGE:
-        figure, what = paired_change(x, y, compared.seed), "B / A - 1"
+        figure, what = found.change or paired_change(x, y, compared.seed), "B / A - 1"
         shown = [wording.change(v) for v in (threshold.of(figure), figure.value, figure.low, figure.high)]
         whole = f"{shown[1]} ({shown[2]} to {shown[3]})"
     elif threshold.kind == DIFFERENCE:
@@ -201,6 +211,8 @@ def _judge(threshold: Threshold, compared: Compared) -> tuple[str, str, str]:
     else:  # of B alone: pairs in which only A is NA count too
         y = [value for value in y if not math.isnan(value)]
         figure = share(int(sum(y)), len(y)) if measure.is_rate else mean(y, compared.seed)
+        if isinstance(measure, Frequency):
+            figure = measure.figure(sides[1])
         what, count = "B", f"{int(sum(y))} of {len(y)} episodes" if measure.is_rate else f"{len(y)} episodes"
         shown = [wording.number(threshold.of(figure), measure)]
         whole = wording.interval(figure, measure)

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from cosim.report.figures import Measure, Row, measures
+from cosim.report.figures import Frequency, Measure, Row, measures
 from cosim.report.statistics import CONFIDENCE, mean, rule_of_three, share
 from cosim.types import IDENTITY, TIMINGS
 from cosim.workers.tasks import OK, STATUSES
@@ -88,10 +88,10 @@ def rate_document(measure: Measure, rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def mean_document(measure: Measure, rows: Sequence[Row], seed: int = 0) -> dict[str, Any]:
-    """Mean over the rows with its bootstrap interval."""
+    """Mean over the rows with its bootstrap interval; of events per exposure their weighted quotient."""
     values = [v for v in measure.values(rows) if not math.isnan(v)]
     return {
-        **mean(values, seed).document(),
+        **(measure.figure(rows) if isinstance(measure, Frequency) else mean(values, seed)).document(),
         "n": len(values),
         "na": len(rows) - len(values),
         "unit": measure.unit,

@@ -1,0 +1,71 @@
+"""A tilt: human errors drawn more often than they happen, and what an episode so drawn weighs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from cosim.errors import BadInput
+from cosim.seeding import uniform
+
+MOST = 0.5  # of a tilted probability: both outcomes of a trial stay likely
+UNTILTED = 0.1  # share of episodes that are drawn as errors happen: no episode weighs more than 1 / UNTILTED
+_SHARE = "untilted"
+
+
+@dataclass(frozen=True, slots=True)
+class Tilt:
+    """Kinds of errors whose probabilities are multiplied, in all but a share of the episodes.
+
+    Importance sampling with a defensive mixture (Hesterberg, Technometrics 37 (1995) 185-194; Owen and Zhou,
+    JASA 95 (2000) 135-143): docs/estimate.md.
+    """
+
+    factors: Mapping[str, float] = field(default_factory=dict)  # kind -> factor, 1 or more
+    untilted: float = UNTILTED
+
+    def rate(self, kind: str, p: float) -> float:
+        """q, the tilted probability of a trial whose probability is p."""
+        return max(p, min(p * self.factors.get(kind, 1.0), MOST))
+
+    def log_ratio(self, kind: str, p: float, begins: bool) -> float:
+        """What one trial adds to log(q / p) of its episode: the logarithm of q/p or of (1-q)/(1-p)."""
+        q = self.rate(kind, p)
+        if q == p:
+            return 0.0
+        return math.log(q / p) if begins else math.log1p(-q) - math.log1p(-p)
+
+    def drawn(self, seed: int) -> bool:
+        """Whether the episode of this seed is drawn from the tilted probabilities."""
+        return uniform(seed, "tilt") >= self.untilted
+
+    def weight(self, log_ratio: float) -> float:
+        """p over the mixture's probability of an episode: 1 / (a + (1 - a) q / p)."""
+        return 1.0 / (self.untilted + (1.0 - self.untilted) * math.exp(min(log_ratio, 700.0)))
+
+    def text(self) -> str:
+        """`cut_in=300,forced_entry=30,untilted=0.1`; `read` is the way back."""
+        named = [*sorted(self.factors.items()), (_SHARE, self.untilted)]
+        return ",".join(f"{name}={value:g}" for name, value in named)
+
+
+def read(text: str, where: str = "--tilt") -> Tilt:
+    """The tilt of a `text()`. Raises BadInput: not of that form, a factor below 1, a share that is none."""
+    factors: dict[str, float] = {}
+    for part in filter(None, map(str.strip, text.split(","))):
+        name, equals, number = part.partition("=")
+        try:
+            factors[name.strip()] = float(number) if equals else math.nan
+        except ValueError:
+            factors[name.strip()] = math.nan
+        if not math.isfinite(factors[name.strip()]):
+            problem = "write KIND=FACTOR,... as in cut_in=100,forced_entry=30,untilted=0.1"
+            raise BadInput(problem, field=where, value=part)
+    share = factors.pop(_SHARE, UNTILTED)
+    if not 0.0 < share <= 1.0:
+        raise BadInput("must be above 0 and at most 1", field=f"{where}.{_SHARE}", value=share)
+    for name, factor in factors.items():
+        if factor < 1.0:
+            raise BadInput("must be 1 or more", field=f"{where}.{name}", value=factor)
+    return Tilt(dict(sorted(factors.items())), share)

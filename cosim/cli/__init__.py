@@ -8,6 +8,7 @@ for is imported, and what a command needs is imported inside `work`.
 COMMANDS = (
     "run",
     "evaluate",
+    "estimate",
     "compare",
     "replay",
     "report",

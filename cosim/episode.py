@@ -25,6 +25,7 @@ from cosim.types import (
     EpisodeResult,
     Events,
     History,
+    HumanError,
     Metric,
     ObservationConfig,
     Offence,
@@ -141,6 +142,7 @@ class Episode:
         self._begin = self.snapshot.time
         self._collisions: list[Collision] = []
         self._interventions: Counter[str] = Counter()  # by reason
+        self._errors: list[HumanError] = []
         self._missions: dict[str, None] = {}  # every mission vehicle seen, in order of appearance
         self._tally: dict[str, int] = dict.fromkeys(
             ("decisions", "vetoes", "fallbacks", "lane_changes", "blocked"), 0
@@ -194,6 +196,7 @@ class Episode:
             self._metrics.add(frame)
             self._collisions += frame.events.collisions
             self._interventions.update(i.reason for i in frame.events.interventions)
+            self._errors += frame.events.errors
             if self.scenario.on_collision == OnCollision.END:
                 self.terminated |= any(c.crash for c in frame.events.collisions)
         self.truncated = not self.terminated and self.elapsed >= self.scenario.duration - 1e-6
@@ -251,6 +254,7 @@ class Episode:
             timings=dict(self.timings),
             validity=self._validity(metrics),
             interventions_by_reason=dict(self._interventions.most_common()),
+            errors_begun=tuple(self._errors),
             mission_vehicle=", ".join(self._missions) or None,
             mission_guessed=bool(self._missions) and self.scenario.mission.guessed,
             manifest=manifest(self.scenario, self.seed),

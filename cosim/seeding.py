@@ -3,6 +3,7 @@
 import hashlib
 
 import numpy as np
+import numpy.typing as npt
 
 # What a result may rest on (docs/definitions.md, Seeds); tests begin where tuning and validation end, and a
 # result on a test seed never changes a parameter.
@@ -25,3 +26,16 @@ def uniform(seed: int, *purpose: str) -> float:
 def generator(seed: int, *purpose: str) -> np.random.Generator:
     """A numpy generator for one purpose."""
     return np.random.default_rng(subseed(seed, *purpose))
+
+
+def uniforms(streams: npt.NDArray[np.uint64], number: int) -> npt.NDArray[np.float64]:
+    """The `number`-th draw in [0, 1) of each stream (a `subseed`), of any shape.
+
+    splitmix64: Steele, Lea and Flood, Fast splittable pseudorandom number generators, OOPSLA 2014.
+    """
+    with np.errstate(over="ignore"):
+        z = streams + np.uint64(0x9E3779B97F4A7C15) * np.uint64(number + 1)
+        z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        z ^= z >> np.uint64(31)
+    return (z >> np.uint64(11)) * 2.0**-53

@@ -7,6 +7,7 @@ Letters in shapes: `n` vehicles, `N` past frames, `M` predicted frames, `C, H, W
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from enum import IntEnum
@@ -99,6 +100,8 @@ class Collision:
     y: float  # m
     involves_mission: bool = False
     av_caused: bool = False  # an AV was the collider, or had just cut in
+    # one of both, or the vehicle just ahead of one, was erring or had been shortly before (HumanError)
+    human_error_involved: bool = False
 
     @property
     def insertion(self) -> bool:
@@ -452,6 +455,7 @@ class Identity:
     driver_model: str
     penetration: float | None  # share of AVs, where that chooses them
     preset: str
+    errors: str | None = field(default=None, kw_only=True)  # a level, or a file's stem and digest; None: none
     svo_deg: float
     seed: int
 
@@ -476,7 +480,7 @@ RESERVED = {
     "steps",
 } | {
     *("trace_hash", "timings", "comparable", "not_comparable_because", "collision_list"),
-    "interventions_by_reason",
+    *("interventions_by_reason", "human_errors_by_kind", "human_error_list"),
     *("units", "better", "manifest"),
 }
 
@@ -494,6 +498,7 @@ class EpisodeResult(Identity):
     mission_vehicle: str | None = None  # its id (of several: joined by ", "); None: none was on the road
     mission_guessed: bool = False  # nobody named it: its figures feed no gate
     interventions_by_reason: dict[str, int] = field(default_factory=dict)  # the most frequent first
+    errors_begun: tuple[HumanError, ...] = ()
     manifest: dict[str, Any] = field(default_factory=dict)
 
     def value(self, name: str) -> float | int | bool | None:
@@ -512,6 +517,8 @@ class EpisodeResult(Identity):
             "comparable": not self.validity,
             "not_comparable_because": list(self.validity),
             "interventions_by_reason": dict(self.interventions_by_reason),
+            "human_errors_by_kind": dict(Counter(e.kind for e in self.errors_begun).most_common()),
+            "human_error_list": [[e.kind, e.who, round(e.time, 3)] for e in self.errors_begun],
             "collision_list": [{k: _plain(v) for k, v in asdict(c).items()} for c in self.collisions],
             "units": {name: metric.unit for name, metric in self.metrics.items()},
             "better": {name: metric.better for name, metric in self.metrics.items()},

@@ -15,7 +15,7 @@ from cosim.policies import check
 from cosim.recording.file import write
 from cosim.recording.folder import Folder
 from cosim.recording.recorder import Recorder
-from cosim.scenario import place
+from cosim.scenario import human_errors, place
 from cosim.scenario.episode_id import EpisodeId
 from cosim.scenario.policy_name import read
 from cosim.types import IDENTITY
@@ -35,6 +35,7 @@ def planned(
     warmup: float | None = None,
     mission: str | None = None,
     on_collision: str | None = None,
+    errors: str | None = None,
 ) -> Plan:
     """Every combination; what is left out is the scenario's own. Raises BadInput."""
     spec = Spec(
@@ -48,6 +49,7 @@ def planned(
         warmup=warmup,
         mission=mission,
         on_collision=on_collision,
+        errors=(human_errors.asked(errors),),
     )
     plan = matrix.plan(dict.fromkeys(matrix.cells(spec)), seeds, check)
     for cell in plan.cells:

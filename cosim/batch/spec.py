@@ -16,7 +16,7 @@ from cosim.errors import BadInput, Range, check_pattern, hint, inside, one_of
 from cosim.files import code
 from cosim.files.xml_input import is_there
 from cosim.files.yaml_input import NonNegative, Positive, check_known, document, value_of
-from cosim.scenario import BEHAVIORS, policy_name
+from cosim.scenario import BEHAVIORS, human_errors, policy_name
 from cosim.scenario.behaviors import DRIVER_MODELS
 from cosim.seeding import FIRST_TEST_SEED
 from cosim.types import OnCollision, Preset
@@ -32,6 +32,7 @@ AXES = {
     "driver_model": "driver_model",
     "penetration": "penetration",
     "preset": "preset",
+    "errors": "errors",
     "policy": "policy",
     "svo": "svo_deg",
 }
@@ -55,6 +56,7 @@ class Spec:
         45.0,
     )  # degrees; 45 weighs oneself and the others alike
     preset: tuple[str | None, ...] = (None,)
+    errors: tuple[str | None, ...] = (None,)  # of human drivers: levels, absolute paths; None: none
     av_type: str | None = None
     av_ids: str | None = None
     duration: Positive | None = None  # s
@@ -141,6 +143,10 @@ def _axis(name: str, value: object, folder: Path, file: object, field: str) -> A
         found = [code.absolute(item, field, folder=folder, file=file) for item in found]
     elif name == "reward":
         found = code.absolute(found, field, folder=folder, file=file)
+    elif name == "errors":
+        found = [human_errors.asked(item, folder) for item in found]
+        for item in found:
+            human_errors.read(item, field, file)
     elif name in ("scenario", "demand"):
         found = [point for item in found for point in _expand(item, folder, file, field, name)]
         found = [point[0] for point in found] if name == "scenario" else found

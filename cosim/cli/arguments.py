@@ -55,6 +55,10 @@ def _shared() -> dict[str, dict[str, Any]]:
             "choices": OnCollision.ALL,
             "help": "of an AV or the mission vehicle (default: worlds end, your own .sumocfg continue)",
         },
+        "--errors": {
+            "metavar": "LEVEL|FILE",
+            "help": "of human drivers: none (default), field, stress, or a YAML file (docs/human_errors.md)",
+        },
         "--seed": {"type": seed, "metavar": "N"},
         "--seeds": {"metavar": "A:B", "help": "seeds A, A+1, ... B-1"},
         "--duration": {

@@ -55,7 +55,7 @@ def add_matrix(command: argparse.ArgumentParser) -> None:
         help="a name, or a file or glob (.rou.xml, .trips.xml, flows, .gz); A,B is one demand of two files",
     )
     arguments.add(axes, "--policy", "--behavior", "--driver-model", action="append")
-    arguments.add(axes, "--penetration", "--svo", "--preset", action="append")
+    arguments.add(axes, "--penetration", "--svo", "--preset", "--errors", action="append")
     arguments.add(axes, "--output", "--metric", action="append")
     arguments.add(command, "--av-type", "--av-ids", "--duration", "--warmup", "--mission")
     arguments.add(command, "--reward", "--on-collision")

@@ -17,7 +17,7 @@ def add(commands: arguments.SubCommands) -> None:
     arguments.add(record, "--demand", "--behavior", "--policy", action="append", default=[])
     arguments.add(record, "--svo", default=45.0)
     arguments.add(record, "--seeds", type=arguments.seeds, required=True)
-    arguments.add(record, "--duration", "--warmup", "--mission", "--on-collision", "--resume")
+    arguments.add(record, "--duration", "--warmup", "--mission", "--on-collision", "--errors", "--resume")
     arguments.add(record, "--out", required=True)
     arguments.add(record, "--workers", default=1, help="processes (1)")
     record.set_defaults(work=work)
@@ -37,6 +37,7 @@ def work(args: argparse.Namespace) -> int:
         "warmup": args.warmup,
         "mission": args.mission,
         "on_collision": args.on_collision,
+        "errors": args.errors,
     }
     wanted = planned(args.scenario, args.demand, args.behavior, policies, args.seeds, args.svo, **times)
     failed = record(Path(args.out), wanted, workers=args.workers, resume=args.resume)

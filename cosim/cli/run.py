@@ -16,7 +16,7 @@ from cosim.cli import arguments
 from cosim.errors import BadInput
 from cosim.files import code
 from cosim.files.xml_input import is_there
-from cosim.scenario import Scenario, chosen_preset, place
+from cosim.scenario import Scenario, chosen_preset, human_errors, place
 from cosim.scenario.episode_id import EpisodeId
 from cosim.scenario.policy_name import label, read
 from cosim.seeding import FIRST_TEST_SEED
@@ -43,7 +43,7 @@ def add(commands: arguments.SubCommands) -> None:
     arguments.add(run, "--policy", default="idm")
     arguments.add(run, "--svo", default=45.0)
     arguments.add(run, "--behavior", "--preset", "--duration", "--warmup", "--mission")
-    arguments.add(run, "--on-collision", "--reward", "--out")
+    arguments.add(run, "--on-collision", "--errors", "--reward", "--out")
     arguments.add(run, "--driver-model", default="lc2013", help="of the human drivers (default lc2013)")
     arguments.add(run.add_mutually_exclusive_group(), "--av-type", "--av-ids", "--penetration")
     arguments.add(run, "--seed", default=FIRST_TEST_SEED, help=f"default {FIRST_TEST_SEED}")
@@ -161,6 +161,7 @@ def case_of(args: argparse.Namespace) -> EpisodeId:
         outputs=tuple(dict.fromkeys(args.output)),
         metrics=tuple(code.absolute(metric, "--metric") for metric in args.metric),
         reward=args.reward and code.absolute(args.reward, "--reward"),
+        errors=human_errors.asked(args.errors),
         **{name: getattr(args, name) for name in same},
     )
 

@@ -80,6 +80,7 @@ def open(
     warmup: float | None = None,
     mission: str | None = None,
     on_collision: str | None = None,
+    errors: str | None = None,
     options: Sequence[str] = (),
     seed: int | None = None,
     observation: ObservationConfig = COMPACT,
@@ -94,7 +95,8 @@ def open(
 
     The same words mean the same as in `cosim run`: `penetration`, `av_type` and `av_ids` (or a `Fleet`)
     say who is an AV, `duration` and `warmup` are in s, `mission` is a vehicle's id, a pattern, "none" or
-    "auto"; `svo` is in degrees (it weighs the reward). A `Scenario` holds them: beside it they are
+    "auto"; `errors` are those of human drivers; `svo` is in degrees (it weighs the reward). A `Scenario`
+    holds them: beside it they are
     refused. `seed` is the first episode's. `reward`: a `cosim.rewards.Reward` (a `RewardConfig`, a
     function of your own), a name of `REWARDS`, FILE.py:NAME or MODULE:NAME; without it P's. `metrics`:
     classes like those of `cosim.metrics`, or FILE.py:NAME, measured besides. `others` builds a policy for
@@ -119,6 +121,7 @@ def open(
         }
         given |= {"penetration": penetration, "av_type": av_type, "av_ids": av_ids}
         given |= {"duration": duration, "warmup": warmup, "mission": mission, "options": options or None}
+        given |= {"on_collision": on_collision, "errors": errors}
         for name, value in given.items():
             if value is not None:
                 raise BadInput("is part of the Scenario that is given", field=name, value=value)
@@ -135,6 +138,7 @@ def open(
             warmup=warmup,
             mission=mission,
             on_collision=on_collision,
+            errors=errors,
             options=options,
         )
     if simulator is None:

@@ -13,6 +13,7 @@ from cosim.metrics.drac import DecelerationRate
 from cosim.metrics.events import TrafficEvents
 from cosim.metrics.hard_braking import HardBraking
 from cosim.metrics.headway import Headway
+from cosim.metrics.human_errors import HumanErrors
 from cosim.metrics.jerk import Jerk
 from cosim.metrics.law import AvCounts, StopLines
 from cosim.metrics.mission import MissionSuccess
@@ -45,6 +46,7 @@ METRICS: dict[str, type[EpisodeMetric]] = {
     "trips": Trips,
     "persons": PersonConflicts,
     "interventions": Interventions,
+    "human_errors": HumanErrors,
 }
 
 

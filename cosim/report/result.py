@@ -1,6 +1,7 @@
 """One episode's result: a short table to read, a run folder to keep."""
 
 import json
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -50,6 +51,10 @@ def table(result: EpisodeResult, *, first: bool = True) -> str:
         f"  behaviour {result.behavior}, drivers {result.driver_model}, preset {result.preset}, "
         f"svo {result.svo_deg:g} deg, seed {result.seed}, {result.steps} decisions",
     ]
+    if result.errors is not None:
+        begun = Counter(error.kind for error in result.errors_begun).most_common()
+        words = ", ".join(f"{count} {kind}" for kind, count in begun) or "none"
+        lines.append(f"  human errors {result.errors}: {words}")
     if result.mission_vehicle is not None:
         lines.append(f"  mission vehicle {result.mission_vehicle}" + f", {GUESSED}" * result.mission_guessed)
     shown = [name for name in FIRST if name in result.metrics] if first else result.metrics

@@ -63,6 +63,7 @@ def group(identity: Mapping[str, Any], *, policy: bool = True) -> str:
         "policy": "{}",
         "behavior": "{}",
         "preset": "{}",
+        "errors": "errors {}",
         "svo_deg": "svo {:g}",
         "penetration": "penetration {:g}",
         "driver_model": "{}",

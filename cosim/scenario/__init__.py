@@ -12,8 +12,9 @@ from cosim.errors import BadInput, check_pattern, hint, one_of
 from cosim.files import yaml_input
 from cosim.files.xml_input import is_there, regular_file
 from cosim.files.yaml_input import NonNegative, Positive
-from cosim.scenario import sumocfg
+from cosim.scenario import human_errors, sumocfg
 from cosim.scenario.behaviors import AS_IS, DRIVER_MODELS, LC2013, MIXED, load_behaviors
+from cosim.scenario.human_errors import Errors
 from cosim.types import Identity, OnCollision, Preset, Timing
 
 BEHAVIORS = load_behaviors().names
@@ -104,6 +105,7 @@ class Scenario:
     demand_name: str = "as-is"
     behavior: str = AS_IS
     driver_model: str = LC2013
+    errors: Errors | None = None  # of human drivers and persons; None: nobody errs
     demands: Mapping[str, Path] | None = None  # name -> file, of a world
     title: str = ""
     definition: Path | None = None  # the scenario.yaml of a world
@@ -129,6 +131,7 @@ class Scenario:
             driver_model=self.driver_model,
             penetration=self.fleet.penetration,
             preset=self.preset,
+            errors=None if self.errors is None else self.errors.name,
             svo_deg=svo_deg,
             seed=seed,
         )
@@ -139,6 +142,8 @@ class Scenario:
         ours = [sumo_scenarios.TYPES] if self.definition is None else [self.definition]
         if self.behavior != AS_IS:
             ours.append(sumo_scenarios.BEHAVIORS)
+        if self.errors is not None:
+            ours.append(self.errors.file)
         return (self.config, self.net, *self.demand, *self.additional, *ours)
 
 
@@ -154,13 +159,15 @@ def load(
     warmup: float | None = None,
     mission: str | None = None,
     on_collision: str | None = None,
+    errors: str | None = None,
     options: Sequence[str] = (),
 ) -> Scenario:
     """The scenario `what` (a world's name or folder, a .sumocfg), with what the command line says otherwise.
 
     `demand`: names of the world's demands or files; `options`: SUMO options as typed after `--`, which win
     over the file's. `duration`, `warmup` in s. `mission`: a vehicle's id or a pattern of ids (full match),
-    "none" or "auto". Only this file's own syntax is checked: `cosim.scenario.vet` reads the rest.
+    "none" or "auto". `errors`: of human drivers, a level or a file (`cosim.scenario.human_errors`). Only this
+    file's own syntax is checked: `cosim.scenario.vet` reads the rest.
 
     Raises:
         BadInput: names file (or option), field and value, with the nearest name where one is near.
@@ -194,6 +201,7 @@ def load(
         preset=one_of(scenario.preset if preset is None else preset, Preset.ALL, "--preset"),
         on_collision=one_of(on_collision or scenario.on_collision, OnCollision.ALL, "--on-collision"),
         fleet=scenario.fleet if fleet is None else _checked_fleet(fleet),
+        errors=human_errors.read(errors),
     )
 
 

@@ -22,6 +22,7 @@ OPTIONAL = (
     "warmup",
     "mission",
     "on_collision",
+    "errors",
 )  # named only where they are asked for: older keys stay as they are
 KEY_LENGTH = 12  # hexadecimal digits of a cell: 48 bits, a collision among 10,000 cells has odds of 2e-7
 
@@ -51,6 +52,7 @@ class EpisodeId:
     metrics: tuple[str, ...] = ()  # measured besides, FILE.py:NAME or MODULE:NAME
     reward: str | None = None  # paid and reported: a name of `cosim.rewards.REWARDS`, or code likewise
     on_collision: str | None = None  # of `OnCollision`; None: the scenario's own
+    errors: str | None = None  # of human drivers: a level, or an absolute path; None: none
 
     @cached_property
     def cell(self) -> str:
@@ -110,5 +112,6 @@ class EpisodeId:
             warmup=self.warmup,
             mission=self.mission,
             on_collision=self.on_collision,
+            errors=self.errors,
             options=options,
         )

@@ -12,6 +12,7 @@ from cosim.errors import inside
 from cosim.files.yaml_input import mapping, value_of
 from cosim.scenario import Scenario
 from cosim.scenario.episode_id import EpisodeId
+from cosim.scenario.human_errors import Errors
 from cosim.scenario.sumocfg import CLOCK, INPUTS, command_line, keeps
 from cosim.types import OnCollision
 
@@ -37,6 +38,7 @@ def manifest(scenario: Scenario, seed: int) -> dict[str, Any]:
         # named where they are not a world's own: episodes are told apart by this document, older ones too
         **({"on_collision": goes_on} if (goes_on := scenario.on_collision) != OnCollision.END else {}),
         **({} if scenario.built_in else {"mission": scenario.mission.vehicles or scenario.mission.kind}),
+        **({} if scenario.errors is None else {"errors": _errors(scenario.errors)}),
         "driver_model": scenario.driver_model,
         "behavior": scenario.behavior,
         "fleet": scenario.fleet.describe(),
@@ -109,6 +111,10 @@ def named(files: Iterable[Path]) -> dict[str, Path]:
         unique = (n for n in lengths if sum(end(other, n) == end(path, n) for other in each) == 1)
         found[end(path, next(unique, len(path.parts)))] = path
     return found
+
+
+def _errors(errors: Errors) -> dict[str, str]:
+    return {"name": errors.name, "sha256": errors.digest}
 
 
 @lru_cache

@@ -170,19 +170,22 @@ class Wrecks:
         self._stopped: list[str] = []  # since the last `take`
         self._removed: list[str] = []
 
-    def add(self, collisions: Sequence[Collision]) -> None:
-        """Stop the vehicles of these; SUMO's insertions onto one another are no crashes."""
+    def add(self, collisions: Sequence[Collision]) -> list[str]:
+        """Stop the vehicles of these, and name them; SUMO's insertions onto one another are no crashes."""
+        new = []
         on_road = frozenset(libsumo.vehicle.getIDList()) if collisions else frozenset()
         for c in collisions:
             for name in () if c.insertion else (c.collider, c.victim):
                 if name in on_road and name not in self._since:
                     self._since[name] = c.time
-                    self._stopped.append(name)
+                    new.append(name)
                     self._commander.wreck(name)
                     self._drivers.drop(name)
                     libsumo.vehicle.setSpeedMode(name, 0)  # at once, not within its deceleration
                     libsumo.vehicle.setLaneChangeMode(name, 0)
                     libsumo.vehicle.setSpeed(name, 0.0)
+        self._stopped += new
+        return new
 
     def remove(self, now: float) -> None:
         """Take those off the road that have stood long enough."""

@@ -95,6 +95,16 @@ class Drivers:
         if self.mobil is not None:
             self.mobil.drop(vehicle)
 
+    def pause(self, vehicle: str) -> None:
+        """It makes no lane changes of its own until `resume`."""
+        if self.mobil is not None:
+            self.mobil.paused.add(vehicle)
+
+    def resume(self, vehicle: str) -> None:
+        """End of `pause`."""
+        if self.mobil is not None:
+            self.mobil.paused.discard(vehicle)
+
     def step(self, time: float) -> None:
         """After every SUMO step (`time` in s): MOBIL's decisions; LC2013 decides inside SUMO."""
         if self.mobil is not None:

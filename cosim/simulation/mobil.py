@@ -218,6 +218,7 @@ class MobilDriving:
         self._drivers: dict[str, tuple[IdmParameters, MobilParameters]] = {}
         self._due: list[list[str]] = []
         self._steps = 0
+        self.paused: set[str] = set()  # decide nothing for now
 
     def known(self, vehicle: str) -> IdmParameters | None:
         """Parameters of a driver of ours, None for another vehicle."""
@@ -255,7 +256,7 @@ class MobilDriving:
         self._due[turn] = on_road
 
     def _decide(self, vehicle: str) -> int:
-        if changing(vehicle):
+        if vehicle in self.paused or changing(vehicle):
             return 0
         mobil = self._drivers[vehicle][1]
         edge = libsumo.vehicle.getRoadID(vehicle)

@@ -26,9 +26,10 @@ from cosim.simulation.convert import Body, SnapshotReader, read_road, struggling
 from cosim.simulation.drivers import Drivers
 from cosim.simulation.entries import EntryWatcher
 from cosim.simulation.fleet import Fleet
+from cosim.simulation.human_errors import HumanErrors
 from cosim.simulation.stderr import SumoStderr
 from cosim.simulation.xerces import keep_initialized
-from cosim.types import Command, Events, Kind, OnCollision, Preset, Receipt, Snapshot
+from cosim.types import Collision, Command, Events, Kind, OnCollision, Preset, Receipt, Snapshot
 
 SUMO_ERRORS = (libsumo.TraCIException, libsumo.FatalTraCIError)
 
@@ -107,8 +108,11 @@ class SumoSimulator:
         self._bodies: dict[str, Body] = {}
         self._routes: dict[str, tuple[str, ...]] = {}
         self._detector = CollisionDetector()
-        goes_on = self._scenario.on_collision == OnCollision.CONTINUE
+        errors = self._scenario.errors
+        # with errors humans hit humans, and an episode that only an AV's crash ends goes on
+        goes_on = self._scenario.on_collision == OnCollision.CONTINUE or errors is not None
         self._wrecks = Wrecks(self._commander, self._drivers) if goes_on else None
+        self._errors = None if errors is None else HumanErrors(errors, self.road, self._drivers, seed, step)
         self._reader.bodies_changed()
         self._entries.reset()
         self._mission_found = not self._scenario.mission.guessed
@@ -124,6 +128,8 @@ class SumoSimulator:
                 self._step()
                 if k >= first_kept and (steps - k) % self._steps_per_frame == 0:
                     frames.append(self._snapshot())
+        if self._errors is not None:
+            self._errors.begin(libsumo.simulation.getTime())
         return tuple(frames) or (self._snapshot(),)
 
     def advance(self, commands: Sequence[Command]) -> tuple[tuple[Receipt, ...], tuple[Snapshot, ...]]:
@@ -245,15 +251,19 @@ class SumoSimulator:
         self._waited.difference_update(departed)
         for name in departed:
             self._bodies[name] = self._fleet.depart(name, self._seed)
+            if self._errors is not None:
+                self._errors.depart(name, self._bodies[name])
         arrived = simulation.getArrivedIDList()
         for name in arrived:
             self._commander.drop(name)
             self._routes.pop(name, None)
+            if self._errors is not None:
+                self._errors.drop(name)
         now = simulation.getTime()
         self._detector.inserted((*departed, *simulation.getEndingTeleportIDList()), now)
         collisions = self._detector.from_sumo(self._bodies, self._commander.lane_changes, now)
+        collisions = self._crashed(collisions)
         if self._wrecks is not None:
-            self._wrecks.add(collisions)
             self._wrecks.remove(now)
         self._happened.append(
             (
@@ -271,6 +281,18 @@ class SumoSimulator:
         if self._gives_up:
             self._waited.update(simulation.getPendingVehicles())
         self._drivers.step(now)
+        if self._errors is not None:
+            self._errors.step(now)
+
+    def _crashed(self, collisions: list[Collision]) -> list[Collision]:
+        """Make wrecks of their vehicles where the episode goes on; the same collisions, attributed."""
+        if self._errors is not None and collisions:
+            collisions = self._errors.attribute(collisions)
+        if self._wrecks is not None:
+            for name in self._wrecks.add(collisions):
+                if self._errors is not None:
+                    self._errors.drop(name)
+        return collisions
 
     def _snapshot(self) -> Snapshot:
         happened = (tuple(chain.from_iterable(field)) for field in zip(*self._happened, strict=True))
@@ -283,12 +305,14 @@ class SumoSimulator:
         extra = self._detector.from_boxes(snapshot, self.road, self._bodies, self._commander.lane_changes)
         wrecked: tuple[str, ...] = ()
         removed: tuple[str, ...] = ()
+        extra = self._crashed(extra)
         if self._wrecks is not None:
-            self._wrecks.add(extra)
             wrecked, removed = self._wrecks.take()
-        if extra or wrecked or removed:
+        errors = () if self._errors is None else self._errors.take()
+        if extra or wrecked or removed or errors:
             found = (*snapshot.events.collisions, *extra)
-            events = replace(snapshot.events, collisions=found, wrecked=wrecked, wrecks_removed=removed)
+            about = {"wrecked": wrecked, "wrecks_removed": removed, "errors": errors}
+            events = replace(snapshot.events, collisions=found, **about)
             snapshot = replace(snapshot, events=events)
         return snapshot
 

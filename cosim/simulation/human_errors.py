@@ -1,0 +1,477 @@
+"""Lets human drivers and persons err: one trial per driver and second or per manoeuvre, drawn from hashes."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import libsumo
+import numpy as np
+
+from cosim.control import LANE_CHANGE_TIME
+from cosim.road import RoadMap
+from cosim.scenario.human_errors import KINDS, Errors, Span
+from cosim.seeding import subseed, uniform, uniforms
+from cosim.simulation.convert import PERSON, Body, may_change
+from cosim.simulation.drivers import Drivers
+from cosim.simulation.mobil import LEFT, RIGHT, route_allows
+from cosim.types import Collision, HumanError, Kind
+
+# SUMO's speed mode (Change_Vehicle_State): what an erring driver no longer heeds.
+SAFE_SPEED, MAX_ACCEL, MAX_DECEL, RIGHT_OF_WAY, RED_LIGHT = 1, 2, 4, 8, 16
+IGNORES_JUNCTION = 32  # also those who are inside the junction already
+BLIND = 0  # neither speed nor lane-change mode heeds anybody; its own lane changes are off
+
+FOLLOWING = 3.0  # s: at a shorter time headway a driver follows (HCM 2000, percent time-spent-following)
+MOVES = 1.0  # m/s: slower than that nobody errs by driving on
+SLOW = 3.0  # m/s, at most, of who waits at a line
+AT_LINE = 15.0  # m before the line within which it waits
+APPROACHES = 30.0  # m before the line within which it looks who has the right of way
+SEES_SIGNAL = 150.0  # m before the line
+LEAST_GAP = 1.0  # m, bumper to bumper, ahead and behind: less is beside, where nobody changes lanes
+WITHIN = 100.0  # m, in which others are looked for
+PASSES = 10.0  # s at most for driving through a junction
+HOLDS = 4.0  # s that a forced lane change may take
+REMEMBERED = 5.0  # s after its end in which an error still has a part in a collision
+
+# Kinds drawn every second for every driver; the others belong to a manoeuvre.
+EVERY_SECOND = ("inattention", "hard_braking", "cut_in", "aborted_cut_in", "stalled_car")
+IGNORE = {
+    "jmDriveAfterRedTime": ("1000", "-1"),
+    "jmIgnoreFoeProb": ("1", "0"),
+    "jmIgnoreFoeSpeed": ("100", "0"),
+}
+
+_sumo = libsumo._libsumo  # the compiled getters, as in cosim.simulation.convert
+lane_of, position_of, speed_of = (
+    _sumo.vehicle_getLaneID,
+    _sumo.vehicle_getLanePosition,
+    _sumo.vehicle_getSpeed,
+)
+
+
+@dataclass(slots=True)
+class Erring:
+    """One error under way, and what is given back when it ends."""
+
+    error: HumanError
+    modes: tuple[int, int] = (0, 0)  # speed mode and lane-change mode before
+    deceleration: float | None = None  # m/s2, of a driver who holds (0) or lowers its speed
+    swerves: tuple[float, int] | None = None  # s, when it changes back, and to which side
+    leaves: str = ""  # it ends when the vehicle has left this edge and the junction behind it
+
+
+class HumanErrors:
+    """The errors of one episode. `step`: of the simulation, s.
+
+    A trial holds a number hashed from (root seed, kind, who, second or manoeuvre) against the kind's rate, so
+    draws are equal under every policy. An error begins where it was drawn and can begin; whether it can
+    never depends on the draw. Nobody errs before `begin`: the warm-up is as without errors.
+    """
+
+    def __init__(self, errors: Errors, road: RoadMap, drivers: Drivers, seed: int, step: float) -> None:
+        self._kinds = {name: kind for name in KINDS if (kind := getattr(errors.kinds, name)) is not None}
+        self._road, self._drivers, self._seed, self._step = road, drivers, seed, step
+        self._every_second = [name for name in EVERY_SECOND if name in self._kinds]
+        self._rates = np.array([self._kinds[name].rate for name in self._every_second])  # [k]
+        self._streams: dict[str, Any] = {}  # HV on the road -> [k] its streams of draws
+        self._erring: dict[str, Erring] = {}
+        self._ended: dict[str, float] = {}  # who erred before -> s, when that ended
+        self._waited: dict[str, int] = {}  # HV -> s that it has waited for a gap
+        self._tried: set[tuple[str, str, str]] = set()  # manoeuvres: kind, HV, edge
+        self._wants: dict[tuple[str, str], tuple[int, float]] = {}  # route, lane -> `_needed_change`
+        self._happened: list[HumanError] = []
+        self._next: float | None = None  # s, of the next trials
+        lanes = road.lanes
+        self._gives_way = frozenset(lanes[k.origin].id for k in road.links if k.foes)
+        self._signals = frozenset(lanes[k.origin].id for k in road.links if k.signal >= 0)
+
+    # ---- what the simulator tells
+
+    def begin(self, now: float) -> None:
+        """The counted time begins: the first trials are a second later."""
+        self._next = now + 1.0
+
+    def depart(self, name: str, body: Body) -> None:
+        """A vehicle has departed."""
+        if body.kind == Kind.HV:
+            kinds = self._every_second
+            self._streams[name] = np.array([subseed(self._seed, "error", k, name) for k in kinds], np.uint64)
+
+    def drop(self, name: str) -> None:
+        """It has left the road, crashed, or is driven by somebody else from now on; it is left as it is."""
+        self._streams.pop(name, None)
+        self._waited.pop(name, None)
+        erring = self._erring.pop(name, None)
+        if erring is not None:
+            self._ended[name] = min(erring.error.until, libsumo.simulation.getTime())
+            self._drivers.resume(name)
+
+    def restore(self) -> None:
+        """End every error under way now; everybody drives as before it."""
+        for name in [*self._erring]:
+            self._end(name)
+
+    def step(self, now: float) -> None:
+        """After a simulation step that ended at `now` (s)."""
+        for name in [*self._erring]:
+            self._go_on(name, now)
+        if self._next is not None and now >= self._next - 1e-6:
+            self._next += 1.0
+            self._trials(now)
+
+    def take(self) -> tuple[HumanError, ...]:
+        """The errors that began since this was asked last."""
+        found = tuple(self._happened)
+        self._happened.clear()
+        return found
+
+    def attribute(self, collisions: Sequence[Collision]) -> list[Collision]:
+        """The same, each with `human_error_involved`: whether the collider, the victim, or the vehicle just
+        ahead of either is erring, or was so at most `REMEMBERED` s before."""
+        return [replace(c, human_error_involved=self._had_a_part(c)) for c in collisions]
+
+    # ---- trials
+
+    def _trials(self, now: float) -> None:
+        """Those of one second."""
+        second = round(now)
+        names = [*self._streams]
+        if names and self._every_second:
+            drawn = uniforms(np.array([*self._streams.values()]), second)  # [n,k]
+            for row, k in np.argwhere(drawn < self._rates).tolist():
+                self._try(self._every_second[k], names[row], self._rates[k], drawn[row, k], now)
+        if self._kinds.keys() & {"forced_entry", "failure_to_yield", "red_light"}:
+            for name in names:
+                self._manoeuvres(name, now)
+        if "step_out" in self._kinds and libsumo.person.getIDCount():
+            rate = self._kinds["step_out"].rate
+            for person in libsumo.person.getIDList():
+                if libsumo.person.getWaitingTime(person) > 0.0:
+                    who = PERSON + person
+                    self._try("step_out", who, rate, self._draw("step_out", who, f"{second}"), now)
+
+    def _try(self, kind: str, who: str, rate: float, drawn: float, now: float) -> None:
+        """One trial. Whether the error can begin is looked at only where that decides."""
+        if drawn < rate and who not in self._erring:
+            begun = getattr(self, f"_{kind}")(who, now)
+            if begun is not None:
+                self._erring[who] = begun
+                self._happened.append(begun.error)
+
+    def _draw(self, kind: str, who: str, *which: str) -> float:
+        """In [0, 1)."""
+        return uniform(self._seed, "error", kind, who, *which)
+
+    def _drawn(self, span: Span, kind: str, who: str, now: float, what: str) -> float:
+        """A magnitude of an error that begins now."""
+        low, high = span
+        return low + (high - low) * self._draw(kind, who, f"{round(now)}", what)
+
+    def _manoeuvres(self, name: str, now: float) -> None:
+        """Where it must give way, is at a signal, or its lane does not go on."""
+        lane = lane_of(name)
+        if not lane or lane[0] == ":":
+            self._waited.pop(name, None)
+            return
+        number = self._road.index.get(lane, -1)
+        if number < 0:
+            return
+        to_line = self._road.lanes[number].length - position_of(name)
+        edge = self._road.lanes[number].edge
+        gives_way = lane in self._gives_way
+        looks = gives_way and to_line < APPROACHES and "failure_to_yield" in self._kinds
+        if looks and self._yields(name):
+            self._once("failure_to_yield", name, edge, now)
+        if lane in self._signals and to_line < SEES_SIGNAL and "red_light" in self._kinds:
+            self._at_signal(name, edge, now)
+        if "forced_entry" in self._kinds:
+            waits = gives_way and to_line < AT_LINE and speed_of(name) < SLOW and self._yields(name)
+            self._waits(name, waits or self._at_end_of_lane(name, lane), now)
+
+    def _once(self, kind: str, name: str, manoeuvre: str, now: float) -> None:
+        """The one trial of a manoeuvre."""
+        trial = kind, name, manoeuvre
+        if trial not in self._tried:
+            self._tried.add(trial)
+            self._try(kind, name, self._kinds[kind].rate, self._draw(kind, name, manoeuvre), now)
+
+    def _waits(self, name: str, waits: bool, now: float) -> None:
+        """A forced entry becomes the likelier the longer it has waited."""
+        if not waits:
+            self._waited.pop(name, None)
+            return
+        waited = self._waited[name] = self._waited.get(name, 0) + 1
+        kind = self._kinds["forced_entry"]
+        rate = min(kind.rate * max(waited - kind.patience, 0.0), 1.0)
+        self._try("forced_entry", name, rate, self._draw("forced_entry", name, f"{round(now)}"), now)
+
+    def _at_signal(self, name: str, edge: str, now: float) -> None:
+        ahead = libsumo.vehicle.getNextTLS(name)
+        if not ahead or ahead[0][3] not in "yY":
+            return
+        light, _, away, _ = ahead[0]
+        red = libsumo.trafficlight.getNextSwitch(light)
+        arrives = now + away / max(speed_of(name), 0.1)
+        if red < arrives <= red + self._kinds["red_light"].late:
+            self._once("red_light", name, f"{edge}/{red:.1f}", now)
+
+    def _at_end_of_lane(self, name: str, lane: str) -> bool:
+        zone = self._kinds["forced_entry"].zone
+        return self._needed_change(name, lane)[0] != 0 and self._left(name, lane) < zone
+
+    def _needed_change(self, name: str, lane: str) -> tuple[int, float]:
+        """To which side its route wants it to change (0: it need not), and m that its lane serves it."""
+        key = libsumo.vehicle.getRouteID(name), lane
+        found = self._wants.get(key)
+        if found is None:
+            here = next((k for k in libsumo.vehicle.getBestLanes(name) if k[0] == lane), None)
+            offset, length = (0, math.inf) if here is None else (here[3], here[1])
+            found = self._wants[key] = (offset > 0) - (offset < 0), length
+        return found
+
+    def _left(self, name: str, lane: str) -> float:
+        """m until its lane serves its route no more."""
+        return self._needed_change(name, lane)[1] - position_of(name)
+
+    # ---- the kinds: what begins, None where it cannot
+
+    def _inattention(self, who: str, now: float) -> Erring | None:
+        leader = libsumo.vehicle.getLeader(who, WITHIN)
+        speed = speed_of(who)
+        if not leader or not leader[0] or speed < MOVES or leader[1] > FOLLOWING * speed:
+            return None
+        length = self._drawn(self._kinds["inattention"].duration, "inattention", who, now, "duration")
+        erring = self._begins("inattention", who, now, length, f"sees nobody for {length:.1f} s", leader[0])
+        self._take(who, erring, BLIND, BLIND)
+        erring.deceleration = 0.0
+        libsumo.vehicle.setSpeed(who, speed)
+        return erring
+
+    def _hard_braking(self, who: str, now: float) -> Erring | None:
+        kind = self._kinds["hard_braking"]
+        if speed_of(who) < MOVES:
+            return None
+        hard = self._drawn(kind.deceleration, "hard_braking", who, now, "deceleration")
+        length = self._drawn(kind.duration, "hard_braking", who, now, "duration")
+        what = f"brakes with {hard:.1f} m/s2 for {length:.1f} s for no reason"
+        erring = self._begins("hard_braking", who, now, length, what, _follower(who))
+        return self._slows(who, erring, hard)
+
+    def _stalled_car(self, who: str, now: float) -> Erring | None:
+        kind = self._kinds["stalled_car"]
+        speed = speed_of(who)
+        if speed < MOVES or lane_of(who).startswith(":"):
+            return None
+        slows = self._drawn(kind.deceleration, "stalled_car", who, now, "deceleration")
+        stands = self._drawn(kind.duration, "stalled_car", who, now, "duration")
+        erring = self._begins(
+            "stalled_car", who, now, speed / slows + stands, "stops in its lane", _follower(who)
+        )
+        return self._slows(who, erring, slows)
+
+    def _slows(self, who: str, erring: Erring, deceleration: float) -> Erring:
+        """It still sees its leader and the signals, and may brake harder for them."""
+        self._take(who, erring, libsumo.vehicle.getSpeedMode(who) & ~(MAX_ACCEL | MAX_DECEL), BLIND)
+        erring.deceleration = deceleration
+        return erring
+
+    def _cut_in(self, who: str, now: float, kind: str = "cut_in") -> Erring | None:
+        low, high = self._kinds[kind].deceleration
+        lane = lane_of(who)
+        if speed_of(who) < MOVES or self._changing(who) or not lane or lane[0] == ":":
+            return None
+        found = []
+        for side in (LEFT, RIGHT):
+            beside = self._beside(who, lane, side)
+            if beside is not None and low <= beside[0] <= high and route_allows(who, side):
+                found.append((*beside, side))
+        if not found:
+            return None
+        asked, whom, side = min(found)
+        again = kind == "aborted_cut_in"
+        length = (2 if again else 1) * LANE_CHANGE_TIME + self._step
+        what = f"cuts in before {whom}, who must brake with {asked:.1f} m/s2" + ", and swerves back" * again
+        erring = self._begins(kind, who, now, length, what, whom)
+        self._take(who, erring, None, BLIND)
+        if again:
+            erring.swerves = now + LANE_CHANGE_TIME, -side
+        libsumo.vehicle.changeLaneRelative(who, side, LANE_CHANGE_TIME)
+        return erring
+
+    def _aborted_cut_in(self, who: str, now: float) -> Erring | None:
+        return self._cut_in(who, now, "aborted_cut_in")
+
+    def _forced_entry(self, who: str, now: float) -> Erring | None:
+        most = self._kinds["forced_entry"].deceleration
+        lane, waited = lane_of(who), self._waited[who]
+        if self._at_end_of_lane(who, lane):
+            side, _ = self._needed_change(who, lane)
+            beside = None if self._changing(who) else self._beside(who, lane, side)
+            if beside is None or beside[0] > most:
+                return None
+            asked, whom = beside
+            what = f"forces its way in after {waited} s; {whom or 'nobody'} must brake with {asked:.1f} m/s2"
+            erring = self._begins("forced_entry", who, now, HOLDS, what, whom)
+            self._take(who, erring, None, BLIND)
+            libsumo.vehicle.changeLaneRelative(who, side, HOLDS)
+            return erring
+        met = self._foes(who)
+        if not met or met[0][0] > most:
+            return None
+        asked, whom = met[0]
+        what = f"forces its way in after {waited} s; {whom} must brake with {asked:.1f} m/s2"
+        return self._drives_on("forced_entry", who, now, RIGHT_OF_WAY, what, whom)
+
+    def _failure_to_yield(self, who: str, now: float) -> Erring | None:
+        met = self._foes(who)
+        whom = met[0][1] if met else ""
+        what = f"does not see {whom}, who has the right of way" if whom else "does not look who comes"
+        erring = self._drives_on("failure_to_yield", who, now, RIGHT_OF_WAY, what, whom)
+        libsumo.vehicle.setSpeedMode(who, libsumo.vehicle.getSpeedMode(who) | IGNORES_JUNCTION)
+        return erring
+
+    def _red_light(self, who: str, now: float) -> Erring | None:
+        return self._drives_on("red_light", who, now, RIGHT_OF_WAY | RED_LIGHT, "does not stop for red", "")
+
+    def _step_out(self, who: str, now: float) -> Erring | None:
+        person = who.removeprefix(PERSON)
+        length = self._drawn(self._kinds["step_out"].duration, "step_out", who, now, "duration")
+        erring = self._begins("step_out", who, now, length, "walks onto the crossing without waiting", "")
+        libsumo.person.setMinGap(person, libsumo.person.getMinGap(person))  # a type of its own
+        _ignores(person, True)
+        return erring
+
+    def _begins(self, kind: str, who: str, now: float, length: float, what: str, near: str) -> Erring:
+        return Erring(HumanError(now, who, kind, now + length, what, near))
+
+    def _drives_on(self, kind: str, who: str, now: float, ignored: int, what: str, near: str) -> Erring:
+        """Until it is through the junction ahead."""
+        erring = self._begins(kind, who, now, PASSES, what, near)
+        self._take(who, erring, libsumo.vehicle.getSpeedMode(who) & ~ignored, BLIND)
+        erring.leaves = libsumo.vehicle.getRoadID(who)
+        return erring
+
+    def _take(self, who: str, erring: Erring, speed_mode: int | None, lane_mode: int) -> None:
+        """Take the vehicle from its driver model as far as the error asks for it (None: not its speed)."""
+        vehicle = libsumo.vehicle
+        erring.modes = vehicle.getSpeedMode(who), vehicle.getLaneChangeMode(who)
+        if speed_mode is not None:
+            vehicle.setSpeedMode(who, speed_mode)
+        vehicle.setLaneChangeMode(who, lane_mode)
+        self._drivers.pause(who)
+
+    # ---- errors under way
+
+    def _go_on(self, name: str, now: float) -> None:
+        erring = self._erring[name]
+        over = now >= erring.error.until - 1e-6
+        if erring.leaves and not over:
+            edge = libsumo.vehicle.getRoadID(name)
+            over = bool(edge) and edge != erring.leaves and edge[0] != ":"
+        if over:
+            self._end(name)
+            return
+        if erring.deceleration:
+            speed = speed_of(name) - erring.deceleration * self._step
+            libsumo.vehicle.setSpeed(name, max(speed, 0.0))
+        if erring.swerves is not None and now >= erring.swerves[0] - 1e-6:
+            libsumo.vehicle.changeLaneRelative(name, erring.swerves[1], LANE_CHANGE_TIME)
+            erring.swerves = None
+
+    def _end(self, name: str) -> None:
+        """Give back what was taken."""
+        erring = self._erring.pop(name)
+        self._ended[name] = libsumo.simulation.getTime()
+        if erring.error.kind == "step_out":
+            person = name.removeprefix(PERSON)
+            if person in libsumo.person.getIDList():
+                _ignores(person, False)
+            return
+        if erring.deceleration is not None:
+            libsumo.vehicle.setSpeed(name, -1.0)
+        libsumo.vehicle.setSpeedMode(name, erring.modes[0])
+        libsumo.vehicle.setLaneChangeMode(name, erring.modes[1])
+        self._drivers.resume(name)
+
+    def _had_a_part(self, collision: Collision) -> bool:
+        now = collision.time
+        pair = [collision.collider, collision.victim]
+        ahead = [found[0] for name in pair if (found := _leader(name)) is not None]
+        return any(
+            who in self._erring or now - self._ended.get(who, -math.inf) <= REMEMBERED
+            for who in (*pair, *ahead)
+        )
+
+    # ---- what is around
+
+    def _changing(self, who: str) -> bool:
+        return bool(libsumo.vehicle.getLateralSpeed(who) != 0.0)
+
+    def _beside(self, who: str, lane: str, side: int) -> tuple[float, str] | None:
+        """What a change to that side asks of the follower there (m/s2), and who that is ("": nobody); None
+        where there is no such lane, or somebody in it beside."""
+        edge, _, index = lane.rpartition("_")
+        there = int(index) + side
+        if not 0 <= there < libsumo.edge.getLaneNumber(edge):
+            return None
+        if not may_change(lane, side, libsumo.vehicle.getVehicleClass(who)):
+            return None
+        bits = 0 if side == LEFT else 1  # of getNeighbors: bit 0 right, bit 1 ahead
+        behind, ahead = (
+            min(libsumo.vehicle.getNeighbors(who, bits | way), key=lambda v: v[1], default=None)
+            for way in (0, 2)
+        )
+        speed = speed_of(who)
+        if ahead is not None:
+            gap = ahead[1] + libsumo.vehicle.getMinGap(who)
+            if gap < LEAST_GAP or _asked(speed - speed_of(ahead[0]), gap) > self._most:
+                return None
+        if behind is None:
+            return 0.0, ""
+        gap = behind[1] + libsumo.vehicle.getMinGap(behind[0])
+        if gap < LEAST_GAP:
+            return None
+        return _asked(speed_of(behind[0]) - speed, gap), behind[0]
+
+    _most = 9.0  # m/s2, that nobody can exceed
+
+    def _yields(self, name: str) -> bool:
+        """Whether it must give way at the next line, and the signal there lets it go."""
+        links = libsumo.vehicle.getNextLinks(name)
+        return bool(links) and links[0][5] in "mswZ=go"
+
+    def _foes(self, who: str) -> list[tuple[float, str]]:
+        """Who has the right of way at the next line: the deceleration (m/s2) with which it can stop before
+        the conflict (inf for who is in it), and its id; who has to brake hardest first."""
+        vehicle, found = libsumo.vehicle, []
+        links = vehicle.getNextLinks(who)
+        for foe, _, to, _, beyond, via, _, goes_first, _ in vehicle.getJunctionFoes(who, WITHIN):
+            if goes_first and via == links[0][4] and beyond + vehicle.getLength(foe) > 0.0:
+                found.append((speed_of(foe) ** 2 / (2.0 * to) if to > 0.0 else math.inf, foe))
+        return sorted(found, reverse=True)
+
+
+def _asked(closing: float, gap: float) -> float:
+    """The deceleration (m/s2) with which a speed difference (m/s) is gone when a gap (m) is used up."""
+    return max(closing, 0.0) ** 2 / (2.0 * gap)
+
+
+def _follower(who: str) -> str:
+    found = libsumo.vehicle.getFollower(who, WITHIN)
+    return found[0] if found else ""
+
+
+def _leader(name: str) -> tuple[str, float] | None:
+    try:
+        found = libsumo.vehicle.getLeader(name, WITHIN)
+    except libsumo.TraCIException:  # a person, or it has left the road
+        return None
+    return found if found and found[0] else None
+
+
+def _ignores(person: str, ignores: bool) -> None:
+    """Signals and vehicles at crossings, by parameters of the type that is this person's alone."""
+    kind = libsumo.person.getTypeID(person)
+    for name, (on, off) in IGNORE.items():
+        libsumo.vehicletype.setParameter(kind, f"junctionModel.{name}", on if ignores else off)

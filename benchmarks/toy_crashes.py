@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cosim.scenario.tilt import Tilt
+from cosim.scenario.tilt import log_ratio as of_trial
 
 Array = npt.NDArray[np.float64]
 KINDS = ("inattention", "hard_braking", "stalled_car")
@@ -91,7 +92,7 @@ class Toy:
             begun = []
             for kind, p, can in zip(KINDS, self.rates, self.eligible(dense, inattentive), strict=True):
                 begins = rng.random(shape) < np.where(tilted, tilt.rate(kind, p), p)
-                ratio = np.where(begins, *(tilt.log_ratio(kind, p, b) for b in (True, False)))
+                ratio = np.where(begins, *(of_trial(p, tilt.rate(kind, p), b) for b in (True, False)))
                 log_ratio += np.where(live & can, ratio, 0.0)
                 begun.append(begins & can)
             crash = live & (rng.random(shape) < self.crash(dense, inattentive, begun))

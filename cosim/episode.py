@@ -255,12 +255,20 @@ class Episode:
             validity=self._validity(metrics),
             interventions_by_reason=dict(self._interventions.most_common()),
             errors_begun=tuple(self._errors),
+            tilt=self._tilt(),
             mission_vehicle=", ".join(self._missions) or None,
             mission_guessed=bool(self._missions) and self.scenario.mission.guessed,
             manifest=manifest(self.scenario, self.seed),
         )
 
     # ---- inside ----
+
+    def _tilt(self) -> dict[str, float | bool]:
+        tilt = self.scenario.tilt
+        if tilt is None:
+            return {}
+        log_ratio = self.simulator.log_ratio
+        return {"weight": tilt.weight(log_ratio), "log_ratio": log_ratio, "tilted": tilt.drawn(self.seed)}
 
     def _observe(self, frames: tuple[Snapshot, ...]) -> None:
         began = time.perf_counter()

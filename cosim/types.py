@@ -427,6 +427,10 @@ class Simulator(Protocol):
     def commanded(self, vehicle: str) -> tuple[float | None, int]:
         """Present target speed in m/s (None while uncommanded) and lane change under way (+1, 0, -1)."""
 
+    @property
+    def log_ratio(self) -> float:
+        """Of this episode's errors: log(q / p), 0 where none is tilted (docs/estimate.md)."""
+
     def counts(self) -> dict[str, int]:
         """Vehicles since the start: `inserted`, and `waiting` ones that found no room so far."""
 
@@ -499,6 +503,7 @@ class EpisodeResult(Identity):
     mission_guessed: bool = False  # nobody named it: its figures feed no gate
     interventions_by_reason: dict[str, int] = field(default_factory=dict)  # the most frequent first
     errors_begun: tuple[HumanError, ...] = ()
+    tilt: dict[str, float | bool] = field(default_factory=dict)  # by the names of `TILT`, of tilted errors
     manifest: dict[str, Any] = field(default_factory=dict)
 
     def value(self, name: str) -> float | int | bool | None:
@@ -511,6 +516,7 @@ class EpisodeResult(Identity):
             **{name: getattr(self, name) for name in IDENTITY},
             "steps": self.steps,
             **{name: getattr(self, name) for name in MISSION},
+            **self.tilt,
             **{name: _plain(metric.value) for name, metric in self.metrics.items()},
             "trace_hash": self.trace_hash,
             "timings": {name: round(value, 6) for name, value in self.timings.items()},

@@ -12,8 +12,8 @@ from cosim.scenario.episode_id import EpisodeId
 FIELD = "field"  # the level of human errors that is estimated unless another one is named
 
 EPILOG = """\
-Most episodes are drawn with errors made more frequent (the tilt), and weigh so much the less; docs/estimate.md.
-The run folder is one of `cosim evaluate`: cosim compare --fail-on 'crash_rate_per_million_km > 2' gates on it.
+Most episodes are drawn with errors made more frequent (the tilt), and weigh less: docs/estimate.md.
+`cosim compare A B --fail-on 'crash_rate_per_million_km > 2'` reads the folder as one of `cosim evaluate`.
 `--resume --out DIR --episodes N` lets a run go on to N episodes a cell.
 """
 
@@ -23,8 +23,8 @@ def add(commands: arguments.SubCommands) -> None:
     estimate = commands.add_parser(
         "estimate",
         help="estimate crashes per million km, by importance sampling",
-        description="Estimate crashes and near-misses per million km of every combination of what the flags or "
-        "SPEC.yaml name, with 95 % intervals, at the rates at which human drivers err.",
+        description="Estimate crashes and near-misses per million km of every combination of what the flags "
+        "or SPEC.yaml name, with 95 % intervals, at the rates at which human drivers err.",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -93,5 +93,8 @@ def _as_asked(case: EpisodeId, args: argparse.Namespace) -> EpisodeId:
         return replace(case, tilt=tilt.read(args.tilt).text())
     known = tilt.shipped(case.what) if case.errors == FIELD else None
     if known is None:
-        print(f"cosim: no tilt is known for {case.what} with these errors: they are drawn as they happen", file=sys.stderr)
+        print(
+            f"cosim: no tilt is known for {case.what} with these errors: they are drawn as they happen",
+            file=sys.stderr,
+        )
     return case if known is None else replace(case, tilt=known.text())

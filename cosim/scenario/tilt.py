@@ -5,13 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 
-from cosim.errors import BadInput
+import sumo_scenarios
+from cosim.errors import BadInput, one_of
+from cosim.files import yaml_input
+from cosim.scenario.human_errors import KINDS
 from cosim.seeding import uniform
 
 MOST = 0.5  # of a tilted probability: both outcomes of a trial stay likely
 UNTILTED = 0.1  # share of episodes that are drawn as errors happen: no episode weighs more than 1 / UNTILTED
-_SHARE = "untilted"
+ALL = "all"  # kinds that are not named
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,19 +26,20 @@ class Tilt:
     JASA 95 (2000) 135-143): docs/estimate.md.
     """
 
-    factors: Mapping[str, float] = field(default_factory=dict)  # kind -> factor, 1 or more
+    factors: Mapping[str, float] = field(default_factory=dict)  # kind, or all -> of errors that meet an AV
+    others: float = 1.0  # factor of all other errors near an AV
     untilted: float = UNTILTED
 
-    def rate(self, kind: str, p: float) -> float:
-        """q, the tilted probability of a trial whose probability is p."""
-        return max(p, min(p * self.factors.get(kind, 1.0), MOST))
+    def raises(self, kind: str) -> bool:
+        """Whether any trial of this kind is tilted."""
+        return max(self._factor(kind), self.others) > 1.0
 
-    def log_ratio(self, kind: str, p: float, begins: bool) -> float:
-        """What one trial adds to log(q / p) of its episode: the logarithm of q/p or of (1-q)/(1-p)."""
-        q = self.rate(kind, p)
-        if q == p:
-            return 0.0
-        return math.log(q / p) if begins else math.log1p(-q) - math.log1p(-p)
+    def rate(self, kind: str, p: float, meets_av: bool = True) -> float:
+        """q, the tilted probability of a trial whose probability is p."""
+        return max(p, min(p * (self._factor(kind) if meets_av else self.others), MOST))
+
+    def _factor(self, kind: str) -> float:
+        return self.factors.get(kind, self.factors.get(ALL, 1.0))
 
     def drawn(self, seed: int) -> bool:
         """Whether the episode of this seed is drawn from the tilted probabilities."""
@@ -46,8 +51,15 @@ class Tilt:
 
     def text(self) -> str:
         """`cut_in=300,forced_entry=30,untilted=0.1`; `read` is the way back."""
-        named = [*sorted(self.factors.items()), (_SHARE, self.untilted)]
+        named = [*sorted(self.factors.items()), ("others", self.others), ("untilted", self.untilted)]
         return ",".join(f"{name}={value:g}" for name, value in named)
+
+
+def log_ratio(p: float, q: float, begins: bool) -> float:
+    """What one trial adds to log(q / p) of its episode: the logarithm of q/p or of (1-q)/(1-p)."""
+    if q == p:
+        return 0.0
+    return math.log(q / p) if begins else math.log1p(-q) - math.log1p(-p)
 
 
 def read(text: str, where: str = "--tilt") -> Tilt:
@@ -62,10 +74,19 @@ def read(text: str, where: str = "--tilt") -> Tilt:
         if not math.isfinite(factors[name.strip()]):
             problem = "write KIND=FACTOR,... as in cut_in=100,forced_entry=30,untilted=0.1"
             raise BadInput(problem, field=where, value=part)
-    share = factors.pop(_SHARE, UNTILTED)
+    share = factors.pop("untilted", UNTILTED)
     if not 0.0 < share <= 1.0:
-        raise BadInput("must be above 0 and at most 1", field=f"{where}.{_SHARE}", value=share)
+        raise BadInput("must be above 0 and at most 1", field=f"{where}.untilted", value=share)
     for name, factor in factors.items():
+        one_of(name, (*KINDS, ALL, "others"), where)
         if factor < 1.0:
             raise BadInput("must be 1 or more", field=f"{where}.{name}", value=factor)
-    return Tilt(dict(sorted(factors.items())), share)
+    others = factors.pop("others", 1.0)
+    return Tilt(dict(sorted(factors.items())), others, share)
+
+
+@lru_cache
+def shipped(world: str) -> Tilt | None:
+    """The tilt of the level `field` in a world that ships; None where none was made."""
+    found = yaml_input.document(sumo_scenarios.TILTS).get(world)
+    return None if found is None else read(str(found["tilt"]), world)

@@ -1,7 +1,7 @@
 """Lets human drivers and persons err: one trial per driver and second or per manoeuvre, drawn from hashes."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 from cosim.control import LANE_CHANGE_TIME
 from cosim.road import RoadMap
 from cosim.scenario.human_errors import KINDS, Errors, Span
+from cosim.scenario.tilt import Tilt, log_ratio
 from cosim.seeding import subseed, uniform, uniforms
 from cosim.simulation.convert import PERSON, Body, may_change
 from cosim.simulation.drivers import Drivers
@@ -32,6 +33,8 @@ LEAST_GAP = 1.0  # m, bumper to bumper, ahead and behind: less is beside, where 
 WITHIN = 100.0  # m, in which others are looked for
 PASSES = 10.0  # s at most for driving through a junction
 HOLDS = 4.0  # s that a forced lane change may take
+NEAR = 60.0  # m: within that of an AV errors may be tilted
+MEET_ANYBODY = ("red_light", "step_out")  # kinds of which nobody knows before whom they meet
 REMEMBERED = 5.0  # s after its end in which an error still has a part in a collision
 
 # Kinds drawn every second for every driver; the others belong to a manoeuvre.
@@ -48,6 +51,10 @@ lane_of, position_of, speed_of = (
     _sumo.vehicle_getLanePosition,
     _sumo.vehicle_getSpeed,
 )
+
+
+# A trial whose error can begin yields whom it would meet ("": nobody); resumed, it begins.
+Trial = Generator[str, None, "Erring"]
 
 
 @dataclass(slots=True)
@@ -69,11 +76,23 @@ class HumanErrors:
     never depends on the draw. Nobody errs before `begin`: the warm-up is as without errors.
     """
 
-    def __init__(self, errors: Errors, road: RoadMap, drivers: Drivers, seed: int, step: float) -> None:
+    def __init__(
+        self, errors: Errors, road: RoadMap, drivers: Drivers, seed: int, step: float, tilt: Tilt | None
+    ) -> None:
         self._kinds = {name: kind for name in KINDS if (kind := getattr(errors.kinds, name)) is not None}
         self._road, self._drivers, self._seed, self._step = road, drivers, seed, step
         self._every_second = [name for name in EVERY_SECOND if name in self._kinds]
         self._rates = np.array([self._kinds[name].rate for name in self._every_second])  # [k]
+        self._tilt = tilt
+        self._tilted = tilt is not None and tilt.drawn(seed)
+        self._raised = np.array(
+            [tilt is not None and tilt.raises(k) for k in self._every_second], bool
+        )  # [k]
+        self.log_ratio = (
+            0.0  # of the trials so far: the probability drawn tilted over that drawn as it happens
+        )
+        self._avs: set[str] = set()
+        self._near: frozenset[str] = frozenset()  # whose trials are weighed
         self._streams: dict[str, Any] = {}  # HV on the road -> [k] its streams of draws
         self._erring: dict[str, Erring] = {}
         self._ended: dict[str, float] = {}  # who erred before -> s, when that ended
@@ -94,12 +113,15 @@ class HumanErrors:
 
     def depart(self, name: str, body: Body) -> None:
         """A vehicle has departed."""
+        if body.kind == Kind.AV:
+            self._avs.add(name)
         if body.kind == Kind.HV:
             kinds = self._every_second
             self._streams[name] = np.array([subseed(self._seed, "error", k, name) for k in kinds], np.uint64)
 
     def drop(self, name: str) -> None:
         """It has left the road, crashed, or is driven by somebody else from now on; it is left as it is."""
+        self._avs.discard(name)
         self._streams.pop(name, None)
         self._waited.pop(name, None)
         erring = self._erring.pop(name, None)
@@ -137,9 +159,13 @@ class HumanErrors:
         """Those of one second."""
         second = round(now)
         names = [*self._streams]
+        self._near = frozenset() if self._tilt is None else self._beside_avs(names)
         if names and self._every_second:
             drawn = uniforms(np.array([*self._streams.values()]), second)  # [n,k]
-            for row, k in np.argwhere(drawn < self._rates).tolist():
+            looked_at = drawn < self._rates
+            if self._near:
+                looked_at |= np.outer([name in self._near for name in names], self._raised)
+            for row, k in np.argwhere(looked_at).tolist():
                 self._try(self._every_second[k], names[row], self._rates[k], drawn[row, k], now)
         if self._kinds.keys() & {"forced_entry", "failure_to_yield", "red_light"}:
             for name in names:
@@ -153,11 +179,36 @@ class HumanErrors:
 
     def _try(self, kind: str, who: str, rate: float, drawn: float, now: float) -> None:
         """One trial. Whether the error can begin is looked at only where that decides."""
-        if drawn < rate and who not in self._erring:
-            begun = getattr(self, f"_{kind}")(who, now)
-            if begun is not None:
-                self._erring[who] = begun
-                self._happened.append(begun.error)
+        weighed = who in self._near
+        if not (drawn < rate or weighed) or who in self._erring:
+            return
+        trial: Trial = getattr(self, f"_{kind}")(who, now)
+        whom = next(trial, None)
+        if whom is None or not drawn < (self._weighed(kind, rate, drawn, whom) if weighed else rate):
+            return
+        try:
+            next(trial)
+        except StopIteration as begun:
+            self._erring[who] = begun.value
+            self._happened.append(begun.value.error)
+
+    def _weighed(self, kind: str, p: float, drawn: float, whom: str) -> float:
+        """The probability that holds for a trial near an AV; the episode's `log_ratio` takes it in."""
+        assert self._tilt is not None
+        q = self._tilt.rate(kind, p, whom in self._avs or kind in MEET_ANYBODY)
+        held = q if self._tilted else p
+        self.log_ratio += log_ratio(p, q, drawn < held)
+        return held
+
+    def _beside_avs(self, names: Sequence[str]) -> frozenset[str]:
+        """Those who drive within `NEAR` of an AV, and persons: their errors may be tilted."""
+        if not self._avs:
+            return frozenset()
+        avs, places = (np.array([libsumo.vehicle.getPosition(n) for n in k]) for k in (self._avs, names))
+        if not len(places):
+            return frozenset()
+        away = np.abs(places[:, None] - avs).max(2).min(1)  # m, the larger of both coordinates
+        return frozenset(name for name, m in zip(names, away, strict=True) if m < NEAR)
 
     def _draw(self, kind: str, who: str, *which: str) -> float:
         """In [0, 1)."""
@@ -234,13 +285,14 @@ class HumanErrors:
         """m until its lane serves its route no more."""
         return self._needed_change(name, lane)[1] - position_of(name)
 
-    # ---- the kinds: what begins, None where it cannot
+    # ---- the kinds: each yields whom it would meet where it can begin, and begins when it is resumed
 
-    def _inattention(self, who: str, now: float) -> Erring | None:
+    def _inattention(self, who: str, now: float) -> Trial:
         leader = libsumo.vehicle.getLeader(who, WITHIN)
         speed = speed_of(who)
         if not leader or not leader[0] or speed < MOVES or leader[1] > FOLLOWING * speed:
             return None
+        yield leader[0]
         length = self._drawn(self._kinds["inattention"].duration, "inattention", who, now, "duration")
         erring = self._begins("inattention", who, now, length, f"sees nobody for {length:.1f} s", leader[0])
         self._take(who, erring, BLIND, BLIND)
@@ -248,26 +300,28 @@ class HumanErrors:
         libsumo.vehicle.setSpeed(who, speed)
         return erring
 
-    def _hard_braking(self, who: str, now: float) -> Erring | None:
+    def _hard_braking(self, who: str, now: float) -> Trial:
         kind = self._kinds["hard_braking"]
         if speed_of(who) < MOVES:
             return None
+        follower = _follower(who)
+        yield follower
         hard = self._drawn(kind.deceleration, "hard_braking", who, now, "deceleration")
         length = self._drawn(kind.duration, "hard_braking", who, now, "duration")
         what = f"brakes with {hard:.1f} m/s2 for {length:.1f} s for no reason"
-        erring = self._begins("hard_braking", who, now, length, what, _follower(who))
+        erring = self._begins("hard_braking", who, now, length, what, follower)
         return self._slows(who, erring, hard)
 
-    def _stalled_car(self, who: str, now: float) -> Erring | None:
+    def _stalled_car(self, who: str, now: float) -> Trial:
         kind = self._kinds["stalled_car"]
         speed = speed_of(who)
         if speed < MOVES or lane_of(who).startswith(":"):
             return None
+        follower = _follower(who)
+        yield follower
         slows = self._drawn(kind.deceleration, "stalled_car", who, now, "deceleration")
         stands = self._drawn(kind.duration, "stalled_car", who, now, "duration")
-        erring = self._begins(
-            "stalled_car", who, now, speed / slows + stands, "stops in its lane", _follower(who)
-        )
+        erring = self._begins("stalled_car", who, now, speed / slows + stands, "stops in its lane", follower)
         return self._slows(who, erring, slows)
 
     def _slows(self, who: str, erring: Erring, deceleration: float) -> Erring:
@@ -276,7 +330,7 @@ class HumanErrors:
         erring.deceleration = deceleration
         return erring
 
-    def _cut_in(self, who: str, now: float, kind: str = "cut_in") -> Erring | None:
+    def _cut_in(self, who: str, now: float, kind: str = "cut_in") -> Trial:
         low, high = self._kinds[kind].deceleration
         lane = lane_of(who)
         if speed_of(who) < MOVES or self._changing(who) or not lane or lane[0] == ":":
@@ -289,6 +343,7 @@ class HumanErrors:
         if not found:
             return None
         asked, whom, side = min(found)
+        yield whom
         again = kind == "aborted_cut_in"
         length = (2 if again else 1) * LANE_CHANGE_TIME + self._step
         what = f"cuts in before {whom}, who must brake with {asked:.1f} m/s2" + ", and swerves back" * again
@@ -299,10 +354,10 @@ class HumanErrors:
         libsumo.vehicle.changeLaneRelative(who, side, LANE_CHANGE_TIME)
         return erring
 
-    def _aborted_cut_in(self, who: str, now: float) -> Erring | None:
+    def _aborted_cut_in(self, who: str, now: float) -> Trial:
         return self._cut_in(who, now, "aborted_cut_in")
 
-    def _forced_entry(self, who: str, now: float) -> Erring | None:
+    def _forced_entry(self, who: str, now: float) -> Trial:
         most = self._kinds["forced_entry"].deceleration
         lane, waited = lane_of(who), self._waited[who]
         if self._at_end_of_lane(who, lane):
@@ -311,6 +366,7 @@ class HumanErrors:
             if beside is None or beside[0] > most:
                 return None
             asked, whom = beside
+            yield whom
             what = f"forces its way in after {waited} s; {whom or 'nobody'} must brake with {asked:.1f} m/s2"
             erring = self._begins("forced_entry", who, now, HOLDS, what, whom)
             self._take(who, erring, None, BLIND)
@@ -320,21 +376,25 @@ class HumanErrors:
         if not met or met[0][0] > most:
             return None
         asked, whom = met[0]
+        yield whom
         what = f"forces its way in after {waited} s; {whom} must brake with {asked:.1f} m/s2"
         return self._drives_on("forced_entry", who, now, RIGHT_OF_WAY, what, whom)
 
-    def _failure_to_yield(self, who: str, now: float) -> Erring | None:
+    def _failure_to_yield(self, who: str, now: float) -> Trial:
         met = self._foes(who)
         whom = met[0][1] if met else ""
+        yield whom
         what = f"does not see {whom}, who has the right of way" if whom else "does not look who comes"
         erring = self._drives_on("failure_to_yield", who, now, RIGHT_OF_WAY, what, whom)
         libsumo.vehicle.setSpeedMode(who, libsumo.vehicle.getSpeedMode(who) | IGNORES_JUNCTION)
         return erring
 
-    def _red_light(self, who: str, now: float) -> Erring | None:
+    def _red_light(self, who: str, now: float) -> Trial:
+        yield ""
         return self._drives_on("red_light", who, now, RIGHT_OF_WAY | RED_LIGHT, "does not stop for red", "")
 
-    def _step_out(self, who: str, now: float) -> Erring | None:
+    def _step_out(self, who: str, now: float) -> Trial:
+        yield ""
         person = who.removeprefix(PERSON)
         length = self._drawn(self._kinds["step_out"].duration, "step_out", who, now, "duration")
         erring = self._begins("step_out", who, now, length, "walks onto the crossing without waiting", "")

@@ -84,13 +84,13 @@ def test_the_mean_weight_is_one() -> None:
 
 def test_a_tilt_is_written_as_it_is_read() -> None:
     found = tilt.read("hard_braking=30, cut_in=300")
-    assert found.text() == "cut_in=300,hard_braking=30,untilted=0.1"
+    assert found.text() == "cut_in=300,hard_braking=30,others=1,untilted=0.1"
     assert tilt.read(found.text()) == found
     assert found.rate("cut_in", 1e-4) == pytest.approx(0.03)
     assert found.rate("cut_in", 0.1) == 0.5  # no trial becomes certain
     assert found.rate("cut_in", 0.7) == 0.7
     assert found.rate("red_light", 0.1) == 0.1
-    assert found.log_ratio("red_light", 0.1, True) == 0.0
+    assert tilt.log_ratio(0.1, 0.1, True) == 0.0
 
 
 @pytest.mark.parametrize("text", ["cut_in", "cut_in=many", "cut_in=0.5", "untilted=0", "cut_in=nan"])

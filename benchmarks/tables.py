@@ -18,7 +18,7 @@ from cosim.report.compare import Compared, PairedFigure
 from cosim.report.figures import Measure, Row
 from cosim.report.run_folder import Run
 from cosim.report.statistics import NA, Figure
-from cosim.report.summary import mean_document, not_comparable, rate_document
+from cosim.report.summary import incidence_document, mean_document, not_comparable, rate_document
 from cosim.workers.tasks import OK
 
 HEADS = {
@@ -57,7 +57,8 @@ class Line(NamedTuple):
 def found(rows: Sequence[Row], measure: Measure) -> tuple[Figure, dict[str, Any]]:
     """A measure over the episodes that came through, and its counts: `n`, `na`, `hits` of a rate."""
     ok = [row for row in rows if row["status"] == OK]
-    counts = rate_document(measure, ok) if measure.is_rate else mean_document(measure, ok)
+    document = rate_document if measure.is_rate else incidence_document if measure.per else mean_document
+    counts = document(measure, ok)
     bounds = (counts[name] for name in ("value", "low", "high"))
     return Figure(*(math.nan if x is None else x for x in bounds)), counts
 

@@ -14,8 +14,10 @@ from cosim.workers.tasks import Outcome
 FIRST = ("key", "cell", "status", *IDENTITY)  # in every table; then the order of `cosim run --json`
 LAST = ("error", "stderr", "attempts")
 _NESTED = ("units", "better", "manifest")  # the same for all episodes of a cell: kept once, in the manifest
-_AS_TEXT = ("timings", "collision_list", "not_comparable_because", "interventions_by_reason")
-_AS_TEXT += ("human_errors_by_kind", "human_error_list")
+_AS_TEXT = (
+    *("timings", "collision_list", "not_comparable_because"),
+    *("interventions_by_reason", "human_errors_by_kind", "human_error_list"),
+)
 
 
 def row(cell: Cell, case: EpisodeId, outcome: Outcome) -> dict[str, Any]:

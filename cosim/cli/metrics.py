@@ -60,7 +60,7 @@ def work(args: argparse.Namespace) -> int:
     from cosim.fcd.vehicle_types import read_sizes
     from cosim.files import cannot, write_csv
     from cosim.files.xml_input import regular_file
-    from cosim.metrics.time_to_collision import CRITICAL
+    from cosim.metrics.context import CRITICAL
     from cosim.report.result import figure
     from cosim.workers.progress import Progress
 

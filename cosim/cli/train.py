@@ -30,6 +30,7 @@ def add(commands: arguments.SubCommands) -> None:
     )
     arguments.add(train, "--reward", help="learn from this: p, t, or your own (default: the file's)")
     arguments.add(train, "--metric", action="append", default=[])
+    arguments.add(train, "--errors")
     train.add_argument("--iterations", type=arguments.count, metavar="N", help="instead of the file's")
     arguments.add(train, "--seed", help="of everything; instead of the file's")
     arguments.add(train, "--resume")

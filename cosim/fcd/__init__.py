@@ -22,7 +22,7 @@ from cosim.road import Lane, RoadMap
 from cosim.simulation.conventions import centres, type_names
 from cosim.types import Kind, Metric, Snapshot, Timing
 
-FIGURES = ("time_to_collision", "post_encroachment", "drac", "hard_braking", "jerk", "headway")
+FIGURES = ("time_to_collision", "post_encroachment", "drac", "hard_braking", "jerk", "headway", "exposure")
 CONFLICTS = ("time_to_collision", "drac")  # figures of single frames, which a jump would make up
 SIDEWAYS = 2.5  # m/s: nobody moves faster to the side, but for SUMO's lane changes that take no time
 STRAIGHT = math.radians(5.0)  # who turns less has not come to the side by a bend

@@ -14,13 +14,12 @@ from cosim.geometry import (
     post_encroachment_time,
     time_to_collision,
 )
-from cosim.metrics.context import watched
+from cosim.metrics.context import CRITICAL, watched
+from cosim.metrics.near_misses import APART
 from cosim.metrics.post_encroachment import LONGEST
-from cosim.metrics.time_to_collision import CRITICAL
 from cosim.road import RoadMap
 from cosim.types import Snapshot
 
-APART = 1.0  # s without a critical frame: what follows is another encounter
 STEPS = 3  # lanes followed ahead to see whether two ways become one
 ALIGNED, ONCOMING = math.radians(15.0), math.radians(135.0)  # as in PET and DRAC
 

@@ -113,32 +113,41 @@ def deceleration_to_avoid_crash(a: Boxes, b: Boxes) -> Floats:
 
 
 class Conflicts(NamedTuple):
-    """The worst conflict of each watched vehicle with any other, at one moment; k watched vehicles."""
+    """The conflicts of one moment: the worst of each of k watched vehicles, and the grave ones of all."""
 
     rows: Ints  # [k]
     time_to_collision: Floats  # [k] s, the smallest; the horizon when there is none
     deceleration: Floats  # [k] m/s2, the largest finite DRAC; 0 without a conflict or when overlapping only
+    soon: Ints  # [p,2] rows of the pairs, watched or not, with a time to collision above 0 and below `soon`
+    hard: Ints  # [q,2] rows of those with a finite DRAC above `hard`, the lower row first
 
 
 def conflicts(
-    all_boxes: Boxes, watched: Bools, horizon: float = 10.0, roads: tuple[Ints, Bools] | None = None
+    all_boxes: Boxes,
+    watched: Bools,
+    horizon: float = 10.0,
+    roads: tuple[Ints, Bools] | None = None,
+    *,
+    soon: float = 0.0,
+    hard: float = INF,
 ) -> Conflicts:
-    """Conflicts of the watched vehicles with any of the n.
+    """Conflicts of the n vehicles with one another.
 
     The same as `time_to_collision` and `deceleration_to_avoid_crash` over all pairs, in one pass.
 
     Args:
         all_boxes: n boxes, each field [n].
-        watched: [n] which vehicles' conflicts are wanted.
+        watched: [n] whose worst conflicts are wanted.
         horizon: s, how far ahead.
         roads: each vehicle's road [n] and which roads can touch [S,S] (`cosim.road.contact`); None: all can.
+        soon: s, of the time to collision.
+        hard: m/s2, of the DRAC.
     """
     x, y, heading, length, width, speed = (np.asarray(v, dtype=np.float64) for v in all_boxes)
     number, touch = (np.zeros(len(x), np.int64), EVERYWHERE) if roads is None else roads
+    course = x, y, heading, length, width, speed
     return Conflicts(
-        *kernels.watched_conflicts(
-            x, y, heading, length, width, speed, watched, float(horizon), number, touch
-        )
+        *kernels.conflicts(*course, watched, float(horizon), number, touch, float(soon), float(hard))
     )
 
 
@@ -198,7 +207,7 @@ def post_encroachment_time(a: Boxes, b: Boxes, interval: float, longest: float =
     for t in range(1, len(trail)):
         window = trail[max(0, t - back) : t + 1]
         best = min(
-            best, float(encroachment(window, len(window) - 1, 2, sizes, relevant, interval, EVERYWHERE))
+            best, float(encroachment(window, len(window) - 1, 2, sizes, relevant, interval, EVERYWHERE)[0])
         )
     return best if best <= longest else INF
 

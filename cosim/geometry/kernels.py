@@ -253,7 +253,15 @@ def first_contacts(
 
 
 @compiled
-def watched_conflicts(
+def _table_of(pairs: list[tuple[int, int]]) -> Ints:
+    table = np.empty((len(pairs), 2), np.int64)
+    for k in range(len(pairs)):
+        table[k, 0], table[k, 1] = pairs[k]
+    return table
+
+
+@compiled
+def conflicts(
     x: Floats,
     y: Floats,
     heading: Floats,
@@ -264,25 +272,45 @@ def watched_conflicts(
     horizon: float,
     number: Ints,
     touch: Bools,
-) -> tuple[Ints, Floats, Floats]:
+    soon: float,
+    hard: float,
+) -> tuple[Ints, Floats, Floats, Ints, Ints]:
     """See `cosim.geometry.conflicts`."""
     n = len(x)
     cosine, sine = np.cos(heading), np.sin(heading)
     nearest, hardest = np.full(n, horizon), np.zeros(n)
-    rows = np.flatnonzero(watched)
-    for i in rows:
-        a = (x[i], y[i], cosine[i], sine[i], length[i], width[i], speed[i])
-        for j in range(n):
-            if j == i or (j < i and watched[j]) or not touch[number[i], number[j]]:
-                continue  # both watched: done when it was j's turn
+    near, braking = [(0, 0) for _ in range(0)], [(0, 0) for _ in range(0)]
+    fastest, largest = 0.0, 0.0  # m/s, m
+    for i in range(n):
+        fastest, largest = max(fastest, abs(speed[i])), max(largest, length[i] + width[i])
+    reach = largest + 2.0 * fastest * horizon  # m, nobody further away can be met
+    order = np.argsort(x)
+    for k in range(n):
+        for other in order[k + 1 :]:
+            i, j = min(order[k], other), max(order[k], other)
+            if x[other] - x[order[k]] > reach:
+                break
+            if not touch[number[i], number[j]]:
+                continue
+            if watched[j] and not watched[i]:
+                i, j = j, i
+            a = (x[i], y[i], cosine[i], sine[i], length[i], width[i], speed[i])
             b = (x[j], y[j], cosine[j], sine[j], length[j], width[j], speed[j])
             ttc = _ttc(a, b, horizon)
-            if ttc < horizon:
-                needed = _drac(a, b) if ttc > 0.0 else 0.0
-                needed = needed if needed < np.inf else 0.0
-                nearest[i], hardest[i] = min(nearest[i], ttc), max(hardest[i], needed)
-                nearest[j], hardest[j] = min(nearest[j], ttc), max(hardest[j], needed)
-    return rows, nearest[rows], hardest[rows]
+            if not 0.0 < ttc < horizon:
+                if ttc <= 0.0:
+                    nearest[i] = nearest[j] = 0.0
+                continue
+            needed = _drac(a, b)
+            needed = needed if needed < np.inf else 0.0
+            nearest[i], hardest[i] = min(nearest[i], ttc), max(hardest[i], needed)
+            nearest[j], hardest[j] = min(nearest[j], ttc), max(hardest[j], needed)
+            if ttc < soon:
+                near.append((min(i, j), max(i, j)))
+            if needed > hard:
+                braking.append((min(i, j), max(i, j)))
+    rows = np.flatnonzero(watched)
+    return rows, nearest[rows], hardest[rows], _table_of(near), _table_of(braking)
 
 
 @compiled
@@ -440,13 +468,14 @@ def record(
 
 @compiled
 def _lag(
-    trail: Floats, newest: int, a: int, b: int, sizes: Floats, interval: float, touch: Bools
+    trail: Floats, newest: int, a: int, b: int, sizes: Floats, interval: float, touch: Bools, back: int
 ) -> float:
-    """Post-encroachment time (s, inf for none) of b, now, after a, as in `encroachment`."""
+    """Post-encroachment time (s, inf for none) of b, now, after a up to `back` frames ago, as in
+    `encroachment`."""
     frames = trail.shape[0]
     x, y, c, s, v, road = trail[newest, b]
     now = (x, y, c, s, sizes[b, 0], sizes[b, 1], v)
-    for age in range(1, frames):
+    for age in range(1, min(back + 1, frames)):
         k = (newest - age) % frames
         if np.isnan(trail[k, a, 0]) or trail[k, a, 2] * c + trail[k, a, 3] * s > FOLLOWING_COSINE:
             continue
@@ -470,14 +499,22 @@ def _lag(
 
 @compiled
 def encroachment(
-    trail: Floats, newest: int, m: int, sizes: Floats, relevant: Bools, interval: float, touch: Bools
-) -> float:
-    """Smallest post-encroachment time (s, inf for none) that ends at the newest frame of a ring of frames.
+    trail: Floats,
+    newest: int,
+    m: int,
+    sizes: Floats,
+    relevant: Bools,
+    interval: float,
+    touch: Bools,
+    soon: float = 0.0,
+) -> tuple[float, Ints]:
+    """Smallest post-encroachment time (s, inf for none) that ends at the newest frame of a ring of frames,
+    and [p,2] every pair, relevant or not, the one who came first first, whose own is below `soon` s.
 
     trail [K,>=m,6] of the first m vehicles (x m, y m, cos heading, sin heading, speed m/s, number of the
     road; NaN while absent), `newest` its newest frame, the frame after it (cyclically) the oldest; sizes
-    [>=m,2] length and width in m; pairs without a `relevant` [>=m] vehicle are left out, and those whose
-    roads do not `touch` [S,S]; `interval` s between frames. See `post_encroachment_time`.
+    [>=m,2] length and width in m; the smallest is over pairs with a `relevant` [>=m] vehicle; pairs whose
+    roads do not `touch` [S,S] have none; `interval` s between frames. See `post_encroachment_time`.
     """
     bounds, course = _trail_bounds(trail, newest, m)
     present = np.flatnonzero(~np.isnan(trail[newest, :m, 0]))
@@ -487,7 +524,8 @@ def encroachment(
     largest = 0.0  # m, a box's reach from its centre
     for a in range(m):
         largest = max(largest, 0.5 * (sizes[a, 0] + sizes[a, 1]))
-    best = np.inf
+    best, near = np.inf, [(0, 0) for _ in range(0)]
+    recent = int(np.ceil(soon / interval)) + 1
     for a in range(m):
         if not bounds[a, 0] <= bounds[a, 1]:
             continue  # it was not there before
@@ -498,7 +536,8 @@ def encroachment(
         high = _cell(bounds[a, 3] + margin - south, side, lines)
         for line in range(low, high + 1):
             for b in order[begin[line * columns + left] : begin[line * columns + right + 1]]:
-                if a == b or not (relevant[a] or relevant[b]):
+                counts = relevant[a] or relevant[b]
+                if a == b or not (counts or soon > 0.0):
                     continue
                 x, y, c, s = trail[newest, b, :4]
                 if course[a, 0] * c + course[a, 1] * s > _SAME_COURSE_COSINE:
@@ -507,6 +546,11 @@ def encroachment(
                 beside = x < bounds[a, 0] - reach or x > bounds[a, 1] + reach
                 if beside or y < bounds[a, 2] - reach or y > bounds[a, 3] + reach:
                     continue
-                lag = _lag(trail, newest, a, b, sizes, interval, touch)
-                best = min(best, lag)
-    return best
+                lag = _lag(
+                    trail, newest, a, b, sizes, interval, touch, trail.shape[0] if counts else recent
+                )
+                if counts:
+                    best = min(best, lag)
+                if lag < soon:
+                    near.append((a, b))
+    return best, _table_of(near)

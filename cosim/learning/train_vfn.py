@@ -15,7 +15,7 @@ from cosim.learning.configuration import configuration
 from cosim.learning.rollouts import Rollouts
 from cosim.metrics import read as read_metric
 from cosim.rewards import read as read_reward
-from cosim.scenario import load, place
+from cosim.scenario import human_errors, load, place
 from cosim.scenario.manifest import digests
 from cosim.scenario.policy_name import BEST
 from cosim.workers.memory import keep_freed_memory
@@ -92,8 +92,11 @@ def _scheduled(training: VfnTraining, args: argparse.Namespace, name: str) -> Vf
         read_reward(reward)
     for metric in metrics:
         read_metric(metric)
-    own = tuple(" ".join(item) for item in digests(code.files_of([*metrics, reward])).items())
-    training = replace(training, reward=reward, metrics=metrics, code=own)
+    errors = human_errors.asked(args.errors or training.errors or None)
+    level = human_errors.read(errors)
+    files = [*code.files_of([*metrics, reward]), *([] if level is None else [level.file])]
+    own = tuple(" ".join(item) for item in digests(files).items())
+    training = replace(training, reward=reward, metrics=metrics, errors=errors or "", code=own)
     given = {field: getattr(args, field) for field in ("iterations", "seed")}
     changes = {field: value for field, value in given.items() if value is not None}
     return replace(training, learning=APPROACHES[name].learning, **changes)

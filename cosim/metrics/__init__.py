@@ -17,6 +17,7 @@ from cosim.metrics.human_errors import HumanErrors
 from cosim.metrics.jerk import Jerk
 from cosim.metrics.law import AvCounts, StopLines
 from cosim.metrics.mission import MissionSuccess
+from cosim.metrics.near_misses import Exposure
 from cosim.metrics.persons import PersonConflicts
 from cosim.metrics.post_encroachment import PostEncroachment
 from cosim.metrics.speeding import Speeding
@@ -46,6 +47,7 @@ METRICS: dict[str, type[EpisodeMetric]] = {
     "trips": Trips,
     "persons": PersonConflicts,
     "interventions": Interventions,
+    "exposure": Exposure,
     "human_errors": HumanErrors,
 }
 

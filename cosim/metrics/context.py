@@ -11,10 +11,14 @@ import numpy.typing as npt
 from cosim.geometry import Conflicts, boxes, conflicts
 from cosim.geometry.compiled import compiled
 from cosim.road import RoadMap
+from cosim.road.meeting import Meeting
 from cosim.types import Bools, Floats, Ints, Kind, Metric, Snapshot, Timing
 
 AV = int(Kind.AV)  # comparing arrays with an IntEnum member costs five times as much
+PERSON = int(Kind.PERSON)
 HORIZON = 10.0  # s, further ahead straight-line extrapolation says nothing (docs/paper_map.md)
+CRITICAL = 1.5  # s, the usual bound of a serious conflict (van der Horst 1990); critical_th of P
+HARD = 3.35  # m/s2, of the DRAC: above it a crossing or following is a conflict (Archer 2005)
 
 
 class ConflictView:
@@ -29,10 +33,11 @@ class ConflictView:
         self._snapshot: Snapshot | None = None
 
     def of(self, snapshot: Snapshot) -> Conflicts:
-        """Conflicts of AVs and mission vehicles with any vehicle, up to `HORIZON` ahead."""
+        """Of AVs and mission vehicles with any vehicle, up to `HORIZON` ahead; of all the grave ones."""
         if snapshot is not self._snapshot:
             roads = self._contact.numbers(snapshot.place), self._contact.table
-            self._conflicts = conflicts(boxes(snapshot), watched(snapshot, self._guessed), HORIZON, roads)
+            mine = watched(snapshot, self._guessed)
+            self._conflicts = conflicts(boxes(snapshot), mine, HORIZON, roads, soon=CRITICAL, hard=HARD)
             self._snapshot = snapshot
         return self._conflicts
 
@@ -47,6 +52,11 @@ class MetricContext:
     goal: frozenset[int]  # lanes (indices into RoadMap.lanes) on which the mission has succeeded
     duration: float  # s, counted
     mission_guessed: bool = False  # nobody named the mission vehicle: it counts in its own figures alone
+
+    @cached_property
+    def meeting(self) -> Meeting:
+        """Shared likewise."""
+        return Meeting(self.road)
 
     @cached_property
     def conflicts(self) -> ConflictView:

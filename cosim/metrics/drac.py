@@ -1,6 +1,8 @@
-"""DRAC: the hardest constant braking that an AV or mission vehicle, or its opponent, would have needed."""
+"""DRAC: the hardest constant braking that an AV or mission vehicle, or its opponent, would have needed;
+how often anybody would have needed a hard one."""
 
 from cosim.metrics.context import MetricContext
+from cosim.metrics.near_misses import NearMisses
 from cosim.types import Metric, Snapshot
 
 
@@ -12,13 +14,16 @@ class DecelerationRate:
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._conflicts = context.conflicts
+        self._near_misses = NearMisses("drac", context.meeting)
         self._largest: float | None = None
         self.add(first)
 
     def add(self, snapshot: Snapshot) -> None:
-        needed = self._conflicts.of(snapshot).deceleration  # [k] m/s2
+        found = self._conflicts.of(snapshot)
+        self._near_misses.add(snapshot, found.hard)
+        needed = found.deceleration  # [k] m/s2
         if len(needed):
             self._largest = max(self._largest or 0.0, float(needed.max()))
 
     def result(self) -> dict[str, Metric]:
-        return {"max_drac_mps2": Metric(self._largest, "m/s2", "lower")}
+        return {"max_drac_mps2": Metric(self._largest, "m/s2", "lower"), **self._near_misses.result()}

@@ -6,14 +6,12 @@ import numpy as np
 
 from cosim.geometry import EVERYWHERE, Boxes, boxes, time_to_collision
 from cosim.geometry.kernels import encroachment
-from cosim.metrics.context import AV, MetricContext, slow
+from cosim.metrics.context import AV, CRITICAL, PERSON, MetricContext, slow
 from cosim.metrics.law import AvCounts
-from cosim.types import Kind, Metric, Snapshot
+from cosim.metrics.post_encroachment import ENCROACHED
+from cosim.types import Metric, Snapshot
 
-CRITICAL = 1.5  # s, time to collision
-ENCROACHED = 1.0  # s, post-encroachment time
 SPEEDS = 2.0  # the present ones, times this, bound those of the last second
-PERSON = int(Kind.PERSON)
 
 
 class PersonConflicts(AvCounts):
@@ -63,4 +61,4 @@ class PersonConflicts(AvCounts):
                     trail[k, n] = frame.x[row], frame.y[row], *course
                     sizes[n] = frame.length[row], frame.width[row]
         both = np.ones(2, np.bool_)
-        return float(encroachment(trail, len(trail) - 1, 2, sizes, both, self._interval, EVERYWHERE))
+        return float(encroachment(trail, len(trail) - 1, 2, sizes, both, self._interval, EVERYWHERE)[0])

@@ -1,12 +1,15 @@
-"""Post-encroachment time: the shortest time between an AV's (or mission vehicle's) and another's passage."""
+"""Post-encroachment time: the shortest time between an AV's (or mission vehicle's) and another's passage;
+how often anybody's was short."""
 
 import numpy as np
 
 from cosim.geometry.kernels import encroachment, record
 from cosim.metrics.context import MetricContext, Slots, grown, watched
+from cosim.metrics.near_misses import NearMisses
 from cosim.types import Ints, Metric, Snapshot
 
 LONGEST = 5.0  # s, a later passage is no encounter any more (Allen et al. 1978 look at 1 to 5 s)
+ENCROACHED = 1.0  # s, a shorter one is a near-miss
 
 
 class PostEncroachment:
@@ -19,11 +22,13 @@ class PostEncroachment:
         self._slots = Slots()
         self._frames = int(np.ceil(LONGEST / self._interval)) + 1
         self._trail = np.full((self._frames, 64, 6), np.nan)  # x m, y m, cos, sin, m/s, road
+        self._lanes = np.full((self._frames, 64), -1)  # [frames,slots] as in `Snapshot.lane`
         self._sizes = np.zeros((64, 2))  # [slots,2] m
         self._watched = np.zeros(64, dtype=np.bool_)
         self._newest = -1
         self._known: Ints | None = None
         self._smallest = np.inf
+        self._near_misses = NearMisses("pet", context.meeting)
         self.add(first)
 
     def add(self, snapshot: Snapshot) -> None:
@@ -34,6 +39,7 @@ class PostEncroachment:
         self._sizes = grown(self._sizes, len(self._slots), 0.0)
         self._watched = grown(self._watched, len(self._slots), False)
         self._trail = grown(self._trail, len(self._slots), np.nan, axis=1)
+        self._lanes = grown(self._lanes, len(self._slots), -1, axis=1)
         self._newest = (self._newest + 1) % self._frames
         number = self._contact.numbers(s.place)
         record(self._trail, self._newest, slot, s.x, s.y, s.heading, s.speed, number)
@@ -42,17 +48,33 @@ class PostEncroachment:
             self._known = slot
         self._watched[slot] |= watched(s, self._guessed)
         vehicles = len(self._slots), self._sizes, self._watched
-        found = encroachment(self._trail, self._newest, *vehicles, self._interval, self._contact.table)
-        self._smallest = min(self._smallest, found)
+        ring = self._trail, self._newest, *vehicles, self._interval, self._contact.table
+        smallest, pairs = encroachment(*ring, ENCROACHED)
+        self._smallest = min(self._smallest, smallest)
+        self._lanes[self._newest] = -1
+        self._lanes[self._newest, slot] = s.lane
+        self._near_misses.add(s, self._met(s, slot, pairs))
+
+    def _met(self, s: Snapshot, slot: Ints, pairs: Ints) -> Ints:
+        """[q,2] rows of those `pairs` [p,2] of places who are both on the road, the second not having
+        followed the first: on its lane the first has not been in all of the trail."""
+        if not len(pairs):
+            return pairs
+        row = np.full(len(self._slots), -1)
+        row[slot] = np.arange(s.n)
+        first, second = pairs.T
+        lane = self._lanes[self._newest, second]
+        followed = ((self._lanes[:, first] == lane) & (lane >= 0)).any(0)
+        return row[pairs[~followed & (row[first] >= 0)]]
 
     def _drop_absent(self) -> None:
         """In an hour thousands of vehicles come and go, and a frame's cost grows with all that have slots."""
         kept = np.flatnonzero(~np.isnan(self._trail[:, : len(self._slots), 0]).all(0))
         self._slots.keep(kept)
-        self._trail = self._trail[:, kept]
+        self._trail, self._lanes = self._trail[:, kept], self._lanes[:, kept]
         self._sizes, self._watched = self._sizes[kept], self._watched[kept]
         self._known = None
 
     def result(self) -> dict[str, Metric]:
         value = float(self._smallest) if self._smallest <= LONGEST else None
-        return {"min_pet_s": Metric(value, "s", "higher")}
+        return {"min_pet_s": Metric(value, "s", "higher"), **self._near_misses.result()}

@@ -1,9 +1,9 @@
-"""Time to collision of AVs and mission vehicles with others: the smallest, and how long it was critical."""
+"""Time to collision of AVs and mission vehicles with others: the smallest, and how long it was critical; how
+often anybody's was."""
 
-from cosim.metrics.context import HORIZON, MetricContext
+from cosim.metrics.context import CRITICAL, HORIZON, MetricContext
+from cosim.metrics.near_misses import NearMisses
 from cosim.types import Metric, Snapshot
-
-CRITICAL = 1.5  # s, the usual bound of a serious conflict (van der Horst 1990); critical_th of P
 
 
 class TimeToCollision:
@@ -11,12 +11,15 @@ class TimeToCollision:
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._conflicts = context.conflicts
+        self._near_misses = NearMisses("ttc", context.meeting)
         self._smallest = HORIZON
         self._critical = self._counted = 0  # vehicle-frames
         self.add(first)
 
     def add(self, snapshot: Snapshot) -> None:
-        nearest = self._conflicts.of(snapshot).time_to_collision  # [k] s
+        found = self._conflicts.of(snapshot)
+        self._near_misses.add(snapshot, found.soon)
+        nearest = found.time_to_collision  # [k] s
         if not len(nearest):
             return
         self._counted += len(nearest)
@@ -30,4 +33,5 @@ class TimeToCollision:
         return {
             "min_ttc_s": Metric(self._smallest if self._smallest < HORIZON else None, "s", "higher"),
             "ttc_below_1_5_share": Metric(share, "share of vehicle time", "lower"),
+            **self._near_misses.result(),
         }

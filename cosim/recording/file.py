@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 from cosim.errors import BadInput
 from cosim.files import cannot, whole
 from cosim.recording.recorder import Knowledge, Recorder
-from cosim.types import Bytes, Collision, Entry, Events, Intervention, Snapshot
+from cosim.types import Bytes, Collision, Entry, Events, HumanError, Intervention, Snapshot
 
 FORMAT = "cosim-recording-1"
 # float64, so that a recording gives back exactly what was driven: histories built from it equal the policy's
@@ -25,7 +25,12 @@ FORMAT = "cosim-recording-1"
 # near +-pi by a whole circle and moves target speeds.
 REAL = ("x", "y", "heading", "speed", "accel", "length", "width", "lane_position")
 WHOLE: dict[str, Any] = {"kind": pa.int8(), "mission": pa.bool_(), "lane": pa.int32(), "actor": pa.int8()}
-HAPPENED: dict[str, Any] = {"collisions": Collision, "entries": Entry, "interventions": Intervention}
+HAPPENED: dict[str, Any] = {
+    "collisions": Collision,
+    "entries": Entry,
+    "interventions": Intervention,
+    "errors": HumanError,
+}
 SCHEMA = pa.schema(
     [
         ("frame", pa.int32()),  # index into the times of the file's metadata

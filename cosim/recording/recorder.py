@@ -7,7 +7,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cosim.episode import Episode, Hook, Step
-from cosim.types import Collision, Decision, Forecast, Intervention, Ints, Offence, Policy, Snapshot
+from cosim.types import (
+    Collision,
+    Decision,
+    Forecast,
+    HumanError,
+    Intervention,
+    Ints,
+    Offence,
+    Policy,
+    Snapshot,
+)
 
 DRAWN = 400_000  # vehicle frames of a drawing: about 2 MB of page
 
@@ -68,12 +78,15 @@ class Recorder(Hook):
         self.collisions: list[Collision] = [*frames[-1].events.collisions]
         self.offences: list[Offence] = []
         self.interventions: list[Intervention] = []
+        before = [error for frame in frames for error in frame.events.errors]  # in the warm-up
+        self.errors: list[HumanError] = [e for e in before if e.until > frames[-1].time]
         self._stride, self._driven, self._kept = 1, 0, sum(s.n for s in frames)
 
     def add(self, frame: Snapshot) -> None:
         """One more frame; every second one goes once there are too many, and the forecasts of its time."""
         self.collisions += frame.events.collisions
         self.interventions += frame.events.interventions
+        self.errors += frame.events.errors
         self._driven += 1
         if self._driven % self._stride:
             return

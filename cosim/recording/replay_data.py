@@ -15,6 +15,7 @@ from cosim.types import (
     Collision,
     Floats,
     Forecast,
+    HumanError,
     Intervention,
     Ints,
     Kind,
@@ -61,6 +62,7 @@ class ReplayData:
     signals: Bytes = field(default_factory=lambda: np.zeros((0, 0), np.uint8))  # [T,s] as in `Snapshot`
     offences: tuple[Offence, ...] = ()
     interventions: tuple[Intervention, ...] = ()
+    errors: tuple[HumanError, ...] = ()  # those of the warm-up that went on into the counted time first
 
 
 def replay_data(recorder: Recorder, simulator: Simulator, facts: Mapping[str, Any]) -> ReplayData:
@@ -84,6 +86,7 @@ def replay_data(recorder: Recorder, simulator: Simulator, facts: Mapping[str, An
         signals=np.stack([s.signals for s in frames]),
         offences=tuple(recorder.offences),
         interventions=tuple(recorder.interventions),
+        errors=tuple(recorder.errors),
     )
 
 

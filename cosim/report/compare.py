@@ -11,7 +11,7 @@ import numpy as np
 
 from cosim.errors import BadInput
 from cosim.report import wording
-from cosim.report.figures import Frequency, Measure, Row
+from cosim.report.figures import Measure, Row
 from cosim.report.pairing import Group, Side, pair, title
 from cosim.report.statistics import (
     Figure,
@@ -20,10 +20,11 @@ from cosim.report.statistics import (
     mean,
     paired_change,
     paired_mean,
-    paired_rates,
+    paired_rate,
+    paired_rate_change,
     paired_share,
+    pooled_rate,
     share,
-    weighted_rate,
 )
 from cosim.report.thresholds import CHANGE, DIFFERENCE, Threshold, parse
 
@@ -43,8 +44,8 @@ class PairedFigure:
     na: int  # pairs in which it is NA on either side
     na_on_both: int  # of these
     hits: tuple[int, int] | None = None  # episodes of A and of B in which it happened, of a rate
+    tallies: tuple[tuple[int, float], ...] = ()  # of A and of B: events and exposure, of an incidence
     p: float | None = None  # exact McNemar, of a rate
-    change: Figure | None = None  # b / a - 1, of events per exposure
 
     def document(self) -> dict[str, Any]:
         """Plain JSON values."""
@@ -59,7 +60,17 @@ class PairedFigure:
         }
         if self.hits is not None:
             found |= {"hits_a": self.hits[0], "hits_b": self.hits[1], "p": self.p}
+        for side, (events, exposure) in zip("ab", self.tallies, strict=False):
+            found |= {f"events_{side}": events, f"exposure_{side}": exposure}
         return found
+
+    @property
+    def counts(self) -> tuple[str, str]:
+        """What stands beside A and B: `3/40`, `12 in 3.4 h`, or nothing."""
+        if self.tallies:
+            a, b = (wording.events(*tally, self.measure.per) for tally in self.tallies)
+            return a, b
+        return (f"{self.hits[0]}/{self.n}", f"{self.hits[1]}/{self.n}") if self.hits else ("", "")
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,16 +177,15 @@ def compare(
 
 def paired(measure: Measure, pairs: Sequence[tuple[Row, Row]], seed: int = 0) -> PairedFigure:
     """One measure over the pairs; those in which it is NA on either side are left out, and counted."""
-    sides = [[pair[k] for pair in pairs] for k in (0, 1)]
-    values = np.array([measure.values(rows) for rows in sides])  # [2,pairs]
+    values = np.array([measure.values([pair[k] for pair in pairs]) for k in (0, 1)])  # [2,pairs]
     missing = np.isnan(values)
     x, y = values[:, ~missing.any(0)]
     n, na, neither = len(x), len(pairs) - len(x), int(missing.all(0).sum())
-    if isinstance(measure, Frequency):
-        a, b = (measure.parts(rows)[:, ~missing.any(0)] for rows in sides)
-        difference, change = paired_rates(a, b)
-        of_each = weighted_rate(*a), weighted_rate(*b)
-        return PairedFigure(measure, *of_each, difference, n, na, neither, change=change)
+    if measure.per:
+        before, after = (measure.tally([pair[k] for pair in pairs])[:, ~missing.any(0)] for k in (0, 1))
+        rates = pooled_rate(*before), pooled_rate(*after), paired_rate(before, after)
+        tallies = tuple((int(k.sum()), measure.scale * float(t.sum())) for k, t, _ in (before, after))
+        return PairedFigure(measure, *rates, n, na, neither, tallies=tallies)
     if not measure.is_rate:
         difference = paired_mean(x, y, seed)
         return PairedFigure(measure, mean(x, seed), mean(y, seed), difference, n, na, neither)
@@ -183,7 +193,7 @@ def paired(measure: Measure, pairs: Sequence[tuple[Row, Row]], seed: int = 0) ->
     hits = (int(was.sum()), int(now.sum()))
     difference = paired_share(was, now)
     p = mcnemar(*discordant(was, now)) if n else None
-    return PairedFigure(measure, share(hits[0], n), share(hits[1], n), difference, n, na, neither, hits, p)
+    return PairedFigure(measure, share(hits[0], n), share(hits[1], n), difference, n, na, neither, hits, p=p)
 
 
 # ---- inside ----
@@ -197,11 +207,10 @@ def _judge(threshold: Threshold, compared: Compared) -> tuple[str, str, str]:
         return FAILED, "no pair of episodes finished on both sides", ""
     if found.na_on_both == len(pairs):
         return SKIPPED, f"{measure.name} is NA in all {len(pairs)} pairs", ""
-    sides = [[both[k] for both in pairs] for k in (0, 1)]
-    x, y = map(measure.values, sides)
+    rows = [[both[k] for both in pairs] for k in (0, 1)]
     count = f"{found.n} pairs" + (f", NA in {found.na} more" if found.na else "")
     if threshold.kind == CHANGE:
-        figure, what = found.change or paired_change(x, y, compared.seed), "B / A - 1"
+        figure, what = _change(measure, rows, compared.seed), "B / A - 1"
         shown = [wording.change(v) for v in (threshold.of(figure), figure.value, figure.low, figure.high)]
         whole = f"{shown[1]} ({shown[2]} to {shown[3]})"
     elif threshold.kind == DIFFERENCE:
@@ -209,11 +218,8 @@ def _judge(threshold: Threshold, compared: Compared) -> tuple[str, str, str]:
         shown = [wording.number(threshold.of(figure), measure, signed=True)]
         whole = wording.interval(figure, measure, signed=True)
     else:  # of B alone: pairs in which only A is NA count too
-        y = [value for value in y if not math.isnan(value)]
-        figure = share(int(sum(y)), len(y)) if measure.is_rate else mean(y, compared.seed)
-        if isinstance(measure, Frequency):
-            figure = measure.figure(sides[1])
-        what, count = "B", f"{int(sum(y))} of {len(y)} episodes" if measure.is_rate else f"{len(y)} episodes"
+        figure, count = _alone(measure, rows[1], compared.seed)
+        what = "B"
         shown = [wording.number(threshold.of(figure), measure)]
         whole = wording.interval(figure, measure)
     finding = f"{what} is {whole}, {count}"
@@ -222,10 +228,32 @@ def _judge(threshold: Threshold, compared: Compared) -> tuple[str, str, str]:
     return FAILED if threshold.fails(threshold.of(figure)) else PASSED, finding, _figures(found)
 
 
+def _change(measure: Measure, rows: Sequence[Sequence[Row]], seed: int) -> Figure:
+    """B / A - 1 over the pairs in which both are known."""
+    if not measure.per:
+        return paired_change(*(measure.values(mine) for mine in rows), seed)
+    before, after = (measure.tally(mine) for mine in rows)
+    known = ~np.isnan([*before, *after]).any(0)
+    return paired_rate_change(before[:, known], after[:, known])
+
+
+def _alone(measure: Measure, rows: Sequence[Row], seed: int) -> tuple[Figure, str]:
+    """The figure of one side over all its episodes, and what it is from."""
+    y = [value for value in measure.values(rows) if not math.isnan(value)]
+    if measure.per:
+        tally = measure.tally(rows)
+        events, exposure, weight = tally[:, ~np.isnan(tally).any(0)]
+        said = wording.events(int(events.sum()), measure.scale * float(exposure.sum()), measure.per)
+        return pooled_rate(events, exposure, weight), f"{said} of {len(y)} episodes"
+    if measure.is_rate:
+        return share(int(sum(y)), len(y)), f"{int(sum(y))} of {len(y)} episodes"
+    return mean(y, seed), f"{len(y)} episodes"
+
+
 def _figures(found: PairedFigure) -> str:
     """`A 2.5 % (0.4 to 12.9) = 1/40, B ..., B - A ..., p 1`"""
     m = found.measure
-    counts = [f" = {hits}/{found.n}" for hits in found.hits] if found.hits else ["", ""]
+    counts = [f" = {count}" if count else "" for count in found.counts]
     parts = [
         f"A {wording.interval(found.a, m)}{counts[0]}",
         f"B {wording.interval(found.b, m)}{counts[1]}",

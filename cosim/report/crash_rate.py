@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from cosim.report import wording
-from cosim.report.figures import CRASHES, FREQUENCIES, Row, weights
+from cosim.report.figures import CRASHES, INCIDENCES, Row, measures, weights
 from cosim.report.statistics import Figure, effective
-from cosim.report.summary import status_counts
+from cosim.report.summary import incidence_document, status_counts
 from cosim.workers.tasks import OK
 
 FEW = 10.0  # effective crashes, below which an interval was seen to hold the truth less often than it says
@@ -20,16 +20,8 @@ HEAVY = 0.25  # of all crashes' weight in one episode: another one like it would
 def estimate(rows: Sequence[Row]) -> dict[str, Any]:
     """Plain JSON values of the episodes of one cell; counts and km are those driven, without weights."""
     ok = [row for row in rows if row["status"] == OK]
-    figures = {}
-    for name, measure in FREQUENCIES.items():
-        counts, exposures, _ = measure.parts(ok)
-        if (~np.isnan(counts + exposures)).any():
-            figures[name] = {
-                **measure.figure(ok).document(),
-                "unit": measure.unit,
-                "events": int(np.nansum(counts)),
-                "episodes": int((counts > 0.0).sum()),
-            }
+    known = measures(ok)
+    figures = {name: incidence_document(m, ok) for name, m in known.items() if m.per}
     every = np.array(weights(ok))
     crashed = every[[bool(row["av_involved_collisions"]) for row in ok]]
     return {
@@ -53,14 +45,14 @@ def text(found: Mapping[str, Any]) -> str:
     lines = []
     for name, figure in found["figures"].items():
         value = Figure(*(math.nan if figure[n] is None else figure[n] for n in ("value", "low", "high")))
-        shown = wording.interval(value, FREQUENCIES[name])
-        lines.append(f"  {name:<37} {shown}; {figure['events']} events in {figure['episodes']} episodes")
+        shown = wording.interval(value, INCIDENCES[name])
+        lines.append(f"  {name:<37} {shown}, {wording.sample(figure)}")
     lines += [
         f"  {found['episodes']} episodes ({found['tilted_episodes']} tilted), {found['av_km']:.0f} AV-km, "
         f"{found['vehicle_km']:.0f} vehicle-km; effective samples {found['effective_samples']:.0f}, "
         f"largest weight {_percent(found['largest_weight_share'])} of all",
         f"  {found['crashed_episodes']} episodes with a crash of an AV: effective "
-        f"{found['effective_crashes']:.1f}, largest weight {_percent(found['largest_crash_share'])} of theirs",
+        f"{found['effective_crashes']:.1f}, largest {_percent(found['largest_crash_share'])} of their weight",
     ]
     return "\n".join([*lines, *(f"  note: {note}" for note in _notes(found))])
 

@@ -9,7 +9,6 @@ import numpy as np
 import numpy.typing as npt
 
 from cosim.report.result import FIRST
-from cosim.report.statistics import Figure, weighted_rate
 from cosim.types import RESERVED, TIMINGS, WEIGHT
 
 Row = Mapping[str, Any]  # one episode: a line of episodes.parquet, NA as None
@@ -19,13 +18,17 @@ SHARE = "share"  # unit of what is shown in per cent and compared in percentage 
 
 @dataclass(frozen=True, slots=True)
 class Measure:
-    """A figure by name: the share of episodes in which `column` is true or above 0, or the column's mean."""
+    """A figure by name: the share of episodes in which `column` is true or above 0, the column's mean, or its
+    sum over that of the column `per`."""
 
     name: str
     column: str
     unit: str  # SHARE for a rate, "" where the run does not say
     better: str  # "higher", "lower" or ""
     is_rate: bool = False
+    per: str = ""  # the column of the exposure that events are counted in
+    scale: float = 1.0  # of the exposure: how much of it is one of the unit
+    more: tuple[str, ...] = ()  # columns whose events count too
 
     @property
     def is_share(self) -> bool:
@@ -34,58 +37,25 @@ class Measure:
 
     def values(self, rows: Sequence[Row]) -> list[float]:
         """The figure in each row, nan for NA; of a rate 1.0 or 0.0."""
-        found = [math.nan if row.get(self.column) is None else float(row[self.column]) for row in rows]
+        if self.per:
+            return [k / t if t > 0.0 else math.nan for k, t, _ in self.tally(rows).T]
+        found = _column(rows, self.column)
         return [float(x > 0) if self.is_rate and not math.isnan(x) else x for x in found]
 
-
-@dataclass(frozen=True, slots=True)
-class Frequency(Measure):
-    """Events per exposure: sums over episodes, each with its weight (docs/estimate.md).
-
-    `column` is the exposure's; an episode's value is its own quotient.
-    """
-
-    events: tuple[str, ...] = ()  # columns of counts, added up
-    scale: float = 1.0  # of the quotient: 1e6 where the column is in km and the unit million km
-
-    def values(self, rows: Sequence[Row]) -> list[float]:
-        """The figure in each row, nan for NA and where there is no exposure."""
-        counts, exposures, _ = self.parts(rows)
-        return [c / e if e > 0.0 else math.nan for c, e in zip(counts, exposures, strict=True)]
-
-    def parts(self, rows: Sequence[Row]) -> npt.NDArray[np.float64]:
-        """[3,n] events, exposure and weight of each row; the exposure in the figure's unit, nan for NA."""
-        found = np.array([[row.get(name) for name in (self.column, *self.events)] for row in rows], float)
-        found = found.reshape(len(rows), 1 + len(self.events))
-        return np.array([found[:, 1:].sum(1), found[:, 0] / self.scale, weights(rows)])
-
-    def figure(self, rows: Sequence[Row]) -> Figure:
-        """Its value over rows and the interval; rows in which it is NA are left out."""
-        parts = self.parts(rows)
-        return weighted_rate(*parts[:, ~np.isnan(parts).any(0)])
+    def tally(self, rows: Sequence[Row]) -> npt.NDArray[np.float64]:
+        """[3,n] events, exposure in the figure's unit, and weight of each row; nan for NA."""
+        events = np.sum([_column(rows, name) for name in (self.column, *self.more)], axis=0)
+        exposure = np.array(_column(rows, self.per)) / self.scale
+        return np.array([events, exposure, weights(rows)])
 
 
 def weights(rows: Sequence[Row]) -> list[float]:
-    """The likelihood ratio of each episode; 1 where its errors were not tilted."""
+    """The likelihood ratio of each episode; 1 where its errors were not tilted (docs/estimate.md)."""
     return [1.0 if row.get(WEIGHT) is None else float(row[WEIGHT]) for row in rows]
 
 
-CRASHES = "crash_rate_per_million_km"
-# Events per exposure, by the name that thresholds and tables use.
-FREQUENCIES: dict[str, Frequency] = {
-    name: Frequency(name, column, unit, "lower", events=events, scale=scale)
-    for name, events, column, scale, unit in (
-        (CRASHES, ("av_involved_collisions",), "av_km", 1e6, "per million AV-km"),
-        (f"av_caused_{CRASHES}", ("av_caused_collisions",), "av_km", 1e6, "per million AV-km"),
-        (
-            f"all_{CRASHES}",
-            ("av_involved_collisions", "hv_hv_collisions"),
-            "vehicle_km",
-            1e6,
-            "per million vehicle-km",
-        ),
-    )
-}
+def _column(rows: Sequence[Row], name: str) -> list[float]:
+    return [math.nan if row.get(name) is None else float(row[name]) for row in rows]
 
 
 # Shares of episodes, by the name that thresholds and tables use.
@@ -100,18 +70,33 @@ RATES: dict[str, Measure] = {
     )
 }
 
+CRASHES = "crash_rate_per_million_km"
+# Events per distance and per vehicle time: all of them over all of it (docs/definitions.md, Near-misses).
+INCIDENCES: dict[str, Measure] = {
+    name: Measure(name, column, f"per million {km}", "lower", per=per, scale=1e6, more=more)
+    for name, column, more, km, per in (
+        (CRASHES, "av_involved_collisions", (), "AV-km", "av_km"),
+        (f"av_caused_{CRASHES}", "av_caused_collisions", (), "AV-km", "av_km"),
+        (f"all_{CRASHES}", "av_involved_collisions", ("hv_hv_collisions",), "vehicle-km", "vehicle_km"),
+    )
+} | {
+    name: Measure(name, f"{who}near_misses_{kind}", f"per {hour}", "lower", per=hours)
+    for who, hour, hours in (("av_", "AV-hour", "av_hours"), ("", "vehicle-hour", "vehicle_hours"))
+    for kind in ("ttc", "drac", "pet")
+    for name in (f"{who}near_misses_{kind}_per_{hour.lower().replace('-', '_')}",)
+}
+
 HEADLINE = tuple(filter(None, FIRST.values()))  # what reports and comparisons show first
 
 
 def measures(
     rows: Sequence[Row], units: Mapping[str, str] | None = None, better: Mapping[str, str] | None = None
 ) -> dict[str, Measure]:
-    """Every figure these rows hold, by name: rates, then means, events per exposure, timings.
-
-    Of episodes whose errors were tilted only those that weigh them: others would be those of no traffic.
+    """Every figure these rows hold, by name: rates, then events per exposure, then means, then timings.
 
     `units` and `better` say by column what `cosim run --json` says of its metrics. Columns of yes and no
-    give rates, of numbers means; so a metric that is new has its figure without being listed here.
+    give rates, of numbers means; so a metric that is new has its figure without being listed here. Of tilted
+    episodes (docs/estimate.md) only events per exposure and timings: what is not weighed is of no traffic.
     """
     units, better = units or {}, better or {}
     kinds: dict[str, set[type]] = {}  # of the values that are not NA
@@ -119,6 +104,7 @@ def measures(
         for column, value in row.items():
             kinds.setdefault(column, set()).update(() if value is None else (type(value),))
     rates = {m.name: m for m in RATES.values() if m.column in kinds}
+    incidences = {m.name: m for m in INCIDENCES.values() if {m.column, m.per, *m.more} <= kinds.keys()}
     rated = {m.column for m in rates.values() if kinds[m.column] <= {bool}}
     means = {}
     for column in [c for c in kinds if c not in RESERVED | rated]:
@@ -128,7 +114,6 @@ def measures(
         elif column in units or (kinds[column] and kinds[column] <= {int, float}):
             means[column] = Measure(column, column, units.get(column, ""), better.get(column, ""))
     timings = {column: Measure(column, column, "s", "lower") for column in TIMINGS if column in kinds}
-    frequencies = {m.name: m for m in FREQUENCIES.values() if kinds.keys() >= {m.column, *m.events}}
     if any(weight != 1.0 for weight in weights(rows)):
-        return frequencies | timings
-    return rates | means | frequencies | timings
+        return incidences | timings
+    return rates | incidences | means | timings

@@ -6,6 +6,7 @@ pairs that agree in `PAIR`. Nothing is pooled over groups.
 
 import itertools
 import json
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -56,6 +57,16 @@ class Group:
     def mission_guessed(self) -> int:
         """Pairs in which either episode's mission vehicle was guessed."""
         return sum(mission_guessed(a) or mission_guessed(b) for a, b in self.pairs)
+
+    @property
+    def errors_begun(self) -> tuple[int, int, int]:
+        """Human errors that began in A's episodes, in B's, and of both the same: kind, who and second."""
+        begun = [[Counter(map(tuple, _errors(row))) for row in pair] for pair in self.pairs]
+        return (
+            sum(a.total() for a, _ in begun),
+            sum(b.total() for _, b in begun),
+            sum((a & b).total() for a, b in begun),
+        )
 
     @property
     def identical(self) -> int:
@@ -136,6 +147,13 @@ def pair(a: Side, b: Side, across: Sequence[str] = ()) -> tuple[list[Group], tup
 
 
 # ---- inside ----
+
+
+def _errors(row: Row) -> list[list[Any]]:
+    """`human_error_list` of an episode; [] where it has none."""
+    found = row.get("human_error_list") or []
+    return list(json.loads(found) if isinstance(found, str) else found)
+
 
 _Key = tuple[Any, ...]
 

@@ -38,6 +38,8 @@ LAW = {
     "speeding_share": "speeding",
     "worst_speeding_mps": "worst speeding",
 }
+# Near-misses (definitions.md), by the end of their columns' names.
+NEAR_MISSES = {"ttc": "TTC < 1.5 s", "drac": "DRAC > 3.35 m/s2", "pet": "PET < 1 s"}
 LAW_IN_ANY_CASE = 3  # the first of them are said of one episode even when they are 0
 REASONS = 4  # of interventions, that are said
 GUESSED = "guessed: its figures feed no gate (--mission ID names it, --mission none does without)"
@@ -59,7 +61,7 @@ def table(result: EpisodeResult, *, first: bool = True) -> str:
         lines.append(f"  mission vehicle {result.mission_vehicle}" + f", {GUESSED}" * result.mission_guessed)
     shown = [name for name in FIRST if name in result.metrics] if first else result.metrics
     lines += [f"  {name:<24} {figure(result.metrics[name])}" for name in shown]
-    lines += law_lines(result)
+    lines += near_miss_lines(result) + law_lines(result)
     for c in result.collisions:
         who = f"{c.kind}, {'AV-caused' if c.av_caused else 'not AV-caused'}"
         lines.append(
@@ -71,6 +73,16 @@ def table(result: EpisodeResult, *, first: bool = True) -> str:
     times = ", ".join(f"{name.removesuffix('_s')} {value:.2f} s" for name, value in result.timings.items())
     lines.append(f"  time spent               {times}")
     return "\n".join(lines)
+
+
+def near_miss_lines(result: EpisodeResult) -> list[str]:
+    """`near-misses   3 TTC < 1.5 s (1 with an AV), ...`; nothing where there is none."""
+    said = []
+    for kind, what in NEAR_MISSES.items():
+        count, avs = (result.metrics.get(f"{who}near_misses_{kind}") for who in ("", "av_"))
+        if count and count.value:
+            said.append(f"{count.value} {what} ({(avs and avs.value) or 0} with an AV)")
+    return [f"  {'near-misses':<24} {', '.join(said)}"] if said else []
 
 
 def law_lines(result: EpisodeResult) -> list[str]:

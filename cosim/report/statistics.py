@@ -79,42 +79,42 @@ def rate(count: int, exposure: float) -> Figure:
     return Figure(count / exposure, float(low) / exposure, float(high) / exposure)
 
 
-def weighted_rate(
-    counts: Sequence[float] | Array, exposures: Sequence[float] | Array, weights: Sequence[float] | Array
+def pooled_rate(
+    counts: Sequence[float] | Array,
+    exposures: Sequence[float] | Array,
+    weights: Sequence[float] | Array | None = None,
 ) -> Figure:
-    """Events per unit of exposure of weighted episodes: sum(w y) / sum(w k), with a gamma interval.
+    """Events per unit of exposure of n samples: R = sum(w y) / sum(w k), with a gamma interval.
 
-    The interval is that of weighted Poisson counts (Fay and Feuer, Statistics in Medicine 16 (1997) 791-801),
-    the variance that of the ratio, sum(w^2 (y - R k)^2), and at least the Poisson variance sum(w^2 y). Its
-    upper bound allows for one more event of the largest weight of an event seen, and of the largest weight
-    of all where none was seen. With equal weights and at most one event an episode it is `rate`'s.
+    Of weighted Poisson counts (Fay and Feuer, Statistics in Medicine 16 (1997) 791-801): its variance is that
+    of the ratio, sum(w^2 (y - R k)^2), and at least the Poisson variance sum(w^2 y): events of one episode
+    come together. The upper bound allows for one more event, of the largest weight of the events seen, and of
+    the largest weight of all samples where none was seen. With equal weights and no more scatter than
+    Poisson counts have it is the exact interval of `rate`.
 
     Args:
-        counts: [n] events of each episode.
-        exposures: [n] what they are divided by, e.g. km.
-        weights: [n] likelihood ratios, positive.
+        counts: [n] y, events of each sample.
+        exposures: [n] k, what they are divided by.
+        weights: [n] w, positive likelihood ratios; None: all alike.
     """
-    y, k, w = (np.asarray(values, np.float64) for values in (counts, exposures, weights))
-    exposure = float((w * k).sum())
+    y, k = np.asarray(counts, np.float64), np.asarray(exposures, np.float64)
+    w = np.ones(len(y)) if weights is None else np.asarray(weights, np.float64)
+    exposure, events = float((w * k).sum()), float((w * y).sum())
     if not exposure > 0.0:
         return NA
-    events = float((w * y).sum())
     tail = (1.0 - CONFIDENCE) / 2.0
     if events == 0.0:
         return Figure(0.0, 0.0, float(w.max() * stats.chi2.ppf(1.0 - tail, 2) / 2.0) / exposure)
-    ratio = float((w**2 * (y - events / exposure * k) ** 2).sum()) * len(y) / max(len(y) - 1, 1)
-    variance = max(ratio, float((w**2 * y).sum()))
+    scatter = float((w**2 * (y - events / exposure * k) ** 2).sum()) * len(y) / max(len(y) - 1, 1)
+    variance = max(scatter, float((w**2 * y).sum()))
     largest = float(w[y > 0.0].max())
 
     def bound(p: float, mean: float, spread: float) -> float:
         """The p-quantile of the gamma distribution of this mean and variance."""
         return float(stats.gamma.ppf(p, mean**2 / spread, scale=spread / mean)) / exposure
 
-    return Figure(
-        events / exposure,
-        bound(tail, events, variance),
-        bound(1.0 - tail, events + largest, variance + largest**2),
-    )
+    low, high = bound(tail, events, variance), bound(1.0 - tail, events + largest, variance + largest**2)
+    return Figure(events / exposure, low, high)
 
 
 def effective(weights: Sequence[float] | Array) -> float:
@@ -190,30 +190,38 @@ def paired_change(before: Sequence[float] | Array, after: Sequence[float] | Arra
     return _bootstrap((b, a), _change, seed)
 
 
-def paired_rates(a: tuple[Array, Array, Array], b: tuple[Array, Array, Array]) -> tuple[Figure, Figure]:
-    """Difference b - a, and relative change b / a - 1, of two weighted rates on equal draws.
+def paired_rate(before: Array, after: Array) -> Figure:
+    """Difference of two pooled rates, after - before.
 
-    `a`, `b`: counts, exposures and weights, [n] each, as `weighted_rate` takes them. The bounds are recovered
-    from those of the two rates (Zou and Donner, Statistics in Medicine 27 (2008) 1693-1702), with the
-    correlation of what single episodes contribute; those of the change likewise, of logarithms. The change
-    is nan where the rate of a is 0, and has no bounds where that of b is.
+    Each [3,n]: events, exposure and weight of every pair, as `pooled_rate` takes them. The bounds are
+    recovered from those of the two rates (MOVER, Zou and Donner, Statistics in Medicine 27 (2008) 1693-1702),
+    with the correlation of what each pair contributes to them.
     """
-    one, other = weighted_rate(*a), weighted_rate(*b)
-    if not (one.known and other.known):
-        return NA, NA
-    parts = [w * (y - rate.value * k) for (y, k, w), rate in ((a, one), (b, other))]
-    alike = float(np.corrcoef(*parts)[0, 1]) if all(np.ptp(part) > 0.0 for part in parts) else 0.0
-    difference = _recovered(one, other, alike)
-    if one.value == 0.0:
-        return difference, NA
-    if other.value == 0.0:
-        return difference, Figure(-1.0, math.nan, math.nan)
-    logs = (Figure(*(math.log(x) for x in (f.value, f.low, f.high))) for f in (one, other))
-    change = _recovered(*logs, alike)
-    return difference, Figure(*(math.expm1(x) for x in (change.value, change.low, change.high)))
+    a, b = pooled_rate(*before), pooled_rate(*after)
+    return _recovered(a, b, _alike(before, after, a, b)) if a.known and b.known else NA
+
+
+def paired_rate_change(before: Array, after: Array) -> Figure:
+    """Relative change of a pooled rate over pairs [3,n], recovered likewise from logarithms; infinite and
+    unbounded as `paired_change`, and without bounds where there is no event after."""
+    a, b = pooled_rate(*before), pooled_rate(*after)
+    if not (a.known and b.known):
+        return NA
+    if a.value == 0.0 or b.value == 0.0:
+        change = -1.0 if a.value else math.inf if b.value else 0.0
+        return Figure(change, math.nan, math.nan)
+    logs = (Figure(*map(math.log, (f.value, f.low, f.high))) for f in (a, b))
+    change = _recovered(*logs, _alike(before, after, a, b))
+    return Figure(*map(math.expm1, (change.value, change.low, change.high)))
 
 
 # ---- inside ----
+
+
+def _alike(before: Array, after: Array, a: Figure, b: Figure) -> float:
+    """The correlation of two pooled rates; 0 where one of them does not scatter."""
+    parts = [w * (y - rate.value * k) for (y, k, w), rate in ((before, a), (after, b))]
+    return float(np.corrcoef(*parts)[0, 1]) if all(np.ptp(part) > 0.0 for part in parts) else 0.0
 
 
 def _recovered(a: Figure, b: Figure, alike: float) -> Figure:

@@ -7,8 +7,10 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from cosim.report.figures import Frequency, Measure, Row, measures
-from cosim.report.statistics import CONFIDENCE, mean, rule_of_three, share
+import numpy as np
+
+from cosim.report.figures import Measure, Row, measures
+from cosim.report.statistics import CONFIDENCE, mean, pooled_rate, rule_of_three, share
 from cosim.types import IDENTITY, TIMINGS
 from cosim.workers.tasks import OK, STATUSES
 
@@ -58,7 +60,8 @@ def group_figures(rows: Sequence[Row], known: Mapping[str, Measure], seed: int =
     """Counts, rates, means and timings of episodes of one group."""
     ok = [row for row in rows if row.get("status", OK) == OK]
     rates = {m.name: rate_document(m, ok) for m in known.values() if m.is_rate}
-    means = {m.name: mean_document(m, ok, seed) for m in known.values() if not m.is_rate}
+    incidences = {m.name: incidence_document(m, ok) for m in known.values() if m.per}
+    means = {m.name: mean_document(m, ok, seed) for m in known.values() if not (m.is_rate or m.per)}
     return {
         "episodes": len(rows),
         "ok": len(ok),
@@ -67,6 +70,7 @@ def group_figures(rows: Sequence[Row], known: Mapping[str, Measure], seed: int =
         "not_comparable_because": reasons(ok),
         "mission_guessed": sum(mission_guessed(row) for row in ok),
         "rates": rates,
+        "incidences": incidences,
         "means": {name: found for name, found in means.items() if name not in TIMINGS},
         "timings": {name: found for name, found in means.items() if name in TIMINGS},
     }
@@ -87,11 +91,27 @@ def rate_document(measure: Measure, rows: Sequence[Row]) -> dict[str, Any]:
     }
 
 
+def incidence_document(measure: Measure, rows: Sequence[Row]) -> dict[str, Any]:
+    """Events of all rows over their exposure, with the Poisson interval."""
+    tally = measure.tally(rows)
+    events, exposure, weight = tally[:, ~np.isnan(tally).any(0)]
+    return {
+        **pooled_rate(events, exposure, weight).document(),
+        "events": int(events.sum()) if len(events) else None,
+        "per": measure.per,
+        "exposure": measure.scale * float(exposure.sum()) if len(events) else None,
+        "n": len(events),
+        "na": len(rows) - len(events),
+        "unit": measure.unit,
+        "better": measure.better,
+    }
+
+
 def mean_document(measure: Measure, rows: Sequence[Row], seed: int = 0) -> dict[str, Any]:
-    """Mean over the rows with its bootstrap interval; of events per exposure their weighted quotient."""
+    """Mean over the rows with its bootstrap interval."""
     values = [v for v in measure.values(rows) if not math.isnan(v)]
     return {
-        **(measure.figure(rows) if isinstance(measure, Frequency) else mean(values, seed)).document(),
+        **mean(values, seed).document(),
         "n": len(values),
         "na": len(rows) - len(values),
         "unit": measure.unit,

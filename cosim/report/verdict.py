@@ -10,7 +10,7 @@ from junitparser import Error, Failure, JUnitXml, Skipped, TestCase, TestSuite
 from cosim.files import whole
 from cosim.report import wording
 from cosim.report.compare import FAILED, PASSED, SKIPPED, Compared, Comparison, PairedFigure
-from cosim.report.figures import HEADLINE, Row
+from cosim.report.figures import HEADLINE, INCIDENCES, Row
 from cosim.report.pairing import who
 from cosim.report.result import LAW
 
@@ -133,6 +133,7 @@ def _group_document(compared: Compared) -> dict[str, Any]:
         "identical": group.identical,
         "not_comparable": group.not_comparable,
         "mission_guessed": group.mission_guessed,
+        "human_errors": dict(zip(("a", "b", "both"), group.errors_begun, strict=True)),
         "failed": [row["key"] for row in group.failed],
         "refused": [row["key"] for row in group.refused],
         "only_in_a": group.unpaired[0],
@@ -142,11 +143,15 @@ def _group_document(compared: Compared) -> dict[str, Any]:
 
 
 def _shown(comparison: Comparison, compared: Compared) -> list[PairedFigure]:
-    """Headline figures, those of the law that are not 0, and those a threshold asks for, where they apply."""
+    """Headline figures, those of the law and of near-misses that are not 0, and those a threshold asks for,
+    where they apply."""
     asked = [check.threshold.measure.name for check in comparison.checks]
-    names = [name for name in dict.fromkeys((*HEADLINE, *LAW, *asked)) if name in compared.figures]
-    broken = {n for n in LAW if (f := compared.figures.get(n)) and (f.a.value > 0.0 or f.b.value > 0.0)}
-    names = [name for name in names if name not in LAW or name in broken or name in asked]
+    names = [
+        name for name in dict.fromkeys((*HEADLINE, *INCIDENCES, *LAW, *asked)) if name in compared.figures
+    ]
+    rare = {*INCIDENCES, *LAW} - {*asked}
+    happened = {n for n in rare if (f := compared.figures.get(n)) and (f.a.value > 0.0 or f.b.value > 0.0)}
+    names = [name for name in names if name not in rare or name in happened]
     return [compared.figures[name] for name in names if compared.figures[name].n]
 
 
@@ -154,7 +159,7 @@ def _cells(figure: PairedFigure) -> tuple[str, str, str, str]:
     """Name, A, B, B - A, with intervals and counts."""
     m = figure.measure
     arrow = {"higher": " ↑", "lower": " ↓"}.get(m.better, "")
-    counts = [f", {hits}/{figure.n}" for hits in figure.hits] if figure.hits else ["", ""]
+    counts = [f", {count}" if count else "" for count in figure.counts]
     difference = wording.interval(figure.difference, m, signed=True)
     if figure.p is not None:
         difference += f", {wording.p_value(figure.p)}"
@@ -182,6 +187,10 @@ def _notes(compared: Compared) -> list[str]:
         f"{group.unpaired[1]} episodes of B have no partner and do not count": group.unpaired[1],
     }
     notes += [note for note, count in counted.items() if count]
+    begun_a, begun_b, both = group.errors_begun
+    if either := begun_a + begun_b - both:
+        words = f"human errors: {begun_a} in A, {begun_b} in B"
+        notes.append(f"{words}; {100 * both / either:.0f} % of all began in both, in the same second")
     for row in [*group.failed, *group.refused][:_SHOWN]:
         notes.append(f"{row['status']} {row['key']} ({row['policy']}, seed {row['seed']}): {_reason(row)}")
     hidden = len(group.failed) + len(group.refused) - _SHOWN

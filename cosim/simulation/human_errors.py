@@ -283,7 +283,7 @@ class HumanErrors:
 
     def _left(self, name: str, lane: str) -> float:
         """m until its lane serves its route no more."""
-        return self._needed_change(name, lane)[1] - position_of(name)
+        return self._needed_change(name, lane)[1] - float(position_of(name))
 
     # ---- the kinds: each yields whom it would meet where it can begin, and begins when it is resumed
 

@@ -320,8 +320,9 @@ class SumoSimulator:
         errors = () if self._errors is None else self._errors.take()
         if extra or wrecked or removed or errors:
             found = (*snapshot.events.collisions, *extra)
-            about = {"wrecked": wrecked, "wrecks_removed": removed, "errors": errors}
-            events = replace(snapshot.events, collisions=found, **about)
+            events = replace(
+                snapshot.events, collisions=found, wrecked=wrecked, wrecks_removed=removed, errors=errors
+            )
             snapshot = replace(snapshot, events=events)
         return snapshot
 

@@ -50,6 +50,7 @@ class VfnTraining:
     learning: Literal["ddqn", "a2c"] = "ddqn"
     reward: str = ""  # a user's, FILE.py:NAME, or one of `cosim.rewards.REWARDS`; "": the file's section
     metrics: tuple[str, ...] = ()  # a user's, FILE.py:NAME: logged besides
+    errors: str = ""  # of the human drivers: a level or a user's file; "": none
     code: tuple[str, ...] = ()  # their files and SHA-256
     replay: ReplayConfig = field(default_factory=ReplayConfig)
     ddqn: DdqnConfig = field(default_factory=DdqnConfig)
@@ -67,6 +68,7 @@ class Drive(NamedTuple):
     frozen: str  # file of the others'
     record: bool  # False: validation, greedy, nothing is recorded
     guided: bool = False  # by the demonstrator
+    errors: str = ""  # of the human drivers
 
 
 class Drove(NamedTuple):
@@ -91,6 +93,7 @@ def drives(c: VfnTraining, k: int, weights: str, frozen: str, epsilon: float, gu
                 frozen,
                 record=True,
                 guided=draws[2] < guided,
+                errors=c.errors,
             )
         )
     return drawn
@@ -105,7 +108,7 @@ def validation(c: VfnTraining, weights: str) -> list[Drive]:
     """Every lesson in turn, greedy, on tuning seeds."""
     svo = math.radians(c.svo[len(c.svo) // 2])
     return [
-        Drive(lesson, TUNING_SEEDS[j], svo, 0.0, weights, weights, record=False)
+        Drive(lesson, TUNING_SEEDS[j], svo, 0.0, weights, weights, record=False, errors=c.errors)
         for lesson in c.lessons
         for j in range(c.validation)
     ]

@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.toy_crashes import KINDS, Toy
 from cosim.errors import BadInput
-from cosim.report.statistics import effective, paired_rates, rate, weighted_rate
+from cosim.report.statistics import effective, paired_rate, paired_rate_change, pooled_rate, rate
 from cosim.scenario import tilt
 from cosim.scenario.tilt import Tilt
 
@@ -19,7 +19,7 @@ RAISED = Tilt(dict.fromkeys(KINDS, 100.0))
 def test_the_interval_holds_the_truth_of_a_toy() -> None:
     """400 estimates of 1,000 episodes each, of which brute force would see a crash in every fifth."""
     toy = Toy()
-    found = [weighted_rate(*parts) for parts in zip(*toy.drive((400, 1000), RAISED, 7), strict=True)]
+    found = [pooled_rate(*parts) for parts in zip(*toy.drive((400, 1000), RAISED, 7), strict=True)]
     truth = toy.truth()
     assert 0.90 <= np.mean([f.low <= truth <= f.high for f in found]) <= 0.98
     values = np.array([f.value for f in found])
@@ -32,40 +32,41 @@ def test_the_interval_holds_the_truth_of_a_toy() -> None:
 def test_the_paired_difference_and_change_hold_the_truth_of_a_toy() -> None:
     toys = Toy(), Toy(danger=0.6)
     sides = [zip(*toy.drive((400, 1000), RAISED, 7), strict=True) for toy in toys]
-    found = [paired_rates(*both) for both in zip(*sides, strict=True)]
+    pairs = [tuple(map(np.array, both)) for both in zip(*sides, strict=True)]
     was, now = (toy.truth() for toy in toys)
-    for k, truth in enumerate((now - was, now / was - 1.0)):
-        assert 0.90 <= np.mean([f[k].low <= truth <= f[k].high for f in found]) <= 0.99
+    for figure, truth in ((paired_rate, now - was), (paired_rate_change, now / was - 1.0)):
+        found = [figure(*both) for both in pairs]
+        assert 0.90 <= np.mean([f.low <= truth <= f.high for f in found]) <= 0.99
 
 
 def test_without_a_tilt_the_rate_is_the_unweighted_one() -> None:
     toy = Toy(rates=(1e-2, 1e-2, 0.0))
     crashes, km, weights = toy.drive((4000,), Tilt(), 3)
     assert (weights == 1.0).all()
-    found, plain = weighted_rate(crashes, km, weights), rate(int(crashes.sum()), km.sum())
+    found, plain = pooled_rate(crashes, km, weights), rate(int(crashes.sum()), km.sum())
     assert crashes.sum() > 20
     assert found.value == pytest.approx(plain.value)
     assert (found.low, found.high) == pytest.approx((plain.low, plain.high))
 
 
 def test_no_crash_still_bounds_the_rate() -> None:
-    found = weighted_rate([0.0] * 100, [0.01] * 100, [1.0] * 100)
+    found = pooled_rate([0.0] * 100, [0.01] * 100, [1.0] * 100)
     assert (found.value, found.low) == (0.0, 0.0)
     assert found.high == pytest.approx(rate(0, 1.0).high)
-    heavier = weighted_rate([0.0] * 100, [0.01] * 100, [4.0] + [1.0] * 99)
+    heavier = pooled_rate([0.0] * 100, [0.01] * 100, [4.0] + [1.0] * 99)
     assert heavier.high > 3.8 * found.high
-    assert not weighted_rate([], [], []).known
+    assert not pooled_rate([], [], []).known
 
 
 def test_one_crash_in_each_episode_keeps_a_width() -> None:
-    found = weighted_rate([1.0] * 5, [1.0] * 5, [1.0] * 5)
+    found = pooled_rate([1.0] * 5, [1.0] * 5, [1.0] * 5)
     assert found.low < 0.5
     assert found.high > 2.0
 
 
 def test_episodes_with_several_events_widen_the_interval() -> None:
     spread, bunched = [1.0] * 10 + [0.0] * 90, [10.0] + [0.0] * 99
-    one, other = (weighted_rate(counts, [1.0] * 100, [1.0] * 100) for counts in (spread, bunched))
+    one, other = (pooled_rate(counts, [1.0] * 100, [1.0] * 100) for counts in (spread, bunched))
     assert one.value == other.value
     assert other.high - other.low > 2.0 * (one.high - one.low)
 

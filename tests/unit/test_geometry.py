@@ -352,7 +352,7 @@ def test_the_smallest_encroachment_of_a_wide_crowd_is_that_of_its_worst_pair() -
 
     def smallest(rows: list[int]) -> float:
         parts = np.ascontiguousarray(trail[:, rows]), frames - 1, len(rows), sizes[rows], relevant[rows]
-        return float(kernels.encroachment(*parts, interval, EVERYWHERE))
+        return float(kernels.encroachment(*parts, interval, EVERYWHERE)[0])
 
     pairs = [smallest([a, b]) for a in range(n) for b in range(a)]
     assert sum(lag < 5.0 for lag in pairs) > 1

@@ -36,13 +36,14 @@ class Series:
 
     @cached_property
     def figures(self) -> dict[str, Any]:
-        """Counts, rates and means (`summary.group_figures`)."""
+        """Counts, rates, incidences and means (`summary.group_figures`)."""
         return group_figures(self.rows, self.known)
 
     def counts(self, name: str) -> dict[str, Any]:
         """Value, interval and counts of one measure; {} where the run does not have it."""
         found = self.figures
-        return found["rates"].get(name) or found["means"].get(name) or found["timings"].get(name) or {}
+        kinds = (found[kind] for kind in ("rates", "incidences", "means", "timings"))
+        return next((kind[name] for kind in kinds if name in kind), {})
 
     def values(self, name: str) -> list[float]:
         """One measure of every ok episode, nan for NA."""

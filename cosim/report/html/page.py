@@ -11,7 +11,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from cosim.files import cannot, whole
 from cosim.report import wording
-from cosim.report.figures import HEADLINE, Row
+from cosim.report.figures import HEADLINE, INCIDENCES, Row
 from cosim.report.html import tables
 from cosim.report.html.blocks import Block, Difference, blocks
 from cosim.report.html.plots import plots
@@ -60,6 +60,7 @@ def html(run: Run, shown: str | None = None) -> str:
     )
     found = blocks(run)
     differences = [block.differences(COMPARED) for block in found]
+    closer = [block.differences(INCIDENCES) for block in found]
     folder = str(run.path) if shown is None else shown
     wrong = [row for row in run.rows if row["status"] != OK]
     return environment.get_template("page.html").render(
@@ -69,7 +70,8 @@ def html(run: Run, shown: str | None = None) -> str:
         shown=FINDINGS,
         figures=tables.figures(found, run.measures) if found else None,
         law=tables.law(found, run.measures),
-        sections=[_section(block, differences[k], k < PLOTTED) for k, block in enumerate(found)],
+        near_misses=tables.near_misses(found, run.measures),
+        sections=[_section(b, differences[k], closer[k], k < PLOTTED) for k, b in enumerate(found)],
         plotted=PLOTTED,
         worst=[
             {
@@ -150,13 +152,16 @@ def _findings(found: Sequence[Block], differences: Sequence[list[Difference]]) -
     return lines
 
 
-def _section(block: Block, differences: list[Difference], draw: bool) -> dict[str, Any]:
+def _section(
+    block: Block, differences: list[Difference], closer: list[Difference], draw: bool
+) -> dict[str, Any]:
     return {
         "title": wording.group(block.identity),
         "plots": plots(block) if draw else [],
         "drawn": draw,
         "ok": sum(len(s.ok) for s in block.series),
         "differences": tables.differences(differences),
+        "near_misses": tables.differences([d for d in closer if any(f.n for f in d.figures.values())]),
         "everything": tables.everything(block),
     }
 

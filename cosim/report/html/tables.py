@@ -7,9 +7,9 @@ from typing import Any
 
 from cosim.report import wording
 from cosim.report.compare import PairedFigure
-from cosim.report.figures import HEADLINE, Measure
+from cosim.report.figures import HEADLINE, INCIDENCES, Measure
 from cosim.report.html.blocks import Block, Difference, Series
-from cosim.report.result import LAW
+from cosim.report.result import LAW, NEAR_MISSES
 from cosim.report.statistics import CONFIDENCE, Figure
 from cosim.report.summary import GROUP
 
@@ -20,6 +20,7 @@ TITLES = {
     "behavior": "behaviour",
     "penetration": "penetration",
     "preset": "preset",
+    "errors": "human errors",
     "svo_deg": "SVO",
     "driver_model": "drivers",
     "collision_rate": "collisions",
@@ -33,6 +34,12 @@ TITLES = {
     "veto_rate": "vetoes",
     **LAW,
     "av_trips_completed": "AV trips completed",
+    **{
+        m.name: f"{what}, {'AVs' if m.per == 'av_hours' else 'all'}"
+        for kind, what in NEAR_MISSES.items()
+        for m in INCIDENCES.values()
+        if m.column.endswith(kind)
+    },
 }
 
 
@@ -87,6 +94,16 @@ def law(blocks: Sequence[Block], known: dict[str, Measure]) -> Table | None:
         for s in series
     ]
     return Table(["policy", *(head(known[n]) for n in (*names, *more))], rows, [])
+
+
+def near_misses(blocks: Sequence[Block], known: dict[str, Measure]) -> Table | None:
+    """One row per cell with its near-misses per vehicle time; None without any such column."""
+    series, varying = _series(blocks)
+    names = [n for n in INCIDENCES if any(s.counts(n).get("n") for s in series)]
+    if not names:
+        return None
+    rows = [[_named(s, varying), *(_figure(s.counts(n), known[n]) for n in names)] for s in series]
+    return Table(["policy", *(head(known[n]) for n in names)], rows, [])
 
 
 def differences(found: Sequence[Difference]) -> Table | None:

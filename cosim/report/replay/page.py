@@ -72,6 +72,7 @@ def document(replay: ReplayData) -> dict[str, Any]:
             {
                 "t": _ms(c.time), "collider": c.collider, "victim": c.victim, "kind": c.kind, "lane": c.lane,
                 "x": _finite(c.x), "y": _finite(c.y), "av_caused": c.av_caused,
+                "human_error": c.human_error_involved,
             }
             for c in r.collisions
         ],
@@ -86,6 +87,12 @@ def document(replay: ReplayData) -> dict[str, Any]:
             [_ms(one.time), number[one.vehicle], words.setdefault(one.reason, len(words))]
             for one in r.interventions
             if one.vehicle in number
+        ],
+        "errors": [
+            [_ms(one.time), _ms(one.until), number[one.who],
+             *(words.setdefault(text, len(words)) for text in (one.kind, one.what, one.near))]
+            for one in r.errors
+            if one.who in number
         ],
         "words": [*words],
     }  # fmt: skip
@@ -129,8 +136,8 @@ def _facts(r: ReplayData) -> dict[str, Any]:
     """What stands at the head of the page and in its table of figures."""
     units = r.facts.get("units", {})
     names = (
-        "scenario demand policy policy_label behavior driver_model preset svo_deg seed steps trace_hash "
-        "not_comparable_because mission_vehicle mission_guessed"
+        "scenario demand policy policy_label behavior driver_model preset errors svo_deg seed steps "
+        "trace_hash not_comparable_because mission_vehicle mission_guessed"
     )
     return {
         **{name: r.facts.get(name) for name in names.split()},

@@ -23,7 +23,7 @@ SIGMAS = 2.0  # half the width of a predicted interval, in standard deviations
 GROUND, ROAD, EDGE, JUNCTION = (238, 241, 244), (201, 206, 214), (255, 255, 255), (188, 194, 203)
 MARK = (255, 255, 255)  # paint on the road
 TEXT, BAD, WARN = (27, 33, 41), (200, 30, 30), (180, 83, 9)
-LAW, CORRECTION = (109, 40, 217), (14, 116, 144)
+LAW, CORRECTION, ERROR = (109, 40, 217), (14, 116, 144), (124, 90, 18)
 HOUSING, SIGN = (32, 37, 43), (200, 30, 30)
 MISSION, AV = (184, 69, 155), (0, 114, 178)
 DRIVERS = {"conservative": (0, 158, 115), "moderate": (230, 159, 0), "aggressive": (213, 94, 0)}
@@ -231,6 +231,24 @@ class Strip:
         """A square around an AV that its car corrected."""
         side = 0.62 * p.track.length * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
         self._pen.line(self._pixels(side + np.array([p.x, p.y])), fill=CORRECTION, width=2 * FINE)
+
+    def erring(self, p: Pose, kind: str, other: Pose | None) -> None:
+        """A triangle on who errs, the `kind` of its error beneath it ("": left out), a line to whom it meets."""
+        if other is not None:
+            self._pen.line(
+                [self._pixel(p.x, p.y), self._pixel(other.x, other.y)], fill=(*ERROR, 170), width=FINE
+            )
+        x, y = self._pixel(p.x, p.y)
+        r = 8.0 * FINE
+        corners = [(x, y - r), (x + r, y + 0.8 * r), (x - r, y + 0.8 * r)]
+        self._pen.polygon(corners, fill=ERROR, outline=(255, 255, 255), width=FINE)
+        for top, bottom in ((-0.4, 0.2), (0.38, 0.6)):
+            self._pen.rectangle(
+                (x - 0.12 * r, y + top * r, x + 0.12 * r, y + bottom * r), fill=(255, 255, 255)
+            )
+        if kind:
+            x, y = self._pixel(p.x, p.y - p.track.width / 2 - 2.6)
+            self._text(x, y, kind, ERROR, 11, bold=True)
 
     def name(self, p: Pose) -> None:
         """The vehicle's id above it."""

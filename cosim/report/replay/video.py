@@ -22,6 +22,7 @@ from cosim.report.replay.strip import (
     AV,
     BAD,
     CORRECTION,
+    ERROR,
     LAW,
     OTHER,
     PERSON,
@@ -161,6 +162,10 @@ def picture_at(r: ReplayData, time: float, camera: _Camera, *, small: bool = Fal
     for correction in () if small else r.interventions:
         if correction.vehicle in seen and 0.0 <= time - correction.time + 0.05 < SHOWN_EVENT:
             strip.corrected(by_name[correction.vehicle])
+    for error in r.errors:
+        if error.who in seen and error.time <= time + 0.05 and error.until > time - 0.05:
+            kind = "" if small else error.kind.replace("_", " ")
+            strip.erring(by_name[error.who], kind, by_name.get(error.near))
     for crash in r.collisions:
         if math.isfinite(crash.x) and 0.0 <= time - crash.time + 0.05 < SHOWN_CRASH:
             strip.crash(crash.x, crash.y)
@@ -231,14 +236,18 @@ class _Board:
         self._wrapped(14, line + 72, outcome, colour, SPLIT - 24)
         broken = [one for one in r.offences if one.time <= time + 0.05]
         corrections = [one for one in r.interventions if one.time <= time + 0.05]
+        errors = [one for one in r.errors if r.begin < one.time <= time + 0.05]
         if t := camera.follow:
             what = _kind(t) + ", mission vehicle" * t.mission
             where = f"{here[t.id].speed:.1f} m/s" if t.id in here else "not on the road"
             self._wrapped(14, line + 104, f"{t.id} ({what}): {where}", colour_of(t), SPLIT - 24, most=1)
-        if corrections or broken:
-            counts = (f"law broken {len(broken)} times", f"AVs corrected {len(corrections)} times")
-            said = ", ".join(text for text, n in zip(counts, (broken, corrections), strict=True) if n)
-            self._line(14, line + 121, f"{said} so far", LAW if broken else CORRECTION, 12)
+        counts = {
+            f"law broken {len(broken)} times": LAW if broken else None,
+            f"AVs corrected {len(corrections)} times": CORRECTION if corrections else None,
+            f"humans erred {len(errors)} times": ERROR if errors else None,
+        }
+        if said := {text: colour for text, colour in counts.items() if colour}:
+            self._line(14, line + 121, f"{', '.join(said)} so far", next(iter(said.values())), 12)
         if shown is not None:
             mine = [one for one in corrections if one.vehicle == shown.track.id]
             reason = mine[-1].reason if mine and time - mine[-1].time < SHOWN_EVENT else None

@@ -27,7 +27,7 @@ function read(raw) {
   const vehicles = raw.vehicles.map(([id, kind, mission, driver, length, width, actor], number) => ({
     id, number, av: kind === 1, person: kind === 2, mission: mission === 1, driver, actor, what: shapes.get(actor).name,
     length: Math.max(length / 100, shapes.get(actor).least[0]), width: Math.max(width / 100, shapes.get(actor).least[1]),
-    tracks: [], choices: [], corrections: [], violations: [],
+    tracks: [], choices: [], corrections: [], violations: [], errors: [],
   }));
   for (const [v, first, x, y, heading, speed, accel, lane] of raw.tracks) {
     vehicles[v].tracks.push({
@@ -37,6 +37,11 @@ function read(raw) {
   }
   const said = ([t, v, word]) => ({ t: t / 1000 - begin, text: raw.words[word], vehicle: vehicles[v] });
   const corrections = raw.interventions.map(said), violations = raw.violations.map(said);
+  const errors = raw.errors.map(([t, until, v, kind, what, near]) => ({
+    t: t / 1000 - begin, until: until / 1000 - begin, vehicle: vehicles[v], kind: raw.words[kind].replaceAll("_", " "),
+    text: raw.words[what] + (raw.words[near] && !raw.words[what].includes(raw.words[near]) ? `, near ${raw.words[near]}` : ""), near: raw.words[near],
+  }));
+  for (const one of errors) one.vehicle.errors.push(one);
   for (const one of corrections) one.vehicle.corrections.push(one);
   for (const one of violations) one.vehicle.violations.push(one);
   const decided = raw.decided.map((t) => t / 1000 - begin);
@@ -56,7 +61,7 @@ function read(raw) {
   const open = raw.lanes.filter(([, , internal]) => internal === 0).length;
   const lanes = raw.lanes.map(([id, width, internal, shape]) => ({ id, width: width / 100, internal: internal === 1, ...line(shape) }));
   return {
-    facts: raw.facts, shapes, lamps: raw.lamps, corrections, violations,
+    facts: raw.facts, shapes, lamps: raw.lamps, corrections, violations, errors,
     signals: raw.signals.map(([states, frames]) => ({ states, frames: summed(frames) })),
     crossings: raw.crossings.map(([width, shape, signal]) => ({ width: width / 100, signal, ...line(shape) })),
     stopLines: raw.stop_lines.map(([lane, rule, signals]) => ({ ...endOf(lanes[lane]), rule, signals })),
@@ -120,7 +125,7 @@ function choiceOf(data, vehicle, t) {
 
 // Kinds of events, the gravest first: what the filter calls them, and their colour.
 const EVENTS = {
-  collision: ["collisions", "bad"], law: ["law broken", "law"], unsafe: ["no safe action", "aggressive"],
+  collision: ["collisions", "bad"], law: ["law broken", "law"], error: ["human errors", "error"], unsafe: ["no safe action", "aggressive"],
   mission: ["mission", "good"], correction: ["corrections by the car", "correction"],
   refused: ["commands refused", "quiet"], veto: ["vetoes", "warn"],
 };
@@ -129,9 +134,12 @@ const EVENTS = {
 function eventsOf(data) {
   const found = data.collisions.map((c) => ({
     t: c.t, kind: "collision", who: [c.collider, c.victim],
-    text: `${c.collider} hit ${c.victim} (${c.kind}${c.av_caused ? ", AV-caused" : ""})`,
+    text: `${c.collider} hit ${c.victim} (${c.kind}${c.av_caused ? ", AV-caused" : ""}${c.human_error ? ", a human had erred" : ""})`,
   }));
   for (const one of data.violations) found.push({ t: one.t, kind: "law", who: [one.vehicle.id], text: `${one.vehicle.id} ${one.text}` });
+  for (const one of data.errors) { // of the warm-up none
+    if (one.t > 0) found.push({ t: one.t, kind: "error", who: [one.vehicle.id, one.near], text: `${one.vehicle.id} ${one.text} (${one.kind})` });
+  }
   for (const one of data.corrections) {
     found.push({ t: one.t, kind: "correction", who: [one.vehicle.id], text: `${one.vehicle.id}: corrected by the car, ${one.text}` });
   }

@@ -6,7 +6,7 @@ const VIEW_RANGE = 125; // m: what a chosen AV's own rows reach (contract)
 function colours() {
   const style = getComputedStyle(document.documentElement);
   const names = "ground road edge junction goal zone text quiet panel line pick halo av conservative moderate " +
-    "aggressive asis mission bad good warn person mark dark sign law correction";
+    "aggressive asis mission bad good warn person mark dark sign law correction error";
   return Object.fromEntries(names.split(" ").map((n) => [n, style.getPropertyValue(`--${n}`).trim()]));
 }
 
@@ -165,7 +165,7 @@ function drawScene(ctx, state) {
   }
   for (const [vehicle, s] of state.shown) drawVehicle(ctx, vehicle, s, c, view, vehicle === state.chosen, data.shapes);
   view.inPixels(ctx);
-  for (const [vehicle, s] of state.shown) { drawChoice(ctx, state, vehicle, s); drawLaw(ctx, state, vehicle, s); }
+  for (const [vehicle, s] of state.shown) { drawChoice(ctx, state, vehicle, s); drawLaw(ctx, state, vehicle, s); drawError(ctx, state, vehicle, s); }
   for (const [vehicle, s] of state.shown) {
     if (vehicle === state.chosen || vehicle.mission || (state.labels && view.scale > 1.5)) {
       const up = (Math.abs(Math.sin(s.heading)) * vehicle.length + vehicle.width) * 0.5 * view.scale + 9;
@@ -217,6 +217,32 @@ function drawLaw(ctx, { view, c, t }, vehicle, s) {
   if (!broken) return;
   ctx.font = "bold 12px system-ui, sans-serif"; ctx.textAlign = "center"; ctx.textBaseline = "middle";
   halo(ctx, broken.text, px, py + 0.62 * vehicle.length * view.scale + 20, c.law, c);
+}
+
+// The error under way, if any: of several the last one.
+function erring(vehicle, t) { return vehicle.errors.findLast((e) => e.t <= t + 0.05 && e.until > t - 0.05) || null; }
+
+// A warning triangle of `r` pixels.
+function triangle(ctx, x, y, r, c) {
+  ctx.lineJoin = "round"; ctx.fillStyle = c.error; ctx.strokeStyle = c.halo; ctx.lineWidth = 2;
+  ctx.beginPath(); ctx.moveTo(x, y - r); ctx.lineTo(x + r, y + 0.8 * r); ctx.lineTo(x - r, y + 0.8 * r); ctx.closePath(); ctx.stroke(); ctx.fill();
+  ctx.fillStyle = c.panel; ctx.fillRect(x - 0.12 * r, y - 0.4 * r, 0.24 * r, 0.6 * r); ctx.fillRect(x - 0.12 * r, y + 0.38 * r, 0.24 * r, 0.22 * r);
+}
+
+// A triangle on who errs, what it does wrong beneath it, and a line to whom it meets first.
+function drawError(ctx, { data, view, c, t }, vehicle, s) {
+  const error = erring(vehicle, t);
+  if (!error) return;
+  const [px, py] = view.toPixels(s.x, s.y), other = data.byId.get(error.near), o = other && stateOf(data, other, t);
+  if (o) {
+    ctx.strokeStyle = c.error; ctx.lineWidth = 1.5; ctx.setLineDash([2, 4]);
+    ctx.beginPath(); ctx.moveTo(px, py); ctx.lineTo(...view.toPixels(o.x, o.y)); ctx.stroke(); ctx.setLineDash([]);
+  }
+  triangle(ctx, px, py, Math.min(Math.max(0.32 * vehicle.length * view.scale, 6), 14), c);
+  if (view.scale < 2.2) return;
+  const below = (Math.abs(Math.sin(s.heading)) * vehicle.length + vehicle.width) * 0.5 * view.scale + 12;
+  ctx.font = "bold 11px system-ui, sans-serif"; ctx.textAlign = "center"; ctx.textBaseline = "middle";
+  halo(ctx, error.kind, px, py + below, c.error, c);
 }
 
 function halo(ctx, text, x, y, colour, c) {

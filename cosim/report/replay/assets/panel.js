@@ -40,6 +40,11 @@ function fillDetails(state) {
   const lane = s.lane >= 0 ? data.lanes[s.lane].id : "off every lane";
   box.append(element("p", `${s.speed.toFixed(1)} m/s (${(3.6 * s.speed).toFixed(0)} km/h), ` +
     `${s.accel.toFixed(1)} m/s\u00b2, lane ${lane}`));
+  const error = erring(chosen, t), was = lastOf(chosen.errors, t, Infinity);
+  if (error || was) {
+    const one = error || was;
+    box.append(element("p", `${error ? "" : "last error: "}${one.kind} ${one.t > 0 ? `at ${one.t.toFixed(1)} s` : "from the warm-up"}: it ${one.text}`, error ? "error" : "quiet"));
+  }
   if (!chosen.av) return;
   const choice = choiceOf(data, chosen, t);
   const last = lastOf(chosen.corrections, t, Infinity), corrected = lastOf(chosen.corrections, t);
@@ -155,6 +160,10 @@ function fillLegend(state) {
       ctx.globalAlpha = 0.3; ctx.beginPath(); ctx.ellipse(20, 8, 9, 5, 0, 0, 7); ctx.fill();
     });
   }
+  if (data.errors.length) entry("a human errs; line to whom it meets first", (ctx) => {
+    ctx.strokeStyle = c.error; ctx.lineWidth = 1.5; ctx.setLineDash([2, 3]); ctx.beginPath(); ctx.moveTo(10, 8); ctx.lineTo(29, 8); ctx.stroke();
+    triangle(ctx, 10, 8, 7, c);
+  });
   if (data.corrections.length) {
     entry("its car corrected the AV", (ctx) => { ctx.strokeStyle = c.correction; ctx.lineWidth = 2; ctx.strokeRect(9, 2, 12, 12); });
   }

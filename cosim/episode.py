@@ -8,7 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from cosim.scenario import Scenario
 from cosim.scenario.manifest import manifest
 from cosim.seeding import generator
 from cosim.types import (
+    TILT,
     Collision,
     Command,
     Decision,
@@ -263,12 +264,13 @@ class Episode:
 
     # ---- inside ----
 
-    def _tilt(self) -> dict[str, float | bool]:
+    def _tilt(self) -> dict[str, Any]:
         tilt = self.scenario.tilt
         if tilt is None:
             return {}
-        log_ratio = self.simulator.log_ratio
-        return {"weight": tilt.weight(log_ratio), "log_ratio": log_ratio, "tilted": tilt.drawn(self.seed)}
+        log_ratio, trials = self.simulator.tilted
+        values = tilt.weight(log_ratio), log_ratio, tilt.drawn(self.seed), dict(trials)
+        return dict(zip(TILT, values, strict=True))
 
     def _observe(self, frames: tuple[Snapshot, ...]) -> None:
         began = time.perf_counter()

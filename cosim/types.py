@@ -428,8 +428,8 @@ class Simulator(Protocol):
         """Present target speed in m/s (None while uncommanded) and lane change under way (+1, 0, -1)."""
 
     @property
-    def log_ratio(self) -> float:
-        """Of this episode's errors: log(q / p), 0 where none is tilted (docs/estimate.md)."""
+    def tilted(self) -> tuple[float, Mapping[str, Sequence[float]]]:
+        """Of this episode's errors: log(q / p), and what was tilted, case by case (docs/estimate.md)."""
 
     def counts(self) -> dict[str, int]:
         """Vehicles since the start: `inserted`, and `waiting` ones that found no room so far."""
@@ -469,7 +469,7 @@ TIMINGS = ("reset_s", "simulation_s", "observation_s", "decision_s", "total_s") 
 # What stands beside the figures in documents and rows: no figure may be called so.
 MISSION = ("mission_vehicle", "mission_guessed")
 WEIGHT = "weight"  # of an episode whose errors were drawn from tilted rates (docs/estimate.md)
-TILT = (WEIGHT, "log_ratio", "tilted")
+TILT = (WEIGHT, "log_ratio", "tilted", "tilt_trials")
 RESERVED = {
     *IDENTITY,
     *TIMINGS,
@@ -503,7 +503,7 @@ class EpisodeResult(Identity):
     mission_guessed: bool = False  # nobody named it: its figures feed no gate
     interventions_by_reason: dict[str, int] = field(default_factory=dict)  # the most frequent first
     errors_begun: tuple[HumanError, ...] = ()
-    tilt: dict[str, float | bool] = field(default_factory=dict)  # by the names of `TILT`, of tilted errors
+    tilt: dict[str, Any] = field(default_factory=dict)  # by the names of `TILT`, of tilted errors
     manifest: dict[str, Any] = field(default_factory=dict)
 
     def value(self, name: str) -> float | int | bool | None:

@@ -16,6 +16,8 @@ from cosim.seeding import uniform
 MOST = 0.5  # of a tilted probability: both outcomes of a trial stay likely
 UNTILTED = 0.1  # share of episodes that are drawn as errors happen: no episode weighs more than 1 / UNTILTED
 ALL = "all"  # kinds that are not named
+ENDINGS = ("", ".during", ".other", ".other.during")
+CASES = tuple(kind + ending for kind in (*KINDS, ALL) for ending in ENDINGS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,20 +28,20 @@ class Tilt:
     JASA 95 (2000) 135-143): docs/estimate.md.
     """
 
-    factors: Mapping[str, float] = field(default_factory=dict)  # kind, or all -> of errors that meet an AV
-    others: float = 1.0  # factor of all other errors near an AV
+    factors: Mapping[str, float] = field(default_factory=dict)  # `case` -> factor, 1 or more
     untilted: float = UNTILTED
 
     def raises(self, kind: str) -> bool:
         """Whether any trial of this kind is tilted."""
-        return max(self._factor(kind), self.others) > 1.0
+        return any(self._factor(kind + ending) > 1.0 for ending in ENDINGS)
 
-    def rate(self, kind: str, p: float, meets_av: bool = True) -> float:
-        """q, the tilted probability of a trial whose probability is p."""
-        return max(p, min(p * (self._factor(kind) if meets_av else self.others), MOST))
+    def rate(self, what: str, p: float) -> float:
+        """q, the tilted probability of a trial of the `case` that is p as it happens."""
+        return max(p, min(p * self._factor(what), MOST))
 
-    def _factor(self, kind: str) -> float:
-        return self.factors.get(kind, self.factors.get(ALL, 1.0))
+    def _factor(self, what: str) -> float:
+        names = what, ALL + what[len(what.partition(".")[0]) :]
+        return next((self.factors[name] for name in names if name in self.factors), 1.0)
 
     def drawn(self, seed: int) -> bool:
         """Whether the episode of this seed is drawn from the tilted probabilities."""
@@ -51,8 +53,14 @@ class Tilt:
 
     def text(self) -> str:
         """`cut_in=300,forced_entry=30,untilted=0.1`; `read` is the way back."""
-        named = [*sorted(self.factors.items()), ("others", self.others), ("untilted", self.untilted)]
+        named = [*sorted(self.factors.items()), ("untilted", self.untilted)]
         return ",".join(f"{name}={value:g}" for name, value in named)
+
+
+def case(kind: str, meets_av: bool, during: bool) -> str:
+    """What a factor is for: `kind`, with `.other` where the error does not meet an AV first, and with
+    `.during` where somebody near errs already."""
+    return kind + ".other" * (not meets_av) + ".during" * during
 
 
 def log_ratio(p: float, q: float, begins: bool) -> float:
@@ -78,11 +86,10 @@ def read(text: str, where: str = "--tilt") -> Tilt:
     if not 0.0 < share <= 1.0:
         raise BadInput("must be above 0 and at most 1", field=f"{where}.untilted", value=share)
     for name, factor in factors.items():
-        one_of(name, (*KINDS, ALL, "others"), where)
+        one_of(name, CASES, where)
         if factor < 1.0:
             raise BadInput("must be 1 or more", field=f"{where}.{name}", value=factor)
-    others = factors.pop("others", 1.0)
-    return Tilt(dict(sorted(factors.items())), others, share)
+    return Tilt(dict(sorted(factors.items())), share)
 
 
 @lru_cache

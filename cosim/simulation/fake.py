@@ -88,9 +88,9 @@ class FakeSimulator:
         return v.target, 0 if v.goal_lane < 0 else int(np.sign(v.goal_lane - v.lane))
 
     @property
-    def log_ratio(self) -> float:
+    def tilted(self) -> tuple[float, dict[str, list[float]]]:
         """Nobody errs."""
-        return 0.0
+        return 0.0, {}
 
     def counts(self) -> dict[str, int]:
         """All vehicles are inserted at the start."""

@@ -11,12 +11,12 @@ import numpy as np
 from cosim.control import LANE_CHANGE_TIME
 from cosim.road import RoadMap
 from cosim.scenario.human_errors import KINDS, Errors, Span
-from cosim.scenario.tilt import Tilt, log_ratio
+from cosim.scenario.tilt import Tilt, case, log_ratio
 from cosim.seeding import subseed, uniform, uniforms
 from cosim.simulation.convert import PERSON, Body, may_change
 from cosim.simulation.drivers import Drivers
 from cosim.simulation.mobil import LEFT, RIGHT, route_allows
-from cosim.types import Collision, HumanError, Kind
+from cosim.types import Bools, Collision, HumanError, Kind
 
 # SUMO's speed mode (Change_Vehicle_State): what an erring driver no longer heeds.
 SAFE_SPEED, MAX_ACCEL, MAX_DECEL, RIGHT_OF_WAY, RED_LIGHT = 1, 2, 4, 8, 16
@@ -93,6 +93,8 @@ class HumanErrors:
         )
         self._avs: set[str] = set()
         self._near: frozenset[str] = frozenset()  # whose trials are weighed
+        self._during: frozenset[str] = frozenset()  # of these, near somebody who errs
+        self.weighed: dict[str, list[float]] = {}  # `cosim.scenario.tilt.case` -> errors begun, sum of p
         self._streams: dict[str, Any] = {}  # HV on the road -> [k] its streams of draws
         self._erring: dict[str, Erring] = {}
         self._ended: dict[str, float] = {}  # who erred before -> s, when that ended
@@ -159,7 +161,8 @@ class HumanErrors:
         """Those of one second."""
         second = round(now)
         names = [*self._streams]
-        self._near = frozenset() if self._tilt is None else self._beside_avs(names)
+        if self._tilt is not None:
+            self._near, self._during = self._beside_avs(names, now)
         if names and self._every_second:
             drawn = uniforms(np.array([*self._streams.values()]), second)  # [n,k]
             looked_at = drawn < self._rates
@@ -184,7 +187,7 @@ class HumanErrors:
             return
         trial: Trial = getattr(self, f"_{kind}")(who, now)
         whom = next(trial, None)
-        if whom is None or not drawn < (self._weighed(kind, rate, drawn, whom) if weighed else rate):
+        if whom is None or not drawn < (self._weighed(who, kind, rate, drawn, whom) if weighed else rate):
             return
         try:
             next(trial)
@@ -192,23 +195,38 @@ class HumanErrors:
             self._erring[who] = begun.value
             self._happened.append(begun.value.error)
 
-    def _weighed(self, kind: str, p: float, drawn: float, whom: str) -> float:
-        """The probability that holds for a trial near an AV; the episode's `log_ratio` takes it in."""
+    def _weighed(self, who: str, kind: str, p: float, drawn: float, whom: str) -> float:
+        """The probability that holds for a trial near an AV; `log_ratio` and `weighed` take it in."""
         assert self._tilt is not None
-        q = self._tilt.rate(kind, p, whom in self._avs or kind in MEET_ANYBODY)
+        what = case(kind, whom in self._avs or kind in MEET_ANYBODY, who in self._during)
+        q = self._tilt.rate(what, p)
         held = q if self._tilted else p
-        self.log_ratio += log_ratio(p, q, drawn < held)
+        begins = bool(drawn < held)
+        self.log_ratio += log_ratio(p, q, begins)
+        counted = self.weighed.setdefault(what, [0, 0.0])
+        counted[0] += begins
+        counted[1] += float(p)
         return held
 
-    def _beside_avs(self, names: Sequence[str]) -> frozenset[str]:
-        """Those who drive within `NEAR` of an AV, and persons: their errors may be tilted."""
-        if not self._avs:
-            return frozenset()
-        avs, places = (np.array([libsumo.vehicle.getPosition(n) for n in k]) for k in (self._avs, names))
-        if not len(places):
-            return frozenset()
-        away = np.abs(places[:, None] - avs).max(2).min(1)  # m, the larger of both coordinates
-        return frozenset(name for name, m in zip(names, away, strict=True) if m < NEAR)
+    def _beside_avs(self, names: Sequence[str], now: float) -> tuple[frozenset[str], frozenset[str]]:
+        """Who drives within `NEAR` of an AV, so that its errors may be tilted; and of those who does so of
+        somebody else who is erring, or was until `REMEMBERED` s ago."""
+        if not (self._avs and names):
+            return frozenset(), frozenset()
+        recent = {who for who, end in self._ended.items() if now - end <= REMEMBERED}
+        erring = [name for name in names if name in self._erring or name in recent]
+        places = {name: libsumo.vehicle.getPosition(name) for name in (*names, *self._avs)}
+
+        def close(to: Sequence[str]) -> Bools:
+            """[n,t]"""
+            here, there = (np.array([places[k] for k in group]).reshape(-1, 2) for group in (names, to))
+            return np.asarray(np.abs(here[:, None] - there).max(2) < NEAR)
+
+        near = close([*self._avs]).any(1)
+        during = near & (close(erring) & (np.array(names)[:, None] != np.array(erring, str))).any(1)
+        return tuple(
+            frozenset(n for n, is_so in zip(names, mask, strict=True) if is_so) for mask in (near, during)
+        )
 
     def _draw(self, kind: str, who: str, *which: str) -> float:
         """In [0, 1)."""

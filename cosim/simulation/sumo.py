@@ -167,9 +167,9 @@ class SumoSimulator:
         return state.target, state.changing(libsumo.simulation.getTime())
 
     @property
-    def log_ratio(self) -> float:
-        """Of the errors that were drawn in this episode."""
-        return 0.0 if self._errors is None else self._errors.log_ratio
+    def tilted(self) -> tuple[float, dict[str, list[float]]]:
+        """Of this episode's errors: log(q / p); case -> those begun near AVs, and the sum of p."""
+        return (0.0, {}) if self._errors is None else (self._errors.log_ratio, self._errors.weighed)
 
     def counts(self) -> dict[str, int]:
         """Vehicles since the start: `inserted`, and `waiting`: due and not inserted, whether SUMO has dropped

@@ -17,6 +17,7 @@ from scipy.optimize import brentq
 CONFIDENCE = 0.95
 Z = float(stats.norm.ppf(0.5 + CONFIDENCE / 2.0))
 RESAMPLES = 2000  # the bounds of a mean then wander by some 2 % of the interval's width from seed to seed
+FEW = 3.0  # effective events, from which on their weights tell what another one may weigh
 BATCH = 2_000_000  # resampled values held at once: 16 MB
 
 Array = npt.NDArray[np.float64]
@@ -88,8 +89,8 @@ def pooled_rate(
 
     Of weighted Poisson counts (Fay and Feuer, Statistics in Medicine 16 (1997) 791-801): its variance is that
     of the ratio, sum(w^2 (y - R k)^2), and at least the Poisson variance sum(w^2 y): events of one episode
-    come together. The upper bound allows for one more event, of the largest weight of the events seen, and of
-    the largest weight of all samples where none was seen. With equal weights and no more scatter than
+    come together. The upper bound allows for one more event, of the largest weight of the events seen; of
+    the largest weight of all samples where the events seen are effectively fewer than `FEW`. With equal weights and no more scatter than
     Poisson counts have it is the exact interval of `rate`.
 
     Args:
@@ -107,7 +108,8 @@ def pooled_rate(
         return Figure(0.0, 0.0, float(w.max() * stats.chi2.ppf(1.0 - tail, 2) / 2.0) / exposure)
     scatter = float((w**2 * (y - events / exposure * k) ** 2).sum()) * len(y) / max(len(y) - 1, 1)
     variance = max(scatter, float((w**2 * y).sum()))
-    largest = float(w[y > 0.0].max())
+    seen = w[y > 0.0]
+    largest = float(seen.max() if effective(seen) >= FEW else w.max())
 
     def bound(p: float, mean: float, spread: float) -> float:
         """The p-quantile of the gamma distribution of this mean and variance."""

@@ -16,31 +16,32 @@ from cosim.seeding import uniform
 MOST = 0.5  # of a tilted probability: both outcomes of a trial stay likely
 UNTILTED = 0.1  # share of episodes that are drawn as errors happen: no episode weighs more than 1 / UNTILTED
 ALL = "all"  # kinds that are not named
-ENDINGS = ("", ".during", ".other", ".other.during")
-CASES = tuple(kind + ending for kind in (*KINDS, ALL) for ending in ENDINGS)
+OTHER = ".other"  # errors that do not meet an AV first
+CASES = tuple(kind + ending for kind in (*KINDS, ALL) for ending in ("", OTHER))
 
 
 @dataclass(frozen=True, slots=True)
 class Tilt:
-    """Kinds of errors whose probabilities are multiplied, in all but a share of the episodes.
+    """The first two errors near AVs are drawn more often, in all but a share of the episodes.
 
     Importance sampling with a defensive mixture (Hesterberg, Technometrics 37 (1995) 185-194; Owen and Zhou,
     JASA 95 (2000) 135-143): docs/estimate.md.
     """
 
     factors: Mapping[str, float] = field(default_factory=dict)  # `case` -> factor, 1 or more
+    during: float = 1.0  # times that, for a second error near somebody who errs
     untilted: float = UNTILTED
 
     def raises(self, kind: str) -> bool:
         """Whether any trial of this kind is tilted."""
-        return any(self._factor(kind + ending) > 1.0 for ending in ENDINGS)
+        return any(self._factor(kind + ending) > 1.0 for ending in ("", OTHER))
 
-    def rate(self, what: str, p: float) -> float:
+    def rate(self, what: str, p: float, during: bool = False) -> float:
         """q, the tilted probability of a trial of the `case` that is p as it happens."""
-        return max(p, min(p * self._factor(what), MOST))
+        return max(p, min(p * self._factor(what) * (self.during if during else 1.0), MOST))
 
     def _factor(self, what: str) -> float:
-        names = what, ALL + what[len(what.partition(".")[0]) :]
+        names = what, ALL + OTHER * what.endswith(OTHER)
         return next((self.factors[name] for name in names if name in self.factors), 1.0)
 
     def drawn(self, seed: int) -> bool:
@@ -53,14 +54,13 @@ class Tilt:
 
     def text(self) -> str:
         """`cut_in=300,forced_entry=30,untilted=0.1`; `read` is the way back."""
-        named = [*sorted(self.factors.items()), ("untilted", self.untilted)]
+        named = [*sorted(self.factors.items()), ("during", self.during), ("untilted", self.untilted)]
         return ",".join(f"{name}={value:g}" for name, value in named)
 
 
-def case(kind: str, meets_av: bool, during: bool) -> str:
-    """What a factor is for: `kind`, with `.other` where the error does not meet an AV first, and with
-    `.during` where somebody near errs already."""
-    return kind + ".other" * (not meets_av) + ".during" * during
+def case(kind: str, meets_av: bool) -> str:
+    """What a factor is for: a kind, with `OTHER` where its error does not meet an AV first."""
+    return kind if meets_av else kind + OTHER
 
 
 def log_ratio(p: float, q: float, begins: bool) -> float:
@@ -82,14 +82,14 @@ def read(text: str, where: str = "--tilt") -> Tilt:
         if not math.isfinite(factors[name.strip()]):
             problem = "write KIND=FACTOR,... as in cut_in=100,forced_entry=30,untilted=0.1"
             raise BadInput(problem, field=where, value=part)
-    share = factors.pop("untilted", UNTILTED)
+    during, share = factors.pop("during", 1.0), factors.pop("untilted", UNTILTED)
     if not 0.0 < share <= 1.0:
         raise BadInput("must be above 0 and at most 1", field=f"{where}.untilted", value=share)
-    for name, factor in factors.items():
-        one_of(name, CASES, where)
+    for name, factor in {**factors, "during": during}.items():
+        one_of(name, (*CASES, "during"), where)
         if factor < 1.0:
             raise BadInput("must be 1 or more", field=f"{where}.{name}", value=factor)
-    return Tilt(dict(sorted(factors.items())), share)
+    return Tilt(dict(sorted(factors.items())), during, share)
 
 
 @lru_cache

@@ -94,7 +94,8 @@ class HumanErrors:
         self._avs: set[str] = set()
         self._near: frozenset[str] = frozenset()  # whose trials are weighed
         self._during: frozenset[str] = frozenset()  # of these, near somebody who errs
-        self.weighed: dict[str, list[float]] = {}  # `cosim.scenario.tilt.case` -> errors begun, sum of p
+        self._begun = 0  # errors whose trials were weighed
+        self.weighed: dict[str, list[float]] = {}  # `case` -> first errors begun, sum of p until then
         self._streams: dict[str, Any] = {}  # HV on the road -> [k] its streams of draws
         self._erring: dict[str, Erring] = {}
         self._ended: dict[str, float] = {}  # who erred before -> s, when that ended
@@ -161,13 +162,13 @@ class HumanErrors:
         """Those of one second."""
         second = round(now)
         names = [*self._streams]
-        if self._tilt is not None:
+        if self._tilt is not None and self._begun < 2:
             self._near, self._during = self._beside_avs(names, now)
         if names and self._every_second:
             drawn = uniforms(np.array([*self._streams.values()]), second)  # [n,k]
             looked_at = drawn < self._rates
-            if self._near:
-                looked_at |= np.outer([name in self._near for name in names], self._raised)
+            if self._near and self._begun < 2:
+                looked_at |= np.outer([self._is_weighed(name) for name in names], self._raised)
             for row, k in np.argwhere(looked_at).tolist():
                 self._try(self._every_second[k], names[row], self._rates[k], drawn[row, k], now)
         if self._kinds.keys() & {"forced_entry", "failure_to_yield", "red_light"}:
@@ -182,7 +183,7 @@ class HumanErrors:
 
     def _try(self, kind: str, who: str, rate: float, drawn: float, now: float) -> None:
         """One trial. Whether the error can begin is looked at only where that decides."""
-        weighed = who in self._near
+        weighed = self._is_weighed(who)
         if not (drawn < rate or weighed) or who in self._erring:
             return
         trial: Trial = getattr(self, f"_{kind}")(who, now)
@@ -198,15 +199,23 @@ class HumanErrors:
     def _weighed(self, who: str, kind: str, p: float, drawn: float, whom: str) -> float:
         """The probability that holds for a trial near an AV; `log_ratio` and `weighed` take it in."""
         assert self._tilt is not None
-        what = case(kind, whom in self._avs or kind in MEET_ANYBODY, who in self._during)
-        q = self._tilt.rate(what, p)
+        if not self._is_weighed(who):
+            return p
+        what = case(kind, whom in self._avs or kind in MEET_ANYBODY)
+        q = self._tilt.rate(what, p, self._begun > 0)
         held = q if self._tilted else p
         begins = bool(drawn < held)
         self.log_ratio += log_ratio(p, q, begins)
-        counted = self.weighed.setdefault(what, [0, 0.0])
-        counted[0] += begins
-        counted[1] += float(p)
+        if not self._begun:
+            counted = self.weighed.setdefault(what, [0, 0.0])
+            counted[0] += begins
+            counted[1] += float(p)
+        self._begun += begins
         return held
+
+    def _is_weighed(self, who: str) -> bool:
+        """The first error of an episode is tilted near an AV, the second near whoever errs then, no further."""
+        return who in (self._near, self._during, ())[min(self._begun, 2)]
 
     def _beside_avs(self, names: Sequence[str], now: float) -> tuple[frozenset[str], frozenset[str]]:
         """Who drives within `NEAR` of an AV, so that its errors may be tilted; and of those who does so of

@@ -85,7 +85,7 @@ def test_the_mean_weight_is_one() -> None:
 
 def test_a_tilt_is_written_as_it_is_read() -> None:
     found = tilt.read("hard_braking=30, cut_in=300")
-    assert found.text() == "cut_in=300,hard_braking=30,untilted=0.1"
+    assert found.text() == "cut_in=300,hard_braking=30,during=1,untilted=0.1"
     assert tilt.read(found.text()) == found
     assert found.rate("cut_in", 1e-4) == pytest.approx(0.03)
     assert found.rate("cut_in", 0.1) == 0.5  # no trial becomes certain

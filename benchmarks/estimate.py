@@ -2,9 +2,9 @@
 
     python -m benchmarks.estimate tune --world merge --runs runs/tilts [--episodes 400] [--rounds 4]
 
-`tune` drives tilted episodes of `idm` AVs on tuning seeds, and lets the tilt become that under which errors are
-as frequent as in those episodes in which an AV crashed (cross-entropy; docs/estimate.md); it prints the line of
-sumo_scenarios/tilts.yaml.
+`tune` drives tilted episodes of `idm` AVs on tuning seeds, and lets the tilt become that under which errors
+are as frequent as in those episodes in which an AV crashed (cross-entropy; docs/estimate.md); it prints the
+tilt for sumo_scenarios/tilts.yaml.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cosim.cli.main import main as cosim
-from cosim.report import crash_rate, run_folder
+from cosim.report import run_folder
 from cosim.report.figures import Row, weights
 from cosim.report.statistics import effective
 from cosim.scenario.tilt import ALL, OTHER, Tilt
@@ -37,7 +37,7 @@ HUMANS = 0.2  # share of the score that crashes among humans have
 def drive(
     folder: Path, world: str, demand: str, errors: str, tilt: Tilt, seeds: range, workers: int
 ) -> list[Row]:
-    """The episodes of `idm` AVs under a tilt, those that came through; what is in the folder is not driven again."""
+    """The episodes of `idm` AVs under a tilt; what is in the folder already is not driven again."""
     flags = {
         "--scenario": world,
         "--demand": demand,
@@ -104,9 +104,8 @@ def tune(world: str, demand: str, errors: str, runs: Path, episodes: int, rounds
         seeds = range(TUNING_SEEDS.start + k * episodes, TUNING_SEEDS.start + (k + 1) * episodes)
         rows = drive(runs / f"{world}-{k}", world, demand, errors, tilt, seeds, workers)
         crashes = np.array(weights(rows))[[row["av_involved_collisions"] > 0 for row in rows]]
-        print(
-            f"round {k}: {len(crashes)} crashes, effective {effective(crashes):.1f}, needed {needed(rows):.3g}"
-        )
+        said = f"{len(crashes)} crashes, effective {effective(crashes):.1f}, needed {needed(rows):.3g}"
+        print(f"round {k}: {said}")
         tilt = crossed(rows, tilt) if k else balanced(rows, tilt)
         tilt = replace(tilt, factors={name: float(f"{f:.2g}") for name, f in tilt.factors.items()})
         print(tilt.text())

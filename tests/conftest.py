@@ -35,10 +35,11 @@ def vehicle(name: str, kind: str, x: float, lane: int = 0, speed: float = 20.0, 
 
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Start]:
-    """`start(vehicles, preset=...)`: a worker that holds a SumoSimulator with just these vehicles."""
+    """`start(vehicles, preset=...)`: a worker that holds a SumoSimulator (or another `simulator`) with just
+    these vehicles."""
     workers: list[Worker] = []
 
-    def begin(vehicles: list[str], **changes: object) -> Worker:
+    def begin(vehicles: list[str], simulator: type = SumoSimulator, **changes: object) -> Worker:
         demand = tmp_path / f"demand{len(workers)}.rou.xml"
         demand.write_text(TYPES + "\n".join(vehicles) + "</routes>")
         scenario: Scenario = replace(
@@ -52,7 +53,7 @@ def start(tmp_path: Path) -> Iterator[Start]:
             options=(("insertion-checks", "none"), ("extrapolate-departpos", "false")),
         )
         scenario = replace(scenario, **changes)  # type: ignore[arg-type]
-        worker = Worker(SumoSimulator, scenario, timeout=60.0)
+        worker = Worker(simulator, scenario, timeout=60.0)
         workers.append(worker)
         worker.call("reset", 0)
         return worker

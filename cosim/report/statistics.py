@@ -87,11 +87,11 @@ def pooled_rate(
 ) -> Figure:
     """Events per unit of exposure of n samples: R = sum(w y) / sum(w k), with a gamma interval.
 
-    Of weighted Poisson counts (Fay and Feuer, Statistics in Medicine 16 (1997) 791-801): its variance is that
-    of the ratio, sum(w^2 (y - R k)^2), and at least the Poisson variance sum(w^2 y): events of one episode
-    come together. The upper bound allows for one more event, of the largest weight of the events seen; of
-    the largest weight of all samples where the events seen are effectively fewer than `FEW`. With equal weights and no more scatter than
-    Poisson counts have it is the exact interval of `rate`.
+    Of weighted Poisson counts (Fay and Feuer, Statistics in Medicine 16 (1997) 791-801): its variance is
+    that of the ratio, sum(w^2 (y - R k)^2), and at least the Poisson variance sum(w^2 y): events of one
+    episode come together. The upper bound allows for one more event, of the largest weight of the events
+    seen; of the largest weight of all samples where the events seen are effectively fewer than `FEW`.
+    With equal weights and no more scatter than Poisson counts have it is the exact interval of `rate`.
 
     Args:
         counts: [n] y, events of each sample.

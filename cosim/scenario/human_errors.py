@@ -36,7 +36,8 @@ class Kind:
 
 @dataclass(frozen=True, slots=True)
 class Inattention(Kind):
-    """It keeps its speed and its lane and sees nobody. A trial: a second in which it follows somebody."""
+    """It keeps its speed and its lane and sees nobody. A trial: a second of driving within 100 m behind
+    somebody."""
 
     duration: Span = (1.0, 3.0)  # s
 
@@ -68,7 +69,7 @@ class ForcedEntry(Kind):
 
     patience: NonNegative = 3.0  # s
     zone: Positive = 150.0  # m before the end of its lane in which it wants to change
-    deceleration: Positive = 9.0  # m/s2: a gap that asks more of the follower, or of a foe, it still refuses
+    lag: NonNegative = 0.5  # s: it refuses to enter before somebody who would be there sooner at its speed
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,14 +3,14 @@
 import math
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import libsumo
 import numpy as np
 
 from cosim.control import LANE_CHANGE_TIME
 from cosim.road import RoadMap
-from cosim.scenario.human_errors import KINDS, Errors, Span
+from cosim.scenario.human_errors import KINDS, Errors, ForcedEntry, Span
 from cosim.scenario.tilt import Tilt, case, log_ratio
 from cosim.seeding import subseed, uniform, uniforms
 from cosim.simulation.convert import PERSON, Body, may_change
@@ -23,13 +23,13 @@ SAFE_SPEED, MAX_ACCEL, MAX_DECEL, RIGHT_OF_WAY, RED_LIGHT = 1, 2, 4, 8, 16
 IGNORES_JUNCTION = 32  # also those who are inside the junction already
 BLIND = 0  # neither speed nor lane-change mode heeds anybody; its own lane changes are off
 
-FOLLOWING = 3.0  # s: at a shorter time headway a driver follows (HCM 2000, percent time-spent-following)
 MOVES = 1.0  # m/s: slower than that nobody errs by driving on
 SLOW = 3.0  # m/s, at most, of who waits at a line
 AT_LINE = 15.0  # m before the line within which it waits
 APPROACHES = 30.0  # m before the line within which it looks who has the right of way
 SEES_SIGNAL = 150.0  # m before the line
 LEAST_GAP = 1.0  # m, bumper to bumper, ahead and behind: less is beside, where nobody changes lanes
+HARDEST = 9.0  # m/s2: it does not change lanes to where it cannot stop itself
 WITHIN = 100.0  # m, in which others are looked for
 PASSES = 10.0  # s at most for driving through a junction
 HOLDS = 4.0  # s that a forced lane change may take
@@ -55,6 +55,17 @@ lane_of, position_of, speed_of = (
 
 # A trial whose error can begin yields whom it would meet ("": nobody); resumed, it begins.
 Trial = Generator[str, None, "Erring"]
+
+
+class Gap(NamedTuple):
+    """A place to enter, as somebody who comes leaves it."""
+
+    asked: float  # m/s2, the deceleration with which that one can still avoid a contact
+    lag: float  # s until it would be there at its speed
+    whom: str = ""  # who comes; "": nobody
+
+
+NOBODY = Gap(0.0, math.inf)
 
 
 @dataclass(slots=True)
@@ -214,7 +225,7 @@ class HumanErrors:
         return held
 
     def _is_weighed(self, who: str) -> bool:
-        """The first error of an episode is tilted near an AV, the second near whoever errs then, no further."""
+        """Near an AV the first error of an episode is tilted, and the second near whoever errs then."""
         return who in (self._near, self._during, ())[min(self._begun, 2)]
 
     def _beside_avs(self, names: Sequence[str], now: float) -> tuple[frozenset[str], frozenset[str]]:
@@ -280,8 +291,7 @@ class HumanErrors:
             self._waited.pop(name, None)
             return
         waited = self._waited[name] = self._waited.get(name, 0) + 1
-        kind = self._kinds["forced_entry"]
-        rate = min(kind.rate * max(waited - kind.patience, 0.0), 1.0)
+        rate = hazard(self._kinds["forced_entry"], waited)
         self._try("forced_entry", name, rate, self._draw("forced_entry", name, f"{round(now)}"), now)
 
     def _at_signal(self, name: str, edge: str, now: float) -> None:
@@ -317,14 +327,14 @@ class HumanErrors:
     def _inattention(self, who: str, now: float) -> Trial:
         leader = libsumo.vehicle.getLeader(who, WITHIN)
         speed = speed_of(who)
-        if not leader or not leader[0] or speed < MOVES or leader[1] > FOLLOWING * speed:
+        if not leader or not leader[0] or speed < MOVES:
             return None
         yield leader[0]
         length = self._drawn(self._kinds["inattention"].duration, "inattention", who, now, "duration")
         erring = self._begins("inattention", who, now, length, f"sees nobody for {length:.1f} s", leader[0])
         self._take(who, erring, BLIND, BLIND)
         erring.deceleration = 0.0
-        libsumo.vehicle.setSpeed(who, speed)
+        self._slow(who, 0.0)
         return erring
 
     def _hard_braking(self, who: str, now: float) -> Trial:
@@ -355,7 +365,12 @@ class HumanErrors:
         """It still sees its leader and the signals, and may brake harder for them."""
         self._take(who, erring, libsumo.vehicle.getSpeedMode(who) & ~(MAX_ACCEL | MAX_DECEL), BLIND)
         erring.deceleration = deceleration
+        self._slow(who, deceleration)
         return erring
+
+    def _slow(self, who: str, deceleration: float) -> None:
+        """One step slower; 0 holds the speed."""
+        libsumo.vehicle.setSpeed(who, max(speed_of(who) - deceleration * self._step, 0.0))
 
     def _cut_in(self, who: str, now: float, kind: str = "cut_in") -> Trial:
         low, high = self._kinds[kind].deceleration
@@ -365,11 +380,11 @@ class HumanErrors:
         found = []
         for side in (LEFT, RIGHT):
             beside = self._beside(who, lane, side)
-            if beside is not None and low <= beside[0] <= high and route_allows(who, side):
-                found.append((*beside, side))
+            if beside is not None and low <= beside.asked <= high and route_allows(who, side):
+                found.append((beside, side))
         if not found:
             return None
-        asked, whom, side = min(found)
+        (asked, _, whom), side = min(found)
         yield whom
         again = kind == "aborted_cut_in"
         length = (2 if again else 1) * LANE_CHANGE_TIME + self._step
@@ -385,36 +400,30 @@ class HumanErrors:
         return self._cut_in(who, now, "aborted_cut_in")
 
     def _forced_entry(self, who: str, now: float) -> Trial:
-        most = self._kinds["forced_entry"].deceleration
+        refuses = self._kinds["forced_entry"].lag
         lane, waited = lane_of(who), self._waited[who]
         if self._at_end_of_lane(who, lane):
             side, _ = self._needed_change(who, lane)
             beside = None if self._changing(who) else self._beside(who, lane, side)
-            if beside is None or beside[0] > most:
+            if beside is None or beside.lag < refuses:
                 return None
-            asked, whom = beside
-            yield whom
-            what = f"forces its way in after {waited} s; {whom or 'nobody'} must brake with {asked:.1f} m/s2"
-            erring = self._begins("forced_entry", who, now, HOLDS, what, whom)
+            yield beside.whom
+            erring = self._begins("forced_entry", who, now, HOLDS, _forces(waited, beside), beside.whom)
             self._take(who, erring, None, BLIND)
             libsumo.vehicle.changeLaneRelative(who, side, HOLDS)
             return erring
         met = self._foes(who)
-        if not met or met[0][0] > most:
+        if not met or any(foe.lag < refuses for foe in met):
             return None
-        asked, whom = met[0]
-        yield whom
-        what = f"forces its way in after {waited} s; {whom} must brake with {asked:.1f} m/s2"
-        return self._drives_on("forced_entry", who, now, RIGHT_OF_WAY, what, whom)
+        yield met[0].whom
+        return self._drives_on("forced_entry", who, now, RIGHT_OF_WAY, _forces(waited, met[0]), met[0].whom)
 
     def _failure_to_yield(self, who: str, now: float) -> Trial:
         met = self._foes(who)
-        whom = met[0][1] if met else ""
+        whom = met[0].whom if met else ""
         yield whom
         what = f"does not see {whom}, who has the right of way" if whom else "does not look who comes"
-        erring = self._drives_on("failure_to_yield", who, now, RIGHT_OF_WAY, what, whom)
-        libsumo.vehicle.setSpeedMode(who, libsumo.vehicle.getSpeedMode(who) | IGNORES_JUNCTION)
-        return erring
+        return self._drives_on("failure_to_yield", who, now, RIGHT_OF_WAY, what, whom)
 
     def _red_light(self, who: str, now: float) -> Trial:
         yield ""
@@ -435,7 +444,8 @@ class HumanErrors:
     def _drives_on(self, kind: str, who: str, now: float, ignored: int, what: str, near: str) -> Erring:
         """Until it is through the junction ahead."""
         erring = self._begins(kind, who, now, PASSES, what, near)
-        self._take(who, erring, libsumo.vehicle.getSpeedMode(who) & ~ignored, BLIND)
+        mode = libsumo.vehicle.getSpeedMode(who) & ~ignored | IGNORES_JUNCTION
+        self._take(who, erring, mode, BLIND)
         erring.leaves = libsumo.vehicle.getRoadID(who)
         return erring
 
@@ -460,8 +470,7 @@ class HumanErrors:
             self._end(name)
             return
         if erring.deceleration:
-            speed = speed_of(name) - erring.deceleration * self._step
-            libsumo.vehicle.setSpeed(name, max(speed, 0.0))
+            self._slow(name, erring.deceleration)
         if erring.swerves is not None and now >= erring.swerves[0] - 1e-6:
             libsumo.vehicle.changeLaneRelative(name, erring.swerves[1], LANE_CHANGE_TIME)
             erring.swerves = None
@@ -495,9 +504,9 @@ class HumanErrors:
     def _changing(self, who: str) -> bool:
         return bool(libsumo.vehicle.getLateralSpeed(who) != 0.0)
 
-    def _beside(self, who: str, lane: str, side: int) -> tuple[float, str] | None:
-        """What a change to that side asks of the follower there (m/s2), and who that is ("": nobody); None
-        where there is no such lane, or somebody in it beside."""
+    def _beside(self, who: str, lane: str, side: int) -> Gap | None:
+        """The gap in the lane to that side, as the follower there leaves it; None where there is no such
+        lane, or somebody in it beside, or just ahead and much slower."""
         edge, _, index = lane.rpartition("_")
         there = int(index) + side
         if not 0 <= there < libsumo.edge.getLaneNumber(edge):
@@ -512,36 +521,56 @@ class HumanErrors:
         speed = speed_of(who)
         if ahead is not None:
             gap = ahead[1] + libsumo.vehicle.getMinGap(who)
-            if gap < LEAST_GAP or _asked(speed - speed_of(ahead[0]), gap) > self._most:
+            if gap < LEAST_GAP or _asked(speed - speed_of(ahead[0]), gap) > HARDEST:
                 return None
         if behind is None:
-            return 0.0, ""
-        gap = behind[1] + libsumo.vehicle.getMinGap(behind[0])
+            return NOBODY
+        gap, comes = behind[1] + libsumo.vehicle.getMinGap(behind[0]), speed_of(behind[0])
         if gap < LEAST_GAP:
             return None
-        return _asked(speed_of(behind[0]) - speed, gap), behind[0]
-
-    _most = 9.0  # m/s2, that nobody can exceed
+        slows = max(-libsumo.vehicle.getAcceleration(who), 0.0)  # and will go on to, behind its leader
+        return Gap(_asked(comes - speed, gap) + slows, _time(gap, comes), behind[0])
 
     def _yields(self, name: str) -> bool:
         """Whether it must give way at the next line, and the signal there lets it go."""
         links = libsumo.vehicle.getNextLinks(name)
         return bool(links) and links[0][5] in "mswZ=go"
 
-    def _foes(self, who: str) -> list[tuple[float, str]]:
-        """Who has the right of way at the next line: the deceleration (m/s2) with which it can stop before
-        the conflict (inf for who is in it), and its id; who has to brake hardest first."""
+    def _foes(self, who: str) -> list[Gap]:
+        """Who has the right of way at the next line, and is not gone when `who` is there, driving on; `lag`
+        is counted from then. Who must brake hardest comes first."""
         vehicle, found = libsumo.vehicle, []
         links = vehicle.getNextLinks(who)
-        for foe, _, to, _, beyond, via, _, goes_first, _ in vehicle.getJunctionFoes(who, WITHIN):
-            if goes_first and via == links[0][4] and beyond + vehicle.getLength(foe) > 0.0:
-                found.append((speed_of(foe) ** 2 / (2.0 * to) if to > 0.0 else math.inf, foe))
+        speed, gains = speed_of(who), vehicle.getAccel(who)
+        for foe, away, to, _, beyond, via, _, goes_first, _ in vehicle.getJunctionFoes(who, WITHIN):
+            if not goes_first or via != links[0][4]:
+                continue
+            arrives = (math.sqrt(speed**2 + 2.0 * gains * max(away, 0.0)) - speed) / gains  # s
+            comes = speed_of(foe)
+            if _time(beyond + vehicle.getLength(foe), comes) > arrives:
+                asked = _asked(comes, to) if to > 0.0 else math.inf
+                found.append(Gap(asked, _time(to, comes) - arrives, foe))
         return sorted(found, reverse=True)
+
+
+def hazard(kind: ForcedEntry, waited: int) -> float:
+    """The probability that a driver who has waited so many s forces its way in in the next one."""
+    return min(kind.rate * max(waited - kind.patience, 0.0), 1.0)
 
 
 def _asked(closing: float, gap: float) -> float:
     """The deceleration (m/s2) with which a speed difference (m/s) is gone when a gap (m) is used up."""
     return max(closing, 0.0) ** 2 / (2.0 * gap)
+
+
+def _time(distance: float, speed: float) -> float:
+    """s in which somebody is there."""
+    return distance / max(speed, 0.1)
+
+
+def _forces(waited: int, gap: Gap) -> str:
+    whom = f"{gap.whom} must brake with {gap.asked:.1f} m/s2" if gap.whom else "nobody comes"
+    return f"forces its way in after {waited} s; {whom}"
 
 
 def _follower(who: str) -> str:

@@ -1,0 +1,328 @@
+"""Human drivers and persons who err: what each kind does to a vehicle, and that all of it is given back."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import libsumo
+import numpy as np
+import pytest
+from conftest import Start, vehicle
+
+from cosim.host import Host
+from cosim.scenario import Fleet, load
+from cosim.scenario.human_errors import (
+    AbortedCutIn,
+    CutIn,
+    Errors,
+    FailureToYield,
+    ForcedEntry,
+    HardBraking,
+    Inattention,
+    Kinds,
+    RedLight,
+    StalledCar,
+    StepOut,
+)
+from cosim.scenario.vet import vetted
+from cosim.simulation.sumo import SumoSimulator
+from cosim.types import Collision, Command, HumanError, Snapshot
+from cosim.workers.worker import Worker
+
+HOLD = 0.4  # s
+UNTOUCHED = (31, 1621, -1.0)  # SUMO's own speed mode and lane-change mode, no speed of ours
+AHEAD = vehicle("a", "av", 130.0, speed=20.0)
+ALONE = vehicle("h", "hv", 100.0, speed=20.0)
+
+
+class Watched(SumoSimulator):
+    """Says what SUMO's driver of a vehicle heeds."""
+
+    def modes(self, name: str) -> tuple[int, int, float]:
+        vehicle = libsumo.vehicle
+        held = vehicle.getSpeedWithoutTraCI(name) != vehicle.getSpeed(name)
+        return vehicle.getSpeedMode(name), vehicle.getLaneChangeMode(name), 1.0 if held else -1.0
+
+
+class Seen:
+    """Runs in a worker: the frames of an episode of any scenario that SUMO drives."""
+
+    def __init__(self, what: str, kinds: Kinds, share: float | None = None, demand: str = "") -> None:
+        fleet = None if share is None else Fleet(penetration=share)
+        scenario = load(what, demand=[demand] if demand else (), fleet=fleet, warmup=0.0 if share else None)
+        scenario = vetted(replace(scenario, errors=Errors("test", "", kinds, Path("test"))))
+        self._host = Host(scenario, "idm", 0.0)
+
+    def frames(self, seed: int, decisions: int) -> list[Snapshot]:
+        episode = self._host.episode
+        self._host.policy.reset(episode.context(seed, 0.0))
+        episode.start(seed)
+        found: list[Snapshot] = [episode.snapshot]
+        for _ in range(decisions):
+            episode.advance({})
+            found += episode.frames
+            if episode.over:
+                break
+        return found
+
+    def road(self) -> Any:
+        return self._host.simulator.road
+
+    def restored(self, person: str) -> tuple[str, ...]:
+        """What a person's own type says about signals and vehicles at crossings."""
+        kind = libsumo.person.getTypeID(person)
+        names = ("jmDriveAfterRedTime", "jmIgnoreFoeProb", "jmIgnoreFoeSpeed")
+        return tuple(libsumo.vehicletype.getParameter(kind, f"junctionModel.{name}") for name in names)
+
+    def close(self) -> None:
+        self._host.close()
+
+
+def level(**kinds: object) -> Errors:
+    return Errors("test", "", Kinds(**kinds), Path("test"))  # type: ignore[arg-type]
+
+
+def drive(
+    worker: Worker, decisions: int, commands: list[Command] | None = None, watched: str = ""
+) -> tuple[list[Snapshot], list[Any]]:
+    """Every frame, and the modes of `watched` after every decision while it is on the road."""
+    frames: list[Snapshot] = []
+    modes = []
+    for _ in range(decisions):
+        frames += worker.call("advance", commands or [])[1]
+        if watched in frames[-1].row:
+            modes.append((frames[-1].time, worker.call("modes", watched)))
+    return frames, modes
+
+
+def errors(frames: list[Snapshot]) -> list[HumanError]:
+    return [error for frame in frames for error in frame.events.errors]
+
+
+def collisions(frames: list[Snapshot]) -> list[Collision]:
+    return [c for frame in frames for c in frame.events.collisions]
+
+
+def of(frames: list[Snapshot], name: str, field: str, since: float, until: float) -> np.ndarray[Any, Any]:
+    return np.array(
+        [
+            getattr(f, field)[f.row[name]]
+            for f in frames
+            if since - 1e-6 <= f.time <= until + 1e-6 and name in f.row
+        ]
+    )
+
+
+def given_back(frames: list[Snapshot], modes: list[Any]) -> bool:
+    """Whether the driver is SUMO's own at every time at which no error is under way."""
+    spans = [(e.time, e.until) for e in errors(frames)]
+    free = [mode for t, mode in modes if all(not a - 1e-6 <= t <= b + 0.11 for a, b in spans)]
+    return bool(free) and {mode[:2] for mode in free} == {UNTOUCHED[:2]}
+
+
+def test_an_inattentive_driver_keeps_its_speed_while_its_leader_brakes(start: Start) -> None:
+    kind = Inattention(rate=0.3, duration=(2.0, 2.0))
+    worker = start([AHEAD, ALONE], Watched, errors=level(inattention=kind))
+    frames, modes = drive(worker, 2, [Command("a", 20.0, 0, HOLD)], "h")
+    assert not errors(frames)
+    more = drive(worker, 28, [Command("a", 14.0, 0, HOLD)], "h")
+    frames, modes = frames + more[0], modes + more[1]
+    first = errors(frames)[0]
+    assert (first.who, first.kind, first.near) == ("h", "inattention", "a")
+    assert np.ptp(of(frames, "h", "speed", first.time, first.until)) <= 0.1
+    assert np.ptp(of(frames, "a", "speed", first.time, first.until)) > 1.0
+    assert of(frames, "h", "speed", first.until + 0.2, first.until + 1.0).max() < 20.0
+    assert given_back(frames, modes)
+
+
+def test_who_drives_alone_is_not_inattentive(start: Start) -> None:
+    worker = start([ALONE], Watched, errors=level(inattention=Inattention(rate=1.0)))
+    assert not errors(drive(worker, 20)[0])
+
+
+def test_a_driver_brakes_hard_for_no_reason_and_drives_on(start: Start) -> None:
+    kind = HardBraking(rate=0.2, deceleration=(5.0, 5.0), duration=(1.0, 1.0))
+    worker = start([ALONE], Watched, errors=level(hard_braking=kind))
+    frames, modes = drive(worker, 30, watched="h")
+    first = errors(frames)[0]
+    speed = of(frames, "h", "speed", first.time, first.until)
+    assert speed[0] - speed[-1] == pytest.approx(5.0, abs=0.3)
+    later = of(frames, "h", "speed", first.until + 0.4, first.until + 1.0)
+    assert np.diff(later).min() > 0.0
+    assert given_back(frames, modes)
+
+
+def test_a_stalled_car_stops_in_its_lane_and_stands(start: Start) -> None:
+    kind = StalledCar(rate=0.3, deceleration=(4.0, 4.0), duration=(5.0, 5.0))
+    worker = start([ALONE], Watched, errors=level(stalled_car=kind))
+    frames, modes = drive(worker, 60, watched="h")
+    first = errors(frames)[0]
+    standing = of(frames, "h", "speed", first.until - 4.8, first.until)
+    assert standing.max() < 1e-6
+    assert np.ptp(of(frames, "h", "y", first.time, first.until)) == 0.0
+    assert of(frames, "h", "speed", first.until + 2.0, first.until + 2.2).min() > 1.0
+    assert given_back(frames, modes)
+
+
+def closing(gap: float) -> list[str]:
+    """An AV at 22 m/s in the left lane, `gap` m behind a human at 16 m/s in the right."""
+    return [
+        vehicle("h", "hv", 100.0, speed=16.0, more='speedFactor="0.64"'),
+        vehicle("a", "av", 95.0 - gap, lane=1, speed=22.0, more='speedFactor="0.88"'),
+    ]
+
+
+def test_a_cut_in_takes_a_gap_that_the_follower_can_just_manage(start: Start) -> None:
+    worker = start(closing(11.0), Watched, errors=level(cut_in=CutIn(rate=1.0)))
+    frames, modes = drive(worker, 12, watched="h")
+    (found,) = errors(frames)
+    assert found.near == "a"
+    before = next(f for f in frames if f.time >= found.time - 1e-6)
+    h, a = before.row["h"], before.row["a"]
+    gap = before.x[h] - before.x[a] - 5.0
+    asked = (before.speed[a] - before.speed[h]) ** 2 / (2.0 * gap)
+    assert 3.0 <= asked <= 8.0
+    across = of(frames, "h", "y", found.time, found.until + 0.2)
+    assert across[-1] - across[0] == pytest.approx(3.2, abs=0.3)
+    assert not collisions(frames), "who comes brakes in time"
+    assert given_back(frames, modes)
+
+
+def test_nobody_cuts_in_where_the_follower_has_time_enough(start: Start) -> None:
+    worker = start(closing(60.0), Watched, errors=level(cut_in=CutIn(rate=1.0)))
+    assert not errors(drive(worker, 10)[0])
+
+
+def test_an_aborted_cut_in_ends_in_its_own_lane(start: Start) -> None:
+    worker = start(closing(11.0), Watched, errors=level(aborted_cut_in=AbortedCutIn(rate=1.0)))
+    frames, modes = drive(worker, 20, watched="h")
+    first = errors(frames)[0]
+    across = of(frames, "h", "y", first.time, first.until + 0.2)
+    assert across.max() - across[0] > 2.5
+    assert across[-1] == pytest.approx(across[0], abs=0.2)
+    assert given_back(frames, modes)
+
+
+@pytest.mark.parametrize(("patience", "lag"), [(3.0, 0.0), (6.0, 0.0), (3.0, 100.0)])
+def test_who_forces_its_way_in_has_lost_its_patience_and_refuses_too_short_a_gap(
+    patience: float, lag: float
+) -> None:
+    kind = ForcedEntry(rate=1.0, patience=patience, lag=lag)
+    worker = Worker(Seen, "merge", Kinds(forced_entry=kind), None, "contested")
+    try:
+        frames: list[Snapshot] = worker.call("frames", 100000, 60)
+    finally:
+        worker.close()
+    found = [e for e in errors(frames) if e.who == "mission.0"]
+    if lag:
+        assert all("nobody comes" in e.what for e in found)
+        return
+    waited = re.search(r"after (\d+) s", found[0].what)
+    assert waited is not None
+    assert patience + 1 <= int(waited[1]) <= patience + 3
+    lanes = of(frames, "mission.0", "lane", found[0].time, found[0].time + 3.0)
+    assert lanes[0] != lanes[-1]
+
+
+def test_the_longer_one_has_waited_the_likelier_it_forces_its_way_in() -> None:
+    from cosim.simulation.human_errors import hazard
+
+    kind = ForcedEntry(rate=0.03, patience=3.0)
+    assert [hazard(kind, s) for s in (1, 3, 4, 13, 60)] == pytest.approx([0.0, 0.0, 0.03, 0.3, 1.0])
+
+
+def test_a_driver_who_does_not_yield_enters_without_slowing_down() -> None:
+    worker = Worker(Seen, "intersection", Kinds(failure_to_yield=FailureToYield(rate=1.0)), None, "contested")
+    try:
+        frames: list[Snapshot] = worker.call("frames", 100000, 100)
+        road = worker.call("road")
+    finally:
+        worker.close()
+    first = next(e for e in errors(frames) if e.who == "mission.0")
+    assert first.near
+    inside = next(
+        f for f in frames if f.time > first.time and road.lanes[f.lane[f.row[first.who]]].edge.startswith(":")
+    )
+    assert inside.time - first.time < 4.0
+    assert of(frames, first.who, "speed", first.time, inside.time).min() > 5.0
+
+
+def test_who_runs_a_red_light_passes_within_the_seconds_that_its_kind_allows(
+    law_worlds: dict[str, Path],
+) -> None:
+    late = 2.0
+    worker = Worker(
+        Seen, str(law_worlds["grid_signals"]), Kinds(red_light=RedLight(rate=1.0, late=late)), 0.1
+    )
+    try:
+        frames: list[Snapshot] = worker.call("frames", 3, 300)
+        road = worker.call("road")
+    finally:
+        worker.close()
+    found = errors(frames)
+    assert len(found) > 3
+    signal_of = {link.origin: link.signal for link in road.links}
+    for error in found:
+        before = next(f for f in frames if f.time >= error.time)
+        lane = int(before.lane[before.row[error.who]])
+        passed = next(f for f in frames if f.time > error.time and f.lane[f.row[error.who]] != lane)
+        states = [
+            (f.time, chr(f.signals[signal_of[lane]])) for f in frames if error.time <= f.time <= passed.time
+        ]
+        red = [t for t, state in states if state == "r"]
+        assert red, "on red"
+        assert passed.time - red[0] <= late + 0.5
+
+
+def test_a_person_steps_out_and_looks_again_afterwards(law_worlds: dict[str, Path]) -> None:
+    kind = StepOut(rate=1.0, duration=(4.0, 4.0))
+    worker = Worker(Seen, str(law_worlds["crossing_signals"]), Kinds(step_out=kind), 0.1)
+    try:
+        frames: list[Snapshot] = worker.call("frames", 3, 200)
+        found = errors(frames)
+        assert found
+        walks = [of(frames, e.who, "speed", e.time + 0.4, e.time + 3.0).max() > 0.5 for e in found]
+        assert np.mean(walks) > 0.7
+        last = frames[-1]
+        over = [e.who for e in found if e.until < last.time - 0.2 and e.who in last.row]
+        again = {e.who for e in found if e.until >= last.time - 0.2}
+        for who in set(over) - again:
+            assert worker.call("restored", who.removeprefix("person:")) == ("-1", "0", "0")
+    finally:
+        worker.close()
+
+
+@pytest.mark.parametrize("errs", [False, True])
+def test_a_driver_with_mobil_changes_no_lanes_while_it_errs(start: Start, errs: bool) -> None:
+    """It would: somebody slow is ahead and the next lane is empty."""
+    slow = vehicle("s", "av", 150.0, speed=10.0)
+    kinds = level(inattention=Inattention(rate=1.0, duration=(3.0, 3.0))) if errs else None
+    more = {"behavior": "aggressive", "driver_model": "mobil"}
+    worker = start([slow, vehicle("h", "hv", 115.0, speed=10.0)], Watched, errors=kinds, **more)
+    frames, _ = drive(worker, 20, [Command("s", 8.0, 0, HOLD)])
+    begun = errors(frames)[0].time if errs else frames[0].time
+    across = of(frames, "h", "y", begun + 2.0 * errs, begun + (3.0 if errs else 8.0))
+    assert (np.ptp(across) > 2.0) != errs
+
+
+def test_two_humans_who_crash_become_wrecks_and_the_episode_goes_on(start: Start) -> None:
+    """`on_collision` is `end`: only an AV or the mission vehicle ends it."""
+    kinds = level(inattention=Inattention(rate=1.0, duration=(8.0, 8.0)))
+    stands = vehicle("s", "hv", 160.0, speed=0.0).removesuffix("/>")
+    stands += '><stop lane="main_in_0" endPos="170" duration="1000"/></vehicle>'
+    worker = start([stands, vehicle("h", "hv", 110.0, speed=20.0)], Watched, errors=kinds)
+    frames, _ = drive(worker, 40)
+    (crash,) = collisions(frames)
+    assert {crash.collider, crash.victim} == {"h", "s"}
+    assert crash.human_error_involved
+    assert not crash.crash
+    gone = [name for f in frames for name in f.events.wrecks_removed]
+    assert sorted(gone) == ["h", "s"]
+
+
+def test_avs_never_err(start: Start) -> None:
+    worker = start([vehicle("a", "av", 100.0)], Watched, errors=level(hard_braking=HardBraking(rate=1.0)))
+    assert not errors(drive(worker, 10)[0])

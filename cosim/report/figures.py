@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cosim.report.result import FIRST
+from cosim.report.statistics import Figure, pooled_rate
 from cosim.types import RESERVED, TIMINGS, WEIGHT
 
 Row = Mapping[str, Any]  # one episode: a line of episodes.parquet, NA as None
@@ -47,6 +48,11 @@ class Measure:
         events = np.sum([_column(rows, name) for name in (self.column, *self.more)], axis=0)
         exposure = np.array(_column(rows, self.per)) / self.scale
         return np.array([events, exposure, weights(rows)])
+
+    def figure(self, rows: Sequence[Row]) -> Figure:
+        """Of events per exposure: their weighted quotient over the rows in which neither is NA."""
+        tally = self.tally(rows)
+        return pooled_rate(*tally[:, ~np.isnan(tally).any(0)])
 
 
 def weights(rows: Sequence[Row]) -> list[float]:

@@ -1,0 +1,218 @@
+"""The tables of docs/human_errors.md: rates, what `stress` does to IDM AVs, how often humans alone crash.
+
+    python -m benchmarks.error_levels [rates] [stress] [alone] [--episodes 40] [--page docs/human_errors.md]
+
+`stress`: AVs driven by SUMO's IDM, tuning seeds, every world, dense and contested. `alone`: nobody is an AV,
+errors of `field` at raised rates, in which brute force sees crashes; what happens is scaled back: errors that
+crash by themselves by the factor of their rate, and those that need two errors (an inattentive follower
+behind somebody who brakes hard or cuts in) by the product of both factors. Each table stands between a pair
+of markers in the page; `rates` only reads sumo_scenarios/errors.yaml.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import sumo_scenarios
+from benchmarks.tables import markdown_row
+from cosim.episode import Episode, Hook, Step
+from cosim.files import whole
+from cosim.host import Host
+from cosim.report.statistics import share
+from cosim.scenario import Fleet, load
+from cosim.scenario.human_errors import KINDS, Errors, Kinds, levels
+from cosim.scenario.vet import vetted
+from cosim.seeding import TUNING_SEEDS
+from cosim.types import EpisodeResult
+
+PAGE = Path("docs/human_errors.md")
+DEMANDS = ("dense", "contested")
+MILLION = 1e6  # km
+
+
+class Raised(NamedTuple):
+    """One line of `alone`."""
+
+    name: str
+    by: dict[str, float]  # kind -> how many times its rate of `field`
+    factor: float  # what happens so many times as often
+    parts: tuple[str, ...] = ()  # lines whose collisions are not counted again: these kinds alone
+
+
+ALONE = (
+    Raised("inattention", {"inattention": 10.0}, 10.0),
+    Raised("hard braking", {"hard_braking": 300.0}, 300.0),
+    Raised("cut-ins", {"cut_in": 300.0, "aborted_cut_in": 300.0}, 300.0),
+    Raised("forced entries", {"forced_entry": 1000.0}, 1000.0),
+    Raised("failures to yield", {"failure_to_yield": 200.0}, 200.0),
+    Raised("stalled cars", {"stalled_car": 1000.0}, 1000.0),
+    Raised(
+        "hard braking before the inattentive",
+        {"hard_braking": 100.0, "inattention": 10.0},
+        1000.0,
+        ("inattention",),
+    ),
+    Raised(
+        "cut-ins before the inattentive",
+        {"cut_in": 300.0, "aborted_cut_in": 300.0, "inattention": 10.0},
+        3000.0,
+        ("inattention", "cut-ins"),
+    ),
+)
+
+
+class Kilometres(Hook):
+    """What all vehicles together drive in the counted time."""
+
+    def __init__(self) -> None:
+        self.driven = 0.0  # km
+
+    def on_step(self, episode: Episode, step: Step) -> None:
+        """Speeds times the time between frames."""
+        for frame in step.frames:
+            self.driven += float(frame.vehicles.speed.sum()) * episode.scenario.timing.frame / 1000.0
+
+
+@dataclass
+class Tally:
+    """What happened in some episodes."""
+
+    episodes: int = 0
+    av: int = 0  # episodes with an AV in a collision
+    ended: int = 0  # episodes with a collision of an AV or the mission vehicle
+    pairs: int = 0  # collisions
+    near: int = 0  # near-misses by time to collision, where that is a figure
+    driven: float = 0.0  # km
+    errors: Counter[str] = field(default_factory=Counter)
+
+    def add(self, result: EpisodeResult, driven: float) -> None:
+        """One episode."""
+        crashes = [c for c in result.collisions if not c.insertion]
+        near = result.metrics.get("near_misses_ttc")
+        self.episodes += 1
+        self.av += any(c.involves_av for c in crashes)
+        self.ended += any(c.crash for c in crashes)
+        self.pairs += len(crashes)
+        self.near += int(near.value or 0) if near is not None else 0
+        self.driven += driven
+        self.errors.update(e.kind for e in result.errors_begun)
+
+
+def places() -> list[tuple[str, str]]:
+    """Every world with those of `DEMANDS` that it has."""
+    return [(w, d) for w in sumo_scenarios.names() for d in DEMANDS if d in (load(w).demands or {})]
+
+
+def driven(
+    world: str, demand: str, errors: Errors | None, episodes: int, fleet: Fleet | None = None
+) -> Tally:
+    """Episodes on tuning seeds, whose AVs SUMO drives."""
+    scenario = vetted(replace(load(world, demand=[demand], fleet=fleet), errors=errors))
+    host, tally = Host(scenario, "idm", math.radians(45.0)), Tally()
+    try:
+        for seed in TUNING_SEEDS[:episodes]:
+            hook = Kilometres()
+            tally.add(host.run(seed, hooks=[hook]), hook.driven)
+    finally:
+        host.close()
+    print(world, demand, tally, flush=True)
+    return tally
+
+
+def rates() -> list[str]:
+    """Every kind of every level."""
+    shipped = levels()
+    lines = [
+        markdown_row(["kind", *shipped, "source of `field`"]),
+        markdown_row(["---"] * (len(shipped) + 2)),
+    ]
+    for kind in KINDS:
+        of = [getattr(level.kinds, kind) for level in shipped.values()]
+        lines.append(markdown_row([f"`{kind}`", *map(_magnitudes, of), of[0].source]))
+    return lines
+
+
+def stress(episodes: int) -> list[str]:
+    """Plain IDM AVs among drivers who err as in `stress`."""
+    heads = "world, demand, episodes, with an AV in a collision, ended by a crash, collisions an episode"
+    heads += ", errors an episode"
+    lines = [markdown_row(heads.split(", ")), markdown_row(["---"] * 7)]
+    for world, demand in places():
+        t = driven(world, demand, levels()["stress"], episodes)
+        hit = share(t.av, t.episodes)
+        begun = ", ".join(f"{n / t.episodes:.1f} {kind}" for kind, n in t.errors.most_common())
+        interval = f"{100 * hit.value:.0f} % ({100 * hit.low:.0f} to {100 * hit.high:.0f})"
+        cells = [world, demand, str(t.episodes), interval, f"{100 * t.ended / t.episodes:.0f} %"]
+        lines.append(markdown_row([*cells, f"{t.pairs / t.episodes:.1f}", begun]))
+    return lines
+
+
+def alone(episodes: int) -> list[str]:
+    """Humans alone at raised rates of `field`, and what that means at its own rates."""
+    base = levels()["field"]
+    heads = "raised, by, km, collisions, near-misses, collisions per million km at the rates of `field`"
+    lines = [markdown_row(heads.split(", ")), markdown_row(["---"] * 6)]
+    raw: dict[str, float] = {}  # per million km
+    total = 0.0
+    for name, factors, factor, parts in ALONE:
+        kinds = Kinds(**{kind: _raised(getattr(base.kinds, kind), by) for kind, by in factors.items()})
+        errors = Errors(name, "", kinds, base.file)
+        tallies = [
+            driven(w, d, errors, episodes, Fleet(penetration=0.0)) for w, d in places() if d == "dense"
+        ]
+        km, pairs, near = (sum(getattr(t, n) for t in tallies) for n in ("driven", "pairs", "near"))
+        raw[name] = pairs / km * MILLION
+        per = max(raw[name] - sum(raw[part] for part in parts), 0.0) / factor
+        total += per
+        by = " and ".join(f"{by:g}" for by in dict.fromkeys(factors.values()))
+        lines.append(markdown_row([name, by, f"{km:,.0f}", str(pairs), str(near or "-"), f"{per:.2g}"]))
+    return [*lines, markdown_row(["together", "", "", "", "", f"{total:.2g}"])]
+
+
+def _raised(kind: Any, by: float) -> Any:
+    return replace(kind, rate=min(kind.rate * by, 1.0))
+
+
+def _magnitudes(kind: Any) -> str:
+    """`0.008; duration 1 to 3`"""
+    if kind is None:
+        return "-"
+    more = {k: v for k, v in asdict(kind).items() if k not in ("rate", "source")}
+    words = [f"{k} {v[0]:g} to {v[1]:g}" if isinstance(v, tuple) else f"{k} {v:g}" for k, v in more.items()]
+    return "; ".join([f"{kind.rate:.2g}", *words])
+
+
+def fill(page: Path, name: str, lines: Sequence[str]) -> None:
+    """Put the lines between the page's markers of this name."""
+    begin, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
+    text = page.read_text(encoding="utf-8")
+    before, _, rest = text.partition(begin)
+    _, marked, after = rest.partition(end)
+    if not marked:
+        raise SystemExit(f"{page}: no markers {begin} and {end}")
+    with whole(page) as draft:
+        draft.write_text("\n".join([before + begin, *lines, end + after]), encoding="utf-8")
+
+
+TABLES = {"stress": stress, "alone": alone}
+
+
+def main() -> None:
+    """Make the tables that are asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("tables", nargs="*", choices=("rates", "stress", "alone"), default=["rates"])
+    parser.add_argument("--episodes", type=int, default=40)
+    parser.add_argument("--page", type=Path, default=PAGE)
+    args = parser.parse_args()
+    for name in args.tables:
+        fill(args.page, name, rates() if name == "rates" else TABLES[name](args.episodes))
+
+
+if __name__ == "__main__":
+    main()

@@ -231,7 +231,8 @@ def _judge(threshold: Threshold, compared: Compared) -> tuple[str, str, str]:
 def _change(measure: Measure, rows: Sequence[Sequence[Row]], seed: int) -> Figure:
     """B / A - 1 over the pairs in which both are known."""
     if not measure.per:
-        return paired_change(*(measure.values(mine) for mine in rows), seed)
+        before, after = map(measure.values, rows)
+        return paired_change(before, after, seed)
     before, after = (measure.tally(mine) for mine in rows)
     known = ~np.isnan([*before, *after]).any(0)
     return paired_rate_change(before[:, known], after[:, known])

@@ -34,7 +34,7 @@ class Tilt:
 
     def raises(self, kind: str) -> bool:
         """Whether any trial of this kind is tilted."""
-        return any(self._factor(kind + ending) > 1.0 for ending in ("", OTHER))
+        return self.during > 1.0 or any(self._factor(kind + ending) > 1.0 for ending in ("", OTHER))
 
     def rate(self, what: str, p: float, during: bool = False) -> float:
         """q, the tilted probability of a trial of the `case` that is p as it happens."""

@@ -54,7 +54,7 @@ lane_of, position_of, speed_of = (
 
 
 # A trial whose error can begin yields whom it would meet ("": nobody); resumed, it begins.
-Trial = Generator[str, None, "Erring"]
+Trial = Generator[str, None, "Erring | None"]
 
 
 class Gap(NamedTuple):
@@ -105,7 +105,7 @@ class HumanErrors:
         self._avs: set[str] = set()
         self._near: frozenset[str] = frozenset()  # whose trials are weighed
         self._during: frozenset[str] = frozenset()  # of these, near somebody who errs
-        self._begun = 0  # errors whose trials were weighed
+        self._begun = 0  # errors from raised probabilities
         self.weighed: dict[str, list[float]] = {}  # `case` -> first errors begun, sum of p until then
         self._streams: dict[str, Any] = {}  # HV on the road -> [k] its streams of draws
         self._erring: dict[str, Erring] = {}
@@ -203,9 +203,9 @@ class HumanErrors:
             return
         try:
             next(trial)
-        except StopIteration as begun:
-            self._erring[who] = begun.value
-            self._happened.append(begun.value.error)
+        except StopIteration as end:
+            self._erring[who] = end.value
+            self._happened.append(end.value.error)
 
     def _weighed(self, who: str, kind: str, p: float, drawn: float, whom: str) -> float:
         """The probability that holds for a trial near an AV; `log_ratio` and `weighed` take it in."""
@@ -221,11 +221,11 @@ class HumanErrors:
             counted = self.weighed.setdefault(what, [0, 0.0])
             counted[0] += begins
             counted[1] += float(p)
-        self._begun += begins
+        self._begun += begins and q > p
         return held
 
     def _is_weighed(self, who: str) -> bool:
-        """Near an AV the first error of an episode is tilted, and the second near whoever errs then."""
+        """Near an AV the first error is tilted, and a second one near whoever errs then; no further ones."""
         return who in (self._near, self._during, ())[min(self._begun, 2)]
 
     def _beside_avs(self, names: Sequence[str], now: float) -> tuple[frozenset[str], frozenset[str]]:

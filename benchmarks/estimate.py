@@ -96,19 +96,6 @@ def crossed(rows: Sequence[Row], before: Tilt) -> Tilt:
     return replace(before, factors=factors)
 
 
-def needed(rows: Sequence[Row], half_width: float = 0.5) -> float:
-    """Episodes for a 95 % interval of about +- `half_width` of the crash rate, by the variance of these."""
-    w = np.array(weights(rows))
-    y, k = (np.array([float(row[name]) for row in rows]) for name in ("av_involved_collisions", "av_km"))
-    events = float((w * y).sum())
-    rate = events / float((w * k).sum())
-    return (
-        float((1.96 / half_width) ** 2 * (w**2 * (y - rate * k) ** 2).sum() / events**2 * len(rows))
-        if events
-        else np.inf
-    )
-
-
 def tune(world: str, demand: str, errors: str, runs: Path, episodes: int, rounds: int, workers: int) -> Tilt:
     """The tilt after the last round; every round has seeds of its own."""
     tilt = Tilt({ALL: 2.0, ALL + OTHER: 2.0}, DURING)
@@ -116,8 +103,7 @@ def tune(world: str, demand: str, errors: str, runs: Path, episodes: int, rounds
         seeds = range(TUNING_SEEDS.start + k * episodes, TUNING_SEEDS.start + (k + 1) * episodes)
         rows = drive(runs / f"{world}-{k}", world, demand, errors, tilt, seeds, workers)
         crashes = np.array(weights(rows))[[row["av_involved_collisions"] > 0 for row in rows]]
-        said = f"{len(crashes)} crashes, effective {effective(crashes):.1f}, needed {needed(rows):.3g}"
-        print(f"round {k}: {said}")
+        print(f"round {k}: {len(crashes)} crashes, effective {effective(crashes):.1f}, {len(rows)} episodes")
         tilt = crossed(rows, tilt) if k else balanced(rows, tilt)
         tilt = replace(tilt, factors={name: float(f"{f:.2g}") for name, f in tilt.factors.items()})
         print(tilt.text())
@@ -232,7 +218,7 @@ def _field(runs: Path) -> list[str]:
             wording.interval(INCIDENCES[n].figure(rows), INCIDENCES[n]) for n in INCIDENCES if CRASHES in n
         ]
         share = found["largest_crash_share"]
-        many = needed(rows)
+        many = crash_rate.needed(rows)
         lines.append(
             markdown_row(
                 (folder.name.removeprefix("field-"), f"{len(rows)}", *intervals,

@@ -9,11 +9,12 @@ import numpy.typing as npt
 
 from cosim.report import wording
 from cosim.report.figures import CRASHES, INCIDENCES, Row, measures, weights
-from cosim.report.statistics import Figure, effective
+from cosim.report.statistics import Figure, Z, effective
 from cosim.report.summary import incidence_document, status_counts
 from cosim.workers.tasks import OK
 
 FEW = 10.0  # effective crashes, below which an interval was seen to hold the truth less often than it says
+HALF = 0.5  # relative half width of an interval that is called useful
 HEAVY = 0.25  # of all crashes' weight in one episode: another one like it would move the estimate
 
 
@@ -35,9 +36,20 @@ def estimate(rows: Sequence[Row]) -> dict[str, Any]:
         "crashed_episodes": len(crashed),
         "effective_crashes": effective(crashed),
         "largest_crash_share": _largest(crashed),
+        "episodes_needed": round(many) if math.isfinite(many := needed(ok)) else None,
         "status": status_counts(rows),
         "figures": figures,
     }
+
+
+def needed(rows: Sequence[Row]) -> float:
+    """About how many episodes an interval of +- `HALF` of the crash rate takes; inf without a crash."""
+    y, k, w = INCIDENCES[CRASHES].tally(rows)
+    events = float((w * y).sum())
+    if not events:
+        return math.inf
+    scatter = float((w**2 * (y - events / (w * k).sum() * k) ** 2).sum()) / events**2
+    return (Z / HALF) ** 2 * scatter * len(rows)
 
 
 def text(found: Mapping[str, Any]) -> str:
@@ -61,7 +73,8 @@ def _notes(found: Mapping[str, Any]) -> list[str]:
     """What makes the interval less than it says."""
     if not found["crashed_episodes"]:
         return ["no AV crashed: of the crash rate only the upper bound is known"]
-    notes = []
+    many = found["episodes_needed"]
+    notes = [f"+-{100 * HALF:.0f} % takes about {many} episodes"] if many > found["episodes"] else []
     if found["effective_crashes"] < FEW:
         notes.append(f"fewer than {FEW:.0f} effective crashes: go on with more --episodes")
     if (found["largest_crash_share"] or 0.0) > HEAVY:

@@ -28,9 +28,11 @@ def add(commands: arguments.SubCommands) -> None:
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    evaluate.add_matrix(estimate)
-    arguments.add(estimate, "--seeds", help="seeds A, A+1, ... B-1 (default: N of them from 200000 on)")
-    estimate.add_argument("--episodes", type=arguments.count, metavar="N", help="of each cell")
+    evaluate.add_matrix(estimate, errors=FIELD)
+    arguments.add(estimate, "--seeds", help="seeds A, A+1, ... B-1 (default: from 200000 on)")
+    estimate.add_argument(
+        "--episodes", type=arguments.count, metavar="N", help="of each cell, from the first seed on"
+    )
     estimate.add_argument(
         "--tilt",
         metavar="TILT",
@@ -56,7 +58,7 @@ def work(args: argparse.Namespace) -> int:
     go_on = evaluate.continued(args)
     if go_on and args.tilt is not None:
         raise BadInput("a run goes on with its own tilt", field="--tilt", value=args.tilt)
-    if not go_on and args.episodes is None:
+    if not (go_on or args.episodes or args.seeds or args.spec):
         raise BadInput("say how many: more episodes, a narrower interval", field="--episodes")
     cases, seeds = evaluate.asked(args)
     if args.episodes is not None:

@@ -43,8 +43,8 @@ def add(commands: arguments.SubCommands) -> None:
     evaluate.set_defaults(work=work)
 
 
-def add_matrix(command: argparse.ArgumentParser) -> None:
-    """The flags that say what is driven, but for the seeds."""
+def add_matrix(command: argparse.ArgumentParser, errors: str = "none") -> None:
+    """The flags that say what is driven, but for the seeds. `errors`: the default of that flag."""
     command.add_argument("spec", nargs="?", metavar="SPEC.yaml", help="the matrix, by the flags' names")
     axes = command.add_argument_group("the matrix (each flag may be repeated)")
     arguments.add(axes, "--scenario", action="append", help="a world, its folder, a .sumocfg, or a glob")
@@ -55,7 +55,9 @@ def add_matrix(command: argparse.ArgumentParser) -> None:
         help="a name, or a file or glob (.rou.xml, .trips.xml, flows, .gz); A,B is one demand of two files",
     )
     arguments.add(axes, "--policy", "--behavior", "--driver-model", action="append")
-    arguments.add(axes, "--penetration", "--svo", "--preset", "--errors", action="append")
+    arguments.add(axes, "--penetration", "--svo", "--preset", action="append")
+    levels = "of human drivers: none, field, stress, or a YAML file (docs/human_errors.md); default "
+    arguments.add(axes, "--errors", action="append", help=levels + errors)
     arguments.add(axes, "--output", "--metric", action="append")
     arguments.add(command, "--av-type", "--av-ids", "--duration", "--warmup", "--mission")
     arguments.add(command, "--reward", "--on-collision")

@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from cosim.geometry import Conflicts, boxes, conflicts
 from cosim.geometry.compiled import compiled
+from cosim.metrics.lane_courses import LaneCourses
 from cosim.road import RoadMap
-from cosim.road.meeting import Meeting
 from cosim.types import Bools, Floats, Ints, Kind, Metric, Snapshot, Timing
 
 AV = int(Kind.AV)  # comparing arrays with an IntEnum member costs five times as much
@@ -54,9 +54,9 @@ class MetricContext:
     mission_guessed: bool = False  # nobody named the mission vehicle: it counts in its own figures alone
 
     @cached_property
-    def meeting(self) -> Meeting:
-        """Shared likewise."""
-        return Meeting(self.road)
+    def courses(self) -> LaneCourses:
+        """Shared by the metrics of one episode."""
+        return LaneCourses(self.road)
 
     @cached_property
     def conflicts(self) -> ConflictView:

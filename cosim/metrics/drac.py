@@ -14,16 +14,16 @@ class DecelerationRate:
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._conflicts = context.conflicts
-        self._near_misses = NearMisses("drac", context.meeting)
+        self.near_misses = NearMisses("drac", context.courses)
         self._largest: float | None = None
         self.add(first)
 
     def add(self, snapshot: Snapshot) -> None:
         found = self._conflicts.of(snapshot)
-        self._near_misses.add(snapshot, found.hard)
+        self.near_misses.add(snapshot, found.hard)
         needed = found.deceleration  # [k] m/s2
         if len(needed):
             self._largest = max(self._largest or 0.0, float(needed.max()))
 
     def result(self) -> dict[str, Metric]:
-        return {"max_drac_mps2": Metric(self._largest, "m/s2", "lower"), **self._near_misses.result()}
+        return {"max_drac_mps2": Metric(self._largest, "m/s2", "lower"), **self.near_misses.result()}

@@ -1,20 +1,35 @@
 """Near-misses: encounters of two that came grave by one measure, and the vehicle time they are counted in."""
 
+from dataclasses import dataclass, field
+
 from cosim.metrics.context import AV, PERSON, MetricContext
-from cosim.road.meeting import Meeting
+from cosim.metrics.lane_courses import LaneCourses, Ways
 from cosim.types import Ints, Metric, Snapshot
 
 APART = 1.0  # s without a grave frame: what follows is another encounter
+SETTLED = 2.0  # s after which a way that is still open counts as taken
+
+
+@dataclass(slots=True)
+class Meeting:
+    """One encounter."""
+
+    pair: tuple[str, str]
+    last: float  # s, its last grave frame
+    with_av: bool
+    counts: bool = False
+    open: list[tuple[float, Ways]] = field(default_factory=list)  # grave frames that count on some ways only
 
 
 class NearMisses:
     """Counts the encounters of one measure, each pair with a vehicle in it by itself."""
 
-    def __init__(self, measure: str, meeting: Meeting) -> None:
+    def __init__(self, measure: str, courses: LaneCourses | None = None) -> None:
+        """`courses`: of a measure that lets both drive straight on."""
         self._measure = measure  # ttc, drac, pet
-        self._meeting = meeting
-        self._last: dict[tuple[str, str], float] = {}  # pair -> s, its last grave frame
-        self._all = self._with_av = 0
+        self._courses = courses
+        self._met: list[Meeting] = []
+        self._now: dict[tuple[str, str], Meeting] = {}  # the newest one of each pair
         self._vehicles = self._avs = False  # whether any has been seen
 
     def add(self, snapshot: Snapshot, pairs: Ints) -> None:
@@ -22,19 +37,43 @@ class NearMisses:
         s = snapshot
         self._vehicles = self._vehicles or s.vehicles.n > 0
         self._avs = self._avs or bool((s.kind == AV).any())
-        for row, other in pairs.tolist():
-            kinds = {int(s.kind[row]), int(s.kind[other])}
-            if kinds == {PERSON} or not self._meeting.meet(int(s.lane[row]), int(s.lane[other])):
+        self._settle(s)
+        for rows in pairs.tolist():
+            i, j = sorted(rows)  # ids are sorted
+            kinds = {int(s.kind[i]), int(s.kind[j])}
+            ways = None if self._courses is None else self._courses.meeting(s, i, j)
+            if kinds == {PERSON} or (ways is not None and not ways):
                 continue
-            i, j = sorted((row, other))  # ids are sorted
             pair = s.ids[i], s.ids[j]
-            if pair not in self._last or s.time - self._last[pair] > APART + 1e-9:
-                self._all += 1
-                self._with_av += AV in kinds
-            self._last[pair] = s.time
+            if pair not in self._now or s.time - self._now[pair].last > APART + 1e-9:
+                self._now[pair] = Meeting(pair, s.time, AV in kinds)
+                self._met.append(self._now[pair])
+            meeting = self._now[pair]
+            meeting.last, meeting.counts = s.time, meeting.counts or ways is None
+            if ways is not None and not meeting.counts:
+                meeting.open.append((s.time, ways))
+
+    def _settle(self, s: Snapshot) -> None:
+        """Forget grave frames that lay on ways that were not taken."""
+        if self._courses is None:
+            return
+        for pair, meeting in self._now.items():
+            if meeting.open:
+                left = [(time, self._courses.still(ways, s, pair)) for time, ways in meeting.open]
+                meeting.open = [(time, ways) for time, ways in left if ways]
+                meeting.counts |= any(s.time - time > SETTLED for time, _ in meeting.open)
+                if meeting.counts:
+                    meeting.open.clear()
+
+    @property
+    def counted(self) -> list[Meeting]:
+        """The near-misses so far, in the order they began."""
+        return [meeting for meeting in self._met if meeting.counts or meeting.open]
 
     def result(self) -> dict[str, Metric]:
-        counts = {"": (self._all, self._vehicles), "av_": (self._with_av, self._avs)}
+        found = self.counted
+        with_av = sum(meeting.with_av for meeting in found)
+        counts = {"": (len(found), self._vehicles), "av_": (with_av, self._avs)}
         return {
             f"{who}near_misses_{self._measure}": Metric(count if seen else None, "encounters", "lower")
             for who, (count, seen) in counts.items()

@@ -28,7 +28,7 @@ class PostEncroachment:
         self._newest = -1
         self._known: Ints | None = None
         self._smallest = np.inf
-        self._near_misses = NearMisses("pet", context.meeting)
+        self.near_misses = NearMisses("pet")
         self.add(first)
 
     def add(self, snapshot: Snapshot) -> None:
@@ -53,19 +53,19 @@ class PostEncroachment:
         self._smallest = min(self._smallest, smallest)
         self._lanes[self._newest] = -1
         self._lanes[self._newest, slot] = s.lane
-        self._near_misses.add(s, self._met(s, slot, pairs))
+        self.near_misses.add(s, self._met(s, slot, pairs))
 
     def _met(self, s: Snapshot, slot: Ints, pairs: Ints) -> Ints:
-        """[q,2] rows of those `pairs` [p,2] of places who are both on the road, the second not having
-        followed the first: on its lane the first has not been in all of the trail."""
-        if not len(pairs):
-            return pairs
+        """[q,2] rows of those `pairs` [p,2] of places who are both on the road and have not been on one lane
+        in all of the trail: those follow one another, or part, in a bend."""
         row = np.full(len(self._slots), -1)
         row[slot] = np.arange(s.n)
-        first, second = pairs.T
-        lane = self._lanes[self._newest, second]
-        followed = ((self._lanes[:, first] == lane) & (lane >= 0)).any(0)
-        return row[pairs[~followed & (row[first] >= 0)]]
+        kept = [
+            (a, b)
+            for a, b in pairs.tolist()
+            if row[a] >= 0 and not np.isin(self._lanes[:, b][self._lanes[:, b] >= 0], self._lanes[:, a]).any()
+        ]
+        return row[np.array(kept, np.int64).reshape(-1, 2)]
 
     def _drop_absent(self) -> None:
         """In an hour thousands of vehicles come and go, and a frame's cost grows with all that have slots."""
@@ -77,4 +77,4 @@ class PostEncroachment:
 
     def result(self) -> dict[str, Metric]:
         value = float(self._smallest) if self._smallest <= LONGEST else None
-        return {"min_pet_s": Metric(value, "s", "higher"), **self._near_misses.result()}
+        return {"min_pet_s": Metric(value, "s", "higher"), **self.near_misses.result()}

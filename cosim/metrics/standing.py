@@ -66,11 +66,9 @@ class Standing(AvCounts):
 
     def _blocks(self, number: int) -> str:
         """The junction in which a vehicle on this lane stands in others' way, "" for none."""
-        lanes = self._road.lanes
-        if number < 0 or not lanes[number].internal:
+        if number < 0 or not self._road.lanes[number].internal or self._road.waits_inside(number):
             return ""
-        lane = lanes[number]
-        return "" if any(lanes[k].internal for k in lane.successors) else lane.start
+        return self._road.lanes[number].start
 
     def _reasons(self, s: Snapshot, standing: Sequence[int]) -> frozenset[int]:
         """The rows among `standing` that have a reason to stand: they, or the head of their queue."""

@@ -11,14 +11,14 @@ class TimeToCollision:
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._conflicts = context.conflicts
-        self._near_misses = NearMisses("ttc", context.meeting)
+        self.near_misses = NearMisses("ttc", context.courses)
         self._smallest = HORIZON
         self._critical = self._counted = 0  # vehicle-frames
         self.add(first)
 
     def add(self, snapshot: Snapshot) -> None:
         found = self._conflicts.of(snapshot)
-        self._near_misses.add(snapshot, found.soon)
+        self.near_misses.add(snapshot, found.soon)
         nearest = found.time_to_collision  # [k] s
         if not len(nearest):
             return
@@ -33,5 +33,5 @@ class TimeToCollision:
         return {
             "min_ttc_s": Metric(self._smallest if self._smallest < HORIZON else None, "s", "higher"),
             "ttc_below_1_5_share": Metric(share, "share of vehicle time", "lower"),
-            **self._near_misses.result(),
+            **self.near_misses.result(),
         }

@@ -231,8 +231,7 @@ def _judge(threshold: Threshold, compared: Compared) -> tuple[str, str, str]:
 def _change(measure: Measure, rows: Sequence[Sequence[Row]], seed: int) -> Figure:
     """B / A - 1 over the pairs in which both are known."""
     if not measure.per:
-        before, after = map(measure.values, rows)
-        return paired_change(before, after, seed)
+        return paired_change(measure.values(rows[0]), measure.values(rows[1]), seed)
     before, after = (measure.tally(mine) for mine in rows)
     known = ~np.isnan([*before, *after]).any(0)
     return paired_rate_change(before[:, known], after[:, known])

@@ -64,6 +64,7 @@ def table(result: EpisodeResult, *, first: bool = True) -> str:
     lines += near_miss_lines(result) + law_lines(result)
     for c in result.collisions:
         who = f"{c.kind}, {'AV-caused' if c.av_caused else 'not AV-caused'}"
+        who += ", a human had erred" * c.human_error_involved
         lines.append(
             f"  collision at {_clock(c.time, result)}: {c.collider} hit {c.victim} on {c.lane} ({who})"
         )

@@ -195,7 +195,7 @@ def paired_change(before: Sequence[float] | Array, after: Sequence[float] | Arra
 def paired_rate(before: Array, after: Array) -> Figure:
     """Difference of two pooled rates, after - before.
 
-    Each [3,n]: events, exposure and weight of every pair, as `pooled_rate` takes them. The bounds are
+    Each [3,n]: events, exposure and weight of every pair (or [2,n], all alike), as for `pooled_rate`. The bounds are
     recovered from those of the two rates (MOVER, Zou and Donner, Statistics in Medicine 27 (2008) 1693-1702),
     with the correlation of what each pair contributes to them.
     """
@@ -222,7 +222,7 @@ def paired_rate_change(before: Array, after: Array) -> Figure:
 
 def _alike(before: Array, after: Array, a: Figure, b: Figure) -> float:
     """The correlation of two pooled rates; 0 where one of them does not scatter."""
-    parts = [w * (y - rate.value * k) for (y, k, w), rate in ((before, a), (after, b))]
+    parts = [math.prod(w) * (y - rate.value * k) for (y, k, *w), rate in ((before, a), (after, b))]
     return float(np.corrcoef(*parts)[0, 1]) if all(np.ptp(part) > 0.0 for part in parts) else 0.0
 
 

@@ -138,6 +138,12 @@ class RoadMap:
         """Whether vehicles on lanes or places (`Snapshot.place`) `a` and `b` can touch; -1 touches all."""
         return bool(self.contact.touch(a, np.array([b]))[0])
 
+    def waits_inside(self, lane: int) -> bool:
+        """Whether the lane lies in a junction and ends at a place in it where the net lets vehicles wait for
+        others (SUMO's internal junctions)."""
+        lanes = self.lanes
+        return lane >= 0 and lanes[lane].internal and any(lanes[k].internal for k in lanes[lane].successors)
+
     @cached_property
     def before(self) -> tuple[tuple[int, ...], ...]:
         """The lanes that lead directly into each lane."""

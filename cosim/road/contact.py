@@ -35,6 +35,10 @@ class Contact:
         self._members: list[int] = []  # the edges met
         self.table: Bools = np.zeros((16, 16), np.bool_)
 
+    def edge(self, place: int) -> str:
+        """The edge of a place, "" off every edge."""
+        return "" if place == -1 else self._first[self._edge[place]].edge
+
     def numbers(self, place: npt.NDArray[np.integer]) -> Ints:
         """[n] places -> [n] rows of `table` (which may grow: read it afterwards)."""
         edge = self._edge[place]

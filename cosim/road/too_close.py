@@ -15,11 +15,23 @@ SPACING = 2.0  # m between the points compared
 def heed_each_other(road: RoadMap, a: int, b: int) -> bool:
     """Whether drivers on lanes `a` and `b` (indices) have to heed one another: one lane, or one after the
     other, or two that part, join or cross, or of which one has the right of way over the other."""
-    near = [{lane, *road.lanes[lane].successors, *road.before[lane]} for lane in (a, b)]
-    if not near[0].isdisjoint(near[1]) or _cross(road.lanes[a].shape, road.lanes[b].shape):
+    if along_one_another(road, a, b) or _cross(road.lanes[a].shape, road.lanes[b].shape):
         return True
     ways = [road.links_through.get(lane, ()) for lane in (a, b)]
     return any(m in road.links[k].foes or k in road.links[m].foes for k in ways[0] for m in ways[1])
+
+
+def along_one_another(road: RoadMap, a: int, b: int) -> bool:
+    """Whether two lanes (indices) are one, follow one another, or part or join at one place."""
+    near = [{lane, *road.lanes[lane].successors, *road.before[lane]} for lane in (a, b)]
+    return not near[0].isdisjoint(near[1])
+
+
+def walks_beside(road: RoadMap, place: int) -> bool:
+    """Whether a place (`Snapshot.place`) is a walking area: persons on it are beside every road, and vehicles
+    and persons do not heed one another (SUMO: Simulation/Pedestrians)."""
+    edge = road.contact.edge(place)
+    return edge.startswith(":") and edge.rpartition("_")[2].startswith("w")
 
 
 def foot(road: RoadMap, lane: int, behind: float, rear: Floats) -> list[int]:

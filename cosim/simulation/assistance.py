@@ -17,19 +17,18 @@ from cosim.simulation.commands import Commander, Controlled
 from cosim.simulation.fleet import set_type
 from cosim.types import Intervention, Preset
 
-LAWFUL_TYPE = "cosim.av.lawful"  # sumo_scenarios/types.add.xml: an extended IDM that brakes comfortably
+LAWFUL_TYPE = "cosim.av.lawful"  # sumo_scenarios/types.add.xml: an IDM that brakes comfortably
 CORRECTED = 1.0  # m/s2 more braking than asked for: from there on the car drives otherwise than commanded
 STALLED = 0.2, 1.5  # m/s2, or so little acceleration where so much was asked for
 RESPITE = 2.0  # s without a correction: the next one is a new one
 HARD = 3.5  # m/s2: harder braking is an emergency's
 KEEPS_MOVING = 3.0  # m/s: no slower wish is followed inside a junction, nor for longer than `PATIENCE`
+CROSSES = 5.0  # s behind a junction in which it had to give way: inside and so long it takes its gap swiftly
 NOTICE = 150.0  # m: signals and stop lines further ahead are no reason yet
 SERVES = 60.0, 100.0  # m that a lane must serve the route at least, and more for every lane to change back
-ASKS = 0.4  # s between looks for who needs a gap
+LOOKS = 0.4  # s between looks at right of way and blocked lane changes
 GAP = 2.0, 1.0  # m and s: the gap given to who changes lanes
-YIELDING = 2.0, 3.0  # m/s2 and m/s: how hard, and down to what, an AV slows for who asked
-ROOM = 30.0  # m from the junction at least, in which it still slows down
-STANDS = 0.1  # m/s
+YIELDING = 2.0, 1.0  # m/s2 and m/s: how hard, and down to what, an AV slows for who asked
 PATIENCE = 10.0  # s
 
 STRATEGIC, BLOCKED = 8, 512 + 1024 + 2048 + 4096 + 8192  # bits of SUMO's lane-change state
@@ -47,8 +46,9 @@ class Assisted(Controlled):
     lateral: float = 0.0  # m, on its lane
     corrected: float = -math.inf  # s, when the car last drove otherwise
     gap_for: str = ""  # who asked for a gap
+    gives_way: bool = False  # at the next junction, or in this one
+    crosses: float = 0.0  # s left of `CROSSES`
     idled: float = 0.0  # s, for which the agent has asked for less than `KEEPS_MOVING`
-    waits_since: float = math.inf  # s, when it came to stand
 
 
 class Assistance(Commander):
@@ -58,7 +58,7 @@ class Assistance(Commander):
 
     def __init__(self, step: float) -> None:
         super().__init__(Preset.LAWFUL, step)
-        self._asked = -math.inf  # s
+        self._looked = -math.inf  # s
         self._begun: list[Intervention] = []
 
     def drive(self) -> None:
@@ -73,7 +73,11 @@ class Assistance(Commander):
                 state.accel = (speed - state.speed) / self._step
             target = min(state.target, state.limit)
             state.idled = state.idled + self._step if state.target < KEEPS_MOVING else 0.0
-            if state.idled > PATIENCE or get.getRoadID(name).startswith(":"):
+            inside = get.getRoadID(name).startswith(":")
+            state.crosses = CROSSES if inside and state.gives_way else state.crosses - self._step
+            if state.crosses > 0.0:
+                target = state.limit
+            elif inside or state.idled > PATIENCE:
                 target = max(target, min(KEEPS_MOVING, state.limit))
             target = min(target, get.getAllowedSpeed(name))
             state.raw, state.accel = wished_accel(speed, target, state.accel, self._step)
@@ -97,17 +101,13 @@ class Assistance(Commander):
                 if now - state.corrected > RESPITE:
                     begun.append(Intervention(now, name, _reason(name, accel)))
                 state.corrected = now
-            if speed > STANDS:
-                state.waits_since = math.inf
-            elif state.waits_since == math.inf:
-                state.waits_since = now
             lateral = get.getLateralLanePosition(name)
             drift, state.lateral = lateral - state.lateral, lateral
             if 0.05 < abs(drift) < 1.0 and not state.changing(now):  # SUMO changes lanes for the route
                 self._changes(name, state, 1 if drift > 0.0 else -1, now)
-        if now - self._asked > ASKS - 1e-6:
-            self._asked = now
-            self._ask(now)
+        if now - self._looked > LOOKS - 1e-6:
+            self._looked = now
+            self._look()
         return begun
 
     def heads_for(self, name: str) -> float | None:
@@ -133,49 +133,40 @@ class Assistance(Commander):
                 self._begun.append(Intervention(libsumo.simulation.getTime(), name, why))
         return why
 
-    def _ask(self, now: float) -> None:
-        """Who must change lanes and cannot, or waits long at a line, asks an AV to make room (V2V)."""
+    def _look(self) -> None:
+        """Who has to give way; and who must change lanes and cannot asks the AV behind to make room (V2V)."""
         get = libsumo.vehicle
         for state in self.controlled.values():
             state.gap_for = ""
         for name, state in self.controlled.items():
+            if not get.getRoadID(name).startswith(":"):
+                links = get.getNextLinks(name)
+                state.gives_way = bool(links) and not links[0][1]
             for side in (1, -1):
                 wanted = get.getLaneChangeState(name, side)[0]
                 if wanted & STRATEGIC and wanted & BLOCKED:
                     # of two that block one another the one that asks first goes first
                     followers = get.getNeighbors(name, 0 if side > 0 else 1)
                     self._give([other for other, _ in followers], name)
-            if (now - state.waits_since) % (2.0 * PATIENCE) > PATIENCE:  # asks, then lets others pass
-                foes = get.getJunctionFoes(name, NOTICE)
-                # of a foe: 0 its id, 2 m to the place where the ways meet, 7 whether it goes first
-                near = sorted((foe[2], foe[0]) for foe in foes if foe[7])
-                able = (foe for way, foe in near if way > self._stopping(foe))
-                self._give([next(able, "")], name)
 
     def _give(self, asked: list[str], name: str) -> None:
         for other in asked:
             if other in self.controlled and not self.controlled[name].gap_for:
                 self.controlled[other].gap_for = name
 
-    def _stopping(self, name: str) -> float:
-        """m in which an AV slows down comfortably for who asked; inf for who is no AV."""
-        if name not in self.controlled:
-            return math.inf
-        return float(libsumo.vehicle.getSpeed(name)) ** 2 / (2.0 * YIELDING[0]) + ROOM
-
     def _yielding(self, name: str, speed: float, state: Assisted) -> float:
         """The acceleration in m/s2 that opens a gap for who asked for one."""
         get, (brakes, least) = libsumo.vehicle, YIELDING
         try:
-            if get.getRoadID(name) != get.getRoadID(state.gap_for):  # it waits at a junction
-                return max(least - speed, -brakes)
             ahead = get.getLanePosition(state.gap_for) - get.getLength(state.gap_for)
             gap = ahead - get.getLanePosition(name)
             theirs = get.getSpeed(state.gap_for)
         except libsumo.TraCIException:  # it has left
             return COMFORT
         room, headway = GAP
-        slower = max(theirs + 0.5 * (gap - room - headway * speed), 1.0)  # m/s
+        if gap < max(speed**2 - theirs**2, 0.0) / (2.0 * brakes):
+            return COMFORT  # it is beside, or too near: it goes first, whoever follows it gives way
+        slower = max(theirs + 0.5 * (gap - room - headway * speed), least)  # m/s
         return float(max(slower - speed, -brakes))
 
 

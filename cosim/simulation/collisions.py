@@ -7,7 +7,7 @@ import numpy as np
 
 from cosim.geometry import Boxes, boxes, overlap, overlapping_pairs
 from cosim.road import RoadMap
-from cosim.road.too_close import foot, heed_each_other
+from cosim.road.too_close import along_one_another, foot, heed_each_other, walks_beside
 from cosim.simulation.commands import Commander
 from cosim.simulation.conventions import centres
 from cosim.simulation.convert import Body
@@ -241,11 +241,14 @@ def mover(before: Boxes, now: Boxes) -> int | None:
 
 def the_nets(snapshot: Snapshot, road: RoadMap, i: int, j: int) -> bool:
     """Whether two vehicles overlap though each follows its own lane, on lanes whose drivers need not heed one
-    another (`heed_each_other`): the lanes lie too close together, and no driver can help it; or one behind
-    the other on a lane that is drawn shorter than it is, with a gap between them by its length."""
-    ways, drawn_shorter = [], False
+    another (`heed_each_other`): the lanes lie too close together, and no driver can help it; or past one that
+    waits where the net lets it wait inside a junction, or past a person on a walking area; or one behind the
+    other on a lane that is drawn shorter than it is, with a gap between them by its length."""
+    ways, drawn_shorter, waits = [], False, False
     for row in (i, j):
         lane = int(snapshot.lane[row])
+        if walks_beside(road, int(snapshot.place[row])):
+            continue
         if lane < 0:
             return False
         path = road.path(lane)
@@ -255,11 +258,13 @@ def the_nets(snapshot: Snapshot, road: RoadMap, i: int, j: int) -> bool:
             return False
         behind = snapshot.length[row] - snapshot.lane_position[row] * path.scale
         ways.append(foot(road, lane, behind, _end(snapshot, row, -0.5)))
+        waits |= snapshot.speed[row] < HALTING and road.waits_inside(lane)
         if snapshot.lane[i] == snapshot.lane[j] and path.scale < DRAWN_WHOLE:
             last, first = sorted((i, j), key=lambda k: float(snapshot.lane_position[k]))
             rear = snapshot.lane_position[first] - snapshot.length[first]
             drawn_shorter = bool(rear > snapshot.lane_position[last])
-    return drawn_shorter or not any(heed_each_other(road, a, b) for a in ways[0] for b in ways[1])
+    heeds = along_one_another if waits else heed_each_other
+    return drawn_shorter or len(ways) == 1 or not any(heeds(road, a, b) for a in ways[0] for b in ways[1])
 
 
 def _end(snapshot: Snapshot, row: int, share: float) -> Floats:

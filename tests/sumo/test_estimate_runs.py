@@ -72,6 +72,8 @@ def test_a_run_grows_and_says_what_it_found(tilted: Path, capsys: pytest.Capture
     assert manifest["seeds"] == [200000, 200000 + EPISODES]
     (cell,) = manifest["cells"].values()
     assert cell["case"]["tilt"] == cell["manifest"]["tilt"]
+    assert run(f"estimate --resume --episodes 3 --out {tilted}") == 2
+    assert "it can grow" in capsys.readouterr().err
 
 
 def test_untilted_episodes_of_a_mixture_are_those_of_evaluate(tilted: Path, untilted: Path) -> None:

@@ -19,6 +19,15 @@ from cosim.geometry import (
     post_encroachment_time,
     time_to_collision,
 )
+from cosim.host import Host
+from cosim.metrics import MetricContext
+from cosim.metrics.context import CRITICAL
+from cosim.metrics.time_to_collision import TimeToCollision
+from cosim.recording.recorder import Recorder
+from cosim.scenario.episode_id import EpisodeId
+from cosim.scenario.vet import vetted
+from cosim.types import Timing
+from cosim.workers.worker import Worker
 
 # Lanes as wide as the vehicles: SUMO's conflict area of a crossing is as wide as the lanes, ours as wide as
 # the vehicles, so that only here the two must agree to the last digit.
@@ -228,3 +237,78 @@ def test_the_post_encroachment_time_of_a_crossing_agrees_with_the_ssm_device(
     )  # at the metrics' frame rate too
     assert not np.isfinite(time_to_collision(seen.ego, seen.foe)).any()
     assert np.isnan(seen.ttc).all()
+
+
+# ---- whole worlds ----
+
+BETWEEN_FRAMES = 0.1  # s: SUMO looks at every step of 0.1 s, cosim at every second one
+MERGES = 15.0  # degrees between two courses
+
+
+class Pairs(NamedTuple):
+    """Who came near whom in one episode."""
+
+    ours: dict[tuple[str, str], str]  # how they met: "edge" on one edge, "angle" at an angle, "row" in a row
+    theirs: dict[tuple[str, str], float]  # s, the smallest time to collision
+
+
+class Driven:
+    """Drives in a worker with an SSM device on every vehicle; near-misses by time to collision."""
+
+    def __init__(self, world: str, errors: str | None) -> None:
+        case = EpisodeId(
+            world, "idm", 0, ("dense",), warmup=0.0, duration=80.0, on_collision="continue", errors=errors
+        )
+        self._host = Host(vetted(case.scenario(())), "idm", 0.0)
+
+    def pairs(self, seed: int, folder: Path) -> Pairs:
+        recorder = Recorder()
+        self._host.run(seed, hooks=[recorder], outputs=("ssm",), folder=folder)
+        road, frames = self._host.simulator.road, recorder.frames[recorder.first :]
+        metric = TimeToCollision()
+        metric.reset(frames[0], MetricContext(road, Timing(), "none", frozenset(), 80.0))
+        for frame in frames[1:]:
+            metric.add(frame)
+        at = {round(frame.time, 3): frame for frame in frames}
+        ours = {}
+        for met in metric.near_misses.counted:
+            s = at[round(met.last, 3)]
+            i, j = (s.row[name] for name in met.pair)
+            edges = {road.lanes[s.lane[row]].edge for row in (i, j)}
+            turned = abs(np.degrees(np.remainder(s.heading[i] - s.heading[j] + np.pi, 2 * np.pi) - np.pi))
+            ours[met.pair] = (
+                "row" if s.lane[i] == s.lane[j] else
+                "edge" if len(edges) == 1 else
+                "angle" if turned > MERGES else "row"
+            )  # fmt: skip
+        theirs: dict[tuple[str, str], float] = {}
+        for conflict in ElementTree.parse(folder / "ssm.xml").getroot().findall("conflict"):
+            found = conflict.find("minTTC")
+            if found is not None and found.get("value") != "NA":
+                a, b = sorted((conflict.attrib["ego"], conflict.attrib["foe"]))
+                theirs[a, b] = min(theirs.get((a, b), np.inf), float(found.attrib["value"]))
+        return Pairs(ours, theirs)
+
+
+@pytest.mark.parametrize(
+    ("world", "errors"),
+    [("merge", "stress"), ("highway", "stress"), ("roundabout", None), ("intersection", None)],
+)
+def test_near_misses_of_whole_worlds_agree_with_the_ssm_device(
+    world: str, errors: str | None, tmp_path: Path
+) -> None:
+    """What SUMO's device calls near by time to collision, cosim counts; what only cosim counts are changes of
+    lanes, of which the device knows nothing, and vehicles that merge or cross at an angle, whom it takes to
+    where the lanes have become one."""
+    agreed = 0
+    with Worker(Driven, world, errors) as worker:
+        for seed in range(200_000, 200_004):
+            folder = tmp_path / str(seed)
+            folder.mkdir()
+            ours, theirs = worker.call("pairs", seed, folder)
+            near = {pair for pair, ttc in theirs.items() if ttc < CRITICAL - BETWEEN_FRAMES}
+            assert near <= ours.keys()
+            only_ours = [pair for pair in ours if theirs.get(pair, np.inf) >= CRITICAL]
+            assert {ours[pair] for pair in only_ours} <= {"edge", "angle"}
+            agreed += len(near)
+    assert agreed > 0

@@ -259,6 +259,36 @@ def test_whose_tail_is_on_a_crossing_lane_has_collided() -> None:
     assert hit.collider == "hv"
 
 
+def test_past_one_that_waits_inside_a_junction_where_the_net_lets_it_nobody_collides() -> None:
+    road = RoadMap(
+        (
+            lane(":J_0", [(0.0, 0.0), (10.0, 0.0)], (1,)),
+            lane(":J_1", [(10.0, 0.0), (30.0, 0.0)]),
+            lane(":J_2", [(9.5, -20.0), (9.5, 20.0)]),
+        )
+    )
+    known = bodies("av", "hv")
+    for speed, hits in ((0.0, 0), (2.0, 1)):
+        cars: dict[str, Pose] = {"av": (7.5, 0.0, 0.0, speed), "hv": (9.5, -2.5, 90.0, 8.0)}
+        here = replace(scene(1.0, cars, {"av": 0, "hv": 2}), lane_position=np.array([10.0, 20.0]))
+        assert len(CollisionDetector().from_boxes(here, road, known, {})) == hits
+
+
+@pytest.mark.parametrize(("edge", "hits"), [(":J_w0", 0), (":J_c0", 1)])
+def test_a_person_is_hit_on_a_crossing_and_not_on_a_walking_area(edge: str, hits: int) -> None:
+    road = RoadMap(
+        (lane("a_0", [(0.0, 0.0), (100.0, 0.0)]),), closed=(lane(f"{edge}_0", [(50, 1), (50, 9)]),)
+    )
+    cars: dict[str, Pose] = {"av": (50.0, 0.0, 0.0, 10.0), "person:p": (50.0, 1.5, 0.0, 0.0)}
+    here = scene(1.0, cars, {"av": 0})
+    here = replace(
+        here,
+        kind=np.array([Kind.AV, Kind.PERSON], np.int8),
+        place=np.array([0, -2 - road.contact.edges[edge]], np.int32),
+    )
+    assert len(CollisionDetector().from_boxes(here, road, bodies("av"), {})) == hits
+
+
 def test_lanes_too_close_together_are_found_and_lanes_that_meet_are_not() -> None:
     ((distance, a, b),) = too_close(two_lanes(3.2, 1.9))[:1]
     assert (a, b) == (0, 1)

@@ -201,6 +201,62 @@ def test_what_applies_to_one_side_only_is_left_out_and_counted(tmp_path: Path) -
     assert figure.difference.value == 10.0
 
 
+# ---- near-misses ----
+
+
+@pytest.fixture
+def near(tmp_path: Path) -> Path:
+    """Ten episodes of 0.5 vehicle hours each: 30 near-misses of idm, 40 of rash; 0 and 2 by DRAC."""
+    counts = {"idm": ([3] * 10, [0] * 10), "rash": ([4, 5, 3, 4, 4, 4, 4, 3, 5, 4], [1, 1] + [0] * 8)}
+    cells = [
+        cell(
+            policy,
+            10,
+            columns={
+                "near_misses_ttc": ttc,
+                "near_misses_drac": drac,
+                "near_misses_pet": [0] * 10,
+                "vehicle_hours": [0.5] * 10,
+            },
+        )
+        for policy, (ttc, drac) in counts.items()
+    ]
+    return write(tmp_path / "near", *cells)
+
+
+def test_near_misses_are_compared_per_vehicle_hour(near: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = run(capsys, f"{near}:idm", f"{near}:rash")
+    assert code == 0
+    (line,) = [line for line in out.splitlines() if "near_misses_ttc_per_vehicle_hour" in line]
+    assert "6.0 per vehicle-hour (4.0 to 8.6), 30 in 5 h" in line
+    assert "8.0 per vehicle-hour (5.7 to 10.9), 40 in 5 h" in line
+    assert "+2.0 per vehicle-hour" in line
+    assert "near_misses_drac_per_vehicle_hour" in out
+    assert "near_misses_pet" not in out  # none on either side
+
+
+@pytest.mark.parametrize(
+    ("threshold", "code"),
+    [
+        ("near_misses_ttc_per_vehicle_hour > 7.9 per vehicle-hour", 1),
+        ("near_misses_ttc_per_vehicle_hour > 8", 0),
+        ("near_misses_ttc_per_vehicle_hour.upper > 10", 1),  # Garwood: 40 (28.6 to 54.5) in 5 h
+        ("near_misses_ttc_per_vehicle_hour.upper > 11", 0),
+        ("near_misses_ttc_per_vehicle_hour > +1.9", 1),
+        ("near_misses_ttc_per_vehicle_hour > +2", 0),
+        ("near_misses_ttc_per_vehicle_hour.lower > +0", 1),  # the pairs show that it is more
+        ("near_misses_ttc_per_vehicle_hour > +33%", 1),
+        ("near_misses_ttc_per_vehicle_hour > +34%", 0),
+        ("near_misses_drac_per_vehicle_hour.lower > +0", 0),  # two against none may be chance
+        ("near_misses_pet_per_vehicle_hour.upper > +1", 0),
+    ],
+)
+def test_near_misses_are_gated(
+    near: Path, threshold: str, code: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(capsys, f"{near}:idm", f"{near}:rash", "--fail-on", threshold)[0] == code
+
+
 # ---- verdicts ----
 
 

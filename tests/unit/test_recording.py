@@ -29,6 +29,7 @@ from cosim.types import (
     Entry,
     Events,
     History,
+    HumanError,
     Intervention,
     MetaAction,
     Snapshot,
@@ -122,7 +123,9 @@ def test_events_come_back(tmp_path: Path) -> None:
     drive(world(), tape)
     hit = Collision(1.0, "av", "human", True, False, "overlap", "box", "road_0", 1.0, 2.0, True, True)
     entry, corrected = Entry(0.7, "av", 3, "y", 9.0, 8.0), Intervention(0.5, "av", "red light")
+    erring = HumanError(0.6, "human", "inattention", 2.6, "sees nobody for 2.0 s", "av")
     happened = Events((hit,), ("late",), ("early",), ("lost",), ("stopped",), (entry,), (corrected,))
+    happened = replace(happened, errors=(erring,))
     tape.frames[3] = replace(tape.frames[3], events=happened)
     write(tmp_path / "x.parquet", tape, {})
     found = read(tmp_path / "x.parquet").snapshots()
@@ -141,10 +144,12 @@ def test_actors_and_signals_come_back(driven: Driven, tmp_path: Path) -> None:
         assert_same(a, b)
 
 
-def test_recordings_without_actors_and_signals_are_read(driven: Driven, tmp_path: Path) -> None:
+def test_recordings_without_actors_signals_and_errors_are_read(driven: Driven, tmp_path: Path) -> None:
     table = pq.read_table(driven[0])
     about = json.loads(table.schema.metadata[b"cosim"])
     del about["signals"]
+    about["events"]["0"] = {"departed": ["leaver"]}
+    driven[1].frames[0] = replace(driven[1].frames[0], events=Events(departed=("leaver",)))
     table = table.drop_columns("actor").replace_schema_metadata({"cosim": json.dumps(about)})
     pq.write_table(table, tmp_path / "old.parquet")
     for a, b in zip(read(tmp_path / "old.parquet").snapshots(), driven[1].frames, strict=True):

@@ -29,8 +29,10 @@ from cosim.road import Crossing, Lane, Link, RoadMap, Rule
 from cosim.types import (
     Actor,
     Decision,
+    Events,
     Forecast,
     History,
+    HumanError,
     Intervention,
     Kind,
     MetaAction,
@@ -416,6 +418,44 @@ def test_the_film_marks_a_correction_while_it_is_new(replay: ReplayData) -> None
         True,
         False,
     ]
+
+
+def with_errors(replay: ReplayData) -> ReplayData:
+    """From the warm-up one error goes on to 0.5 s; then "a" sees nobody from 1 s to 2 s."""
+    before = HumanError(-1.0, "a", "hard_braking", 0.5, "brakes for no reason")
+    errors = (before, HumanError(1.0, "a", "inattention", 2.0, "sees nobody for 1.0 s", "human"))
+    return replace(replay, errors=(*errors, HumanError(1.0, "nobody", "inattention", 2.0, "sees nobody")))
+
+
+def test_the_page_says_who_erred_when_and_how(replay: ReplayData) -> None:
+    data = document(with_errors(replay))
+    names, words = [v[0] for v in data["vehicles"]], data["words"]
+    said = [(t, until, names[v], *(words[w] for w in more)) for t, until, v, *more in data["errors"]]
+    assert said == [
+        (-1000, 500, "a", "hard_braking", "brakes for no reason", ""),
+        (1000, 2000, "a", "inattention", "sees nobody for 1.0 s", "human"),
+    ]
+
+
+def test_the_film_marks_who_errs_for_as_long_as_it_errs(replay: ReplayData) -> None:
+    found = with_errors(replay)
+    camera = Camera(found, "a")
+    road = slice(0, HEIGHT - 140)
+    marked = []
+    for time in (0.2, 0.8, 1.4, 2.4):
+        pictures = [np.asarray(picture_at(r, time, camera))[road] for r in (found, replay)]
+        marked.append(bool((pictures[0] != pictures[1]).any()))
+    assert marked == [True, False, True, False]
+
+
+def test_an_error_of_the_warm_up_that_goes_on_is_kept() -> None:
+    first = platoon().reset(0)[-1]
+    errors = tuple(HumanError(first.time - 2.0, who, "inattention", first.time + s, "sees nobody")
+                   for who, s in (("a", 1.0), ("human", -1.0)))  # fmt: skip
+    recorder = Recorder()
+    recorder.begin([replace(first, time=first.time - 2.0, events=Events(errors=errors)), first])
+    recorder.add(replace(first, time=first.time + 0.2, events=Events(errors=errors[1:])))
+    assert [error.who for error in recorder.errors] == ["a", "human"]
 
 
 def test_long_reasons_stay_within_the_picture(replay: ReplayData) -> None:

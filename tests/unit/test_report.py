@@ -56,6 +56,7 @@ def full(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Page]:
     """Two policies, one with an SVO sweep, crashes, vetoes and a simulation that crashed."""
     spread = [700.0 + 10 * k for k in range(10)]
     hit = {"time": 12.3, "collider": "av.1", "victim": "hv.7", "av_caused": True, "lane": "a_0"}
+    hit["human_error_involved"] = True
     crashed = {
         "crashed": [True] + [False] * 9,
         "av_caused_collisions": [1] + [0] * 9,
@@ -63,6 +64,8 @@ def full(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Page]:
         "veto_rate": [0.1] * 9 + [None],
         "dt_av_m": spread,
         "min_ttc_s": [0.4, 0.9, *([None] * 8)],
+        "near_misses_ttc": [3] * 10,
+        "vehicle_hours": [0.3] * 10,
     }
     broken = replace(CASE, policy="vfn-p", svo_deg=90.0, seed=200_010)
     folder = write(
@@ -92,12 +95,13 @@ def test_figures_stand_with_intervals_and_counts(full: tuple[Path, Page]) -> Non
     assert "mission success +100.0 pp" in text
     assert "10 of 11 1 sim_crash" in text
     assert "(untrained)" in text
+    assert "10.0 per vehicle-hour 6.7 to 14.3 30 in 3 h" in text  # Garwood: 20.2 to 42.8
 
 
 def test_worst_episodes_come_with_their_replay_command(full: tuple[Path, Page]) -> None:
     text = full[1].text
     key = replace(CASE, policy="vfn-p", svo_deg=90.0).key
-    assert "AV-caused collision at 12.3 s of SUMO's clock: av.1 hit hv.7" in text
+    assert "AV-caused collision at 12.3 s of SUMO's clock: av.1 hit hv.7, a human had erred" in text
     assert f"cosim replay 'runs/my run' {key}" in text
     assert text.index("AV-caused collision at") < text.index("time to collision down to 0.90 s")
 

@@ -16,7 +16,10 @@ from cosim.report.statistics import (
     mean,
     paired_change,
     paired_mean,
+    paired_rate,
+    paired_rate_change,
     paired_share,
+    pooled_rate,
     quantile,
     rate,
     rule_of_three,
@@ -170,6 +173,55 @@ def test_change_from_nothing_has_no_bounds() -> None:
     assert found.document()["value"] is None
     assert paired_change([0.0, 0.0], [0.0, 0.0]) == Figure(0.0, 0.0, 0.0)
     assert math.isnan(paired_change([0.0, 0.0, 1.0], [1.0, 2.0, 3.0]).high)  # a resample may divide by 0
+
+
+def test_a_pooled_rate_is_all_events_over_all_exposure() -> None:
+    """Not the mean of rates: an episode of an hour counts for more than one of a minute."""
+    found = pooled_rate([1, 9], [0.1, 0.9])
+    assert found.value == pytest.approx(10.0)
+    assert (found.low, found.high) == pytest.approx((4.795, 18.390), abs=1e-3)  # Garwood
+    assert pooled_rate([0, 0], [1.0, 1.0]).high == pytest.approx(3.689 / 2.0, abs=1e-3)
+    assert not pooled_rate([], []).known
+
+
+def test_a_pooled_rate_of_events_that_come_together_is_less_certain() -> None:
+    """Of ten episodes one had all 30: Pearson's chi-square is 270 with 9 degrees of freedom, factor 30."""
+    even, together = pooled_rate([3] * 10, [1.0] * 10), pooled_rate([30] + [0] * 9, [1.0] * 10)
+    assert (even.low, even.high) == pytest.approx((rate(30, 10.0).low, rate(30, 10.0).high))
+    assert (together.low, together.high) == pytest.approx((rate(1, 1 / 3).low, rate(1, 1 / 3).high))
+
+
+def test_the_interval_of_a_pooled_rate_covers_the_truth() -> None:
+    rng, truth, inside = np.random.default_rng(0), 2.0, 0
+    for _ in range(400):
+        hours = rng.uniform(0.8, 1.2, 40)
+        found = pooled_rate(rng.poisson(rng.gamma(1.0, truth * hours)), hours)
+        inside += found.low <= truth <= found.high
+    assert 0.91 <= inside / 400 <= 0.98
+
+
+def test_the_difference_of_rates_is_of_pooled_rates_and_pairs_help() -> None:
+    rng = np.random.default_rng(0)
+    hours, busy = rng.uniform(0.8, 1.2, 60), rng.gamma(0.5, 40.0, 60)
+    before = np.array([np.round(busy), hours])
+    after = np.array([np.round(busy) + 2, hours])
+    found = paired_rate(before, after)
+    assert found.value == pytest.approx(120.0 / hours.sum())
+    assert 0.0 < found.low < found.value < found.high < 3.0
+    alone = pooled_rate(*before)
+    assert found.high - found.low < 0.2 * (alone.high - alone.low)
+    change = paired_rate_change(before, after)
+    assert change.value == pytest.approx(120.0 / before[0].sum())
+    assert 0.0 < change.low < change.value < change.high
+
+
+def test_the_difference_of_a_few_events_keeps_the_doubt_of_both_rates() -> None:
+    """Nothing on either side in 10 hours: each may be 0.37 an hour."""
+    nothing = np.array([np.zeros(10), np.ones(10)])
+    found = paired_rate(nothing, nothing)
+    assert (found.value, found.low, found.high) == pytest.approx((0.0, -0.3689, 0.3689), abs=1e-4)
+    assert paired_rate_change(nothing, nothing).value == 0.0
+    assert paired_rate_change(nothing, nothing + 1.0).value == math.inf
 
 
 def test_quantile_lies_between_its_order_statistics() -> None:

@@ -58,6 +58,25 @@ def test_a_mean_over_some_episodes_says_over_how_many() -> None:
     assert (found["value"], found["n"], found["na"], found["unit"]) == (0.2, 2, 2, "share")
 
 
+def test_near_misses_are_pooled_over_vehicle_hours() -> None:
+    """12 in 3 hours, whatever the episodes' own rates are; an episode of an earlier version has none."""
+    columns = {
+        "near_misses_ttc": [2, 10, None],
+        "vehicle_hours": [2.0, 1.0, None],
+        "av_near_misses_ttc": [None, 1, None],
+        "av_hours": [0.0, 0.5, None],
+    }
+    (group,) = summarize([r for _, r in cell("idm", 3, columns=columns)])["groups"]
+    found = group["incidences"]
+    assert set(found) == {"av_near_misses_ttc_per_av_hour", "near_misses_ttc_per_vehicle_hour"}
+    all_of_them = found["near_misses_ttc_per_vehicle_hour"]
+    assert (all_of_them["value"], all_of_them["events"], all_of_them["exposure"]) == (4.0, 12, 3.0)
+    assert (all_of_them["n"], all_of_them["na"]) == (2, 1)
+    assert all_of_them["low"] < 4.0 < all_of_them["high"]
+    assert found["av_near_misses_ttc_per_av_hour"]["value"] == 2.0
+    assert group["means"]["near_misses_ttc"]["value"] == 6.0
+
+
 def test_nothing_crashed_says_what_that_bounds() -> None:
     group = summarize(rows(cell("idm", 30)))["groups"][0]
     assert group["rates"]["collision_rate"]["rule_of_three"] == 0.1

@@ -232,28 +232,21 @@ class Strip:
         side = 0.62 * p.track.length * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
         self._pen.line(self._pixels(side + np.array([p.x, p.y])), fill=CORRECTION, width=2 * FINE)
 
-    def erring(self, p: Pose, kind: str, other: Pose | None) -> None:
-        """A triangle on who errs, the `kind` of its error beneath it ("": left out), a line to whom it meets."""
-        if other is not None:
-            self._pen.line(
-                [self._pixel(p.x, p.y), self._pixel(other.x, other.y)], fill=(*ERROR, 170), width=FINE
-            )
+    def erring(self, p: Pose, other: Pose | None) -> None:
+        """A triangle on who errs, and a line to whom it meets first."""
         x, y = self._pixel(p.x, p.y)
-        r = 8.0 * FINE
+        if other is not None:
+            self._pen.line([(x, y), self._pixel(other.x, other.y)], fill=(*ERROR, 170), width=FINE)
+        r, w = 8.0 * FINE, 1.0 * FINE
         corners = [(x, y - r), (x + r, y + 0.8 * r), (x - r, y + 0.8 * r)]
-        self._pen.polygon(corners, fill=ERROR, outline=(255, 255, 255), width=FINE)
-        for top, bottom in ((-0.4, 0.2), (0.38, 0.6)):
-            self._pen.rectangle(
-                (x - 0.12 * r, y + top * r, x + 0.12 * r, y + bottom * r), fill=(255, 255, 255)
-            )
-        if kind:
-            x, y = self._pixel(p.x, p.y - p.track.width / 2 - 2.6)
-            self._text(x, y, kind, ERROR, 11, bold=True)
+        self._pen.polygon(corners, fill=MARK, outline=ERROR, width=2 * FINE)
+        self._pen.rectangle((x - w, y - 0.35 * r, x + w, y + 0.2 * r), fill=ERROR)
+        self._pen.rectangle((x - w, y + 0.35 * r, x + w, y + 0.35 * r + 2 * w), fill=ERROR)
 
-    def name(self, p: Pose) -> None:
-        """The vehicle's id above it."""
+    def name(self, p: Pose, words: str = "", colour: Colour = TEXT) -> None:
+        """The vehicle's id, or other words, above it."""
         x, y = self._pixel(p.x, p.y + p.track.width / 2 + 1.3)
-        self._text(x, y, p.track.id, TEXT, 11)
+        self._text(x, y, words or p.track.id, colour, 11)
 
     def crash(self, x: float, y: float) -> None:
         """A cross in a ring."""

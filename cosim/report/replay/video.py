@@ -150,11 +150,14 @@ def picture_at(r: ReplayData, time: float, camera: _Camera, *, small: bool = Fal
     near = [p for p in poses if strip.sees(np.array([[p.x, p.y]]))]
     for pose in near:
         strip.vehicle(pose)
+    under_way = [e for e in r.errors if e.time <= time + 0.05 and e.until > time - 0.05]
+    erring = {e.who: (e.kind.replace("_", " "),) for e in under_way}
     for pose in () if small else near:
         if pose.track.id in choices:
             strip.choice(pose, choices[pose.track.id], by_name)
-        if pose.track.mission or pose is shown:
-            strip.name(pose)
+        named = [pose.track.id] if pose.track.mission or pose is shown else []
+        if words := ": ".join([*named, *erring.get(pose.track.id, ())]):
+            strip.name(pose, words, ERROR if pose.track.id in erring else TEXT)
     seen = {p.track.id for p in near}
     for one in r.offences:
         if one.vehicle in seen and 0.0 <= time - one.time + 0.05 < SHOWN_EVENT:
@@ -162,10 +165,9 @@ def picture_at(r: ReplayData, time: float, camera: _Camera, *, small: bool = Fal
     for correction in () if small else r.interventions:
         if correction.vehicle in seen and 0.0 <= time - correction.time + 0.05 < SHOWN_EVENT:
             strip.corrected(by_name[correction.vehicle])
-    for error in r.errors:
-        if error.who in seen and error.time <= time + 0.05 and error.until > time - 0.05:
-            kind = "" if small else error.kind.replace("_", " ")
-            strip.erring(by_name[error.who], kind, by_name.get(error.near))
+    for error in under_way:
+        if error.who in seen:
+            strip.erring(by_name[error.who], by_name.get(error.near))
     for crash in r.collisions:
         if math.isfinite(crash.x) and 0.0 <= time - crash.time + 0.05 < SHOWN_CRASH:
             strip.crash(crash.x, crash.y)

@@ -167,10 +167,13 @@ function drawScene(ctx, state) {
   view.inPixels(ctx);
   for (const [vehicle, s] of state.shown) { drawChoice(ctx, state, vehicle, s); drawLaw(ctx, state, vehicle, s); drawError(ctx, state, vehicle, s); }
   for (const [vehicle, s] of state.shown) {
-    if (vehicle === state.chosen || vehicle.mission || (state.labels && view.scale > 1.5)) {
+    const named = vehicle === state.chosen || vehicle.mission || (state.labels && view.scale > 1.5);
+    const error = (named || view.scale > 3.5) && erring(vehicle, t);
+    if (named || error) {
       const up = (Math.abs(Math.sin(s.heading)) * vehicle.length + vehicle.width) * 0.5 * view.scale + 9;
       const [px, py] = view.toPixels(s.x, s.y);
-      caption(ctx, vehicle.id, px, py - up, vehicle === state.chosen ? c.pick : c.text, c);
+      const words = [named && vehicle.id, error && error.kind].filter(Boolean).join(": ");
+      caption(ctx, words, px, py - up, error ? c.error : vehicle === state.chosen ? c.pick : c.text, c);
     }
   }
   for (const crash of data.collisions) if (crash.x != null && crash.t <= t + 0.05 && crash.t > t - 4) drawCrash(ctx, view, crash, c);
@@ -224,12 +227,12 @@ function erring(vehicle, t) { return vehicle.errors.findLast((e) => e.t <= t + 0
 
 // A warning triangle of `r` pixels.
 function triangle(ctx, x, y, r, c) {
-  ctx.lineJoin = "round"; ctx.fillStyle = c.error; ctx.strokeStyle = c.halo; ctx.lineWidth = 2;
-  ctx.beginPath(); ctx.moveTo(x, y - r); ctx.lineTo(x + r, y + 0.8 * r); ctx.lineTo(x - r, y + 0.8 * r); ctx.closePath(); ctx.stroke(); ctx.fill();
-  ctx.fillStyle = c.panel; ctx.fillRect(x - 0.12 * r, y - 0.4 * r, 0.24 * r, 0.6 * r); ctx.fillRect(x - 0.12 * r, y + 0.38 * r, 0.24 * r, 0.22 * r);
+  ctx.lineJoin = "round"; ctx.fillStyle = c.panel; ctx.strokeStyle = c.error; ctx.lineWidth = 2;
+  ctx.beginPath(); ctx.moveTo(x, y - r); ctx.lineTo(x + r, y + 0.8 * r); ctx.lineTo(x - r, y + 0.8 * r); ctx.closePath(); ctx.fill(); ctx.stroke();
+  ctx.fillStyle = c.error; ctx.fillRect(x - 1, y - 0.35 * r, 2, 0.55 * r); ctx.fillRect(x - 1, y + 0.35 * r, 2, 2);
 }
 
-// A triangle on who errs, what it does wrong beneath it, and a line to whom it meets first.
+// A triangle on who errs, and a line to whom it meets first.
 function drawError(ctx, { data, view, c, t }, vehicle, s) {
   const error = erring(vehicle, t);
   if (!error) return;
@@ -238,11 +241,7 @@ function drawError(ctx, { data, view, c, t }, vehicle, s) {
     ctx.strokeStyle = c.error; ctx.lineWidth = 1.5; ctx.setLineDash([2, 4]);
     ctx.beginPath(); ctx.moveTo(px, py); ctx.lineTo(...view.toPixels(o.x, o.y)); ctx.stroke(); ctx.setLineDash([]);
   }
-  triangle(ctx, px, py, Math.min(Math.max(0.32 * vehicle.length * view.scale, 6), 14), c);
-  if (view.scale < 2.2) return;
-  const below = (Math.abs(Math.sin(s.heading)) * vehicle.length + vehicle.width) * 0.5 * view.scale + 12;
-  ctx.font = "bold 11px system-ui, sans-serif"; ctx.textAlign = "center"; ctx.textBaseline = "middle";
-  halo(ctx, error.kind, px, py + below, c.error, c);
+  triangle(ctx, px, py, 8, c);
 }
 
 function halo(ctx, text, x, y, colour, c) {

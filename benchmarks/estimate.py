@@ -35,6 +35,7 @@ from cosim.workers.tasks import OK
 
 Array = npt.NDArray[np.float64]
 FIRST = 2.0  # errors a tilted episode that the first tilt aims at, if none ended the trials
+MEET = 0.75  # share of them that meets an AV first
 DURING = 10.0  # the second error has a tenth of the time and of the drivers of the first
 PAGE = Path("docs/results/estimate.md")
 INTERVALS = 400
@@ -74,9 +75,12 @@ def trials(rows: Sequence[Row]) -> dict[str, Array]:
 
 
 def balanced(rows: Sequence[Row], before: Tilt) -> Tilt:
-    """Every case is drawn equally often, `FIRST` errors an episode in all."""
-    known = {name: expected.mean() for name, (_, expected) in trials(rows).items()}
-    return replace(before, factors={n: max(FIRST / len(known) / e, 1.0) for n, e in known.items()})
+    """`FIRST` errors an episode, `MEET` of them such as meet an AV, in either share every kind equally often."""
+    factors = {}
+    for meets, share in ((True, MEET), (False, 1.0 - MEET)):
+        expected = {n: e.mean() for n, (_, e) in trials(rows).items() if n.endswith(OTHER) != meets}
+        factors |= {n: max(FIRST * share / len(expected) / e, 1.0) for n, e in expected.items()}
+    return replace(before, factors=factors)
 
 
 def crossed(rows: Sequence[Row], before: Tilt) -> Tilt:

@@ -11,6 +11,8 @@ from cosim.scenario.tilt import Tilt
 from cosim.scenario.tilt import log_ratio as of_trial
 
 Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Bools = npt.NDArray[np.bool_]
 KINDS = ("inattention", "hard_braking", "stalled_car")
 SECONDS = 60
 LASTS = 3  # s of inattention
@@ -37,18 +39,16 @@ class Toy:
     def __init__(self, rates: tuple[float, float, float] = (1e-4, 2e-4, 2e-6), danger: float = 1.0) -> None:
         self.rates, self.danger = rates, danger
 
-    def eligible(self, dense: npt.NDArray[np.int64], inattentive: npt.NDArray[np.int64]) -> list[Array]:
+    def eligible(self, dense: Ints, inattentive: Ints) -> list[Bools]:
         """Whether an error of each kind can begin."""
         return [inattentive == 0, dense == 1, np.ones(dense.shape, bool)]
 
-    def crash(
-        self, dense: npt.NDArray[np.int64], inattentive: npt.NDArray[np.int64], begun: list[Array]
-    ) -> Array:
+    def crash(self, dense: Ints, inattentive: Ints, begun: list[Bools]) -> Array:
         """The probability of a crash in this second."""
-        each = (0.02 * dense, np.where(inattentive > 0, 0.6, 0.05), 0.3)
-        return np.asarray(
-            1.0 - np.prod([1.0 - self.danger * c * b for c, b in zip(each, begun, strict=True)], 0)
-        )
+        attention, braking, stalled = begun
+        safe = 1.0 - self.danger * 0.02 * (dense * attention)
+        safe *= 1.0 - self.danger * np.where(inattentive > 0, 0.6, 0.05) * braking
+        return np.asarray(1.0 - safe * (1.0 - self.danger * 0.3 * stalled))
 
     def truth(self) -> float:
         """Crashes per km: the chain's states are followed through an episode, all outcomes of each second."""
@@ -72,14 +72,14 @@ class Toy:
                     (np.arange(size), now * (LASTS + 1) + after),
                     chance * (1.0 - crashes) * MOVES[dense, now],
                 )
-        live = np.zeros(size)
-        live[0] = 1.0
-        crashes_expected = km_expected = 0.0
+        here = np.zeros(size)
+        here[0] = 1.0
+        crashed = km = 0.0
         for _ in range(SECONDS):
-            crashes_expected += live @ crash
-            km_expected += live @ KM[dense]
-            live = live @ step
-        return float(crashes_expected / km_expected)
+            crashed += float(here @ crash)
+            km += float(here @ KM[dense])
+            here = here @ step
+        return crashed / km
 
     def drive(self, shape: tuple[int, ...], tilt: Tilt, seed: int) -> Episodes:
         """Episodes drawn from the mixture of `tilt`; equal seeds are equal draws under every `danger`."""

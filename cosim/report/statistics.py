@@ -18,6 +18,7 @@ CONFIDENCE = 0.95
 Z = float(stats.norm.ppf(0.5 + CONFIDENCE / 2.0))
 RESAMPLES = 2000  # the bounds of a mean then wander by some 2 % of the interval's width from seed to seed
 FEW = 3.0  # effective events, from which on their weights tell what another one may weigh
+MANY = 20.0  # effective events of a pair, from which on the difference of their rates is about normal
 BATCH = 2_000_000  # resampled values held at once: 16 MB
 
 Array = npt.NDArray[np.float64]
@@ -89,9 +90,10 @@ def pooled_rate(
 
     Of weighted Poisson counts (Fay and Feuer, Statistics in Medicine 16 (1997) 791-801): its variance is
     that of the ratio, sum(w^2 (y - R k)^2), and at least the Poisson variance sum(w^2 y): events of one
-    episode come together. The upper bound allows for one more event, of the largest weight of the events
-    seen; of the largest weight of all samples where the events seen are effectively fewer than `FEW`.
-    With equal weights and no more scatter than Poisson counts have it is the exact interval of `rate`.
+    episode come together. The upper bound allows for one more event (or as many as come together), of the
+    largest weight of the events seen; of the largest weight of all samples where the events seen are
+    effectively fewer than `FEW`. With equal weights and no more scatter than Poisson counts have it is
+    the exact interval of `rate`.
 
     Args:
         counts: [n] y, events of each sample.
@@ -107,9 +109,10 @@ def pooled_rate(
     if events == 0.0:
         return Figure(0.0, 0.0, float(w.max() * stats.chi2.ppf(1.0 - tail, 2) / 2.0) / exposure)
     scatter = float((w**2 * (y - events / exposure * k) ** 2).sum()) * len(y) / max(len(y) - 1, 1)
-    variance = max(scatter, float((w**2 * y).sum()))
+    poisson = float((w**2 * y).sum())
+    variance = max(scatter, poisson)
     seen = w[y > 0.0]
-    largest = float(seen.max() if effective(seen) >= FEW else w.max())
+    largest = float(seen.max() if effective(seen) >= FEW else w.max()) * variance / poisson
 
     def bound(p: float, mean: float, spread: float) -> float:
         """The p-quantile of the gamma distribution of this mean and variance."""
@@ -195,45 +198,60 @@ def paired_change(before: Sequence[float] | Array, after: Sequence[float] | Arra
 def paired_rate(before: Array, after: Array) -> Figure:
     """Difference of two pooled rates, after - before.
 
-    Each [3,n]: events, exposure and weight of every pair (or [2,n], all alike), as for `pooled_rate`. The bounds are
-    recovered from those of the two rates (MOVER, Zou and Donner, Statistics in Medicine 27 (2008) 1693-1702),
-    with the correlation of what each pair contributes to them.
+    Each [3,n]: events, exposure and weight of every pair (or [2,n], all alike), as for `pooled_rate`. With
+    effectively `MANY` events or more its error is that of what single pairs contribute (delta method). With
+    fewer the bounds are recovered from those of the two rates and the correlation of the contributions
+    (MOVER, Zou and Donner, Statistics in Medicine 27 (2008) 1693-1702).
     """
     a, b = pooled_rate(*before), pooled_rate(*after)
-    return _recovered(a, b, _alike(before, after, a, b)) if a.known and b.known else NA
+    if not (a.known and b.known):
+        return NA
+    return _recovered(a, b, _contributions(before, a), _contributions(after, b), _many(before, after))
 
 
 def paired_rate_change(before: Array, after: Array) -> Figure:
-    """Relative change of a pooled rate over pairs [3,n], recovered likewise from logarithms; infinite and
-    unbounded as `paired_change`, and without bounds where there is no event after."""
+    """Relative change of a pooled rate over pairs [3,n], likewise from logarithms; infinite and unbounded as
+    `paired_change`, and without bounds where there is no event after."""
     a, b = pooled_rate(*before), pooled_rate(*after)
     if not (a.known and b.known):
         return NA
     if a.value == 0.0 or b.value == 0.0:
         change = -1.0 if a.value else math.inf if b.value else 0.0
         return Figure(change, math.nan, math.nan)
-    logs = (Figure(*map(math.log, (f.value, f.low, f.high))) for f in (a, b))
-    change = _recovered(*logs, _alike(before, after, a, b))
+    log_a, log_b = (Figure(*map(math.log, (f.value, f.low, f.high))) for f in (a, b))
+    parts = _contributions(before, a) / a.value, _contributions(after, b) / b.value
+    change = _recovered(log_a, log_b, *parts, _many(before, after))
     return Figure(*map(math.expm1, (change.value, change.low, change.high)))
 
 
 # ---- inside ----
 
 
-def _alike(before: Array, after: Array, a: Figure, b: Figure) -> float:
-    """The correlation of two pooled rates; 0 where one of them does not scatter."""
-    parts = [math.prod(w) * (y - rate.value * k) for (y, k, *w), rate in ((before, a), (after, b))]
-    return float(np.corrcoef(*parts)[0, 1]) if all(np.ptp(part) > 0.0 for part in parts) else 0.0
+def _weights(tally: Array) -> Array:
+    return tally[2] if len(tally) > 2 else np.ones(tally.shape[1])
 
 
-def _recovered(a: Figure, b: Figure, alike: float) -> Figure:
-    """b - a; `alike`: their correlation."""
+def _many(before: Array, after: Array) -> bool:
+    y, w = (np.concatenate(both) for both in ((before[0], after[0]), (_weights(before), _weights(after))))
+    return bool(y.any()) and float((w * y).sum()) ** 2 >= MANY * float((w**2 * y).sum())
 
-    def reach(of_b: float, of_a: float) -> float:
-        return math.sqrt(max(of_b**2 + of_a**2 - 2.0 * alike * of_b * of_a, 0.0))
 
+def _contributions(tally: Array, rate: Figure) -> Array:
+    """[n] what each sample adds to the error of a pooled rate."""
+    w = _weights(tally)
+    return np.asarray(w * (tally[0] - rate.value * tally[1]) / (w * tally[1]).sum())
+
+
+def _recovered(a: Figure, b: Figure, part_a: Array, part_b: Array, many: bool) -> Figure:
+    """b - a, to whose errors pairs contribute `part_a` and `part_b`."""
     value = b.value - a.value
-    down, up = reach(b.value - b.low, a.high - a.value), reach(b.high - b.value, a.value - a.low)
+    if many:
+        reach = Z * float(np.linalg.norm(part_b - part_a)) * math.sqrt(len(part_a) / (len(part_a) - 1))
+        return Figure(value, value - reach, value + reach)
+    scatter = np.ptp(part_a) > 0.0 and np.ptp(part_b) > 0.0
+    alike = float(np.corrcoef(part_a, part_b)[0, 1]) if scatter else 0.0
+    sides = (b.value - b.low, a.high - a.value), (b.high - b.value, a.value - a.low)
+    down, up = (math.sqrt(max(p**2 + q**2 - 2.0 * alike * p * q, 0.0)) for p, q in sides)
     return Figure(value, value - down, value + up)
 
 

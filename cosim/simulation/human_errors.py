@@ -242,11 +242,12 @@ class HumanErrors:
             here, there = (np.array([places[k] for k in group]).reshape(-1, 2) for group in (names, to))
             return np.asarray(np.abs(here[:, None] - there).max(2) < NEAR)
 
-        near = close([*self._avs]).any(1)
-        during = near & (close(erring) & (np.array(names)[:, None] != np.array(erring, str))).any(1)
-        return tuple(
-            frozenset(n for n, is_so in zip(names, mask, strict=True) if is_so) for mask in (near, during)
-        )
+        def those(mask: Bools) -> frozenset[str]:
+            return frozenset(name for name, is_so in zip(names, mask.tolist(), strict=True) if is_so)
+
+        near = np.asarray(close([*self._avs]).any(1))
+        others = np.array(names)[:, None] != np.array(erring, str)
+        return those(near), those(near & (close(erring) & others).any(1))
 
     def _draw(self, kind: str, who: str, *which: str) -> float:
         """In [0, 1)."""

@@ -75,7 +75,7 @@ def trials(rows: Sequence[Row]) -> dict[str, Array]:
 
 
 def balanced(rows: Sequence[Row], before: Tilt) -> Tilt:
-    """`FIRST` errors an episode, `MEET` of them such as meet an AV, in either share every kind equally often."""
+    """`FIRST` errors an episode, `MEET` of them meeting an AV; in either share every kind equally often."""
     factors = {}
     for meets, share in ((True, MEET), (False, 1.0 - MEET)):
         expected = {n: e.mean() for n, (_, e) in trials(rows).items() if n.endswith(OTHER) != meets}
@@ -155,7 +155,7 @@ def _toy() -> list[str]:
         ),
         "|---|---|---|---|---|---|---|---|",
     ]  # fmt: skip
-    for factor, episodes in ((1, 4000), (30, 1000), (100, 300), (100, 1000), (100, 4000), (300, 1000)):
+    for factor, episodes in ((1, 2000), (30, 1000), (100, 300), (100, 1000), (100, 2000), (300, 1000)):
         tilt = Tilt(dict.fromkeys(KINDS, float(factor)))
         each = [*zip(*toy.drive((INTERVALS, episodes), tilt, factor * episodes), strict=True)]
         found = [pooled_rate(*parts) for parts in each]

@@ -220,8 +220,8 @@ def paired_rate_change(before: Array, after: Array) -> Figure:
         return Figure(change, math.nan, math.nan)
     log_a, log_b = (Figure(*map(math.log, (f.value, f.low, f.high))) for f in (a, b))
     parts = _contributions(before, a) / a.value, _contributions(after, b) / b.value
-    change = _recovered(log_a, log_b, *parts, _many(before, after))
-    return Figure(*map(math.expm1, (change.value, change.low, change.high)))
+    found = _recovered(log_a, log_b, *parts, _many(before, after))
+    return Figure(*map(math.expm1, (found.value, found.low, found.high)))
 
 
 # ---- inside ----

@@ -8,7 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from cosim.scenario import Scenario
 from cosim.scenario.manifest import manifest
 from cosim.seeding import generator
 from cosim.types import (
+    TILT,
     Collision,
     Command,
     Decision,
@@ -262,12 +263,21 @@ class Episode:
             validity=self._validity(metrics),
             interventions_by_reason=dict(self._interventions.most_common()),
             errors_begun=tuple(self._errors),
+            tilt=self._tilt(),
             mission_vehicle=", ".join(self._missions) or None,
             mission_guessed=bool(self._missions) and self.scenario.mission.guessed,
             manifest=manifest(self.scenario, self.seed),
         )
 
     # ---- inside ----
+
+    def _tilt(self) -> dict[str, Any]:
+        tilt = self.scenario.tilt
+        if tilt is None:
+            return {}
+        log_ratio, trials = self.simulator.tilted
+        values = tilt.weight(log_ratio), log_ratio, tilt.drawn(self.seed), dict(trials)
+        return dict(zip(TILT, values, strict=True))
 
     def _observe(self, frames: tuple[Snapshot, ...]) -> None:
         began = time.perf_counter()

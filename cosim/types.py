@@ -441,6 +441,10 @@ class Simulator(Protocol):
     def commanded(self, vehicle: str) -> tuple[float | None, int]:
         """Present target speed in m/s (None while uncommanded) and lane change under way (+1, 0, -1)."""
 
+    @property
+    def tilted(self) -> tuple[float, Mapping[str, Sequence[float]]]:
+        """Of this episode's errors: log(q / p), and what was tilted, case by case (docs/estimate.md)."""
+
     def counts(self) -> dict[str, int]:
         """Vehicles since the start: `inserted`, and `waiting` ones that found no room so far."""
 
@@ -478,10 +482,13 @@ IDENTITY = tuple(field.name for field in fields(Identity))
 TIMINGS = ("reset_s", "simulation_s", "observation_s", "decision_s", "total_s")  # wall time, never repeatable
 # What stands beside the figures in documents and rows: no figure may be called so.
 MISSION = ("mission_vehicle", "mission_guessed")
+WEIGHT = "weight"  # of an episode whose errors were drawn from tilted rates (docs/estimate.md)
+TILT = (WEIGHT, "log_ratio", "tilted", "tilt_trials")
 RESERVED = {
     *IDENTITY,
     *TIMINGS,
     *MISSION,
+    *TILT,
     "key",
     "cell",
     "status",
@@ -510,6 +517,7 @@ class EpisodeResult(Identity):
     mission_guessed: bool = False  # nobody named it: its figures feed no gate
     interventions_by_reason: dict[str, int] = field(default_factory=dict)  # the most frequent first
     errors_begun: tuple[HumanError, ...] = ()
+    tilt: dict[str, Any] = field(default_factory=dict)  # by the names of `TILT`, of tilted errors
     manifest: dict[str, Any] = field(default_factory=dict)
 
     def value(self, name: str) -> float | int | bool | None:
@@ -522,6 +530,7 @@ class EpisodeResult(Identity):
             **{name: getattr(self, name) for name in IDENTITY},
             "steps": self.steps,
             **{name: getattr(self, name) for name in MISSION},
+            **self.tilt,
             **{name: _plain(metric.value) for name, metric in self.metrics.items()},
             "trace_hash": self.trace_hash,
             "timings": {name: round(value, 6) for name, value in self.timings.items()},

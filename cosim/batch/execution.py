@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,22 @@ def begin_or_resume(plan: Plan, store: Store, document: Mapping[str, Any], *, re
     else:
         problem = f"holds a run named {store.run} already: --resume it, or name another --out"
         raise BadInput(problem, field="--store")
+
+
+def begin_or_grow(plan: Plan, store: Store, document: Mapping[str, Any], *, resume: bool) -> None:
+    """As `begin_or_resume`, but a run may go on to further seeds than it was begun with.
+
+    Raises BadInput as that does, and when it holds seeds that the plan does not.
+    """
+    if not resume or store.spec_hash() is None:
+        begin_or_resume(plan, store, document, resume=resume)
+        return
+    first, end = store.document()["seeds"]
+    check_same(replace(plan, seeds=range(first, end)), store)
+    if plan.seeds.start != first or plan.seeds.stop < end:
+        problem = f"the run has the seeds {first}:{end}: it can grow, not begin elsewhere or shrink"
+        raise BadInput(problem, field="--resume", value=f"{plan.seeds.start}:{plan.seeds.stop}")
+    store.note("seeds", [first, plan.seeds.stop], plan.spec_hash)
 
 
 def begin(plan: Plan, store: Store, document: Mapping[str, Any]) -> None:

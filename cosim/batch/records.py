@@ -16,7 +16,7 @@ LAST = ("error", "stderr", "attempts")
 _NESTED = ("units", "better", "manifest")  # the same for all episodes of a cell: kept once, in the manifest
 _AS_TEXT = (
     *("timings", "collision_list", "not_comparable_because"),
-    *("interventions_by_reason", "human_errors_by_kind", "human_error_list"),
+    *("interventions_by_reason", "human_errors_by_kind", "human_error_list", "tilt_trials"),
 )
 
 

@@ -109,11 +109,11 @@ class Store(contextlib.AbstractContextManager["Store"]):
         with self._writing() as connection:
             connection.execute(_cells.update().where(here).values(manifest=dict(manifest)))
 
-    def note(self, name: str, value: Any) -> None:
-        """Set one field of what `begin` wrote down."""
-        document = {**self.document(), name: value}
+    def note(self, name: str, value: Any, spec_hash: str | None = None) -> None:
+        """Set one field of what `begin` wrote down, and the hash where that changes with it."""
+        values = {"document": {**self.document(), name: value}, "spec_hash": spec_hash or self.spec_hash()}
         with self._writing() as connection:
-            connection.execute(_runs.update().where(_runs.c.run == self.run).values(document=document))
+            connection.execute(_runs.update().where(_runs.c.run == self.run).values(**values))
 
     def keys(self) -> set[str]:
         """The episodes that are done."""

@@ -9,6 +9,7 @@ COMMANDS = (
     "run",
     "join",
     "evaluate",
+    "estimate",
     "compare",
     "replay",
     "report",

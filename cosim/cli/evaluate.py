@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import shlex
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +19,9 @@ from cosim.errors import BadInput
 if TYPE_CHECKING:
     from cosim.batch.matrix import Plan
     from cosim.batch.store import Store
+    from cosim.scenario.episode_id import EpisodeId
     from cosim.workers.engines import Engine
+    from cosim.workers.tasks import Outcome
 
 LISTED = 200  # cells that a dry run lists
 
@@ -30,8 +34,19 @@ def add(commands: arguments.SubCommands) -> None:
         description="Drive every combination of what the flags or SPEC.yaml name, once per seed. A flag that "
         "is given beside SPEC.yaml replaces that line of it.",
     )
-    evaluate.add_argument("spec", nargs="?", metavar="SPEC.yaml", help="the matrix, by the flags' names")
-    axes = evaluate.add_argument_group("the matrix (each flag may be repeated)")
+    add_matrix(evaluate)
+    arguments.add(evaluate, "--seeds", help="seeds A, A+1, ... B-1 (default 200000:200001)")
+    running = add_work(evaluate)
+    running.add_argument("--no-report", action="store_true", help="leave report.html out")
+    running.add_argument("--dry-run", action="store_true", help="print the matrix and an estimated time")
+    arguments.add(running, "--json")
+    evaluate.set_defaults(work=work)
+
+
+def add_matrix(command: argparse.ArgumentParser, errors: str = "none") -> None:
+    """The flags that say what is driven, but for the seeds. `errors`: the default of that flag."""
+    command.add_argument("spec", nargs="?", metavar="SPEC.yaml", help="the matrix, by the flags' names")
+    axes = command.add_argument_group("the matrix (each flag may be repeated)")
     arguments.add(axes, "--scenario", action="append", help="a world, its folder, a .sumocfg, or a glob")
     axes.add_argument(
         "--demand",
@@ -40,12 +55,17 @@ def add(commands: arguments.SubCommands) -> None:
         help="a name, or a file or glob (.rou.xml, .trips.xml, flows, .gz); A,B is one demand of two files",
     )
     arguments.add(axes, "--policy", "--behavior", "--driver-model", action="append")
-    arguments.add(axes, "--penetration", "--svo", "--preset", "--errors", action="append")
+    arguments.add(axes, "--penetration", "--svo", "--preset", action="append")
+    levels = "of human drivers: none, field, stress, or a YAML file (docs/human_errors.md); default "
+    arguments.add(axes, "--errors", action="append", help=levels + errors)
     arguments.add(axes, "--output", "--metric", action="append")
-    arguments.add(evaluate, "--seeds", help="seeds A, A+1, ... B-1 (default 200000:200001)")
-    arguments.add(evaluate, "--av-type", "--av-ids", "--duration", "--warmup", "--mission")
-    arguments.add(evaluate, "--reward", "--on-collision")
-    running = evaluate.add_argument_group("the work")
+    arguments.add(command, "--av-type", "--av-ids", "--duration", "--warmup", "--mission")
+    arguments.add(command, "--reward", "--on-collision")
+
+
+def add_work(command: argparse.ArgumentParser) -> Any:
+    """The flags that say where and by whom it is driven; returns their group."""
+    running = command.add_argument_group("the work")
     arguments.add(running, "--out", "--resume")
     arguments.add(running, "--workers", help="processes (default: all cores)")
     running.add_argument("--engine", choices=("local", "ray"), default="local")
@@ -53,10 +73,7 @@ def add(commands: arguments.SubCommands) -> None:
     running.add_argument("--store", metavar="URL", help="a database instead of DIR/store.sqlite")
     running.add_argument("--step-timeout", type=arguments.positive, metavar="S", help="end a hung decision")
     running.add_argument("--reset-timeout", type=arguments.positive, metavar="S", help="end a hung start")
-    running.add_argument("--no-report", action="store_true", help="leave report.html out")
-    running.add_argument("--dry-run", action="store_true", help="print the matrix and an estimated time")
-    arguments.add(running, "--json")
-    evaluate.set_defaults(work=work)
+    return running
 
 
 def work(args: argparse.Namespace) -> int:
@@ -64,41 +81,61 @@ def work(args: argparse.Namespace) -> int:
 
     Raises BadInput before anything is run, or CosimError when it cannot go on.
     """
-    from cosim.batch import execution, matrix, spec
-    from cosim.batch.folder import RunFolder
-    from cosim.batch.store import Store
+    from cosim.batch import execution, matrix
     from cosim.policies import check
 
-    flags = {name: getattr(args, name) for name in spec.FIELDS}
-    continued = args.resume and args.spec is None and all(value is None for value in flags.values())
-    if args.out is None and (continued or not args.dry_run):
+    if args.out is None and (continued(args) or not args.dry_run):
         raise BadInput("name the run's folder", field="--out")
-    if continued:  # neither a spec nor a flag of the matrix: what the folder holds
-        cases, seeds = execution.asked(Path(args.out), args.store)
-    else:
-        wanted = spec.read(None if args.spec is None else Path(args.spec), flags)
-        cases, seeds = [*matrix.cells(wanted)], range(*wanted.seeds)
-    plan = matrix.plan(cases, seeds, check)
+    plan = matrix.plan(*asked(args), check)
     if not args.resume:
         matrix.check_names(plan)
-    engine = _engine(args)
+    engine = engine_of(args)
     if args.dry_run:
         return _dry_run(plan, engine, args)
+    with opened(plan, args, execution.begin_or_resume) as (store, folder):
+        return _drive(plan, engine, store, folder, args)
+
+
+def continued(args: argparse.Namespace) -> bool:
+    """Whether a run is to go on with what its folder holds: neither a spec nor a flag of the matrix."""
+    from cosim.batch import spec
+
+    return bool(args.resume) and args.spec is None and all(getattr(args, n) is None for n in spec.FIELDS)
+
+
+def asked(args: argparse.Namespace) -> tuple[list[EpisodeId], range]:
+    """The case of every cell, and the seeds. Raises BadInput."""
+    from cosim.batch import execution, matrix, spec
+
+    if continued(args):
+        return execution.asked(Path(args.out), args.store)
+    flags = {name: getattr(args, name) for name in spec.FIELDS}
+    wanted = spec.read(None if args.spec is None else Path(args.spec), flags)
+    return [*matrix.cells(wanted)], range(*wanted.seeds)
+
+
+@contextlib.contextmanager
+def opened(plan: Plan, args: argparse.Namespace, begin: Callable[..., None]) -> Iterator[tuple[Store, Path]]:
+    """The store and the folder of a run, begun with this plan or resumed; nothing is left if that fails."""
+    from cosim.batch.folder import RunFolder
+    from cosim.batch.store import Store
+
     with RunFolder(args.out, resume=args.resume, episodes=plan.episodes) as folder:
         try:
             store = Store.in_folder(folder.path, args.store)
             began = time.strftime("%Y-%m-%dT%H:%M:%S%z")
             about = {"command": shlex.join(["cosim", *sys.argv[1:]]), "began": began}
-            execution.begin_or_resume(plan, store, about, resume=args.resume)
+            begin(plan, store, about, resume=args.resume)
         except BaseException:
             if not args.resume:
                 folder.undo()
             raise
         with store:
-            return _drive(plan, engine, store, folder.path, args)
+            yield store, folder.path
 
 
-def _engine(args: argparse.Namespace) -> Engine:
+def engine_of(args: argparse.Namespace) -> Engine:
+    """Who spreads the episodes over processes or machines."""
     from cosim.batch.episode_runner import EpisodeRunner
     from cosim.workers.engines import LocalEngine
     from cosim.workers.supervisor import Limits
@@ -115,34 +152,66 @@ def _engine(args: argparse.Namespace) -> Engine:
 
 
 def _drive(plan: Plan, engine: Engine, store: Store, folder: Path, args: argparse.Namespace) -> int:
+    found = driven("evaluate", plan, engine, store, folder)
+    if not args.no_report:
+        from cosim.report import html, run_folder  # matplotlib: a second that only a report need pay
+
+        html.write(run_folder.read(folder), None, shown=args.out)
+    found.warn()
+    if args.json:
+        print(json.dumps(found.summary))
+    else:
+        print(found.text(plan, folder))
+    return found.exit_code
+
+
+@dataclass(frozen=True)
+class Driven:
+    """What came of a plan."""
+
+    rows: Sequence[Mapping[str, Any]]
+    summary: Mapping[str, Any]
+    faults: Sequence[Outcome]  # of our own code: they have no row
+    done: int  # episodes driven before
+    seconds: float
+
+    @property
+    def exit_code(self) -> int:
+        """0 when every episode has its row, else 4."""
+        return 4 if self.faults else 0
+
+    def warn(self) -> None:
+        """Say on stderr which episodes have no figures or no row."""
+        _warn(self.rows)
+        for fault in self.faults:
+            print(f"cosim: {fault.key}: no row, --resume tries it again: {fault.stderr}", file=sys.stderr)
+
+    def text(self, plan: Plan, folder: Path) -> str:
+        """How many episodes, how fast, and what became of them."""
+        now = plan.episodes - self.done
+        status = {**self.summary["status"], "not driven": plan.episodes - len(self.rows)}
+        return (
+            f"{plan.episodes} episodes of {len(plan.cells)} cells in {folder}\n"
+            f"  driven now {now} in {self.seconds:.1f} s ({now / max(self.seconds, 1e-9):.2f} episodes/s)\n"
+            "  status     " + ", ".join(f"{name} {n}" for name, n in status.items() if n)
+        )
+
+
+def driven(name: str, plan: Plan, engine: Engine, store: Store, folder: Path) -> Driven:
+    """Drive what the store does not hold yet, with progress, and export all."""
     from cosim.batch import execution
     from cosim.report.run_folder import export
     from cosim.workers.progress import Progress
 
     done = len(store.keys())
-    title = f"evaluate ({done} of {plan.episodes} done before)" if done else "evaluate"
+    title = f"{name} ({done} of {plan.episodes} done before)" if done else name
     began = time.monotonic()
     with Progress(title, "episodes") as progress:
         faults = execution.drive(plan, store, engine, folder / "outputs", progress)
     seconds = time.monotonic() - began
     rows = store.rows()
     summary = export(folder, rows, execution.manifest(plan, store), plan.episodes)
-    if not args.no_report:
-        from cosim.report import html, run_folder  # matplotlib: a second that only a report need pay
-
-        html.write(run_folder.read(folder), None, shown=args.out)
-    _warn(rows)
-    for fault in faults:
-        print(f"cosim: {fault.key}: no row, --resume tries it again: {fault.stderr}", file=sys.stderr)
-    if args.json:
-        print(json.dumps(summary))
-    else:
-        driven = plan.episodes - done
-        print(f"{plan.episodes} episodes of {len(plan.cells)} cells in {folder}")
-        print(f"  driven now {driven} in {seconds:.1f} s ({driven / max(seconds, 1e-9):.2f} episodes/s)")
-        status = {**summary["status"], "not driven": plan.episodes - len(rows)}
-        print("  status     " + ", ".join(f"{name} {n}" for name, n in status.items() if n))
-    return 4 if faults else 0
+    return Driven(rows, summary, faults, done, seconds)
 
 
 def _warn(rows: Sequence[Mapping[str, Any]]) -> None:

@@ -1,4 +1,4 @@
-"""Distance driven (DT of both papers): of all vehicles, of AVs, of HVs and of the mission vehicle."""
+"""Distance driven: means by kind of vehicle (DT of both papers), and what all of them drove in sum."""
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +13,8 @@ class Distance:
 
     The vehicles are those on the road at the first frame, so that a policy cannot change which vehicles are
     counted; a vehicle that left keeps its distance. On a road that starts empty (a foreign scenario without
-    warm-up) they are all that ever appeared. The mission vehicle counts whenever it appears.
+    warm-up) they are all that ever appeared. The mission vehicle counts whenever it appears. Kilometres
+    are of all vehicles, whenever they appeared.
     """
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
@@ -44,6 +45,8 @@ class Distance:
             "dt_av_m": _mean(driven[counted & av]),
             "dt_hv_m": _mean(driven[counted & ~av]),
             "dt_mission_m": _mean(driven[mission]),
+            "vehicle_km": Metric(float(driven.sum()) / 1000.0, "km", ""),
+            "av_km": Metric(float(driven[av].sum()) / 1000.0, "km", ""),
         }
 
 

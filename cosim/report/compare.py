@@ -68,7 +68,7 @@ class PairedFigure:
     def counts(self) -> tuple[str, str]:
         """What stands beside A and B: `3/40`, `12 in 3.4 h`, or nothing."""
         if self.tallies:
-            a, b = (wording.events(*tally) for tally in self.tallies)
+            a, b = (wording.events(*tally, self.measure.per) for tally in self.tallies)
             return a, b
         return (f"{self.hits[0]}/{self.n}", f"{self.hits[1]}/{self.n}") if self.hits else ("", "")
 
@@ -183,8 +183,8 @@ def paired(measure: Measure, pairs: Sequence[tuple[Row, Row]], seed: int = 0) ->
     n, na, neither = len(x), len(pairs) - len(x), int(missing.all(0).sum())
     if measure.per:
         before, after = (measure.tally([pair[k] for pair in pairs])[:, ~missing.any(0)] for k in (0, 1))
-        rates = pooled_rate(*before), pooled_rate(*after), paired_rate(before, after, seed)
-        tallies = tuple((int(k.sum()), float(t.sum())) for k, t in (before, after))
+        rates = pooled_rate(*before), pooled_rate(*after), paired_rate(before, after)
+        tallies = tuple((int(k.sum()), measure.scale * float(t.sum())) for k, t, _ in (before, after))
         return PairedFigure(measure, *rates, n, na, neither, tallies=tallies)
     if not measure.is_rate:
         difference = paired_mean(x, y, seed)
@@ -234,7 +234,7 @@ def _change(measure: Measure, rows: Sequence[Sequence[Row]], seed: int) -> Figur
         return paired_change(measure.values(rows[0]), measure.values(rows[1]), seed)
     before, after = (measure.tally(mine) for mine in rows)
     known = ~np.isnan([*before, *after]).any(0)
-    return paired_rate_change(before[:, known], after[:, known], seed)
+    return paired_rate_change(before[:, known], after[:, known])
 
 
 def _alone(measure: Measure, rows: Sequence[Row], seed: int) -> tuple[Figure, str]:
@@ -242,9 +242,9 @@ def _alone(measure: Measure, rows: Sequence[Row], seed: int) -> tuple[Figure, st
     y = [value for value in measure.values(rows) if not math.isnan(value)]
     if measure.per:
         tally = measure.tally(rows)
-        events, exposure = tally[:, ~np.isnan(tally).any(0)]
-        said = wording.events(int(events.sum()), float(exposure.sum()))
-        return pooled_rate(events, exposure), f"{said} of {len(y)} episodes"
+        events, exposure, weight = tally[:, ~np.isnan(tally).any(0)]
+        said = wording.events(int(events.sum()), measure.scale * float(exposure.sum()), measure.per)
+        return pooled_rate(events, exposure, weight), f"{said} of {len(y)} episodes"
     if measure.is_rate:
         return share(int(sum(y)), len(y)), f"{int(sum(y))} of {len(y)} episodes"
     return mean(y, seed), f"{len(y)} episodes"

@@ -1,7 +1,7 @@
 """Which columns of the rows are figures, what they are called, their units, and which direction is better."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cosim.report.result import FIRST
-from cosim.types import RESERVED, TIMINGS
+from cosim.report.statistics import Figure, pooled_rate
+from cosim.types import RESERVED, TIMINGS, WEIGHT
 
 Row = Mapping[str, Any]  # one episode: a line of episodes.parquet, NA as None
 
@@ -27,6 +28,8 @@ class Measure:
     better: str  # "higher", "lower" or ""
     is_rate: bool = False
     per: str = ""  # the column of the exposure that events are counted in
+    scale: float = 1.0  # of the exposure: how much of it is one of the unit
+    more: tuple[str, ...] = ()  # columns whose events count too
 
     @property
     def is_share(self) -> bool:
@@ -36,13 +39,25 @@ class Measure:
     def values(self, rows: Sequence[Row]) -> list[float]:
         """The figure in each row, nan for NA; of a rate 1.0 or 0.0."""
         if self.per:
-            return [k / t if t > 0.0 else math.nan for k, t in zip(*self.tally(rows), strict=True)]
+            return [k / t if t > 0.0 else math.nan for k, t, _ in self.tally(rows).T]
         found = _column(rows, self.column)
         return [float(x > 0) if self.is_rate and not math.isnan(x) else x for x in found]
 
     def tally(self, rows: Sequence[Row]) -> npt.NDArray[np.float64]:
-        """[2,n] events and exposure (in units of `per`) of each row, nan for NA."""
-        return np.array([_column(rows, self.column), _column(rows, self.per)])
+        """[3,n] events, exposure in the figure's unit, and weight of each row; nan for NA."""
+        events = np.sum([_column(rows, name) for name in (self.column, *self.more)], axis=0)
+        exposure = np.array(_column(rows, self.per)) / self.scale
+        return np.array([events, exposure, weights(rows)])
+
+    def figure(self, rows: Sequence[Row]) -> Figure:
+        """Of events per exposure: their weighted quotient over the rows in which neither is NA."""
+        tally = self.tally(rows)
+        return pooled_rate(*tally[:, ~np.isnan(tally).any(0)])
+
+
+def weights(rows: Sequence[Row]) -> list[float]:
+    """The likelihood ratio of each episode; 1 where its errors were not tilted (docs/estimate.md)."""
+    return [1.0 if row.get(WEIGHT) is None else float(row[WEIGHT]) for row in rows]
 
 
 def _column(rows: Sequence[Row], name: str) -> list[float]:
@@ -61,8 +76,16 @@ RATES: dict[str, Measure] = {
     )
 }
 
-# Events per vehicle time: all of them over all of it (docs/definitions.md, Near-misses).
+CRASHES = "crash_rate_per_million_km"
+# Events per distance and per vehicle time: all of them over all of it (docs/definitions.md, Near-misses).
 INCIDENCES: dict[str, Measure] = {
+    name: Measure(name, column, f"per million {km}", "lower", per=per, scale=1e6, more=more)
+    for name, column, more, km, per in (
+        (CRASHES, "av_involved_collisions", (), "AV-km", "av_km"),
+        (f"av_caused_{CRASHES}", "av_caused_collisions", (), "AV-km", "av_km"),
+        (f"all_{CRASHES}", "av_involved_collisions", ("hv_hv_collisions",), "vehicle-km", "vehicle_km"),
+    )
+} | {
     name: Measure(name, f"{who}near_misses_{kind}", f"per {hour}", "lower", per=hours)
     for who, hour, hours in (("av_", "AV-hour", "av_hours"), ("", "vehicle-hour", "vehicle_hours"))
     for kind in ("ttc", "drac", "pet")
@@ -73,12 +96,13 @@ HEADLINE = tuple(filter(None, FIRST.values()))  # what reports and comparisons s
 
 
 def measures(
-    rows: Iterable[Row], units: Mapping[str, str] | None = None, better: Mapping[str, str] | None = None
+    rows: Sequence[Row], units: Mapping[str, str] | None = None, better: Mapping[str, str] | None = None
 ) -> dict[str, Measure]:
     """Every figure these rows hold, by name: rates, then events per exposure, then means, then timings.
 
     `units` and `better` say by column what `cosim run --json` says of its metrics. Columns of yes and no
-    give rates, of numbers means; so a metric that is new has its figure without being listed here.
+    give rates, of numbers means; so a metric that is new has its figure without being listed here. Of tilted
+    episodes (docs/estimate.md) only events per exposure and timings: what is not weighed is of no traffic.
     """
     units, better = units or {}, better or {}
     kinds: dict[str, set[type]] = {}  # of the values that are not NA
@@ -86,7 +110,7 @@ def measures(
         for column, value in row.items():
             kinds.setdefault(column, set()).update(() if value is None else (type(value),))
     rates = {m.name: m for m in RATES.values() if m.column in kinds}
-    incidences = {m.name: m for m in INCIDENCES.values() if {m.column, m.per} <= kinds.keys()}
+    incidences = {m.name: m for m in INCIDENCES.values() if {m.column, m.per, *m.more} <= kinds.keys()}
     rated = {m.column for m in rates.values() if kinds[m.column] <= {bool}}
     means = {}
     for column in [c for c in kinds if c not in RESERVED | rated]:
@@ -96,4 +120,6 @@ def measures(
         elif column in units or (kinds[column] and kinds[column] <= {int, float}):
             means[column] = Measure(column, column, units.get(column, ""), better.get(column, ""))
     timings = {column: Measure(column, column, "s", "lower") for column in TIMINGS if column in kinds}
+    if any(weight != 1.0 for weight in weights(rows)):
+        return incidences | timings
     return rates | incidences | means | timings

@@ -20,7 +20,7 @@ from cosim.scenario.manifest import checked
 from cosim.types import OnCollision
 from cosim.workers.tasks import OK
 
-SETTINGS = ("duration", "warmup", "mission", "on_collision", "errors_sha256")
+SETTINGS = ("duration", "warmup", "mission", "on_collision", "errors_sha256", "tilt")
 NEEDED = ("key", "cell", "status", "scenario", "demand", "policy", "seed")
 
 
@@ -64,6 +64,7 @@ class Run:
             "mission": asked.get("mission"),
             "on_collision": driven.get("on_collision", asked.get("on_collision") or OnCollision.END),
             "errors_sha256": driven.get("errors", {}).get("sha256"),
+            "tilt": driven.get("tilt"),
         }
 
     def _cell(self, row: Row) -> Mapping[str, Any]:

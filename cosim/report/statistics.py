@@ -17,7 +17,8 @@ from scipy.optimize import brentq
 CONFIDENCE = 0.95
 Z = float(stats.norm.ppf(0.5 + CONFIDENCE / 2.0))
 RESAMPLES = 2000  # the bounds of a mean then wander by some 2 % of the interval's width from seed to seed
-FEW = 20  # events of both sides, below which the difference of two rates is not bootstrapped
+FEW = 3.0  # effective events, from which on their weights tell what another one may weigh
+MANY = 20.0  # effective events of a pair, from which on the difference of their rates is about normal
 BATCH = 2_000_000  # resampled values held at once: 16 MB
 
 Array = npt.NDArray[np.float64]
@@ -72,7 +73,7 @@ def rule_of_three(count: int) -> float:
     return min(3.0 / count, 1.0) if count else math.nan
 
 
-def rate(count: float, exposure: float) -> Figure:
+def rate(count: int, exposure: float) -> Figure:
     """Events per unit of exposure with the exact Poisson interval (Garwood 1936)."""
     tail = (1.0 - CONFIDENCE) / 2.0
     low = stats.chi2.ppf(tail, 2 * count) / 2 if count else 0.0
@@ -80,24 +81,52 @@ def rate(count: float, exposure: float) -> Figure:
     return Figure(count / exposure, float(low) / exposure, float(high) / exposure)
 
 
-def pooled_rate(counts: Sequence[float] | Array, exposures: Sequence[float] | Array) -> Figure:
-    """All events over all exposure of n samples, with the exact Poisson interval of `rate`.
+def pooled_rate(
+    counts: Sequence[float] | Array,
+    exposures: Sequence[float] | Array,
+    weights: Sequence[float] | Array | None = None,
+) -> Figure:
+    """Events per unit of exposure of n samples: R = sum(w y) / sum(w k), with a gamma interval.
 
-    Where the samples scatter more than Poisson counts do (Pearson's chi-square per degree of freedom above
-    1), count and exposure are divided by that factor for the bounds, as in quasi-Poisson regression
-    (McCullagh and Nelder 1989): events of one episode come together, and the exact interval would then be
-    too narrow.
+    Of weighted Poisson counts (Fay and Feuer, Statistics in Medicine 16 (1997) 791-801): its variance is
+    that of the ratio, sum(w^2 (y - R k)^2), and at least the Poisson variance sum(w^2 y): events of one
+    episode come together. The upper bound allows for one more event (or as many as come together), of the
+    largest weight of the events seen; of the largest weight of all samples where the events seen are
+    effectively fewer than `FEW`. With equal weights and no more scatter than Poisson counts have it is
+    the exact interval of `rate`.
+
+    Args:
+        counts: [n] y, events of each sample.
+        exposures: [n] k, what they are divided by.
+        weights: [n] w, positive likelihood ratios; None: all alike.
     """
-    k, t = np.asarray(counts, np.float64), np.asarray(exposures, np.float64)
-    if not t.sum() > 0.0:
+    y, k = np.asarray(counts, np.float64), np.asarray(exposures, np.float64)
+    w = np.ones(len(y)) if weights is None else np.asarray(weights, np.float64)
+    exposure, events = float((w * k).sum()), float((w * y).sum())
+    if not exposure > 0.0:
         return NA
-    value, expected = k.sum() / t.sum(), (k.sum() / t.sum() * t)[t > 0.0]
-    scatter = 1.0
-    if len(expected) > 1 and value > 0.0:
-        squares = (k[t > 0.0] - expected) ** 2 / expected
-        scatter = max(float(squares.sum()) / (len(expected) - 1), 1.0)
-    bounds = rate(k.sum() / scatter, t.sum() / scatter)
-    return Figure(float(value), bounds.low, bounds.high)
+    tail = (1.0 - CONFIDENCE) / 2.0
+    if events == 0.0:
+        return Figure(0.0, 0.0, float(w.max() * stats.chi2.ppf(1.0 - tail, 2) / 2.0) / exposure)
+    scatter = float((w**2 * (y - events / exposure * k) ** 2).sum()) * len(y) / max(len(y) - 1, 1)
+    poisson = float((w**2 * y).sum())
+    variance = max(scatter, poisson)
+    seen = w[y > 0.0]
+    largest = float(seen.max() if effective(seen) >= FEW else w.max()) * variance / poisson
+
+    def bound(p: float, mean: float, spread: float) -> float:
+        """The p-quantile of the gamma distribution of this mean and variance."""
+        return float(stats.gamma.ppf(p, mean**2 / spread, scale=spread / mean)) / exposure
+
+    low, high = bound(tail, events, variance), bound(1.0 - tail, events + largest, variance + largest**2)
+    return Figure(events / exposure, low, high)
+
+
+def effective(weights: Sequence[float] | Array) -> float:
+    """How many equal weights tell as much: (sum w)^2 / sum w^2 (Kish 1965); 0 of none."""
+    w = np.asarray(weights, np.float64)
+    total = float((w**2).sum())
+    return float(w.sum()) ** 2 / total if total > 0.0 else 0.0
 
 
 def mean(values: Sequence[float] | Array, seed: int = 0) -> Figure:
@@ -166,35 +195,64 @@ def paired_change(before: Sequence[float] | Array, after: Sequence[float] | Arra
     return _bootstrap((b, a), _change, seed)
 
 
-def paired_rate(before: Array, after: Array, seed: int = 0) -> Figure:
-    """Difference of two pooled rates, after - before, BCa bootstrap over pairs.
+def paired_rate(before: Array, after: Array) -> Figure:
+    """Difference of two pooled rates, after - before.
 
-    Each [2,n]: events and exposure of every pair. With fewer than `FEW` events a resample may hold none: then
-    the bounds come from those of the two rates as if they were independent (MOVER, Donner and Zou 2012).
+    Each [3,n]: events, exposure and weight of every pair (or [2,n], all alike), as for `pooled_rate`. With
+    effectively `MANY` events or more its error is that of what single pairs contribute (delta method). With
+    fewer the bounds are recovered from those of the two rates and the correlation of the contributions
+    (MOVER, Zou and Donner, Statistics in Medicine 27 (2008) 1693-1702).
     """
     a, b = pooled_rate(*before), pooled_rate(*after)
     if not (a.known and b.known):
         return NA
-    if before[0].sum() + after[0].sum() >= FEW:
-        return _bootstrap((*before, *after), _rate_difference, seed)
-    value = b.value - a.value
-    low = value - math.hypot(b.value - b.low, a.high - a.value)
-    return Figure(value, low, value + math.hypot(b.high - b.value, a.value - a.low))
+    return _recovered(a, b, _contributions(before, a), _contributions(after, b), _many(before, after))
 
 
-def paired_rate_change(before: Array, after: Array, seed: int = 0) -> Figure:
-    """Relative change of a pooled rate, bootstrapped over pairs [2,n]; infinite and unbounded as
-    `paired_change`."""
+def paired_rate_change(before: Array, after: Array) -> Figure:
+    """Relative change of a pooled rate over pairs [3,n], likewise from logarithms; infinite and unbounded as
+    `paired_change`, and without bounds where there is no event after."""
     a, b = pooled_rate(*before), pooled_rate(*after)
     if not (a.known and b.known):
         return NA
-    if a.value == 0.0:
-        change = 0.0 if b.value == 0.0 else math.inf
+    if a.value == 0.0 or b.value == 0.0:
+        change = -1.0 if a.value else math.inf if b.value else 0.0
         return Figure(change, math.nan, math.nan)
-    return _bootstrap((*before, *after), _rate_change, seed)
+    log_a, log_b = (Figure(*map(math.log, (f.value, f.low, f.high))) for f in (a, b))
+    parts = _contributions(before, a) / a.value, _contributions(after, b) / b.value
+    found = _recovered(log_a, log_b, *parts, _many(before, after))
+    return Figure(*map(math.expm1, (found.value, found.low, found.high)))
 
 
 # ---- inside ----
+
+
+def _weights(tally: Array) -> Array:
+    return tally[2] if len(tally) > 2 else np.ones(tally.shape[1])
+
+
+def _many(before: Array, after: Array) -> bool:
+    y, w = (np.concatenate(both) for both in ((before[0], after[0]), (_weights(before), _weights(after))))
+    return bool(y.any()) and float((w * y).sum()) ** 2 >= MANY * float((w**2 * y).sum())
+
+
+def _contributions(tally: Array, rate: Figure) -> Array:
+    """[n] what each sample adds to the error of a pooled rate."""
+    w = _weights(tally)
+    return np.asarray(w * (tally[0] - rate.value * tally[1]) / (w * tally[1]).sum())
+
+
+def _recovered(a: Figure, b: Figure, part_a: Array, part_b: Array, many: bool) -> Figure:
+    """b - a, to whose errors pairs contribute `part_a` and `part_b`."""
+    value = b.value - a.value
+    if many:
+        reach = Z * float(np.linalg.norm(part_b - part_a)) * math.sqrt(len(part_a) / (len(part_a) - 1))
+        return Figure(value, value - reach, value + reach)
+    scatter = np.ptp(part_a) > 0.0 and np.ptp(part_b) > 0.0
+    alike = float(np.corrcoef(part_a, part_b)[0, 1]) if scatter else 0.0
+    sides = (b.value - b.low, a.high - a.value), (b.high - b.value, a.value - a.low)
+    down, up = (math.sqrt(max(p**2 + q**2 - 2.0 * alike * p * q, 0.0)) for p, q in sides)
+    return Figure(value, value - down, value + up)
 
 
 def _known(values: Sequence[float] | Array) -> Array:
@@ -205,16 +263,6 @@ def _known(values: Sequence[float] | Array) -> Array:
 def _change(before: Array, after: Array, axis: int = -1) -> Array:
     with np.errstate(divide="ignore", invalid="ignore"):  # a resample may hold nothing but zeros
         return np.asarray(after.mean(axis=axis) / before.mean(axis=axis) - 1.0)
-
-
-def _rate_difference(k: Array, t: Array, n: Array, u: Array, axis: int = -1) -> Array:
-    return np.asarray(n.sum(axis=axis) / u.sum(axis=axis) - k.sum(axis=axis) / t.sum(axis=axis))
-
-
-def _rate_change(k: Array, t: Array, n: Array, u: Array, axis: int = -1) -> Array:
-    with np.errstate(divide="ignore", invalid="ignore"):
-        rates = n.sum(axis=axis) / u.sum(axis=axis), k.sum(axis=axis) / t.sum(axis=axis)
-        return np.asarray(rates[0] / rates[1] - 1.0)
 
 
 def _bootstrap(samples: tuple[Array, ...], statistic: Callable[..., Any], seed: int) -> Figure:

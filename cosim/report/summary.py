@@ -94,11 +94,12 @@ def rate_document(measure: Measure, rows: Sequence[Row]) -> dict[str, Any]:
 def incidence_document(measure: Measure, rows: Sequence[Row]) -> dict[str, Any]:
     """Events of all rows over their exposure, with the Poisson interval."""
     tally = measure.tally(rows)
-    events, exposure = tally[:, ~np.isnan(tally).any(0)]
+    events, exposure, weight = tally[:, ~np.isnan(tally).any(0)]
     return {
-        **pooled_rate(events, exposure).document(),
+        **pooled_rate(events, exposure, weight).document(),
         "events": int(events.sum()) if len(events) else None,
-        "exposure": float(exposure.sum()) if len(events) else None,
+        "per": measure.per,
+        "exposure": measure.scale * float(exposure.sum()) if len(events) else None,
         "n": len(events),
         "na": len(rows) - len(events),
         "unit": measure.unit,

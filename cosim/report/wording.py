@@ -47,15 +47,15 @@ def interval(figure: Figure, measure: Measure, *, signed: bool = False) -> str:
 def sample(counts: Mapping[str, Any]) -> str:
     """`3/40` of a rate, `12 in 3.4 h` of an incidence, `n 40` of a mean, with the NA beside them."""
     if counts.get("events") is not None:
-        text = events(counts["events"], counts["exposure"])
+        text = events(counts["events"], counts["exposure"], counts["per"])
         return f"{text}, {counts['na']} NA" if counts.get("na") else text
     text = f"{counts['hits']}/{counts['n']}" if counts.get("hits") is not None else f"n {counts['n']}"
     return f"{text}, {counts['na']} NA" if counts.get("na") else text
 
 
-def events(count: int, hours: float) -> str:
-    """`12 in 3.4 h`"""
-    return f"{count} in {_digits(hours, False)} h"
+def events(count: int, exposure: float, per: str) -> str:
+    """`12 in 3.4 h`, `1 in 850 km`; `per`: the column of the exposure."""
+    return f"{count} in {_digits(exposure, False)} {'km' if per.endswith('km') else 'h'}"
 
 
 def p_value(p: float) -> str:

@@ -15,6 +15,7 @@ from cosim.files.yaml_input import NonNegative, Positive
 from cosim.scenario import human_errors, sumocfg
 from cosim.scenario.behaviors import AS_IS, DRIVER_MODELS, LC2013, MIXED, load_behaviors
 from cosim.scenario.human_errors import Errors
+from cosim.scenario.tilt import Tilt
 from cosim.types import Identity, OnCollision, Preset, Timing
 
 BEHAVIORS = load_behaviors().names
@@ -106,6 +107,7 @@ class Scenario:
     behavior: str = AS_IS
     driver_model: str = LC2013
     errors: Errors | None = None  # of human drivers and persons; None: nobody errs
+    tilt: Tilt | None = None  # of these errors; None: they are drawn as they happen
     demands: Mapping[str, Path] | None = None  # name -> file, of a world
     title: str = ""
     definition: Path | None = None  # the scenario.yaml of a world

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 from cosim.errors import BadInput, Range, inside
 from cosim.files.yaml_input import dataclass_from, mapping
-from cosim.scenario import Scenario, chosen_fleet, load
+from cosim.scenario import Scenario, chosen_fleet, load, tilt
 from cosim.scenario.behaviors import LC2013
 from cosim.types import Preset
 
@@ -23,6 +23,7 @@ OPTIONAL = (
     "mission",
     "on_collision",
     "errors",
+    "tilt",
 )  # named only where they are asked for: older keys stay as they are
 KEY_LENGTH = 12  # hexadecimal digits of a cell: 48 bits, a collision among 10,000 cells has odds of 2e-7
 
@@ -53,6 +54,7 @@ class EpisodeId:
     reward: str | None = None  # paid and reported: a name of `cosim.rewards.REWARDS`, or code likewise
     on_collision: str | None = None  # of `OnCollision`; None: the scenario's own
     errors: str | None = None  # of human drivers: a level, or an absolute path; None: none
+    tilt: str | None = None  # of these errors (`cosim.scenario.tilt`); None: drawn as they happen
 
     @cached_property
     def cell(self) -> str:
@@ -101,7 +103,7 @@ class EpisodeId:
         Raises:
             BadInput: see `cosim.scenario.load`.
         """
-        return load(
+        found = load(
             self.what,
             demand=self.demand,
             behavior=self.behavior,
@@ -115,3 +117,4 @@ class EpisodeId:
             errors=self.errors,
             options=options,
         )
+        return found if self.tilt is None else replace(found, tilt=tilt.read(self.tilt, "tilt"))

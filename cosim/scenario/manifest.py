@@ -40,6 +40,7 @@ def manifest(scenario: Scenario, seed: int) -> dict[str, Any]:
         **({"on_collision": goes_on} if (goes_on := scenario.on_collision) != OnCollision.END else {}),
         **({} if scenario.built_in else {"mission": scenario.mission.vehicles or scenario.mission.kind}),
         **({} if scenario.errors is None else {"errors": _errors(scenario.errors)}),
+        **({} if scenario.tilt is None else {"tilt": scenario.tilt.text()}),
         "driver_model": scenario.driver_model,
         "behavior": scenario.behavior,
         "fleet": scenario.fleet.describe(),

@@ -67,7 +67,7 @@ def open(
 
 
 class Remote(Session):
-    """A session on a server. Of an upload `scenario` knows the name and the times, its files are elsewhere."""
+    """A session on a server. `scenario` of an upload knows names and times; its files are elsewhere."""
 
     def __init__(self, connection: Connection, request: Mapping[str, Any]) -> None:
         caller = _Caller(connection, request)

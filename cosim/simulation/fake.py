@@ -88,6 +88,11 @@ class FakeSimulator:
         v = self._vehicles[vehicle]
         return v.target, 0 if v.goal_lane < 0 else int(np.sign(v.goal_lane - v.lane))
 
+    @property
+    def tilted(self) -> tuple[float, dict[str, list[float]]]:
+        """Nobody errs."""
+        return 0.0, {}
+
     def counts(self) -> dict[str, int]:
         """All vehicles are inserted at the start."""
         return {"inserted": len(self._template), "waiting": 0}

@@ -1,7 +1,7 @@
 """Lets human drivers and persons err: one trial per driver and second or per manoeuvre, drawn from hashes."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -10,12 +10,13 @@ import numpy as np
 from cosim.control import LANE_CHANGE_TIME
 from cosim.road import RoadMap
 from cosim.scenario.human_errors import KINDS, Errors, ForcedEntry, Span
+from cosim.scenario.tilt import Tilt, case, log_ratio
 from cosim.seeding import subseed, uniform, uniforms
 from cosim.simulation.backend import sumo
 from cosim.simulation.convert import PERSON, Body, may_change
 from cosim.simulation.drivers import Drivers
 from cosim.simulation.mobil import LEFT, RIGHT, route_allows
-from cosim.types import Collision, HumanError, Kind
+from cosim.types import Bools, Collision, HumanError, Kind
 
 # SUMO's speed mode (Change_Vehicle_State): what an erring driver no longer heeds.
 SAFE_SPEED, MAX_ACCEL, MAX_DECEL, RIGHT_OF_WAY, RED_LIGHT = 1, 2, 4, 8, 16
@@ -32,6 +33,8 @@ HARDEST = 9.0  # m/s2: it does not change lanes to where it cannot stop itself
 WITHIN = 100.0  # m, in which others are looked for
 PASSES = 10.0  # s at most for driving through a junction
 HOLDS = 4.0  # s that a forced lane change may take
+NEAR = 60.0  # m: within that of an AV errors may be tilted
+MEET_ANYBODY = ("red_light", "step_out")  # kinds of which nobody knows before whom they meet
 REMEMBERED = 5.0  # s after its end in which an error still has a part in a collision
 
 # Kinds drawn every second for every driver; the others belong to a manoeuvre.
@@ -41,6 +44,10 @@ IGNORE = {
     "jmIgnoreFoeProb": ("1", "0"),
     "jmIgnoreFoeSpeed": ("100", "0"),
 }
+
+
+# A trial whose error can begin yields whom it would meet ("": nobody); resumed, it begins.
+Trial = Generator[str, None, "Erring | None"]
 
 
 class Gap(NamedTuple):
@@ -73,13 +80,28 @@ class HumanErrors:
     never depends on the draw. Nobody errs before `begin`: the warm-up is as without errors.
     """
 
-    def __init__(self, errors: Errors, road: RoadMap, drivers: Drivers, seed: int, step: float) -> None:
+    def __init__(
+        self, errors: Errors, road: RoadMap, drivers: Drivers, seed: int, step: float, tilt: Tilt | None
+    ) -> None:
         self._kinds = {name: kind for name in KINDS if (kind := getattr(errors.kinds, name)) is not None}
         self._road, self._drivers, self._seed, self._step = road, drivers, seed, step
         names = "LaneID", "LanePosition", "Speed"
         self._lane_of, self._position_of, self._speed_of = (sumo.getter("vehicle", name) for name in names)
         self._every_second = [name for name in EVERY_SECOND if name in self._kinds]
         self._rates = np.array([self._kinds[name].rate for name in self._every_second])  # [k]
+        self._tilt = tilt
+        self._tilted = tilt is not None and tilt.drawn(seed)
+        self._raised = np.array(
+            [tilt is not None and tilt.raises(k) for k in self._every_second], bool
+        )  # [k]
+        self.log_ratio = (
+            0.0  # of the trials so far: the probability drawn tilted over that drawn as it happens
+        )
+        self._avs: set[str] = set()
+        self._near: frozenset[str] = frozenset()  # whose trials are weighed
+        self._during: frozenset[str] = frozenset()  # of these, near somebody who errs
+        self._begun = 0  # errors from raised probabilities
+        self.weighed: dict[str, list[float]] = {}  # `case` -> first errors begun, sum of p until then
         self._streams: dict[str, Any] = {}  # HV on the road -> [k] its streams of draws
         self._erring: dict[str, Erring] = {}
         self._ended: dict[str, float] = {}  # who erred before -> s, when that ended
@@ -100,12 +122,15 @@ class HumanErrors:
 
     def depart(self, name: str, body: Body) -> None:
         """A vehicle has departed."""
+        if body.kind == Kind.AV:
+            self._avs.add(name)
         if body.kind == Kind.HV:
             kinds = self._every_second
             self._streams[name] = np.array([subseed(self._seed, "error", k, name) for k in kinds], np.uint64)
 
     def drop(self, name: str) -> None:
         """It has left the road, crashed, or is driven by somebody else from now on; it is left as it is."""
+        self._avs.discard(name)
         self._streams.pop(name, None)
         self._waited.pop(name, None)
         erring = self._erring.pop(name, None)
@@ -121,7 +146,10 @@ class HumanErrors:
     def step(self, now: float) -> None:
         """After a simulation step that ended at `now` (s)."""
         for name in [*self._erring]:
-            self._go_on(name, now)
+            try:
+                self._go_on(name, now)
+            except sumo.TraCIException:  # taken off the road, neither arrived nor crashed
+                self.drop(name)
         if self._next is not None and now >= self._next - 1e-6:
             self._next += 1.0
             self._trials(now)
@@ -141,11 +169,18 @@ class HumanErrors:
 
     def _trials(self, now: float) -> None:
         """Those of one second."""
-        second = round(now)
+        second, on_road = round(now), frozenset(sumo.vehicle.getIDList())
+        for name in self._streams.keys() - on_road:
+            self.drop(name)
         names = [*self._streams]
+        if self._tilt is not None and self._begun < 2:
+            self._near, self._during = self._beside_avs(names, now)
         if names and self._every_second:
             drawn = uniforms(np.array([*self._streams.values()]), second)  # [n,k]
-            for row, k in np.argwhere(drawn < self._rates).tolist():
+            looked_at = drawn < self._rates
+            if self._near and self._begun < 2:
+                looked_at |= np.outer([self._is_weighed(name) for name in names], self._raised)
+            for row, k in np.argwhere(looked_at).tolist():
                 self._try(self._every_second[k], names[row], self._rates[k], drawn[row, k], now)
         if self._kinds.keys() & {"forced_entry", "failure_to_yield", "red_light"}:
             for name in names:
@@ -159,11 +194,60 @@ class HumanErrors:
 
     def _try(self, kind: str, who: str, rate: float, drawn: float, now: float) -> None:
         """One trial. Whether the error can begin is looked at only where that decides."""
-        if drawn < rate and who not in self._erring:
-            begun = getattr(self, f"_{kind}")(who, now)
-            if begun is not None:
-                self._erring[who] = begun
-                self._happened.append(begun.error)
+        weighed = self._is_weighed(who)
+        if not (drawn < rate or weighed) or who in self._erring:
+            return
+        trial: Trial = getattr(self, f"_{kind}")(who, now)
+        whom = next(trial, None)
+        if whom is None or not drawn < (self._weighed(who, kind, rate, drawn, whom) if weighed else rate):
+            return
+        try:
+            next(trial)
+        except StopIteration as end:
+            self._erring[who] = end.value
+            self._happened.append(end.value.error)
+
+    def _weighed(self, who: str, kind: str, p: float, drawn: float, whom: str) -> float:
+        """The probability that holds for a trial near an AV; `log_ratio` and `weighed` take it in."""
+        assert self._tilt is not None
+        if not self._is_weighed(who):
+            return p
+        what = case(kind, whom in self._avs or kind in MEET_ANYBODY)
+        q = self._tilt.rate(what, p, self._begun > 0)
+        held = q if self._tilted else p
+        begins = bool(drawn < held)
+        self.log_ratio += log_ratio(p, q, begins)
+        if not self._begun:
+            counted = self.weighed.setdefault(what, [0, 0.0])
+            counted[0] += begins
+            counted[1] += float(p)
+        self._begun += begins and q > p
+        return held
+
+    def _is_weighed(self, who: str) -> bool:
+        """Near an AV the first error is tilted, and a second one near whoever errs then; no further ones."""
+        return who in (self._near, self._during, ())[min(self._begun, 2)]
+
+    def _beside_avs(self, names: Sequence[str], now: float) -> tuple[frozenset[str], frozenset[str]]:
+        """Who drives within `NEAR` of an AV, so that its errors may be tilted; and of those who does so of
+        somebody else who is erring, or was until `REMEMBERED` s ago."""
+        if not (self._avs and names):
+            return frozenset(), frozenset()
+        recent = {who for who, end in self._ended.items() if now - end <= REMEMBERED}
+        erring = [name for name in names if name in self._erring or name in recent]
+        places = {name: sumo.vehicle.getPosition(name) for name in (*names, *self._avs)}
+
+        def close(to: Sequence[str]) -> Bools:
+            """[n,t]"""
+            here, there = (np.array([places[k] for k in group]).reshape(-1, 2) for group in (names, to))
+            return np.asarray(np.abs(here[:, None] - there).max(2) < NEAR)
+
+        def those(mask: Bools) -> frozenset[str]:
+            return frozenset(name for name, is_so in zip(names, mask.tolist(), strict=True) if is_so)
+
+        near = np.asarray(close([*self._avs]).any(1))
+        others = np.array(names)[:, None] != np.array(erring, str)
+        return those(near), those(near & (close(erring) & others).any(1))
 
     def _draw(self, kind: str, who: str, *which: str) -> float:
         """In [0, 1)."""
@@ -239,13 +323,14 @@ class HumanErrors:
         """m until its lane serves its route no more."""
         return self._needed_change(name, lane)[1] - float(self._position_of(name))
 
-    # ---- the kinds: what begins, None where it cannot
+    # ---- the kinds: each yields whom it would meet where it can begin, and begins when it is resumed
 
-    def _inattention(self, who: str, now: float) -> Erring | None:
+    def _inattention(self, who: str, now: float) -> Trial:
         leader = sumo.vehicle.getLeader(who, WITHIN)
         speed = self._speed_of(who)
         if not leader or not leader[0] or speed < MOVES:
             return None
+        yield leader[0]
         length = self._drawn(self._kinds["inattention"].duration, "inattention", who, now, "duration")
         erring = self._begins("inattention", who, now, length, f"sees nobody for {length:.1f} s", leader[0])
         self._take(who, erring, BLIND, BLIND)
@@ -253,26 +338,28 @@ class HumanErrors:
         self._slow(who, 0.0)
         return erring
 
-    def _hard_braking(self, who: str, now: float) -> Erring | None:
+    def _hard_braking(self, who: str, now: float) -> Trial:
         kind = self._kinds["hard_braking"]
         if self._speed_of(who) < MOVES:
             return None
+        follower = _follower(who)
+        yield follower
         hard = self._drawn(kind.deceleration, "hard_braking", who, now, "deceleration")
         length = self._drawn(kind.duration, "hard_braking", who, now, "duration")
         what = f"brakes with {hard:.1f} m/s2 for {length:.1f} s for no reason"
-        erring = self._begins("hard_braking", who, now, length, what, _follower(who))
+        erring = self._begins("hard_braking", who, now, length, what, follower)
         return self._slows(who, erring, hard)
 
-    def _stalled_car(self, who: str, now: float) -> Erring | None:
+    def _stalled_car(self, who: str, now: float) -> Trial:
         kind = self._kinds["stalled_car"]
         speed = self._speed_of(who)
         if speed < MOVES or self._lane_of(who).startswith(":"):
             return None
+        follower = _follower(who)
+        yield follower
         slows = self._drawn(kind.deceleration, "stalled_car", who, now, "deceleration")
         stands = self._drawn(kind.duration, "stalled_car", who, now, "duration")
-        erring = self._begins(
-            "stalled_car", who, now, speed / slows + stands, "stops in its lane", _follower(who)
-        )
+        erring = self._begins("stalled_car", who, now, speed / slows + stands, "stops in its lane", follower)
         return self._slows(who, erring, slows)
 
     def _slows(self, who: str, erring: Erring, deceleration: float) -> Erring:
@@ -286,7 +373,7 @@ class HumanErrors:
         """One step slower; 0 holds the speed."""
         sumo.vehicle.setSpeed(who, max(self._speed_of(who) - deceleration * self._step, 0.0))
 
-    def _cut_in(self, who: str, now: float, kind: str = "cut_in") -> Erring | None:
+    def _cut_in(self, who: str, now: float, kind: str = "cut_in") -> Trial:
         low, high = self._kinds[kind].deceleration
         lane = self._lane_of(who)
         if self._speed_of(who) < MOVES or self._changing(who) or not lane or lane[0] == ":":
@@ -299,6 +386,7 @@ class HumanErrors:
         if not found:
             return None
         (asked, _, whom), side = min(found)
+        yield whom
         again = kind == "aborted_cut_in"
         length = (2 if again else 1) * LANE_CHANGE_TIME + self._step
         what = f"cuts in before {whom}, who must brake with {asked:.1f} m/s2" + ", and swerves back" * again
@@ -309,10 +397,10 @@ class HumanErrors:
         sumo.vehicle.changeLaneRelative(who, side, LANE_CHANGE_TIME)
         return erring
 
-    def _aborted_cut_in(self, who: str, now: float) -> Erring | None:
+    def _aborted_cut_in(self, who: str, now: float) -> Trial:
         return self._cut_in(who, now, "aborted_cut_in")
 
-    def _forced_entry(self, who: str, now: float) -> Erring | None:
+    def _forced_entry(self, who: str, now: float) -> Trial:
         refuses = self._kinds["forced_entry"].lag
         lane, waited = self._lane_of(who), self._waited[who]
         if self._at_end_of_lane(who, lane):
@@ -320,6 +408,7 @@ class HumanErrors:
             beside = None if self._changing(who) else self._beside(who, lane, side)
             if beside is None or beside.lag < refuses:
                 return None
+            yield beside.whom
             erring = self._begins("forced_entry", who, now, HOLDS, _forces(waited, beside), beside.whom)
             self._take(who, erring, None, BLIND)
             sumo.vehicle.changeLaneRelative(who, side, HOLDS)
@@ -327,18 +416,22 @@ class HumanErrors:
         met = self._foes(who)
         if not met or any(foe.lag < refuses for foe in met):
             return None
+        yield met[0].whom
         return self._drives_on("forced_entry", who, now, RIGHT_OF_WAY, _forces(waited, met[0]), met[0].whom)
 
-    def _failure_to_yield(self, who: str, now: float) -> Erring | None:
+    def _failure_to_yield(self, who: str, now: float) -> Trial:
         met = self._foes(who)
         whom = met[0].whom if met else ""
+        yield whom
         what = f"does not see {whom}, who has the right of way" if whom else "does not look who comes"
         return self._drives_on("failure_to_yield", who, now, RIGHT_OF_WAY, what, whom)
 
-    def _red_light(self, who: str, now: float) -> Erring | None:
+    def _red_light(self, who: str, now: float) -> Trial:
+        yield ""
         return self._drives_on("red_light", who, now, RIGHT_OF_WAY | RED_LIGHT, "does not stop for red", "")
 
-    def _step_out(self, who: str, now: float) -> Erring | None:
+    def _step_out(self, who: str, now: float) -> Trial:
+        yield ""
         person = who.removeprefix(PERSON)
         length = self._drawn(self._kinds["step_out"].duration, "step_out", who, now, "duration")
         erring = self._begins("step_out", who, now, length, "walks onto the crossing without waiting", "")

@@ -114,7 +114,11 @@ class SumoSimulator:
         # with errors humans hit humans, and an episode that only an AV's crash ends goes on
         goes_on = self._scenario.on_collision == OnCollision.CONTINUE or errors is not None
         self._wrecks = Wrecks(self._commander, self._drivers) if goes_on else None
-        self._errors = None if errors is None else HumanErrors(errors, self.road, self._drivers, seed, step)
+        self._errors = (
+            None
+            if errors is None
+            else HumanErrors(errors, self.road, self._drivers, seed, step, self._scenario.tilt)
+        )
         self._reader.bodies_changed()
         self._entries.reset()
         self._mission_found = not self._scenario.mission.guessed
@@ -163,6 +167,11 @@ class SumoSimulator:
         if state is None:
             return self._commander.heads_for(vehicle), 0
         return state.target, state.changing(sumo.simulation.getTime())
+
+    @property
+    def tilted(self) -> tuple[float, dict[str, list[float]]]:
+        """Of this episode's errors: log(q / p); case -> those begun near AVs, and the sum of p."""
+        return (0.0, {}) if self._errors is None else (self._errors.log_ratio, self._errors.weighed)
 
     def counts(self) -> dict[str, int]:
         """Vehicles since the start: `inserted`, and `waiting`: due and not inserted, whether SUMO has dropped

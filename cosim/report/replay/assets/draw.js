@@ -168,7 +168,7 @@ function drawScene(ctx, state) {
   for (const [vehicle, s] of state.shown) { drawChoice(ctx, state, vehicle, s); drawLaw(ctx, state, vehicle, s); drawError(ctx, state, vehicle, s); }
   for (const [vehicle, s] of state.shown) {
     const named = vehicle === state.chosen || vehicle.mission || (state.labels && view.scale > 1.5);
-    const error = view.scale > 2.2 && erring(vehicle, t);
+    const error = (named || view.scale > 3.5) && erring(vehicle, t);
     if (named || error) {
       const up = (Math.abs(Math.sin(s.heading)) * vehicle.length + vehicle.width) * 0.5 * view.scale + 9;
       const [px, py] = view.toPixels(s.x, s.y);

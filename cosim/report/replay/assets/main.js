@@ -67,7 +67,7 @@ function start(data) {
       if (s) { view.x = s.x; view.y = s.y; }
       drawScene(scene.getContext("2d"), state);
       drawMap($$("map"), state); drawChart($$("chart"), state); drawTimeline();
-      fillDetails(state);
+      fillDetails(state); markEvent(state);
       $$("follow").classList.toggle("on", state.following);
       $$("clock").textContent = `${state.t.toFixed(1)} / ${data.end.toFixed(1)} s`;
       $$("predictions").checked = state.predictions; $$("labels").checked = state.labels;

@@ -218,7 +218,7 @@ function wantedEvents(state) {
 
 function fillEvents(state) {
   const list = document.getElementById("events"), wanted = wantedEvents(state), most = 400;
-  list.replaceChildren();
+  list.replaceChildren(); state.listed = wanted.slice(0, most); state.now = -1;
   for (const event of wanted.slice(0, most)) {
     const row = element("li");
     row.append(element("time", `${event.t.toFixed(1)} s`), element("span", event.text, EVENTS[event.kind][1]));
@@ -232,6 +232,16 @@ function fillEvents(state) {
   if (wanted.length > most) list.append(element("li", `and ${wanted.length - most} more`, "quiet"));
   if (!wanted.length) list.append(element("li", "none", "quiet"));
   document.getElementById("count").textContent = `(${wanted.length})`;
+}
+
+// The last event that has begun is marked in the list, which follows it unless the pointer is on it.
+function markEvent(state) {
+  const list = document.getElementById("events"), now = atOrBefore(state.listed.map((e) => e.t), state.t + 0.05);
+  if (now === state.now) return;
+  list.children[state.now]?.classList.remove("now"); state.now = now;
+  const row = list.children[now];
+  row?.classList.add("now");
+  if (!list.matches(":hover")) list.scrollTop = row ? row.offsetTop - list.offsetTop - list.clientHeight / 2 : 0;
 }
 
 function fillFigures(data) {
@@ -256,7 +266,8 @@ function fillHead(data) {
   if (f.policy_label) chip(f.policy_label, "warn");
   chip(`seed ${f.seed}`); chip(f.preset); chip(`humans ${f.behavior}, ${f.driver_model}`); chip(`svo ${f.svo_deg}\u00b0`);
   if (f.errors) chip(`human errors ${f.errors}`);
-  if (figure("crashed") != null) chip(figure("crashed") ? `${figure("collisions")} collision(s)` : "no collision", figure("crashed") ? "bad" : "good");
+  const crashes = figure("collisions"), among = figure("crashed") ? "" : ", none of an AV or the mission vehicle";
+  if (crashes != null) chip(crashes ? `${crashes} collision${crashes > 1 ? "s" : ""}${among}` : "no collision", figure("crashed") ? "bad" : crashes ? "warn" : "good");
   if (figure("mission_success") != null) chip(figure("mission_success") ? "mission fulfilled" : "mission not fulfilled", figure("mission_success") ? "good" : "bad");
   if (f.mission_vehicle) chip(`mission vehicle ${f.mission_vehicle}${f.mission_guessed ? ", guessed" : ""}`, f.mission_guessed ? "warn" : "");
   for (const reason of f.not_comparable_because || []) chip(reason, "warn");

@@ -1,0 +1,271 @@
+"""The tilts of `cosim estimate`, and what its intervals are worth: a toy of known truth, brute force, speed.
+
+    python -m benchmarks.estimate tune --world merge --runs runs/tilts [--episodes 400] [--rounds 4]
+    python -m benchmarks.estimate measure --runs runs/estimate [--worlds merge] [--episodes 4000]
+    python -m benchmarks.estimate page --runs runs/estimate [--out PAGE]
+
+`tune` drives tilted episodes of `idm` AVs on tuning seeds, and lets the tilt become that under which errors
+are as frequent as in those episodes in which an AV crashed (cross-entropy; docs/estimate.md); it prints the
+tilt for sumo_scenarios/tilts.yaml. `measure` drives what `page` shows, on test seeds: a case that brute force
+reaches, with and without a tilt, and `dense` at the level `field`. Both go on where they stopped. `page` adds
+the toy and writes docs/results/estimate.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from benchmarks.tables import markdown_row, write_page
+from benchmarks.toy_crashes import KINDS, Toy
+from cosim.cli.main import main as cosim
+from cosim.report import crash_rate, run_folder, wording
+from cosim.report.figures import CRASHES, INCIDENCES, Row, weights
+from cosim.report.statistics import effective, pooled_rate
+from cosim.scenario.tilt import ALL, OTHER, Tilt, shipped
+from cosim.seeding import FIRST_TEST_SEED, TUNING_SEEDS
+from cosim.workers.tasks import OK
+
+Array = npt.NDArray[np.float64]
+FIRST = 2.0  # errors a tilted episode that the first tilt aims at, if none ended the trials
+MEET = 0.75  # share of them that meets an AV first
+DURING = 10.0  # the second error has a tenth of the time and of the drivers of the first
+PAGE = Path("docs/results/estimate.md")
+INTERVALS = 400
+REAL = ("exit", "contested", "stress")  # world, demand, errors: AVs crash so often that brute force sees it
+REAL_TILT = Tilt({ALL: 3.0, ALL + OTHER: 2.0}, 2.0, 0.1)
+BRUTE, REPETITIONS, EACH = 400, 10, 40  # episodes; estimates, and episodes of each
+TEMPER = 0.5  # power of the weights of crashed episodes: fewer of them decide everything
+KEPT = 0.2  # of the tilt before, in units of one crashed episode
+HUMANS = 0.2  # share of the score that crashes among humans have
+
+
+def drive(
+    folder: Path, world: str, demand: str, errors: str, tilt: Tilt | None, seeds: range, workers: int
+) -> list[Row]:
+    """The episodes of `idm` AVs under a tilt; what is in the folder already is not driven again."""
+    flags = {
+        "--scenario": world,
+        "--demand": demand,
+        "--errors": errors,
+        "--tilt": "none" if tilt is None else tilt.text(),
+        "--seeds": f"{seeds.start}:{seeds.stop}",
+        "--episodes": len(seeds),
+        "--workers": workers,
+        "--out": folder,
+    }
+    words = [str(word) for flag in flags.items() for word in flag]
+    if cosim(["estimate", *words, *(["--resume"] if folder.exists() else [])]):
+        raise SystemExit(f"{folder}: not every episode could be driven")
+    return _ok(folder)
+
+
+def trials(rows: Sequence[Row]) -> dict[str, Array]:
+    """Case -> [2,n] errors begun and sum of their probabilities in each episode."""
+    each = [json.loads(row["tilt_trials"]) for row in rows]
+    names = sorted({name for found in each for name in found})
+    return {name: np.array([found.get(name, (0, 0.0)) for found in each], float).T for name in names}
+
+
+def balanced(rows: Sequence[Row], before: Tilt) -> Tilt:
+    """`FIRST` errors an episode, `MEET` of them meeting an AV; in either share every kind equally often."""
+    factors = {}
+    for meets, share in ((True, MEET), (False, 1.0 - MEET)):
+        expected = {n: e.mean() for n, (_, e) in trials(rows).items() if n.endswith(OTHER) != meets}
+        factors |= {n: max(FIRST * share / len(expected) / e, 1.0) for n, e in expected.items()}
+    return replace(before, factors=factors)
+
+
+def crossed(rows: Sequence[Row], before: Tilt) -> Tilt:
+    """Every case as frequent as in the crashed episodes, by their weights; shrunk towards the tilt before."""
+    weight = np.array(weights(rows)) ** TEMPER
+    score = np.zeros(len(rows))
+    for share, column in ((1.0 - HUMANS, "av_involved_collisions"), (HUMANS, "hv_hv_collisions")):
+        hit = weight * np.array([row[column] > 0 for row in rows])
+        score += share * hit / hit.sum() if hit.any() else 0.0
+    factors = dict(before.factors)
+    for name, (begun, expected) in trials(rows).items():
+        usual, was = expected.mean(), before.factors.get(name, 1.0)
+        if not usual > 0.0:
+            continue
+        new = (score @ begun + KEPT * was * usual) / (score @ expected + KEPT * usual)
+        factors[name] = max(float(new), 1.0)
+    return replace(before, factors=factors)
+
+
+def tune(world: str, demand: str, errors: str, runs: Path, episodes: int, rounds: int, workers: int) -> Tilt:
+    """The tilt after the last round; every round has seeds of its own."""
+    tilt = Tilt({ALL: 2.0, ALL + OTHER: 2.0}, DURING)
+    for k in range(rounds):
+        seeds = range(TUNING_SEEDS.start + k * episodes, TUNING_SEEDS.start + (k + 1) * episodes)
+        rows = drive(runs / f"{world}-{k}", world, demand, errors, tilt, seeds, workers)
+        crashes = np.array(weights(rows))[[row["av_involved_collisions"] > 0 for row in rows]]
+        print(f"round {k}: {len(crashes)} crashes, effective {effective(crashes):.1f}, {len(rows)} episodes")
+        tilt = crossed(rows, tilt) if k else balanced(rows, tilt)
+        tilt = replace(tilt, factors={name: float(f"{f:.2g}") for name, f in tilt.factors.items()})
+        print(tilt.text())
+    return tilt
+
+
+def measure(runs: Path, worlds: Sequence[str], episodes: int, workers: int) -> None:
+    """The episodes of the page."""
+    for name, tilt, count in (("brute", None, BRUTE), ("tilted", REAL_TILT, REPETITIONS * EACH)):
+        first = FIRST_TEST_SEED + (BRUTE if name == "tilted" else 0)
+        drive(runs / name, *REAL, tilt, range(first, first + count), workers)
+    for world in worlds:
+        tilt = shipped(world)
+        if tilt is None:
+            raise SystemExit(f"{world} has no tilt: sumo_scenarios/tilts.yaml")
+        seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + episodes)
+        drive(runs / f"field-{world}", world, "dense", "field", tilt, seeds, workers)
+
+
+def page(runs: Path, out: Path) -> None:
+    """Write it from the toy and from what `measure` left."""
+    lines = ["# What the intervals of `cosim estimate` are worth", ""]
+    lines += [
+        "Made by `python -m benchmarks.estimate page`; [what is estimated, and how](../estimate.md).",
+        "",
+    ]
+    lines += [*_toy(), *_real(runs), *_field(runs)]
+    write_page(out, lines)
+
+
+def _toy() -> list[str]:
+    """Coverage of `INTERVALS` intervals at several tilts and sizes."""
+    toy = Toy()
+    truth = toy.truth()
+    lines = [
+        "## A toy of known truth",
+        "",
+        f"Two kinds of errors that crash together, a third that crashes alone and seldom happens "
+        f"(`benchmarks/toy_crashes.py`); truth {1e6 * truth:.1f} crashes per million km. "
+        f"{INTERVALS} estimates a line.",
+        "",
+        markdown_row(
+            ("tilt", "episodes each", "crashes each", "effective", "95 % intervals that hold the truth",
+             "truth above, below", "mean over truth", "half width over truth (median)")
+        ),
+        "|---|---|---|---|---|---|---|---|",
+    ]  # fmt: skip
+    for factor, episodes in ((1, 2000), (30, 1000), (100, 300), (100, 1000), (100, 2000), (300, 1000)):
+        tilt = Tilt(dict.fromkeys(KINDS, float(factor)))
+        each = [*zip(*toy.drive((INTERVALS, episodes), tilt, factor * episodes), strict=True)]
+        found = [pooled_rate(*parts) for parts in each]
+        below, above = (np.mean([f.high < truth for f in found]), np.mean([f.low > truth for f in found]))
+        values = np.array([f.value for f in found]) / truth
+        error = values.std() / math.sqrt(len(values))
+        cells = (
+            f"{factor}", f"{episodes}", f"{np.mean([y.sum() for y, _, _ in each]):.1f}",
+            f"{np.mean([effective(w[y > 0]) for y, _, w in each]):.1f}",
+            f"{100 * (1 - below - above):.1f} %", f"{100 * below:.1f} %, {100 * above:.1f} %",
+            f"{values.mean():.3f} ± {1.96 * error:.3f}",
+            f"{np.median([(f.high - f.low) / 2 for f in found]) / truth:.2f}",
+        )  # fmt: skip
+        lines.append(markdown_row(cells))
+    return [*lines, ""]
+
+
+def _real(runs: Path) -> list[str]:
+    """Brute force against repetitions of the tilted estimate."""
+    if not ((runs / "brute").is_dir() and (runs / "tilted").is_dir()):
+        return []
+    brute, tilted = (_ok(runs / name) for name in ("brute", "tilted"))
+    known = INCIDENCES[CRASHES]
+    truth = known.figure(brute)
+    each = [known.figure(tilted[k : k + EACH]) for k in range(0, len(tilted), EACH)]
+    values = np.array([f.value for f in each])
+    scatter, of_brute = float(values.std(ddof=1)), (truth.high - truth.low) / 2 / 1.96
+    error = math.hypot(scatter / math.sqrt(len(values)), of_brute)
+    held = sum(f.low <= truth.value <= f.high for f in each)
+    world, demand, errors = REAL
+    return [
+        f"## {world}, {demand}, errors {errors}: brute force and tilt",
+        "",
+        f"`idm` AVs, test seeds. Brute force, {len(brute)} episodes: {wording.interval(truth, known)}, "
+        f"standard error {of_brute:.0f}. {len(each)} tilted estimates of {EACH} episodes "
+        f"(`{REAL_TILT.text()}`): mean {values.mean():.0f}, scatter {scatter:.0f}, so that brute force errs "
+        f"by {of_brute / scatter:.2f} of a repetition. Difference {values.mean() - truth.value:+.0f} ± "
+        f"{1.96 * error:.0f}: {abs(values.mean() - truth.value) / error:.1f} standard errors. {held} of "
+        f"{len(each)} intervals hold the rate of brute force.",
+        "",
+    ]
+
+
+def _field(runs: Path) -> list[str]:
+    """What the level `field` costs."""
+    folders = sorted(runs.glob("field-*"))
+    if not folders:
+        return []
+    lines = [
+        "## `dense` at the level `field`, `idm` AVs",
+        "",
+        markdown_row(
+            ("world", "episodes", "crashes per million AV-km", "AV-caused", "all, per million vehicle-km",
+             "crashed episodes, effective", "effective samples", "largest weight of the crashed",
+             "episodes for +-50 %", "s each", "hours of two cores for +-50 %")
+        ),
+        "|" + "---|" * 11,
+    ]  # fmt: skip
+    for folder in folders:
+        rows = _ok(folder)
+        found = crash_rate.estimate(rows)
+        seconds = float(np.mean([row["total_s"] for row in rows]))
+        intervals = [
+            wording.interval(INCIDENCES[n].figure(rows), INCIDENCES[n]) for n in INCIDENCES if CRASHES in n
+        ]
+        share = found["largest_crash_share"]
+        many = crash_rate.needed(rows)
+        lines.append(
+            markdown_row(
+                (folder.name.removeprefix("field-"), f"{len(rows)}", *intervals,
+                 f"{found['crashed_episodes']}, {found['effective_crashes']:.1f}",
+                 f"{found['effective_samples']:.0f}", "-" if share is None else f"{100 * share:.0f} %",
+                 f"{many:.0f}", f"{seconds:.2f}", f"{many * seconds / 7200:.1f}")
+            )
+        )  # fmt: skip
+    return [*lines, ""]
+
+
+def _ok(folder: Path) -> list[Row]:
+    return [row for row in run_folder.read(folder).rows if row["status"] == OK]
+
+
+def main() -> None:
+    """One of the commands."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    commands = parser.add_subparsers(required=True)
+    tuning = commands.add_parser("tune")
+    tuning.add_argument("--world", required=True)
+    tuning.add_argument("--demand", default="dense")
+    tuning.add_argument("--errors", default="field")
+    tuning.add_argument("--runs", type=Path, required=True)
+    tuning.add_argument("--episodes", type=int, default=400)
+    tuning.add_argument("--rounds", type=int, default=5)
+    tuning.add_argument("--workers", type=int, default=2)
+    tuning.set_defaults(work=tune)
+    measuring = commands.add_parser("measure")
+    measuring.add_argument("--runs", type=Path, required=True)
+    measuring.add_argument("--worlds", nargs="*", default=["merge"])
+    measuring.add_argument("--episodes", type=int, default=4000)
+    measuring.add_argument("--workers", type=int, default=2)
+    measuring.set_defaults(work=measure)
+    writing = commands.add_parser("page")
+    writing.add_argument("--runs", type=Path, required=True)
+    writing.add_argument("--out", type=Path, default=PAGE)
+    writing.set_defaults(work=page)
+    args = vars(parser.parse_args())
+    args.pop("work")(**args)
+
+
+if __name__ == "__main__":
+    main()

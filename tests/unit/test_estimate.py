@@ -1,0 +1,106 @@
+"""A crash rate from tilted episodes has an interval that holds the truth, and a weight that is a ratio."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from benchmarks.toy_crashes import KINDS, Toy
+from cosim.errors import BadInput
+from cosim.report.statistics import effective, paired_rate, paired_rate_change, pooled_rate, rate
+from cosim.scenario import tilt
+from cosim.scenario.tilt import Tilt
+
+RAISED = Tilt(dict.fromkeys(KINDS, 100.0))
+
+
+def test_the_interval_holds_the_truth_of_a_toy() -> None:
+    """400 estimates of 1,000 episodes each, of which brute force would see a crash in every fifth."""
+    toy = Toy()
+    found = [pooled_rate(*parts) for parts in zip(*toy.drive((400, 1000), RAISED, 7), strict=True)]
+    truth = toy.truth()
+    assert 0.90 <= np.mean([f.low <= truth <= f.high for f in found]) <= 0.98
+    values = np.array([f.value for f in found])
+    assert abs(values.mean() - truth) < 3.0 * values.std() / math.sqrt(len(values))
+    assert (
+        np.median([f.high - f.low for f in found]) < 2.0 * truth
+    )  # +-100 %: brute force gives 25 times that
+
+
+def test_the_paired_difference_and_change_hold_the_truth_of_a_toy() -> None:
+    toys = Toy(), Toy(danger=0.6)
+    sides = [zip(*toy.drive((400, 1000), RAISED, 7), strict=True) for toy in toys]
+    pairs = [tuple(map(np.array, both)) for both in zip(*sides, strict=True)]
+    was, now = (toy.truth() for toy in toys)
+    for figure, truth in ((paired_rate, now - was), (paired_rate_change, now / was - 1.0)):
+        found = [figure(*both) for both in pairs]
+        assert 0.90 <= np.mean([f.low <= truth <= f.high for f in found]) <= 0.99
+
+
+def test_without_a_tilt_the_rate_is_the_unweighted_one() -> None:
+    toy = Toy(rates=(1e-2, 1e-2, 0.0))
+    crashes, km, weights = toy.drive((4000,), Tilt(), 3)
+    assert (weights == 1.0).all()
+    found, plain = pooled_rate(crashes, km, weights), rate(int(crashes.sum()), km.sum())
+    assert crashes.sum() > 20
+    assert found.value == pytest.approx(plain.value)
+    assert (found.low, found.high) == pytest.approx((plain.low, plain.high))
+
+
+def test_no_crash_still_bounds_the_rate() -> None:
+    found = pooled_rate([0.0] * 100, [0.01] * 100, [1.0] * 100)
+    assert (found.value, found.low) == (0.0, 0.0)
+    assert found.high == pytest.approx(rate(0, 1.0).high)
+    heavier = pooled_rate([0.0] * 100, [0.01] * 100, [4.0] + [1.0] * 99)
+    assert heavier.high > 3.8 * found.high
+    assert not pooled_rate([], [], []).known
+
+
+def test_one_crash_in_each_episode_keeps_a_width() -> None:
+    found = pooled_rate([1.0] * 5, [1.0] * 5, [1.0] * 5)
+    assert found.low < 0.5
+    assert found.high > 2.0
+
+
+def test_episodes_with_several_events_widen_the_interval() -> None:
+    spread, bunched = [1.0] * 10 + [0.0] * 90, [10.0] + [0.0] * 99
+    one, other = (pooled_rate(counts, [1.0] * 100, [1.0] * 100) for counts in (spread, bunched))
+    assert one.value == other.value
+    assert other.high - other.low > 2.0 * (one.high - one.low)
+
+
+def test_effective_samples_count_equal_weights() -> None:
+    assert effective([2.0] * 7) == pytest.approx(7.0)
+    assert effective([1.0, 0.0, 0.0]) == pytest.approx(1.0)
+    assert effective([]) == 0.0
+
+
+def test_the_mean_weight_is_one() -> None:
+    weights = Toy().drive((40_000,), RAISED, 5).weights
+    assert weights.mean() == pytest.approx(1.0, abs=3.0 * weights.std() / 200.0)
+    assert weights.max() <= 1.0 / RAISED.untilted
+
+
+def test_a_tilt_is_written_as_it_is_read() -> None:
+    found = tilt.read("hard_braking=30, cut_in=300")
+    assert found.text() == "cut_in=300,hard_braking=30,during=1,untilted=0.1"
+    assert tilt.read(found.text()) == found
+    assert found.rate("cut_in", 1e-4) == pytest.approx(0.03)
+    assert found.rate("cut_in", 0.1) == 0.5  # no trial becomes certain
+    assert found.rate("cut_in", 0.7) == 0.7
+    assert found.rate("red_light", 0.1) == 0.1
+    assert tilt.log_ratio(0.1, 0.1, True) == 0.0
+
+
+@pytest.mark.parametrize("text", ["cut_in", "cut_in=many", "cut_in=0.5", "untilted=0", "cut_in=nan"])
+def test_a_tilt_that_is_none_is_refused(text: str) -> None:
+    with pytest.raises(BadInput, match="--tilt"):
+        tilt.read(text)
+
+
+def test_the_share_of_untilted_episodes_is_drawn_by_the_seed() -> None:
+    drawn = [Tilt(untilted=0.25).drawn(seed) for seed in range(4000)]
+    assert np.mean(drawn) == pytest.approx(0.75, abs=0.03)
+    assert drawn == [Tilt(untilted=0.25).drawn(seed) for seed in range(4000)]

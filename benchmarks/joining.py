@@ -1,6 +1,6 @@
 """How fast `cosim join` drives in a SUMO that somebody else started, alone and beside other programs.
 
-    python -m benchmarks.joining [--rounds 5] [--seconds 20] [--out docs/results/joining.md]
+    python -m benchmarks.joining [--rounds 5] [--seconds 20] [--small] [--out docs/results/joining.md]
 
 The motorway interchange that SUMO's package ships (A10KW), with 200 vehicles. SUMO runs in a process of its
 own, as does every other program; the ways take turns. Wants a machine with nothing else to do: what else it
@@ -111,7 +111,7 @@ class Clock(Hook):
         return time.perf_counter(), time.process_time() + ticks / os.sysconf("SC_CLK_TCK")
 
 
-def drive(way: Way, seconds: float, work: Path) -> Drive:
+def drive(way: Way, warmup: float, seconds: float, work: Path) -> Drive:
     """One drive of `seconds` counted s, every AV commanded at random."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -130,7 +130,7 @@ def drive(way: Way, seconds: float, work: Path) -> Drive:
     try:
         client = Client("localhost", port, ORDER, LIMIT)
         theirs_, seed = theirs(client)
-        scenario = replace(theirs_, fleet=way.fleet, preset=way.preset, warmup=WARMUP, duration=seconds)
+        scenario = replace(theirs_, fleet=way.fleet, preset=way.preset, warmup=warmup, duration=seconds)
         host, clock = (
             Host(scenario, "random", 0.0, simulator=joining(client)),
             Clock([p.pid for p in programs]),
@@ -181,15 +181,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--rounds", type=int, default=5, metavar="N", help="default 5")
     parser.add_argument("--seconds", type=float, default=20.0, metavar="S", help="counted s of a drive")
+    parser.add_argument("--small", action="store_true", help="one short drive; its figures are worth nothing")
     parser.add_argument("--out", type=Path, metavar="FILE.md", help="default: printed")
     args = parser.parse_args(arguments)
+    ways, warmup = (WAYS[:1], 2.0) if args.small else (WAYS, WARMUP)
     os.environ["SUMO_HOME"] = str(GAME.parents[1])  # where simpla looks for SUMO's tools
-    found: dict[str, list[Drive]] = {way.what: [] for way in WAYS}
+    found: dict[str, list[Drive]] = {way.what: [] for way in ways}
     with tempfile.TemporaryDirectory(prefix="cosim-joining-") as work:
         for number in range(args.rounds):
-            for way in WAYS:
+            for way in ways:
                 print(f"joining {number + 1}/{args.rounds}: {way.what}", file=sys.stderr, flush=True)
-                found[way.what].append(drive(way, args.seconds, Path(work)))
+                found[way.what].append(drive(way, warmup, args.seconds, Path(work)))
     command = f"python -m benchmarks.joining --rounds {args.rounds} --seconds {args.seconds:g}"
     write_page(args.out, page(found, command))
 

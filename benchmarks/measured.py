@@ -133,7 +133,7 @@ def real_nets(place: Place) -> list[list[str]]:
 
 def joining(place: Place) -> list[list[str]]:
     """How fast `cosim join` drives."""
-    flags = ["--rounds", "1", "--seconds", "2"] if place.small else ["--rounds", "5"]
+    flags = ["--rounds", "1", "--seconds", "1", "--small"] if place.small else ["--rounds", "5"]
     return [["benchmarks.joining", *flags, "--out", str(place.out / "joining.md")]]
 
 

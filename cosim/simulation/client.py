@@ -17,7 +17,7 @@ from traci.connection import Connection
 from traci.exceptions import FatalTraCIError, TraCIException
 from traci.storage import Storage
 
-from cosim.errors import BadInput, SimulationError
+from cosim.errors import BadInput, SimulationEnded, SimulationError
 
 RETRY = 0.2  # s between attempts to connect
 EVERYWHERE = 1e6  # m around a junction
@@ -77,7 +77,7 @@ class Client:
         order: the place among its clients, different for each: higher ones act later, and win a conflict.
         timeout: s that SUMO may take to answer (it waits for all other clients).
 
-    Raises BadInput where nobody listens. Every call raises FatalTraCIError once the connection is lost.
+    Raises BadInput where nobody listens. Any call raises SimulationEnded when the connection is lost.
     """
 
     TraCIException, FatalTraCIError, constants = TraCIException, FatalTraCIError, tc
@@ -88,7 +88,7 @@ class Client:
         try:
             self._connection.setOrder(order)
             self.version: str = self._connection.getVersion()[1]
-        except (TraCIException, FatalTraCIError) as error:
+        except (TraCIException, FatalTraCIError, SimulationEnded) as error:
             raise SimulationError(f"{self.place}: {error}") from None
         c = self._connection
         self.edge, self.junction, self.lane, self.person = c.edge, c.junction, c.lane, c.person
@@ -108,7 +108,7 @@ class Client:
         with contextlib.redirect_stdout(io.StringIO()):  # traci says there what it misses of who was removed
             self._connection.simulationStep()
         if not self.simulation.came:  # no word of what was subscribed
-            raise FatalTraCIError("its owner has loaded another simulation")
+            raise SimulationEnded("its owner has loaded another simulation")
         here, came = self.vehicle.stepped(), self.simulation.came[""]
         departed = came[tc.VAR_DEPARTED_VEHICLES_IDS]
         came[tc.VAR_DEPARTED_VEHICLES_IDS] = tuple(name for name in departed if name in here)
@@ -116,7 +116,7 @@ class Client:
     def close(self) -> None:
         """Leave: SUMO goes on with the others."""
         for last in (self._connection.flush, self.vehicle.unsubscribe, self._connection.close):
-            with contextlib.suppress(TraCIException, FatalTraCIError):
+            with contextlib.suppress(TraCIException, FatalTraCIError, SimulationEnded):
                 last()
 
 
@@ -223,7 +223,7 @@ class _Connection(Connection):  # type: ignore[misc]  # traci is not typed
 
     def _lose(self, why: str) -> NoReturn:
         self._drop()
-        raise FatalTraCIError(why) from None
+        raise SimulationEnded(why) from None
 
     def _drop(self) -> None:
         if self._socket is not None:

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cosim.control import to_commands
+from cosim.errors import SimulationEnded
 from cosim.metrics import MetricContext, MetricFactory, Metrics, joined
 from cosim.observation.observer import Observer
 from cosim.scenario import Scenario
@@ -111,7 +112,8 @@ class Episode:
 
     `start` and `advance` return what every AV on the road observes; decisions given to `advance` are
     commanded, AVs without one are driven by SUMO. `terminated` after a collision of an AV or the mission
-    vehicle unless the scenario goes on, `truncated` when its duration is over (definitions.md, Episode).
+    vehicle unless the scenario goes on, `truncated` when its duration is over (definitions.md, Episode), or
+    when another program has ended the simulation.
     `metrics` are measured besides those of `cosim.metrics.METRICS`.
     """
 
@@ -140,6 +142,7 @@ class Episode:
         self.frames: tuple[Snapshot, ...] = frames
         self.step: Step | None = None  # the last one
         self.terminated = self.truncated = False
+        self._ended = ""  # why the simulation ended before its time
         self._begin = self.snapshot.time
         self._collisions: list[Collision] = []
         self._interventions: Counter[str] = Counter()  # by reason
@@ -185,7 +188,11 @@ class Episode:
         commands = to_commands(decisions, self.histories, self.scenario.timing.decision, lawful)
         self.histories.expire()
         began = time.perf_counter()
-        receipts, self.frames = self.simulator.advance(commands)
+        try:
+            receipts, self.frames = self.simulator.advance(commands)
+        except SimulationEnded as error:
+            self.truncated, self._ended = True, str(error)
+            return self.histories
         self.timings["simulation_s"] += time.perf_counter() - began
         self.step = step = Step(self.snapshot, decisions, tuple(commands), receipts, self.frames)
         self.snapshot = step.after
@@ -292,11 +299,14 @@ class Episode:
         for array in (s.x, s.y, s.speed, s.heading):
             update(np.ascontiguousarray(array, np.float64).tobytes())
         update(s.lane.tobytes())
-        update(repr(sorted((name, int(d.action)) for name, d in decisions.items())).encode())
+        asked = [(n, int(d.action), *(() if d.accel is None else (d.accel,))) for n, d in decisions.items()]
+        update(repr(sorted(asked)).encode())
 
     def _validity(self, metrics: Mapping[str, Metric]) -> tuple[str, ...]:
         """Why this result must not be compared with others; empty when it may be."""
         reasons = list(self.scenario.warnings)
+        if self._ended:
+            reasons.append(f"ended after {self.elapsed:g} s of {self.scenario.duration:g} s: {self._ended}")
         waiting = metrics["vehicles_never_inserted"].value or 0
         inserted = metrics["vehicles_inserted"].value or 0
         if inserted == 0:

@@ -5,6 +5,7 @@
     |   `-- WeightsMismatch         2   a checkpoint that does not fit its network
     |-- SimulationError             3   SUMO failed
     |   |-- SimulationInUse         3   a second simulation in one process
+    |   |-- SimulationEnded         3   another program ended the simulation (docs/traci.md)
     |   `-- SimulationCrashed       3   the process that ran SUMO ended
     |       `-- SimulationTimeout   3   ... or did not answer and was killed
     `-- ReplayDiffers               1   `cosim replay`: not the recorded episode (cosim.report.replay.episode)
@@ -89,6 +90,10 @@ class SimulationTimeout(SimulationCrashed):
 
 class SimulationInUse(SimulationError):
     """A second simulation was started in this process: libsumo would silently replace the first."""
+
+
+class SimulationEnded(SimulationError):
+    """Somebody else ended a simulation that is shared: what was driven so far counts."""
 
 
 class WeightsMismatch(BadInput):

@@ -164,3 +164,25 @@ def sumo(scenario: Scenario, av_parameters: Mapping[str, str], history: int) -> 
     from cosim.simulation.sumo import SumoSimulator  # libsumo: in the worker's process alone
 
     return SumoSimulator(scenario, av_parameters=av_parameters, history=history)
+
+
+def serving(port: int, clients: int) -> SimulatorFactory:
+    """SUMO in this process, which `clients` TraCI programs share at `port` (docs/traci.md)."""
+
+    def simulator(scenario: Scenario, av_parameters: Mapping[str, str], history: int) -> Simulator:
+        from cosim.simulation.shared import ServingSimulator
+
+        return ServingSimulator(scenario, port, clients, av_parameters=av_parameters, history=history)
+
+    return simulator
+
+
+def joining(client: Any) -> SimulatorFactory:
+    """The SUMO that a `cosim.simulation.client.Client` has joined."""
+
+    def simulator(scenario: Scenario, av_parameters: Mapping[str, str], history: int) -> Simulator:
+        from cosim.simulation.shared import TraciSimulator
+
+        return TraciSimulator(scenario, client, av_parameters=av_parameters, history=history)
+
+    return simulator

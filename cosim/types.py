@@ -40,6 +40,18 @@ class MetaAction(IntEnum):
 LANE_OFFSET = {MetaAction.LANE_LEFT: 1, MetaAction.LANE_RIGHT: -1}  # as SUMO counts: left is up
 
 
+class ContinuousAction(NamedTuple):
+    """What an agent may ask of one AV in place of a meta-action, for one decision."""
+
+    accel: float  # m/s2, within what the car can do (`cosim.control`) and, in `lawful`, what it does of it
+    lane_offset: int = 0  # +1 begins a change to the left, -1 to the right
+
+    @property
+    def lane_change(self) -> MetaAction:
+        """The meta-action of the same lane change; IDLE without one."""
+        return {1: MetaAction.LANE_LEFT, -1: MetaAction.LANE_RIGHT}.get(self.lane_offset, MetaAction.IDLE)
+
+
 class Kind(IntEnum):
     """Who it is: a human-driven vehicle (HV), an autonomous one (AV), or a person on foot."""
 
@@ -304,6 +316,7 @@ class Decision(NamedTuple):
     blamed: str | None = None  # which vehicle made the preferred action unsafe, or another reason in brackets
     vetoed: bool = False  # the preferred action was masked
     fallback: bool = False  # every action was unsafe: the highest score was taken
+    accel: float | None = None  # m/s2, in place of a target speed: `action` says the lane change alone
 
 
 class Forecast(NamedTuple):
@@ -331,6 +344,7 @@ class Command(NamedTuple):
     limit: float = (
         math.inf
     )  # m/s, the most that the law allows, as far as the agent sees it (preset `lawful`)
+    accel: float | None = None  # m/s2, held until the next decision; `target_speed` is where it leads to
 
 
 class Receipt(NamedTuple):

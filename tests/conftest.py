@@ -11,6 +11,7 @@ import pytest
 from cosim.scenario import Fleet, Mission, Scenario, load
 from cosim.simulation.sumo import SumoSimulator
 from cosim.workers.worker import Worker
+from tests.service.servers import Server
 from tests.worlds.build import build
 
 TYPES = """<routes>
@@ -61,6 +62,13 @@ def start(tmp_path: Path) -> Iterator[Start]:
     yield begin
     for worker in workers:
         worker.close()
+
+
+@pytest.fixture(scope="session")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """`cosim serve` with two workers, without a token; for tests that leave it as they found it."""
+    with Server(tmp_path_factory.mktemp("service") / "data", "--workers", "2") as running:
+        yield running
 
 
 @pytest.fixture(scope="session")

@@ -61,18 +61,7 @@ class Store(contextlib.AbstractContextManager["Store"]):
     def __init__(self, url: str, run: str = "") -> None:
         self.run = run  # its name in the database
         self._url = url
-        try:
-            self._engine = sa.create_engine(url)
-            if self._engine.dialect.name == "sqlite":
-                sa.event.listen(self._engine, "connect", _sqlite)
-            _tables.create_all(self._engine)
-        except ArgumentError:
-            raise BadInput("is no database URL", field="--store", value=url) from None
-        except ModuleNotFoundError as error:
-            problem = f"needs the package {error.name} (pip install 'cosim-sumo[postgresql]')"
-            raise BadInput(problem, field="--store", value=self._shown) from None
-        except SQLAlchemyError as error:
-            raise BadInput(_first_line(error), field="--store", value=self._shown) from None
+        self._engine = connect(url, _tables)
 
     @classmethod
     def in_folder(cls, folder: Path, url: str | None = None) -> Store:
@@ -170,7 +159,7 @@ class Store(contextlib.AbstractContextManager["Store"]):
     @property
     def _shown(self) -> str:
         """The URL without its password."""
-        return sa.engine.make_url(self._url).render_as_string(hide_password=True)
+        return shown(self._url)
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[sa.Connection]:
@@ -188,6 +177,28 @@ class Store(contextlib.AbstractContextManager["Store"]):
     def _read(self, query: sa.Select[Any]) -> list[sa.Row[Any]]:
         with self._engine.connect() as connection:
             return [*connection.execute(query)]
+
+
+def connect(url: str, tables: sa.MetaData, field: str = "--store") -> sa.Engine:
+    """The database `url` with these tables in it. Raises BadInput (naming `field`): it cannot be reached."""
+    try:
+        engine = sa.create_engine(url)
+        if engine.dialect.name == "sqlite":
+            sa.event.listen(engine, "connect", _sqlite)
+        tables.create_all(engine)
+    except ArgumentError:
+        raise BadInput("is no database URL", field=field, value=url) from None
+    except ModuleNotFoundError as error:
+        problem = f"needs the package {error.name} (pip install 'cosim-sumo[postgresql]')"
+        raise BadInput(problem, field=field, value=shown(url)) from None
+    except SQLAlchemyError as error:
+        raise BadInput(_first_line(error), field=field, value=shown(url)) from None
+    return engine
+
+
+def shown(url: str) -> str:
+    """The URL without its password."""
+    return sa.engine.make_url(url).render_as_string(hide_password=True)
 
 
 def _sqlite(connection: Any, _: object) -> None:

@@ -7,6 +7,7 @@ for is imported, and what a command needs is imported inside `work`.
 
 COMMANDS = (
     "run",
+    "join",
     "evaluate",
     "estimate",
     "compare",
@@ -16,6 +17,7 @@ COMMANDS = (
     "metrics",
     "train",
     "fit-predictors",
+    "serve",
     "bench",
     "scenarios",
     "doctor",

@@ -120,6 +120,12 @@ def count(text: str) -> int:
     return _whole(text, 1, "a whole number from 1 to 2^62")
 
 
+def port(text: str) -> int:
+    """A number of a TCP port."""
+    _number(text, 1, 65535, "a port from 1 to 65535")
+    return _whole(text, 1, "a port from 1 to 65535")
+
+
 def seed(text: str) -> int:
     """A whole number of 0 or more."""
     return _whole(text, 0, "a whole number from 0 to 2^62")

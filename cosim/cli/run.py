@@ -8,12 +8,14 @@ import json
 import math
 import shlex
 import shutil
+import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cosim.cli import arguments
-from cosim.errors import BadInput
+from cosim.errors import BadInput, SimulationTimeout
 from cosim.files import code
 from cosim.files.xml_input import is_there
 from cosim.scenario import Scenario, chosen_preset, human_errors, place
@@ -26,6 +28,9 @@ from cosim.workers.worker import Worker
 if TYPE_CHECKING:
     from cosim.episode import Progress as Reported
     from cosim.host import Host
+
+
+DEFAULT_TIMEOUT = 300.0  # s
 
 
 def add(commands: arguments.SubCommands) -> None:
@@ -52,6 +57,17 @@ def add(commands: arguments.SubCommands) -> None:
     arguments.add(run, "--metric", action="append", default=[])
     run.add_argument("--replay", action="store_true", help="draw DIR/replay.html and DIR/replay.mp4 too")
     arguments.add(run, "--json")
+    run.add_argument(
+        "--traci-port",
+        type=arguments.port,
+        metavar="PORT",
+        help="let TraCI programs drive with us: SUMO serves them here, and begins when all have connected",
+    )
+    run.add_argument(
+        "--traci-clients", type=arguments.count, metavar="N", help="how many of them (default 1)"
+    )
+    waits = f"s to wait for them, at the start and in any step (default {DEFAULT_TIMEOUT:g})"
+    run.add_argument("--traci-timeout", type=arguments.positive, metavar="S", help=waits)
     run.set_defaults(work=work, passes_on=True)
 
 
@@ -68,17 +84,28 @@ class Driver:
         self._host: Host | None = None
 
     def drive(
-        self, scenario: Scenario, case: EpisodeId, recorded: bool, folder: Path | None, progress: Reported
+        self,
+        scenario: Scenario,
+        case: EpisodeId,
+        recorded: bool,
+        folder: Path | None,
+        served: tuple[int, int] | None,
+        progress: Reported,
     ) -> tuple[EpisodeResult, Any]:
         """The episode, with its replay data or None; progress of 0 s in all: kernels are being compiled.
 
-        Raises as `Host`.
+        `served`: the port at which SUMO serves so many TraCI programs. Raises as `Host`.
         """
         from cosim.geometry.compiled import on_compilation
+        from cosim.host import serving
 
         on_compilation(functools.cache(lambda: progress(0.0, 0.0)))
         self._host = self._make(
-            scenario, svo=math.radians(case.svo_deg), metrics=case.metrics, reward=case.reward
+            scenario,
+            svo=math.radians(case.svo_deg),
+            metrics=case.metrics,
+            reward=case.reward,
+            simulator=None if served is None else serving(*served),
         )
         if recorded:
             return self._host.run_recorded(case.seed, progress, outputs=case.outputs, folder=folder)
@@ -95,11 +122,12 @@ def work(args: argparse.Namespace) -> int:
     for flag, wanted in (("--output", args.output), ("--replay", args.replay)):
         if wanted and not args.out:
             raise BadInput("needs a run folder to write into: --out DIR", field=flag)
+    served = _served(args)
     case = case_of(args)
-    worker = Worker(Driver, case.policy, name="cosim-run", wait=False)
+    limits = {} if served is None else {"timeout": args.traci_timeout or DEFAULT_TIMEOUT}
+    worker = Worker(Driver, case.policy, name="cosim-run", wait=False, **limits)
     from cosim.files import prepare_folder
     from cosim.policies import check
-    from cosim.report import result as output
     from cosim.scenario import sumo_outputs
     from cosim.scenario.manifest import remembered
     from cosim.scenario.vet import vetted
@@ -118,22 +146,46 @@ def work(args: argparse.Namespace) -> int:
         raise
     files = folder / "outputs" if folder is not None and case.outputs else None
     progress = Progress(f"{scenario.name} {label(case.policy)}", "s")
-    progress.starting()
+    if served is None:
+        progress.starting()
+    else:
+        print(
+            f"cosim: SUMO waits for {_programs(served[1])} at port {served[0]}", file=sys.stderr, flush=True
+        )
     try:
-        result, replay = worker.call("drive", scenario, case, args.replay, files, progress=progress)
-    except BaseException:
+        result, replay = worker.call("drive", scenario, case, args.replay, files, served, progress=progress)
+    except BaseException as error:
         worker.kill()
         if new and folder is not None:
             shutil.rmtree(folder, ignore_errors=True)
+        if served is not None and isinstance(error, SimulationTimeout):
+            problem = f"{_programs(served[1])} did not connect, or did not step, for {limits['timeout']:g} s"
+            raise SimulationTimeout(f"port {served[0]}: {problem}") from None
         raise
     finally:
         worker.close()
         if files is not None:  # what a simulation that crashed leaves behind
             shutil.rmtree(files / sumo_outputs.DRAFT, ignore_errors=True)
         progress.done()
-    result = replace(result, manifest=result.manifest | remembered(case, args.sumo_options))
+    if served is None:
+        result = replace(result, manifest=result.manifest | remembered(case, args.sumo_options))
+    show(args, result, replay, folder, case.outputs)
+    return 0
+
+
+def show(
+    args: argparse.Namespace,
+    result: EpisodeResult,
+    replay: Any,
+    folder: Path | None,
+    outputs: Sequence[str] = (),
+) -> None:
+    """Keep the result, and what a `replay` draws, in the run folder, where there is one; print it."""
+    from cosim.report import result as output
+    from cosim.scenario.manifest import CASE
+
     if folder is not None:
-        output.write_folder(folder, result, case.outputs)
+        output.write_folder(folder, result, outputs)
         if replay is not None:
             from cosim.report.replay.episode import draw
 
@@ -141,10 +193,24 @@ def work(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps(result.document()))
     else:
-        print(output.table(result, first=not (case.metrics or case.reward)))  # else every figure
+        print(output.table(result, first=not (args.metric or args.reward)))  # else every figure
         if folder is not None:
-            print(f"  run folder               {folder} (cosim replay {shlex.quote(args.out)} draws it)")
-    return 0
+            again = f" (cosim replay {shlex.quote(args.out)} draws it)" if CASE in result.manifest else ""
+            print(f"  run folder               {folder}{again}")
+
+
+def _served(args: argparse.Namespace) -> tuple[int, int] | None:
+    """The port at which SUMO serves so many TraCI programs; None: it drives alone."""
+    if args.traci_port is not None:
+        return args.traci_port, args.traci_clients or 1
+    for flag, value in (("--traci-clients", args.traci_clients), ("--traci-timeout", args.traci_timeout)):
+        if value is not None:
+            raise BadInput("needs a port to serve them at: --traci-port PORT", field=flag, value=value)
+    return None
+
+
+def _programs(count: int) -> str:
+    return f"{count} TraCI program{'s' * (count > 1)}"
 
 
 def case_of(args: argparse.Namespace) -> EpisodeId:

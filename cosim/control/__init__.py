@@ -218,6 +218,12 @@ def to_commands(
         if lawful:  # a slow lane inside a junction lowers no wish for the road behind it
             limit, ahead = lawful_speed(history.rules), float(history.rules.limits[:, 1].max())
             highest = ahead if math.isfinite(ahead) else highest
-        target = next_target(history.target_speed, history.ego_speed, decision.action, highest)
-        commands.append(Command(vehicle, target, LANE_OFFSET.get(decision.action, 0), hold, limit))
+        speed, accel = history.ego_speed, decision.accel
+        if accel is None:
+            target = next_target(history.target_speed, speed, decision.action, highest)
+        else:
+            top = max(highest + SPEED_MARGIN, speed)
+            accel = min(max(accel, -MAX_DECEL), MAX_ACCEL, (top - speed) / hold)
+            target = max(speed + accel * hold, 0.0)
+        commands.append(Command(vehicle, target, LANE_OFFSET.get(decision.action, 0), hold, limit, accel))
     return commands

@@ -16,7 +16,7 @@ from cosim.envs.spaces import Observation
 from cosim.errors import BadInput
 from cosim.observation.view import View
 from cosim.scenario import Scenario
-from cosim.types import COMPACT, Bytes, MetaAction, ObservationConfig
+from cosim.types import COMPACT, Bytes, ObservationConfig
 
 if TYPE_CHECKING:
     from cosim.envs.host import PolicyFactory
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 MISSION, NEAREST = "mission", "nearest"
 
 
-class SumoEnv(gymnasium.Env[Observation, np.int64]):
+class SumoEnv(gymnasium.Env[Observation, Any]):
     """One AV learns, one step is one decision (0.4 s); the reward is its SVO reward (cosim.rewards).
 
     Who learns is settled at the end of the warm-up. `learner="mission"`: the AV that reaches the conflict
@@ -37,7 +37,9 @@ class SumoEnv(gymnasium.Env[Observation, np.int64]):
     `terminated`: the learner or the mission vehicle crashed. `truncated`: the duration is over, the learner
     left the road, or another AV's collision ended the episode; `info["ended"]` says which.
     `reset(seed=s)` is the very episode that `cosim run --seed s` drives; without a seed the next one is drawn
-    from the training seeds. Each environment has a process of its own: close it. `words` are `cosim.open`'s.
+    from the training seeds. `continuous`: an action is an acceleration in m/s2 and a lane offset
+    (`cosim.types.ContinuousAction`), the latter rounded. Each environment has a process of its own: close
+    it. `words` are `cosim.open`'s.
     """
 
     metadata = {"render_modes": [*spaces.RENDER_MODES], "render_fps": 2.5}  # noqa: RUF012 - gymnasium's own form
@@ -51,11 +53,13 @@ class SumoEnv(gymnasium.Env[Observation, np.int64]):
         observation: ObservationConfig = COMPACT,
         flatten: str | None = None,
         render_mode: str | None = None,
+        continuous: bool = False,
         **words: Any,
     ) -> None:
         observation = spaces.checked(observation, flatten, render_mode)
         self.render_mode = render_mode
-        self.action_space = gymnasium.spaces.Discrete(len(MetaAction))
+        self.action_space = spaces.action_space(continuous)
+        self._continuous = continuous
         self.observation_space = spaces.observation_space(observation, flatten)
         self._config, self._flatten, self._wanted = observation, flatten, learner
         self._session: Session = sessions.open(config, others=others, observation=observation, **words)
@@ -83,10 +87,10 @@ class SumoEnv(gymnasium.Env[Observation, np.int64]):
         self._view = views[found]
         return self._observation(), {"action_mask": self.action_masks(), "learner": found, "seed": seed}
 
-    def step(self, action: np.int64) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """One decision of the learner."""
         name = self.learner
-        step = self._session.act({name: int(action)}, see=(name,))
+        step = self._session.act({name: spaces.action_of(action, self._continuous)}, see=(name,))
         self._view = step.observations.get(name, self._view)  # gone: what it saw last
         reason = step.ended.get(name, "")
         terminated, truncated = step.terminated[name], step.truncated[name]

@@ -16,6 +16,7 @@ from cosim.road import RoadMap
 from cosim.scenario import Scenario
 from cosim.types import (
     Bytes,
+    ContinuousAction,
     Decision,
     EpisodeResult,
     Events,
@@ -82,10 +83,10 @@ class SessionHost(Host):
         self._started = True
         return self._reply(self._packer.pack(histories, None))
 
-    def act(self, actions: Mapping[str, int], see: Collection[str] | None) -> Reply:
+    def act(self, actions: Mapping[str, int | ContinuousAction], see: Collection[str] | None) -> Reply:
         """One decision. `see`: AVs whose views are wanted (None: all)."""
         episode = self.episode
-        decisions = {name: Decision(MetaAction(action)) for name, action in actions.items()}
+        decisions = {name: _decision(action) for name, action in actions.items()}
         left = {name: h for name, h in episode.histories.items() if name not in actions}
         decisions |= self.policy.decide(left)
         # sorted: SUMO takes commands in the order given, which must not hang on a caller's dict order
@@ -189,6 +190,12 @@ class SessionHost(Host):
             elif self.episode.truncated:
                 ended[name] = "duration"
         return ended
+
+
+def _decision(action: int | ContinuousAction) -> Decision:
+    if isinstance(action, ContinuousAction):
+        return Decision(action.lane_change, accel=action.accel)
+    return Decision(MetaAction(action))
 
 
 def _common(observation: ObservationConfig, others: Policy) -> ObservationConfig:

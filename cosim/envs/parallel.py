@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import gymnasium
 import numpy as np
 from pettingzoo import ParallelEnv
 
@@ -17,7 +16,7 @@ from cosim.envs.spaces import Observation
 from cosim.errors import BadInput, hint
 from cosim.observation.view import View
 from cosim.scenario import Scenario
-from cosim.types import COMPACT, Bytes, MetaAction, ObservationConfig
+from cosim.types import COMPACT, Bytes, ObservationConfig
 
 MAX_AGENTS = 32  # slots: about twice the AVs on the road in our worlds; SUMO drives any further ones
 NATIVE_RANDOM = 0  # the seed of the seeds, until reset(seed=...) gives another
@@ -58,6 +57,7 @@ class SumoParallelEnv(ParallelEnv):  # type: ignore[misc]
         observation: ObservationConfig = COMPACT,
         flatten: str | None = None,
         render_mode: str | None = None,
+        continuous: bool = False,
         **words: Any,
     ) -> None:
         observation = spaces.checked(observation, flatten, render_mode)
@@ -67,7 +67,8 @@ class SumoParallelEnv(ParallelEnv):  # type: ignore[misc]
         self.observation_spaces = {
             a: spaces.observation_space(observation, flatten) for a in self.possible_agents
         }
-        self.action_spaces = {a: gymnasium.spaces.Discrete(len(MetaAction)) for a in self.possible_agents}
+        self.action_spaces = {a: spaces.action_space(continuous) for a in self.possible_agents}
+        self._continuous = continuous
         self._config, self._flatten = observation, flatten
         self._rng = np.random.default_rng(NATIVE_RANDOM)
         self._slots: dict[str, str] = {}  # SUMO id -> agent, for all that had one in this episode
@@ -83,7 +84,7 @@ class SumoParallelEnv(ParallelEnv):  # type: ignore[misc]
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> Any:
-        """Of one agent: the five meta-actions."""
+        """Of one agent: the five meta-actions, or acceleration and lane offset (`continuous`)."""
         return self.action_spaces[agent]
 
     def reset(
@@ -104,7 +105,7 @@ class SumoParallelEnv(ParallelEnv):  # type: ignore[misc]
             raise no_av(seed, None)
         return self._observations(self.agents), {a: self._info(a) for a in self.agents}
 
-    def step(self, actions: dict[str, int]) -> Step:
+    def step(self, actions: dict[str, Any]) -> Step:
         """One decision of every agent; an agent without an action is handed to SUMO for this step."""
         unknown = [agent for agent in actions if agent not in self.possible_agents]
         if unknown:
@@ -112,7 +113,9 @@ class SumoParallelEnv(ParallelEnv):  # type: ignore[misc]
             raise BadInput(problem, field="actions", value=unknown[0])
         av_of = {agent: av for av, agent in self._slots.items()}
         acting = self.agents
-        step = self._session.act({av_of[a]: int(actions[a]) for a in acting if a in actions})
+        step = self._session.act(
+            {av_of[a]: spaces.action_of(actions[a], self._continuous) for a in acting if a in actions}
+        )
         terminated = {a: step.terminated[av_of[a]] for a in acting}
         truncated = {a: step.truncated[av_of[a]] for a in acting}
         rewards = {a: step.rewards[av_of[a]] for a in acting}

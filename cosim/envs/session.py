@@ -10,6 +10,8 @@ import pickle
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast
 
+import numpy as np
+
 from cosim.errors import BadInput, hint
 from cosim.observation.view import Unpacker, View
 from cosim.rewards import Reward, RewardTerms, read
@@ -18,6 +20,7 @@ from cosim.seeding import TRAINING_SEEDS
 from cosim.types import (
     COMPACT,
     Bytes,
+    ContinuousAction,
     EpisodeResult,
     Events,
     MetaAction,
@@ -33,6 +36,7 @@ if TYPE_CHECKING:
     from cosim.metrics import MetricFactory
     from cosim.road import RoadMap
 
+Action = int | ContinuousAction | tuple[float, int]
 TIMEOUT = 120.0  # s without an answer; the first step of a machine compiles the kernels
 TERMINAL = ("collision", "collision of the mission vehicle")  # all else that ends it cuts it short
 
@@ -202,17 +206,18 @@ class Session(contextlib.AbstractContextManager["Session"]):
 
     def act(
         self,
-        actions: Mapping[str, int | None],
+        actions: Mapping[str, Action | None],
         *,
         see: Sequence[str] | None = None,
     ) -> StepResult:
-        """Carry out one meta-action per AV for one decision (0.4 s).
+        """Carry out one action per AV for one decision (0.4 s): a meta-action, or a `ContinuousAction`
+        (acceleration in m/s2, lane offset +1, 0 or -1; a pair of numbers will do).
 
         An AV without an action, or with None, is driven by `others`, or else by SUMO.
         `see`: the AVs whose observation you want (all by default; fewer are faster).
 
         Raises:
-            BadInput: an id that is not an AV on the road, something that is no meta-action, no episode.
+            BadInput: an id that is not an AV on the road, something that is no action, no episode.
             SimulationError, SimulationCrashed: SUMO failed, its process ended or hung.
         """
         if self._views is None:
@@ -270,6 +275,11 @@ class Session(contextlib.AbstractContextManager["Session"]):
     def __exit__(self, *error: object) -> None:
         self.close()
 
+    @property
+    def begun(self) -> bool:
+        """Whether an episode has."""
+        return self._views is not None
+
     # ---- inside ----
 
     def _call(self, method: str, *arguments: Any) -> Any:
@@ -292,20 +302,34 @@ class Session(contextlib.AbstractContextManager["Session"]):
         self.elapsed = reply.elapsed
         self.over = reply.terminated or reply.truncated
 
-    def _checked(self, actions: Mapping[str, int | None]) -> dict[str, int]:
-        found = {}
+    def _checked(self, actions: Mapping[str, Action | None]) -> dict[str, int | ContinuousAction]:
+        found: dict[str, int | ContinuousAction] = {}
         for name, action in actions.items():
             if action is None:
                 continue
             if name not in self.avs:
                 problem = f"no AV of that name is on the road{hint(name, self.avs)}"
                 raise BadInput(problem, field="actions", value=name)
+            if np.ndim(cast(Any, action)):
+                found[name] = _continuous(name, action)
+                continue
             try:
                 found[name] = int(MetaAction(operator.index(action)))
             except (TypeError, ValueError):
                 known = ", ".join(f"{a.value} {a.name}" for a in MetaAction)
                 raise BadInput(f"is no meta-action ({known})", field=name, value=action) from None
         return found
+
+
+def _continuous(name: str, action: Any) -> ContinuousAction:
+    try:
+        accel, offset = map(float, action)
+    except (TypeError, ValueError):
+        accel, offset = math.nan, math.nan
+    if not math.isfinite(accel) or offset not in (-1.0, 0.0, 1.0):
+        problem = "is no continuous action (acceleration in m/s2, lane offset +1, 0 or -1)"
+        raise BadInput(problem, field=name, value=action)
+    return ContinuousAction(accel, int(offset))
 
 
 class _InProcess:

@@ -12,7 +12,14 @@ from cosim.errors import one_of
 from cosim.observation.view import View
 from cosim.road.rules import GREEN, RED, YELLOW
 from cosim.seeding import TRAINING_SEEDS
-from cosim.types import KINEMATIC_FEATURES, Floats, Floats32, ObservationConfig
+from cosim.types import (
+    KINEMATIC_FEATURES,
+    ContinuousAction,
+    Floats,
+    Floats32,
+    MetaAction,
+    ObservationConfig,
+)
 
 Observation = dict[str, npt.NDArray[np.generic]] | Floats32
 Space = gymnasium.Space[Observation]
@@ -68,6 +75,21 @@ def observation_space(config: ObservationConfig, flatten: str | None) -> Space:
         shape = (n, len(config.channels), config.height, config.width)
         spaces["velocity_map"] = gymnasium.spaces.Box(0, 255, shape, np.uint8)
     return cast(Space, gymnasium.spaces.Dict(spaces))
+
+
+def action_space(continuous: bool) -> gymnasium.Space[Any]:
+    """The five meta-actions; or acceleration in m/s2 and lane offset, which is rounded to +1, 0 or -1."""
+    if continuous:
+        from cosim.control import MAX_ACCEL, MAX_DECEL  # numba: only when it is asked for
+
+        low, high = np.array([-MAX_DECEL, -1.0], np.float32), np.array([MAX_ACCEL, 1.0], np.float32)
+        return gymnasium.spaces.Box(low, high, dtype=np.float32)
+    return gymnasium.spaces.Discrete(len(MetaAction))
+
+
+def action_of(action: Any, continuous: bool) -> int | ContinuousAction:
+    """What a session takes, of an element of `action_space`."""
+    return ContinuousAction(float(action[0]), round(float(action[1]))) if continuous else int(action)
 
 
 def checked(

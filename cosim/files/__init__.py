@@ -76,11 +76,11 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def prepare_folder(path: str) -> Path:
-    """Make the run folder now, so that a bad path fails before the simulation. Raises BadInput."""
+def prepare_folder(path: str, field: str = "--out") -> Path:
+    """Make the folder that `field` names now, so that a bad path fails before the work. Raises BadInput."""
     folder = Path(path)
-    with cannot("make this folder", field="--out", value=path):
+    with cannot("make this folder", field=field, value=path):
         folder.mkdir(parents=True, exist_ok=True)
     if not os.access(folder, os.W_OK):
-        raise BadInput("cannot write into this folder", field="--out", value=path)
+        raise BadInput("cannot write into this folder", field=field, value=path)
     return folder

@@ -25,6 +25,9 @@ class Way(NamedTuple):
     line: Floats  # [p,3] lane position m, x m, y m
 
 
+OFF = Way(frozenset(), np.zeros((0, 3)))  # of who is off every lane
+
+
 class LaneCourses:
     """Lets vehicles follow their lanes at constant speed, at the present distance to the centre line."""
 
@@ -36,10 +39,10 @@ class LaneCourses:
         """The ways ahead of the vehicles of rows `i` and `j`, which touch if they drive straight on, by which
         they touch along their lanes too, at most `LATER` s after that; None where they do in any case.
 
-        Those on one edge, who may be changing lanes, and those off every lane do in any case.
+        Those on one edge, who may be changing lanes, do in any case. Who is off every lane goes straight on.
         """
         a, b = int(s.lane[i]), int(s.lane[j])
-        if min(a, b) < 0 or self._road.lanes[a].edge == self._road.lanes[b].edge:
+        if max(a, b) < 0 or (min(a, b) >= 0 and self._road.lanes[a].edge == self._road.lanes[b].edge):
             return None
         one, other = (boxes(s, np.array([row])) for row in (i, j))
         within = float(time_to_collision(one, other)[0]) + LATER
@@ -62,6 +65,14 @@ class LaneCourses:
     def _courses(self, s: Snapshot, row: int, times: Floats) -> Boxes:
         """One vehicle on each of its ways: x, y, heading, speed [ways,t], length and width [ways]."""
         length, poses = float(s.length[row]), []
+        if s.lane[row] < 0:
+            alone = boxes(s, np.array([row]))
+            course = np.array([np.cos(alone.heading), np.sin(alone.heading)])  # [2,1]
+            x, y = np.array([alone.x, alone.y]) + course * alone.speed * times
+            still = np.zeros_like(times)[None]
+            return alone._replace(
+                x=x[None], y=y[None], heading=alone.heading + still, speed=alone.speed + still
+            )
         front = s.lane_position[row] + s.speed[row] * times
         for _, line in self._ways(int(s.lane[row])):
             nose, tail = (
@@ -77,6 +88,8 @@ class LaneCourses:
         return Boxes(x, y, heading, *sizes, np.full_like(x, s.speed[row]))
 
     def _ways(self, lane: int) -> list[Way]:
+        if lane < 0:
+            return [OFF]
         if lane not in self._known:
             self._known[lane] = [self._way(lanes) for lanes in self._sequences((lane,), 0.0)]
         return self._known[lane]

@@ -8,6 +8,8 @@ from cosim.scenario.policy_name import WEIGHTS, read
 from cosim.types import Policy
 from policy import agents
 
+NAMES = tuple(agents.POLICIES)  # of those that ship
+
 
 def check(text: str) -> None:
     """Raises BadInput when there is no such policy: names the nearest, or what its file lacks."""

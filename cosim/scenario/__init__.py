@@ -193,7 +193,7 @@ def load(
             raise BadInput("must be a number of seconds from 0 on", field="--warmup", value=warmup)
         scenario = replace(scenario, warmup=float(warmup))
     if mission is not None:
-        scenario = replace(scenario, mission=_mission(scenario.mission, mission))
+        scenario = replace(scenario, mission=chosen_mission(scenario.mission, mission))
     if behavior is None:
         behavior = _default_behavior(scenario)
     return replace(
@@ -202,7 +202,7 @@ def load(
         driver_model=one_of(driver_model, DRIVER_MODELS, "--driver-model"),
         preset=one_of(scenario.preset if preset is None else preset, Preset.ALL, "--preset"),
         on_collision=one_of(on_collision or scenario.on_collision, OnCollision.ALL, "--on-collision"),
-        fleet=scenario.fleet if fleet is None else _checked_fleet(fleet),
+        fleet=scenario.fleet if fleet is None else checked_fleet(fleet),
         errors=human_errors.read(errors),
     )
 
@@ -267,7 +267,7 @@ def _world(folder: Path) -> Scenario:
     demand = one_of(top.demand or next(iter(demands)), demands, "demand", file)
     one_of(top.mission.kind, MISSIONS, "mission.kind", file)
     check_pattern(top.mission.vehicles, "mission.vehicles", file)
-    _check_timing(top.timing, file, "timing.step", top.timing.step)
+    check_timing(top.timing, file, "timing.step", top.timing.step)
     preset = one_of(top.preset, Preset.ALL, "preset", file)
     return Scenario(
         name=name,
@@ -289,7 +289,7 @@ def _world(folder: Path) -> Scenario:
         preset=Preset.LAWFUL if ships else preset,
         mission=top.mission,
         zones=tuple(replace(z, name=z.name or f"zone{i}") for i, z in enumerate(top.conflict_zones)),
-        fleet=_checked_fleet(top.fleet, file, "fleet."),
+        fleet=checked_fleet(top.fleet, file, "fleet."),
     )
 
 
@@ -351,7 +351,7 @@ def _with_sumo_options(scenario: Scenario, chosen: Mapping[str, str]) -> Scenari
     timing = scenario.timing
     if "step-length" in chosen:
         timing = replace(timing, step=sumocfg.time_of(chosen["step-length"], place, "--step-length"))
-        _check_timing(timing, place, "--step-length", chosen["step-length"])
+        check_timing(timing, place, "--step-length", chosen["step-length"])
     files = {
         name: sumocfg.files(chosen[name], here, place, f"--{name}")
         for name in sumocfg.INPUTS
@@ -377,7 +377,7 @@ def _default_behavior(scenario: Scenario) -> str:
     return "moderate" if scenario.demand_name == "contested" else MIXED
 
 
-def _mission(own: Mission, wanted: str) -> Mission:
+def chosen_mission(own: Mission, wanted: str) -> Mission:
     """`--mission`: what a scenario's own becomes."""
     if wanted in (NONE, AUTO):
         return Mission(wanted)
@@ -387,7 +387,7 @@ def _mission(own: Mission, wanted: str) -> Mission:
     return replace(own, vehicles=wanted, kind=AUTO if own.kind == NONE else own.kind)
 
 
-def _check_timing(timing: Timing, file: object, field: str, value: object) -> None:
+def check_timing(timing: Timing, file: object, field: str, value: object) -> None:
     """Each clock must be a whole number of the one below it (definitions.md, Time)."""
     for name, long, short in (
         ("frame", timing.frame, timing.step),
@@ -399,7 +399,7 @@ def _check_timing(timing: Timing, file: object, field: str, value: object) -> No
             raise BadInput(problem, file=file, field=field, value=value)
 
 
-def _checked_fleet(fleet: Fleet, file: object = None, prefix: str = "--av-") -> Fleet:
+def checked_fleet(fleet: Fleet, file: object = None, prefix: str = "--av-") -> Fleet:
     if fleet.ids is not None:
         check_pattern(fleet.ids, f"{prefix}ids", file)
     share = fleet.penetration

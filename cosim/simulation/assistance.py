@@ -9,10 +9,9 @@ given (V2V), because SUMO's cooperation ends where a speed is commanded.
 import math
 from dataclasses import dataclass
 
-import libsumo
-
-from cosim.control import COMFORT, wished_accel
+from cosim.control import COMFORT, COMFORT_TIME, wished_accel
 from cosim.road.rules import RED, YELLOW
+from cosim.simulation.backend import sumo
 from cosim.simulation.commands import Commander, Controlled
 from cosim.simulation.fleet import set_type
 from cosim.types import Intervention, Preset
@@ -50,6 +49,11 @@ class Assisted(Controlled):
     crosses: float = 0.0  # s left of `CROSSES`
     idled: float = 0.0  # s, for which the agent has asked for less than `KEEPS_MOVING`
 
+    @property
+    def asked(self) -> float:
+        """As of every commanded AV."""
+        return self.wish if self.ours else math.inf
+
 
 class Assistance(Commander):
     """Drives every commanded AV of preset `lawful`."""
@@ -63,7 +67,7 @@ class Assistance(Commander):
 
     def drive(self) -> None:
         """Before every simulation step: the agent's wish where it is the slower one, else SUMO's driver."""
-        get = libsumo.vehicle
+        get = sumo.vehicle
         for name, state in self.controlled.items():
             speed = get.getSpeed(name)
             # what SUMO's driver did in the last step, or would have done
@@ -71,7 +75,7 @@ class Assistance(Commander):
             slower = allowed < state.wish - 1e-3
             if not state.ours:
                 state.accel = (speed - state.speed) / self._step
-            target = min(state.target, state.limit)
+            target = min(state.goal(speed, COMFORT_TIME), state.limit)
             state.idled = state.idled + self._step if state.target < KEEPS_MOVING else 0.0
             inside = get.getRoadID(name).startswith(":")
             state.crosses = CROSSES if inside and state.gives_way else state.crosses - self._step
@@ -92,7 +96,7 @@ class Assistance(Commander):
 
     def observe(self, now: float) -> list[Intervention]:
         """After every simulation step, at `now` (s): where the car began to drive otherwise than asked."""
-        get, begun = libsumo.vehicle, self._begun
+        get, begun = sumo.vehicle, self._begun
         self._begun = []
         for name, state in self.controlled.items():
             speed = get.getSpeed(name)
@@ -112,12 +116,12 @@ class Assistance(Commander):
 
     def heads_for(self, name: str) -> float | None:
         """SUMO's driver heads for the limit."""
-        return float(libsumo.vehicle.getAllowedSpeed(name))
+        return float(sumo.vehicle.getAllowedSpeed(name))
 
     # ---- inside ----
 
     def _take_over(self, name: str) -> Assisted:
-        get = libsumo.vehicle
+        get = sumo.vehicle
         set_type(name, _lawful(get.getTypeID(name)))
         get.setSpeedFactor(name, min(get.getSpeedFactor(name), 1.0))
         return Assisted(0.0, speed=get.getSpeed(name), lateral=get.getLateralLanePosition(name))
@@ -130,12 +134,12 @@ class Assistance(Commander):
         if why is None:
             why = _leaves_route(name, lane, offset)
             if why is not None:
-                self._begun.append(Intervention(libsumo.simulation.getTime(), name, why))
+                self._begun.append(Intervention(sumo.simulation.getTime(), name, why))
         return why
 
     def _look(self) -> None:
         """Who has to give way; and who must change lanes and cannot asks the AV behind to make room (V2V)."""
-        get = libsumo.vehicle
+        get = sumo.vehicle
         for state in self.controlled.values():
             state.gap_for = ""
         for name, state in self.controlled.items():
@@ -156,12 +160,12 @@ class Assistance(Commander):
 
     def _yielding(self, name: str, speed: float, state: Assisted) -> float:
         """The acceleration in m/s2 that opens a gap for who asked for one."""
-        get, (brakes, least) = libsumo.vehicle, YIELDING
+        get, (brakes, least) = sumo.vehicle, YIELDING
         try:
             ahead = get.getLanePosition(state.gap_for) - get.getLength(state.gap_for)
             gap = ahead - get.getLanePosition(name)
             theirs = get.getSpeed(state.gap_for)
-        except libsumo.TraCIException:  # it has left
+        except sumo.TraCIException:  # it has left
             return COMFORT
         room, headway = GAP
         if gap < max(speed**2 - theirs**2, 0.0) / (2.0 * brakes):
@@ -173,19 +177,19 @@ class Assistance(Commander):
 def _lawful(own: str) -> str:
     """The type of a commanded AV whose own one is this; outputs name both (`type_names`)."""
     name = f"{own.partition('@')[0].partition('/')[0]}/{Preset.LAWFUL}"
-    if name not in libsumo.vehicletype.getIDList():
-        libsumo.vehicletype.copy(LAWFUL_TYPE, name)
+    if name not in sumo.vehicletype.getIDList():
+        sumo.vehicletype.copy(LAWFUL_TYPE, name)
     return name
 
 
 def _leaves_route(name: str, lane: str, offset: int) -> str | None:
     """Why the lane at `offset` does not serve the route long enough to change to it; None if it does."""
-    best = libsumo.vehicle.getBestLanes(name)
+    best = sumo.vehicle.getBestLanes(name)
     here = int(lane.rpartition("_")[2])
     if not 0 <= here + offset < len(best):
         return None
     now, then = best[here], best[here + offset]
-    at = libsumo.vehicle.getLanePosition(name)
+    at = sumo.vehicle.getLanePosition(name)
     least, more = SERVES
     away = abs(then[3])
     if away <= abs(now[3]) or then[1] - at > least + more * away:
@@ -195,7 +199,7 @@ def _leaves_route(name: str, lane: str, offset: int) -> str | None:
 
 def _reason(name: str, accel: float) -> str:
     """Why the car drives slower than the agent wishes, or brakes harder (`accel` m/s2)."""
-    get = libsumo.vehicle
+    get = sumo.vehicle
     words = "emergency: " if accel < -HARD else ""
     speed = get.getSpeed(name)
     reach = min(0.5 * speed * speed + 2.0 * speed + 10.0, NOTICE)  # m, from where an IDM begins to brake
@@ -208,9 +212,9 @@ def _reason(name: str, accel: float) -> str:
         return f"{words}vehicle ahead"
     links = get.getNextLinks(name)
     for link in links[:1]:
-        at = libsumo.lane.getLength(get.getLaneID(name)) - get.getLanePosition(name)
+        at = sumo.lane.getLength(get.getLaneID(name)) - get.getLanePosition(name)
         if at < reach and not link[1]:
             return words + ("stop sign" if link[5] in "sw" else "right of way")
-        if at < reach and link[4] and libsumo.lane.getMaxSpeed(link[4]) < speed + 1.0:
+        if at < reach and link[4] and sumo.lane.getMaxSpeed(link[4]) < speed + 1.0:
             return f"{words}speed limit"
     return f"{words}lane ends" if not links else f"{words}junction or speed limit"

@@ -2,13 +2,13 @@
 
 from collections.abc import Iterable, Sequence
 
-import libsumo
 import numpy as np
 
 from cosim.geometry import Boxes, boxes, overlap, overlapping_pairs
 from cosim.road import RoadMap
 from cosim.road.too_close import along_one_another, foot, heed_each_other, walks_beside
-from cosim.simulation.commands import Commander
+from cosim.simulation.backend import sumo
+from cosim.simulation.commands import Commander, hand_back
 from cosim.simulation.conventions import centres
 from cosim.simulation.convert import Body
 from cosim.simulation.drivers import Drivers
@@ -59,8 +59,8 @@ class CollisionDetector:
         `changes`: AV -> when it last changed lanes, s.
         """
         found: list[Collision] = []
-        touching = libsumo.simulation.getCollidingVehiclesNumber()  # costs less than the list
-        for c in libsumo.simulation.getCollisions() if touching else ():
+        touching = sumo.simulation.getCollidingVehiclesNumber()  # costs less than the list
+        for c in sumo.simulation.getCollisions() if touching else ():
             person = c.type in OF_PERSONS
             names = c.collider, f"person:{c.victim}" if person else c.victim
             if frozenset(names) in self._seen or any(n not in bodies for n in names[: 1 if person else 2]):
@@ -76,8 +76,8 @@ class CollisionDetector:
                     first = mover(self._poses_before(names, pair, now), pair)
                     names = names[::-1] if first == 1 else names
             try:
-                x, y = libsumo.vehicle.getPosition(c.collider)[:2]
-            except libsumo.TraCIException:
+                x, y = sumo.vehicle.getPosition(c.collider)[:2]
+            except sumo.TraCIException:
                 x = y = float("nan")
             found.append(self._collision(now, names, c.type, "sumo", c.lane, x, y, bodies, changes))
         return found
@@ -173,7 +173,7 @@ class Wrecks:
     def add(self, collisions: Sequence[Collision]) -> list[str]:
         """Stop the vehicles of these, and name them; SUMO's insertions onto one another are no crashes."""
         new = []
-        on_road = frozenset(libsumo.vehicle.getIDList()) if collisions else frozenset()
+        on_road = frozenset(sumo.vehicle.getIDList()) if collisions else frozenset()
         for c in collisions:
             for name in () if c.insertion else (c.collider, c.victim):
                 if name in on_road and name not in self._since:
@@ -181,21 +181,26 @@ class Wrecks:
                     new.append(name)
                     self._commander.wreck(name)
                     self._drivers.drop(name)
-                    libsumo.vehicle.setSpeedMode(name, 0)  # at once, not within its deceleration
-                    libsumo.vehicle.setLaneChangeMode(name, 0)
-                    libsumo.vehicle.setSpeed(name, 0.0)
+                    sumo.vehicle.setSpeedMode(name, 0)  # at once, not within its deceleration
+                    sumo.vehicle.setLaneChangeMode(name, 0)
+                    sumo.vehicle.setSpeed(name, 0.0)
         self._stopped += new
         return new
 
     def remove(self, now: float) -> None:
         """Take those off the road that have stood long enough."""
         due = [name for name, since in self._since.items() if now - since >= WRECK_STANDS - 1e-6]
-        on_road = frozenset(libsumo.vehicle.getIDList()) if due else frozenset()
+        on_road = frozenset(sumo.vehicle.getIDList()) if due else frozenset()
         for name in due:
             del self._since[name]
             if name in on_road:
-                libsumo.vehicle.remove(name)
+                sumo.vehicle.remove(name)
                 self._removed.append(name)
+
+    def release(self) -> None:
+        """Let those that stand go: SUMO drives them."""
+        for name in self._since.keys() & set(sumo.vehicle.getIDList()):
+            hand_back(name)
 
     def take(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Who has become a wreck, and which wrecks were removed, since this was asked last."""
@@ -275,12 +280,12 @@ def _end(snapshot: Snapshot, row: int, share: float) -> Floats:
 
 def _poses(names: Sequence[str], bodies: dict[str, Body]) -> Boxes | None:
     """[2] where two vehicles are now; None when one has left the road."""
-    get = libsumo.vehicle
+    get = sumo.vehicle
     try:
         front = np.array([get.getPosition(name)[:2] for name in names], np.float64)
         angle = np.array([get.getAngle(name) for name in names], np.float64)
         speed = np.array([get.getSpeed(name) for name in names], np.float64)
-    except libsumo.TraCIException:
+    except sumo.TraCIException:
         return None
     length = np.array([bodies[name].length for name in names])
     width = np.array([bodies[name].width for name in names])

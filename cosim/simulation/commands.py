@@ -1,12 +1,11 @@
-"""Commands become libsumo calls, each with a receipt that says whether it was carried out, and why not."""
+"""Commands become SUMO's calls, each with a receipt that says whether it was carried out, and why not."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import libsumo
-
-from cosim.control import LANE_CHANGE_TIME, MAX_DECEL, tracked_speed
+from cosim.control import LANE_CHANGE_TIME, MAX_DECEL, TIME_CONSTANT, tracked_speed
+from cosim.simulation.backend import sumo
 from cosim.simulation.convert import may_change
 from cosim.simulation.fleet import AV_IDM
 from cosim.types import Command, Intervention, Preset, Receipt
@@ -18,6 +17,7 @@ SPEED_MODE = {Preset.UNGUARDED: 6, Preset.GUARDED: 31, Preset.LAWFUL: 31}
 LANE_CHANGE_MODE = {Preset.UNGUARDED: 0, Preset.GUARDED: 512, Preset.LAWFUL: 513}
 SUMO_SPEED_MODE, SUMO_LANE_CHANGE_MODE = 31, 1621  # SUMO's defaults
 SETTLED = 1e-3  # m/s: closer to its target an AV needs no new command
+OVERRULED = 0.05  # m/s: further from the commanded speed another program has set one
 
 
 @dataclass(slots=True)
@@ -29,6 +29,16 @@ class Controlled:
     change: int = 0  # the last lane change: +1 left, -1 right
     change_until: float = -1.0  # s, when it ends
     requested: float = -1.0  # m/s, the last speed handed to SUMO
+    asks: float | None = None  # m/s2, in place of the target speed
+
+    def goal(self, speed: float, time: float) -> float:
+        """The speed in m/s to be tracked with the time constant `time` (s) at `speed` (m/s)."""
+        return self.target if self.asks is None else speed + self.asks * time
+
+    @property
+    def asked(self) -> float:
+        """The speed in m/s that the last step was to end with, at most; inf where SUMO drove it."""
+        return self.requested
 
     def changing(self, now: float) -> int:
         """The lane change under way at time `now` (s): +1 left, -1 right, 0 none."""
@@ -37,6 +47,8 @@ class Controlled:
 
 class Commander:
     """Holds every commanded AV at its target speed, step by step, and starts lane changes."""
+
+    shared = False  # whether other programs command vehicles too
 
     def __init__(self, preset: str, step: float) -> None:
         self._preset = preset
@@ -51,15 +63,15 @@ class Commander:
         if name in self._wrecks:
             return Receipt(name, False, "crashed")
         try:
-            lane = libsumo.vehicle.getLaneID(name)
-        except libsumo.TraCIException:
+            lane = sumo.vehicle.getLaneID(name)
+        except sumo.TraCIException:
             return Receipt(name, False, "not on the road")
         state = self.controlled.get(name)
         if state is None:
             state = self.controlled[name] = self._take_over(name)
-            libsumo.vehicle.setSpeedMode(name, SPEED_MODE[self._preset])
-            libsumo.vehicle.setLaneChangeMode(name, LANE_CHANGE_MODE[self._preset])
-        state.target, state.limit = command.target_speed, command.limit
+            sumo.vehicle.setSpeedMode(name, SPEED_MODE[self._preset])
+            sumo.vehicle.setLaneChangeMode(name, LANE_CHANGE_MODE[self._preset])
+        state.target, state.limit, state.asks = command.target_speed, command.limit, command.accel
         if command.lane_offset == 0:
             return Receipt(name, True)
         why = (
@@ -69,13 +81,13 @@ class Commander:
         )
         if why is not None:
             return Receipt(name, False, why)
-        libsumo.vehicle.changeLaneRelative(name, command.lane_offset, command.hold)
+        sumo.vehicle.changeLaneRelative(name, command.lane_offset, command.hold)
         self._changes(name, state, command.lane_offset, now)
         return Receipt(name, True)
 
     def _hand_back(self, name: str) -> None:
         """Take back what `_take_over` gave."""
-        libsumo.vehicle.setDecel(name, AV_IDM["Decel"])
+        sumo.vehicle.setDecel(name, AV_IDM["Decel"])
 
     def _changes(self, name: str, state: Controlled, offset: int, now: float) -> None:
         state.change = offset
@@ -88,7 +100,7 @@ class Commander:
 
     def _take_over(self, name: str) -> Controlled:
         """Give the car what it needs to carry commands out."""
-        libsumo.vehicle.setDecel(name, MAX_DECEL)
+        sumo.vehicle.setDecel(name, MAX_DECEL)
         return Controlled(0.0)
 
     def _forbidden(self, name: str, lane: str, offset: int) -> str | None:
@@ -100,35 +112,47 @@ class Commander:
         names = {c.vehicle for c in commanded}
         for name in [n for n in self.controlled if n not in names]:
             del self.controlled[name]
-            libsumo.vehicle.setSpeed(name, -1.0)
-            libsumo.vehicle.setSpeedMode(name, SUMO_SPEED_MODE)
-            libsumo.vehicle.setLaneChangeMode(name, SUMO_LANE_CHANGE_MODE)
+            hand_back(name)
             self._hand_back(name)
 
     def confirm(self, receipts: Sequence[Receipt], commands: Sequence[Command]) -> tuple[Receipt, ...]:
-        """After the hold: a lane change that did not begin was refused by SUMO's safety checks."""
+        """After the hold: a lane change that did not begin was refused by SUMO's safety checks; a speed that
+        is not the commanded one was set by another program."""
         confirmed = list(receipts)
+        if self.shared:
+            confirmed = [self._overruled(receipt) for receipt in receipts]
         for k, (receipt, command) in enumerate(zip(receipts, commands, strict=True)):
             if not command.lane_offset or not receipt.executed:
                 continue
             name, state = command.vehicle, self.controlled.get(command.vehicle)
-            if not state or name not in libsumo.vehicle.getIDList():
+            if not state or name not in sumo.vehicle.getIDList():
                 continue
-            if abs(libsumo.vehicle.getLateralLanePosition(name)) < 0.05:
+            if abs(sumo.vehicle.getLateralLanePosition(name)) < 0.05:
                 state.change, state.change_until = 0, -1.0
                 self.lane_changes.pop(name, None)
                 confirmed[k] = Receipt(name, False, f"refused by SUMO's lane-change safety ({self._preset})")
         return tuple(confirmed)
 
+    def _overruled(self, receipt: Receipt) -> Receipt:
+        name, state = receipt.vehicle, self.controlled.get(receipt.vehicle)
+        if not receipt.executed or not state or name not in sumo.vehicle.getIDList():
+            return receipt
+        more = sumo.vehicle.getSpeed(name) - state.asked  # m/s
+        if more > OVERRULED or (self._preset == Preset.UNGUARDED and more < -OVERRULED):
+            return Receipt(name, False, "another program set its speed")
+        return receipt
+
     def drive(self) -> None:
         """Before every simulation step: track the target speeds."""
-        vehicle = libsumo.vehicle
+        vehicle = sumo.vehicle
         for name, state in self.controlled.items():
             speed = vehicle.getSpeed(name)
-            wanted = tracked_speed(speed, state.target, self._step)
-            if abs(wanted - state.requested) > SETTLED:
-                vehicle.setSpeed(name, wanted)
+            wanted = tracked_speed(speed, state.goal(speed, TIME_CONSTANT), self._step)
+            news = abs(wanted - state.requested) > SETTLED
+            if news:
                 state.requested = wanted
+            if news or self.shared:  # another program may have set one
+                vehicle.setSpeed(name, state.requested)
 
     def observe(self, now: float) -> list[Intervention]:
         """After every simulation step, at `now` (s): where the car began to drive otherwise than asked."""
@@ -145,16 +169,23 @@ class Commander:
         self.lane_changes.pop(name, None)
 
 
+def hand_back(name: str) -> None:
+    """Let SUMO's own driver drive a vehicle again."""
+    sumo.vehicle.setSpeed(name, -1.0)
+    sumo.vehicle.setSpeedMode(name, SUMO_SPEED_MODE)
+    sumo.vehicle.setLaneChangeMode(name, SUMO_LANE_CHANGE_MODE)
+
+
 def _forbidden(name: str, lane: str, offset: int) -> str | None:
     """Why the road does not let vehicle `name` on `lane` change by `offset` lanes; None if it does."""
     if lane.startswith(":"):
         return "inside a junction"
     edge, _, index = lane.rpartition("_")
     target = int(index) + offset
-    if not 0 <= target < libsumo.edge.getLaneNumber(edge):
+    if not 0 <= target < sumo.edge.getLaneNumber(edge):
         return "no lane on that side"
-    kind = libsumo.vehicle.getVehicleClass(name)
-    allowed = libsumo.lane.getAllowed(f"{edge}_{target}")
+    kind = sumo.vehicle.getVehicleClass(name)
+    allowed = sumo.lane.getAllowed(f"{edge}_{target}")
     if allowed and kind not in allowed:
         return "the lane is closed to this vehicle class"
     return None if may_change(lane, offset, kind) else "lane changes are forbidden here"

@@ -6,28 +6,20 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import libsumo
 import numpy as np
 
 from cosim.errors import BadInput
 from cosim.files.xml_input import scan
 from cosim.road import ConflictZone, Crossing, Lane, Link, RoadMap, Rule
 from cosim.scenario import Zone
+from cosim.simulation.backend import sumo
 from cosim.simulation.conventions import centres
 from cosim.types import Actor, Bytes, Events, Floats, Kind, Snapshot
 
-# The compiled getters: libsumo's Python wrappers around them double the cost of a read. The version
-# is pinned; a test compares them with the public ones.
-GETTERS = tuple(
-    getattr(libsumo._libsumo, f"vehicle_get{name}")
-    for name in ("Position", "Angle", "Speed", "Acceleration", "LaneID", "LanePosition")
-)
+READ = ("Position", "Angle", "Speed", "Acceleration", "LaneID", "LanePosition")  # of every vehicle
 # The same of persons, of whose acceleration SUMO says nothing. No lane is theirs: they walk beside, along,
 # against and across those of vehicles.
-PERSON_GETTERS = (
-    *(getattr(libsumo._libsumo, f"person_get{name}") for name in ("Position", "Angle", "Speed")),
-    *(lambda _: 0.0, lambda _: "", lambda _: 0.0),
-)
+NOT_OF_PERSONS = (lambda _: 0.0, lambda _: "", lambda _: 0.0)
 PERSON = "person:"  # a person's name in a snapshot: this and its id, which may be a vehicle's too
 GIVE_WAY = "mswZ"  # link states: minor, stop, all-way stop, zipper (SUMO, Networks/SUMO_Road_Networks)
 # link states at a stop line without signals (SUMO, Networks/SUMO_Road_Networks)
@@ -70,6 +62,8 @@ class SnapshotReader:
         self._lane_index = road.index
         self._edges = road.contact.edges
         self._lights = Counter(light for light, _ in road.signals)  # -> how many signals, in their order
+        self._of_vehicles = tuple(sumo.getter("vehicle", name) for name in READ)
+        self._of_persons = (*(sumo.getter("person", name) for name in READ[:3]), *NOT_OF_PERSONS)
         self._ids: tuple[str, ...] | None = None
         # kind, mission, length m, width m, actor [n] of `_ids`
         self._static: tuple[np.ndarray, ...] = ()
@@ -85,8 +79,8 @@ class SnapshotReader:
             bodies: what is constant of each vehicle that has departed, by id; new persons are added.
             events: what happened since the last snapshot.
         """
-        persons = _walking() if libsumo.person.getIDCount() else {}
-        ids = tuple(sorted((*libsumo.vehicle.getIDList(), *persons)))
+        persons = _walking() if sumo.person.getIDCount() else {}
+        ids = tuple(sorted((*sumo.vehicle.getIDList(), *persons)))
         if ids != self._ids:
             present = [bodies.get(i) or bodies.setdefault(i, _person(persons[i])) for i in ids]
             self._static = (
@@ -102,19 +96,19 @@ class SnapshotReader:
             [vehicle(i) for i in ids]
             if not persons
             else [person(persons[i]) if i in persons else vehicle(i) for i in ids]
-            for vehicle, person in zip(GETTERS, PERSON_GETTERS, strict=True)
+            for vehicle, person in zip(self._of_vehicles, self._of_persons, strict=True)
         )
         on = np.array([self._lane_index.get(i, -1) for i in lane], np.int32)
         off = np.flatnonzero(on < 0)
         place = on.copy() if len(off) else on
         for k in off:
             person = persons.get(ids[k])
-            edge = lane[k].rpartition("_")[0] if person is None else libsumo.person.getRoadID(person)
+            edge = lane[k].rpartition("_")[0] if person is None else sumo.person.getRoadID(person)
             place[k] = -2 - self._edges.get(edge, -1)
         front = np.array(position, np.float64).reshape(-1, 2)  # [n,2] m
         x, y, heading = centres(front[:, 0], front[:, 1], np.array(angle), 0.5 * length)
         return Snapshot(
-            time=libsumo.simulation.getTime(),
+            time=sumo.simulation.getTime(),
             ids=ids,
             kind=kind,
             mission=mission,
@@ -136,25 +130,25 @@ class SnapshotReader:
 
     def _signals(self) -> Bytes:
         """[s] the state of every signal; a light may have states for more links than there are."""
-        get = libsumo.trafficlight
+        get = sumo.trafficlight
         states = (get.getRedYellowGreenState(light)[:count] for light, count in self._lights.items())
         return np.frombuffer("".join(states).encode(), np.uint8)
 
     def _switches(self) -> Floats:
         """[s] s until the next phase of every signal's light."""
-        get, now = libsumo.trafficlight.getNextSwitch, libsumo.simulation.getTime()
+        get, now = sumo.trafficlight.getNextSwitch, sumo.simulation.getTime()
         left = np.array([get(light) for light in self._lights], np.float64) - now
         return np.repeat(left, np.fromiter(self._lights.values(), np.int64))
 
 
 def _walking() -> dict[str, str]:
     """Name -> SUMO's id of everybody on foot: neither in a vehicle or waiting for one, nor busy elsewhere."""
-    get = libsumo.person
-    return {PERSON + i: i for i in get.getIDList() if get.getStage(i).type == libsumo.constants.STAGE_WALKING}
+    get = sumo.person
+    return {PERSON + i: i for i in get.getIDList() if get.getStage(i).type == sumo.constants.STAGE_WALKING}
 
 
 def _person(person: str) -> Body:
-    get = libsumo.person
+    get = sumo.person
     return Body(Kind.PERSON, False, get.getLength(person), get.getWidth(person), Actor.PERSON)
 
 
@@ -168,7 +162,7 @@ def read_road(zones: Sequence[Zone], scenario_file: object) -> RoadMap:
     Raises:
         BadInput: a conflict zone names an edge that the net does not have.
     """
-    get = libsumo.lane
+    get = sumo.lane
     ids = [i for i in get.getIDList() if not (a := get.getAllowed(i)) or MOTOR_CLASSES.intersection(a)]
     place = {name: k for k, name in enumerate(ids)}
     lanes = []
@@ -188,15 +182,15 @@ def read_road(zones: Sequence[Zone], scenario_file: object) -> RoadMap:
                 left=_beside(name, place, 1),
                 right=_beside(name, place, -1),
                 internal=name.startswith(":"),
-                start=libsumo.edge.getFromJunction(edge),
-                end=libsumo.edge.getToJunction(edge),
+                start=sumo.edge.getFromJunction(edge),
+                end=sumo.edge.getToJunction(edge),
             )
         )
     found = tuple(_zone(z, lanes, scenario_file) for z in zones)
     outlines = tuple(
         np.array(shape, np.float64)[:, :2]
-        for j in libsumo.junction.getIDList()
-        if not j.startswith(":") and len(shape := libsumo.junction.getShape(j)) > 2
+        for j in sumo.junction.getIDList()
+        if not j.startswith(":") and len(shape := sumo.junction.getShape(j)) > 2
     )
     links, signals = _links(lanes, place)
     crossings = _crossings(place, signals)
@@ -208,7 +202,7 @@ def _links(
     lanes: Sequence[Lane], place: Mapping[str, int]
 ) -> tuple[tuple[Link, ...], tuple[tuple[str, int], ...]]:
     """Every link with its rule and foes; and the (traffic light, link index) of every signal."""
-    get, lights = libsumo.lane, libsumo.trafficlight
+    get, lights = sumo.lane, sumo.trafficlight
     signals: list[tuple[str, int]] = []
     signal_of: dict[tuple[str, str], int] = {}  # (origin, target) -> index into `signals`
     for light in lights.getIDList():
@@ -238,22 +232,22 @@ def _links(
 
 def _closed(lanes: Sequence[Lane]) -> tuple[Lane, ...]:
     """A lane of every edge that has none for motor vehicles: footpaths, cycleways, rails."""
-    get, known = libsumo.lane, {lane.edge for lane in lanes}
+    get, known = sumo.lane, {lane.edge for lane in lanes}
     found = []
-    for edge in libsumo.edge.getIDList():
+    for edge in sumo.edge.getIDList():
         if edge in known:
             continue
         name = f"{edge}_0"
         shape = np.array(get.getShape(name), np.float64)[:, :2]
         size = get.getLength(name), get.getWidth(name), get.getMaxSpeed(name)
-        ends = libsumo.edge.getFromJunction(edge), libsumo.edge.getToJunction(edge)
+        ends = sumo.edge.getFromJunction(edge), sumo.edge.getToJunction(edge)
         internal = edge.startswith(":")
         found.append(Lane(name, edge, 0, shape, *size, internal=internal, start=ends[0], end=ends[1]))
     return tuple(found)
 
 
 def _requests() -> dict[str, tuple[tuple[str, ...], tuple[str, ...]]]:
-    """Of the loaded net's right-of-way tables, which libsumo gives per lane only: the last lane of a link
+    """Of the loaded net's right-of-way tables, which SUMO's calls give per lane only: the last lane of a link
     inside its junction -> those of the links that go first, and those of the links that it meets."""
     found: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {}
     inside: list[str] = []
@@ -270,18 +264,18 @@ def _requests() -> dict[str, tuple[tuple[str, ...], tuple[str, ...]]]:
             )
             found[inside[int(attributes["index"])]] = before, met
 
-    scan(Path(libsumo.simulation.getOption("net-file")), ("net",), start)
+    scan(Path(sumo.simulation.getOption("net-file")), ("net",), start)
     return found
 
 
 def _crossings(place: Mapping[str, int], signals: Sequence[tuple[str, int]]) -> tuple[Crossing, ...]:
     """Every pedestrian crossing of the net."""
-    get, found = libsumo.lane, []
+    get, found = sumo.lane, []
     signal_of: dict[str, int] = {}
     for number, (light, index) in enumerate(signals):
-        for way in libsumo.trafficlight.getControlledLinks(light)[index]:
+        for way in sumo.trafficlight.getControlledLinks(light)[index]:
             signal_of[way[1]] = signal_of[way[2]] = number
-    for edge in libsumo.edge.getIDList():
+    for edge in sumo.edge.getIDList():
         if CROSSING.fullmatch(edge):
             lane = f"{edge}_0"
             crossed = tuple(place[i] for i in get.getInternalFoes(lane) if i in place)
@@ -292,7 +286,7 @@ def _crossings(place: Mapping[str, int], signals: Sequence[tuple[str, int]]) -> 
 
 def may_change(lane: str, offset: int, vehicle_class: str) -> bool:
     """Whether SUMO lets a vehicle of this class leave the lane to that side (+1 left), if there is a lane."""
-    return not lane.startswith(":") and vehicle_class in libsumo.lane.getChangePermissions(lane, offset)
+    return not lane.startswith(":") and vehicle_class in sumo.lane.getChangePermissions(lane, offset)
 
 
 def _beside(lane: str, place: Mapping[str, int], offset: int) -> int:
@@ -302,7 +296,7 @@ def _beside(lane: str, place: Mapping[str, int], offset: int) -> int:
     other = f"{edge}_{int(number) + offset}"
     if other not in place:
         return -1
-    here, there = (frozenset(libsumo.lane.getAllowed(i)) or MOTOR_CLASSES for i in (lane, other))
+    here, there = (frozenset(sumo.lane.getAllowed(i)) or MOTOR_CLASSES for i in (lane, other))
     classes = {CAR} if CAR in here else MOTOR_CLASSES & here
     return place[other] if any(may_change(lane, offset, c) for c in classes & there) else -1
 
@@ -320,7 +314,7 @@ def struggling_lanes(road: RoadMap) -> frozenset[int]:
 def _needs_help(lane: Lane, lanes: Sequence[Lane]) -> bool:
     if not lane.successors:
         return any(o >= 0 and lanes[o].successors for o in (lane.left, lane.right))
-    links = libsumo.lane.getLinks(lane.id)
+    links = sumo.lane.getLinks(lane.id)
     return bool(links) and all(link[5] in GIVE_WAY for link in links)
 
 

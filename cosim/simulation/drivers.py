@@ -2,17 +2,16 @@
 
 import hashlib
 
-import libsumo
-
 from cosim.errors import BadInput, one_of
 from cosim.scenario.behaviors import AS_IS, DRIVER_MODELS, MOBIL, Behaviors, DriverClass, load_behaviors
+from cosim.simulation.backend import sumo
 from cosim.simulation.mobil import MobilDriving
 
 # A vehicle cannot be given another car-following model while it drives, except through its type. A network
 # whose types do not use IDM gets this one as an additional file (sumo_scenarios/types.add.xml).
 IDM_TYPE = "cosim.idm"
 
-# What a derived type keeps of its original: getters and setters of libsumo.vehicletype, in this order.
+# What a derived type keeps of its original: getters and setters of sumo.vehicletype, in this order.
 BODY = ("VehicleClass", "Length", "Width", "Height", "MaxSpeed", "ShapeClass", "Color")
 
 EMERGENCY_DECELERATION = 9.0  # m/s2, the limit of the tyres (SUMO's default)
@@ -24,7 +23,7 @@ def derive_idm_type(original: str, name: str) -> None:
 
     Raises BadInput if `original` does not use IDM and the base type has not been loaded.
     """
-    get = libsumo.vehicletype
+    get = sumo.vehicletype
     if IDM_TYPE in get.getIDList():
         get.copy(IDM_TYPE, name)
         for parameter in BODY:
@@ -79,7 +78,7 @@ class Drivers:
             return AS_IS
         u_class, u_speed, u_phase = self.draws(vehicle)
         driver = self.behaviors.draw(self.behavior, u_class)
-        set_ = libsumo.vehicle
+        set_ = sumo.vehicle
         set_.setType(vehicle, self._type(set_.getTypeID(vehicle), driver))
         # setType leaves the lane-change parameters of the old type in place (SUMO 1.28): set each of them.
         for key, value in driver.lc2013:
@@ -117,7 +116,7 @@ class Drivers:
             name = f"{original}/{driver.name}"
             draft = f"{name}/draft"
             derive_idm_type(original, draft)
-            set_, idm = libsumo.vehicletype, driver.idm
+            set_, idm = sumo.vehicletype, driver.idm
             parameters = {
                 "Tau": idm.time_headway,
                 "MinGap": idm.minimum_gap,
@@ -130,7 +129,7 @@ class Drivers:
             }
             for parameter, value in parameters.items():
                 getattr(set_, f"set{parameter}")(draft, value)
-            set_.setActionStepLength(draft, libsumo.simulation.getDeltaT(), True)
+            set_.setActionStepLength(draft, sumo.simulation.getDeltaT(), True)
             # SUMO's IDM keeps the 2 sqrt(a b) of its construction: setAccel and setDecel change a and b, but
             # not d* (measured: -0.06 instead of -0.44 m/s2). Copying the type constructs the model anew.
             set_.copy(draft, name)

@@ -2,7 +2,7 @@
 
 An AV is looked at in every step only where it may be within `NEAR` m of a line that matters (a signal, a stop
 sign, somebody with the right of way); further away the look is put off to the step in which it could at the
-earliest be there. Signals are read when SUMO says that they switch.
+earliest be there. Signals are read when SUMO says that they switch; in every step where others switch them.
 """
 
 import heapq
@@ -10,13 +10,12 @@ import math
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from itertools import chain, pairwise
 from typing import NamedTuple
 
-import libsumo
-
 from cosim.road import RoadMap, Rule
+from cosim.simulation.backend import sumo
 from cosim.types import Entry
 
 LAST = 10.0  # m before the line over which the least speed is taken (docs/definitions.md, The law)
@@ -27,14 +26,6 @@ STANDING = 0.05  # m/s: slower than that in the last 10 m makes no difference
 LONGEST = 100  # steps until the next look, for whoever SUMO puts elsewhere (teleports)
 HOPS = 8  # lanes that one step may lead across
 EPSILON = 1e-6
-
-_sumo = libsumo._libsumo  # the compiled getters, as in cosim.simulation.convert
-lane_of, position_of, speed_of = (
-    _sumo.vehicle_getLaneID,
-    _sumo.vehicle_getLanePosition,
-    _sumo.vehicle_getSpeed,
-)
-odometer_of, accel_of = _sumo.vehicle_getDistance, _sumo.vehicle_getAcceleration
 
 
 class Passed(NamedTuple):
@@ -62,10 +53,14 @@ class Light:
 
 
 class EntryWatcher:
-    """Yields an `Entry` for every AV that passes a stop line; `step` is the simulation step in s."""
+    """Yields an `Entry` for every AV that passes a stop line; `step` is the simulation step in s.
 
-    def __init__(self, road: RoadMap, step: float) -> None:
+    `shared`: whether other programs switch signals too.
+    """
+
+    def __init__(self, road: RoadMap, step: float, shared: bool = False) -> None:
         self._road = road
+        self._shared = shared
         self._step = step
         self._matters = [
             link.signal >= 0 or bool(link.foes) or link.rule in (Rule.STOP, Rule.ALL_WAY_STOP)
@@ -73,6 +68,9 @@ class EntryWatcher:
         ]
         self._lengths = [lane.length for lane in road.lanes]  # [l] m
         self.needed = any(self._matters)
+        get = partial(sumo.getter, "vehicle")
+        self._lane_of, self._position_of, self._odometer_of = map(get, ("LaneID", "LanePosition", "Distance"))
+        self._speed_of, self._accel_of = map(get, ("Speed", "Acceleration"))
         self.reset()
 
     def reset(self) -> None:
@@ -84,7 +82,7 @@ class EntryWatcher:
         self._switches: list[tuple[float, str]] = []  # (s, light), a heap
         if self.needed:
             for light in dict.fromkeys(name for name, _ in self._road.signals):
-                state = libsumo.trafficlight.getRedYellowGreenState(light)
+                state = sumo.trafficlight.getRedYellowGreenState(light)
                 self._lights[light] = Light(state)
                 heapq.heappush(self._switches, (-math.inf, light))
 
@@ -108,8 +106,8 @@ class EntryWatcher:
         """Look at one AV, and say when next; its entries."""
         av = self._avs[name]
         try:
-            lane = self._road.index.get(lane_of(name), -1)
-        except libsumo.TraCIException:  # it left the road
+            lane = self._road.index.get(self._lane_of(name), -1)
+        except sumo.TraCIException:  # it left the road
             del self._avs[name]
             return ()
         before, av.lane = av.lane, lane
@@ -117,7 +115,7 @@ class EntryWatcher:
             av.near = False
             self._due[self._count + 1].append(name)
             return ()
-        position, speed = position_of(name), speed_of(name)
+        position, speed = self._position_of(name), self._speed_of(name)
         entries: Sequence[Entry] = ()
         if lane != before and av.near:
             lines = self._passed(before, lane)
@@ -125,7 +123,7 @@ class EntryWatcher:
         away = self._lengths[lane] - position + self._free[lane]  # m to the next line
         av.near = away <= NEAR
         if av.near:
-            self._remember(av.trail, odometer_of(name), speed)
+            self._remember(av.trail, self._odometer_of(name), speed)
         elif av.trail:
             av.trail.clear()
         if not av.near or speed < STANDING:  # before then it is not near, or still stands where it is now
@@ -154,12 +152,12 @@ class EntryWatcher:
         self, name: str, av: Watched, passed: Passed, position: float, speed: float, now: float
     ) -> Entry:
         link = self._road.links[passed.link]
-        line = odometer_of(name) - passed.beyond - position  # the odometer at the line, m
+        line = self._odometer_of(name) - passed.beyond - position  # the odometer at the line, m
         last = [v for at, v in av.trail if line - LAST - EPSILON <= at]
         state, yellow = "", (-1.0, 0.0, 0.0)
         if link.signal >= 0:
             light, index = self._road.signals[link.signal]
-            state = libsumo.trafficlight.getRedYellowGreenState(light)[index]
+            state = sumo.trafficlight.getRedYellowGreenState(light)[index]
             if state in "yY":
                 since, marks = self._lights[light].yellow.get(index, (now - self._step, {}))
                 odometer, then = marks.get(name, (line, math.inf))
@@ -173,8 +171,8 @@ class EntryWatcher:
         while self._switches[0][0] <= began + EPSILON:
             name = heapq.heappop(self._switches)[1]
             light = self._lights[name]
-            old, light.state = light.state, libsumo.trafficlight.getRedYellowGreenState(name)
-            following = libsumo.trafficlight.getNextSwitch(name)
+            old, light.state = light.state, sumo.trafficlight.getRedYellowGreenState(name)
+            following = began if self._shared else sumo.trafficlight.getNextSwitch(name)
             heapq.heappush(self._switches, (max(following, began + self._step), name))
             if light.state == old:
                 continue
@@ -188,10 +186,10 @@ class EntryWatcher:
         found = {}
         for name in self._avs:
             try:
-                speed = speed_of(name)
-                odometer = odometer_of(name) - speed * self._step
-                found[name] = odometer, speed - accel_of(name) * self._step
-            except libsumo.TraCIException:
+                speed = self._speed_of(name)
+                odometer = self._odometer_of(name) - speed * self._step
+                found[name] = odometer, speed - self._accel_of(name) * self._step
+            except sumo.TraCIException:
                 continue
         return found
 
@@ -204,10 +202,10 @@ class EntryWatcher:
         edges = {self._road.lanes[self._road.links[foe].origin].edge for foe in first}
         for foe in first:
             for inner in self._inside(foe):
-                found.update((other, foe) for other in libsumo.lane.getLastStepVehicleIDs(inner))
+                found.update((other, foe) for other in sumo.lane.getLastStepVehicleIDs(inner))
         for lane, position in self._before(entered):
-            for other in libsumo.lane.getLastStepVehicleIDs(self._road.lanes[lane].id):
-                if other not in found and position_of(other) >= position:
+            for other in sumo.lane.getLastStepVehicleIDs(self._road.lanes[lane].id):
+                if other not in found and self._position_of(other) >= position:
                     taken = self._taken(other, lane, edges)
                     found.update((other, foe) for foe in first if foe in taken)
         found.pop(name, None)
@@ -218,15 +216,15 @@ class EntryWatcher:
         if link.signal < 0:
             return False
         light, index = self._road.signals[link.signal]
-        return libsumo.trafficlight.getRedYellowGreenState(light)[index] in "ru"
+        return sumo.trafficlight.getRedYellowGreenState(light)[index] in "ru"
 
     def _taken(self, name: str, lane: int, edges: set[str]) -> Sequence[int]:
         """The links that a vehicle on `lane` may take where its route next leaves one of `edges`.
 
         They go on from the lanes that it can be on without a change; all of them, where there are none.
         """
-        route = libsumo.vehicle.getRoute(name)
-        place = libsumo.vehicle.getRouteIndex(name)
+        route = sumo.vehicle.getRoute(name)
+        place = sumo.vehicle.getRouteIndex(name)
         at = {lane}
         while self._road.lanes[lane].internal:  # the lane it comes out on
             at = set(self._road.lanes[lane].successors)

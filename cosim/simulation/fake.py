@@ -6,7 +6,7 @@ from itertools import combinations
 
 import numpy as np
 
-from cosim.control import tracked_speed
+from cosim.control import TIME_CONSTANT, tracked_speed
 from cosim.road import Lane, RoadMap
 from cosim.types import Collision, Command, Events, Kind, Receipt, Snapshot, Timing
 
@@ -26,6 +26,7 @@ class FakeVehicle:
     mission: bool = False
     desired: float = 25.0  # m/s, of an HV (and of an AV without a command)
     target: float | None = None  # m/s, once commanded
+    asks: float | None = None  # m/s2, in its place
     goal_lane: int = -1  # while a lane change is under way
     offset: float = 0.0  # m, lateral, from the centre of `lane`
     accel: float = 0.0
@@ -103,7 +104,7 @@ class FakeSimulator:
         v = self._vehicles.get(command.vehicle)
         if v is None:
             return Receipt(command.vehicle, False, "not on the road")
-        v.target = command.target_speed
+        v.target, v.asks = command.target_speed, command.accel
         if command.lane_offset == 0:
             return Receipt(v.id, True)
         if v.goal_lane >= 0:
@@ -118,7 +119,8 @@ class FakeSimulator:
         old = {v.id: v.speed for v in self._vehicles.values()}
         for v in self._vehicles.values():
             free = max(v.speed + self._idm(v, old) * step, 0.0)
-            wanted = free if v.target is None else tracked_speed(v.speed, v.target, step)
+            target = v.target if v.asks is None else v.speed + v.asks * TIME_CONSTANT
+            wanted = free if target is None else tracked_speed(v.speed, target, step)
             v.accel = (wanted - v.speed) / step
             v.speed = wanted
         for v in list(self._vehicles.values()):

@@ -3,12 +3,11 @@
 import re
 from collections.abc import Mapping
 
-import libsumo
-
 from cosim.scenario import Scenario
 from cosim.scenario.behaviors import AS_IS
 from cosim.scenario.vet_rules import NOT_CARS
 from cosim.seeding import uniform
+from cosim.simulation.backend import sumo
 from cosim.simulation.conventions import AV_TYPE
 from cosim.simulation.convert import ACTORS, Body
 from cosim.simulation.drivers import IDM_TYPE, Drivers
@@ -21,7 +20,7 @@ AV_LANE_CHANGE = {
     "laneChangeModel.lcCooperativeSpeed": "0",
     "laneChangeModel.lcKeepRight": "0",
 }
-# What a vehicle keeps when its type changes: getters and setters of libsumo.vehicle, in this order.
+# What a vehicle keeps when its type changes: getters and setters of sumo.vehicle, in this order.
 KEPT = ("Length", "Width", "MaxSpeed", "SpeedFactor", "VehicleClass")
 
 
@@ -36,7 +35,7 @@ class Fleet:
 
     def depart(self, vehicle: str, seed: int) -> Body:
         """A vehicle departed: give it its driver; what it is."""
-        get, s = libsumo.vehicle, self._scenario
+        get, s = sumo.vehicle, self._scenario
         mission = s.mission.includes(vehicle)
         is_av = not mission and self._is_av(vehicle, seed)
         if is_av:
@@ -53,20 +52,20 @@ class Fleet:
 
     def _take_av_type(self, vehicle: str) -> None:
         """In our worlds an AV drives as its type says, one of a user's file by IDM."""
-        own, ours = libsumo.vehicle.getTypeID(vehicle), self._scenario.built_in
+        own, ours = sumo.vehicle.getTypeID(vehicle), self._scenario.built_in
         name = self._av_types.get(own)
         if name is None:
             name = self._av_types[own] = AV_TYPE + own
-            libsumo.vehicletype.copy(own if ours else IDM_TYPE, name)
+            sumo.vehicletype.copy(own if ours else IDM_TYPE, name)
         if ours:
-            libsumo.vehicle.setType(vehicle, name)
+            sumo.vehicle.setType(vehicle, name)
         else:
             set_type(vehicle, name)
-            mean = libsumo.vehicletype.getSpeedFactor(own)  # not a draw about it
-            libsumo.vehicle.setSpeedFactor(vehicle, mean)
-            limit = libsumo.lane.getMaxSpeed(libsumo.vehicle.getLaneID(vehicle))
-            if self._scenario.preset == Preset.LAWFUL and libsumo.vehicle.getSpeed(vehicle) > limit:
-                libsumo.vehicle.setPreviousSpeed(vehicle, limit)  # its file asks for more
+            mean = sumo.vehicletype.getSpeedFactor(own)  # not a draw about it
+            sumo.vehicle.setSpeedFactor(vehicle, mean)
+            limit = sumo.lane.getMaxSpeed(sumo.vehicle.getLaneID(vehicle))
+            if self._scenario.preset == Preset.LAWFUL and sumo.vehicle.getSpeed(vehicle) > limit:
+                sumo.vehicle.setPreviousSpeed(vehicle, limit)  # its file asks for more
 
     def _is_av(self, vehicle: str, seed: int) -> bool:
         rule = self._scenario.fleet
@@ -74,9 +73,9 @@ class Fleet:
             return re.fullmatch(rule.ids, vehicle) is not None
         if rule.penetration is not None:
             drawn = uniform(seed, "av", vehicle) < rule.penetration
-            return drawn and libsumo.vehicle.getVehicleClass(vehicle) not in NOT_CARS
+            return drawn and sumo.vehicle.getVehicleClass(vehicle) not in NOT_CARS
         if rule.type is not None:
-            name: str = libsumo.vehicle.getTypeID(vehicle)
+            name: str = sumo.vehicle.getTypeID(vehicle)
             return name == rule.type or name.startswith(f"{rule.type}@")
         return False
 
@@ -86,7 +85,7 @@ def set_type(vehicle: str, name: str) -> None:
 
     `setType` replaces the car-following model (Krauss in most files); nothing else can.
     """
-    get = libsumo.vehicle
+    get = sumo.vehicle
     kept = {field: getattr(get, f"get{field}")(vehicle) for field in KEPT}
     get.setType(vehicle, name)
     for field, value in kept.items():

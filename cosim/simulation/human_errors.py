@@ -5,7 +5,6 @@ from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-import libsumo
 import numpy as np
 
 from cosim.control import LANE_CHANGE_TIME
@@ -13,6 +12,7 @@ from cosim.road import RoadMap
 from cosim.scenario.human_errors import KINDS, Errors, ForcedEntry, Span
 from cosim.scenario.tilt import Tilt, case, log_ratio
 from cosim.seeding import subseed, uniform, uniforms
+from cosim.simulation.backend import sumo
 from cosim.simulation.convert import PERSON, Body, may_change
 from cosim.simulation.drivers import Drivers
 from cosim.simulation.mobil import LEFT, RIGHT, route_allows
@@ -44,13 +44,6 @@ IGNORE = {
     "jmIgnoreFoeProb": ("1", "0"),
     "jmIgnoreFoeSpeed": ("100", "0"),
 }
-
-_sumo = libsumo._libsumo  # the compiled getters, as in cosim.simulation.convert
-lane_of, position_of, speed_of = (
-    _sumo.vehicle_getLaneID,
-    _sumo.vehicle_getLanePosition,
-    _sumo.vehicle_getSpeed,
-)
 
 
 # A trial whose error can begin yields whom it would meet ("": nobody); resumed, it begins.
@@ -92,16 +85,15 @@ class HumanErrors:
     ) -> None:
         self._kinds = {name: kind for name in KINDS if (kind := getattr(errors.kinds, name)) is not None}
         self._road, self._drivers, self._seed, self._step = road, drivers, seed, step
+        names = "LaneID", "LanePosition", "Speed"
+        self._lane_of, self._position_of, self._speed_of = (sumo.getter("vehicle", name) for name in names)
         self._every_second = [name for name in EVERY_SECOND if name in self._kinds]
         self._rates = np.array([self._kinds[name].rate for name in self._every_second])  # [k]
         self._tilt = tilt
         self._tilted = tilt is not None and tilt.drawn(seed)
-        self._raised = np.array(
-            [tilt is not None and tilt.raises(k) for k in self._every_second], bool
-        )  # [k]
-        self.log_ratio = (
-            0.0  # of the trials so far: the probability drawn tilted over that drawn as it happens
-        )
+        raised = [tilt is not None and tilt.raises(kind) for kind in self._every_second]
+        self._raised = np.array(raised, bool)  # [k]
+        self.log_ratio = 0.0  # of the trials so far
         self._avs: set[str] = set()
         self._near: frozenset[str] = frozenset()  # whose trials are weighed
         self._during: frozenset[str] = frozenset()  # of these, near somebody who errs
@@ -140,7 +132,7 @@ class HumanErrors:
         self._waited.pop(name, None)
         erring = self._erring.pop(name, None)
         if erring is not None:
-            self._ended[name] = min(erring.error.until, libsumo.simulation.getTime())
+            self._ended[name] = min(erring.error.until, sumo.simulation.getTime())
             self._drivers.resume(name)
 
     def restore(self) -> None:
@@ -151,7 +143,10 @@ class HumanErrors:
     def step(self, now: float) -> None:
         """After a simulation step that ended at `now` (s)."""
         for name in [*self._erring]:
-            self._go_on(name, now)
+            try:
+                self._go_on(name, now)
+            except sumo.TraCIException:  # taken off the road, neither arrived nor crashed
+                self.drop(name)
         if self._next is not None and now >= self._next - 1e-6:
             self._next += 1.0
             self._trials(now)
@@ -171,7 +166,10 @@ class HumanErrors:
 
     def _trials(self, now: float) -> None:
         """Those of one second."""
-        second = round(now)
+        second, on_road = round(now), frozenset(sumo.vehicle.getIDList())
+        for name in self._streams.keys() - on_road:
+            self.drop(name)
+        self._avs &= on_road
         names = [*self._streams]
         if self._tilt is not None and self._begun < 2:
             self._near, self._during = self._beside_avs(names, now)
@@ -185,10 +183,10 @@ class HumanErrors:
         if self._kinds.keys() & {"forced_entry", "failure_to_yield", "red_light"}:
             for name in names:
                 self._manoeuvres(name, now)
-        if "step_out" in self._kinds and libsumo.person.getIDCount():
+        if "step_out" in self._kinds and sumo.person.getIDCount():
             rate = self._kinds["step_out"].rate
-            for person in libsumo.person.getIDList():
-                if libsumo.person.getWaitingTime(person) > 0.0:
+            for person in sumo.person.getIDList():
+                if sumo.person.getWaitingTime(person) > 0.0:
                     who = PERSON + person
                     self._try("step_out", who, rate, self._draw("step_out", who, f"{second}"), now)
 
@@ -235,7 +233,7 @@ class HumanErrors:
             return frozenset(), frozenset()
         recent = {who for who, end in self._ended.items() if now - end <= REMEMBERED}
         erring = [name for name in names if name in self._erring or name in recent]
-        places = {name: libsumo.vehicle.getPosition(name) for name in (*names, *self._avs)}
+        places = {name: sumo.vehicle.getPosition(name) for name in (*names, *self._avs)}
 
         def close(to: Sequence[str]) -> Bools:
             """[n,t]"""
@@ -260,14 +258,14 @@ class HumanErrors:
 
     def _manoeuvres(self, name: str, now: float) -> None:
         """Where it must give way, is at a signal, or its lane does not go on."""
-        lane = lane_of(name)
+        lane = self._lane_of(name)
         if not lane or lane[0] == ":":
             self._waited.pop(name, None)
             return
         number = self._road.index.get(lane, -1)
         if number < 0:
             return
-        to_line = self._road.lanes[number].length - position_of(name)
+        to_line = self._road.lanes[number].length - self._position_of(name)
         edge = self._road.lanes[number].edge
         gives_way = lane in self._gives_way
         looks = gives_way and to_line < APPROACHES and "failure_to_yield" in self._kinds
@@ -276,7 +274,7 @@ class HumanErrors:
         if lane in self._signals and to_line < SEES_SIGNAL and "red_light" in self._kinds:
             self._at_signal(name, edge, now)
         if "forced_entry" in self._kinds:
-            waits = gives_way and to_line < AT_LINE and speed_of(name) < SLOW and self._yields(name)
+            waits = gives_way and to_line < AT_LINE and self._speed_of(name) < SLOW and self._yields(name)
             self._waits(name, waits or self._at_end_of_lane(name, lane), now)
 
     def _once(self, kind: str, name: str, manoeuvre: str, now: float) -> None:
@@ -296,12 +294,12 @@ class HumanErrors:
         self._try("forced_entry", name, rate, self._draw("forced_entry", name, f"{round(now)}"), now)
 
     def _at_signal(self, name: str, edge: str, now: float) -> None:
-        ahead = libsumo.vehicle.getNextTLS(name)
+        ahead = sumo.vehicle.getNextTLS(name)
         if not ahead or ahead[0][3] not in "yY":
             return
         light, _, away, _ = ahead[0]
-        red = libsumo.trafficlight.getNextSwitch(light)
-        arrives = now + away / max(speed_of(name), 0.1)
+        red = sumo.trafficlight.getNextSwitch(light)
+        arrives = now + away / max(self._speed_of(name), 0.1)
         if red < arrives <= red + self._kinds["red_light"].late:
             self._once("red_light", name, f"{edge}/{red:.1f}", now)
 
@@ -311,23 +309,23 @@ class HumanErrors:
 
     def _needed_change(self, name: str, lane: str) -> tuple[int, float]:
         """To which side its route wants it to change (0: it need not), and m that its lane serves it."""
-        key = libsumo.vehicle.getRouteID(name), lane
+        key = sumo.vehicle.getRouteID(name), lane
         found = self._wants.get(key)
         if found is None:
-            here = next((k for k in libsumo.vehicle.getBestLanes(name) if k[0] == lane), None)
+            here = next((k for k in sumo.vehicle.getBestLanes(name) if k[0] == lane), None)
             offset, length = (0, math.inf) if here is None else (here[3], here[1])
             found = self._wants[key] = (offset > 0) - (offset < 0), length
         return found
 
     def _left(self, name: str, lane: str) -> float:
         """m until its lane serves its route no more."""
-        return self._needed_change(name, lane)[1] - float(position_of(name))
+        return self._needed_change(name, lane)[1] - float(self._position_of(name))
 
     # ---- the kinds: each yields whom it would meet where it can begin, and begins when it is resumed
 
     def _inattention(self, who: str, now: float) -> Trial:
-        leader = libsumo.vehicle.getLeader(who, WITHIN)
-        speed = speed_of(who)
+        leader = sumo.vehicle.getLeader(who, WITHIN)
+        speed = self._speed_of(who)
         if not leader or not leader[0] or speed < MOVES:
             return None
         yield leader[0]
@@ -340,7 +338,7 @@ class HumanErrors:
 
     def _hard_braking(self, who: str, now: float) -> Trial:
         kind = self._kinds["hard_braking"]
-        if speed_of(who) < MOVES:
+        if self._speed_of(who) < MOVES:
             return None
         follower = _follower(who)
         yield follower
@@ -352,8 +350,8 @@ class HumanErrors:
 
     def _stalled_car(self, who: str, now: float) -> Trial:
         kind = self._kinds["stalled_car"]
-        speed = speed_of(who)
-        if speed < MOVES or lane_of(who).startswith(":"):
+        speed = self._speed_of(who)
+        if speed < MOVES or self._lane_of(who).startswith(":"):
             return None
         follower = _follower(who)
         yield follower
@@ -364,19 +362,19 @@ class HumanErrors:
 
     def _slows(self, who: str, erring: Erring, deceleration: float) -> Erring:
         """It still sees its leader and the signals, and may brake harder for them."""
-        self._take(who, erring, libsumo.vehicle.getSpeedMode(who) & ~(MAX_ACCEL | MAX_DECEL), BLIND)
+        self._take(who, erring, sumo.vehicle.getSpeedMode(who) & ~(MAX_ACCEL | MAX_DECEL), BLIND)
         erring.deceleration = deceleration
         self._slow(who, deceleration)
         return erring
 
     def _slow(self, who: str, deceleration: float) -> None:
         """One step slower; 0 holds the speed."""
-        libsumo.vehicle.setSpeed(who, max(speed_of(who) - deceleration * self._step, 0.0))
+        sumo.vehicle.setSpeed(who, max(self._speed_of(who) - deceleration * self._step, 0.0))
 
     def _cut_in(self, who: str, now: float, kind: str = "cut_in") -> Trial:
         low, high = self._kinds[kind].deceleration
-        lane = lane_of(who)
-        if speed_of(who) < MOVES or self._changing(who) or not lane or lane[0] == ":":
+        lane = self._lane_of(who)
+        if self._speed_of(who) < MOVES or self._changing(who) or not lane or lane[0] == ":":
             return None
         found = []
         for side in (LEFT, RIGHT):
@@ -394,7 +392,7 @@ class HumanErrors:
         self._take(who, erring, None, BLIND)
         if again:
             erring.swerves = now + LANE_CHANGE_TIME, -side
-        libsumo.vehicle.changeLaneRelative(who, side, LANE_CHANGE_TIME)
+        sumo.vehicle.changeLaneRelative(who, side, LANE_CHANGE_TIME)
         return erring
 
     def _aborted_cut_in(self, who: str, now: float) -> Trial:
@@ -402,7 +400,7 @@ class HumanErrors:
 
     def _forced_entry(self, who: str, now: float) -> Trial:
         refuses = self._kinds["forced_entry"].lag
-        lane, waited = lane_of(who), self._waited[who]
+        lane, waited = self._lane_of(who), self._waited[who]
         if self._at_end_of_lane(who, lane):
             side, _ = self._needed_change(who, lane)
             beside = None if self._changing(who) else self._beside(who, lane, side)
@@ -411,7 +409,7 @@ class HumanErrors:
             yield beside.whom
             erring = self._begins("forced_entry", who, now, HOLDS, _forces(waited, beside), beside.whom)
             self._take(who, erring, None, BLIND)
-            libsumo.vehicle.changeLaneRelative(who, side, HOLDS)
+            sumo.vehicle.changeLaneRelative(who, side, HOLDS)
             return erring
         met = self._foes(who)
         if not met or any(foe.lag < refuses for foe in met):
@@ -435,7 +433,7 @@ class HumanErrors:
         person = who.removeprefix(PERSON)
         length = self._drawn(self._kinds["step_out"].duration, "step_out", who, now, "duration")
         erring = self._begins("step_out", who, now, length, "walks onto the crossing without waiting", "")
-        libsumo.person.setMinGap(person, libsumo.person.getMinGap(person))  # a type of its own
+        sumo.person.setMinGap(person, sumo.person.getMinGap(person))  # a type of its own
         _ignores(person, True)
         return erring
 
@@ -445,14 +443,14 @@ class HumanErrors:
     def _drives_on(self, kind: str, who: str, now: float, ignored: int, what: str, near: str) -> Erring:
         """Until it is through the junction ahead."""
         erring = self._begins(kind, who, now, PASSES, what, near)
-        mode = libsumo.vehicle.getSpeedMode(who) & ~ignored | IGNORES_JUNCTION
+        mode = sumo.vehicle.getSpeedMode(who) & ~ignored | IGNORES_JUNCTION
         self._take(who, erring, mode, BLIND)
-        erring.leaves = libsumo.vehicle.getRoadID(who)
+        erring.leaves = sumo.vehicle.getRoadID(who)
         return erring
 
     def _take(self, who: str, erring: Erring, speed_mode: int | None, lane_mode: int) -> None:
         """Take the vehicle from its driver model as far as the error asks for it (None: not its speed)."""
-        vehicle = libsumo.vehicle
+        vehicle = sumo.vehicle
         erring.modes = vehicle.getSpeedMode(who), vehicle.getLaneChangeMode(who)
         if speed_mode is not None:
             vehicle.setSpeedMode(who, speed_mode)
@@ -465,7 +463,7 @@ class HumanErrors:
         erring = self._erring[name]
         over = now >= erring.error.until - 1e-6
         if erring.leaves and not over:
-            edge = libsumo.vehicle.getRoadID(name)
+            edge = sumo.vehicle.getRoadID(name)
             over = bool(edge) and edge != erring.leaves and edge[0] != ":"
         if over:
             self._end(name)
@@ -473,22 +471,22 @@ class HumanErrors:
         if erring.deceleration:
             self._slow(name, erring.deceleration)
         if erring.swerves is not None and now >= erring.swerves[0] - 1e-6:
-            libsumo.vehicle.changeLaneRelative(name, erring.swerves[1], LANE_CHANGE_TIME)
+            sumo.vehicle.changeLaneRelative(name, erring.swerves[1], LANE_CHANGE_TIME)
             erring.swerves = None
 
     def _end(self, name: str) -> None:
         """Give back what was taken."""
         erring = self._erring.pop(name)
-        self._ended[name] = libsumo.simulation.getTime()
+        self._ended[name] = sumo.simulation.getTime()
         if erring.error.kind == "step_out":
             person = name.removeprefix(PERSON)
-            if person in libsumo.person.getIDList():
+            if person in sumo.person.getIDList():
                 _ignores(person, False)
             return
         if erring.deceleration is not None:
-            libsumo.vehicle.setSpeed(name, -1.0)
-        libsumo.vehicle.setSpeedMode(name, erring.modes[0])
-        libsumo.vehicle.setLaneChangeMode(name, erring.modes[1])
+            sumo.vehicle.setSpeed(name, -1.0)
+        sumo.vehicle.setSpeedMode(name, erring.modes[0])
+        sumo.vehicle.setLaneChangeMode(name, erring.modes[1])
         self._drivers.resume(name)
 
     def _had_a_part(self, collision: Collision) -> bool:
@@ -503,51 +501,51 @@ class HumanErrors:
     # ---- what is around
 
     def _changing(self, who: str) -> bool:
-        return bool(libsumo.vehicle.getLateralSpeed(who) != 0.0)
+        return bool(sumo.vehicle.getLateralSpeed(who) != 0.0)
 
     def _beside(self, who: str, lane: str, side: int) -> Gap | None:
         """The gap in the lane to that side, as the follower there leaves it; None where there is no such
         lane, or somebody in it beside, or just ahead and much slower."""
         edge, _, index = lane.rpartition("_")
         there = int(index) + side
-        if not 0 <= there < libsumo.edge.getLaneNumber(edge):
+        if not 0 <= there < sumo.edge.getLaneNumber(edge):
             return None
-        if not may_change(lane, side, libsumo.vehicle.getVehicleClass(who)):
+        if not may_change(lane, side, sumo.vehicle.getVehicleClass(who)):
             return None
         bits = 0 if side == LEFT else 1  # of getNeighbors: bit 0 right, bit 1 ahead
         behind, ahead = (
-            min(libsumo.vehicle.getNeighbors(who, bits | way), key=lambda v: v[1], default=None)
+            min(sumo.vehicle.getNeighbors(who, bits | way), key=lambda v: v[1], default=None)
             for way in (0, 2)
         )
-        speed = speed_of(who)
+        speed = self._speed_of(who)
         if ahead is not None:
-            gap = ahead[1] + libsumo.vehicle.getMinGap(who)
-            if gap < LEAST_GAP or _asked(speed - speed_of(ahead[0]), gap) > HARDEST:
+            gap = ahead[1] + sumo.vehicle.getMinGap(who)
+            if gap < LEAST_GAP or _asked(speed - self._speed_of(ahead[0]), gap) > HARDEST:
                 return None
         if behind is None:
             return NOBODY
-        gap, comes = behind[1] + libsumo.vehicle.getMinGap(behind[0]), speed_of(behind[0])
+        gap, comes = behind[1] + sumo.vehicle.getMinGap(behind[0]), self._speed_of(behind[0])
         if gap < LEAST_GAP:
             return None
-        slows = max(-libsumo.vehicle.getAcceleration(who), 0.0)  # and will go on to, behind its leader
+        slows = max(-sumo.vehicle.getAcceleration(who), 0.0)  # and will go on to, behind its leader
         return Gap(_asked(comes - speed, gap) + slows, _time(gap, comes), behind[0])
 
     def _yields(self, name: str) -> bool:
         """Whether it must give way at the next line, and the signal there lets it go."""
-        links = libsumo.vehicle.getNextLinks(name)
+        links = sumo.vehicle.getNextLinks(name)
         return bool(links) and links[0][5] in "mswZ=go"
 
     def _foes(self, who: str) -> list[Gap]:
         """Who has the right of way at the next line, and is not gone when `who` is there, driving on; `lag`
         is counted from then. Who must brake hardest comes first."""
-        vehicle, found = libsumo.vehicle, []
+        vehicle, found = sumo.vehicle, []
         links = vehicle.getNextLinks(who)
-        speed, gains = speed_of(who), vehicle.getAccel(who)
+        speed, gains = self._speed_of(who), vehicle.getAccel(who)
         for foe, away, to, _, beyond, via, _, goes_first, _ in vehicle.getJunctionFoes(who, WITHIN):
             if not goes_first or via != links[0][4]:
                 continue
             arrives = (math.sqrt(speed**2 + 2.0 * gains * max(away, 0.0)) - speed) / gains  # s
-            comes = speed_of(foe)
+            comes = self._speed_of(foe)
             if _time(beyond + vehicle.getLength(foe), comes) > arrives:
                 asked = _asked(comes, to) if to > 0.0 else math.inf
                 found.append(Gap(asked, _time(to, comes) - arrives, foe))
@@ -575,20 +573,20 @@ def _forces(waited: int, gap: Gap) -> str:
 
 
 def _follower(who: str) -> str:
-    found = libsumo.vehicle.getFollower(who, WITHIN)
+    found = sumo.vehicle.getFollower(who, WITHIN)
     return found[0] if found else ""
 
 
 def _leader(name: str) -> tuple[str, float] | None:
     try:
-        found = libsumo.vehicle.getLeader(name, WITHIN)
-    except libsumo.TraCIException:  # a person, or it has left the road
+        found = sumo.vehicle.getLeader(name, WITHIN)
+    except sumo.TraCIException:  # a person, or it has left the road
         return None
     return found if found and found[0] else None
 
 
 def _ignores(person: str, ignores: bool) -> None:
     """Signals and vehicles at crossings, by parameters of the type that is this person's alone."""
-    kind = libsumo.person.getTypeID(person)
+    kind = sumo.person.getTypeID(person)
     for name, (on, off) in IGNORE.items():
-        libsumo.vehicletype.setParameter(kind, f"junctionModel.{name}", on if ignores else off)
+        sumo.vehicletype.setParameter(kind, f"junctionModel.{name}", on if ignores else off)

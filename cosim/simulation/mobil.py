@@ -9,9 +9,8 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
-import libsumo
-
 from cosim.scenario.behaviors import IdmParameters, MobilParameters
+from cosim.simulation.backend import sumo
 
 FAR = 1.0e6  # m: the gap without a leader
 TOUCHING = 0.01  # m: smaller gaps (also overlaps) brake as hard as this one
@@ -141,7 +140,7 @@ def worth(a: Accelerations, mobil: MobilParameters) -> float | None:
 
 def read_car(vehicle: str, known: IdmParameters | None = None) -> Car:
     """A vehicle's state; IDM parameters as SUMO has them unless `known` (AVs and foreign types are read)."""
-    get = libsumo.vehicle
+    get = sumo.vehicle
     idm = known or IdmParameters(
         get.getTau(vehicle), get.getMinGap(vehicle), get.getAccel(vehicle), get.getDecel(vehicle)
     )
@@ -164,7 +163,7 @@ def _neighbor(
 
 def read_own_lane(vehicle: str, known: Known) -> Situation:
     """The vehicle, its leader and its follower; the next lanes are not read yet."""
-    get = libsumo.vehicle
+    get = sumo.vehicle
     ego = read_car(vehicle, known(vehicle))
     leader = _neighbor(get.getLeader(vehicle, LOOK_AHEAD), vehicle, known, ego.idm.minimum_gap)
     return Situation(ego, leader, _neighbor(get.getFollower(vehicle, LOOK_AHEAD), vehicle, known), None, None)
@@ -177,7 +176,7 @@ def read_beside(own: Situation, vehicle: str, direction: int, known: Known) -> S
     """
     side = 0 if direction == LEFT else 1  # getNeighbors: bit 0 = right side, bit 1 = those ahead
     ahead, behind = (
-        min(libsumo.vehicle.getNeighbors(vehicle, which | side), key=lambda v: v[1], default=None)
+        min(sumo.vehicle.getNeighbors(vehicle, which | side), key=lambda v: v[1], default=None)
         for which in (2, 0)
     )
     return own._replace(
@@ -188,21 +187,21 @@ def read_beside(own: Situation, vehicle: str, direction: int, known: Known) -> S
 
 def changing(vehicle: str) -> bool:
     """Whether a lane change of the vehicle is under way."""
-    return bool(libsumo.vehicle.getLateralSpeed(vehicle) != 0.0)
+    return bool(sumo.vehicle.getLateralSpeed(vehicle) != 0.0)
 
 
 def route_allows(vehicle: str, direction: int) -> bool:
     """Whether there is a lane that serves the route as well as this one, or lasts long enough to return."""
-    lanes = libsumo.vehicle.getBestLanes(vehicle)
-    here = libsumo.vehicle.getLaneID(vehicle)
+    lanes = sumo.vehicle.getBestLanes(vehicle)
+    here = sumo.vehicle.getLaneID(vehicle)
     index = next((i for i, lane in enumerate(lanes) if lane[0] == here), -1)
     target = index + direction
     if index < 0 or not 0 <= target < len(lanes):  # inside a junction, or no lane on that side
         return False
     if abs(lanes[target][3]) <= abs(lanes[index][3]) and lanes[target][1] >= lanes[index][1]:
         return True
-    remaining = lanes[target][1] - libsumo.vehicle.getLanePosition(vehicle)
-    return bool(remaining > RETURN_TIME * max(libsumo.vehicle.getSpeed(vehicle), 1.0))
+    remaining = lanes[target][1] - sumo.vehicle.getLanePosition(vehicle)
+    return bool(remaining > RETURN_TIME * max(sumo.vehicle.getSpeed(vehicle), 1.0))
 
 
 class MobilDriving:
@@ -227,8 +226,8 @@ class MobilDriving:
     def add(self, vehicle: str, idm: IdmParameters, mobil: MobilParameters, phase: float) -> None:
         """Take over one HV; `phase` in [0, 1) of the period."""
         if not self._due:
-            self._due = [[] for _ in range(max(1, round(self._period / libsumo.simulation.getDeltaT())))]
-        libsumo.vehicle.setLaneChangeMode(vehicle, STRATEGIC_ONLY)
+            self._due = [[] for _ in range(max(1, round(self._period / sumo.simulation.getDeltaT())))]
+        sumo.vehicle.setLaneChangeMode(vehicle, STRATEGIC_ONLY)
         self._drivers[vehicle] = (idm, mobil)
         self._due[int(phase * len(self._due))].append(vehicle)
 
@@ -247,25 +246,25 @@ class MobilDriving:
         for vehicle in self._due[turn]:
             try:
                 direction = self._decide(vehicle)
-            except libsumo.TraCIException:  # it has left the road
+            except sumo.TraCIException:  # it has left the road
                 del self._drivers[vehicle]
                 continue
             on_road.append(vehicle)
             if direction and _gap_is_free(vehicle, direction, requested):
-                libsumo.vehicle.changeLaneRelative(vehicle, direction, 0.0)
+                sumo.vehicle.changeLaneRelative(vehicle, direction, 0.0)
         self._due[turn] = on_road
 
     def _decide(self, vehicle: str) -> int:
         if vehicle in self.paused or changing(vehicle):
             return 0
         mobil = self._drivers[vehicle][1]
-        edge = libsumo.vehicle.getRoadID(vehicle)
+        edge = sumo.vehicle.getRoadID(vehicle)
         if not edge or edge[0] == ":":  # not inserted yet, teleporting, or inside a junction
             return 0
         own = read_own_lane(vehicle, self.known)
         if best_incentive(own, mobil.politeness) <= mobil.threshold:
             return 0
-        lane, lanes = libsumo.vehicle.getLaneIndex(vehicle), libsumo.edge.getLaneNumber(edge)
+        lane, lanes = sumo.vehicle.getLaneIndex(vehicle), sumo.edge.getLaneNumber(edge)
         best, best_gain = 0, 0.0
         for direction in (LEFT, RIGHT):
             if not 0 <= lane + direction < lanes:
@@ -278,7 +277,7 @@ class MobilDriving:
 
 def _gap_is_free(vehicle: str, direction: int, requested: list[tuple[str, int, float]]) -> bool:
     """Whether no earlier request of this step is for the same gap; this one is then added to `requested`."""
-    get = libsumo.vehicle
+    get = sumo.vehicle
     edge, lane = get.getRoadID(vehicle), get.getLaneIndex(vehicle) + direction
     place = get.getLanePosition(vehicle)
     if any(e == edge and i == lane and abs(p - place) < CONFLICT_RANGE for e, i, p in requested):

@@ -20,6 +20,7 @@ from cosim.scenario.disabled_outputs import disable_outputs
 from cosim.scenario.sumo_outputs import sumo_options
 from cosim.scenario.sumocfg import time_of
 from cosim.simulation.assistance import Assistance
+from cosim.simulation.backend import sumo
 from cosim.simulation.collisions import CollisionDetector, Wrecks
 from cosim.simulation.commands import Commander
 from cosim.simulation.convert import Body, SnapshotReader, read_road, struggling_lanes
@@ -30,8 +31,6 @@ from cosim.simulation.human_errors import HumanErrors
 from cosim.simulation.stderr import SumoStderr
 from cosim.simulation.xerces import keep_initialized
 from cosim.types import Collision, Command, Events, Kind, OnCollision, Preset, Receipt, Snapshot
-
-SUMO_ERRORS = (libsumo.TraCIException, libsumo.FatalTraCIError)
 
 # Ours, where a user's file does not say otherwise. A teleport would let a vehicle appear on the road.
 DEFAULTS = {
@@ -64,6 +63,9 @@ class SumoSimulator:
     `history` frames are returned by `reset`, so that an agent starts with a full past.
     """
 
+    _SHARED = False  # whether other programs change things too
+    _FLEET = Fleet
+
     def __init__(
         self, scenario: Scenario, *, av_parameters: Mapping[str, str] | None = None, history: int = 10
     ) -> None:
@@ -87,24 +89,24 @@ class SumoSimulator:
         self._steps_per_decision = round(timing.decision / timing.step)
         patience = time_of(dict(scenario.options).get(GIVES_UP, "-1"), scenario.config, GIVES_UP)  # s
         self._gives_up = 0.0 <= patience < scenario.warmup + scenario.duration
+        self.road: RoadMap
         try:
-            self._load(seed=0)
-            self.road: RoadMap = read_road(scenario.zones, scenario.config)
-            self.goal_lanes, self._struggling = self._goal()
+            self._open()
         except BaseException:
             self.close()
             raise
         self._reader = SnapshotReader(self.road)
-        self._entries = EntryWatcher(self.road, scenario.timing.step)
+        self._entries = EntryWatcher(self.road, scenario.timing.step, self._SHARED)
 
     def reset(self, seed: int) -> tuple[Snapshot, ...]:
         """Load the episode `seed` anew, drive the warm-up; the last `history` frames, newest last."""
         self._load(seed)
         self._seed = seed
         self._drivers = Drivers(self._scenario.behavior, self._scenario.driver_model, seed)
-        self._fleet = Fleet(self._scenario, self._drivers, self._av_parameters)
+        self._fleet = self._FLEET(self._scenario, self._drivers, self._av_parameters)
         preset, step = self._scenario.preset, self._scenario.timing.step
         self._commander = Assistance(step) if preset == Preset.LAWFUL else Commander(preset, step)
+        self._commander.shared = self._SHARED
         self._bodies: dict[str, Body] = {}
         self._routes: dict[str, tuple[str, ...]] = {}
         self._detector = CollisionDetector()
@@ -133,14 +135,14 @@ class SumoSimulator:
                 if k >= first_kept and (steps - k) % self._steps_per_frame == 0:
                     frames.append(self._snapshot())
         if self._errors is not None:
-            self._errors.begin(libsumo.simulation.getTime())
+            self._errors.begin(sumo.simulation.getTime())
         return tuple(frames) or (self._snapshot(),)
 
     def advance(self, commands: Sequence[Command]) -> tuple[tuple[Receipt, ...], tuple[Snapshot, ...]]:
         """Hold the commands for one decision; one snapshot per frame. Raises SimulationError."""
         frames = []
         with self._stderr:
-            now = libsumo.simulation.getTime()
+            now = sumo.simulation.getTime()
             self._commander.release(commands)
             receipts = tuple(self._commander.take(c, now) for c in commands)
             for k in range(1, self._steps_per_decision + 1):
@@ -153,10 +155,10 @@ class SumoSimulator:
 
     def route(self, vehicle: str) -> tuple[str, ...]:
         """The edges still ahead, the present one first."""
-        index = max(libsumo.vehicle.getRouteIndex(vehicle), 0)
+        index = max(sumo.vehicle.getRouteIndex(vehicle), 0)
         edges = self._routes.get(vehicle)
         if edges is None:
-            edges = self._routes[vehicle] = tuple(libsumo.vehicle.getRoute(vehicle))
+            edges = self._routes[vehicle] = tuple(sumo.vehicle.getRoute(vehicle))
         return edges[index:] if index else edges
 
     def commanded(self, vehicle: str) -> tuple[float | None, int]:
@@ -164,7 +166,7 @@ class SumoSimulator:
         state = self._commander.controlled.get(vehicle)
         if state is None:
             return self._commander.heads_for(vehicle), 0
-        return state.target, state.changing(libsumo.simulation.getTime())
+        return state.target, state.changing(sumo.simulation.getTime())
 
     @property
     def tilted(self) -> tuple[float, dict[str, list[float]]]:
@@ -174,7 +176,7 @@ class SumoSimulator:
     def counts(self) -> dict[str, int]:
         """Vehicles since the start: `inserted`, and `waiting`: due and not inserted, whether SUMO has dropped
         them (`max-depart-delay`) or not."""
-        waiting = self._waited.union(libsumo.simulation.getPendingVehicles())
+        waiting = self._waited.union(sumo.simulation.getPendingVehicles())
         return {"inserted": self._inserted, "waiting": len(waiting)}
 
     def write_outputs(self, files: Mapping[str, Path]) -> None:
@@ -184,6 +186,9 @@ class SumoSimulator:
     def finish_outputs(self) -> None:
         """End SUMO, which makes its files whole, and ask for no more; the next `reset` starts it again."""
         self._outputs = {}
+        self._stop()
+
+    def _stop(self) -> None:
         if self._started:
             self._started = False
             with self._stderr:
@@ -204,6 +209,15 @@ class SumoSimulator:
         self._scratch.cleanup()
         _in_use = False
 
+    def _open(self) -> None:
+        """Read what stays the same in all episodes."""
+        self._load(seed=0)
+        self._read_net()
+
+    def _read_net(self) -> None:
+        self.road = read_road(self._scenario.zones, self._scenario.config)
+        self.goal_lanes, self._struggling = self._goal()
+
     def _load(self, seed: int) -> None:
         arguments = self._arguments(seed)
         try:
@@ -214,7 +228,7 @@ class SumoSimulator:
                     libsumo.start(["sumo", *arguments])
                     self._started = True
                     keep_initialized()
-        except SUMO_ERRORS as error:
+        except sumo.errors as error:
             self._started = libsumo.isLoaded()
             raise self._explain(error, starting=True) from None
 
@@ -249,12 +263,16 @@ class SumoSimulator:
             return BadInput(f"SUMO refuses it: {words}{warned}", file=files)
         return SimulationError(f"{self._scenario.config}: SUMO failed: {words}{warned}")
 
-    def _step(self) -> None:
-        simulation = libsumo.simulation
+    def _simulate(self) -> None:
+        """One step of SUMO's own."""
         try:
-            libsumo.simulationStep()
-        except SUMO_ERRORS as error:
+            sumo.simulationStep()
+        except sumo.errors as error:
             raise self._explain(error) from None
+
+    def _step(self) -> None:
+        simulation = sumo.simulation
+        self._simulate()
         departed = simulation.getDepartedIDList()
         self._inserted += len(departed)
         self._waited.difference_update(departed)

@@ -76,8 +76,8 @@ class Supervisor:
         """The present worker process."""
         return None if self._worker is None else self._worker.pid
 
-    def run(self, task: Task) -> Outcome:
-        """One task, attempted as often as the limits say."""
+    def run(self, task: Task, progress: Progress | None = None) -> Outcome:
+        """One task, attempted as often as the limits say; `progress` gets its heartbeats."""
         allowed = {
             "crashed": self._limits.crashes,
             "killed": self._limits.kills,
@@ -86,7 +86,7 @@ class Supervisor:
         ends: Counter[str] = Counter()
         while True:
             began = time.monotonic()
-            end, value, error, stderr = self._attempt(task)
+            end, value, error, stderr = self._attempt(task, progress or _nothing)
             ends[end] += 1
             if end != "done":
                 if end != "refused":
@@ -110,11 +110,11 @@ class Supervisor:
 
     # ---- inside ----
 
-    def _attempt(self, task: Task) -> tuple[str, Any, str | None, str | None]:
+    def _attempt(self, task: Task, progress: Progress) -> tuple[str, Any, str | None, str | None]:
         """How it ended, the value, the error in one line, stderr of the process that ended."""
         try:
             worker = self._ready()
-            value = worker.call("run", task.arguments, progress=_nothing)
+            value = worker.call("run", task.arguments, progress=progress)
         except CosimError as error:
             end = next(end for kind, end in _ENDS.items() if isinstance(error, kind))
             if end == "crashed" and getattr(error, "exitcode", None) in KILLED_FROM_OUTSIDE:

@@ -102,6 +102,34 @@ def test_pettingzoo_accepts_the_parallel_environment() -> None:
     parallel_seed_test(build, num_cycles=30)
 
 
+def test_the_checkers_accept_continuous_actions(make: Make) -> None:
+    env = make(fake_worlds.platoon, continuous=True)
+    with warnings.catch_warnings():  # Gymnasium would rather have actions from -1 to 1 than m/s2
+        warnings.filterwarnings("ignore", message=".*symmetric and normalized")
+        check_env(env, skip_render_check=True)
+    several = parallel_env(
+        fake_worlds.scenario(), simulator=fake_worlds.platoon, worker=False, continuous=True, **FAST
+    )
+    several.reset(seed=1)
+    several.step({agent: several.action_space(agent).sample() for agent in several.agents})
+    several.close()
+
+
+def test_an_acceleration_is_carried_out(make: Make) -> None:
+    env = make(fake_worlds.platoon, continuous=True)
+    env.reset(seed=1)
+    session = env.session
+    row = session.snapshot().row[env.learner]
+    before = session.snapshot().speed[row]
+    env.step(np.array([-2.0, 0.3], np.float32))
+    assert session.snapshot().speed[row] == pytest.approx(before - 2.0 * 0.4)
+    session.act({env.learner: (1.0, 0)})
+    assert session.snapshot().speed[row] == pytest.approx(before - 2.0 * 0.4 + 1.0 * 0.4)
+    for action in ((np.nan, 0), (1.0, 2), (1.0,), ("a", 0)):
+        with pytest.raises(BadInput, match="is no continuous action"):
+            session.act({env.learner: action})
+
+
 def test_every_world_is_registered() -> None:
     names = {name for name in gymnasium.registry if name.startswith("cosim/")}
     assert names == {f"cosim/{world.capitalize()}-v0" for world in (*sumo_scenarios.names(), "sumo")}

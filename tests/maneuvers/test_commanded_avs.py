@@ -239,3 +239,9 @@ def test_the_compiled_getters_read_what_the_public_ones_do() -> None:
         pairs = worker.call("read", "right.0")
     assert len(pairs) == 6
     assert all(fast == slow for fast, slow in pairs)
+
+
+def test_an_acceleration_is_held_from_decision_to_decision(start: Start) -> None:
+    worker = start([vehicle("a", "av", 50.0)])
+    _, frames = drive(worker, [Command("a", 0.0, 0, HOLD, accel=-1.5)], 5)
+    assert frames[-1].speed[0] == pytest.approx(20.0 - 1.5 * 5 * HOLD, abs=0.01)

@@ -50,11 +50,13 @@ class Watched(SumoSimulator):
 class Seen:
     """Runs in a worker: the frames of an episode of any scenario that SUMO drives."""
 
-    def __init__(self, what: str, kinds: Kinds, share: float | None = None, demand: str = "") -> None:
+    def __init__(
+        self, what: str, kinds: Kinds, share: float | None = None, demand: str = "", policy: str = "idm"
+    ) -> None:
         fleet = None if share is None else Fleet(penetration=share)
         scenario = load(what, demand=[demand] if demand else (), fleet=fleet, warmup=0.0 if share else None)
         scenario = vetted(replace(scenario, errors=Errors("test", "", kinds, Path("test"))))
-        self._host = Host(scenario, "idm", 0.0)
+        self._host = Host(scenario, policy, 0.8)
 
     def frames(self, seed: int, decisions: int) -> list[Snapshot]:
         episode = self._host.episode
@@ -62,7 +64,7 @@ class Seen:
         episode.start(seed)
         found: list[Snapshot] = [episode.snapshot]
         for _ in range(decisions):
-            episode.advance({})
+            episode.advance(self._host.policy.decide(episode.histories))
             found += episode.frames
             if episode.over:
                 break
@@ -321,6 +323,21 @@ def test_two_humans_who_crash_become_wrecks_and_the_episode_goes_on(start: Start
     assert not crash.crash
     gone = [name for f in frames for name in f.events.wrecks_removed]
     assert sorted(gone) == ["h", "s"]
+
+
+def test_another_policy_meets_the_same_errors() -> None:
+    """All that could begin in both: a driver brakes for no reason wherever it drives."""
+    begun = []
+    for policy in ("idm", "altruist-rule"):
+        kinds = Kinds(hard_braking=HardBraking(rate=0.01))
+        worker = Worker(Seen, "merge", kinds, None, "contested", policy)
+        try:
+            frames: list[Snapshot] = worker.call("frames", 100001, 50)
+        finally:
+            worker.close()
+        begun.append({(e.who, e.time) for e in errors(frames)})
+    assert len(begun[0]) > 3
+    assert len(begun[0] & begun[1]) >= 0.8 * len(begun[0] | begun[1])
 
 
 def test_avs_never_err(start: Start) -> None:

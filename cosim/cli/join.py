@@ -1,0 +1,145 @@
+"""`cosim join`: our agents drive vehicles of a SUMO that somebody else started (docs/traci.md)."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import shutil
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from cosim.cli import arguments
+from cosim.cli.run import show
+from cosim.errors import BadInput
+from cosim.scenario import Fleet, Scenario, checked_fleet, chosen_fleet, chosen_mission
+from cosim.scenario.policy_name import label, read
+
+INTERRUPTED = "interrupted"
+
+
+def add(commands: arguments.SubCommands) -> None:
+    """Register the command and its flags."""
+    join = commands.add_parser(
+        "join",
+        help="drive vehicles of a SUMO that somebody else started",
+        description="Join a SUMO that waits for TraCI clients (sumo --remote-port PORT --num-clients N), "
+        "drive some of its vehicles as AVs, and hand them back. Ctrl-C leaves it in order.",
+    )
+    join.add_argument("place", metavar="HOST:PORT", type=_place, help="where it listens")
+    arguments.add(join, "--policy", default="idm")
+    arguments.add(join, "--svo", default=45.0)
+    arguments.add(
+        join, "--preset", "--duration", "--warmup", "--mission", "--on-collision", "--reward", "--out"
+    )
+    arguments.add(join.add_mutually_exclusive_group(), "--av-type", "--av-ids", "--penetration")
+    arguments.add(join, "--seed", help="of the draw of AVs (default: SUMO's own)")
+    arguments.add(join, "--metric", action="append", default=[])
+    arguments.texts(join, {"--net": ("FILE", "its net, where SUMO's own path of it does not hold here")})
+    join.add_argument(
+        "--order",
+        type=int,
+        default=9,
+        metavar="N",
+        help="place among its clients, another one for each; of two commands that of the higher one holds "
+        "(default 9)",
+    )
+    limit = "s that SUMO may take to be there, and to answer (default 60)"
+    join.add_argument("--timeout", type=arguments.positive, default=60.0, metavar="S", help=limit)
+    join.add_argument("--replay", action="store_true", help="draw DIR/replay.html and DIR/replay.mp4 too")
+    arguments.add(join, "--json")
+    join.set_defaults(work=work)
+
+
+def work(args: argparse.Namespace) -> int:
+    """Connect, drive in this process, hand back, show the result."""
+    if args.replay and not args.out:
+        raise BadInput("needs a run folder to write into: --out DIR", field="--replay")
+    from cosim.host import Host, joining
+    from cosim.policies import check, make
+    from cosim.simulation.client import Client
+    from cosim.simulation.shared import theirs
+    from cosim.workers.progress import Progress
+
+    policy = read(args.policy).text
+    check(policy)
+    fleet = chosen_fleet(args.av_type, args.av_ids, args.penetration) or Fleet()
+    with _run_folder(args.out) as folder:
+        driver = make(policy)  # before SUMO has to wait for it
+        client = Client(*args.place, args.order, args.timeout)
+        try:
+            scenario, seed = theirs(client, args.net)
+            host = Host(
+                _as_asked(scenario, args, fleet),
+                driver,
+                math.radians(args.svo),
+                simulator=joining(client),
+                metrics=args.metric,
+                reward=args.reward,
+            )
+        except BaseException:
+            client.close()
+            raise
+        simulator: Any = host.simulator
+        progress = Progress(f"{scenario.name} {label(policy)}", "s")
+        try:
+            with _leaving(simulator):
+                drive = host.run_recorded if args.replay else host.run
+                driven: Any = drive(seed if args.seed is None else args.seed, progress)
+        finally:
+            progress.done()
+            host.close()
+        show(args, *(driven if args.replay else (driven, None)), folder)
+    return 130 if simulator.leave else 0
+
+
+def _as_asked(scenario: Scenario, args: argparse.Namespace, fleet: Fleet) -> Scenario:
+    """What SUMO simulates, with what the flags say besides."""
+    given = {name: getattr(args, name) for name in ("preset", "duration", "warmup", "on_collision")}
+    if args.mission is not None:
+        given["mission"] = chosen_mission(scenario.mission, args.mission)
+    known = {name: value for name, value in given.items() if value is not None}
+    return replace(scenario, fleet=checked_fleet(fleet), **known)
+
+
+@contextmanager
+def _run_folder(path: str | None) -> Iterator[Path | None]:
+    """The folder --out, made now; gone again where nothing was driven."""
+    from cosim.files import prepare_folder
+
+    new = path is not None and not Path(path).exists()
+    folder = None if path is None else prepare_folder(path)
+    try:
+        yield folder
+    except BaseException:
+        if new and folder is not None:
+            shutil.rmtree(folder, ignore_errors=True)
+        raise
+
+
+@contextmanager
+def _leaving(simulator: Any) -> Iterator[None]:
+    """Ctrl-C and SIGTERM end the drive before the next step, so that SUMO is left in order; a second one
+    while SUMO does not answer ends it at once."""
+
+    def leave(*_: object) -> None:
+        if simulator.leave:
+            raise KeyboardInterrupt
+        simulator.leave = INTERRUPTED
+
+    before = {number: signal.signal(number, leave) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _place(text: str) -> tuple[str, int]:
+    host, colon, port = text.rpartition(":")
+    if not colon:
+        raise argparse.ArgumentTypeError(f"{text!r} is not HOST:PORT")
+    return host or "localhost", arguments.port(port)

@@ -1,0 +1,57 @@
+"""`cosim serve`: runs and sessions for many users over HTTP."""
+
+import argparse
+import sys
+
+from cosim.cli import arguments
+from cosim.errors import BadInput
+
+
+def add(commands: arguments.SubCommands) -> None:
+    """Register the command and its flags."""
+    serve = commands.add_parser(
+        "serve",
+        help="serve runs and sessions over HTTP",
+        description="Serve runs and sessions over HTTP until it is ended (Ctrl-C, SIGTERM). What is queued "
+        "or running then goes on after the next start with the same --data. Bound to another address "
+        "than loopback it asks for a bearer token: the variable COSIM_TOKEN, or else what DIR/token "
+        "holds, which is made at the first start.",
+    )
+    texts = {
+        "--host": ("HOST", "address to bind (default 127.0.0.1)"),
+        "--data": ("DIR", "where runs and uploads are kept (default ./cosim-data)"),
+        "--database": ("URL", "a database instead of DIR/service.sqlite"),
+        "--ray-address": ("A", "an existing cluster (default: a local one)"),
+    }
+    arguments.texts(serve, texts)
+    serve.add_argument(
+        "--port", type=_port, default=8000, metavar="PORT", help="default 8000; 0: any free one"
+    )
+    arguments.add(serve, "--workers", help="processes of runs (default: all cores)")
+    serve.add_argument("--engine", choices=("local", "ray"), default="local")
+    serve.set_defaults(work=work, host="127.0.0.1", data="cosim-data")
+
+
+def work(args: argparse.Namespace) -> int:
+    """Serve until it is ended. Raises BadInput before it listens."""
+    try:
+        import uvicorn  # noqa: F401
+
+        from cosim.service.serving import serve
+    except ModuleNotFoundError as error:
+        problem = f"needs the package {error.name}: pip install 'cosim-sumo[service]'"
+        raise BadInput(problem, field="serve") from None
+    if args.engine == "local" and args.ray_address is not None:
+        raise BadInput("goes with --engine ray", field="--ray-address", value=args.ray_address)
+    given = {name: getattr(args, name) for name in ("host", "port", "database", "workers", "engine")}
+    return serve(args.data, ray_address=args.ray_address, said=sys.stderr, **given)
+
+
+def _port(text: str) -> int:
+    try:
+        port = int(text)
+    except ValueError:
+        port = -1
+    if not 0 <= port < 65536:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a port from 0 to 65535")
+    return port

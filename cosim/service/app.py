@@ -1,0 +1,170 @@
+"""The server's application: its parts, its routes, and one form for whatever goes wrong."""
+
+import contextlib
+import logging
+from collections.abc import AsyncIterator
+from typing import Any
+
+from fastapi import APIRouter, FastAPI, Request, Response
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from starlette.exceptions import HTTPException
+
+import sumo_scenarios
+from cosim import __version__
+from cosim.errors import BadInput, CosimError, hint
+from cosim.policies import NAMES
+from cosim.rewards import REWARDS
+from cosim.scenario import BEHAVIORS, load
+from cosim.scenario.sumo_outputs import OUTPUTS
+from cosim.service import landlock
+from cosim.service.clerk import Clerks
+from cosim.service.documents import Catalogue, Health, Problem, World
+from cosim.service.gate import Gate
+from cosim.service.jobs import Jobs
+from cosim.service.monitor import Figures
+from cosim.service.problems import Refused
+from cosim.service.requests import RunRequest
+from cosim.service.routes_runs import runs_router
+from cosim.service.routes_sessions import sessions_router
+from cosim.service.routes_uploads import uploads_router
+from cosim.service.runs import Runs, shown
+from cosim.service.sessions import Sessions
+from cosim.service.settings import Settings
+from cosim.service.uploads import Uploads
+from cosim.types import Preset
+
+log = logging.getLogger("cosim.service")
+ABOUT = """Co-simulate altruistic cooperative driving on SUMO: submit runs of many episodes and read their
+results, or drive step by step in a session."""
+
+
+def create(settings: Settings) -> FastAPI:
+    """The application. Raises BadInput: the database cannot be reached, Ray is not installed."""
+    uploads = Uploads(settings)
+    jobs = Jobs(settings.jobs_url)
+    limits = settings.limits
+    clerks = Clerks(settings.runs, settings.database, limits.cells, limits.check)
+    runs = Runs(settings, jobs, clerks, lambda number: figures.episodes.inc(number))
+    sessions = Sessions(settings, clerks, lambda seconds: figures.steps.observe(seconds))
+    pool = runs.pool
+    figures = Figures(
+        {
+            "cosim_runs": ("runs by status", "status", jobs.counts),
+            "cosim_sessions": ("sessions", "state", lambda: {"open": sessions.number}),
+            "cosim_workers": (
+                "processes of runs",
+                "state",
+                lambda: {} if pool is None else {"busy": pool.busy, "idle": pool.workers - pool.busy},
+            ),
+        }
+    )
+
+    @contextlib.asynccontextmanager
+    async def life(_: FastAPI) -> AsyncIterator[None]:
+        runs.start()
+        sessions.start()
+        log.info("ready", extra={"host": settings.host, "port": settings.port, "data": str(settings.data)})
+        yield
+        sessions.close()
+        runs.close()
+        clerks.close()
+        jobs.close()
+        log.info("ended")
+
+    wrong: dict[int | str, dict[str, Any]] = {
+        code: {"model": Problem, "description": about}
+        for code, about in {
+            400: "not a request",
+            401: "no token, or another one",
+            403: "from another origin, or not taken by this server",
+            404: "nothing of that id",
+            405: "not a method of this path",
+            409: "not in the state that it needs",
+            413: "too large",
+            422: "bad input: field and value are named",
+            429: "the server is at its limit",
+        }.items()
+    }
+    # no pages of documentation: they would fetch their code from elsewhere
+    app = FastAPI(
+        title="cosim", version=__version__, description=ABOUT, docs_url=None, redoc_url=None,
+        lifespan=life, responses=wrong,
+    )  # fmt: skip
+    app.state.runs = runs
+    _answer_problems(app, settings)
+    app.include_router(_about(figures))
+    app.include_router(runs_router(runs, uploads))
+    app.include_router(uploads_router(uploads, runs, settings))
+    app.include_router(sessions_router(sessions, uploads))
+    app.add_middleware(Gate, settings=settings, figures=figures)
+    return app
+
+
+def _answer_problems(app: FastAPI, settings: Settings) -> None:
+    """Whatever is raised becomes a `Problem`."""
+
+    def answer(
+        status: int, problem: str, field: str | None = None, value: Any = None, file: Any = None
+    ) -> Response:
+        document = {"problem": problem, "field": field, "value": value, "file": file}
+        return JSONResponse(document, status)
+
+    @app.exception_handler(CosimError)
+    def ours(_: Request, error: CosimError) -> Response:
+        if isinstance(error, Refused):
+            return answer(error.status, str(error))
+        if isinstance(error, BadInput):
+            e = shown(error, settings)
+            value = e.value if isinstance(e.value, str | int | float | bool | None) else repr(e.value)
+            return answer(422, e.problem, e.field, value, e.file)
+        log.error("a request failed", extra={"error": str(error)})
+        return answer(500, str(error))
+
+    @app.exception_handler(RequestValidationError)
+    def malformed(_: Request, error: RequestValidationError) -> Response:
+        first = error.errors()[0]
+        place = [str(part) for part in first["loc"] if part not in ("body", "query", "path", "header")]
+        problem, value = str(first["msg"]), first.get("input")
+        if first["type"] == "json_invalid":
+            problem, place = f"not JSON: {first['ctx']['error']} at character {place[-1]}", []
+        elif first["type"] == "extra_forbidden":
+            problem = f"unknown field{hint(place[-1], RunRequest.model_fields)}"
+        plain = value if isinstance(value, str | int | bool | None) else None
+        return answer(422, problem, ".".join(place) or None, plain)
+
+    @app.exception_handler(HTTPException)
+    def http(_: Request, error: HTTPException) -> Response:
+        found = answer(error.status_code, str(error.detail))
+        found.headers.update(error.headers or {})
+        return found
+
+
+def _about(figures: Figures) -> APIRouter:
+    """What the server is and has."""
+    router = APIRouter(tags=["server"])
+
+    @router.get("/health", summary="Does the server answer?")
+    def health() -> Health:
+        return Health(status="ok", version=__version__, uploads=landlock.version() > 0)
+
+    @router.get("/metrics", summary="Figures in Prometheus' format", response_class=Response)
+    def metrics() -> Response:
+        return Response(figures.text(), media_type="text/plain; version=0.0.4; charset=utf-8")
+
+    @router.get("/api/catalogue", summary="Worlds, policies and words that a run can name")
+    def catalogue() -> Catalogue:
+        worlds = [load(name) for name in sumo_scenarios.names()]
+        return Catalogue(
+            scenarios=[
+                World(name=w.name, title=w.title, demands=[*(w.demands or {})], duration_s=w.duration)
+                for w in worlds
+            ],
+            policies=[*NAMES],
+            behaviors=[*BEHAVIORS],
+            presets=[*Preset.ALL],
+            outputs=[*OUTPUTS],
+            rewards=[*REWARDS],
+        )
+
+    return router

@@ -1,0 +1,102 @@
+"""Unpack a zip file that somebody sent: regular files with plain names, counted while written."""
+
+import gzip
+import stat
+import zipfile
+import zlib
+from pathlib import Path, PurePosixPath
+from typing import IO
+
+from cosim.errors import BadInput
+from cosim.service.settings import MB, Limits
+
+CHUNK = 1 << 18  # bytes
+LONGEST, DEEPEST = 200, 8  # characters of a name, folders in it
+_PLAIN = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_ENCRYPTED = 1  # a bit of an entry's flags
+
+
+def unpack(archive: Path, folder: Path, suffixes: tuple[str, ...], limits: Limits) -> list[Path]:
+    """Write the files of `archive` below `folder`, which is there and empty; their paths, sorted.
+
+    Only files whose names end with one of `suffixes` are taken. What a .gz holds is counted too, unpacked.
+
+    Raises:
+        BadInput: no zip file; a name that leads elsewhere, is there twice or of another kind; links, devices,
+            encryption; more files, more bytes or deeper folders than `limits` say.
+    """
+    try:
+        with zipfile.ZipFile(archive) as found:
+            entries = [entry for entry in found.infolist() if not entry.is_dir()]
+            if len(found.infolist()) > limits.files:
+                problem = f"{len(found.infolist())} entries are more than {limits.files}"
+                raise BadInput(problem, field="archive")
+            if sum(entry.file_size for entry in entries) > limits.unpacked:
+                raise _too_much(limits)
+            names = [_name(entry, suffixes) for entry in entries]
+            left = limits.unpacked
+            paths = []
+            for entry, name in zip(entries, names, strict=True):
+                path = folder / name
+                if path.exists():
+                    raise BadInput("is there twice", field="archive", value=name)
+                path.parent.mkdir(parents=True, exist_ok=True)
+                with found.open(entry) as source, path.open("xb") as target:
+                    left -= _copied(source, target, left, limits)
+                if name.endswith(".gz"):
+                    left -= _unpacked_size(path, name, left, limits)
+                paths.append(path)
+            return sorted(paths)
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, UnicodeError) as error:
+        raise BadInput(f"is no zip file that can be read: {error}", field="archive") from None
+    except OSError as error:
+        raise BadInput(f"cannot be unpacked: {error.strerror or error}", field="archive") from None
+
+
+def _name(entry: zipfile.ZipInfo, suffixes: tuple[str, ...]) -> str:
+    """The name of an entry that may be unpacked."""
+    name = entry.filename
+    path = PurePosixPath(name)
+    mode = entry.external_attr >> 16
+    problem = ""
+    if len(name) > LONGEST or len(path.parts) > DEEPEST:
+        problem = f"a name has at most {LONGEST} characters and {DEEPEST} parts"
+    elif not name.isprintable() or "\\" in name or ":" in name or "\0" in entry.orig_filename:
+        problem = "a name may not hold this"
+    elif path.is_absolute() or ".." in path.parts or str(path) != name or name.startswith("."):
+        problem = "a name must lead below the archive's own folder"
+    elif stat.S_IFMT(mode) not in (0, stat.S_IFREG):
+        problem = "is no regular file"
+    elif entry.flag_bits & _ENCRYPTED:
+        problem = "is encrypted"
+    elif entry.compress_type not in _PLAIN:
+        problem = "is packed otherwise than stored or deflated"
+    elif not name.endswith(suffixes):
+        problem = f"is not one of {', '.join(suffixes)}"
+    if problem:
+        raise BadInput(problem, field="archive", value=name[:LONGEST])
+    return name
+
+
+def _copied(source: IO[bytes], target: IO[bytes] | None, most: int, limits: Limits) -> int:
+    """How many bytes were copied. Raises BadInput behind `most`, whatever the archive says of its sizes."""
+    total = 0
+    while chunk := source.read(CHUNK):
+        total += len(chunk)
+        if total > most:
+            raise _too_much(limits)
+        if target is not None:
+            target.write(chunk)
+    return total
+
+
+def _unpacked_size(path: Path, name: str, most: int, limits: Limits) -> int:
+    try:
+        with gzip.open(path) as packed:
+            return _copied(packed, None, most, limits)
+    except (OSError, EOFError, zlib.error) as error:
+        raise BadInput(f"broken gzip file: {error}", field="archive", value=name) from None
+
+
+def _too_much(limits: Limits) -> BadInput:
+    return BadInput(f"unpacks to more than {limits.unpacked // MB} MB", field="archive")

@@ -1,0 +1,107 @@
+"""Checks, tables and reports, in processes of their own: no request keeps the server from answering."""
+
+from __future__ import annotations
+
+import os
+import queue
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from cosim.batch import execution, matrix, spec
+from cosim.batch.matrix import Plan
+from cosim.batch.store import Store
+from cosim.errors import BadInput, SimulationTimeout
+from cosim.policies import check
+from cosim.scenario import Scenario
+from cosim.scenario.episode_id import EpisodeId
+from cosim.scenario.vet import vetted
+from cosim.workers.worker import Worker
+
+
+class Clerk:
+    """Hosted in a process whose working folder is that of the runs; the reports are imported when needed."""
+
+    def __init__(self, runs: str, database: str | None, cells: int) -> None:
+        os.chdir(runs)
+        self._database, self._cells = database, cells
+
+    def spec(self, flags: Mapping[str, Any]) -> Plan:
+        """The plan of a request. Raises BadInput, as `cosim evaluate` does."""
+        wanted = spec.read(None, flags)
+        seeds = range(*wanted.seeds)
+        if (cells := wanted.episodes // len(seeds)) > self._cells:
+            problem = f"{cells} cells are more than {self._cells}: ask for several runs"
+            raise BadInput(problem, field="scenario")
+        found = matrix.plan([*matrix.cells(wanted)], seeds, check)
+        matrix.check_names(found)
+        for cell in found.cells:
+            if cell.refused:
+                raise BadInput(cell.refused, field="scenario")
+        return found
+
+    def plan(self, cases: Sequence[EpisodeId], seeds: range) -> Plan:
+        """The plan of a run that was begun."""
+        return matrix.plan(cases, seeds, check)
+
+    def session(self, flags: Mapping[str, Any]) -> tuple[Scenario, EpisodeId]:
+        """What a session is opened on. Raises BadInput, as `cosim run` does."""
+        (case,) = matrix.cells(spec.read(None, flags))
+        check(case.policy)
+        return vetted(case.scenario()), case
+
+    def finish(self, run: str, plan: Plan) -> None:
+        """Write the tables, the manifest and the summary of a run."""
+        from cosim.report import run_folder
+
+        folder = Path.cwd() / run
+        with Store.in_folder(folder, self._database) as store:
+            run_folder.export(folder, store.rows(), execution.manifest(plan, store), plan.episodes)
+
+    def report(self, run: str) -> None:
+        """Write the report of a run that has its tables."""
+        from cosim.report import html, run_folder  # matplotlib: a second
+
+        html.write(run_folder.read(run), None, shown=run)
+
+    def compare(self, a: str, b: str, fail_on: Sequence[str], across: Sequence[str]) -> dict[str, Any]:
+        """What `cosim compare --json` prints; `a`, `b`: RUN or RUN:POLICY."""
+        from cosim.report import verdict
+        from cosim.report.compare import compare
+        from cosim.report.pairing import side
+
+        return verdict.document(compare(side(a), side(b), fail_on, across=across))
+
+
+class Clerks:
+    """`number` processes that each host a `Clerk`; `call` waits for a free one.
+
+    Raises BadInput: what was asked for takes longer than `limit` s, or what the method raises.
+    """
+
+    def __init__(self, runs: Path, database: str | None, cells: int, limit: float, number: int = 2) -> None:
+        self._arguments = str(runs), database, cells
+        self._limit = limit
+        self._free: queue.Queue[Worker | None] = queue.Queue()
+        for _ in range(number):
+            self._free.put(None)
+        self._number = number
+
+    def call(self, method: str, *arguments: Any) -> Any:
+        """One method of a `Clerk`."""
+        worker = self._free.get()
+        try:
+            if worker is None or worker.pid is None:
+                worker = Worker(Clerk, *self._arguments, timeout=self._limit, name="cosim-clerk")
+            return worker.call(method, *arguments)
+        except SimulationTimeout:
+            raise BadInput(f"takes more than {self._limit:g} s to work out") from None
+        finally:
+            self._free.put(worker)
+
+    def close(self) -> None:
+        """End the processes."""
+        for _ in range(self._number):
+            worker = self._free.get()
+            if worker is not None:
+                worker.close()

@@ -1,0 +1,194 @@
+"""What runs uploads: a process that reads its upload and our code, writes its own folder, and has limits.
+
+Nothing of the simulation is imported before the process is confined: numba settles on its cache when it is
+imported, and gets a copy of its own, which nobody else ever reads.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib.util
+import os
+import resource
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cosim.errors import BadInput
+from cosim.service import landlock
+from cosim.service.settings import Limits, Settings
+
+if TYPE_CHECKING:
+    from cosim.envs.host import SessionHost
+    from cosim.scenario.episode_id import EpisodeId
+    from cosim.workers.tasks import Progress
+
+OPEN_FILES = 512
+_SYSTEM = ("/usr", "/lib", "/lib64", "/etc", "/proc", "/sys", "/dev")
+_DEVICES = ("/dev/null", "/dev/zero")
+_PACKAGES = ("cosim", "policy", "sumo_scenarios")
+_NUMBA = "NUMBA_CACHE_DIR"
+
+
+@dataclass(frozen=True, slots=True)
+class Room:
+    """What a confined process may touch, and how much it may use."""
+
+    scratch: str  # a folder for its own temporary files; whoever confines it removes it
+    reads: tuple[str, ...] = ()  # beside the system's folders and those that Python imports from
+    writes: tuple[str, ...] = ()
+    limits: Limits = Limits()
+
+    def enter(self) -> None:
+        """Confine this process, for good. Raises CosimError without Landlock."""
+        scratch = tempfile.tempdir = tempfile.mkdtemp(dir=self.scratch)
+        packages = [_folder(name) for name in _PACKAGES]
+        _own_numba_cache(Path(scratch, "numba"), packages)
+        for name in ("MPLCONFIGDIR", "TORCHINDUCTOR_CACHE_DIR"):
+            os.environ[name] = scratch
+        os.chdir(scratch)
+        for limit, most in (
+            (resource.RLIMIT_AS, self.limits.memory),
+            (resource.RLIMIT_FSIZE, self.limits.file),
+            (resource.RLIMIT_CORE, 0),
+            (resource.RLIMIT_NOFILE, OPEN_FILES),
+        ):
+            hard = resource.getrlimit(limit)[1]
+            most = most if hard == resource.RLIM_INFINITY else min(most, hard)
+            resource.setrlimit(limit, (most, most))
+        python = [Path(path) for path in (sys.prefix, sys.base_prefix) if path != "/"]
+        imports = [Path(path) for path in sys.path if os.path.isabs(path)]
+        installed = [path for path in imports if path.name in ("site-packages", "dist-packages")]
+        versions = [found for path in imports for found in path.glob("*.egg-info")]
+        landlock.restrict(
+            [*map(Path, (*_SYSTEM, *self.reads)), *python, *installed, *versions, *packages],
+            [Path(scratch), *map(Path, (*_DEVICES, *self.writes))],
+            imports,
+        )
+
+
+@contextlib.contextmanager
+def room(settings: Settings, uploads: Sequence[str], *writes: Path) -> Iterator[Room | None]:
+    """The room of what uses these uploads, its scratch folder removed afterwards; None without uploads."""
+    if not uploads:
+        yield None
+        return
+    scratch = tempfile.mkdtemp(dir=settings.scratch)
+    reads = tuple(str(settings.uploads / upload) for upload in uploads)
+    try:
+        yield Room(scratch, reads, tuple(map(str, writes)), settings.limits)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def allow_processor_time(seconds: float) -> None:
+    """So many s more of it; then the kernel ends the process (SIGXCPU)."""
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    soft = int(used.ru_utime + used.ru_stime + seconds) + 1
+    resource.setrlimit(resource.RLIMIT_CPU, (soft, resource.getrlimit(resource.RLIMIT_CPU)[1]))
+
+
+class ConfinedRunner:
+    """An `EpisodeRunner` in a confined process."""
+
+    def __init__(self, room: Room) -> None:
+        self._limits = room.limits
+        room.enter()
+        from cosim.batch.episode_runner import EpisodeRunner
+
+        self._runner = EpisodeRunner()
+
+    def run(
+        self, case: EpisodeId, warnings: tuple[str, ...], outputs: str | None, progress: Progress
+    ) -> dict[str, Any]:
+        """One episode, as `EpisodeRunner.run`."""
+        allow_processor_time(self._limits.cpu)
+        with _memory_is_limited():
+            return self._runner.run(case, warnings, outputs, progress)
+
+    def close(self) -> None:
+        """End the simulation."""
+        self._runner.close()
+
+
+class Examiner:
+    """Looks at an upload in a confined process: whatever happens there, the server goes on."""
+
+    def __init__(self, room: Room) -> None:
+        room.enter()
+        allow_processor_time(room.limits.check)
+
+    def scenario(self, config: str) -> dict[str, Any]:
+        """What a .sumocfg holds. Raises BadInput as `cosim.scenario.vet.vet`, and what SUMO refuses."""
+        from cosim.host import sumo
+        from cosim.scenario import load
+        from cosim.scenario.vet import vet
+
+        scenario = load(config)
+        report = vet(scenario)
+        with _memory_is_limited():
+            sumo(scenario, {}, 1).close()  # a net that kills SUMO kills it here
+        return {
+            "edges": report.edges,
+            "vehicles": report.vehicles,
+            "flows": report.flows,
+            "duration_s": scenario.duration,
+            "warnings": list(report.warnings),
+            "options_not_passed_on": list(scenario.ignored),
+        }
+
+    def policy(self, weights: str) -> dict[str, Any]:
+        """What agent the weights are of. Raises BadInput where they do not fit their card."""
+        from cosim.policies import make
+
+        with _memory_is_limited():
+            policy = make(f"upload={weights}")
+        return {"approach": type(policy).__name__, "label": policy.label}
+
+
+def confined_host(room: Room, *arguments: Any) -> SessionHost:
+    """The host of a session in a confined process; `arguments` are those of `build_host`."""
+    room.enter()
+    allow_processor_time(room.limits.cpu)
+    from cosim.envs.session import build_host
+
+    return build_host(*arguments)
+
+
+class _memory_is_limited:
+    """A MemoryError of the block is the upload's fault."""
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: object, error: object, _: object) -> None:
+        if isinstance(error, MemoryError) or "can't allocate memory" in str(error):
+            raise BadInput("needs more memory than an upload is given") from None
+
+
+def _folder(package: str) -> Path:
+    """Where a package stands, found without importing it."""
+    spec = importlib.util.find_spec(package)
+    assert spec is not None and spec.origin is not None, package  # noqa: PT018
+    return Path(spec.origin).parent
+
+
+def _own_numba_cache(target: Path, packages: Iterable[Path]) -> None:
+    """Copy the compiled kernels to where this process may write: numba reads no other cache."""
+    given = os.environ.get(_NUMBA)
+    os.environ[_NUMBA] = str(target)
+    if given:
+        if Path(given).is_dir():
+            shutil.copytree(given, target, copy_function=shutil.copyfile)
+        return
+    for package in packages:
+        for kernel in package.rglob("__pycache__/*.nb[ic]"):
+            source = str(kernel.parents[1])  # the folder's name in a given cache is numba's own:
+            name = f"{kernel.parents[1].name}_{hashlib.sha1(source.encode()).hexdigest()}"
+            (target / name).mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(kernel, target / name / kernel.name)

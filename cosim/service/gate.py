@@ -1,0 +1,133 @@
+"""What every request passes first: who may ask, how much may be sent; counted and logged when answered."""
+
+from __future__ import annotations
+
+import hmac
+import json
+import logging
+import time
+from collections.abc import Awaitable, Callable, MutableMapping
+from typing import Any
+from urllib.parse import urlsplit
+
+from starlette.exceptions import HTTPException
+
+from cosim.service.monitor import Figures
+from cosim.service.settings import Settings, is_loopback
+
+Scope = MutableMapping[str, Any]
+Message = MutableMapping[str, Any]
+Receive = Callable[[], Awaitable[Message]]
+Send = Callable[[Message], Awaitable[None]]
+App = Callable[[Scope, Receive, Send], Awaitable[None]]
+
+OPEN = ("/health",)  # needs no token
+UPLOADS = "/api/uploads"
+HEADERS = (
+    (b"x-content-type-options", b"nosniff"),
+    (b"referrer-policy", b"no-referrer"),
+    (b"x-frame-options", b"SAMEORIGIN"),
+)
+log = logging.getLogger("cosim.service.http")
+
+
+class Gate:
+    """ASGI middleware. A browser is served from the server's own origin only; without a token, under this
+    machine's own names only, so that no page elsewhere reaches the server through somebody's browser."""
+
+    def __init__(self, app: App, settings: Settings, figures: Figures) -> None:
+        self._app, self._settings, self._figures = app, settings, figures
+        self._token = None if settings.token is None else settings.token.encode()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "lifespan":
+            await self._app(scope, receive, send)
+            return
+        began = time.perf_counter()
+        status = 0
+        headers = {name.lower(): value for name, value in scope["headers"]}
+
+        async def answered(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+                message["headers"] = [*message.get("headers", ()), *HEADERS]
+            await send(message)
+
+        refused = self._refused(scope, headers)
+        if refused is not None:
+            await _refuse(scope, answered, *refused)
+        elif scope["type"] == "websocket":
+            await self._app(scope, receive, send)
+        else:
+            most = self._most(scope["path"])
+            try:
+                length = int(headers.get(b"content-length", b"0"))
+            except ValueError:
+                length = -1
+            if not 0 <= length <= most:
+                problem = f"at most {most} bytes are taken" if length > 0 else "content-length: no number"
+                await _refuse(scope, answered, 413 if length > 0 else 400, problem)
+            else:
+                await self._app(scope, _limited(receive, most), answered)
+        self._note(scope, status, time.perf_counter() - began)
+
+    def _refused(self, scope: Scope, headers: dict[bytes, bytes]) -> tuple[int, str] | None:
+        """The status and why; None when the request may pass."""
+        host = headers.get(b"host", b"").decode("latin-1")
+        origin = headers.get(b"origin")
+        if origin is not None and urlsplit(origin.decode("latin-1")).netloc != host:
+            return 403, "requests from pages of another origin are refused"
+        if self._token is None:
+            try:
+                name = urlsplit(f"//{host}").hostname or ""
+            except ValueError:
+                name = ""
+            if not is_loopback(name):
+                return 403, "without a token the server is asked by this machine's own names only"
+        elif scope["path"] not in OPEN:
+            scheme, _, given = headers.get(b"authorization", b"").partition(b" ")
+            if scheme.lower() != b"bearer" or not hmac.compare_digest(given.strip(), self._token):
+                return 401, "a bearer token is needed"
+        return None
+
+    def _most(self, path: str) -> int:
+        limits = self._settings.limits
+        return limits.upload if path.startswith(UPLOADS) else limits.body
+
+    def _note(self, scope: Scope, status: int, seconds: float) -> None:
+        route = getattr(scope.get("route"), "path", "none")  # the pattern: an id makes no figure of its own
+        method = scope.get("method", "WEBSOCKET")
+        known = method if method in ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS") else "other"
+        self._figures.requests.labels(known, route, str(status)).inc()
+        self._figures.seconds.labels(known, route).observe(seconds)
+        level = logging.DEBUG if route in ("/health", "/metrics") or "/sessions/" in route else logging.INFO
+        fields = {"method": known, "path": scope["path"], "status": status, "seconds": round(seconds, 6)}
+        log.log(level, "request", extra=fields)
+
+
+def _limited(receive: Receive, most: int) -> Receive:
+    """`receive`, which raises HTTPException (413) behind `most` bytes."""
+    got = 0
+
+    async def limited() -> Message:
+        nonlocal got
+        message = await receive()
+        got += len(message.get("body", b""))
+        if got > most:
+            raise HTTPException(413, f"at most {most} bytes are taken")
+        return message
+
+    return limited
+
+
+async def _refuse(scope: Scope, send: Send, status: int, problem: str) -> None:
+    if scope["type"] == "websocket":
+        await send({"type": "websocket.close", "code": 1008, "reason": problem})
+        return
+    body = json.dumps({"problem": problem, "field": None, "value": None, "file": None}).encode()
+    headers = [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode())]
+    if status == 401:
+        headers.append((b"www-authenticate", b"Bearer"))
+    await send({"type": "http.response.start", "status": status, "headers": headers})
+    await send({"type": "http.response.body", "body": body})

@@ -1,0 +1,12 @@
+"""Ids of runs, uploads and sessions."""
+
+import re
+import secrets
+
+PATTERN = "^[0-9a-f]{12}$"
+ID = re.compile(PATTERN)
+
+
+def new_id() -> str:
+    """A fresh one, which nobody guesses."""
+    return secrets.token_hex(6)

@@ -1,0 +1,27 @@
+"""What a request can meet beside bad input, each with its HTTP status."""
+
+from cosim.errors import CosimError
+
+
+class Refused(CosimError):
+    """A request that is not carried out, for a reason that is no fault of the server's."""
+
+    status = 400
+
+
+class NotFound(Refused):
+    """There is nothing of that id or name."""
+
+    status = 404
+
+
+class Conflict(Refused):
+    """It is not in the state that the request needs."""
+
+    status = 409
+
+
+class Unavailable(Refused):
+    """The server is at its limit: later it will do."""
+
+    status = 429

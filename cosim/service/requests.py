@@ -1,0 +1,226 @@
+"""What a run is asked for with: the fields of `cosim evaluate`'s Spec, safe names only, into its flags."""
+
+import math
+import re
+import typing
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictInt, WithJsonSchema, create_model
+
+import sumo_scenarios
+from cosim.batch.spec import FIELDS, Spec
+from cosim.errors import BadInput, hint
+from cosim.policies import NAMES as POLICIES
+from cosim.rewards import REWARDS
+from cosim.scenario import BEHAVIORS
+from cosim.scenario.behaviors import DRIVER_MODELS
+from cosim.scenario.sumo_outputs import OUTPUTS
+from cosim.types import OnCollision, Preset
+
+UPLOAD = "upload:"  # before an upload's id, where a scenario or a policy is named
+LONGEST = 1000  # characters of a text, items of a list
+_NAME = re.compile(r"[\w+-]+(\.[\w+-]+)*", re.ASCII)
+_FILE = re.compile(r".*\.(ya?ml|json|xml|gz|py|safetensors|sumocfg)", re.IGNORECASE)
+_FREE = ("seeds", "mission", "av_type", "av_ids")  # texts that name no file whatever they hold
+_LABEL = re.compile(r"(?:([\w.+-]+)=)?upload:([0-9a-f]{12})", re.ASCII)
+Find = Callable[[str, str], Path]  # an upload's id, what it must be -> its file; raises BadInput
+_ALLOWED: dict[str, Iterable[str]] = {
+    "reward": REWARDS,
+    "behavior": BEHAVIORS,
+    "driver_model": DRIVER_MODELS,
+    "preset": Preset.ALL,
+    "on_collision": OnCollision.ALL,
+    "output": OUTPUTS,
+}
+_ABOUT = {
+    "scenario": f"worlds by name ({', '.join(sumo_scenarios.names())}), or upload:ID",
+    "seeds": "a:b, the seeds a, a+1, ... b-1",
+    "demand": "by name (free, dense, contested), or files of the upload; A,B is one demand of two files",
+    "policy": f"by name ({', '.join(POLICIES)}), upload:ID or LABEL=upload:ID",
+    "svo": "degrees, 0 to 90",
+    "penetration": "share of vehicles that are AVs, 0 to 1",
+    "duration": "counted s per episode",
+    "warmup": "s driven before the counted time begins",
+    "mission": "the mission vehicle: its id, a pattern of ids, none, or auto",
+    "output": "SUMO's own outputs to keep, by SUMO's names",
+    "metric": "refused: code is not taken over HTTP",
+}
+EXAMPLE: dict[str, Any] = {
+    "name": "two policies on the contested merge",
+    "scenario": "merge",
+    "demand": "contested",
+    "policy": ["idm", "altruist-rule"],
+    "svo": 45,
+    "seeds": "200000:200010",
+}
+
+
+def _schema(name: str, kind: Any) -> dict[str, Any]:
+    """A field's JSON schema: of an axis one value or a list; `cosim.batch.spec` checks the values."""
+    kinds = typing.get_args(kind) if typing.get_origin(kind) is tuple else (kind,)
+    number = any("float" in str(k) for k in kinds)
+    one: dict[str, Any] = {"type": "number"} if number else {"type": "string", "minLength": 1}
+    if name in _ALLOWED:
+        one["enum"] = [*_ALLOWED[name]]
+    if name == "seeds":
+        return {"type": "string", "pattern": r"^[0-9]{1,19}:[0-9]{1,19}$", "examples": [EXAMPLE["seeds"]]}
+    if typing.get_origin(kind) is not tuple:
+        return {"anyOf": [one, {"type": "null"}]}
+    return {"anyOf": [one, {"type": "array", "items": one, "minItems": 1}]}
+
+
+_kinds = typing.get_type_hints(Spec, include_extras=True)
+_fields: dict[str, Any] = {
+    name: (
+        Annotated[Any, WithJsonSchema(_schema(name, _kinds[name]))],
+        Field(default=... if name == "scenario" else None, description=_ABOUT.get(name)),
+    )
+    for name in FIELDS
+}
+
+
+class _Base(BaseModel):
+    model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [EXAMPLE]})
+
+    name: Annotated[str, Field(max_length=200, description="what lists call it")] = ""
+
+
+if TYPE_CHECKING:
+    RunRequest = _Base
+else:
+    RunRequest = create_model("RunRequest", __base__=_Base, **_fields)
+    RunRequest.__doc__ = "The matrix of a run: the fields of `cosim evaluate`, by the same names and rules."
+
+
+# A session has one value of each axis; its seeds, reward and outputs are its own.
+_ONE = {
+    name: (Annotated[Any, WithJsonSchema(_schema(name, _kinds[name])["anyOf"][0])], field)
+    for name, (_, field) in _fields.items()
+    if name not in ("seeds", "reward", "output", "metric")
+}
+SESSION_EXAMPLE: dict[str, Any] = {"scenario": "merge", "demand": "contested", "svo": 45, "policy": "idm"}
+
+
+class _Session(BaseModel):
+    model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [SESSION_EXAMPLE]})
+
+    seed: StrictInt | None = Field(None, ge=0, lt=2**62, description="of the first episode")
+    reward: Literal[tuple(REWARDS)] = Field("p", description="what AVs are paid")  # type: ignore[valid-type]
+    maps: StrictBool = Field(True, description="whether VelocityMaps are drawn")
+    idle_s: float | None = Field(
+        None, gt=0.0, le=1e6, allow_inf_nan=False, description="ends by itself after so long"
+    )
+
+
+if TYPE_CHECKING:
+    SessionRequest = _Session
+else:
+    SessionRequest = create_model("SessionRequest", __base__=_Session, **_ONE)
+    SessionRequest.__doc__ = "What a session drives; `policy` commands the AVs that the caller does not."
+
+
+def flags(
+    request: BaseModel, find: Find, leave: Iterable[str] = ("name",)
+) -> tuple[dict[str, Any], list[str]]:
+    """The flags of `cosim.batch.spec.read`, every file a file of an upload; and the uploads' ids.
+
+    `leave`: fields of the request that are no flags.
+
+    Raises BadInput: a path, code or a glob where a name is wanted, an upload that is not there.
+    """
+    given = request.model_dump(exclude_unset=True)
+    given = {name: value for name, value in given.items() if name not in leave}
+    plain(given)
+    uploads: list[str] = []
+    found = {name: _axis(name, value, find, uploads) for name, value in given.items()}
+    if "demand" in found:
+        found["demand"] = _demand(found["demand"], found.get("scenario"), uploads)
+    return found, list(dict.fromkeys(uploads))
+
+
+def plain(value: object, field: str = "", depth: int = 0) -> None:
+    """Raises BadInput for JSON that nobody means: NaN, endless numbers, texts or lists, NUL in a text."""
+    problem = ""
+    if isinstance(value, Mapping):
+        for name, item in value.items():
+            plain(item, str(name) if not depth else field, depth + 1)
+    elif isinstance(value, list):
+        problem = "" if 0 < len(value) <= LONGEST else f"a list of 1 to {LONGEST} is needed"
+        for item in value[:LONGEST]:
+            plain(item, field, depth + 1)
+    elif isinstance(value, str):
+        if len(value) > LONGEST:
+            problem = f"a text of at most {LONGEST} characters is taken"
+        elif not value.isprintable():
+            problem = "holds characters that cannot be printed"
+    elif isinstance(value, int | float) and not isinstance(value, bool):
+        problem = "" if abs(value) < 2.0**63 and math.isfinite(value) else "is out of range"
+    if depth > 4:
+        problem = "is nested too deeply"
+    if problem:
+        raise BadInput(problem, field=field, value=None if isinstance(value, list) else repr(value)[:100])
+
+
+def _axis(name: str, value: Any, find: Find, uploads: list[str]) -> Any:
+    """A field whose texts are safe to be read as flags."""
+    if name == "metric" and value is not None:
+        raise BadInput("code is not taken over HTTP", field=name, value=value)
+    if name in ("scenario", "policy"):
+        items = value if isinstance(value, list) else [value]
+        return [_named(name, item, find, uploads) for item in items]
+    if name in _ALLOWED:
+        for item in value if isinstance(value, list) else [value]:
+            if item is not None and item not in (known := [*_ALLOWED[name]]):
+                raise BadInput(f"unknown{hint(str(item), known)}", field=name, value=item)
+    if name not in _FREE and name != "demand":
+        for item in value if isinstance(value, list) else [value]:
+            if isinstance(item, str) and not _is_name(item):
+                raise BadInput("is no name: no file or code is read", field=name, value=item)
+    return value
+
+
+def _is_name(text: str) -> bool:
+    return _NAME.fullmatch(text) is not None and _FILE.fullmatch(text) is None
+
+
+def _named(name: str, item: Any, find: Find, uploads: list[str]) -> str:
+    """A world or a policy: its name, or the file of an upload."""
+    known = POLICIES if name == "policy" else sumo_scenarios.names()
+    if not isinstance(item, str):
+        raise BadInput("text is needed", field=name, value=item)
+    if item in known:
+        return item
+    upload = _LABEL.fullmatch(item)
+    if upload and (name == "policy" or not upload[1]):
+        uploads.append(upload[2])
+        file = find(upload[2], name)
+        return f"{upload[1] or file.stem}={file}" if name == "policy" else str(file)
+    if not _is_name(item):
+        raise BadInput("name one that ships, or upload:ID: no file or code is read", field=name, value=item)
+    raise BadInput(f"no such {name}{hint(item, known)}", field=name, value=item)
+
+
+def _demand(value: Any, scenario: Any, uploads: list[str]) -> list[str]:
+    """Names of demands as they are, files by their paths in the one upload that is the scenario."""
+    found = []
+    for item in value if isinstance(value, list) else [value]:
+        if not isinstance(item, str):
+            raise BadInput("text is needed", field="demand", value=item)
+        parts = [part.strip() for part in item.split(",")]
+        if all(map(_is_name, parts)):
+            found.append(item)
+            continue
+        if not (scenario and len(scenario) == 1 and uploads and uploads[0] in scenario[0]):
+            problem = "files are taken of an upload that is the only scenario"
+            raise BadInput(problem, field="demand", value=item)
+        folder = next(p for p in Path(scenario[0]).parents if p.name == uploads[0])
+        files = []
+        for part in parts:
+            inside = {str(p.relative_to(folder)): p for p in folder.rglob("*") if p.is_file()}
+            if part not in inside:
+                raise BadInput(f"no such file in the upload{hint(part, inside)}", field="demand", value=part)
+            files.append(str(inside[part]))
+        found.append(",".join(files))
+    return found

@@ -1,0 +1,334 @@
+"""The runs of a server: submitted, queued, driven a few at a time, cancelled, resumed by a restart."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import shutil
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import sumo_scenarios
+from cosim.batch import execution
+from cosim.batch.episode_runner import EpisodeRunner
+from cosim.batch.estimate import estimate
+from cosim.batch.folder import RunFolder
+from cosim.batch.matrix import Plan
+from cosim.batch.store import FILE, Store
+from cosim.errors import BadInput, CosimError
+from cosim.scenario.sumo_outputs import DRAFT
+from cosim.service.clerk import Clerks
+from cosim.service.confined import ConfinedRunner, Room, room
+from cosim.service.ids import ID, new_id
+from cosim.service.jobs import CANCELLED, FAILED, FINISHED, QUEUED, RUNNING, Job, Jobs, now
+from cosim.service.problems import Conflict, NotFound, Unavailable
+from cosim.service.settings import Settings
+from cosim.workers.engines import Engine, cores
+from cosim.workers.pool import Cancelled, Pool, PoolEngine
+from cosim.workers.ray_engine import RayEngine
+from cosim.workers.supervisor import Limits as WorkerLimits
+
+ACTIVE = 8  # runs that are driven at once on the processes of this machine
+REPORT, SUMMARY = "report.html", "summary.json"
+OUTPUTS = "outputs"  # the folder of SUMO's own
+log = logging.getLogger("cosim.service")
+
+
+class Drive:
+    """One run while it is driven."""
+
+    def __init__(self, episodes: int, done: int) -> None:
+        self.episodes, self.done = episodes, done
+        self.before = done  # driven by an earlier server
+        self.began = time.monotonic()
+        self.cancelled = threading.Event()
+        self.engine: Engine | None = None
+
+    def cancel(self) -> None:
+        """End it: at once on the processes of this machine, on Ray with its next episode."""
+        self.cancelled.set()
+        if isinstance(self.engine, PoolEngine):
+            self.engine.cancel()
+
+    def progress(self, done: int) -> None:
+        """`done` episodes of those that were left. Raises Cancelled."""
+        self.done = self.before + done
+        if self.cancelled.is_set():
+            raise Cancelled
+
+    @property
+    def running(self) -> dict[str, tuple[float, float]]:
+        """Episode -> simulated s so far, of s in all (0 of 0 while it starts)."""
+        return dict(self.engine.running) if isinstance(self.engine, PoolEngine) else {}
+
+    @property
+    def seconds_left(self) -> float | None:
+        """s of wall time at the rate so far; None while that is not known."""
+        driven = self.done - self.before
+        if not driven:
+            return None
+        return (time.monotonic() - self.began) / driven * (self.episodes - self.done)
+
+
+class Runs:
+    """Every run of the server; `count` is told how many episodes were driven.
+
+    `start` it once; `close` leaves what runs and waits to the next start.
+    """
+
+    def __init__(self, settings: Settings, jobs: Jobs, clerks: Clerks, count: Callable[[int], None]) -> None:
+        self._settings, self._jobs, self._clerks, self._count = settings, jobs, clerks, count
+        self._changed = threading.Condition()
+        self._queue: deque[str] = deque()
+        self._plans: dict[str, Plan] = {}  # of runs that wait, as they were checked
+        self._drives: dict[str, Drive] = {}
+        self._closed = False
+        self._threads: list[threading.Thread] = []
+        self.pool: Pool | None = None
+        if settings.engine == "local":
+            self.pool = Pool(settings.workers)
+        else:
+            self._engine()  # raises BadInput where Ray is not installed
+
+    def start(self) -> None:
+        """Go on with what an earlier server left, and take what comes."""
+        for job in self._jobs.open():
+            self._jobs.set(job.run, status=QUEUED)
+            self._queue.append(job.run)
+        if self._queue:
+            log.info("runs picked up", extra={"runs": len(self._queue)})
+        for k in range(ACTIVE if self.pool else 1):
+            thread = threading.Thread(target=self._work, name=f"cosim-run-{k}", daemon=True)
+            thread.start()
+            self._threads.append(thread)
+
+    def close(self) -> None:
+        """End what is driven: rows that are kept stay, the rest is driven after the next start."""
+        with self._changed:
+            self._closed = True
+            for drive in self._drives.values():
+                drive.cancel()
+            self._changed.notify_all()
+        if self.pool is not None:
+            self.pool.close()
+        for thread in self._threads:
+            thread.join(timeout=15.0)
+
+    # ---- what users ask ----
+
+    def submit(
+        self, name: str, request: dict[str, Any], flags: dict[str, Any], uploads: Sequence[str]
+    ) -> Job:
+        """Check a run and queue it. Raises BadInput, Unavailable when too many wait."""
+        if len(self._queue) >= self._settings.limits.queued:
+            raise Unavailable(f"{len(self._queue)} runs wait already: try again later")
+        plan: Plan = self._clerks.call("spec", flags)
+        run = new_id()
+        folder = self.folder(run)
+        try:
+            with RunFolder(str(folder), resume=False, episodes=plan.episodes), self._store(run) as store:
+                execution.begin(plan, store, {"command": "cosim serve", "began": now()})
+            job = self._jobs.add(run, name, request, uploads, plan.episodes)
+        except BaseException:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+        with self._changed:
+            self._plans[run] = plan
+            self._queue.append(run)
+            self._changed.notify()
+        log.info("run submitted", extra={"run": run, "episodes": plan.episodes})
+        return job
+
+    def estimate(self, flags: dict[str, Any], uploads: Sequence[str]) -> dict[str, Any]:
+        """How long a run would take on a server that does nothing else, from short episodes driven now."""
+        plan: Plan = self._clerks.call("spec", flags)
+        workers = self.pool.workers if self.pool else self._settings.workers or cores()
+        with room(self._settings, uploads) as confined:
+            seconds, basis = estimate(plan, self._engine(confined), workers)
+        return {"cells": len(plan.cells), "episodes": plan.episodes, "estimated_s": seconds, "basis": basis}
+
+    def get(self, run: str) -> Job:
+        """One run. Raises NotFound."""
+        job = self._jobs.get(run) if ID.fullmatch(run) else None
+        if job is None:
+            raise NotFound(f"no run {run!r}")
+        return job
+
+    def all(self, status: str | None = None) -> list[Job]:
+        """Every run (of one status), the newest first."""
+        return self._jobs.all(status)
+
+    def compare(self, a: str, b: str, fail_on: Sequence[str], across: Sequence[str]) -> dict[str, Any]:
+        """What `cosim compare --json` prints; `a`, `b`: RUN or RUN:POLICY. Raises BadInput."""
+        found: dict[str, Any] = self._clerks.call("compare", a, b, list(fail_on), list(across))
+        return found
+
+    def that_use(self, upload: str) -> str | None:
+        """A run that waits or is driven with this upload."""
+        return next((job.run for job in self._jobs.open() if upload in job.uploads), None)
+
+    def report(self, run: str) -> None:
+        """Write the report of a run that has finished, unless it is there."""
+        if SUMMARY in self.files(run) and REPORT not in self.files(run):
+            self._clerks.call("report", run)
+
+    def drive(self, run: str) -> Drive | None:
+        """What is known of a run that is driven now."""
+        return self._drives.get(run)
+
+    def place(self, run: str) -> int | None:
+        """How many wait before this one; None when it does not wait."""
+        with self._changed:
+            return self._queue.index(run) if run in self._queue else None
+
+    def cancel(self, run: str) -> Job:
+        """End a run; the rows that it has are kept. Raises Conflict when it has ended."""
+        self.get(run)
+        with self._changed:
+            if run in self._queue:
+                self._queue.remove(run)
+                self._plans.pop(run, None)
+                self._jobs.set(run, status=CANCELLED, ended=now())
+                return self.get(run)
+            drive = self._drives.get(run)
+        if drive is None:
+            raise Conflict(f"run {run} has ended: it is {self.get(run).status}")
+        drive.cancel()
+        deadline = time.monotonic() + 10.0
+        while run in self._drives and time.monotonic() < deadline:
+            time.sleep(0.01)
+        return self.get(run)
+
+    def remove(self, run: str) -> None:
+        """Forget a run and its files. Raises Conflict while it waits or is driven."""
+        job = self.get(run)
+        if job.status in (QUEUED, RUNNING):
+            raise Conflict(f"run {run} is {job.status}: cancel it first")
+        self._jobs.remove(run)
+        shutil.rmtree(self.folder(run), ignore_errors=True)
+
+    def rows(self, run: str) -> list[dict[str, Any]]:
+        """The rows so far, as `cosim evaluate` keeps them."""
+        self.get(run)
+        with self._store(run) as store:
+            return store.rows()
+
+    def files(self, run: str) -> dict[str, Path]:
+        """The files of a run by their names: those of `cosim evaluate`, and SUMO's own outputs."""
+        self.get(run)
+        folder = self.folder(run)
+        found = [*folder.glob("*.*"), *(folder / OUTPUTS).glob("*/*.xml")]
+        return {
+            str(path.relative_to(folder)): path
+            for path in sorted(found)
+            if path.is_file() and not path.is_symlink() and not path.name.startswith((FILE, "."))
+        }
+
+    def folder(self, run: str) -> Path:
+        """Where it keeps its files."""
+        return self._settings.runs / run
+
+    # ---- inside ----
+
+    def _store(self, run: str) -> Store:
+        return Store.in_folder(self.folder(run), self._settings.database)
+
+    def _engine(self, confined: Room | None = None) -> Engine:
+        """Of one run; in a room its processes are confined."""
+        factory: Callable[..., Any] = EpisodeRunner
+        arguments: tuple[Any, ...] = ()
+        if confined is not None:
+            factory, arguments = ConfinedRunner, (confined,)
+        once = None if confined is None else WorkerLimits(step=60.0, start=120.0, crashes=1)
+        if self.pool is not None:
+            return self.pool.engine(factory, arguments, limits=once)
+        settings = self._settings
+        return RayEngine(
+            factory, arguments, workers=settings.workers, limits=once, address=settings.ray_address
+        )
+
+    def _work(self) -> None:
+        """A thread: one run after the other."""
+        while True:
+            with self._changed:
+                while not self._queue and not self._closed:
+                    self._changed.wait()
+                if self._closed:
+                    return
+                run = self._queue.popleft()
+                plan = self._plans.pop(run, None)
+                job = self.get(run)
+                drive = self._drives[run] = Drive(job.episodes, 0)
+            try:
+                self._run(job, plan, drive)
+            except Exception:  # the database is gone
+                log.exception("run lost until the next start", extra={"run": run})
+            finally:
+                self._drives.pop(run, None)
+
+    def _run(self, job: Job, plan: Plan | None, drive: Drive) -> None:
+        """Drive one run and note what became of it."""
+        run = job.run
+        self._jobs.set(run, status=RUNNING, began=job.began or now())
+        log.info("run began", extra={"run": run})
+        status, error = FINISHED, None
+        try:
+            faults = self._episodes(job, plan, drive)
+            if faults:
+                status, error = FAILED, "\n".join(faults)
+        except Cancelled:
+            if self._closed:  # the next start goes on with it
+                return
+            status = CANCELLED
+        except CosimError as problem:
+            status, error = FAILED, str(problem)
+        except Exception as problem:
+            log.exception("a fault of the server's own", extra={"run": run})
+            status, error = FAILED, f"a fault of the server's own: {type(problem).__name__}"
+        for part in self.folder(run).glob(f"{OUTPUTS}/*/{DRAFT}"):
+            shutil.rmtree(part, ignore_errors=True)
+        self._jobs.set(run, status=status, error=error, ended=now(), done=drive.done)
+        seconds = round(time.monotonic() - drive.began, 3)
+        log.info("run ended", extra={"run": run, "status": status, "seconds": seconds})
+
+    def _episodes(self, job: Job, plan: Plan | None, drive: Drive) -> list[str]:
+        """Drive what is left of a run, write its tables and report; the faults of our own code."""
+        run, folder = job.run, self.folder(job.run)
+        if plan is None:
+            plan = self._clerks.call("plan", *execution.asked(folder, self._settings.database))
+        (folder / OUTPUTS).mkdir(exist_ok=True)
+        with RunFolder(str(folder), resume=True, episodes=0), self._store(run) as store:
+            execution.check_same(plan, store)
+            drive.before = drive.done = len(store.keys())
+
+            def progress(done: float, _: float) -> None:
+                self._count(drive.before + int(done) - drive.done)
+                drive.progress(int(done))
+
+            with room(self._settings, job.uploads, folder / OUTPUTS) as confined:
+                drive.engine = self._engine(confined)
+                drive.progress(0)
+                faults = execution.drive(plan, store, drive.engine, folder / OUTPUTS, progress)
+            drive.done = len(store.keys())
+        with contextlib.suppress(OSError):
+            (folder / OUTPUTS).rmdir()  # where no output was asked for
+        self._clerks.call("finish", run, plan)
+        return [f"{fault.key}: {fault.error}" for fault in faults]
+
+
+def shown(error: BadInput, settings: Settings) -> BadInput:
+    """The error without the server's own folders, and the field as the request has it."""
+    ours = (settings.uploads, settings.runs, settings.data, sumo_scenarios.ROOT)
+
+    def clean(text: object) -> Any:
+        for folder in ours if isinstance(text, str) else ():
+            text = str(text).replace(f"{folder}/", "")
+        return text
+
+    field = error.field and error.field.removeprefix("--").replace("-", "_")
+    file = None if error.file == "command line" else clean(error.file)
+    return BadInput(clean(error.problem), file=file, field=field, value=clean(error.value))

@@ -1,0 +1,63 @@
+"""Starts the application on a socket and ends it in order."""
+
+import socket
+from typing import Any, TextIO
+
+import uvicorn
+
+from cosim.errors import BadInput
+from cosim.files import cannot
+from cosim.service.app import create
+from cosim.service.monitor import log_json
+from cosim.service.settings import TOKEN, DataFolder, Settings
+
+KEEP_ALIVE = 120  # s: a driver may think for a while between two decisions
+
+
+def serve(data: str, *, host: str, port: int, said: TextIO, **settings: Any) -> int:
+    """Serve until Ctrl-C or SIGTERM; where to is told on `said` before.
+
+    Raises BadInput: folder, database or address cannot be used.
+    """
+    with DataFolder(data) as folder:
+        token, file = folder.token(host)
+        listening = _bind(host, port)
+        with listening:
+            port = listening.getsockname()[1]
+            app = create(Settings(folder.path, host=host, port=port, token=token, **settings))
+            log_json()
+            shown = f"[{host}]" if ":" in host else host
+            asks = (
+                "no token is asked for"
+                if token is None
+                else f"the token is in {file or 'the variable ' + TOKEN}"
+            )
+            print(f"cosim: http://{shown}:{port} ({asks})", file=said, flush=True)
+            config = uvicorn.Config(
+                app,
+                log_config=None,
+                access_log=False,
+                server_header=False,
+                timeout_keep_alive=KEEP_ALIVE,
+                timeout_graceful_shutdown=5,
+            )
+            uvicorn.Server(config).run(sockets=[listening])
+    return 0
+
+
+def _bind(host: str, port: int) -> socket.socket:
+    """Raises BadInput: no such address, or somebody else's."""
+    try:
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+    except OSError as error:
+        raise BadInput(f"no such address: {error.strerror}", field="--host", value=host) from None
+    listening = socket.socket(family, socket.SOCK_STREAM)
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        with cannot("listen there", field="--port", value=port):
+            listening.bind((host, port))
+            listening.listen(128)
+    except BaseException:
+        listening.close()
+        raise
+    return listening

@@ -1,0 +1,121 @@
+"""What a server is started with, and where it keeps things."""
+
+import contextlib
+import fcntl
+import ipaddress
+import os
+import secrets
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+from cosim.errors import BadInput
+from cosim.files import prepare_folder, whole
+
+TOKEN = "COSIM_TOKEN"  # the variable that names the bearer token
+MB = 1 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What the server takes and how much of it; sizes in bytes, times in s."""
+
+    body: int = 1 * MB  # of a request, uploads apart
+    upload: int = 64 * MB  # of an archive
+    unpacked: int = 256 * MB  # of what is in it
+    files: int = 200  # in it
+    uploads: int = 1000  # kept
+    cells: int = 1000  # of a run
+    queued: int = 1000  # runs that wait
+    sessions: int = 16  # open at once
+    idle: float = 600.0  # until a session ends by itself
+    check: float = 120.0  # to check a request
+    memory: int = 8192 * MB  # address space of a confined process
+    file: int = 512 * MB  # that a confined process writes
+    cpu: float = 900.0  # processor time of one episode, or between two resets of a session, when confined
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """A server's. `data` is absolute."""
+
+    data: Path
+    host: str = "127.0.0.1"
+    port: int = 8000
+    database: str | None = None  # URL; None: SQLite in `data`
+    workers: int | None = None  # processes of runs; None: one a core
+    engine: str = "local"
+    ray_address: str | None = None
+    token: str | None = None  # None: whoever reaches the server may use it
+    limits: Limits = Limits()
+
+    @property
+    def runs(self) -> Path:
+        """A folder a run."""
+        return self.data / "runs"
+
+    @property
+    def uploads(self) -> Path:
+        """A folder an upload."""
+        return self.data / "uploads"
+
+    @property
+    def scratch(self) -> Path:
+        """Temporary files of confined processes."""
+        return self.data / "scratch"
+
+    @property
+    def jobs_url(self) -> str:
+        """The database of the list of runs."""
+        return self.database or f"sqlite:///{self.data / 'service.sqlite'}"
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine reaches a server that is bound to `host`."""
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+class DataFolder(contextlib.AbstractContextManager["DataFolder"]):
+    """The server's folder, made and locked until `close`.
+
+    Raises BadInput: it cannot be made or written, or another server works in it.
+    """
+
+    def __init__(self, path: str) -> None:
+        self.path = prepare_folder(path, "--data").absolute()
+        self._lock = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(self._lock)
+            raise BadInput("another server is working in it", field="--data", value=path) from None
+        shutil.rmtree(self.path / "scratch", ignore_errors=True)  # of a server that was killed
+        for name in ("runs", "uploads", "scratch"):
+            (self.path / name).mkdir(exist_ok=True)
+
+    def token(self, host: str) -> tuple[str | None, Path | None]:
+        """The bearer token, and the file that holds it where this server made one.
+
+        It is the variable `TOKEN`, or else, unless `host` is loopback, kept in the folder for its owner's
+        eyes and made at the first start.
+        """
+        if given := os.environ.get(TOKEN, "").strip():
+            return given, None
+        if is_loopback(host):
+            return None, None
+        file = self.path / "token"
+        if not file.exists():
+            with whole(file) as draft:
+                draft.touch(mode=0o600)
+                draft.write_text(secrets.token_urlsafe(32) + "\n")
+        return file.read_text().strip(), file
+
+    def close(self) -> None:
+        """Give up the lock."""
+        os.close(self._lock)
+
+    def __exit__(self, *error: object) -> None:
+        self.close()

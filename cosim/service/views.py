@@ -1,0 +1,112 @@
+"""A session's answers as JSON for any program: plain names and SI units, null where nothing is ahead."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from cosim.envs.session import Session, StepResult
+from cosim.observation.view import View
+from cosim.types import KINEMATIC_FEATURES, Actor, Kind, MetaAction, Snapshot
+
+DECIMALS = 4
+_FLAGS = ("is_av", "is_mission")
+_LAW = ("signal_distance", "stop_distance", "yield_distance", "crossing_distance", "person_distance")
+
+
+def view(seen: View) -> dict[str, Any]:
+    """What one AV sees now: m, m/s, rad, s; others in its own frame (x ahead, y to the left)."""
+    rules, rows = seen.rules, np.round(seen.kinematics[-1].astype(np.float64), DECIMALS).tolist()
+    x, y, heading = seen.pose.tolist()
+    return {
+        "time": seen.time,
+        "x": x,
+        "y": y,
+        "heading": heading,
+        "speed": seen.ego_speed,
+        "target_speed": seen.target_speed,
+        "lane_changing": seen.lane_changing,
+        "speed_limit": seen.speed_limit,
+        "to_dead_end": seen.to_dead_end.tolist(),
+        "conflict_distance": seen.conflict_distance,
+        "lane_exists": seen.lane_exists.tolist(),
+        "action_mask": dict(zip(MetaAction.__members__, seen.action_mask.tolist(), strict=True)),
+        "signal": rules.signal,
+        "signal_switch_in": None if rules.switch_in < 0.0 else rules.switch_in,
+        "all_way_stop": rules.all_way_stop,
+        **{name: getattr(rules, name) for name in _LAW},
+        "limits": rules.limits.tolist(),
+        "vehicles": [
+            {"id": name, **dict(zip(KINEMATIC_FEATURES, row, strict=True))}
+            for name, row, known in zip(seen.ids, rows, seen.valid[-1].tolist(), strict=True)
+            if known
+        ],
+    }
+
+
+def step(session: Session, result: StepResult | None) -> dict[str, Any]:
+    """What a reset (`result` None) or an act brought."""
+    found: dict[str, Any] = {
+        "seed": session.seed,
+        "elapsed": session.elapsed,
+        "over": session.over,
+        "avs": list(session.avs),
+        "observations": {av: view(seen) for av, seen in session.observe().items()},
+        "events": asdict(session.events),
+    }
+    if result is not None:
+        found |= {
+            "rewards": result.rewards,
+            "terms": {av: terms._asdict() for av, terms in result.terms.items()},
+            "terminated": result.terminated,
+            "truncated": result.truncated,
+            "ended": result.ended,
+            "receipts": {
+                av: {"executed": r.executed, "blocked": r.blocked} for av, r in result.receipts.items()
+            },
+        }
+    return found
+
+
+def snapshot(now: Snapshot) -> dict[str, Any]:
+    """Every vehicle and person, and the state of every signal, as the simulation has them."""
+    columns = {
+        name: np.round(getattr(now, name), DECIMALS).tolist()
+        for name in ("x", "y", "heading", "speed", "accel", "length", "width")
+    }
+    return {
+        "time": now.time,
+        "signals": "".join(map(chr, now.signals.tolist())),
+        "vehicles": [
+            {
+                "id": name,
+                "kind": Kind(now.kind[k]).name.lower(),
+                "actor": Actor(now.actor[k]).name.lower(),
+                "mission": bool(now.mission[k]),
+                "lane": int(now.lane[k]),
+                **{column: values[k] for column, values in columns.items()},
+            }
+            for k, name in enumerate(now.ids)
+        ],
+    }
+
+
+def to_json(document: Mapping[str, Any]) -> bytes:
+    """JSON as every parser reads it: infinities, which say that nothing is ahead, are null."""
+    try:
+        return json.dumps(document, allow_nan=False, separators=(",", ":")).encode()
+    except ValueError:
+        return json.dumps(_finite(document), allow_nan=False, separators=(",", ":")).encode()
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {name: _finite(item) for name, item in value.items()}
+    return [_finite(item) for item in value] if isinstance(value, list | tuple) else value

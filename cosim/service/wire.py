@@ -1,0 +1,131 @@
+"""A session's answers as bytes for our own client: arrays as safetensors, the rest as JSON in their metadata.
+
+Nothing is ever unpickled: a server is trusted with what it says, not with the client's process.
+"""
+
+from __future__ import annotations
+
+import json
+import typing
+from collections.abc import Mapping
+from dataclasses import asdict, fields
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from safetensors.numpy import load as load_arrays
+from safetensors.numpy import save as save_arrays
+
+from cosim.envs.host import Reply
+from cosim.errors import BadInput
+from cosim.observation.view import Packed
+from cosim.rewards import RewardTerms
+from cosim.types import IDENTITY, Collision, EpisodeResult, Events, Metric, Receipt, Snapshot
+
+MEDIA = "application/vnd.cosim.step"  # what a client accepts that wants bytes
+_DOCUMENT = "document"  # the key of the metadata
+Arrays = Mapping[str, npt.NDArray[Any]]
+_PACKED = ("maps", "new_maps", "kinematics", "valid", "numbers", "limits", "lanes", "lines")
+_EVENTS = typing.get_type_hints(Events)
+
+
+def pack(arrays: Arrays, document: Mapping[str, Any]) -> bytes:
+    """Arrays and a JSON document (infinities too) in one."""
+    whole = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    return bytes(save_arrays(whole, {_DOCUMENT: json.dumps(document)}))
+
+
+def unpack(data: bytes) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
+    """The way back. Raises BadInput for anything else."""
+    try:
+        size = int.from_bytes(data[:8], "little")
+        document = json.loads(json.loads(data[8 : 8 + size])["__metadata__"][_DOCUMENT])
+        return load_arrays(data), document
+    except Exception as error:
+        raise BadInput(f"is no answer of a cosim server: {error}") from None
+
+
+def of_reply(reply: Reply) -> bytes:
+    """What one reset or act brought."""
+    packed = reply.packed
+    document = {
+        "avs": packed.avs,
+        "newcomers": packed.newcomers,
+        "ids": packed.ids,
+        "rewards": {av: [*terms] for av, terms in reply.rewards.items()},
+        "ended": reply.ended,
+        "receipts": [[*receipt] for receipt in reply.receipts],
+        "events": asdict(reply.events),
+        **{name: getattr(reply, name) for name in Reply._fields[5:]},
+        "on_road": reply.avs,
+    }
+    return pack({name: getattr(packed, name) for name in _PACKED}, document | {"avs": packed.avs})
+
+
+def to_reply(data: bytes) -> Reply:
+    """The way back."""
+    arrays, found = unpack(data)
+    packed = Packed(
+        avs=tuple(found["avs"]),
+        newcomers=tuple(found["newcomers"]),
+        ids=tuple(map(tuple, found["ids"])),
+        **{name: arrays[name] for name in _PACKED},
+    )
+    return Reply(
+        packed,
+        {av: RewardTerms(*terms) for av, terms in found["rewards"].items()},
+        found["ended"],
+        tuple(Receipt(*receipt) for receipt in found["receipts"]),
+        to_events(found["events"]),
+        tuple(found["on_road"]),
+        *(found[name] for name in Reply._fields[6:]),
+    )
+
+
+def to_events(found: Mapping[str, Any]) -> Events:
+    """Events of their JSON document."""
+    values = {}
+    for name, hint in _EVENTS.items():
+        kind = typing.get_args(hint)[0]
+        values[name] = tuple(
+            kind(**{k: _tuples(v) for k, v in item.items()}) if isinstance(item, dict) else item
+            for item in found[name]
+        )
+    return Events(**values)
+
+
+def of_snapshot(snapshot: Snapshot) -> bytes:
+    """Every vehicle."""
+    values = {f.name: getattr(snapshot, f.name) for f in fields(Snapshot)}
+    arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+    document = {"time": snapshot.time, "ids": snapshot.ids, "events": asdict(snapshot.events)}
+    return pack(arrays, document)
+
+
+def to_snapshot(data: bytes) -> Snapshot:
+    """The way back."""
+    arrays, found = unpack(data)
+    events = to_events(found["events"])
+    return Snapshot(time=found["time"], ids=tuple(found["ids"]), events=events, **arrays)
+
+
+def to_result(document: Mapping[str, Any]) -> EpisodeResult:
+    """The result whose `EpisodeResult.document` this is."""
+    units, better = document["units"], document["better"]
+    return EpisodeResult(
+        **{name: document[name] for name in IDENTITY},
+        steps=document["steps"],
+        trace_hash=document["trace_hash"],
+        metrics={name: Metric(document[name], units[name], better[name]) for name in units},
+        collisions=tuple(Collision(**collision) for collision in document["collision_list"]),
+        timings=document["timings"],
+        validity=tuple(document["not_comparable_because"]),
+        mission_vehicle=document["mission_vehicle"],
+        mission_guessed=document["mission_guessed"],
+        interventions_by_reason=document["interventions_by_reason"],
+        manifest=document["manifest"],
+    )
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value

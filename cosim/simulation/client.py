@@ -1,0 +1,323 @@
+"""A connection to a SUMO that somebody else started: traci's calls, with what every step needs subscribed.
+
+A call over the socket costs a hundred times what libsumo's does. So SUMO sends with every step what is asked
+of every vehicle, of signals and of the simulation; what is asked of AVs alone it sends of those of whom it
+was asked once; and commands to vehicles wait until the next call that needs an answer, to go in one message.
+"""
+
+import contextlib
+import io
+import struct
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, NoReturn
+
+from traci import constants as tc
+from traci.connection import Connection
+from traci.exceptions import FatalTraCIError, TraCIException
+from traci.storage import Storage
+
+from cosim.errors import BadInput, SimulationError
+
+RETRY = 0.2  # s between attempts to connect
+EVERYWHERE = 1e6  # m around a junction
+
+# Getters of libsumo and traci -> SUMO's variable (https://sumo.dlr.de/docs/TraCI), by whom they are asked of.
+VEHICLES = {
+    "getPosition": tc.VAR_POSITION,
+    "getAngle": tc.VAR_ANGLE,
+    "getSpeed": tc.VAR_SPEED,
+    "getAcceleration": tc.VAR_ACCELERATION,
+    "getLanePosition": tc.VAR_LANEPOSITION,
+    "getLaneID": tc.VAR_LANE_ID,  # the last one: it has no fixed size
+}
+AVS = {
+    "getAllowedSpeed": tc.VAR_ALLOWED_SPEED,
+    "getSpeedWithoutTraCI": tc.VAR_SPEED_WITHOUT_TRACI,
+    "getLateralLanePosition": tc.VAR_LANEPOSITION_LAT,
+    "getDistance": tc.VAR_DISTANCE,
+    "getRoadID": tc.VAR_ROAD_ID,
+    "getRouteIndex": tc.VAR_ROUTE_INDEX,
+}
+LIGHTS = {
+    "getRedYellowGreenState": tc.TL_RED_YELLOW_GREEN_STATE,
+    "getNextSwitch": tc.TL_NEXT_SWITCH,
+}
+SIMULATION = {
+    "getTime": tc.VAR_TIME,
+    "getDepartedIDList": tc.VAR_DEPARTED_VEHICLES_IDS,
+    "getArrivedIDList": tc.VAR_ARRIVED_VEHICLES_IDS,
+    "getStartingTeleportIDList": tc.VAR_TELEPORT_STARTING_VEHICLES_IDS,
+    "getEndingTeleportIDList": tc.VAR_TELEPORT_ENDING_VEHICLES_IDS,
+    "getCollidingVehiclesNumber": tc.VAR_COLLIDING_VEHICLES_NUMBER,
+    "getEmergencyStoppingVehiclesIDList": tc.VAR_EMERGENCYSTOPPING_VEHICLES_IDS,
+    "getStopStartingVehiclesIDList": tc.VAR_STOP_STARTING_VEHICLES_IDS,
+    "getStopEndingVehiclesIDList": tc.VAR_STOP_ENDING_VEHICLES_IDS,
+    "getPendingVehicles": tc.VAR_PENDING_VEHICLES,
+}
+# How SUMO sends them of one vehicle: of each the variable, a status of 0, its type and its value.
+_ROW, _SIZE = struct.Struct("!3s2d3sd3sd3sd3sd3si"), struct.Struct("!i")
+_TYPES = (tc.POSITION_2D, *[tc.TYPE_DOUBLE] * 4, tc.TYPE_STRING)
+_HEADS = tuple(bytes((variable, 0, kind)) for variable, kind in zip(VEHICLES.values(), _TYPES, strict=True))
+Row = tuple[tuple[float, float], float, float, float, float, str]  # the values, in their order
+# Commands that change nothing of the above before the next step; after any other one SUMO is asked anew.
+LATER = {"setSpeed", "setSpeedMode", "setLaneChangeMode", "changeLaneRelative"}
+
+
+class Client:
+    """One client among others of a running SUMO; an interface for `cosim.simulation.backend`.
+
+    Args:
+        host, port: where SUMO listens; tried for `timeout` s.
+        order: the place among its clients, different for each: higher ones act later, and win a conflict.
+        timeout: s that SUMO may take to answer (it waits for all other clients).
+
+    Raises BadInput where nobody listens. Every call raises FatalTraCIError once the connection is lost.
+    """
+
+    TraCIException, FatalTraCIError, constants = TraCIException, FatalTraCIError, tc
+
+    def __init__(self, host: str, port: int, order: int, timeout: float) -> None:
+        self.place = f"{host}:{port}"
+        self._connection = _connect(host, port, timeout)
+        try:
+            self._connection.setOrder(order)
+            self.version: str = self._connection.getVersion()[1]
+        except (TraCIException, FatalTraCIError) as error:
+            raise SimulationError(f"{self.place}: {error}") from None
+        c = self._connection
+        self.edge, self.junction, self.lane, self.person = c.edge, c.junction, c.lane, c.person
+        self.vehicletype = c.vehicletype
+        c.simulation.subscribe(list(SIMULATION.values()))
+        for light in c.trafficlight.getIDList():
+            c.trafficlight.subscribe(light, list(LIGHTS.values()))
+        self.simulation, self.trafficlight = (
+            _Domain(c.simulation, SIMULATION),
+            _Domain(c.trafficlight, LIGHTS),
+        )
+        self.vehicle = _Vehicles(c)
+
+    def simulationStep(self) -> None:
+        """Send the commands, wait for everybody else, drive one step."""
+        self._connection.flush()
+        with contextlib.redirect_stdout(io.StringIO()):  # traci says there what it misses of who was removed
+            self._connection.simulationStep()
+        if not self.simulation.came:  # no word of what was subscribed
+            raise FatalTraCIError("its owner has loaded another simulation")
+        here, came = self.vehicle.stepped(), self.simulation.came[""]
+        departed = came[tc.VAR_DEPARTED_VEHICLES_IDS]
+        came[tc.VAR_DEPARTED_VEHICLES_IDS] = tuple(name for name in departed if name in here)
+
+    def close(self) -> None:
+        """Leave: SUMO goes on with the others."""
+        for last in (self._connection.flush, self.vehicle.unsubscribe, self._connection.close):
+            with contextlib.suppress(TraCIException, FatalTraCIError):
+                last()
+
+
+class _Connection(Connection):  # type: ignore[misc]  # traci is not typed
+    """traci's connection with a limit on every answer; commands to vehicles wait for `flush`."""
+
+    def __init__(self, host: str, port: int, timeout: float) -> None:
+        self._waits = False
+        self.everybody: dict[str, Row] = {}  # what came of every vehicle with the last step
+        super().__init__(host, port, None, None, False)
+        self._timeout = timeout
+        self._socket.settimeout(timeout)
+
+    def flush(self) -> None:
+        """Send the commands that wait. One to a vehicle that somebody else has removed counts for nothing."""
+        if self._queue:
+            try:
+                self._sendExact()
+            except TraCIException as error:
+                if "is not known" not in str(error):
+                    raise
+
+    def _sendCmd(self, cmdID: int, *words: Any) -> Any:
+        self._waits = cmdID == tc.CMD_SET_VEHICLE_VARIABLE
+        if not self._waits:
+            self.flush()
+        try:
+            return super()._sendCmd(cmdID, *words)
+        finally:
+            self._waits = False
+
+    def _readSubscription(self, result: Any) -> Any:
+        """traci's, but for the rows of all vehicles: its own reader takes many times as long."""
+        begin = result._pos
+        result.readLength()
+        if result.read("!B")[0] == tc.RESPONSE_SUBSCRIBE_JUNCTION_CONTEXT:
+            junction = result.readString()
+            domain, variables, count = result.read("!BBi")
+            if domain == tc.CMD_GET_VEHICLE_VARIABLE and variables == len(VEHICLES):
+                with contextlib.suppress(struct.error):
+                    self.everybody, result._pos = _rows(result._content, result._pos, count)
+                    return junction, tc.RESPONSE_SUBSCRIBE_JUNCTION_CONTEXT
+        result._pos = begin
+        return super()._readSubscription(result)
+
+    def _sendExact(self) -> Any:
+        if self._waits:
+            return None
+        try:
+            return super()._sendExact()
+        except OSError:
+            self._lose("SUMO has gone")
+
+    def _recvExact(self) -> Any:
+        try:
+            size = int.from_bytes(self._read(4), "big") - 4
+            return Storage(self._read(size))
+        except TimeoutError:
+            self._lose(f"no answer for {self._timeout:g} s: SUMO waits for all of its clients")
+        except OSError:
+            self._lose("SUMO has gone")
+        except BaseException:  # interrupted: what comes next would be this answer
+            self._drop()
+            raise
+
+    def _read(self, size: int) -> bytes:
+        whole = bytearray()
+        while len(whole) < size:
+            part = self._socket.recv(min(size - len(whole), 1 << 20))
+            if not part:
+                raise ConnectionError
+            whole += part
+        return bytes(whole)
+
+    def _lose(self, why: str) -> NoReturn:
+        self._drop()
+        raise FatalTraCIError(why) from None
+
+    def _drop(self) -> None:
+        if self._socket is not None:
+            self._socket.close()
+        self._socket, self._queue, self._string = None, [], b""
+
+
+def _connect(host: str, port: int, timeout: float) -> _Connection:
+    until = time.monotonic() + timeout
+    while True:
+        try:
+            return _Connection(host, port, timeout)
+        except ConnectionRefusedError:
+            if time.monotonic() > until:
+                raise BadInput(
+                    f"no SUMO listens there (tried for {timeout:g} s); one that drives already takes nobody "
+                    "in: it waits at its start for --num-clients",
+                    value=f"{host}:{port}",
+                ) from None
+            time.sleep(RETRY)
+        except OSError as error:
+            raise BadInput(f"cannot connect: {error.strerror or error}", value=f"{host}:{port}") from None
+
+
+def _rows(content: bytes, at: int, count: int) -> tuple[dict[str, Row], int]:
+    """`VEHICLES` of `count` vehicles from byte `at` on; where they end. Raises struct.error for others."""
+    found: dict[str, Row] = {}
+    for _ in range(count):
+        end = at + 4 + _SIZE.unpack_from(content, at)[0]
+        name = content[at + 4 : end].decode()
+        a, x, y, b, angle, c, speed, d, accel, e, position, f, size = _ROW.unpack_from(content, end)
+        if (a, b, c, d, e, f) != _HEADS:
+            raise struct.error
+        at = end + _ROW.size + size
+        found[name] = (x, y), angle, speed, accel, position, content[at - size : at].decode()
+    return found, at
+
+
+class _Domain:
+    """One of traci's domains: a getter of what is subscribed answers from what came with the last step."""
+
+    def __init__(self, domain: Any, subscribed: Mapping[str, int]) -> None:
+        self._domain = domain
+        self.came: dict[str, dict[int, Any]] = domain.getAllSubscriptionResults()  # traci keeps this object
+        for name, variable in subscribed.items():
+            setattr(self, name, self._getter(name, variable))
+
+    def __getattr__(self, name: str) -> Any:
+        found = getattr(self._domain, name)
+        setattr(self, name, found)
+        return found
+
+    def _getter(self, name: str, variable: int) -> Callable[..., Any]:
+        return lambda of="": self.came[of][variable]
+
+
+class _Vehicles(_Domain):
+    """Those of `AVS` are subscribed of who is asked about."""
+
+    def __init__(self, connection: _Connection) -> None:
+        super().__init__(connection.vehicle, AVS)
+        self._connection, self._junctions = connection, connection.junction
+        self._junction: str = self._junctions.getIDList()[0]
+        self._junctions.subscribeContext(
+            self._junction, tc.CMD_GET_VEHICLE_VARIABLE, EVERYWHERE, list(VEHICLES.values())
+        )
+        self._ids: tuple[str, ...] | None = None
+        self._avs: set[str] = set()  # who was asked about
+        for column, name in enumerate(VEHICLES):
+            setattr(self, name, self._row_getter(name, column))
+
+    def stepped(self) -> set[str]:
+        """A step was driven: who is on the road now that it is our turn (others may have removed some)."""
+        self._ids = self._domain.getIDList()
+        here = set(self._ids)
+        for vehicle in self._connection.everybody.keys() - here:
+            del self._connection.everybody[vehicle]
+            self.came.pop(vehicle, None)
+        return here
+
+    def unsubscribe(self) -> None:
+        """SUMO would send it to the other clients for ever."""
+        self._junctions.unsubscribeContext(self._junction, tc.CMD_GET_VEHICLE_VARIABLE, EVERYWHERE)
+
+    def getIDList(self) -> tuple[str, ...]:
+        """Everybody on the road."""
+        if self._ids is None:
+            self._ids = tuple(self._domain.getIDList())
+        return self._ids
+
+    def __getattr__(self, name: str) -> Any:
+        call = getattr(self._domain, name)
+        if name.startswith(("set", "remove")) and name not in LATER:
+
+            def found(vehicle: str, *values: Any) -> None:
+                if name == "remove" and vehicle in self._avs:  # else each client is told that it is missed
+                    self._domain.unsubscribe(vehicle)
+                call(vehicle, *values)
+                self._connection.everybody.pop(vehicle, None)
+                self.came.pop(vehicle, None)
+                self._ids = None
+
+        else:
+            found = call
+        setattr(self, name, found)
+        return found
+
+    def _row_getter(self, name: str, column: int) -> Callable[[str], Any]:
+        ask, connection = getattr(self._domain, name), self._connection
+
+        def get(vehicle: str) -> Any:
+            try:
+                return connection.everybody[vehicle][column]
+            except KeyError:
+                return ask(vehicle)
+
+        return get
+
+    def _getter(self, name: str, variable: int) -> Callable[..., Any]:
+        ask = getattr(self._domain, name)
+
+        def get(vehicle: str) -> Any:
+            try:
+                return self.came[vehicle][variable]
+            except KeyError:
+                if vehicle in self._avs:  # it was changed since the last step
+                    return ask(vehicle)
+                self._domain.subscribe(vehicle, list(AVS.values()))
+                self._avs.add(vehicle)
+                return self.came[vehicle][variable]
+
+        return get

@@ -1,0 +1,45 @@
+"""A signal program of your own, against traci alone: a green that nobody uses ends where others wait.
+
+cosim run CITY.sumocfg --penetration 0.3 --policy vfn-p --traci-port 8813 &
+python examples/traci_signals.py 8813
+"""
+
+import sys
+
+import traci
+
+
+def waits(light: str, wanted: str) -> bool:
+    """Whether a vehicle is on a lane whose signal now shows one of the states `wanted`."""
+    states = traci.trafficlight.getRedYellowGreenState(light)
+    lanes = traci.trafficlight.getControlledLanes(light)
+    return any(
+        traci.lane.getLastStepVehicleNumber(lane)
+        for lane, state in zip(lanes, states, strict=True)
+        if state in wanted
+    )
+
+
+def switch(light: str) -> None:
+    """End the present phase if it is green for nobody and red for somebody."""
+    green = "y" not in traci.trafficlight.getRedYellowGreenState(light).lower()
+    if green and waits(light, "r") and not waits(light, "Gg"):
+        traci.trafficlight.setPhaseDuration(light, 0.0)
+
+
+def main() -> None:
+    """Drive along until SUMO ends."""
+    traci.init(int(sys.argv[1]), numRetries=60)
+    traci.setOrder(1)
+    lights = traci.trafficlight.getIDList()
+    try:
+        while True:
+            traci.simulationStep()
+            for light in lights:
+                switch(light)
+    except traci.exceptions.FatalTraCIError:
+        print("SUMO has ended")
+
+
+if __name__ == "__main__":
+    main()

@@ -34,7 +34,7 @@ from cosim.seeding import FIRST_TEST_SEED, TUNING_SEEDS
 from cosim.workers.tasks import OK
 
 Array = npt.NDArray[np.float64]
-FIRST = 2.0  # errors a tilted episode that the first tilt aims at, if none ended the trials
+FIRST = 1.0  # errors a tilted episode that the first tilt aims at, if none ended the trials
 MEET = 0.75  # share of them that meets an AV first
 DURING = 10.0  # the second error has a tenth of the time and of the drivers of the first
 PAGE = Path("docs/results/estimate.md")

@@ -91,12 +91,9 @@ class HumanErrors:
         self._rates = np.array([self._kinds[name].rate for name in self._every_second])  # [k]
         self._tilt = tilt
         self._tilted = tilt is not None and tilt.drawn(seed)
-        self._raised = np.array(
-            [tilt is not None and tilt.raises(k) for k in self._every_second], bool
-        )  # [k]
-        self.log_ratio = (
-            0.0  # of the trials so far: the probability drawn tilted over that drawn as it happens
-        )
+        raised = [tilt is not None and tilt.raises(kind) for kind in self._every_second]
+        self._raised = np.array(raised, bool)  # [k]
+        self.log_ratio = 0.0  # of the trials so far
         self._avs: set[str] = set()
         self._near: frozenset[str] = frozenset()  # whose trials are weighed
         self._during: frozenset[str] = frozenset()  # of these, near somebody who errs
@@ -172,6 +169,7 @@ class HumanErrors:
         second, on_road = round(now), frozenset(sumo.vehicle.getIDList())
         for name in self._streams.keys() - on_road:
             self.drop(name)
+        self._avs &= on_road
         names = [*self._streams]
         if self._tilt is not None and self._begun < 2:
             self._near, self._during = self._beside_avs(names, now)

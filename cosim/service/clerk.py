@@ -106,6 +106,6 @@ class Clerks:
         for worker in filter(None, self._workers):
             worker.kill()
         for _ in self._workers:
-            worker = self._workers[self._free.get()]
-            if worker is not None:
-                worker.close()
+            ended = self._workers[self._free.get()]
+            if ended is not None:
+                ended.close()

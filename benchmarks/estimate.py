@@ -76,7 +76,7 @@ def trials(rows: Sequence[Row]) -> dict[str, Array]:
 
 def balanced(rows: Sequence[Row], before: Tilt) -> Tilt:
     """`FIRST` errors an episode, `MEET` of them meeting an AV; in either share every kind equally often."""
-    factors = {}
+    factors: dict[str, float] = {}
     for meets, share in ((True, MEET), (False, 1.0 - MEET)):
         expected = {n: e.mean() for n, (_, e) in trials(rows).items() if n.endswith(OTHER) != meets}
         factors |= {n: max(FIRST * share / len(expected) / e, 1.0) for n, e in expected.items()}

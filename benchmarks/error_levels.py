@@ -46,22 +46,22 @@ class Raised(NamedTuple):
 
 
 ALONE = (
-    Raised("inattention", {"inattention": 10.0}, 10.0),
-    Raised("hard braking", {"hard_braking": 300.0}, 300.0),
+    Raised("inattention", {"inattention": 800.0}, 800.0),
+    Raised("hard braking", {"hard_braking": 100.0}, 100.0),
     Raised("cut-ins", {"cut_in": 300.0, "aborted_cut_in": 300.0}, 300.0),
     Raised("forced entries", {"forced_entry": 1000.0}, 1000.0),
     Raised("failures to yield", {"failure_to_yield": 200.0}, 200.0),
     Raised("stalled cars", {"stalled_car": 1000.0}, 1000.0),
     Raised(
         "hard braking before the inattentive",
-        {"hard_braking": 100.0, "inattention": 10.0},
-        1000.0,
-        ("inattention",),
+        {"hard_braking": 100.0, "inattention": 800.0},
+        80_000.0,
+        ("inattention", "hard braking"),
     ),
     Raised(
         "cut-ins before the inattentive",
-        {"cut_in": 300.0, "aborted_cut_in": 300.0, "inattention": 10.0},
-        3000.0,
+        {"cut_in": 300.0, "aborted_cut_in": 300.0, "inattention": 800.0},
+        240_000.0,
         ("inattention", "cut-ins"),
     ),
 )

@@ -131,6 +131,12 @@ def real_nets(place: Place) -> list[list[str]]:
     return [["benchmarks.real_nets", *limit, "--out", str(place.out / "real_nets.md")]]
 
 
+def joining(place: Place) -> list[list[str]]:
+    """How fast `cosim join` drives."""
+    flags = ["--rounds", "1", "--seconds", "1", "--small"] if place.small else ["--rounds", "5"]
+    return [["benchmarks.joining", *flags, "--out", str(place.out / "joining.md")]]
+
+
 def law(place: Place) -> list[list[str]]:
     """How well AVs keep the law in the worlds of tests/worlds."""
     flags = ["--seeds", "20", "--runs", str(place.work / "law_runs")]
@@ -154,6 +160,7 @@ PAGES = (
     Page("decision_cost", decision_cost, ("decision_cost.md",)),
     Page("performance", performance, ("performance.md",)),
     Page("startup", startup, ("startup.md",)),
+    Page("joining", joining, ("joining.md",)),
     Page("reward_balance", reward_balance, ("reward_balance.md",)),
     Page("reward_by_driving", reward_by_driving, ("reward_by_driving.md",)),
     Page(

@@ -7,7 +7,7 @@
 # engine.sh:
 #
 #   BASE     the image to start from (default: debian:bookworm-slim, or made by debootstrap)
-#   EXTRAS   extras of pyproject.toml to put in, with commas between: ray,postgresql
+#   EXTRAS   extras of pyproject.toml to put in, with commas between (default: service,postgresql)
 #   PIP_INDEX_URL, PIP_EXTRA_INDEX_URL   all pip settings that a Docker engine gets, for it mounts nothing
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -22,7 +22,7 @@ tag=$IMAGE
 [ "$target" = runtime ] || tag=$IMAGE-$target
 local_base=localhost/debian-base:bookworm
 args=(--file docker/Dockerfile --target "$target" --tag "$tag"
-    --build-arg "EXTRAS=${EXTRAS:-}"
+    --build-arg "EXTRAS=${EXTRAS-service,postgresql}"
     --build-arg "REVISION=$(git describe --always --dirty --abbrev=40 --exclude '*' 2>/dev/null || echo unknown)")
 
 make_base() {

@@ -16,7 +16,8 @@ DURATION = 120.0  # s
 def main() -> None:
     """Start SUMO for two programs, and drive."""
     options = ["--num-clients", "2", "--step-length", "0.1", "--lanechange.duration", "2"]
-    options += ["--collision.action", "warn", "--additional-files", str(TYPES), "--no-step-log"]
+    options += ["--collision.action", "warn", "--collision.mingap-factor", "0", "--no-step-log"]
+    options += ["--collision.check-junctions", "--additional-files", str(TYPES)]
     traci.start(["sumo", "-c", sys.argv[1], *options], port=int(sys.argv[2]))  # waits for the other one
     traci.setOrder(1)
     most = 0

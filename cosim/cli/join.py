@@ -32,9 +32,14 @@ def add(commands: arguments.SubCommands) -> None:
     join.add_argument("place", metavar="HOST:PORT", type=_place, help="where it listens")
     arguments.add(join, "--policy", default="idm")
     arguments.add(join, "--svo", default=45.0)
-    arguments.add(
-        join, "--preset", "--duration", "--warmup", "--mission", "--on-collision", "--reward", "--out"
-    )
+    ends = "counted s (default: until the end in SUMO's configuration, else 60)"
+    arguments.add(join, "--duration", help=ends)
+    arguments.add(join, "--warmup", help="s driven before the counted time begins (default 0)")
+    arguments.add(join, "--preset", help="safety checks on the AVs (default lawful)")
+    whom = "the mission vehicle: its id, a pattern of ids, none, or auto: guessed (default)"
+    arguments.add(join, "--mission", help=whom)
+    arguments.add(join, "--on-collision", help="of an AV or the mission vehicle (default continue)")
+    arguments.add(join, "--reward", "--out")
     arguments.add(join.add_mutually_exclusive_group(), "--av-type", "--av-ids", "--penetration")
     arguments.add(join, "--seed", help="of the draw of AVs (default: SUMO's own)")
     arguments.add(join, "--metric", action="append", default=[])
@@ -60,16 +65,18 @@ def work(args: argparse.Namespace) -> int:
         raise BadInput("needs a run folder to write into: --out DIR", field="--replay")
     from cosim.host import Host, joining
     from cosim.policies import check, make
+    from cosim.scenario.manifest import TRACI
     from cosim.simulation.client import Client
     from cosim.simulation.shared import theirs
     from cosim.workers.progress import Progress
 
     policy = read(args.policy).text
     check(policy)
-    fleet = chosen_fleet(args.av_type, args.av_ids, args.penetration) or Fleet()
+    fleet = checked_fleet(chosen_fleet(args.av_type, args.av_ids, args.penetration) or Fleet())
     with _run_folder(args.out) as folder:
         driver = make(policy)  # before SUMO has to wait for it
-        client = Client(*args.place, args.order, args.timeout)
+        host_name, port = args.place
+        client = Client(host_name, port, args.order, args.timeout)
         try:
             scenario, seed = theirs(client, args.net)
             host = Host(
@@ -87,12 +94,14 @@ def work(args: argparse.Namespace) -> int:
         progress = Progress(f"{scenario.name} {label(policy)}", "s")
         try:
             with _leaving(simulator):
-                drive = host.run_recorded if args.replay else host.run
-                driven: Any = drive(seed if args.seed is None else args.seed, progress)
+                drive: Any = host.run_recorded if args.replay else host.run
+                driven = drive(seed if args.seed is None else args.seed, progress)
         finally:
             progress.done()
             host.close()
-        show(args, *(driven if args.replay else (driven, None)), folder)
+    result, replay = driven if args.replay else (driven, None)
+    shared = {TRACI: {"joined": client.place, "order": args.order}}
+    show(args, replace(result, manifest=result.manifest | shared), replay, folder)
     return 130 if simulator.leave else 0
 
 
@@ -102,7 +111,7 @@ def _as_asked(scenario: Scenario, args: argparse.Namespace, fleet: Fleet) -> Sce
     if args.mission is not None:
         given["mission"] = chosen_mission(scenario.mission, args.mission)
     known = {name: value for name, value in given.items() if value is not None}
-    return replace(scenario, fleet=checked_fleet(fleet), **known)
+    return replace(scenario, fleet=fleet, **known)
 
 
 @contextmanager

@@ -129,7 +129,7 @@ def work(args: argparse.Namespace) -> int:
     from cosim.files import prepare_folder
     from cosim.policies import check
     from cosim.scenario import sumo_outputs
-    from cosim.scenario.manifest import remembered
+    from cosim.scenario.manifest import TRACI, remembered
     from cosim.scenario.vet import vetted
     from cosim.workers.progress import Progress
 
@@ -168,7 +168,10 @@ def work(args: argparse.Namespace) -> int:
             shutil.rmtree(files / sumo_outputs.DRAFT, ignore_errors=True)
         progress.done()
     if served is None:
-        result = replace(result, manifest=result.manifest | remembered(case, args.sumo_options))
+        beside = remembered(case, args.sumo_options)
+    else:
+        beside = {TRACI: {"port": served[0], "clients": served[1]}}
+    result = replace(result, manifest=result.manifest | beside)
     show(args, result, replay, folder, case.outputs)
     return 0
 

@@ -314,7 +314,7 @@ class Session(contextlib.AbstractContextManager["Session"]):
                 found[name] = _continuous(name, action)
                 continue
             try:
-                found[name] = int(MetaAction(operator.index(action)))
+                found[name] = int(MetaAction(operator.index(cast(Any, action))))
             except (TypeError, ValueError):
                 known = ", ".join(f"{a.value} {a.name}" for a in MetaAction)
                 raise BadInput(f"is no meta-action ({known})", field=name, value=action) from None

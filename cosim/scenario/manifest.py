@@ -26,6 +26,7 @@ _KINDS: Mapping[str, Any] = {  # what is read again of the documents of `cosim r
     "trace_hash": str,
 }
 CASE, OPTIONS = "case", "sumo_arguments"  # what `cosim run --out` adds
+TRACI = "traci"  # in their place where other TraCI programs drove along
 # A name in the manifest -> the distribution whose version it is.
 PACKAGES = {"cosim": "cosim-sumo", "libsumo": "libsumo", "numpy": "numpy", "numba": "numba", "torch": "torch"}
 

@@ -1,13 +1,13 @@
 """The server's application: its parts, its routes, and one form for whatever goes wrong."""
 
 import contextlib
+import json
 import logging
 from collections.abc import AsyncIterator
 from typing import Any
 
 from fastapi import APIRouter, FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
 import sumo_scenarios
@@ -68,7 +68,6 @@ def create(settings: Settings) -> FastAPI:
         yield
         sessions.close()
         runs.close()
-        clerks.close()
         jobs.close()
         log.info("ended")
 
@@ -95,7 +94,7 @@ def create(settings: Settings) -> FastAPI:
     _answer_problems(app, settings)
     app.include_router(_about(figures))
     app.include_router(runs_router(runs, uploads))
-    app.include_router(uploads_router(uploads, runs, settings))
+    app.include_router(uploads_router(uploads, runs, sessions, settings))
     app.include_router(sessions_router(sessions, uploads))
     app.add_middleware(Gate, settings=settings, figures=figures)
     return app
@@ -108,7 +107,7 @@ def _answer_problems(app: FastAPI, settings: Settings) -> None:
         status: int, problem: str, field: str | None = None, value: Any = None, file: Any = None
     ) -> Response:
         document = {"problem": problem, "field": field, "value": value, "file": file}
-        return JSONResponse(document, status)
+        return Response(json.dumps(document), status, media_type="application/json")
 
     @app.exception_handler(CosimError)
     def ours(_: Request, error: CosimError) -> Response:

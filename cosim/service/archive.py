@@ -78,7 +78,7 @@ def _name(entry: zipfile.ZipInfo, suffixes: tuple[str, ...]) -> str:
     return name
 
 
-def _copied(source: IO[bytes], target: IO[bytes] | None, most: int, limits: Limits) -> int:
+def _copied(source: IO[bytes] | gzip.GzipFile, target: IO[bytes] | None, most: int, limits: Limits) -> int:
     """How many bytes were copied. Raises BadInput behind `most`, whatever the archive says of its sizes."""
     total = 0
     while chunk := source.read(CHUNK):

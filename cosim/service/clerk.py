@@ -82,26 +82,30 @@ class Clerks:
     def __init__(self, runs: Path, database: str | None, cells: int, limit: float, number: int = 2) -> None:
         self._arguments = str(runs), database, cells
         self._limit = limit
-        self._free: queue.Queue[Worker | None] = queue.Queue()
-        for _ in range(number):
-            self._free.put(None)
-        self._number = number
+        self._free: queue.Queue[int] = queue.Queue()
+        self._workers: list[Worker | None] = [None] * number
+        for k in range(number):
+            self._free.put(k)
 
     def call(self, method: str, *arguments: Any) -> Any:
         """One method of a `Clerk`."""
-        worker = self._free.get()
+        k = self._free.get()
         try:
+            worker = self._workers[k]
             if worker is None or worker.pid is None:
-                worker = Worker(Clerk, *self._arguments, timeout=self._limit, name="cosim-clerk")
+                worker = Worker(Clerk, *self._arguments, timeout=self._limit, name="cosim-clerk", wait=False)
+                self._workers[k] = worker
             return worker.call(method, *arguments)
         except SimulationTimeout:
             raise BadInput(f"takes more than {self._limit:g} s to work out") from None
         finally:
-            self._free.put(worker)
+            self._free.put(k)
 
     def close(self) -> None:
-        """End the processes."""
-        for _ in range(self._number):
-            worker = self._free.get()
-            if worker is not None:
-                worker.close()
+        """End the processes; calls that wait for them raise SimulationCrashed."""
+        for worker in filter(None, self._workers):
+            worker.kill()
+        for _ in self._workers:
+            ended = self._workers[self._free.get()]
+            if ended is not None:
+                ended.close()

@@ -22,7 +22,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 from urllib.parse import quote, urlencode, urlsplit
 
 import numpy as np
@@ -67,7 +67,7 @@ def open(
 
 
 class Remote(Session):
-    """A session on a server. Of an upload `scenario` knows name and times, its files are elsewhere."""
+    """A session on a server. `scenario` of an upload knows names and times; its files are elsewhere."""
 
     def __init__(self, connection: Connection, request: Mapping[str, Any]) -> None:
         caller = _Caller(connection, request)
@@ -112,7 +112,7 @@ class Connection:
             self._used = time.monotonic()
             if connection.sock is None:
                 connection.connect()
-                connection.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                cast(socket.socket, connection.sock).setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             connection.request(method, self._base + path, body, self._headers)
             answer = connection.getresponse()
             data = answer.read()

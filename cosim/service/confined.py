@@ -24,7 +24,7 @@ from cosim.service import landlock
 from cosim.service.settings import Limits, Settings
 
 if TYPE_CHECKING:
-    from cosim.envs.host import SessionHost
+    from cosim.envs.host import Reply, SessionHost
     from cosim.scenario.episode_id import EpisodeId
     from cosim.workers.tasks import Progress
 
@@ -64,7 +64,9 @@ class Room:
         python = [Path(path) for path in (sys.prefix, sys.base_prefix) if path != "/"]
         imports = [Path(path) for path in sys.path if os.path.isabs(path)]
         installed = [path for path in imports if path.name in ("site-packages", "dist-packages")]
-        versions = [found for path in imports for found in path.glob("*.egg-info")]
+        versions = [
+            found for path in imports for kind in ("egg", "dist") for found in path.glob(f"*.{kind}-info")
+        ]
         landlock.restrict(
             [*map(Path, (*_SYSTEM, *self.reads)), *python, *installed, *versions, *packages],
             [Path(scratch), *map(Path, (*_DEVICES, *self.writes))],
@@ -157,7 +159,15 @@ def confined_host(room: Room, *arguments: Any) -> SessionHost:
     allow_processor_time(room.limits.cpu)
     from cosim.envs.session import build_host
 
-    return build_host(*arguments)
+    host = build_host(*arguments)
+    begin = host.reset
+
+    def reset(seed: int) -> Reply:
+        allow_processor_time(room.limits.cpu)
+        return begin(seed)
+
+    setattr(host, "reset", reset)  # noqa: B010 - what the worker calls
+    return host
 
 
 class _memory_is_limited:

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, StrictFloat, StrictInt
 from cosim.errors import BadInput, hint
 from cosim.service import views, wire
 from cosim.service.ids import PATTERN
+from cosim.service.problems import Conflict
 from cosim.service.requests import SESSION_EXAMPLE, SessionRequest, flags, plain
 from cosim.service.sessions import Open, Sessions
 from cosim.service.uploads import Uploads
@@ -165,8 +166,8 @@ def sessions_router(sessions: Sessions, uploads: Uploads) -> APIRouter:
     @router.post(AVS + "/reset", summary="Begin an episode", response_model=Step, responses=BYTES)
     def reset(session: SessionId, begin: Reset, accept: Accept = None) -> Response:
         with sessions.get(session).using() as found:
-            found.reset(begin.seed)
-            if wants_bytes(accept):
+            found.reset(begin.seed, passes_on=wants_bytes(accept))
+            if found.passes_on:
                 return Response(wire.of_reply(found.reply), media_type=wire.MEDIA)
             return answer(views.step(found, None))
 
@@ -174,15 +175,20 @@ def sessions_router(sessions: Sessions, uploads: Uploads) -> APIRouter:
     def act(session: SessionId, decision: Act, accept: Accept = None) -> Response:
         actions = {av: _action(av, action) for av, action in decision.actions.items()}
         one = sessions.get(session)
-        with one.using():
-            found, result = sessions.act(one, actions, decision.see)
-            if wants_bytes(accept):
+        with one.using() as found:
+            if not wants_bytes(accept):
+                found.check_observed()
+            elif not found.passes_on:
+                raise Conflict("this episode was begun to be answered in JSON: reset first")
+            result = sessions.act(one, actions, decision.see)
+            if found.passes_on:
                 return Response(wire.of_reply(found.reply), media_type=wire.MEDIA)
             return answer(views.step(found, result))
 
     @router.get(AVS + "/observation", summary="What each AV sees now", response_model=Step)
     def observation(session: SessionId) -> Response:
         with sessions.get(session).using() as found:
+            found.check_observed()
             found.observe()  # begins an episode if none has
             return answer(views.step(found, None))
 
@@ -190,6 +196,7 @@ def sessions_router(sessions: Sessions, uploads: Uploads) -> APIRouter:
                 response_class=Response)  # fmt: skip
     def maps(session: SessionId, av: Vehicle | None = None) -> Response:
         with sessions.get(session).using() as found:
+            found.check_observed()
             seen = found.observe()
             if av is not None:
                 _known(av, tuple(seen))

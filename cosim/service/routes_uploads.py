@@ -15,6 +15,7 @@ from cosim.service import landlock
 from cosim.service.ids import PATTERN
 from cosim.service.problems import Conflict
 from cosim.service.runs import Runs
+from cosim.service.sessions import Sessions
 from cosim.service.settings import Settings
 from cosim.service.uploads import KINDS, Uploads
 
@@ -43,7 +44,7 @@ class UploadDocument(BaseModel):
     about: dict[str, Any]
 
 
-def uploads_router(uploads: Uploads, runs: Runs, settings: Settings) -> APIRouter:
+def uploads_router(uploads: Uploads, runs: Runs, sessions: Sessions, settings: Settings) -> APIRouter:
     """All of them."""
     router = APIRouter(prefix="/api", tags=["uploads"])
 
@@ -76,6 +77,8 @@ def uploads_router(uploads: Uploads, runs: Runs, settings: Settings) -> APIRoute
         uploads.get(upload)
         if used := runs.that_use(upload):
             raise Conflict(f"run {used} uses it: cancel that first")
+        if used := sessions.that_uses(upload):
+            raise Conflict(f"session {used} uses it: close that first")
         uploads.remove(upload)
 
     return router

@@ -32,6 +32,7 @@ from cosim.workers.pool import Cancelled, Pool, PoolEngine
 from cosim.workers.ray_engine import RayEngine
 from cosim.workers.supervisor import Limits as WorkerLimits
 
+ENDING = 10.0  # s that runs may take to end when the server does
 ACTIVE = 8  # runs that are driven at once on the processes of this machine
 REPORT, SUMMARY = "report.html", "summary.json"
 OUTPUTS = "outputs"  # the folder of SUMO's own
@@ -77,7 +78,8 @@ class Drive:
 class Runs:
     """Every run of the server; `count` is told how many episodes were driven.
 
-    `start` it once; `close` leaves what runs and waits to the next start.
+    `start` it once; `close` leaves what runs and waits to the next start, and closes
+    the clerks.
     """
 
     def __init__(self, settings: Settings, jobs: Jobs, clerks: Clerks, count: Callable[[int], None]) -> None:
@@ -87,6 +89,7 @@ class Runs:
         self._plans: dict[str, Plan] = {}  # of runs that wait, as they were checked
         self._drives: dict[str, Drive] = {}
         self._closed = False
+        self._reporting = threading.Lock()
         self._threads: list[threading.Thread] = []
         self.pool: Pool | None = None
         if settings.engine == "local":
@@ -115,8 +118,10 @@ class Runs:
             self._changed.notify_all()
         if self.pool is not None:
             self.pool.close()
+        self._clerks.close()
+        deadline = time.monotonic() + ENDING
         for thread in self._threads:
-            thread.join(timeout=15.0)
+            thread.join(timeout=max(deadline - time.monotonic(), 0.0))
 
     # ---- what users ask ----
 
@@ -173,8 +178,9 @@ class Runs:
 
     def report(self, run: str) -> None:
         """Write the report of a run that has finished, unless it is there."""
-        if SUMMARY in self.files(run) and REPORT not in self.files(run):
-            self._clerks.call("report", run)
+        with self._reporting:  # two at once would write the same draft
+            if SUMMARY in self.files(run) and REPORT not in self.files(run):
+                self._clerks.call("report", run)
 
     def drive(self, run: str) -> Drive | None:
         """What is known of a run that is driven now."""
@@ -281,14 +287,14 @@ class Runs:
             if faults:
                 status, error = FAILED, "\n".join(faults)
         except Cancelled:
-            if self._closed:  # the next start goes on with it
-                return
             status = CANCELLED
         except CosimError as problem:
             status, error = FAILED, str(problem)
         except Exception as problem:
             log.exception("a fault of the server's own", extra={"run": run})
             status, error = FAILED, f"a fault of the server's own: {type(problem).__name__}"
+        if self._closed and status != FINISHED:  # the next start goes on with it
+            return
         for part in self.folder(run).glob(f"{OUTPUTS}/*/{DRAFT}"):
             shutil.rmtree(part, ignore_errors=True)
         self._jobs.set(run, status=status, error=error, ended=now(), done=drive.done)

@@ -13,7 +13,8 @@ from typing import Any
 
 from cosim.envs.host import Reply
 from cosim.envs.session import Session, StepResult, build_host
-from cosim.errors import SimulationError
+from cosim.errors import BadInput, SimulationError
+from cosim.observation.view import Packer, View
 from cosim.policies import make
 from cosim.scenario import Scenario
 from cosim.scenario.episode_id import EpisodeId
@@ -27,19 +28,35 @@ from cosim.service.settings import Settings
 from cosim.types import COMPACT, ObservationConfig
 from cosim.workers.worker import Worker
 
+NOTHING = Packer().pack({}, None)
 TIMEOUT = 120.0  # s without an answer of the simulation
 LOOKS = 1.0  # s between looks for idle sessions
 log = logging.getLogger("cosim.service")
 
 
 class Served(Session):
-    """A session that keeps what its process sent, to be passed on as it is."""
+    """A session whose process's answers can be passed on as they are.
+
+    `passes_on` is set for an episode: then nobody observes here, since what is unpacked here costs a
+    millisecond or two and is kept by the other side.
+    """
 
     reply: Reply
+    passes_on = False
+
+    def reset(self, seed: int | None = None, *, passes_on: bool = False) -> dict[str, View]:
+        """As `Session.reset`."""
+        self.passes_on = passes_on
+        return super().reset(seed)
+
+    def check_observed(self) -> None:
+        """Raises Conflict in an episode whose observations are passed on."""
+        if self.passes_on:
+            raise Conflict("this episode's observations go to the client that began it: reset first")
 
     def _take(self, reply: Reply) -> None:
-        super()._take(reply)
         self.reply = reply
+        super()._take(reply._replace(packed=NOTHING) if self.passes_on else reply)
 
 
 class Open:
@@ -137,11 +154,17 @@ class Sessions:
             scenario, case = self._clerks.call("session", flags)
             found = self._begin(request, scenario, case, uploads, observation, seed, reward, idle)
             self._open[found.id] = found
+        except SimulationError as error:
+            raise BadInput(f"the simulation cannot begin: {error}", field="scenario") from None
         finally:
             with self._lock:
                 self._opening -= 1
         log.info("session opened", extra={"session": found.id, "scenario": scenario.name})
         return found
+
+    def that_uses(self, upload: str) -> str | None:
+        """A session that is open on this upload."""
+        return next((one.id for one in self.all() if upload in one.uploads), None)
 
     def get(self, session: str) -> Open:
         """One of them. Raises NotFound."""
@@ -154,14 +177,12 @@ class Sessions:
         """Those that are open, the oldest first."""
         return [*self._open.values()]
 
-    def act(
-        self, one: Open, actions: Mapping[str, Any], see: Sequence[str] | None
-    ) -> tuple[Served, StepResult]:
+    def act(self, one: Open, actions: Mapping[str, Any], see: Sequence[str] | None) -> StepResult:
         """One decision of a session that the caller is `using`."""
         began = time.perf_counter()
         result = one.session.act(actions, see=see)
         self._took(time.perf_counter() - began)
-        return one.session, result
+        return result
 
     def end(self, session: str) -> None:
         """Close one. Raises NotFound."""

@@ -32,15 +32,15 @@ def view(seen: View) -> dict[str, Any]:
         "target_speed": seen.target_speed,
         "lane_changing": seen.lane_changing,
         "speed_limit": seen.speed_limit,
-        "to_dead_end": seen.to_dead_end.tolist(),
-        "conflict_distance": seen.conflict_distance,
+        "to_dead_end": [*map(_ahead, seen.to_dead_end.tolist())],
+        "conflict_distance": _ahead(seen.conflict_distance),
         "lane_exists": seen.lane_exists.tolist(),
         "action_mask": dict(zip(MetaAction.__members__, seen.action_mask.tolist(), strict=True)),
         "signal": rules.signal,
         "signal_switch_in": None if rules.switch_in < 0.0 else rules.switch_in,
         "all_way_stop": rules.all_way_stop,
-        **{name: getattr(rules, name) for name in _LAW},
-        "limits": rules.limits.tolist(),
+        **{name: _ahead(getattr(rules, name)) for name in _LAW},
+        "limits": [[_ahead(at), _ahead(limit)] for at, limit in rules.limits.tolist()],
         "vehicles": [
             {"id": name, **dict(zip(KINEMATIC_FEATURES, row, strict=True))}
             for name, row, known in zip(seen.ids, rows, seen.valid[-1].tolist(), strict=True)
@@ -97,11 +97,16 @@ def snapshot(now: Snapshot) -> dict[str, Any]:
 
 
 def to_json(document: Mapping[str, Any]) -> bytes:
-    """JSON as every parser reads it: infinities, which say that nothing is ahead, are null."""
+    """JSON as every parser reads it: what is not finite is null."""
     try:
         return json.dumps(document, allow_nan=False, separators=(",", ":")).encode()
     except ValueError:
         return json.dumps(_finite(document), allow_nan=False, separators=(",", ":")).encode()
+
+
+def _ahead(distance: float) -> float | None:
+    """m; null where there is none."""
+    return distance if math.isfinite(distance) else None
 
 
 def _finite(value: Any) -> Any:

@@ -9,7 +9,7 @@ import contextlib
 import io
 import struct
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NoReturn
 
 from traci import constants as tc
@@ -17,7 +17,7 @@ from traci.connection import Connection
 from traci.exceptions import FatalTraCIError, TraCIException
 from traci.storage import Storage
 
-from cosim.errors import BadInput, SimulationError
+from cosim.errors import BadInput, SimulationEnded, SimulationError
 
 RETRY = 0.2  # s between attempts to connect
 EVERYWHERE = 1e6  # m around a junction
@@ -38,6 +38,11 @@ AVS = {
     "getDistance": tc.VAR_DISTANCE,
     "getRoadID": tc.VAR_ROAD_ID,
     "getRouteIndex": tc.VAR_ROUTE_INDEX,
+}
+# Asked of all AVs at once when one is asked about: variable, the form of its parameters, all of them.
+AT_TIMES: Mapping[str, tuple[int, str, Sequence[tuple[int, ...]]]] = {
+    "getLaneChangeState": (tc.CMD_CHANGELANE, "i", ((1,), (-1,))),
+    "getNextLinks": (tc.VAR_NEXT_LINKS, "", ((),)),
 }
 LIGHTS = {
     "getRedYellowGreenState": tc.TL_RED_YELLOW_GREEN_STATE,
@@ -72,7 +77,7 @@ class Client:
         order: the place among its clients, different for each: higher ones act later, and win a conflict.
         timeout: s that SUMO may take to answer (it waits for all other clients).
 
-    Raises BadInput where nobody listens. Every call raises FatalTraCIError once the connection is lost.
+    Raises BadInput where nobody listens. Any call raises SimulationEnded when the connection is lost.
     """
 
     TraCIException, FatalTraCIError, constants = TraCIException, FatalTraCIError, tc
@@ -83,7 +88,7 @@ class Client:
         try:
             self._connection.setOrder(order)
             self.version: str = self._connection.getVersion()[1]
-        except (TraCIException, FatalTraCIError) as error:
+        except (TraCIException, FatalTraCIError, SimulationEnded) as error:
             raise SimulationError(f"{self.place}: {error}") from None
         c = self._connection
         self.edge, self.junction, self.lane, self.person = c.edge, c.junction, c.lane, c.person
@@ -103,7 +108,7 @@ class Client:
         with contextlib.redirect_stdout(io.StringIO()):  # traci says there what it misses of who was removed
             self._connection.simulationStep()
         if not self.simulation.came:  # no word of what was subscribed
-            raise FatalTraCIError("its owner has loaded another simulation")
+            raise SimulationEnded("its owner has loaded another simulation")
         here, came = self.vehicle.stepped(), self.simulation.came[""]
         departed = came[tc.VAR_DEPARTED_VEHICLES_IDS]
         came[tc.VAR_DEPARTED_VEHICLES_IDS] = tuple(name for name in departed if name in here)
@@ -111,15 +116,19 @@ class Client:
     def close(self) -> None:
         """Leave: SUMO goes on with the others."""
         for last in (self._connection.flush, self.vehicle.unsubscribe, self._connection.close):
-            with contextlib.suppress(TraCIException, FatalTraCIError):
+            with contextlib.suppress(TraCIException, FatalTraCIError, SimulationEnded):
                 last()
 
 
 class _Connection(Connection):  # type: ignore[misc]  # traci is not typed
     """traci's connection with a limit on every answer; commands to vehicles wait for `flush`."""
 
+    _socket: Any
+    _queue: list[int]
+    _string: bytes
+
     def __init__(self, host: str, port: int, timeout: float) -> None:
-        self._waits = False
+        self._waits = self._gathers = False
         self.everybody: dict[str, Row] = {}  # what came of every vehicle with the last step
         super().__init__(host, port, None, None, False)
         self._timeout = timeout
@@ -134,8 +143,34 @@ class _Connection(Connection):  # type: ignore[misc]  # traci is not typed
                 if "is not known" not in str(error):
                     raise
 
+    def ask(self, command: int, variable: int, form: str, asked: Sequence[tuple[Any, ...]]) -> list[Any]:
+        """The same getter of many in one message, each with (object, parameters in `form`): the values."""
+        self.flush()
+        self._gathers = True
+        try:
+            for name, *parameters in asked:
+                self._sendCmd(command, variable, name, form, *parameters)
+        finally:
+            self._gathers = False
+        message, self._string, self._queue = self._string, b"", []
+        try:
+            self._socket.sendall(struct.pack("!i", len(message) + 4) + message)
+        except OSError:
+            self._lose("SUMO has gone")
+        answer, values = self._recvExact(), []
+        for _ in asked:
+            _, _, failed = answer.read("!BBB")
+            words = answer.readString()
+            if failed:
+                raise TraCIException(words)
+            answer.readLength()
+            answer.read("!BB")
+            answer.readString()
+            values.append(self._subscriptionMapping[command].parse(variable, answer))
+        return values
+
     def _sendCmd(self, cmdID: int, *words: Any) -> Any:
-        self._waits = cmdID == tc.CMD_SET_VEHICLE_VARIABLE
+        self._waits = self._gathers or cmdID == tc.CMD_SET_VEHICLE_VARIABLE
         if not self._waits:
             self.flush()
         try:
@@ -188,7 +223,7 @@ class _Connection(Connection):  # type: ignore[misc]  # traci is not typed
 
     def _lose(self, why: str) -> NoReturn:
         self._drop()
-        raise FatalTraCIError(why) from None
+        raise SimulationEnded(why) from None
 
     def _drop(self) -> None:
         if self._socket is not None:
@@ -257,13 +292,19 @@ class _Vehicles(_Domain):
         )
         self._ids: tuple[str, ...] | None = None
         self._avs: set[str] = set()  # who was asked about
+        self._told: dict[
+            tuple[Any, ...], Any
+        ] = {}  # (variable, AV, parameters) -> value, since the last step
         for column, name in enumerate(VEHICLES):
             setattr(self, name, self._row_getter(name, column))
+        for name, (variable, form, parameters) in AT_TIMES.items():
+            setattr(self, name, self._common_getter(variable, form, parameters))
 
     def stepped(self) -> set[str]:
         """A step was driven: who is on the road now that it is our turn (others may have removed some)."""
         self._ids = self._domain.getIDList()
         here = set(self._ids)
+        self._told.clear()
         for vehicle in self._connection.everybody.keys() - here:
             del self._connection.everybody[vehicle]
             self.came.pop(vehicle, None)
@@ -295,6 +336,20 @@ class _Vehicles(_Domain):
             found = call
         setattr(self, name, found)
         return found
+
+    def _common_getter(
+        self, variable: int, form: str, every: Sequence[tuple[int, ...]]
+    ) -> Callable[..., Any]:
+        def get(vehicle: str, *parameters: int) -> Any:
+            key = (variable, vehicle, *parameters)
+            if key not in self._told:
+                avs = {vehicle, *(self._avs & set(self.getIDList()))}
+                asked = [(one, *values) for one in avs for values in every]
+                found = self._connection.ask(tc.CMD_GET_VEHICLE_VARIABLE, variable, form, asked)
+                self._told.update(((variable, *one), v) for one, v in zip(asked, found, strict=True))
+            return self._told[key]
+
+        return get
 
     def _row_getter(self, name: str, column: int) -> Callable[[str], Any]:
         ask, connection = getattr(self._domain, name), self._connection

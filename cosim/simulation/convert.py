@@ -2,9 +2,10 @@
 
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from cosim.types import Actor, Bytes, Events, Floats, Kind, Snapshot
 READ = ("Position", "Angle", "Speed", "Acceleration", "LaneID", "LanePosition")  # of every vehicle
 # The same of persons, of whose acceleration SUMO says nothing. No lane is theirs: they walk beside, along,
 # against and across those of vehicles.
-NOT_OF_PERSONS = (lambda _: 0.0, lambda _: "", lambda _: 0.0)
+NOT_OF_PERSONS: tuple[Callable[[str], Any], ...] = (lambda _: 0.0, lambda _: "", lambda _: 0.0)
 PERSON = "person:"  # a person's name in a snapshot: this and its id, which may be a vehicle's too
 GIVE_WAY = "mswZ"  # link states: minor, stop, all-way stop, zipper (SUMO, Networks/SUMO_Road_Networks)
 # link states at a stop line without signals (SUMO, Networks/SUMO_Road_Networks)

@@ -22,7 +22,7 @@ from cosim.simulation.drivers import IDM_TYPE, Drivers
 from cosim.simulation.fleet import AV_LANE_CHANGE, Fleet, set_type
 from cosim.simulation.net import NetReader
 from cosim.simulation.sumo import DEFAULTS, FORCED, GIVES_UP, SumoSimulator
-from cosim.types import Command, OnCollision, Receipt, Snapshot, Timing
+from cosim.types import OnCollision, Snapshot, Timing
 
 # Options that decide what figures mean, as `cosim run` sets them.
 OURS = {
@@ -40,13 +40,6 @@ class SharedSimulator(SumoSimulator):
     _over = False  # nothing more can be asked of SUMO
     _pending: Sequence[str] = ()  # vehicles that waited at the last step
 
-    def advance(self, commands: Sequence[Command]) -> tuple[tuple[Receipt, ...], tuple[Snapshot, ...]]:
-        """As alone. Raises SimulationEnded when the others have gone, or SUMO has."""
-        try:
-            return super().advance(commands)
-        except sumo.FatalTraCIError as error:
-            self._end(self._LOST or str(error))
-
     def counts(self) -> dict[str, int]:
         """As alone, up to the last step."""
         return {"inserted": self._inserted, "waiting": len(self._waited.union(self._pending))}
@@ -55,6 +48,9 @@ class SharedSimulator(SumoSimulator):
         before = sumo.simulation.getTime()
         try:
             sumo.simulationStep()
+        except SimulationEnded:
+            self._over = True
+            raise
         except sumo.FatalTraCIError as error:
             self._end(self._LOST or str(error))
         except sumo.TraCIException as error:
@@ -142,7 +138,7 @@ class TraciSimulator(SharedSimulator):
         """Give every AV its own driver back, and leave."""
         if sumo.source is self._client:
             if not self._over:
-                with contextlib.suppress(*sumo.errors):
+                with contextlib.suppress(*sumo.errors, SimulationEnded):
                     self._hand_back()
             sumo.bind(libsumo)
         self._client.close()

@@ -36,13 +36,13 @@ class Server:
         self._file = self.log.open("a")
         self._from = self.log.stat().st_size
         self.process = subprocess.Popen(command, stderr=self._file, env={**os.environ, **environment})
-        deadline = time.monotonic() + 60.0
+        deadline = time.monotonic() + 240.0
         while not (found := READY.search(self.log.read_text()[self._from :])):
             assert self.process.poll() is None, self.log.read_text()
             assert time.monotonic() < deadline, "the server does not start"
             time.sleep(0.02)
         self.url = f"http://127.0.0.1:{found[2]}"
-        self.http = httpx.Client(base_url=self.url, timeout=60.0)
+        self.http = httpx.Client(base_url=self.url, timeout=240.0)
         while time.monotonic() < deadline:
             try:
                 self.http.get("/health")
@@ -56,7 +56,7 @@ class Server:
         assert answer.status_code == 201, answer.text
         return str(answer.json()["id"])
 
-    def wait(self, run: str, *statuses: str, seconds: float = 60.0) -> dict[str, Any]:
+    def wait(self, run: str, *statuses: str, seconds: float = 240.0) -> dict[str, Any]:
         """The run's document once it has one of these statuses (by default: once it has ended)."""
         deadline = time.monotonic() + seconds
         while True:

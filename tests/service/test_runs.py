@@ -117,6 +117,22 @@ def test_bad_input_is_one_sentence_that_names_the_field(
     assert says in problem["problem"]
 
 
+@pytest.mark.parametrize(
+    "body",
+    [
+        b"[" * 100_000,
+        b'{"scenario": ' + b"1" * 10_000 + b"}",
+        b'{"\\ud800": 1}',
+        b'{"name": "\\ud800"}',
+        b"\xff",
+    ],
+)
+def test_json_that_nobody_means_is_refused(server: Server, body: bytes) -> None:
+    answer = server.http.post("/api/runs", content=body, headers={"Content-Type": "application/json"})
+    assert answer.status_code in (400, 422)
+    assert answer.json()["problem"]
+
+
 def test_a_request_that_is_too_large_is_refused(server: Server) -> None:
     answer = server.http.post("/api/runs", content=b" " * (1 << 21))
     assert answer.status_code == 413

@@ -62,7 +62,7 @@ class AllRed:
 '''
 DRIVE = ("--penetration", "0.3", "--policy", "random", "--duration", "20", "--json")
 SEED = 5
-LIMIT = 90  # s, of every wait
+LIMIT = 300  # s, of every wait: kernels may have to be compiled first
 
 Command = list[str]
 
@@ -165,9 +165,7 @@ def test_of_two_speeds_the_one_set_later_holds_and_the_other_is_said_to_be_refus
     world: str, started: Started
 ) -> None:
     served, joined = map(document, both_ways(started, world, 100, "slow", "--policy", "keep-lane"))
-    assert served["dt_av_m"] < 0.8 * joined["dt_av_m"], (
-        "who connects to us acts after us, of order 9 we act last"
-    )
+    assert served["dt_av_m"] < 0.8 * joined["dt_av_m"], "who connects to us acts after us"
     assert served["commands_blocked"] > joined["commands_blocked"] + 10
 
 

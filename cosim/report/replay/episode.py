@@ -14,7 +14,7 @@ from cosim.recording.replay_data import ReplayData
 from cosim.report import run_folder
 from cosim.scenario import Scenario
 from cosim.scenario.episode_id import EpisodeId
-from cosim.scenario.manifest import CASE, OPTIONS, POLICY_FILES, checked, manifest, named
+from cosim.scenario.manifest import CASE, OPTIONS, POLICY_FILES, TRACI, checked, manifest, named
 from cosim.scenario.policy_name import label, read
 from cosim.scenario.sumocfg import keeps
 from cosim.scenario.vet import vetted
@@ -63,6 +63,9 @@ def find(folder: Path, episode: str | None) -> Recorded:
     document = checked(read_json(file, ABSENT), file)
     if "cells" in document:
         return _of_batch(folder, episode)
+    if TRACI in document:
+        problem = "other TraCI programs drove along: it cannot be driven again, draw it with --replay at once"
+        raise BadInput(problem, file=file)
     if CASE not in document:
         raise BadInput("was not written by this version of cosim run or evaluate", file=file)
     driven = checked(read_json(result, ABSENT), result)

@@ -1,0 +1,200 @@
+"""How fast `cosim join` drives in a SUMO that somebody else started, alone and beside other programs.
+
+    python -m benchmarks.joining [--rounds 5] [--seconds 20] [--small] [--out docs/results/joining.md]
+
+The motorway interchange that SUMO's package ships (A10KW), with 200 vehicles. SUMO runs in a process of its
+own, as does every other program; the ways take turns. Wants a machine with nothing else to do: what else it
+does leaves only the ratio by processor time alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import socket
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import sumo
+
+import sumo_scenarios
+from benchmarks.tables import markdown_row, write_page
+from cosim.episode import Episode, Hook, Step
+from cosim.host import Host, joining
+from cosim.scenario import Fleet
+from cosim.simulation.client import Client
+from cosim.simulation.shared import theirs
+
+GAME = Path(sumo.__file__).parent / "tools" / "game"
+ADDITIONAL = (GAME / "input_additional.add.xml", GAME / "A10KW" / "osm.poly.xml", sumo_scenarios.TYPES)
+WARMUP = 70.0  # s, until 200 vehicles are on the road
+TARGET = 5.0  # times real time
+ORDER, LIMIT = 9, 60.0
+STEPS = """
+import sys, traci
+traci.init(int(sys.argv[1]), numRetries=60)
+traci.setOrder(1)
+try:
+    while True:
+        traci.simulationStep()
+except traci.exceptions.FatalTraCIError:
+    pass
+"""
+# SUMO's own platoons (sumo/tools/simpla), of the cars that our agents leave alone.
+PLATOONS = STEPS.replace("try:", "import simpla\nsimpla.load(sys.argv[2])\ntry:", 1)
+PLATOONED = "mw_passenger"
+SIMPLA = f"""<configuration>
+    <vehicleSelectors value="{PLATOONED}"/>
+    <verbosity value="0"/>
+    <vTypeMap original="veh_{PLATOONED}" leader="DEFAULT_VEHTYPE" follower="DEFAULT_VEHTYPE"
+        catchup="DEFAULT_VEHTYPE" catchupFollower="DEFAULT_VEHTYPE"/>
+</configuration>
+"""
+
+
+class Way(NamedTuple):
+    """One way of sharing SUMO."""
+
+    what: str
+    other: str = ""  # the other program
+    preset: str = "lawful"
+    fleet: Fleet = Fleet(penetration=0.2)
+
+
+WAYS = (
+    Way("joined alone"),
+    Way("joined alone, preset unguarded", preset="unguarded"),
+    Way("beside a program that steps along", STEPS),
+    Way("beside SUMO's own simpla, which drives platoons", PLATOONS, fleet=Fleet(ids=r"(?!veh_mw\d).*[0-2]")),
+)
+
+
+class Drive(NamedTuple):
+    """What one drive came to."""
+
+    ratio: float  # times real time
+    busy: float  # the same by the processor time of all its processes
+    vehicles: float  # mean over the decisions
+    avs: float
+
+
+class Clock(Hook):
+    """Times and numbers from the end of the warm-up on; `others`: process ids."""
+
+    def __init__(self, others: Sequence[int]) -> None:
+        self._others = others
+
+    def on_start(self, episode: Episode) -> None:
+        """The warm-up is driven."""
+        self._began = self._now()
+        self.numbers: list[tuple[int, int]] = []
+
+    def on_step(self, episode: Episode, step: Step) -> None:
+        """A decision was carried out."""
+        self.numbers.append((step.after.n, len(step.after.avs)))
+        self.wall, self.busy = (now - began for now, began in zip(self._now(), self._began, strict=True))
+
+    def _now(self) -> tuple[float, float]:
+        """s of wall time, and of processor time of all processes (proc(5): stat, utime and stime)."""
+        ticks = 0
+        for process in self._others:
+            ticks += sum(
+                map(int, Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[11:13])
+            )
+        return time.perf_counter(), time.process_time() + ticks / os.sysconf("SC_CLK_TCK")
+
+
+def drive(way: Way, warmup: float, seconds: float, work: Path) -> Drive:
+    """One drive of `seconds` counted s, every AV commanded at random."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    settings = work / "simpla.cfg.xml"
+    settings.write_text(SIMPLA, encoding="utf-8")
+    options = ["--remote-port", str(port), "--num-clients", str(1 + bool(way.other)), "--step-length", "0.1"]
+    options += ["--additional-files", ",".join(map(str, ADDITIONAL)), "--lanechange.duration", "2"]
+    options += ["--collision.action", "warn", "--collision.mingap-factor", "0", "--time-to-teleport", "-1"]
+    binary = str(GAME.parents[1] / "bin" / "sumo")
+    commands = [[binary, "-c", str(GAME / "A10KW.sumocfg"), *options, "--collision.check-junctions"]]
+    if way.other:
+        commands.append([sys.executable, "-c", way.other, str(port), str(settings)])
+    nowhere = subprocess.DEVNULL
+    programs = [subprocess.Popen(command, stdout=nowhere, stderr=nowhere) for command in commands]
+    try:
+        client = Client("localhost", port, ORDER, LIMIT)
+        theirs_, seed = theirs(client)
+        scenario = replace(theirs_, fleet=way.fleet, preset=way.preset, warmup=warmup, duration=seconds)
+        host, clock = (
+            Host(scenario, "random", 0.0, simulator=joining(client)),
+            Clock([p.pid for p in programs]),
+        )
+        try:
+            result = host.run(seed, hooks=[clock])
+        finally:
+            host.close()
+    finally:
+        for program in programs:
+            program.kill()
+            program.wait()
+    if ended := [reason for reason in result.validity if reason.startswith("ended")]:
+        raise SystemExit(f"error: {way.what}: {ended[0]}")
+    vehicles, avs = (statistics.fmean(column) for column in zip(*clock.numbers, strict=True))
+    return Drive(seconds / clock.wall, seconds / clock.busy, vehicles, avs)
+
+
+def page(found: dict[str, list[Drive]], command: str) -> list[str]:
+    """The Markdown page."""
+    rows = []
+    for what, drives in found.items():
+        ratio, busy, vehicles, avs = zip(*drives, strict=True)
+        said = f"at least {TARGET:g}: {'met' if statistics.median(ratio) >= TARGET else '**missed**'}"
+        mean = [f"{statistics.fmean(column):.0f}" for column in (vehicles, avs)]
+        rows.append([what, *mean, _middle(ratio), _middle(busy), said])
+    return [
+        "# How fast cosim drives in somebody else's SUMO",
+        "",
+        f"Made by `{command}`: `cosim join` ([traci.md](../traci.md))",
+        f"on A10KW, the motorway interchange that SUMO's package ships, from {WARMUP:g} s on. All AVs are",
+        "commanded at every decision, at random, without a network. SUMO, our agents and the other program",
+        "are a process each and wait for one another: where the machine has nothing else to do both ratios",
+        "are nearly the same. Medians (range).",
+        "",
+        markdown_row(["", "vehicles", "AVs", "times real time", "by processor time", "target"]),
+        "|---|---|---|---|---|---|",
+        *map(markdown_row, rows),
+    ]
+
+
+def _middle(values: Sequence[float]) -> str:
+    return f"{statistics.median(values):.1f} ({min(values):.1f} to {max(values):.1f})"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure, then write the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=5, metavar="N", help="default 5")
+    parser.add_argument("--seconds", type=float, default=20.0, metavar="S", help="counted s of a drive")
+    parser.add_argument("--small", action="store_true", help="one short drive; its figures are worth nothing")
+    parser.add_argument("--out", type=Path, metavar="FILE.md", help="default: printed")
+    args = parser.parse_args(arguments)
+    ways, warmup = (WAYS[:1], 2.0) if args.small else (WAYS, WARMUP)
+    os.environ["SUMO_HOME"] = str(GAME.parents[1])  # where simpla looks for SUMO's tools
+    found: dict[str, list[Drive]] = {way.what: [] for way in ways}
+    with tempfile.TemporaryDirectory(prefix="cosim-joining-") as work:
+        for number in range(args.rounds):
+            for way in ways:
+                print(f"joining {number + 1}/{args.rounds}: {way.what}", file=sys.stderr, flush=True)
+                found[way.what].append(drive(way, warmup, args.seconds, Path(work)))
+    command = f"python -m benchmarks.joining --rounds {args.rounds} --seconds {args.seconds:g}"
+    write_page(args.out, page(found, command))
+
+
+if __name__ == "__main__":
+    main()

@@ -2,7 +2,7 @@
 
     python -m benchmarks.estimate tune --world merge --runs runs/tilts [--episodes 400] [--rounds 4]
     python -m benchmarks.estimate measure --runs runs/estimate [--worlds merge] [--episodes 4000]
-    python -m benchmarks.estimate page --runs runs/estimate [--out PAGE]
+    python -m benchmarks.estimate page --runs runs/estimate [--out PAGE] [--intervals 400]
 
 `tune` drives tilted episodes of `idm` AVs on tuning seeds, and lets the tilt become that under which errors
 are as frequent as in those episodes in which an AV crashed (cross-entropy; docs/estimate.md); it prints the
@@ -127,19 +127,19 @@ def measure(runs: Path, worlds: Sequence[str], episodes: int, workers: int) -> N
         drive(runs / f"field-{world}", world, "dense", "field", tilt, seeds, workers)
 
 
-def page(runs: Path, out: Path) -> None:
-    """Write it from the toy and from what `measure` left."""
+def page(runs: Path, out: Path, intervals: int) -> None:
+    """Write it from the toy (`intervals` estimates a line) and from what `measure` left."""
     lines = ["# What the intervals of `cosim estimate` are worth", ""]
     lines += [
         "Made by `python -m benchmarks.estimate page`; [what is estimated, and how](../estimate.md).",
         "",
     ]
-    lines += [*_toy(), *_real(runs), *_field(runs)]
+    lines += [*_toy(intervals), *_real(runs), *_field(runs)]
     write_page(out, lines)
 
 
-def _toy() -> list[str]:
-    """Coverage of `INTERVALS` intervals at several tilts and sizes."""
+def _toy(intervals: int) -> list[str]:
+    """Coverage of so many intervals at several tilts and sizes."""
     toy = Toy()
     truth = toy.truth()
     lines = [
@@ -147,7 +147,7 @@ def _toy() -> list[str]:
         "",
         f"Two kinds of errors that crash together, a third that crashes alone and seldom happens "
         f"(`benchmarks/toy_crashes.py`); truth {1e6 * truth:.1f} crashes per million km. "
-        f"{INTERVALS} estimates a line.",
+        f"{intervals} estimates a line.",
         "",
         markdown_row(
             ("tilt", "episodes each", "crashes each", "effective", "95 % intervals that hold the truth",
@@ -157,7 +157,7 @@ def _toy() -> list[str]:
     ]  # fmt: skip
     for factor, episodes in ((1, 2000), (30, 1000), (100, 300), (100, 1000), (100, 2000), (300, 1000)):
         tilt = Tilt(dict.fromkeys(KINDS, float(factor)))
-        each = [*zip(*toy.drive((INTERVALS, episodes), tilt, factor * episodes), strict=True)]
+        each = [*zip(*toy.drive((intervals, episodes), tilt, factor * episodes), strict=True)]
         found = [pooled_rate(*parts) for parts in each]
         below, above = (np.mean([f.high < truth for f in found]), np.mean([f.low > truth for f in found]))
         values = np.array([f.value for f in found]) / truth
@@ -262,6 +262,7 @@ def main() -> None:
     writing = commands.add_parser("page")
     writing.add_argument("--runs", type=Path, required=True)
     writing.add_argument("--out", type=Path, default=PAGE)
+    writing.add_argument("--intervals", type=int, default=INTERVALS)
     writing.set_defaults(work=page)
     args = vars(parser.parse_args())
     args.pop("work")(**args)

@@ -137,6 +137,13 @@ def joining(place: Place) -> list[list[str]]:
     return [["benchmarks.joining", *flags, "--out", str(place.out / "joining.md")]]
 
 
+def estimate(place: Place) -> list[list[str]]:
+    """What the intervals of `cosim estimate` are worth."""
+    flags = ["--intervals", "2"] if place.small else []
+    runs = str(place.work / "estimate")
+    return [["benchmarks.estimate", "page", "--runs", runs, *flags, "--out", str(place.out / "estimate.md")]]
+
+
 def law(place: Place) -> list[list[str]]:
     """How well AVs keep the law in the worlds of tests/worlds."""
     flags = ["--seeds", "20", "--runs", str(place.work / "law_runs")]
@@ -161,6 +168,7 @@ PAGES = (
     Page("performance", performance, ("performance.md",)),
     Page("startup", startup, ("startup.md",)),
     Page("joining", joining, ("joining.md",)),
+    Page("estimate", estimate, ("estimate.md",)),
     Page("reward_balance", reward_balance, ("reward_balance.md",)),
     Page("reward_by_driving", reward_by_driving, ("reward_by_driving.md",)),
     Page(

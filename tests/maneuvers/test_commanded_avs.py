@@ -226,12 +226,12 @@ class Getters:
     def read(self, name: str) -> list[tuple[object, object]]:
         import libsumo
 
-        from cosim.simulation.convert import GETTERS
+        from cosim.simulation.backend import sumo
+        from cosim.simulation.convert import READ
 
         self._simulator.reset(0)
-        public = ("getPosition", "getAngle", "getSpeed", "getAcceleration", "getLaneID", "getLanePosition")
-        pairs = zip(GETTERS, public, strict=True)
-        return [(fast(name), getattr(libsumo.vehicle, slow)(name)) for fast, slow in pairs]
+        pairs = [(sumo.getter("vehicle", read), getattr(libsumo.vehicle, f"get{read}")) for read in READ]
+        return [(fast(name), slow(name)) for fast, slow in pairs]
 
 
 def test_the_compiled_getters_read_what_the_public_ones_do() -> None:

@@ -64,7 +64,7 @@ def test_the_fcd_file_yields_the_figures_of_the_episode(
     assert main(["metrics", str(folder / seed / "fcd.xml"), *arguments]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["frames"] == 61
-    assert len(document["units"]) == 9
+    assert len(document["units"]) == 17
     for name in document["units"]:
         expected = found[seed].value(name)
         # six digits after the point: differences of speeds 0.2 s apart are right to 5e-6 m/s2

@@ -34,11 +34,16 @@ def keep_distance(rows: Floats32, valid: Bools) -> MetaAction:
 
 def main() -> None:
     with cosim.open("merge", demand="contested", svo=45) as session:
-        views, reward = session.reset(seed=7), 0.0
-        while not session.over:
-            step = session.act({av: my_agent(seen) for av, seen in views.items()})
-            views, reward = step.observations, reward + sum(step.rewards.values())
-        figures = session.result("my-agent").metrics
+        drive(session)
+
+
+def drive(session: cosim.Session) -> None:
+    """One episode, decision by decision, and its figures."""
+    views, reward = session.reset(seed=7), 0.0
+    while not session.over:
+        step = session.act({av: my_agent(seen) for av, seen in views.items()})
+        views, reward = step.observations, reward + sum(step.rewards.values())
+    figures = session.result("my-agent").metrics
     print(f"sum of SVO rewards {reward:.1f}")
     for name in ("crashed", "mission_success", "dt_mean_m", "dt_mission_m", "min_ttc_s"):
         print(f"{name:<16} {figures[name].value} {figures[name].unit}")

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import argparse
 import math
-import shutil
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from cosim.cli import arguments
 from cosim.cli.run import show
 from cosim.errors import BadInput
+from cosim.files import new_folder
 from cosim.scenario import Fleet, Scenario, checked_fleet, chosen_fleet, chosen_mission
 from cosim.scenario.policy_name import label, read
 
@@ -73,7 +72,7 @@ def work(args: argparse.Namespace) -> int:
     policy = read(args.policy).text
     check(policy)
     fleet = checked_fleet(chosen_fleet(args.av_type, args.av_ids, args.penetration) or Fleet())
-    with _run_folder(args.out) as folder:
+    with new_folder(args.out) as folder:
         driver = make(policy)  # before SUMO has to wait for it
         host_name, port = args.place
         client = Client(host_name, port, args.order, args.timeout)
@@ -112,21 +111,6 @@ def _as_asked(scenario: Scenario, args: argparse.Namespace, fleet: Fleet) -> Sce
         given["mission"] = chosen_mission(scenario.mission, args.mission)
     known = {name: value for name, value in given.items() if value is not None}
     return replace(scenario, fleet=fleet, **known)
-
-
-@contextmanager
-def _run_folder(path: str | None) -> Iterator[Path | None]:
-    """The folder --out, made now; gone again where nothing was driven."""
-    from cosim.files import prepare_folder
-
-    new = path is not None and not Path(path).exists()
-    folder = None if path is None else prepare_folder(path)
-    try:
-        yield folder
-    except BaseException:
-        if new and folder is not None:
-            shutil.rmtree(folder, ignore_errors=True)
-        raise
 
 
 @contextmanager

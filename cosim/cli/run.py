@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import functools
 import json
 import math
@@ -126,47 +127,51 @@ def work(args: argparse.Namespace) -> int:
     case = case_of(args)
     limits = {} if served is None else {"timeout": args.traci_timeout or DEFAULT_TIMEOUT}
     worker = Worker(Driver, case.policy, name="cosim-run", wait=False, **limits)
-    from cosim.files import prepare_folder
+    from cosim.files import new_folder
     from cosim.policies import check
     from cosim.scenario import sumo_outputs
     from cosim.scenario.manifest import TRACI, remembered
     from cosim.scenario.vet import vetted
     from cosim.workers.progress import Progress
 
-    try:
-        check(case.policy)
-        scenario = case.scenario(args.sumo_options)
-        sumo_outputs.check(case.outputs, scenario.options)
-        scenario = vetted(scenario)
-        new = bool(args.out) and not Path(args.out).exists()
-        folder = prepare_folder(args.out) if args.out else None
-    except BaseException:
-        worker.kill()  # it is still loading, and has nothing to put away
-        worker.close()
-        raise
-    files = folder / "outputs" if folder is not None and case.outputs else None
-    progress = Progress(f"{scenario.name} {label(case.policy)}", "s")
-    if served is None:
-        progress.starting()
-    else:
-        print(
-            f"cosim: SUMO waits for {_programs(served[1])} at port {served[0]}", file=sys.stderr, flush=True
-        )
-    try:
-        result, replay = worker.call("drive", scenario, case, args.replay, files, served, progress=progress)
-    except BaseException as error:
-        worker.kill()
-        if new and folder is not None:
-            shutil.rmtree(folder, ignore_errors=True)
-        if served is not None and isinstance(error, SimulationTimeout):
-            problem = f"{_programs(served[1])} did not connect, or did not step, for {limits['timeout']:g} s"
-            raise SimulationTimeout(f"port {served[0]}: {problem}") from None
-        raise
-    finally:
-        worker.close()
-        if files is not None:  # what a simulation that crashed leaves behind
-            shutil.rmtree(files / sumo_outputs.DRAFT, ignore_errors=True)
-        progress.done()
+    with contextlib.ExitStack() as undone:
+        try:
+            check(case.policy)
+            scenario = case.scenario(args.sumo_options)
+            sumo_outputs.check(case.outputs, scenario.options)
+            scenario = vetted(scenario)
+            folder = undone.enter_context(new_folder(args.out or None))
+        except BaseException:
+            worker.kill()  # it is still loading, and has nothing to put away
+            worker.close()
+            raise
+        files = folder / "outputs" if folder is not None and case.outputs else None
+        progress = Progress(f"{scenario.name} {label(case.policy)}", "s")
+        if served is None:
+            progress.starting()
+        else:
+            print(
+                f"cosim: SUMO waits for {_programs(served[1])} at port {served[0]}",
+                file=sys.stderr,
+                flush=True,
+            )
+        try:
+            result, replay = worker.call(
+                "drive", scenario, case, args.replay, files, served, progress=progress
+            )
+        except BaseException as error:
+            worker.kill()
+            if served is not None and isinstance(error, SimulationTimeout):
+                problem = (
+                    f"{_programs(served[1])} did not connect, or did not step, for {limits['timeout']:g} s"
+                )
+                raise SimulationTimeout(f"port {served[0]}: {problem}") from None
+            raise
+        finally:
+            worker.close()
+            if files is not None:  # what a simulation that crashed leaves behind
+                shutil.rmtree(files / sumo_outputs.DRAFT, ignore_errors=True)
+            progress.done()
     if served is None:
         beside = remembered(case, args.sumo_options)
     else:

@@ -5,6 +5,7 @@ import csv
 import json
 import math
 import os
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -74,6 +75,22 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float):
         return f"{value:.6g}" if math.isfinite(value) else ""
     return value
+
+
+@contextlib.contextmanager
+def new_folder(path: str | None) -> Iterator[Path | None]:
+    """The folder that --out names, made now; gone again where what is done in it fails and it is new.
+
+    Raises BadInput.
+    """
+    new = path is not None and not Path(path).exists()
+    folder = None if path is None else prepare_folder(path)
+    try:
+        yield folder
+    except BaseException:
+        if new and folder is not None:
+            shutil.rmtree(folder, ignore_errors=True)
+        raise
 
 
 def prepare_folder(path: str, field: str = "--out") -> Path:

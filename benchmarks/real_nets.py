@@ -380,6 +380,7 @@ def page(runs: Sequence[Run], found: Sequence[dict[str, Any] | str | None], comm
     why: dict[str, list[str]] = {}
     for run, one in driven:
         for reason in one["not_comparable_because"]:
+            reason = reason.replace(f"{run.config}", run.config.name)
             why.setdefault(reason, []).append(f"{run.config.stem} {run.policy} {run.seed}")
     if why:
         lines += ["", "## Not comparable with other runs, and the results say so", ""]

@@ -20,7 +20,8 @@ from PIL import Image
 from cosim.episode import Episode, run_episode
 from cosim.recording.recorder import Recorder
 from cosim.recording.replay_data import ReplayData, replay_data
-from cosim.report.replay.page import document, page
+from cosim.report.replay.packing import document
+from cosim.report.replay.page import page
 from cosim.report.replay.signs import LAMPS, states_at, stop_lines, zebra
 from cosim.report.replay.strip import Strip, poses_at
 from cosim.report.replay.video import CAPTION, HEIGHT, LOW, SMALL, WIDTH, animation, film, picture_at

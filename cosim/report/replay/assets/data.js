@@ -17,61 +17,82 @@ async function unpack(base64) {
   return read(await new Response(stream).json());
 }
 
+function outline([x, y]) { // a polyline with its bounding box
+  const px = scaled(x, 0.01), py = scaled(y, 0.01);
+  return { x: px, y: py, box: [Math.min(...px), Math.min(...py), Math.max(...px), Math.max(...py)] };
+}
+
 function read(raw) {
-  const begin = raw.begin / 1000;
-  const line = ([x, y]) => { // a polyline with its bounding box
-    const px = scaled(x, 0.01), py = scaled(y, 0.01);
-    return { x: px, y: py, box: [Math.min(...px), Math.min(...py), Math.max(...px), Math.max(...py)] };
+  const lanes = raw.lanes.map(([id, width, internal, shape]) => ({ id, width: width / 100, internal: internal === 1, ...outline(shape) }));
+  // a mission that was found, not named, may end almost anywhere: no use to mark that
+  const open = raw.lanes.filter(([, , internal]) => internal === 0).length;
+  const begin = raw.begin / 1000, times = Array.from(summed(raw.times), (t) => t / 1000 - begin);
+  const data = {
+    facts: raw.facts, begin, lamps: raw.lamps, words: [], vehicles: [], byId: new Map(), lanes,
+    shapes: new Map(Object.entries(raw.shapes).map(([actor, [name, least, parts]]) => [Number(actor), { name, least, parts }])),
+    times, end: times.length ? times[times.length - 1] : 0, decided: [], forecasts: [], forecastInterval: raw.forecast_interval,
+    corrections: [], violations: [], errors: [], collisions: [],
+    signals: raw.signals.map(([states, frames]) => ({ states, frames: Array.from(summed(frames)) })),
+    crossings: raw.crossings.map(([width, shape, signal]) => ({ width: width / 100, signal, ...outline(shape) })),
+    stopLines: raw.stop_lines.map(([lane, rule, signals]) => ({ ...endOf(lanes[lane]), rule, signals })),
+    junctions: raw.junctions.map(outline), goal: new Set(raw.goal.length > open / 2 && open > 6 ? [] : raw.goal), zones: new Set(raw.zones),
   };
-  const shapes = new Map(Object.entries(raw.shapes).map(([actor, [name, least, parts]]) => [Number(actor), { name, least, parts }]));
-  const vehicles = raw.vehicles.map(([id, kind, mission, driver, length, width, actor], number) => ({
-    id, number, av: kind === 1, person: kind === 2, mission: mission === 1, driver, actor, what: shapes.get(actor).name,
-    length: Math.max(length / 100, shapes.get(actor).least[0]), width: Math.max(width / 100, shapes.get(actor).least[1]),
-    tracks: [], choices: [], corrections: [], violations: [], errors: [],
-  }));
+  for (const [kind, rows] of [["words", raw.words], ["vehicles", raw.vehicles], ["interventions", raw.interventions],
+    ["violations", raw.violations], ["errors", raw.errors], ["collisions", raw.collisions]]) {
+    for (const row of rows) ADD[kind](data, row);
+  }
   for (const [v, first, x, y, heading, speed, accel, lane] of raw.tracks) {
-    vehicles[v].tracks.push({
+    data.vehicles[v].tracks.push({
       first, last: first + x.length - 1, x: scaled(x, 0.01, 2), y: scaled(y, 0.01, 2),
       heading: scaled(heading, 0.001), speed: scaled(speed, 0.01), accel: scaled(accel, 0.01), lane: summed(lane),
     });
   }
-  const said = ([t, v, word]) => ({ t: t / 1000 - begin, text: raw.words[word], vehicle: vehicles[v] });
-  const corrections = raw.interventions.map(said), violations = raw.violations.map(said);
-  const errors = raw.errors.map(([t, until, v, kind, what, near]) => ({
-    t: t / 1000 - begin, until: until / 1000 - begin, vehicle: vehicles[v], kind: raw.words[kind].replaceAll("_", " "),
-    text: raw.words[what] + (raw.words[near] && !raw.words[what].includes(raw.words[near]) ? `, near ${raw.words[near]}` : ""), near: raw.words[near],
-  }));
-  for (const one of errors) one.vehicle.errors.push(one);
-  for (const one of corrections) one.vehicle.corrections.push(one);
-  for (const one of violations) one.vehicle.violations.push(one);
-  const decided = raw.decided.map((t) => t / 1000 - begin);
-  raw.choices.forEach((rows, k) => {
-    for (const [v, action, target, flags, blamed, blocked, q, score, ttc, unsafe] of rows) {
-      vehicles[v].choices.push({
-        k, t: decided[k], action, target: target / 100, vetoed: (flags & 1) > 0, fallback: (flags & 2) > 0,
-        blamed: raw.words[blamed], blocked: raw.words[blocked], q, score, ttc, unsafe,
-      });
-    }
-  });
-  const forecasts = raw.forecasts.map((rows) => rows && new Map(rows.map(([v, x, y, along, across]) => [v, {
+  raw.decided.forEach((t, k) => addDecisions(data, t, raw.choices[k], raw.forecasts[k]));
+  return data;
+}
+
+// What happens once and stays, row by row, as packing.py makes them.
+const ADD = {
+  words: (data, text) => data.words.push(text),
+  vehicles: (data, [id, kind, mission, driver, length, width, actor]) => {
+    const { name, least } = data.shapes.get(actor);
+    const vehicle = {
+      id, number: data.vehicles.length, av: kind === 1, person: kind === 2, mission: mission === 1, driver, actor, what: name,
+      length: Math.max(length / 100, least[0]), width: Math.max(width / 100, least[1]),
+      tracks: [], choices: [], corrections: [], violations: [], errors: [],
+    };
+    data.vehicles.push(vehicle); data.byId.set(id, vehicle);
+  },
+  interventions: (data, row) => addSaid(data, "corrections", row),
+  violations: (data, row) => addSaid(data, "violations", row),
+  errors: (data, [t, until, v, kind, what, near]) => {
+    const [text, whom] = [data.words[what], data.words[near]], vehicle = data.vehicles[v];
+    const one = {
+      t: t / 1000 - data.begin, until: until / 1000 - data.begin, vehicle, kind: data.words[kind].replaceAll("_", " "),
+      text: text + (whom && !text.includes(whom) ? `, near ${whom}` : ""), near: whom,
+    };
+    data.errors.push(one); vehicle.errors.push(one);
+  },
+  collisions: (data, one) => data.collisions.push({ ...one, t: one.t / 1000 - data.begin }),
+};
+
+function addSaid(data, kind, [t, v, word]) {
+  const one = { t: t / 1000 - data.begin, text: data.words[word], vehicle: data.vehicles[v] };
+  data[kind].push(one); one.vehicle[kind].push(one);
+}
+
+function addDecisions(data, time, rows, forecast) {
+  const k = data.decided.length, t = time / 1000 - data.begin;
+  data.decided.push(t);
+  for (const [v, action, target, flags, blamed, blocked, q, score, ttc, unsafe] of rows) {
+    data.vehicles[v].choices.push({
+      k, t, action, target: target / 100, vetoed: (flags & 1) > 0, fallback: (flags & 2) > 0,
+      blamed: data.words[blamed], blocked: data.words[blocked], q, score, ttc, unsafe,
+    });
+  }
+  data.forecasts.push(forecast && new Map(forecast.map(([v, x, y, along, across]) => [v, {
     x: scaled(x, 0.1), y: scaled(y, 0.1), along: scaled(along, 0.1), across: scaled(across, 0.1),
   }])));
-  const times = summed(raw.times).map((t) => t / 1000 - begin);
-  // a mission that was found, not named, may end almost anywhere: no use to mark that
-  const open = raw.lanes.filter(([, , internal]) => internal === 0).length;
-  const lanes = raw.lanes.map(([id, width, internal, shape]) => ({ id, width: width / 100, internal: internal === 1, ...line(shape) }));
-  return {
-    facts: raw.facts, shapes, lamps: raw.lamps, corrections, violations, errors,
-    signals: raw.signals.map(([states, frames]) => ({ states, frames: summed(frames) })),
-    crossings: raw.crossings.map(([width, shape, signal]) => ({ width: width / 100, signal, ...line(shape) })),
-    stopLines: raw.stop_lines.map(([lane, rule, signals]) => ({ ...endOf(lanes[lane]), rule, signals })),
-    times, end: times[times.length - 1], vehicles, decided, forecasts,
-    forecastInterval: raw.forecast_interval,
-    byId: new Map(vehicles.map((v) => [v.id, v])),
-    lanes,
-    junctions: raw.junctions.map(line), goal: new Set(raw.goal.length > open / 2 && open > 6 ? [] : raw.goal), zones: new Set(raw.zones),
-    collisions: raw.collisions.map((c) => ({ ...c, t: c.t / 1000 - begin })),
-  };
 }
 
 // Where a lane ends, in which direction, and half its width between the edges.
@@ -85,6 +106,9 @@ function lampAt(data, signal, t) {
   const { states, frames } = data.signals[signal];
   return states[Math.max(atOrBefore(frames, Math.max(atOrBefore(data.times, t), 0)), 0)];
 }
+
+// s that time lines span: the whole episode, also while it is driven.
+function spanOf(data) { return Math.max(data.end, data.facts.duration || 0) || 1; }
 
 // The last index of an ascending array whose value is not above t; -1 before the first.
 function atOrBefore(sorted, t) {

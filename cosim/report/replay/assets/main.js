@@ -7,15 +7,17 @@ const KEYS = [["space", "play, pause"], ["\u2190 \u2192", "one frame (shift: 2 s
   ["f", "follow the chosen vehicle"], ["m", "choose the mission vehicle"], ["n p", "next, previous vehicle in view"],
   ["g", "predictions"], ["l", "names"], ["t", "dark or light"], ["esc", "choose nobody"], ["?", "these keys"]];
 
-function start(data) {
+// `live` watches an episode that is still driven: pace(state) s of it a s, pull(t) to be driven so far, ended() when the last
+// moment is reached, dark(), darken(on) and keys [key, what, act] of its page. Returns load(data) for another episode, grown() for when it got longer.
+function start(data, live = null) {
   const $$ = (id) => document.getElementById(id);
   const scene = $$("scene"), view = new View(scene), map = new View($$("map")), chart = new View($$("chart"));
   const timeline = new View($$("timeline"));
   const state = {
     data, view, map, chart, t: 0, playing: false, rate: 1, chosen: null, following: false, labels: false, hidden: new Set(),
-    predictions: data.forecasts.some(Boolean), events: eventsOf(data), shown: [], c: null, dirty: true,
+    predictions: true, events: [], shown: [], c: null, dirty: true, live,
   };
-  const net = bounds(data.lanes.length ? data.lanes : [{ box: [0, 0, 100, 100] }]);
+  let net = null;
 
   state.choose = (vehicle, follow = state.following) => {
     state.chosen = vehicle; state.following = Boolean(vehicle) && follow;
@@ -23,18 +25,21 @@ function start(data) {
     if ($$("mine").checked) fillEvents(state);
     touch();
   };
-  state.seek = (t) => { state.t = Math.min(Math.max(t, 0), data.end); touch(); };
+  state.seek = (t) => { state.t = Math.min(Math.max(t, data.times[0] || 0), data.end); touch(); };
   function touch() { state.dirty = true; }
   function play(on = !state.playing) {
-    if (on && state.t >= data.end - 1e-6) state.t = 0;
+    if (on && state.t >= data.end - 1e-6 && !goesOn()) state.t = data.times[0] || 0;
     state.playing = on; $$("play").textContent = on ? "pause" : "play"; touch();
   }
+  function goesOn() { return live && !data.over; }
   function speed(rate) { state.rate = rate; $$("speed").value = rate; }
   function step(frames) {
     const k = atOrBefore(data.times, state.t), on = data.times[k] < state.t - 1e-6 && frames < 0 ? 1 : 0;
-    play(false); state.seek(data.times[Math.min(Math.max(k + frames + on, 0), data.times.length - 1)]);
+    play(false);
+    if (goesOn() && k + frames >= data.times.length) { live.pull(data.end + 0.01); state.stepping = true; }
+    state.seek(data.times[Math.min(Math.max(k + frames + on, 0), data.times.length - 1)]);
   }
-  function theme(dark) { document.documentElement.classList.toggle("dark", dark); state.c = colours(); fillLegend(state); touch(); }
+  function theme(dark) { if (live) live.darken(dark); document.documentElement.classList.toggle("dark", dark); state.c = colours(); fillLegend(state); touch(); }
   function jump(direction) {
     const wanted = wantedEvents(state);
     const next = direction > 0 ? wanted.find((e) => e.t > state.t + 0.05) : wanted.filter((e) => e.t < state.t - 0.05).pop();
@@ -56,8 +61,8 @@ function start(data) {
 
   function picture(now) {
     if (state.playing) {
-      state.t += ((now - (picture.before ?? now)) / 1000) * state.rate;
-      if (state.t >= data.end) { state.t = data.end; play(false); }
+      state.t += ((now - (picture.before ?? now)) / 1000) * state.rate * (goesOn() ? live.pace(state) : 1);
+      if (state.t >= data.end) { state.t = data.end; if (!goesOn()) { play(false); if (live) live.ended(); } }
       touch();
     }
     picture.before = now;
@@ -69,7 +74,7 @@ function start(data) {
       drawMap($$("map"), state); drawChart($$("chart"), state); drawTimeline();
       fillDetails(state); markEvent(state);
       $$("follow").classList.toggle("on", state.following);
-      $$("clock").textContent = `${state.t.toFixed(1)} / ${data.end.toFixed(1)} s`;
+      $$("clock").textContent = `${state.t.toFixed(1)} / ${spanOf(data).toFixed(1)} s`;
       $$("predictions").checked = state.predictions; $$("labels").checked = state.labels;
     }
     requestAnimationFrame(picture);
@@ -86,7 +91,7 @@ function start(data) {
 
   function drawTimeline() {
     const ctx = $$("timeline").getContext("2d"), { c } = state, w = timeline.width, h = timeline.height;
-    const px = (t) => 6 + (t / (data.end || 1)) * (w - 12);
+    const px = (t) => 6 + (t / spanOf(data)) * (w - 12);
     timeline.inPixels(ctx); ctx.clearRect(0, 0, w, h);
     ctx.fillStyle = c.line; ctx.fillRect(6, h - 12, w - 12, 4);
     ctx.fillStyle = c.av; ctx.fillRect(6, h - 12, px(state.t) - 6, 4);
@@ -104,6 +109,7 @@ function start(data) {
       }
     }
     ctx.globalAlpha = 1; ctx.fillStyle = c.pick;
+    if (goesOn()) ctx.fillRect(px(data.end) - 1, h - 16, 2, 12); // as far as it is driven
     ctx.beginPath(); ctx.arc(px(state.t), h - 10, 6, 0, 7); ctx.fill();
   }
 
@@ -167,14 +173,14 @@ function start(data) {
     canvas.onpointermove = (e) => { if (e.buttons) at(e); };
   };
   const inside = (canvas, e) => { const box = canvas.getBoundingClientRect(); return [e.clientX - box.left, e.clientY - box.top]; };
-  scrub($$("timeline"), (e) => state.seek(((inside($$("timeline"), e)[0] - 6) / (timeline.width - 12)) * data.end));
+  scrub($$("timeline"), (e) => state.seek(((inside($$("timeline"), e)[0] - 6) / (timeline.width - 12)) * spanOf(data)));
   $$("timeline").addEventListener("pointermove", (e) => { // what happened beneath the pointer
-    const px = (t) => 6 + (t / (data.end || 1)) * (timeline.width - 12), bin = Math.floor(inside($$("timeline"), e)[0] / BIN);
+    const px = (t) => 6 + (t / spanOf(data)) * (timeline.width - 12), bin = Math.floor(inside($$("timeline"), e)[0] / BIN);
     const bins = timeBins(px), near = [0, -1, 1].map((k) => bins.get(bin + k)).find(Boolean) || [];
     const lines = Object.entries(EVENTS).map(([kind, [name]]) => [name, near.filter((k) => k.kind === kind)]).filter(([, found]) => found.length);
     $$("timeline").title = lines.map(([name, found]) => (found.length > 3 ? `${found.length} ${name}` : found.map((k) => `${k.t.toFixed(1)} s ${k.text}`).join("\n"))).join("\n");
   });
-  scrub($$("chart"), (e) => state.seek(((inside($$("chart"), e)[0] - 26) / (chart.width - 30)) * data.end));
+  scrub($$("chart"), (e) => state.seek(((inside($$("chart"), e)[0] - 26) / (chart.width - 30)) * spanOf(data)));
   scrub($$("map"), (e) => { follow(false); [view.x, view.y] = map.toMetres(...inside($$("map"), e)); touch(); });
 
   $$("play").onclick = () => play(); $$("back").onclick = () => step(-1); $$("forth").onclick = () => step(1);
@@ -204,36 +210,61 @@ function start(data) {
     if (act) { e.preventDefault(); act(e); }
   };
 
+  function refresh() { // what hangs on who was there and what happened so far
+    const before = state.events.length, wide = $$("pick").options.length - 1;
+    state.events = eventsOf(data);
+    if (wide !== data.vehicles.length && document.activeElement !== $$("pick")) {
+      const order = [...data.vehicles].sort((a, b) => b.mission - a.mission || b.av - a.av || a.person - b.person || a.id.localeCompare(b.id, "en", { numeric: true }));
+      $$("pick").replaceChildren(new Option("nobody", ""), ...order.map((v) => new Option(`${v.id} (${v.mission ? "mission" : v.av ? "AV" : v.person ? v.what : v.driver})`, v.number)));
+      $$("pick").value = state.chosen ? state.chosen.number : "";
+      fillLegend(state);
+    }
+    if (before !== state.events.length) { fillKinds(state); fillEvents(state); fillLegend(state); }
+    $$("predictions").parentElement.hidden = !data.forecasts.some(Boolean);
+  }
+
+  function load(fresh) {
+    const same = state.chosen && fresh.byId.get(state.chosen.id), following = state.following;
+    data = state.data = fresh;
+    state.chosen = null; state.stepping = false; state.events = []; state.t = live ? data.end : 0;
+    net = bounds(data.lanes.length ? data.lanes : [{ box: [0, 0, 100, 100] }]);
+    $$("pick").replaceChildren();
+    fillHead(data); fillFigures(data); fillKinds(state); fillEvents(state); refresh();
+    const there = [...$$("pick").options].slice(1).map((option) => data.vehicles[option.value]);
+    const first = same || there.find((v) => stateOf(data, v, state.t)) || there[0];
+    if (first) state.choose(first, same ? following : true);
+    return first;
+  }
+
+  function grown() {
+    refresh();
+    if (state.stepping) { state.stepping = false; step(1); }
+    touch();
+  }
+
   for (const rate of SPEEDS) $$("speed").append(new Option(`${rate} \u00d7`, rate));
   speed(1);
-  $$("pick").append(new Option("nobody", ""));
-  const order = [...data.vehicles].sort((a, b) => b.mission - a.mission || b.av - a.av || a.person - b.person || a.id.localeCompare(b.id, "en", { numeric: true }));
-  for (const v of order) $$("pick").append(new Option(`${v.id} (${v.mission ? "mission" : v.av ? "AV" : v.person ? v.what : v.driver})`, v.number));
   const table = element("table");
-  for (const [key, what] of KEYS) {
+  for (const [key, what] of [...KEYS, ...(live ? live.keys : []).map(([key, what]) => [key, what])]) {
     const row = element("tr"), cell = element("td");
     for (const one of key.split(" ")) cell.append(element("kbd", one), " ");
     row.append(cell, element("td", what)); table.append(row);
   }
+  for (const [key, , act] of live ? live.keys : []) keys[key] = act;
   $$("keys").append(table);
-  $$("predictions").parentElement.hidden = !state.predictions;
   $$("busy").hidden = true;
-  fillHead(data); fillFigures(data); fillKinds(state); fillEvents(state);
-  theme(matchMedia("(prefers-color-scheme: dark)").matches);
+  theme(live ? live.dark() : matchMedia("(prefers-color-scheme: dark)").matches);
+  const first = load(data);
   new ResizeObserver(resize).observe($$("stage"));
   resize();
-  const first = order.find((v) => stateOf(data, v, 0)) || order[0];
   view.scale = view.width / 170;
-  if (first) { state.choose(first, true); const s = stateOf(data, first, 0) || { x: first.tracks[0].x[0], y: first.tracks[0].y[0] }; view.x = s.x; view.y = s.y; }
-  else view.fit(net);
+  const s = first && (stateOf(data, first, state.t) || { x: first.tracks[0].x[0], y: first.tracks[0].y[0] });
+  if (s) { view.x = s.x; view.y = s.y; } else view.fit(net);
   const asked = new URLSearchParams(location.hash.slice(1)); // replay.html#t=12.4&v=av.3&zoom=8
   if (data.byId.has(asked.get("v"))) state.choose(data.byId.get(asked.get("v")), true);
   if (asked.has("zoom")) view.scale = Number(asked.get("zoom")) || view.scale;
   if (asked.has("t")) state.seek(Number(asked.get("t")) || 0);
   window.replay = state; // for whoever looks at it from the console, and for tests
   requestAnimationFrame(picture);
+  return { state, load, grown, play, fit };
 }
-
-unpack(document.getElementById("data").textContent.trim()).then(start).catch((error) => {
-  document.getElementById("busy").textContent = `This page could not be drawn: ${error.message}`;
-});

@@ -89,7 +89,7 @@ function drawChart(canvas, state) {
   if (!chosen) return;
   const left = 26, bottom = small.height - 20, wide = small.width - left - 4;
   const top = Math.max(10, ...chosen.tracks.map((k) => Math.max(...k.speed)), ...chosen.choices.map((k) => k.target));
-  const px = (t) => left + (t / data.end) * wide, py = (v) => bottom - (v / top) * (bottom - 8);
+  const px = (t) => left + (t / spanOf(data)) * wide, py = (v) => bottom - (v / top) * (bottom - 8);
   ctx.font = "10px system-ui, sans-serif"; ctx.fillStyle = c.quiet; ctx.textAlign = "right"; ctx.textBaseline = "middle";
   ctx.strokeStyle = c.line; ctx.lineWidth = 1;
   for (const v of [0, top / 2, top]) {
@@ -146,7 +146,7 @@ function fillLegend(state) {
   }
   const sizes = { 3: [22, 9], 4: [20, 9], 5: [10, 13] }; // pixels, of those that are small
   for (const [actor, { name }] of data.shapes) {
-    if (actor) entry(name, shape(actor, actor === 5 ? c.person : c.asis, sizes[actor] || [28, 10]));
+    if (actor && data.vehicles.some((v) => v.actor === actor)) entry(name, shape(actor, actor === 5 ? c.person : c.asis, sizes[actor] || [28, 10]));
   }
   const ring = (colour) => (ctx) => {
     ctx.strokeStyle = colour; ctx.lineWidth = 2; ctx.beginPath(); ctx.arc(10, 8, 6, 0, 7); ctx.stroke();
@@ -194,12 +194,13 @@ function fillLegend(state) {
 // A button for each kind of events there is: shown or not, in the list, on the time line and for the keys.
 function fillKinds(state) {
   const box = document.getElementById("kinds");
+  box.replaceChildren();
   for (const [kind, [name, colour]] of Object.entries(EVENTS)) {
     const count = state.events.filter((e) => e.kind === kind).length;
     if (!count) continue;
-    const button = element("button", `${name} ${count}`, "on");
+    const shown = !state.hidden.has(kind), button = element("button", `${name} ${count}`, shown ? "on" : "");
     button.style.setProperty("--own", `var(--${colour})`);
-    button.setAttribute("aria-pressed", "true");
+    button.setAttribute("aria-pressed", String(shown));
     button.onclick = () => {
       if (!state.hidden.delete(kind)) state.hidden.add(kind);
       const on = !state.hidden.has(kind);
@@ -246,6 +247,7 @@ function markEvent(state) {
 
 function fillFigures(data) {
   const table = document.getElementById("figures");
+  table.replaceChildren();
   const shown = (v) => v === null ? "NA" : v === true ? "yes" : v === false ? "no" :
     Number.isInteger(v) ? String(v) : v.toPrecision(4);
   const rows = [...data.facts.metrics, ["seed", data.facts.seed, ""], ["svo", data.facts.svo_deg, "deg"]];
@@ -254,12 +256,14 @@ function fillFigures(data) {
     row.append(element("td", name), element("td", `${shown(value)} ${unit === "bool" || value === null ? "" : unit}`));
     table.append(row);
   }
+  if (!data.facts.trace_hash) return;
   const row = element("tr"), cell = element("td", `trace ${data.facts.trace_hash}`);
   cell.colSpan = 2; cell.style.overflowWrap = "anywhere"; row.append(cell); table.append(row);
 }
 
 function fillHead(data) {
   const f = data.facts, chips = document.getElementById("chips");
+  chips.replaceChildren();
   document.getElementById("title").textContent = `${f.scenario} / ${f.demand} / ${f.policy}`;
   const chip = (text, kind = "") => chips.append(element("span", text, `chip ${kind}`));
   const figure = (name) => (f.metrics.find(([n]) => n === name) || [])[1];

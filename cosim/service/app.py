@@ -24,6 +24,7 @@ from cosim.service.gate import Gate
 from cosim.service.jobs import Jobs
 from cosim.service.monitor import Figures
 from cosim.service.problems import Refused
+from cosim.service.replays import Replays
 from cosim.service.requests import RunRequest
 from cosim.service.routes_runs import runs_router
 from cosim.service.routes_sessions import sessions_router
@@ -46,6 +47,7 @@ def create(settings: Settings) -> FastAPI:
     limits = settings.limits
     clerks = Clerks(settings.runs, settings.database, limits.cells, limits.check)
     runs = Runs(settings, jobs, clerks, lambda number: figures.episodes.inc(number))
+    replays = Replays(settings, runs, uploads, clerks)
     sessions = Sessions(settings, clerks, lambda seconds: figures.steps.observe(seconds))
     pool = runs.pool
     figures = Figures(
@@ -67,6 +69,7 @@ def create(settings: Settings) -> FastAPI:
         log.info("ready", extra={"host": settings.host, "port": settings.port, "data": str(settings.data)})
         yield
         sessions.close()
+        replays.close()
         runs.close()
         jobs.close()
         log.info("ended")
@@ -93,7 +96,7 @@ def create(settings: Settings) -> FastAPI:
     app.state.runs = runs
     _answer_problems(app, settings)
     app.include_router(_about(figures))
-    app.include_router(runs_router(runs, uploads))
+    app.include_router(runs_router(runs, replays, uploads))
     app.include_router(uploads_router(uploads, runs, sessions, settings))
     app.include_router(sessions_router(sessions, uploads))
     app.add_middleware(Gate, settings=settings, figures=figures)

@@ -64,6 +64,16 @@ class Clerk:
 
         html.write(run_folder.read(run), None, shown=run)
 
+    def recorded(self, run: str, episode: str) -> tuple[EpisodeId, Mapping[str, Any], str]:
+        """An episode of a run that has its tables, by its key or seed: its case, manifest and trace hash.
+
+        Raises BadInput.
+        """
+        from cosim.report.replay.episode import find
+
+        found = find(Path(run), episode)
+        return found.case, found.manifest, found.trace_hash
+
     def compare(self, a: str, b: str, fail_on: Sequence[str], across: Sequence[str]) -> dict[str, Any]:
         """What `cosim compare --json` prints; `a`, `b`: RUN or RUN:POLICY."""
         from cosim.report import verdict

@@ -9,12 +9,13 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import importlib.util
+import math
 import os
 import resource
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -52,15 +53,7 @@ class Room:
         for name in ("MPLCONFIGDIR", "TORCHINDUCTOR_CACHE_DIR"):
             os.environ[name] = scratch
         os.chdir(scratch)
-        for limit, most in (
-            (resource.RLIMIT_AS, self.limits.memory),
-            (resource.RLIMIT_FSIZE, self.limits.file),
-            (resource.RLIMIT_CORE, 0),
-            (resource.RLIMIT_NOFILE, OPEN_FILES),
-        ):
-            hard = resource.getrlimit(limit)[1]
-            most = most if hard == resource.RLIM_INFINITY else min(most, hard)
-            resource.setrlimit(limit, (most, most))
+        limit_resources(self.limits)
         python = [Path(path) for path in (sys.prefix, sys.base_prefix) if path != "/"]
         imports = [Path(path) for path in sys.path if os.path.isabs(path)]
         installed = [path for path in imports if path.name in ("site-packages", "dist-packages")]
@@ -86,6 +79,19 @@ def room(settings: Settings, uploads: Sequence[str], *writes: Path) -> Iterator[
         yield Room(scratch, reads, tuple(map(str, writes)), settings.limits)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
+
+
+def limit_resources(limits: Limits) -> None:
+    """What this process may use from now on, processor time apart."""
+    for limit, most in (
+        (resource.RLIMIT_AS, limits.memory),
+        (resource.RLIMIT_FSIZE, limits.file),
+        (resource.RLIMIT_CORE, 0),
+        (resource.RLIMIT_NOFILE, OPEN_FILES),
+    ):
+        hard = resource.getrlimit(limit)[1]
+        most = most if hard == resource.RLIM_INFINITY else min(most, hard)
+        resource.setrlimit(limit, (most, most))
 
 
 def allow_processor_time(seconds: float) -> None:
@@ -116,6 +122,38 @@ class ConfinedRunner:
     def close(self) -> None:
         """End the simulation."""
         self._runner.close()
+
+
+class Drawer:
+    """Drives an episode again and draws it; confined in a room, and within the limits without one too."""
+
+    def __init__(self, room: Room | None, limits: Limits) -> None:
+        if room is None:
+            limit_resources(limits)
+        else:
+            room.enter()
+        allow_processor_time(limits.cpu)
+
+    def page(
+        self, case: EpisodeId, manifest: Mapping[str, Any], trace_hash: str, target: str, progress: Progress
+    ) -> None:
+        """Write the page of an episode of this manifest and hash. Raises BadInput, ReplayDiffers as
+        `cosim replay`."""
+        from cosim.host import Host
+        from cosim.report.replay import episode
+
+        recorded = episode.Recorded(case, (), manifest, trace_hash, Path())
+        scenario, _ = episode.check_inputs(recorded)
+        with (
+            _memory_is_limited(),
+            contextlib.closing(Host(scenario, case.policy, math.radians(case.svo_deg))) as host,
+        ):
+
+            def call(method: str, *arguments: Any, **options: Any) -> Any:
+                return getattr(host, method)(*arguments, **options)
+
+            _, recording = episode.driven(recorded, call, progress)
+            episode.draw([recording], Path(target))
 
 
 class Examiner:

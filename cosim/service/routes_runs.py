@@ -1,5 +1,6 @@
 """The routes of runs: submit, list, watch, cancel, read, compare."""
 
+import asyncio
 import json
 import mimetypes
 from enum import Enum
@@ -13,6 +14,7 @@ from cosim.service.documents import Estimate, FileEntry, Progressing, Rows, RunD
 from cosim.service.ids import PATTERN
 from cosim.service.jobs import STATUSES, Job
 from cosim.service.problems import Conflict, NotFound
+from cosim.service.replays import Replays
 from cosim.service.requests import EXAMPLE, LONGEST, RunRequest, flags, plain
 from cosim.service.runs import REPORT, SUMMARY, Runs
 from cosim.service.uploads import Uploads
@@ -20,6 +22,14 @@ from cosim.service.uploads import Uploads
 RunId = Annotated[str, Path(pattern=PATTERN, examples=["3f2a9c10b7de"])]
 Requested = Annotated[RunRequest, Body(openapi_examples={"two policies": {"value": EXAMPLE}})]
 Side = Annotated[str, Query(pattern=r"^[0-9a-f]{12}(:[\w.+-]{1,100})?$", description="RUN or RUN:POLICY")]
+Episode = Annotated[
+    str,
+    Query(
+        pattern=r"^([0-9a-f]{12}-)?[0-9]{1,19}$",
+        description="its key, or its seed where only one episode has it",
+        examples=["5d0c3e9f1a27-200000", "200000"],
+    ),
+]
 Texts = Annotated[list[Annotated[str, Query(max_length=LONGEST)]], Query(max_length=20)]
 # What a report may do: it is a file that was made of somebody's names.
 SANDBOX = {
@@ -29,7 +39,7 @@ SANDBOX = {
 Status = Enum("Status", {name: name for name in STATUSES}, type=str)  # type: ignore[misc]
 
 
-def runs_router(runs: Runs, uploads: Uploads) -> APIRouter:
+def runs_router(runs: Runs, replays: Replays, uploads: Uploads) -> APIRouter:
     """All of them."""
     router = APIRouter(prefix="/api", tags=["runs"])
 
@@ -123,6 +133,16 @@ def runs_router(runs: Runs, uploads: Uploads) -> APIRouter:
     def report(run: RunId) -> Response:
         runs.report(run)
         return file(run, REPORT, SANDBOX)
+
+    @router.get(
+        "/runs/{run}/replay",
+        summary="An episode driven again and drawn: one HTML file, as `cosim replay` makes it",
+        response_class=FileResponse,
+        responses={200: {"content": {"text/html": {"example": "<!DOCTYPE html>..."}}}},
+    )
+    async def replay(run: RunId, episode: Episode) -> Response:
+        page = await asyncio.shield(asyncio.wrap_future(replays.ask(run, episode)))
+        return FileResponse(page, media_type="text/html", headers=SANDBOX)
 
     @router.get("/runs/{run}/files", summary="The files of a run")
     def files(run: RunId) -> list[FileEntry]:

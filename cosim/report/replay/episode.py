@@ -1,7 +1,7 @@
 """`cosim replay`: find an episode in a run folder, drive it once more, prove that it is the same, draw it."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -113,19 +113,29 @@ def check_inputs(recorded: Recorded) -> tuple[Scenario, list[str]]:
 
 
 def drive(recorded: Recorded, scenario: Scenario, *, check: bool = True) -> tuple[EpisodeResult, ReplayData]:
-    """Drive it again, recorded.
+    """Drive it again, recorded, in a process of its own.
 
-    Raises (only with `check`):
-        BadInput: the policy's weights or code have changed.
-        ReplayDiffers: the trace hash is another one.
+    Raises (only with `check`): as `driven`.
     """
     case = recorded.case
     with Progress(f"replay {scenario.name} {label(case.policy)}", "s") as progress:
         worker = Worker(Host, scenario, case.policy, math.radians(case.svo_deg), name="cosim-replay")
         with worker:
-            if check:
-                _same_policy(recorded.manifest.get(POLICY_FILES, {}), worker.call("policy_files"))
-            result, replay = worker.call("run_recorded", case.seed, progress=progress)
+            return driven(recorded, worker.call, progress, check=check)
+
+
+def driven(
+    recorded: Recorded, call: Callable[..., Any], progress: Callable[..., None], *, check: bool = True
+) -> tuple[EpisodeResult, ReplayData]:
+    """Drive it again, recorded, on the host whose methods `call` calls by their names.
+
+    Raises (only with `check`):
+        BadInput: the policy's weights or code have changed.
+        ReplayDiffers: the trace hash is another one.
+    """
+    if check:
+        _same_policy(recorded.manifest.get(POLICY_FILES, {}), call("policy_files"))
+    result, replay = call("run_recorded", recorded.case.seed, progress=progress)
     if check and result.trace_hash != recorded.trace_hash:
         raise ReplayDiffers(
             f"the replay is not the recorded episode: trace hash {result.trace_hash[:16]}... after "

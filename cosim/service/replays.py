@@ -1,0 +1,126 @@
+"""Replays of stored episodes: driven again in a process of their own, drawn, kept beside the run's tables."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+import threading
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from cosim.errors import BadInput, CosimError, SimulationError
+from cosim.service.clerk import Clerks
+from cosim.service.confined import Drawer, room
+from cosim.service.problems import Conflict, NotFound, Unavailable
+from cosim.service.runs import SUMMARY, Runs
+from cosim.service.settings import Settings
+from cosim.service.uploads import Uploads
+from cosim.workers.worker import Worker
+
+AT_ONCE, WAITING = 2, 16  # replays that are drawn, and those and what waits for them
+HEARTBEAT = 60.0  # s
+
+
+class Replays:
+    """Draws them, two at a time; whoever asks for what is being drawn waits for the same."""
+
+    def __init__(self, settings: Settings, runs: Runs, uploads: Uploads, clerks: Clerks) -> None:
+        self._settings, self._runs, self._uploads, self._clerks = settings, runs, uploads, clerks
+        self._threads = ThreadPoolExecutor(AT_ONCE, "cosim-replay")
+        self._lock = threading.Lock()
+        self._asked: dict[tuple[str, str], Future[Path]] = {}
+        self._workers: set[Worker] = set()
+        self._closed = False
+
+    def ask(self, run: str, episode: str) -> Future[Path]:
+        """The page of an episode, named by its key or seed.
+
+        Raises NotFound, Conflict unless the run has finished, Unavailable when too many wait. The future
+        raises BadInput where the run has no such episode or what drove it has changed, Conflict where the
+        episode driven again is another one.
+        """
+        job = self._runs.get(run)
+        found = self._runs.files(run)
+        if job.status != "finished" or SUMMARY not in found:
+            raise Conflict(f"run {run} is {job.status}: it has no replays")
+        future: Future[Path]
+        if kept := found.get(name(episode)):
+            future = Future()
+            future.set_result(kept)
+            return future
+        with self._lock:
+            key = run, episode
+            if key in self._asked:
+                return self._asked[key]
+            if len(self._asked) >= WAITING:
+                raise Unavailable(f"{WAITING} replays are asked for: try again later")
+            future = self._asked[key] = self._threads.submit(self._page, run, episode, job.uploads)
+        future.add_done_callback(lambda _: self._forget(key))
+        return future
+
+    def close(self) -> None:
+        """End what is being drawn."""
+        with self._lock:
+            self._closed = True
+            for worker in self._workers:
+                worker.kill()
+        self._threads.shutdown(cancel_futures=True)
+
+    def _forget(self, key: tuple[str, str]) -> None:
+        with self._lock:
+            self._asked.pop(key, None)
+
+    def _page(self, run: str, episode: str, uploads: list[str]) -> Path:
+        try:
+            case, manifest, trace_hash = self._clerks.call("recorded", run, episode)
+        except BadInput as error:
+            field = "episode" if error.field == "EPISODE" else error.field
+            raise BadInput(error.problem, file=error.file, field=field, value=error.value) from None
+        page = self._runs.folder(run) / name(case.key)
+        if page.is_file():
+            return page
+        for upload in uploads:
+            self._uploads.get(upload)  # raises NotFound: it was deleted since
+        with tempfile.TemporaryDirectory(dir=self._settings.scratch) as folder:
+            draft = Path(folder) / page.name
+            self._draw(uploads, draft, case, manifest, trace_hash)
+            with contextlib.suppress(OSError):
+                if draft.is_file() and not draft.is_symlink():  # it may come from a confined process
+                    os.replace(draft, page)
+        if page.name not in self._runs.files(run):
+            raise NotFound(f"run {run} was deleted meanwhile")
+        return page
+
+    def _draw(self, uploads: list[str], draft: Path, *episode: Any) -> None:
+        """Write the page of an episode, as `Drawer.page` wants it."""
+        settings = self._settings
+        with room(settings, uploads, draft.parent) as confined:
+            worker = Worker(
+                Drawer, confined, settings.limits, timeout=HEARTBEAT, start_timeout=2.0 * HEARTBEAT,
+                name="cosim-replay", wait=False,
+            )  # fmt: skip
+            with worker:
+                with self._lock:
+                    if self._closed:
+                        raise Conflict("the server ends")
+                    self._workers.add(worker)
+                try:
+                    worker.call("page", *episode, str(draft), progress=lambda *_: None)
+                except SimulationError as error:
+                    raise Conflict(f"cannot be driven again: {error}") from None
+                except BadInput:
+                    raise
+                except CosimError as error:
+                    if error.exit_code == 1:  # ReplayDiffers
+                        raise Conflict(str(error).partition(" (--no-check")[0]) from None
+                    raise
+                finally:
+                    with self._lock:
+                        self._workers.discard(worker)
+
+
+def name(episode: str) -> str:
+    """Of the page of an episode, by its key."""
+    return f"replay-{episode}.html"

@@ -119,6 +119,13 @@ def attribution(place: Place) -> list[list[str]]:
     return [["cosim.cli.main", "bench", "attribution", *flags, "--out", str(place.work / "attribution")]]
 
 
+def seeing(place: Place) -> list[list[str]]:
+    """What the frame encoder reads off a map."""
+    return [
+        ["benchmarks.seeing", "--drives", "1" if place.small else "4", "--out", str(place.out / "seeing.md")]
+    ]
+
+
 def behaviors(place: Place) -> list[list[str]]:
     """How faithfully LC2013 drives Table II."""
     flags = ["--report", "--scale", "0.002" if place.small else "1"]
@@ -177,6 +184,7 @@ PAGES = (
         ("attribution.md", "attribution.png", "data/attribution.csv"),
         drop=("*.md", "*.png", "*.csv"),
     ),
+    Page("seeing", seeing, ("seeing.md",)),
     Page("real_nets", real_nets, ("real_nets.md",)),
     Page("behaviors", behaviors, ("behaviors.md",)),
     Page(

@@ -1,5 +1,6 @@
 """Starts the application on a socket and ends it in order."""
 
+import contextlib
 import socket
 from typing import Any, TextIO
 
@@ -41,7 +42,8 @@ def serve(data: str, *, host: str, port: int, said: TextIO, **settings: Any) -> 
                 timeout_keep_alive=KEEP_ALIVE,
                 timeout_graceful_shutdown=5,
             )
-            uvicorn.Server(config).run(sockets=[listening])
+            with contextlib.suppress(KeyboardInterrupt):  # raised again by uvicorn once it has ended in order
+                uvicorn.Server(config).run(sockets=[listening])
     return 0
 
 

@@ -134,8 +134,9 @@ def behaviors(place: Place) -> list[list[str]]:
 
 def real_nets(place: Place) -> list[list[str]]:
     """A scenario of another project."""
-    few = ["--duration", "4", "--runs", str(place.work / "real_nets")] if place.small else []
-    return [["benchmarks.real_nets", *few, "--out", str(place.out / "real_nets.md")]]
+    few = ["--duration", "4"] if place.small else []
+    anew = ["--runs", str(place.work / "real_nets")]
+    return [["benchmarks.real_nets", *few, *anew, "--out", str(place.out / "real_nets.md")]]
 
 
 def joining(place: Place) -> list[list[str]]:

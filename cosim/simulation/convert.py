@@ -4,6 +4,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -94,12 +95,12 @@ class SnapshotReader:
             self._ids = ids
         kind, mission, length, width, actor = self._static
         position, angle, speed, accel, lane, lane_position = (
-            [vehicle(i) for i in ids]
+            list(map(vehicle, ids))
             if not persons
             else [person(persons[i]) if i in persons else vehicle(i) for i in ids]
             for vehicle, person in zip(self._of_vehicles, self._of_persons, strict=True)
         )
-        on = np.array([self._lane_index.get(i, -1) for i in lane], np.int32)
+        on = np.fromiter(map(self._lane_index.get, lane, repeat(-1)), np.int32, len(ids))
         off = np.flatnonzero(on < 0)
         place = on.copy() if len(off) else on
         for k in off:

@@ -4,7 +4,7 @@ import argparse
 
 from cosim.cli import arguments
 
-WHAT = ("vfn", "a2c", "hpn", "encoder")
+WHAT = ("vfn", "a2c", "hpn")
 VARIANTS = ("hpn", "hpn-no-history", "hpn-plain")
 
 
@@ -52,10 +52,6 @@ def work(args: argparse.Namespace) -> int:
 
         train_hpn.check(args)
         return train_hpn.train(args)
-    if args.what == "encoder":
-        from cosim.learning import train_encoder
-
-        return train_encoder.train(args)
     from cosim.learning.train_vfn import train
 
     return train(args)

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cosim.episode import Hook
 from cosim.errors import BadInput
 from cosim.host import Earnings, Host, SimulatorFactory
 from cosim.metrics import MetricFactory
@@ -52,6 +53,8 @@ class SessionHost(Host):
     """The caller commands the AVs it names in `act`; the policy commands those that are left (it sees only
     these): `others`, or SUMO's IDM."""
 
+    hooks: Sequence[Hook] = ()  # see every episode
+
     def __init__(
         self,
         scenario: Scenario,
@@ -79,7 +82,7 @@ class SessionHost(Host):
     def reset(self, seed: int) -> Reply:
         """Begin the episode `seed` and drive its warm-up."""
         self.policy.reset(self.episode.context(seed, self.svo))
-        histories = self.episode.start(seed)
+        histories = self.episode.start(seed, self.hooks)
         self._started = True
         return self._reply(self._packer.pack(histories, None))
 

@@ -15,7 +15,7 @@ from cosim import __version__
 from cosim.errors import BadInput, CosimError, hint
 from cosim.policies import NAMES
 from cosim.rewards import REWARDS
-from cosim.scenario import BEHAVIORS, load
+from cosim.scenario import BEHAVIORS, human_errors, load
 from cosim.scenario.sumo_outputs import OUTPUTS
 from cosim.service import landlock
 from cosim.service.clerk import Clerks
@@ -26,6 +26,8 @@ from cosim.service.monitor import Figures
 from cosim.service.problems import Refused
 from cosim.service.replays import Replays
 from cosim.service.requests import RunRequest
+from cosim.service.routes_live import live_router
+from cosim.service.routes_page import page_router
 from cosim.service.routes_runs import runs_router
 from cosim.service.routes_sessions import sessions_router
 from cosim.service.routes_uploads import uploads_router
@@ -53,7 +55,11 @@ def create(settings: Settings) -> FastAPI:
     figures = Figures(
         {
             "cosim_runs": ("runs by status", "status", jobs.counts),
-            "cosim_sessions": ("sessions", "state", lambda: {"open": sessions.number}),
+            "cosim_sessions": (
+                "sessions",
+                "state",
+                lambda: {"open": sessions.number, "watched": sessions.watched},
+            ),
             "cosim_workers": (
                 "processes of runs",
                 "state",
@@ -99,6 +105,8 @@ def create(settings: Settings) -> FastAPI:
     app.include_router(runs_router(runs, replays, uploads))
     app.include_router(uploads_router(uploads, runs, sessions, settings))
     app.include_router(sessions_router(sessions, uploads))
+    app.include_router(live_router(sessions))
+    app.include_router(page_router(settings))
     app.add_middleware(Gate, settings=settings, figures=figures)
     return app
 
@@ -165,6 +173,7 @@ def _about(figures: Figures) -> APIRouter:
             policies=[*NAMES],
             behaviors=[*BEHAVIORS],
             presets=[*Preset.ALL],
+            errors=[*human_errors.levels()],
             outputs=[*OUTPUTS],
             rewards=[*REWARDS],
         )

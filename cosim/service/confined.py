@@ -25,8 +25,11 @@ from cosim.service import landlock
 from cosim.service.settings import Limits, Settings
 
 if TYPE_CHECKING:
-    from cosim.envs.host import Reply, SessionHost
+    from cosim.envs.host import PolicyFactory, Reply
+    from cosim.scenario import Scenario
     from cosim.scenario.episode_id import EpisodeId
+    from cosim.service.watch import WatchedHost
+    from cosim.types import ObservationConfig
     from cosim.workers.tasks import Progress
 
 OPEN_FILES = 512
@@ -191,13 +194,25 @@ class Examiner:
         return {"approach": type(policy).__name__, "label": policy.label}
 
 
-def confined_host(room: Room, *arguments: Any) -> SessionHost:
-    """The host of a session in a confined process; `arguments` are those of `build_host`."""
+def session_host(
+    scenario: Scenario,
+    observation: ObservationConfig,
+    svo: float,
+    reward: str,
+    others: PolicyFactory | None,
+) -> WatchedHost:
+    """Runs in a session's process: the simulation is imported there, not here."""
+    from cosim.rewards import read
+    from cosim.service.watch import WatchedHost
+
+    return WatchedHost(scenario, observation, svo, read(reward, "reward"), others, None)
+
+
+def confined_host(room: Room, *arguments: Any) -> WatchedHost:
+    """The host of a session in a confined process; `arguments` are those of `session_host`."""
     room.enter()
     allow_processor_time(room.limits.cpu)
-    from cosim.envs.session import build_host
-
-    host = build_host(*arguments)
+    host = session_host(*arguments)
     begin = host.reset
 
     def reset(seed: int) -> Reply:

@@ -38,6 +38,7 @@ class Catalogue(BaseModel):
     policies: list[str]
     behaviors: list[str]
     presets: list[str]
+    errors: list[str]
     outputs: list[str]
     rewards: list[str]
 

@@ -21,7 +21,10 @@ Receive = Callable[[], Awaitable[Message]]
 Send = Callable[[Message], Awaitable[None]]
 App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
-OPEN = ("/health",)  # needs no token
+OPEN = ("/health", "/login")  # need no token
+PARTS = "/page/"  # nor do the parts of the page, which hold nobody's data
+PAGES = ("/", "/runs")  # where a browser without a token is sent to the form
+COOKIE = "cosim"
 UPLOADS = "/api/uploads"
 HEADERS = (
     (b"x-content-type-options", b"nosniff"),
@@ -38,6 +41,7 @@ class Gate:
     def __init__(self, app: App, settings: Settings, figures: Figures) -> None:
         self._app, self._settings, self._figures = app, settings, figures
         self._token = None if settings.token is None else settings.token.encode()
+        self._cookie = None if settings.token is None else cookie_of(settings.token).encode()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "lifespan":
@@ -55,7 +59,12 @@ class Gate:
             await send(message)
 
         refused = self._refused(scope, headers)
-        if refused is not None:
+        if refused is not None and refused[0] == 401 and scope["path"] in PAGES:
+            await answered(
+                {"type": "http.response.start", "status": 303, "headers": [(b"location", b"/login")]}
+            )
+            await answered({"type": "http.response.body"})
+        elif refused is not None:
             await _refuse(scope, answered, *refused)
         elif scope["type"] == "websocket":
             await self._app(scope, receive, send)
@@ -85,11 +94,20 @@ class Gate:
                 name = ""
             if not is_loopback(name):
                 return 403, "without a token the server is asked by this machine's own names only"
-        elif scope["path"] not in OPEN:
+        elif scope["path"] not in OPEN and not scope["path"].startswith(PARTS):
             scheme, _, given = headers.get(b"authorization", b"").partition(b" ")
-            if scheme.lower() != b"bearer" or not hmac.compare_digest(given.strip(), self._token):
+            bearer = scheme.lower() == b"bearer" and hmac.compare_digest(given.strip(), self._token)
+            if not bearer and not self._knows(headers.get(b"cookie", b"")):
                 return 401, "a bearer token is needed"
         return None
+
+    def _knows(self, cookies: bytes) -> bool:
+        """Whether one of them is what the form gave for the token."""
+        assert self._cookie is not None
+        given = (part.strip().partition(b"=") for part in cookies.split(b";"))
+        return any(
+            name == COOKIE.encode() and hmac.compare_digest(value, self._cookie) for name, _, value in given
+        )
 
     def _most(self, path: str) -> int:
         limits = self._settings.limits
@@ -100,10 +118,16 @@ class Gate:
         method = scope.get("method", "WEBSOCKET")
         known = method if method in ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS") else "other"
         self._figures.requests.labels(known, route, str(status)).inc()
-        self._figures.seconds.labels(known, route).observe(seconds)
+        if scope["type"] == "http":  # a socket stays open
+            self._figures.seconds.labels(known, route).observe(seconds)
         level = logging.DEBUG if route in ("/health", "/metrics") or "/sessions/" in route else logging.INFO
         fields = {"method": known, "path": scope["path"], "status": status, "seconds": round(seconds, 6)}
         log.log(level, "request", extra=fields)
+
+
+def cookie_of(token: str) -> str:
+    """What a browser keeps in place of the token: it opens this server only, and does not tell the token."""
+    return hmac.new(token.encode(), b"cosim page", "sha256").hexdigest()
 
 
 def _limited(receive: Receive, most: int) -> Receive:

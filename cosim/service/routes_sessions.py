@@ -76,6 +76,8 @@ class SessionDocument(BaseModel):
     decision: float = Field(description="s between decisions")
     over: bool = Field(description="the episode is over, or none has begun")
     idle_s: float = Field(description="it ends by itself after so long without a request")
+    watched: int = Field(description="pages that watch it")
+    program: bool = Field(description="requests drive it")
 
 
 class Step(BaseModel):
@@ -122,6 +124,8 @@ def sessions_router(sessions: Sessions, uploads: Uploads) -> APIRouter:
             decision=s.timing.decision,
             over=one.session.over or not one.session.begun,
             idle_s=one.idle,
+            watched=one.live.number,
+            program=one.live.program,
         )
 
     def answer(value: dict[str, Any]) -> Response:
@@ -165,7 +169,9 @@ def sessions_router(sessions: Sessions, uploads: Uploads) -> APIRouter:
 
     @router.post(AVS + "/reset", summary="Begin an episode", response_model=Step, responses=BYTES)
     def reset(session: SessionId, begin: Reset, accept: Accept = None) -> Response:
-        with sessions.get(session).using() as found:
+        one = sessions.get(session)
+        with one.using() as found:
+            one.live.program = True
             found.reset(begin.seed, passes_on=wants_bytes(accept))
             if found.passes_on:
                 return Response(wire.of_reply(found.reply), media_type=wire.MEDIA)
@@ -180,7 +186,8 @@ def sessions_router(sessions: Sessions, uploads: Uploads) -> APIRouter:
                 found.check_observed()
             elif not found.passes_on:
                 raise Conflict("this episode was begun to be answered in JSON: reset first")
-            result = sessions.act(one, actions, decision.see)
+            one.live.program = True
+            result = one.act(actions, decision.see)
             if found.passes_on:
                 return Response(wire.of_reply(found.reply), media_type=wire.MEDIA)
             return answer(views.step(found, result))

@@ -1,6 +1,5 @@
 """Starts the application on a socket and ends it in order."""
 
-import contextlib
 import socket
 from typing import Any, TextIO
 
@@ -12,6 +11,7 @@ from cosim.service.app import create
 from cosim.service.monitor import log_json
 from cosim.service.settings import TOKEN, DataFolder, Settings
 
+MESSAGE = 4096  # bytes of what a page asks for
 KEEP_ALIVE = 120  # s: a driver may think for a while between two decisions
 
 
@@ -41,9 +41,9 @@ def serve(data: str, *, host: str, port: int, said: TextIO, **settings: Any) -> 
                 server_header=False,
                 timeout_keep_alive=KEEP_ALIVE,
                 timeout_graceful_shutdown=5,
+                ws_max_size=MESSAGE,
             )
-            with contextlib.suppress(KeyboardInterrupt):  # raised again by uvicorn once it has ended in order
-                uvicorn.Server(config).run(sockets=[listening])
+            uvicorn.Server(config).run(sockets=[listening])
     return 0
 
 

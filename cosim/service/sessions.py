@@ -9,10 +9,10 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cosim.envs.host import Reply
-from cosim.envs.session import Session, StepResult, build_host
+from cosim.envs.session import Session, StepResult
 from cosim.errors import BadInput, SimulationError
 from cosim.observation.view import Packer, View
 from cosim.policies import make
@@ -20,13 +20,17 @@ from cosim.scenario import Scenario
 from cosim.scenario.episode_id import EpisodeId
 from cosim.scenario.policy_name import label
 from cosim.service.clerk import Clerks
-from cosim.service.confined import confined_host, room
+from cosim.service.confined import confined_host, room, session_host
 from cosim.service.ids import ID, new_id
 from cosim.service.jobs import now
+from cosim.service.live import Live, Viewer
 from cosim.service.problems import Conflict, NotFound, Unavailable
 from cosim.service.settings import Settings
 from cosim.types import COMPACT, ObservationConfig
 from cosim.workers.worker import Worker
+
+if TYPE_CHECKING:
+    from cosim.service.watch import Scene
 
 NOTHING = Packer().pack({}, None)
 TIMEOUT = 120.0  # s without an answer of the simulation
@@ -43,6 +47,7 @@ class Served(Session):
 
     reply: Reply
     passes_on = False
+    live: Live | None = None  # who watches
 
     def reset(self, seed: int | None = None, *, passes_on: bool = False) -> dict[str, View]:
         """As `Session.reset`."""
@@ -57,6 +62,23 @@ class Served(Session):
     def _take(self, reply: Reply) -> None:
         self.reply = reply
         super()._take(reply._replace(packed=NOTHING) if self.passes_on else reply)
+        if self.live is not None:
+            self.live.told(reply.steps == 0)
+
+    # ---- what `Live` looks at ----
+
+    def scene(self) -> Scene | None:
+        """The episode as those see it who begin to watch; None where none has begun."""
+        return self._call("scene") if self.begun else None
+
+    def drawn(self) -> tuple[list[str], str]:
+        """What the last decision brought."""
+        found: tuple[list[str], str] = self._call("drawn")
+        return found
+
+    def unwatched(self) -> None:
+        """Nobody looks any more."""
+        self._call("unwatched")
 
 
 class Open:
@@ -69,13 +91,15 @@ class Open:
         idle: float,
         uploads: Sequence[str],
         end: Callable[[], None],
+        took: Callable[[float], None],
     ) -> None:
         self.id, self.created = new_id(), now()
         self.request, self.session, self.idle, self.uploads = request, session, idle, uploads
-        self._end = end
+        self._end, self._took = end, took
         self._lock = threading.Lock()
         self._used = time.monotonic()
         self.ended = False
+        self.live = session.live = Live(session, self._drive, self._reset)
 
     @contextlib.contextmanager
     def using(self) -> Iterator[Served]:
@@ -98,13 +122,39 @@ class Open:
         """s since its last request ended; 0 during one."""
         return 0.0 if self._lock.locked() else time.monotonic() - self._used
 
-    def close(self) -> None:
+    def act(self, actions: Mapping[str, Any], see: Sequence[str] | None) -> StepResult:
+        """One decision; the caller is `using` it."""
+        began = time.perf_counter()
+        result = self.session.act(actions, see=see)
+        self._took(time.perf_counter() - began)
+        return result
+
+    def close(self, reason: str = "closed") -> None:
         """End it: the simulation and its process."""
         with self._lock:
             if not self.ended:
                 self.ended = True
                 self.session.close()
                 self._end()
+        self.live.end(reason)
+
+    def watch(self, viewer: Viewer) -> None:
+        """One more page watches. Raises NotFound, Conflict."""
+        with self.using():
+            self.live.join(viewer)
+
+    # ---- driven for those who watch ----
+
+    def _drive(self, until: float) -> bool:
+        with self.using() as session:
+            on = session.begun and not session.over and session.elapsed < until - 1e-6
+            if on:
+                self.act({}, [])
+        return on
+
+    def _reset(self, seed: int | None) -> None:
+        with self.using() as session:
+            session.reset(seed)
 
 
 class Sessions:
@@ -132,6 +182,11 @@ class Sessions:
     def number(self) -> int:
         """How many are open."""
         return len(self._open)
+
+    @property
+    def watched(self) -> int:
+        """How many pages watch one."""
+        return sum(one.live.number for one in self.all())
 
     def open(
         self,
@@ -177,18 +232,11 @@ class Sessions:
         """Those that are open, the oldest first."""
         return [*self._open.values()]
 
-    def act(self, one: Open, actions: Mapping[str, Any], see: Sequence[str] | None) -> StepResult:
-        """One decision of a session that the caller is `using`."""
-        began = time.perf_counter()
-        result = one.session.act(actions, see=see)
-        self._took(time.perf_counter() - began)
-        return result
-
-    def end(self, session: str) -> None:
+    def end(self, session: str, reason: str = "closed") -> None:
         """Close one. Raises NotFound."""
         one = self.get(session)
         self._open.pop(session, None)
-        one.close()
+        one.close(reason)
         log.info("session ended", extra={"session": session})
 
     # ---- inside ----
@@ -206,12 +254,12 @@ class Sessions:
     ) -> Open:
         svo = math.radians(case.svo_deg)
         others = None if label(case.policy) == "idm" else functools.partial(make, case.policy)
-        arguments = (scenario, observation, svo, reward, others, None, ())
+        arguments = (scenario, observation, svo, reward, others)
         rooms = contextlib.ExitStack()
         confined = rooms.enter_context(room(self._settings, uploads))
 
         def connect() -> Worker:
-            host = (build_host,) if confined is None else (confined_host, confined)
+            host = (session_host,) if confined is None else (confined_host, confined)
             return Worker(*host, *arguments, timeout=TIMEOUT, name="cosim-session")
 
         try:
@@ -220,12 +268,13 @@ class Sessions:
             rooms.close()
             raise
         most = self._settings.limits.idle
-        return Open(request, session, min(idle or most, most), uploads, rooms.close)
+        return Open(request, session, min(idle or most, most), uploads, rooms.close, self._took)
 
     def _reap(self) -> None:
         while not self._closed.wait(LOOKS):
             for one in [*self._open.values()]:
-                if one.idle_for > one.idle:
+                # a page that is open counts for as long as the server takes
+                if one.idle_for > (self._settings.limits.idle if one.live.number else one.idle):
                     log.info("session was idle", extra={"session": one.id, "seconds": one.idle})
                     with contextlib.suppress(NotFound):
-                        self.end(one.id)
+                        self.end(one.id, "nobody used it")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
@@ -96,7 +95,7 @@ def snapshot(now: Snapshot) -> dict[str, Any]:
     }
 
 
-def to_json(document: Mapping[str, Any]) -> bytes:
+def to_json(document: Any) -> bytes:
     """JSON as every parser reads it: what is not finite is null."""
     try:
         return json.dumps(document, allow_nan=False, separators=(",", ":")).encode()

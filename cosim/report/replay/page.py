@@ -11,7 +11,14 @@ from cosim.recording.replay_data import ReplayData
 from cosim.report.replay.packing import document
 
 ASSETS = resources.files(__package__).joinpath("assets")
-VIEWER = ("data.js", "view.js", "draw.js", "panel.js", "main.js")  # what draws, whoever brings the data
+VIEWER = (
+    "text.js",
+    "data.js",
+    "view.js",
+    "draw.js",
+    "panel.js",
+    "main.js",
+)  # what draws, whoever brings the data
 
 
 def page(replay: ReplayData) -> str:

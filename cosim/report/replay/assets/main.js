@@ -29,7 +29,7 @@ function start(data, live = null) {
   function touch() { state.dirty = true; }
   function play(on = !state.playing) {
     if (on && state.t >= data.end - 1e-6 && !goesOn()) state.t = data.times[0] || 0;
-    state.playing = on; $$("play").textContent = on ? "pause" : "play"; touch();
+    state.playing = on; state.stepping = false; $$("play").textContent = on ? "pause" : "play"; touch();
   }
   function goesOn() { return live && !data.over; }
   function speed(rate) { state.rate = rate; $$("speed").value = rate; }
@@ -205,7 +205,8 @@ function start(data, live = null) {
     Escape: () => state.choose(null), "?": () => $$("help").click(),
   };
   window.onkeydown = (e) => {
-    if (e.ctrlKey || e.metaKey || e.altKey || e.target.tagName === "SELECT") return;
+    if (e.ctrlKey || e.metaKey || e.altKey || ["SELECT", "INPUT"].includes(e.target.tagName)) return;
+    if (e.key === "Escape" && $$("keys").open) return; // closes the dialog
     const act = keys[e.key];
     if (act) { e.preventDefault(); act(e); }
   };

@@ -1,19 +1,8 @@
 // The panel at the side: who the chosen vehicle is, what it decided and why, its speed over time.
 
-function element(tag, text, className) {
-  const found = document.createElement(tag);
-  if (text !== undefined) found.textContent = text;
-  if (className) found.className = className;
-  return found;
-}
-
 function describe(vehicle) {
   const who = vehicle.av ? "autonomous (AV)" : vehicle.person ? "" : `human, ${vehicle.driver}`;
   return [who, vehicle.actor ? vehicle.what : "", vehicle.mission ? "mission vehicle" : ""].filter(Boolean).join(", ");
-}
-
-function number(value, digits, unit = "") {
-  return value === null || value === undefined ? "\u2013" : `${value.toFixed(digits)}${unit}`;
 }
 
 function link(state, id) { // a vehicle's name to click on, or plain words such as "[lane end]"
@@ -271,8 +260,9 @@ function fillHead(data) {
   chip(`seed ${f.seed}`); chip(f.preset); chip(`humans ${f.behavior}, ${f.driver_model}`); chip(`svo ${f.svo_deg}\u00b0`);
   if (f.errors) chip(`human errors ${f.errors}`);
   const crashes = figure("collisions"), among = figure("crashed") ? "" : ", none of an AV or the mission vehicle";
-  if (crashes != null) chip(crashes ? `${crashes} collision${crashes > 1 ? "s" : ""}${among}` : "no collision", figure("crashed") ? "bad" : crashes ? "warn" : "good");
-  if (figure("mission_success") != null) chip(figure("mission_success") ? "mission fulfilled" : "mission not fulfilled", figure("mission_success") ? "good" : "bad");
+  const running = data.over === false; // only what has happened can be said
+  if (crashes != null && (crashes || !running)) chip(crashes ? `${crashes} collision${crashes > 1 ? "s" : ""}${among}` : "no collision", figure("crashed") ? "bad" : crashes ? "warn" : "good");
+  if (figure("mission_success") != null && (figure("mission_success") || !running)) chip(figure("mission_success") ? "mission fulfilled" : "mission not fulfilled", figure("mission_success") ? "good" : "bad");
   if (f.mission_vehicle) chip(`mission vehicle ${f.mission_vehicle}${f.mission_guessed ? ", guessed" : ""}`, f.mission_guessed ? "warn" : "");
   for (const reason of f.not_comparable_because || []) chip(reason, "warn");
 }

@@ -1,0 +1,230 @@
+"""Who watches a session and what they are sent; the session as their pages ask it to be driven.
+
+A page asks for the simulation to be driven up to some moment, and asks again as its own clock comes near: so
+a page that pauses, is slow or gone drives nothing. Whoever else drives the session is never kept waiting: of
+what a slow page has not fetched, the oldest steps are dropped.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import threading
+from collections import deque
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Protocol
+
+from cosim.errors import CosimError
+from cosim.service.problems import Conflict
+
+if TYPE_CHECKING:
+    from cosim.service.watch import Scene
+
+KEPT = 16  # steps that wait for a page
+WATCHED = 16  # pages a session
+
+
+class Stage(Protocol):
+    """What is watched; each method waits for its turn, and raises CosimError."""
+
+    def scene(self) -> Scene | None: ...  # None: no episode has begun
+
+    def drawn(self) -> tuple[list[str], str]: ...
+
+    def unwatched(self) -> None: ...
+
+
+class Viewer:
+    """One page. `take` what it is to be sent whenever `wake` is set."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._loop, self._lock = loop, threading.Lock()
+        self.wake = asyncio.Event()
+        self.until = 0.0  # s of the episode that it asks for
+        self.dropped = 0  # steps
+        self.ended = False
+        self._steps: deque[str] = deque()
+        self._said: list[str] = []
+        self._scene: Scene | None = None
+        self._lasting: list[str] = []
+        self._sent = 0  # of `_lasting`
+        self._knows_road = False
+
+    def take(self) -> list[str]:
+        """Messages."""
+        with self._lock:
+            found, self._said = self._said, []
+            steps, length = [*self._steps], len(self._lasting)
+            self._steps.clear()
+            add, self._sent = self._lasting[self._sent : length], length
+            scene, self._scene = self._scene, None
+        parts = []
+        if scene is not None:
+            parts = [f'"episode":{scene.episode}']
+            if not self._knows_road:
+                parts.append(f'"road":{scene.road}')
+                self._knows_road = True
+        if parts or steps or add:
+            parts += [f'"add":[{",".join(add)}]', f'"steps":[{",".join(steps)}]']
+            found.append(f"{{{','.join(parts)}}}")
+        return found
+
+    def begin(self, scene: Scene, lasting: list[str], step: str) -> None:
+        """An episode and its newest step; `lasting` grows with it."""
+        with self._lock:
+            self._scene, self._lasting, self._sent = scene, lasting, 0
+            self._steps.clear()
+            self._steps.append(step)
+        self._call()
+
+    def add(self, step: str) -> None:
+        """One decision."""
+        with self._lock:
+            if len(self._steps) >= KEPT:
+                self._steps.popleft()
+                self.dropped += 1
+            self._steps.append(step)
+        self._call()
+
+    def say(self, message: str, *, end: bool = False) -> None:
+        """Something else, as JSON; the last thing with `end`."""
+        with self._lock:
+            self._said.append(message)
+            self.ended |= end
+        self._call()
+
+    def _call(self) -> None:
+        try:
+            self._loop.call_soon_threadsafe(self.wake.set)
+        except RuntimeError:  # the server has ended
+            self.ended = True
+
+
+class Live:
+    """The viewers of one session.
+
+    `drive(s)` carries out one decision unless the episode is over or that far; `reset(seed)` begins another.
+    """
+
+    def __init__(
+        self, stage: Stage, drive: Callable[[float], bool], reset: Callable[[int | None], None]
+    ) -> None:
+        self._stage, self._drive, self._reset = stage, drive, reset
+        self._changed = threading.Condition()
+        self._viewers: list[Viewer] = []
+        self._scene: Scene | None = None
+        self._lasting: list[str] = []
+        self._step = ""  # the newest
+        self._begin: list[int | None] = []  # seeds that were asked for
+        self._driver: threading.Thread | None = None
+        self.program = False  # whether requests drive it
+
+    @property
+    def number(self) -> int:
+        """How many watch."""
+        return len(self._viewers)
+
+    # ---- in the session's turn ----
+
+    def told(self, begun: bool) -> None:
+        """A decision was carried out, or an episode has begun."""
+        if not self._viewers:
+            if self._scene is not None:
+                self._scene = None
+                self._stage.unwatched()
+        elif begun or self._scene is None:
+            self._look()
+        else:
+            lasting, self._step = self._stage.drawn()
+            self._lasting += lasting
+            for viewer in [*self._viewers]:
+                viewer.add(self._step)
+
+    def join(self, viewer: Viewer) -> None:
+        """One more watches. Raises Conflict when there are too many."""
+        if len(self._viewers) >= WATCHED:
+            raise Conflict(f"{WATCHED} pages watch it already")
+        self._viewers.append(viewer)
+        if self._scene is None:
+            self._look()
+        else:
+            viewer.begin(self._scene, self._lasting, self._step)
+
+    # ---- at any time ----
+
+    def leave(self, viewer: Viewer) -> None:
+        """It watches no more."""
+        with self._changed:
+            if viewer in self._viewers:
+                self._viewers.remove(viewer)
+            self._changed.notify_all()
+
+    def ask(self, viewer: Viewer, until: float) -> None:
+        """Drive up to `until` s of the episode."""
+        with self._changed:
+            viewer.until = until
+            self._go()
+
+    def ask_begin(self, seed: int | None) -> None:
+        """Begin the episode `seed`; None: the one after the last."""
+        with self._changed:
+            self._begin.append(seed)
+            for viewer in self._viewers:
+                viewer.until = 0.0
+            self._go()
+
+    def end(self, reason: str) -> None:
+        """The session has ended."""
+        self.say({"ended": reason}, end=True)
+        with self._changed:
+            self._viewers.clear()
+            self._changed.notify_all()
+
+    def say(self, message: dict[str, str], *, end: bool = False) -> None:
+        """Tell all viewers."""
+        for viewer in [*self._viewers]:
+            viewer.say(json.dumps(message), end=end)
+
+    # ---- inside ----
+
+    def _look(self) -> None:
+        self._scene = self._stage.scene()
+        if self._scene is not None:
+            self._lasting, self._step = [*self._scene.lasting], self._scene.step
+            for viewer in [*self._viewers]:
+                viewer.begin(self._scene, self._lasting, self._step)
+
+    def _go(self) -> None:
+        if self._driver is None:
+            self._driver = threading.Thread(target=self._work, name="cosim-live", daemon=True)
+            self._driver.start()
+        self._changed.notify_all()
+
+    def _work(self) -> None:
+        """A thread while somebody watches: drive as far as is asked for."""
+        while True:
+            with self._changed:
+                while self._viewers and not self._begin and not self._until:
+                    self._changed.wait()
+                if not self._viewers:
+                    self._driver = None
+                    self._begin.clear()
+                    return
+                seed, until = (self._begin[-1:], self._until)
+                self._begin.clear()
+            try:
+                if seed:
+                    self._reset(seed[0])
+                    continue
+                reached = not self._drive(until)
+            except CosimError as error:
+                reached = True
+                self.say({"problem": str(error)})
+            if reached:
+                with self._changed:
+                    for viewer in self._viewers:
+                        viewer.until = 0.0 if viewer.until <= until else viewer.until
+
+    @property
+    def _until(self) -> float:
+        return max((viewer.until for viewer in self._viewers), default=0.0)

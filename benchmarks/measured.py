@@ -119,6 +119,13 @@ def attribution(place: Place) -> list[list[str]]:
     return [["cosim.cli.main", "bench", "attribution", *flags, "--out", str(place.work / "attribution")]]
 
 
+def seeing(place: Place) -> list[list[str]]:
+    """What the frame encoder reads off a map."""
+    return [
+        ["benchmarks.seeing", "--drives", "1" if place.small else "4", "--out", str(place.out / "seeing.md")]
+    ]
+
+
 def behaviors(place: Place) -> list[list[str]]:
     """How faithfully LC2013 drives Table II."""
     flags = ["--report", "--scale", "0.002" if place.small else "1"]
@@ -127,8 +134,9 @@ def behaviors(place: Place) -> list[list[str]]:
 
 def real_nets(place: Place) -> list[list[str]]:
     """A scenario of another project."""
-    few = ["--duration", "4", "--runs", str(place.work / "real_nets")] if place.small else []
-    return [["benchmarks.real_nets", *few, "--out", str(place.out / "real_nets.md")]]
+    few = ["--duration", "4"] if place.small else []
+    anew = ["--runs", str(place.work / "real_nets")]
+    return [["benchmarks.real_nets", *few, *anew, "--out", str(place.out / "real_nets.md")]]
 
 
 def joining(place: Place) -> list[list[str]]:
@@ -177,6 +185,7 @@ PAGES = (
         ("attribution.md", "attribution.png", "data/attribution.csv"),
         drop=("*.md", "*.png", "*.csv"),
     ),
+    Page("seeing", seeing, ("seeing.md",)),
     Page("real_nets", real_nets, ("real_nets.md",)),
     Page("behaviors", behaviors, ("behaviors.md",)),
     Page(

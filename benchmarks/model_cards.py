@@ -54,7 +54,7 @@ def page() -> list[str]:
     lines = ["# The networks that ship", "", "Made by `python -m benchmarks.model_cards`.", ""]
     lines += ["Licence: MIT, as the code. Rates and means with 95 % intervals.", ""]
     for name, card in cards.items():
-        about = driving(name, card) if name in APPROACHES else predicting(name, card)
+        about = (driving if name in APPROACHES else seeing if name == "encoder" else predicting)(name, card)
         lines += [f"## {name}", "", *about, f"- SHA-256 of `{name}.safetensors`: `{card['sha256']}`", ""]
     return lines
 
@@ -145,6 +145,23 @@ def predicting(name: str, card: Card) -> Iterator[str]:
     text = ", ".join(f"{worded(key)} {value:g} {unit}" for key, value in figures.items())
     yield f"- Measured on {check['episodes']} validation episodes: {text}. On test seeds: {page}."
     yield from (f"- Limit: {text}" for text in PREDICTING_LIMITS)
+
+
+def seeing(_: str, card: Card) -> Iterator[str]:
+    """The lines about the frame encoder."""
+    data, r2 = card["data"], card["measured"]["R2 on tuning seeds"]
+    frames, sight = data["frames"], data["sight"]
+    yield "- Turns one velocity map into 128 numbers that tell what stands on it (docs/training.md, Seeing)."
+    yield (
+        f"- Data: {frames['training']:,} frames, {sight['drives']} drives of every demand of "
+        f"{', '.join(data['scenarios'])}, seeds below 100,000; labels from the simulation."
+    )
+    yield f"- Training: `cosim train encoder --scenario all`, {sight['loop']['updates']} updates."
+    shown = ("gap ahead, own lane", "speed ahead, own lane", "mission vehicle, presence")
+    text = ", ".join(f"{key} {r2[key]:.2f}" for key in shown)
+    yield f"- Measured on {frames['validation']:,} frames of tuning seeds, R2: {text}."
+    yield "  On test seeds, by world: docs/results/seeing.md."
+    yield "- Limit: it learned from the five worlds alone; nothing is known of its sight on other roads."
 
 
 def worded(figure: str) -> str:

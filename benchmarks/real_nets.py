@@ -5,7 +5,8 @@
 
 Drives A10KW, a motorway interchange, to its end with SUMO's driver and with the agent, and every other
 configuration of eclipse-sumo's games that loads; lists every collision with an explanation, the overlaps that
-are none, offences and the memory. What `--runs` holds is not driven again; `--held` drives nothing.
+are none, offences and the memory. What `--runs` holds is not driven again: by default what the page was made
+of, so that another folder drives everything anew. `--held` drives nothing.
 Needs `pip install cosim-sumo[tools]`.
 """
 
@@ -51,7 +52,12 @@ CURVE = 12  # of these at most on the page
 FEW = 100  # AVs on the road, up to which the simulation is to be no slower than real time
 STANDING = 0.1  # m/s, SUMO's own threshold of a halting vehicle
 QUEUE = 30.0  # m: further ahead nobody is a leader of a queue
-LISTED = 5  # of each kind of overlap and of offence, the worst or first of a net
+LISTED = 5  # of each kind of overlap and of offence, the worst or first of a run
+KEPT = Path("docs/results/data/real_nets")
+SAME = (  # of an episode's document, kept as they are
+    *("preset", "steps", "trace_hash", "collision_list", "memory", "memory_curve", "avs", "most_avs"),
+    *("few_avs", "end", "heads", "lanes"),
+)
 TRAFFIC = {
     "inserted": "vehicles_inserted",
     "never inserted": "vehicles_never_inserted",
@@ -86,6 +92,7 @@ LOOKED_AT = {  # (net, collider, victim) -> what the pictures show
         " two drive into one another at 12 and 14 m/s where their ways cross"
     ),
 }
+MEASURED = ("depth, m", "askew, degrees", "apart, m", "slower one, m/s")  # of an overlap
 TAIL, NET = "one stands askew", "the lanes lie too close"  # why boxes overlap that have not collided
 
 
@@ -305,9 +312,35 @@ def drive(run: Run, runs: Path, held: bool) -> dict[str, Any] | str | None:
     except CosimError as error:
         return str(error).replace(f"{run.config.parent}/", "")
     runs.mkdir(parents=True, exist_ok=True)
+    found = kept(found, run)
     with whole(file) as draft:
-        draft.write_text(json.dumps(found), encoding="utf-8")
+        draft.write_text(json.dumps(found) + "\n", encoding="utf-8")
     return found
+
+
+def kept(document: dict[str, Any], run: Run) -> dict[str, Any]:
+    """What the page needs of a drive's document; numbers to 4 places, and of overlaps and offences the
+    `LISTED` in words."""
+    by_why: dict[str, Any] = {}
+    for one in sorted(document["overlaps"], key=lambda o: -o["depth"]):
+        of_why = by_why.setdefault(one["why"], {"measured": [], "deepest": []})
+        measured = one["depth"], max(map(abs, one["askew"])), -one["laid"], min(one["speed"])
+        of_why["measured"].append([round(value, 2) for value in measured])
+        if len(of_why["deepest"]) < LISTED:
+            of_why["deepest"].append(_overlap(one))
+    told = document["offences"]
+    found = {
+        **{key: document[key] for key in (*TRAFFIC.values(), *LAW.values(), *SAME)},
+        "total_s": document["timings"]["total_s"],
+        "not_comparable_because": [
+            reason.replace(f"{run.config}", run.config.name) for reason in document["not_comparable_because"]
+        ],
+        "overlaps": by_why,
+        "offences": [f"{at:,.1f} s, `{who}` {what}" for at, who, what in told[:LISTED]],
+        "more_offences": max(len(told) - LISTED, 0),
+    }
+    rounded: dict[str, Any] = json.loads(json.dumps(found), parse_float=lambda text: round(float(text), 4))
+    return rounded
 
 
 def explained(collision: dict[str, Any]) -> str:
@@ -339,6 +372,8 @@ def page(runs: Sequence[Run], found: Sequence[dict[str, Any] | str | None], comm
         "",
         f"Made by `{command}`: the games of the `eclipse-sumo` package",
         f"(`pip install cosim-sumo[tools]`), driven as they stand, {PENETRATION:.0%} of the vehicles AVs.",
+        f"What each drive gave is in `{KEPT.relative_to('docs/results')}`;",
+        "`--runs FOLDER` drives all of it anew.",
         f"A10KW is a motorway interchange with bridges; driven to its end with {', '.join(big)}.",
         f"Memory: of the simulation's process, after {SETTLED:g} s and at the end.",
         "Time factor: simulated s per s that passed, other programs on the machine included; over the steps",
@@ -364,7 +399,7 @@ def page(runs: Sequence[Run], found: Sequence[dict[str, Any] | str | None], comm
     lines += _table([*heads[:3], *LAW], driven, [_figures(one, LAW) for _, one in driven])
     lines += ["", f"## Memory every {EVERY:g} s, MB (on the road then)", ""]
     for run, one in driven:
-        curve = ", ".join(f"{mb} ({n})" for _, n, mb in one.get("memory_curve", ())[:CURVE])
+        curve = ", ".join(f"{mb} ({n})" for _, n, mb in one["memory_curve"][:CURVE])
         lines += [f"- {run.config.stem}, {run.policy}, seed {run.seed}: {curve}"] if curve else []
     lines += ["", "## Every collision", ""]
     collisions = [
@@ -380,7 +415,6 @@ def page(runs: Sequence[Run], found: Sequence[dict[str, Any] | str | None], comm
     why: dict[str, list[str]] = {}
     for run, one in driven:
         for reason in one["not_comparable_because"]:
-            reason = reason.replace(f"{run.config}", run.config.name)
             why.setdefault(reason, []).append(f"{run.config.stem} {run.policy} {run.seed}")
     if why:
         lines += ["", "## Not comparable with other runs, and the results say so", ""]
@@ -408,7 +442,7 @@ def _simulated(one: dict[str, Any]) -> float:
 
 def _end(one: dict[str, Any]) -> float:
     """s, of the scenario as it is written."""
-    return float(one.get("end", _simulated(one)))
+    return float(one["end"])
 
 
 def _figures(one: dict[str, Any], columns: dict[str, str]) -> list[str]:
@@ -423,7 +457,7 @@ def _factors(one: dict[str, Any]) -> list[str]:
     """How much quicker than real time: of the whole, and with few AVs on the road."""
     simulated, passed, processor = one["few_avs"]
     few = f"{simulated / processor:.1f}, {simulated / passed:.1f} ({simulated:,.0f} s)" if passed else "-"
-    return [f"{_simulated(one) / one['timings']['total_s']:.1f}", few]
+    return [f"{_simulated(one) / one['total_s']:.1f}", few]
 
 
 def _table(heads: Sequence[str], driven: Sequence[tuple[Run, Any]], rows: Sequence[list[str]]) -> list[str]:
@@ -448,25 +482,20 @@ def _overlaps(driven: Sequence[tuple[Run, dict[str, Any]]]) -> list[str]:
         f"{NET.capitalize()}: each is on the centre line of its own lane, of lanes whose drivers need not",
         "heed one another, or one is behind the other on a lane that is drawn shorter than it is.",
         "",
-        *_row("net", "policy", "why", "pairs", "depth, m", "askew, degrees", "apart, m", "slower one, m/s"),
+        *_row("net", "policy", "why", "pairs", *MEASURED),
     ]
     lines.append("|---" * 8 + "|")
     deepest = []
     for net, policy in dict.fromkeys((run.config.stem, run.policy) for run, _ in driven):
         of_net = [(r, o) for r, o in driven if (r.config.stem, r.policy) == (net, policy)]
-        every = [(r, o) for r, one in of_net for o in one["overlaps"]]
-        for why in dict.fromkeys(o["why"] for _, o in every):
-            same = [(r, o) for r, o in every if o["why"] == why]
-            columns = (
-                [o["depth"] for _, o in same],
-                [max(map(abs, o["askew"])) for _, o in same],
-                [-o["laid"] for _, o in same],
-                [min(o["speed"]) for _, o in same],
-            )
+        for why in dict.fromkeys(why for _, one in of_net for why in one["overlaps"]):
+            same = [(r, one["overlaps"][why]) for r, one in of_net if why in one["overlaps"]]
+            columns = np.concatenate([o["measured"] for _, o in same]).T
             spread = [f"{np.median(c):.2f} ({min(c):.2f} to {max(c):.2f})" for c in columns]
-            lines += _row(net, policy, why, f"{len(same)}", *spread)
-            worst = sorted(same, key=lambda pair: -pair[1]["depth"])[:LISTED]
-            deepest += [f"- {net}, {policy}, seed {r.seed}, {why}: {_overlap(o)}" for r, o in worst]
+            lines += _row(net, policy, why, f"{len(columns[0])}", *spread)
+            worst = [(o["measured"][k][0], r, text) for r, o in same for k, text in enumerate(o["deepest"])]
+            worst = sorted(worst, key=lambda found: -found[0])[:LISTED]
+            deepest += [f"- {net}, {policy}, seed {r.seed}, {why}: {text}" for _, r, text in worst]
     return (
         [*lines, "", "Medians, and ranges. The deepest:", "", *deepest] if deepest else [*lines[:-2], "None."]
     )
@@ -501,17 +530,13 @@ def _offences(driven: Sequence[tuple[Run, dict[str, Any]]]) -> list[str]:
     ]
     empty = len(lines)
     for run, one in driven:
-        told = one["offences"]
-        lines += [
-            f"- {run.config.stem}, {run.policy}, seed {run.seed}: {at:,.1f} s, `{who}` {what}"
-            for at, who, what in told[:LISTED]
-        ]
-        if len(told) > LISTED:
-            lines.append(f"- {run.config.stem}, {run.policy}, seed {run.seed}: {len(told) - LISTED} more")
-        if heads := one.get("heads"):
+        name = f"- {run.config.stem}, {run.policy}, seed {run.seed}"
+        lines += [f"{name}: {told}" for told in one["offences"]]
+        if more := one["more_offences"]:
+            lines.append(f"{name}: {more} more")
+        if heads := one["heads"]:
             begin = "; ".join(f"{head} ({n})" for head, n in heads.items())
-            name = f"{run.config.stem}, {run.policy}, seed {run.seed}"
-            lines.append(f"- {name}: the queues of those that stood begin where {begin}")
+            lines.append(f"{name}: the queues of those that stood begin where {begin}")
     return lines if len(lines) > empty else [*lines, "None."]
 
 
@@ -521,7 +546,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--duration", type=float, metavar="S", help="default: to each scenario's end")
     parser.add_argument("--seeds", type=int, metavar="N", help=f"at most; default: {SEEDS}")
     parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes (1)")
-    parser.add_argument("--runs", type=Path, default=Path("runs/real_nets"), metavar="FOLDER")
+    parser.add_argument("--runs", type=Path, default=KEPT, metavar="FOLDER")
     parser.add_argument(
         "--held", action="store_true", help="write the page of what was driven, drive nothing"
     )

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Runs the built image as a CI would, locked up, from doctor to gate: `docker/smoke.sh [RESULTS]`.
+# Runs the built image as a CI would, locked up, from doctor to gate and server: `docker/smoke.sh [RESULTS]`.
 #
 # No network, read-only root, no capability, no root user. Every exit code is asserted; what the container wrote
 # (rows, JUnit, reports, a log) stays in RESULTS (default: runs/smoke, which is emptied first). The variables
@@ -76,15 +76,17 @@ expect 0 "evaluate a mounted .sumocfg with mounted demand" evaluate --scenario /
 expect 0 "resume what is complete" evaluate --scenario merge --demand contested \
     --policy idm --policy keep-lane --policy altruist-rule --seeds 200000:200003 --resume --out /results/builtin
 expect 0 "gate: a better policy passes" compare /results/builtin --baseline keep-lane --candidate altruist-rule \
-    --fail-on 'collision_rate > +0.5pp' --junit /results/gate-pass.xml --markdown /results/gate-pass.md
+    --across preset --fail-on 'collision_rate > +0.5pp' --junit /results/gate-pass.xml --markdown /results/gate-pass.md
 expect 1 "gate: a worse policy fails" compare /results/builtin --baseline altruist-rule --candidate keep-lane \
-    --fail-on 'collision_rate > +0.5pp' --junit /results/gate-fail.xml --markdown /results/gate-fail.md
+    --across preset --fail-on 'collision_rate > +0.5pp' --junit /results/gate-fail.xml --markdown /results/gate-fail.md
 expect 2 "gate: an unknown metric is bad input" compare /results/builtin --baseline idm --candidate keep-lane \
-    --fail-on 'colision_rate > 1pp'
+    --across preset --fail-on 'colision_rate > 1pp'
 expect 2 "a demand that is not there is bad input" evaluate --scenario /scenarios/mine.sumocfg \
     --demand '/scenarios/demand/none*.xml' --out /results/none
 expect 0 "report of the built-in world" report /results/builtin
 expect 0 "report of the mounted scenario" report /results/mine
+expect 0 "serve: a world, an upload, a kill in between, a replay, a session" --entrypoint tini -- -- \
+    with-caches python /scenarios/serving.py
 expect 0 "rows, JUnit and reports are readable" --entrypoint python -- /scenarios/artefacts.py
 
 fits="yes"

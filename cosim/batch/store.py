@@ -147,6 +147,12 @@ class Store(contextlib.AbstractContextManager["Store"]):
         )
         return [dict(found.row) for found in self._read(query)]
 
+    def remove(self) -> None:
+        """Forget this run; a database keeps the others."""
+        with self._writing() as connection:
+            for table in (_episodes, _cells, _runs):
+                connection.execute(table.delete().where(table.c.run == self.run))
+
     def close(self) -> None:
         """Let go of the database."""
         self._engine.dispose()
@@ -182,7 +188,7 @@ class Store(contextlib.AbstractContextManager["Store"]):
 def connect(url: str, tables: sa.MetaData, field: str = "--store") -> sa.Engine:
     """The database `url` with these tables in it. Raises BadInput (naming `field`): it cannot be reached."""
     try:
-        engine = sa.create_engine(url)
+        engine = sa.create_engine(url, pool_pre_ping=True)  # a connection may have been lost meanwhile
         if engine.dialect.name == "sqlite":
             sa.event.listen(engine, "connect", _sqlite)
         tables.create_all(engine)

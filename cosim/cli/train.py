@@ -4,7 +4,7 @@ import argparse
 
 from cosim.cli import arguments
 
-WHAT = ("vfn", "a2c", "hpn")
+WHAT = ("vfn", "a2c", "hpn", "encoder")
 VARIANTS = ("hpn", "hpn-no-history", "hpn-plain")
 
 
@@ -52,6 +52,10 @@ def work(args: argparse.Namespace) -> int:
 
         train_hpn.check(args)
         return train_hpn.train(args)
+    if args.what == "encoder":
+        from cosim.learning import train_encoder
+
+        return train_encoder.train(args)
     from cosim.learning.train_vfn import train
 
     return train(args)

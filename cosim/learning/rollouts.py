@@ -59,12 +59,12 @@ class Rollout(Hosts):
 
     def run(self, drive: Drive, progress: Any = None) -> Drove:
         """One whole episode; with metrics of a user's every figure of it is logged."""
-        episode, agent = self.episode(drive.lesson, drive.errors), self.agent
+        episode, agent = self.episode(drive.lesson, drive.errors, drive.preset), self.agent
         self._weights("vfn", agent.vfn, drive.weights)
         self._weights("frozen", agent.frozen, drive.frozen)
         return drive_episode(episode, agent, drive, self._reward, progress, every=bool(self._metrics))
 
-    def episode(self, lesson: Lesson, errors: str = "") -> Episode:
+    def episode(self, lesson: Lesson, errors: str = "", preset: str = Preset.UNGUARDED) -> Episode:
         """Where this lesson is driven, among drivers who err so: that of the last one if it is the same."""
 
         def build() -> Host:
@@ -72,12 +72,12 @@ class Rollout(Hosts):
                 lesson.scenario,
                 demand=[lesson.demand],
                 behavior=lesson.behavior,
-                preset=Preset.UNGUARDED,
+                preset=preset,
                 errors=errors or None,
             )
             return Host(scenario, self.agent, 0.0, metrics=self._metrics)
 
-        return self.host((lesson, errors), build).episode
+        return self.host((lesson, errors, preset), build).episode
 
     def _weights(self, slot: str, network: Any, file: str) -> None:
         if file and self._loaded.get(slot) != file:

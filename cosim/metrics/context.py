@@ -108,7 +108,10 @@ class Slots:
         """[n] the numbers of these vehicles; new ones get the next free numbers."""
         names = tuple(ids)
         if names != self._ids:
-            self._rows = np.array([self.of.setdefault(name, len(self.of)) for name in names], dtype=np.int64)
+            found = list(map(self.of.get, names))
+            if None in found:
+                found = [self.of.setdefault(name, len(self.of)) for name in names]
+            self._rows = np.array(found, dtype=np.int64)
             self._ids = names
         return self._rows
 

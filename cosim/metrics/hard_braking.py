@@ -1,5 +1,7 @@
 """Hard braking: how often vehicles began to brake harder than 3 m/s2, AVs and all."""
 
+import numpy as np
+
 from cosim.metrics.context import MetricContext
 from cosim.types import Kind, Metric, Snapshot
 
@@ -28,7 +30,8 @@ class HardBraking:
         self._kinds.update(s.kind.tolist())
         if change <= 0.0:
             return
-        braking = frozenset(i for i, speed in self._speeds.items() if before.get(i, speed) - speed > change)
+        was = np.fromiter(map(before.get, s.ids, self._speeds.values()), np.float64, s.n)
+        braking = frozenset(s.ids[k] for k in np.flatnonzero(was - s.speed > change))
         begun = braking - self._braking - self._wrecks
         self._all += len(begun)
         self._av += sum(s.kind[s.row[name]] == Kind.AV for name in begun)

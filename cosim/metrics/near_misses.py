@@ -30,6 +30,7 @@ class NearMisses:
         self._courses = courses
         self._met: list[Meeting] = []
         self._now: dict[tuple[str, str], Meeting] = {}  # the newest one of each pair
+        self._open: dict[tuple[str, str], None] = {}  # those of which may have some that count on some ways
         self._vehicles = self._avs = False  # whether any has been seen
 
     def add(self, snapshot: Snapshot, pairs: Ints) -> None:
@@ -52,18 +53,21 @@ class NearMisses:
             meeting.last, meeting.counts = s.time, meeting.counts or ways is None
             if ways is not None and not meeting.counts:
                 meeting.open.append((s.time, ways))
+                self._open[pair] = None
 
     def _settle(self, s: Snapshot) -> None:
         """Forget grave frames that lay on ways that were not taken."""
         if self._courses is None:
             return
-        for pair, meeting in self._now.items():
-            if meeting.open:
-                left = [(time, self._courses.still(ways, s, pair)) for time, ways in meeting.open]
-                meeting.open = [(time, ways) for time, ways in left if ways]
-                meeting.counts |= any(s.time - time > SETTLED for time, _ in meeting.open)
-                if meeting.counts:
-                    meeting.open.clear()
+        for pair in tuple(self._open):
+            meeting = self._now[pair]
+            left = [(time, self._courses.still(ways, s, pair)) for time, ways in meeting.open]
+            meeting.open = [(time, ways) for time, ways in left if ways]
+            meeting.counts |= any(s.time - time > SETTLED for time, _ in meeting.open)
+            if meeting.counts:
+                meeting.open.clear()
+            if not meeting.open:
+                del self._open[pair]
 
     @property
     def counted(self) -> list[Meeting]:

@@ -77,13 +77,16 @@ class Standing(AvCounts):
         ahead = dict(
             zip(queued.tolist(), leaders.tolist(), strict=True)
         )  # row -> row of the next, -1 for none
-        planned = set(s.events.stopped)
+        planned, lanes = set(s.events.stopped), s.lane.tolist()
+        waits: dict[int, bool] = {}  # lane -> whether a signal at its end asks to wait
         found: dict[int, bool] = {}
         for row in standing:
             queue = []
             while row in ahead and row not in found:
                 queue.append(row)
-                found[row] = s.ids[row] in planned or self._at_signal(s, int(s.lane[row]))
+                if (lane := lanes[row]) not in waits:
+                    waits[lane] = self._at_signal(s, lane)
+                found[row] = waits[lane] or s.ids[row] in planned
                 if found[row]:
                     break
                 row = ahead[row]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -9,7 +10,8 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from cosim.batch.store import connect
+from cosim.batch.store import connect, shown
+from cosim.errors import BadInput
 
 QUEUED, RUNNING, FINISHED, CANCELLED, FAILED = STATUSES = (
     "queued",
@@ -19,6 +21,8 @@ QUEUED, RUNNING, FINISHED, CANCELLED, FAILED = STATUSES = (
     "failed",
 )
 OPEN = (QUEUED, RUNNING)
+LOCK = int.from_bytes(b"cosim")  # PostgreSQL's number of it
+CLAIMING = 5.0  # s that the database may take to notice the end of a server that was killed
 
 _tables = sa.MetaData()
 _jobs = sa.Table(
@@ -58,10 +62,14 @@ class Job:
 
 
 class Jobs:
-    """The list. Raises BadInput (`--database`) when its database cannot be reached."""
+    """The list. Raises BadInput (`--database`): its database cannot be reached, or another server has it.
+
+    PostgreSQL is locked until `close`, or until the connection is lost; SQLite lies in a locked folder.
+    """
 
     def __init__(self, url: str) -> None:
         self._engine = connect(url, _tables, "--database")
+        self._claim = self._claimed(url) if self._engine.dialect.name == "postgresql" else None
 
     def add(self, run: str, name: str, request: dict[str, Any], uploads: Sequence[str], episodes: int) -> Job:
         """A run that waits."""
@@ -112,7 +120,21 @@ class Jobs:
 
     def close(self) -> None:
         """Let go of the database."""
+        if self._claim is not None:
+            self._claim.close()
         self._engine.dispose()
+
+    def _claimed(self, url: str) -> sa.Connection:
+        """A connection that holds the lock."""
+        connection = self._engine.connect().execution_options(isolation_level="AUTOCOMMIT")
+        deadline = time.monotonic() + CLAIMING
+        while not connection.execute(sa.select(sa.func.pg_try_advisory_lock(LOCK))).scalar_one():
+            if time.monotonic() > deadline:
+                connection.close()
+                self._engine.dispose()
+                raise BadInput("another server is working in it", field="--database", value=shown(url))
+            time.sleep(0.1)
+        return connection
 
     def _read(self, query: sa.Select[Any]) -> list[Job]:
         with self._engine.connect() as connection:

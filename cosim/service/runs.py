@@ -27,7 +27,7 @@ from cosim.service.ids import ID, new_id
 from cosim.service.jobs import CANCELLED, FAILED, FINISHED, QUEUED, RUNNING, Job, Jobs, now
 from cosim.service.problems import Conflict, NotFound, Unavailable
 from cosim.service.settings import Settings
-from cosim.workers.engines import Engine, cores
+from cosim.workers.engines import Engine, LocalEngine, cores
 from cosim.workers.pool import Cancelled, Pool, PoolEngine
 from cosim.workers.ray_engine import RayEngine
 from cosim.workers.supervisor import Limits as WorkerLimits
@@ -50,9 +50,9 @@ class Drive:
         self.engine: Engine | None = None
 
     def cancel(self) -> None:
-        """End it: at once on the processes of this machine, on Ray with its next episode."""
+        """End it at once."""
         self.cancelled.set()
-        if isinstance(self.engine, PoolEngine):
+        if isinstance(self.engine, PoolEngine | RayEngine):
             self.engine.cancel()
 
     def progress(self, done: int) -> None:
@@ -92,10 +92,11 @@ class Runs:
         self._reporting = threading.Lock()
         self._threads: list[threading.Thread] = []
         self.pool: Pool | None = None
+        self._cluster: RayEngine | None = None
         if settings.engine == "local":
             self.pool = Pool(settings.workers)
         else:
-            self._engine()  # raises BadInput where Ray is not installed
+            self._cluster = RayEngine(EpisodeRunner)  # raises BadInput where Ray is not installed
 
     def start(self) -> None:
         """Go on with what an earlier server left, and take what comes."""
@@ -122,6 +123,8 @@ class Runs:
         deadline = time.monotonic() + ENDING
         for thread in self._threads:
             thread.join(timeout=max(deadline - time.monotonic(), 0.0))
+        if self._cluster is not None:
+            self._cluster.disconnect()
 
     # ---- what users ask ----
 
@@ -139,7 +142,7 @@ class Runs:
                 execution.begin(plan, store, {"command": "cosim serve", "began": now()})
             job = self._jobs.add(run, name, request, uploads, plan.episodes)
         except BaseException:
-            shutil.rmtree(folder, ignore_errors=True)
+            self._forget(run)
             raise
         with self._changed:
             self._plans[run] = plan
@@ -153,7 +156,7 @@ class Runs:
         plan: Plan = self._clerks.call("spec", flags)
         workers = self.pool.workers if self.pool else self._settings.workers or cores()
         with room(self._settings, uploads) as confined:
-            seconds, basis = estimate(plan, self._engine(confined), workers)
+            seconds, basis = estimate(plan, self._engine(confined, probes=True), workers)
         return {"cells": len(plan.cells), "episodes": plan.episodes, "estimated_s": seconds, "basis": basis}
 
     def get(self, run: str) -> Job:
@@ -215,7 +218,7 @@ class Runs:
         if job.status in (QUEUED, RUNNING):
             raise Conflict(f"run {run} is {job.status}: cancel it first")
         self._jobs.remove(run)
-        shutil.rmtree(self.folder(run), ignore_errors=True)
+        self._forget(run)
 
     def rows(self, run: str) -> list[dict[str, Any]]:
         """The rows so far, as `cosim evaluate` keeps them."""
@@ -243,8 +246,15 @@ class Runs:
     def _store(self, run: str) -> Store:
         return Store.in_folder(self.folder(run), self._settings.database)
 
-    def _engine(self, confined: Room | None = None) -> Engine:
-        """Of one run; in a room its processes are confined."""
+    def _forget(self, run: str) -> None:
+        """Remove its rows and files."""
+        if self._settings.database is not None:
+            with contextlib.suppress(CosimError), self._store(run) as store:
+                store.remove()
+        shutil.rmtree(self.folder(run), ignore_errors=True)
+
+    def _engine(self, confined: Room | None = None, *, probes: bool = False) -> Engine:
+        """Of one run, or of `probes`; in a room its processes are confined."""
         factory: Callable[..., Any] = EpisodeRunner
         arguments: tuple[Any, ...] = ()
         if confined is not None:
@@ -252,10 +262,10 @@ class Runs:
         once = None if confined is None else WorkerLimits(step=60.0, start=120.0, crashes=1)
         if self.pool is not None:
             return self.pool.engine(factory, arguments, limits=once)
-        settings = self._settings
-        return RayEngine(
-            factory, arguments, workers=settings.workers, limits=once, address=settings.ray_address
-        )
+        if probes:  # a run may hold every core of the cluster
+            return LocalEngine(factory, arguments, workers=1, limits=once)
+        workers, address = self._settings.workers, self._settings.ray_address
+        return RayEngine(factory, arguments, workers=workers, limits=once, address=address, keep=True)
 
     def _work(self) -> None:
         """A thread: one run after the other."""

@@ -1,5 +1,6 @@
 """Starts the application on a socket and ends it in order."""
 
+import contextlib
 import socket
 from typing import Any, TextIO
 
@@ -43,7 +44,8 @@ def serve(data: str, *, host: str, port: int, said: TextIO, **settings: Any) -> 
                 timeout_graceful_shutdown=5,
                 ws_max_size=MESSAGE,
             )
-            uvicorn.Server(config).run(sockets=[listening])
+            with contextlib.suppress(KeyboardInterrupt):  # raised again by uvicorn once it has ended in order
+                uvicorn.Server(config).run(sockets=[listening])
     return 0
 
 

@@ -4,6 +4,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -66,12 +67,19 @@ class SnapshotReader:
         self._of_vehicles = tuple(sumo.getter("vehicle", name) for name in READ)
         self._of_persons = (*(sumo.getter("person", name) for name in READ[:3]), *NOT_OF_PERSONS)
         self._ids: tuple[str, ...] | None = None
+        self._persons: tuple[str, ...] | None = None
         # kind, mission, length m, width m, actor [n] of `_ids`
         self._static: tuple[np.ndarray, ...] = ()
 
     def bodies_changed(self) -> None:
         """Build the constant columns anew at the next read (a new episode, a new mission vehicle)."""
         self._ids = None
+        self.persons_changed()
+
+    def persons_changed(self) -> None:
+        """Ask anew at the next read who is there: SUMO looks through all that it has loaded, which of a flow
+        are those of the whole day."""
+        self._persons = None
 
     def read(self, bodies: dict[str, Body], events: Events) -> Snapshot:
         """One snapshot of every vehicle and every walking person on the road, sorted by id.
@@ -80,7 +88,7 @@ class SnapshotReader:
             bodies: what is constant of each vehicle that has departed, by id; new persons are added.
             events: what happened since the last snapshot.
         """
-        persons = _walking() if sumo.person.getIDCount() else {}
+        persons = self._walking() if sumo.person.getIDCount() else {}
         ids = tuple(sorted((*sumo.vehicle.getIDList(), *persons)))
         if ids != self._ids:
             present = [bodies.get(i) or bodies.setdefault(i, _person(persons[i])) for i in ids]
@@ -94,12 +102,12 @@ class SnapshotReader:
             self._ids = ids
         kind, mission, length, width, actor = self._static
         position, angle, speed, accel, lane, lane_position = (
-            [vehicle(i) for i in ids]
+            list(map(vehicle, ids))
             if not persons
             else [person(persons[i]) if i in persons else vehicle(i) for i in ids]
             for vehicle, person in zip(self._of_vehicles, self._of_persons, strict=True)
         )
-        on = np.array([self._lane_index.get(i, -1) for i in lane], np.int32)
+        on = np.fromiter(map(self._lane_index.get, lane, repeat(-1)), np.int32, len(ids))
         off = np.flatnonzero(on < 0)
         place = on.copy() if len(off) else on
         for k in off:
@@ -129,6 +137,14 @@ class SnapshotReader:
             switches=self._switches(),
         )
 
+    def _walking(self) -> dict[str, str]:
+        """Name -> SUMO's id of everybody on foot: neither in a vehicle or waiting for one, nor busy
+        elsewhere."""
+        get, on_foot = sumo.person, sumo.constants.STAGE_WALKING
+        if self._persons is None:
+            self._persons = get.getIDList()
+        return {PERSON + i: i for i in self._persons if get.getStage(i).type == on_foot}
+
     def _signals(self) -> Bytes:
         """[s] the state of every signal; a light may have states for more links than there are."""
         get = sumo.trafficlight
@@ -140,12 +156,6 @@ class SnapshotReader:
         get, now = sumo.trafficlight.getNextSwitch, sumo.simulation.getTime()
         left = np.array([get(light) for light in self._lights], np.float64) - now
         return np.repeat(left, np.fromiter(self._lights.values(), np.int64))
-
-
-def _walking() -> dict[str, str]:
-    """Name -> SUMO's id of everybody on foot: neither in a vehicle or waiting for one, nor busy elsewhere."""
-    get = sumo.person
-    return {PERSON + i: i for i in get.getIDList() if get.getStage(i).type == sumo.constants.STAGE_WALKING}
 
 
 def _person(person: str) -> Body:

@@ -286,6 +286,8 @@ class SumoSimulator:
             self._routes.pop(name, None)
             if self._errors is not None:
                 self._errors.drop(name)
+        if self._SHARED or simulation.getDepartedPersonNumber() or simulation.getArrivedPersonNumber():
+            self._reader.persons_changed()
         now = simulation.getTime()
         self._detector.inserted((*departed, *simulation.getEndingTeleportIDList()), now)
         collisions = self._detector.from_sumo(self._bodies, self._commander.lane_changes, now)

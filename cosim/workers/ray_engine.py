@@ -7,16 +7,21 @@ node or without: its task goes back and another actor takes it.
 
 import os
 import sys
+import threading
+import time
 from collections import Counter
 from collections.abc import Generator, Sequence
 from typing import Any
 
 from cosim.errors import BadInput, CosimError
+from cosim.workers.pool import Cancelled
 from cosim.workers.supervisor import Factory, Limits, Supervisor
 from cosim.workers.tasks import SIM_CRASH, Outcome, Task, TaskQueue
 
 LOSSES = 6  # actors that may be lost at one task: as often as a process may be killed at it
+LOOK_EVERY = 0.5  # s between looks whether the run was cancelled
 NOTICE_AFTER = 30.0  # s without any running actor before a note is printed
+_CONNECTING = threading.Lock()
 
 
 class RayEngine:
@@ -39,6 +44,7 @@ class RayEngine:
         workers: int | None = None,
         limits: Limits | None = None,
         address: str | None = None,
+        keep: bool = False,
     ) -> None:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray sends no usage report
         try:
@@ -53,27 +59,44 @@ class RayEngine:
         self._workers = workers
         self._limits = limits or Limits()
         self._address = address
+        self._keep = keep
+        self._cancelled = threading.Event()
 
     def run(self, tasks: Sequence[Task]) -> Generator[Outcome, None, None]:
-        """Exactly one outcome per task."""
+        """Exactly one outcome per task. Raises Cancelled when `cancel` was called."""
         if not tasks:
             return
-        own = not self._ray.is_initialized()
-        self._connect()
-        actors = _Actors(self._ray, self._factory, self._arguments, self._limits)
+        leaves = self._connect() and not self._keep
+        actors = _Actors(self._ray, self._factory, self._arguments, self._limits, self._cancelled)
         try:
             count = self._workers or int(self._ray.cluster_resources().get("CPU", 1))
             yield from actors.drive(tasks, min(count, len(tasks)))
         except self._ray.exceptions.RaySystemError as error:
+            leaves = leaves or self._keep  # the next run connects anew
             raise CosimError(f"the Ray cluster is gone: {error} (--resume goes on from here)") from None
         finally:
             actors.close()
-            if own:
-                self._ray.shutdown()
+            if leaves:
+                self.disconnect()
 
-    def _connect(self) -> None:
-        if self._ray.is_initialized():  # the caller's own connection
-            return
+    def cancel(self) -> None:
+        """End the run, from any thread: its actors are killed, `run` raises Cancelled."""
+        self._cancelled.set()
+
+    def disconnect(self) -> None:
+        """End a connection that was kept, and the local cluster with it."""
+        with _CONNECTING:
+            self._ray.shutdown()
+
+    def _connect(self) -> bool:
+        """Whether there was no connection before."""
+        with _CONNECTING:
+            if self._ray.is_initialized():
+                return False
+            self._init()
+            return True
+
+    def _init(self) -> None:
         local = {"num_cpus": self._workers} if self._address is None else {}
         try:
             self._ray.init(
@@ -93,8 +116,16 @@ class RayEngine:
 class _Actors:
     """The actors, and which task each of them is at."""
 
-    def __init__(self, ray: Any, factory: Factory, arguments: tuple[Any, ...], limits: Limits) -> None:
+    def __init__(
+        self,
+        ray: Any,
+        factory: Factory,
+        arguments: tuple[Any, ...],
+        limits: Limits,
+        cancelled: threading.Event,
+    ) -> None:
         self._ray = ray
+        self._cancelled = cancelled
         # never restarted by Ray: a fresh actor in its place is the same, and may start on another node
         self._actor = ray.remote(num_cpus=1, max_restarts=0, max_task_retries=0)(_Actor)
         self._settings = (factory, arguments, limits)
@@ -108,10 +139,17 @@ class _Actors:
         left = len(tasks)
         for _ in range(count):
             self._start_actor()
+        heard = time.monotonic()
         while left:
-            ready, _ = self._ray.wait(list(self._calls), num_returns=1, timeout=NOTICE_AFTER)
-            if not ready and all(task is None for _, task, _ in self._calls.values()):
-                print("cosim: waiting for the Ray cluster to offer a core", file=sys.stderr, flush=True)
+            ready, _ = self._ray.wait(list(self._calls), num_returns=1, timeout=LOOK_EVERY)
+            if self._cancelled.is_set():
+                raise Cancelled
+            if ready:
+                heard = time.monotonic()
+            elif time.monotonic() - heard > NOTICE_AFTER:
+                heard = time.monotonic()
+                if all(task is None for _, task, _ in self._calls.values()):
+                    print("cosim: waiting for the Ray cluster to offer a core", file=sys.stderr, flush=True)
             for future in ready:
                 actor, task, group = self._calls.pop(future)
                 try:

@@ -57,8 +57,10 @@ def configure(
     if name not in APPROACHES:
         raise BadInput(f"no such approach ({', '.join(APPROACHES)})", field="policy", value=name)
     approach = APPROACHES[name]
-    if not approach.kinematics and observation.channels != APART_OF:
-        problem = f"{name} sees maps alone and reads the channels {', '.join(APART_OF)}"
+    encoded = vfn.extractor == "frames"
+    if (encoded or not approach.kinematics) and observation.channels != APART_OF:
+        how = "with extractor frames reads" if encoded else "sees maps alone and reads"
+        problem = f"{name} {how} the channels {', '.join(APART_OF)}"
         raise BadInput(problem, field="observation.channels", value=", ".join(observation.channels))
     return AgentConfig(
         observation=observation,
@@ -74,7 +76,7 @@ def configure(
             channels=len(observation.channels),
             frames=observation.frames + (chain.hypotheses if approach.predicted_maps else 0),
             rows=observation.rows,
-            extractor=approach.extractor,
+            extractor="frames" if encoded else approach.extractor,
             kinematic=vfn.kinematic if approach.kinematics else 0,
             dueling=vfn.dueling and approach.learning != "a2c",
             critic=approach.learning == "a2c",

@@ -154,17 +154,20 @@ class PredictionAware:
         Raises:
             FloatingPointError: a value is not finite.
         """
-        timing = self._context.timing
         with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=self.config.bf16):
-            if network not in self._memories:
-                fresh = round(timing.decision / timing.frame)
-                self._memories[network] = network.memory(self.observation.frames, fresh)
-            memory = self._memories[network]
+            memory = self._memory(network) if states.maps.dim() == 5 else None  # else latents
             maps = states.maps if memory is None else Frames(memory.frames(agents, states.maps))
             q = to_numpy(network(maps, *states[1:]))
         if not np.isfinite(q).all():
             raise FloatingPointError("the value network returned values that are not finite")
         return q
+
+    def _memory(self, network: VFN) -> FrameMemory | None:
+        if network not in self._memories:
+            timing = self._context.timing
+            fresh = round(timing.decision / timing.frame)
+            self._memories[network] = network.memory(self.observation.frames, fresh)
+        return self._memories[network]
 
     def choose(self, q: Floats32, inputs: Inputs) -> dict[str, Decision]:
         """The safety prioritizer's choice (P, algorithm 3); without a mask the best valued action.

@@ -1,4 +1,4 @@
-"""What turns a stack of maps into features: T's Conv3D (Table 1), and the Conv2D of the simplest baseline."""
+"""What turns a stack of maps into features: T's Conv3D (Table 1), frame by frame, or all as one picture."""
 
 from collections.abc import Callable, Sequence
 from typing import Literal
@@ -9,7 +9,8 @@ from torch import nn
 from torch.nn import functional
 
 from cosim.types import Bytes, Floats32
-from policy.inputs.tensors import to_numpy, unit
+from policy.inputs.tensors import apart, to_numpy, unit
+from policy.networks.frame_encoder import EncoderConfig, FrameEncoder
 
 Strides = Literal["literal", "temporal"]
 Read = Callable[[torch.Tensor], torch.Tensor]  # maps [B,C,H,W] -> the channels that are convolved, float32
@@ -77,6 +78,33 @@ class Conv3dMaps(nn.Module):
         return z.flatten(1)
 
 
+class EncodedMaps(nn.Module):
+    """Every frame through an encoder that was taught to see and learns no more here: maps -> latents.
+
+    `maps` may be latents already [B,T,L]: what never changes is not worked out again.
+    """
+
+    def __init__(self, frames: int, config: EncoderConfig) -> None:
+        super().__init__()
+        self.encoder = FrameEncoder(config).requires_grad_(False)
+        self.flat = frames * config.latent
+
+    def forward(self, maps: torch.Tensor) -> torch.Tensor:
+        """Maps [B,T,C,H,W] as bytes, or latents [B,T,L], -> [B,flat]."""
+        if maps.dim() == 3:
+            return maps.flatten(1).to(torch.float32)
+        return self.frames(maps.flatten(0, 1)).view(len(maps), -1)
+
+    def frames(self, maps: torch.Tensor) -> torch.Tensor:
+        """Latents of single frames: [n,C,H,W] -> [n,L,1,1]."""
+        latents: torch.Tensor = self.encoder(apart(maps).contiguous(memory_format=torch.channels_last))
+        return latents[..., None, None]
+
+    def stacked(self, frames: torch.Tensor) -> torch.Tensor:
+        """[B,T,L,1,1] -> [B,flat]."""
+        return frames.flatten(1)
+
+
 class FrameMemory:
     """Convolves every frame of the AVs' maps once, to the bit as if all were convolved at every decision.
 
@@ -84,7 +112,7 @@ class FrameMemory:
     `fresh` frames later it stands that much further to the front of the `past` ones.
     """
 
-    def __init__(self, extractor: Conv3dMaps, past: int, fresh: int) -> None:
+    def __init__(self, extractor: Conv3dMaps | EncodedMaps, past: int, fresh: int) -> None:
         self._extractor, self._past, self._aged = extractor, past, max(past - fresh, 0)
         self._row: dict[str, int] = {}  # AV -> its place in:
         self._maps: Bytes = np.empty((0, past, 0), np.uint8)  # [B,T,C,H,W]

@@ -15,7 +15,8 @@ from torch.nn import functional
 from cosim.types import IS_MISSION, MetaAction
 from policy.inputs.situation import SITUATION_INPUTS
 from policy.inputs.tensors import APART, KINEMATIC_INPUTS, apart, unit
-from policy.networks.extractors import Conv2dMaps, Conv3dMaps, FrameMemory, Strides
+from policy.networks.extractors import Conv2dMaps, Conv3dMaps, EncodedMaps, FrameMemory, Strides
+from policy.networks.frame_encoder import EncoderConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +35,10 @@ class VfnConfig:
     joined: int = 256  # T, Table 1
     kinematic: int = 64  # features of a vehicle; 0: maps and phi are all the network sees, read by `apart`
     situation: int = 64  # width of the branch of what the ego knows besides; goes with `kinematic`
-    extractor: Literal["conv3d", "conv2d"] = "conv3d"
+    extractor: Literal["conv3d", "conv2d", "frames"] = (
+        "conv3d"  # frames: a trained `FrameEncoder`, then all at once
+    )
+    latent: int = 128  # numbers a frame becomes (extractor `frames`)
     dueling: bool = True  # q = state value + advantage: how good the moment is drowns what an action changes
     critic: bool = False  # True: action preferences and a state value (A2C), not action values
 
@@ -82,8 +86,10 @@ class VFN(nn.Module):
         # without kinematics the same must be found in pixels
         channels, read = (c.channels, unit) if c.kinematic else (APART, apart)
         shape = c.frames, channels, c.height, c.width
-        if c.extractor == "conv2d":
-            self.maps: Any = Conv2dMaps(*shape, c.features, read)
+        if c.extractor == "frames":
+            self.maps: Any = EncodedMaps(c.frames, EncoderConfig(c.height, c.width, latent=c.latent))
+        elif c.extractor == "conv2d":
+            self.maps = Conv2dMaps(*shape, c.features, read)
         else:
             self.maps = Conv3dMaps(*shape, c.features, c.strides, read)
         self.hidden = nn.Linear(int(self.maps.flat), c.hidden)
@@ -108,11 +114,11 @@ class VFN(nn.Module):
     @property
     def layout(self) -> torch.memory_format:
         """The memory format in which its convolutions are fastest."""
-        return torch.channels_last if self.config.extractor == "conv2d" else torch.channels_last_3d
+        return torch.channels_last_3d if self.config.extractor == "conv3d" else torch.channels_last
 
     def memory(self, past: int, fresh: int) -> FrameMemory | None:
         """Makes `Frames` of maps, `fresh` of whose `past` ones are new at each decision; for one episode."""
-        return FrameMemory(self.maps, past, fresh) if isinstance(self.maps, Conv3dMaps) else None
+        return None if isinstance(self.maps, Conv2dMaps) else FrameMemory(self.maps, past, fresh)
 
     def features(
         self,
@@ -120,6 +126,7 @@ class VFN(nn.Module):
         kinematics: torch.Tensor,
         situation: torch.Tensor,
         phi: torch.Tensor,
+        keep: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """The joined representation [B,joined]; arguments as in `forward`."""
         if maps is None:
@@ -129,6 +136,8 @@ class VFN(nn.Module):
             parts = [functional.relu(self.hidden(seen))]
         if self.kinematics is not None:
             parts += [self.kinematics(kinematics), self.situation(situation)]
+        if keep is not None:
+            parts = [part * keep[:, k : k + 1] for k, part in enumerate(parts)]
         return functional.relu(self.joined(torch.cat([*parts, phi], 1)))
 
     def forward(
@@ -137,20 +146,23 @@ class VFN(nn.Module):
         kinematics: torch.Tensor,
         situation: torch.Tensor,
         phi: torch.Tensor,
+        keep: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """Action values (P, figure 4).
 
         Args:
             maps: [B,T,C,H,W] uint8 pixels (where there are kinematics, float32 in [0,1] too), the past frames
-                first; or their `Frames`; None: the map branch gives zeros, and there are no convolutions.
+                first; or their `Frames`, or with an encoder their latents [B,T,L]; None: the map branch gives
+                zeros, and there are no convolutions.
             kinematics: [B,T,R,F+1] scaled, the mask last (`policy.inputs.tensors.kinematic_tensor`).
             situation: [B,SITUATION_INPUTS] (`policy.inputs.situation.situation`).
             phi: [B,2] cosine and sine of the SVO (`policy.inputs.tensors.svo_tensor`).
+            keep: [B,3] 1 or 0: the branches of maps, kinematics and situation, or zeros in place of each.
 
         Returns:
             q: [B,5] value of each `MetaAction`.
         """
-        z = self.features(maps, kinematics, situation, phi)
+        z = self.features(maps, kinematics, situation, phi, keep)
         q: torch.Tensor = self.value(z)
         if self.config.dueling and self.state is not None:
             q = q - q.mean(1, keepdim=True) + self.state(z)

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from cosim.rewards import RewardConfig
 from cosim.types import ObservationConfig
 from policy.agents.approaches import AgentConfig, configure, shipped
+from policy.networks.frame_encoder import EncoderConfig
 from policy.networks.hpn import HpnConfig
 from policy.networks.vfn import VfnConfig
 from policy.prediction.chain import ChainConfig
@@ -13,6 +14,7 @@ from policy.safety import SafetyConfig
 from policy.training.curriculum import VfnTraining
 from policy.training.explorer import ExploreConfig
 from policy.training.hpn import HpnTraining
+from policy.training.sight import SightTraining
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +31,8 @@ class TrainingFile:
     explore: ExploreConfig = field(default_factory=ExploreConfig)
     training: VfnTraining = field(default_factory=VfnTraining)
     prediction: HpnTraining = field(default_factory=HpnTraining)  # cosim train hpn
+    encoder: EncoderConfig = field(default_factory=EncoderConfig)
+    sight: SightTraining = field(default_factory=SightTraining)  # cosim train encoder
 
 
 def agent_config(name: str, file: TrainingFile) -> AgentConfig:

@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from cosim.seeding import TRAINING_SEEDS, TUNING_SEEDS, subseed, uniform
+from cosim.types import Preset
 from policy.training.a2c import A2cConfig
 from policy.training.ddqn import DdqnConfig
 from policy.training.experience import Trajectory
@@ -51,6 +52,12 @@ class VfnTraining:
     reward: str = ""  # a user's, FILE.py:NAME, or one of `cosim.rewards.REWARDS`; "": the file's section
     metrics: tuple[str, ...] = ()  # a user's, FILE.py:NAME: logged besides
     errors: str = ""  # of the human drivers: a level or a user's file; "": none
+    erring: float = 1.0  # share of the drives in which they err
+    preset: str = Preset.UNGUARDED  # what the car does by itself (docs/definitions.md, Presets)
+    encoder: str = (
+        ""  # weights of `cosim train encoder`, for a network of extractor `frames`: encoder, or a file
+    )
+    first: str = ""  # weights to begin with, a file; "": drawn from the seed
     code: tuple[str, ...] = ()  # their files and SHA-256
     replay: ReplayConfig = field(default_factory=ReplayConfig)
     ddqn: DdqnConfig = field(default_factory=DdqnConfig)
@@ -69,6 +76,7 @@ class Drive(NamedTuple):
     record: bool  # False: validation, greedy, nothing is recorded
     guided: bool = False  # by the demonstrator
     errors: str = ""  # of the human drivers
+    preset: str = Preset.UNGUARDED
 
 
 class Drove(NamedTuple):
@@ -93,7 +101,8 @@ def drives(c: VfnTraining, k: int, weights: str, frozen: str, epsilon: float, gu
                 frozen,
                 record=True,
                 guided=draws[2] < guided,
-                errors=c.errors,
+                errors=c.errors if uniform(c.seed, "errors", str(k), str(j)) < c.erring else "",
+                preset=c.preset,
             )
         )
     return drawn
@@ -105,10 +114,20 @@ def judged(c: VfnTraining, k: int) -> bool:
 
 
 def validation(c: VfnTraining, weights: str) -> list[Drive]:
-    """Every lesson in turn, greedy, on tuning seeds."""
+    """Every lesson in turn, greedy, on tuning seeds; where humans err in some drives, in every second one."""
     svo = math.radians(c.svo[len(c.svo) // 2])
     return [
-        Drive(lesson, TUNING_SEEDS[j], svo, 0.0, weights, weights, record=False, errors=c.errors)
+        Drive(
+            lesson,
+            TUNING_SEEDS[j],
+            svo,
+            0.0,
+            weights,
+            weights,
+            record=False,
+            errors=c.errors if c.erring == 1.0 or j % 2 else "",
+            preset=c.preset,
+        )
         for lesson in c.lessons
         for j in range(c.validation)
     ]

@@ -53,7 +53,7 @@ class DdqnLearner(Learner):
             best = self.online(*batch.later).masked_fill(~batch.allowed, -torch.inf).argmax(1, keepdim=True)
             later = self.target(*batch.later).gather(1, best)[:, 0]
             goal = batch.reward * c.scale + batch.discount * later
-        q = self.online(*batch.now)
+        q = self.online(*batch.now, batch.keep)
         chosen = q.gather(1, batch.action[:, None])[:, 0]
         td = functional.smooth_l1_loss(chosen, goal)
         refused = batch.vetoed >= 0
@@ -76,6 +76,31 @@ class DdqnLearner(Learner):
         self.step(self.config.imitation * self._margin(q, batch.possible, batch.wrong))
         choice = q.masked_fill(~batch.possible, -torch.inf).argmax(1, keepdim=True)
         return 1.0 - float(batch.wrong.gather(1, choice).float().mean())
+
+    def effects(self, batch: Batch, past: int) -> Metrics:
+        """Shares of the batch in which another choice comes out on top when one input is another sample's.
+
+        Args:
+            batch: any samples.
+            past: N, the frames of maps and kinematics that were perceived; those behind are predicted.
+        """
+        now, found = batch.now, {}
+        parts = {
+            "maps": ("maps", slice(None)),
+            "predicted_maps": ("maps", slice(past, None)),
+            "kinematics": ("kinematics", slice(None)),
+            "predicted_kinematics": ("kinematics", slice(past, None)),
+            "situation": ("situation", slice(None)),
+            "phi": ("phi", slice(None)),
+        }
+        with torch.no_grad():
+            choice = self.online(*now).masked_fill(~batch.possible, -torch.inf).argmax(1)
+            for name, (field, span) in parts.items():
+                other: torch.Tensor = getattr(now, field).clone()
+                other[:, span] = other.roll(1, 0)[:, span]
+                q = self.online(*now._replace(**{field: other})).masked_fill(~batch.possible, -torch.inf)
+                found[name] = float((q.argmax(1) != choice).float().mean())
+        return found
 
     def update_target(self) -> None:
         """The target network becomes the online one."""

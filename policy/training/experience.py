@@ -29,8 +29,9 @@ class Trajectory:
     episode: str  # scenario, demand and seed, to find it again
     av: str
     stride: int  # frames per decision
-    frames: Bytes  # [N + D * stride, C,H,W] pixel * 255
-    ahead: Bytes  # [D+1, M,C,H,W] predicted maps, pixel * 255
+    # maps [.,C,H,W], pixel * 255; of a network with an encoder their latents [.,L]
+    frames: Bytes | Halves  # [N + D * stride, ...]
+    ahead: Bytes | Halves  # [D+1, M, ...] of predicted maps
     kinematics: Halves  # [D+1, T,R,F+1] scaled (policy.inputs.tensors)
     situation: Floats32  # [D+1, .]
     unsafe: Bools  # [D+1, A] what the prioritizer masked
@@ -51,8 +52,8 @@ class Trajectory:
         """N, the past frames of a state."""
         return int(self.frames.shape[0] - len(self) * self.stride)
 
-    def maps(self, t: int) -> list[Bytes]:
-        """The map groups of state `t`: past [N,C,H,W] and predicted [M,C,H,W] frames."""
+    def maps(self, t: int) -> list[Bytes | Halves]:
+        """The map groups of state `t`: past [N,...] and predicted [M,...] frames."""
         start = t * self.stride
         return [self.frames[start : start + self.past], self.ahead[t]]
 
@@ -67,7 +68,7 @@ def states(chosen: list[tuple[Trajectory, int]], phi: Floats32, device: str = "c
     """
     first = chosen[0][0]
     past, ahead = first.past, first.ahead.shape[1]
-    maps = np.empty((len(chosen), past + ahead, *first.frames.shape[1:]), np.uint8)
+    maps = np.empty((len(chosen), past + ahead, *first.frames.shape[1:]), first.frames.dtype)
     for row, (trajectory, t) in zip(maps, chosen, strict=True):
         row[:past], row[past:] = trajectory.maps(t)
     return States(torch.from_numpy(maps).to(device), *states_without_maps(chosen, phi, device))

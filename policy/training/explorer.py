@@ -13,6 +13,7 @@ from cosim.types import IS_MISSION, Decision, Floats32, History, MetaAction
 from policy.agents.approaches import AgentConfig
 from policy.agents.prediction_aware import Inputs, PredictionAware
 from policy.inputs.tensors import States, to_numpy
+from policy.networks.extractors import EncodedMaps
 from policy.networks.vfn import VFN
 from policy.training.demonstrator import AS_GOOD, YIELD, Demonstrator
 from policy.training.experience import Ending, Trajectory
@@ -27,6 +28,7 @@ class ExploreConfig:
     learners: int = 4  # AVs that explore and are recorded; the others act with frozen weights (P, Alg. 4)
     repeat: float = 2.0  # decisions a random action is kept on average: a gap does not open in 0.4 s
     sample: bool = False  # actions drawn from the network's preferences (A2C), not epsilon-greedy
+    advised: bool = True  # whether the demonstrator is asked in every state; one that is imitated is
     near: float = 60.0  # m to the mission vehicle within which a decision counts as interaction
 
 
@@ -59,7 +61,7 @@ class Explorer(PredictionAware):
         """
         self._label, self._epsilon, self._rng = label, epsilon, rng
         self._guided, self._learners = guided, self.explore.learners if record else 0
-        self._advised = guided or record
+        self._advised = guided or (record and self.explore.advised)
         self._demonstrator.reset(self._context)
         self.learning: dict[str, dict[str, list[Any]]] = {}  # AV -> field of `Trajectory` -> values so far
         self._repeated: dict[str, int] = {}  # random action that an AV keeps for a while
@@ -82,6 +84,17 @@ class Explorer(PredictionAware):
             if av in self.learning:
                 self._record(av, b, inputs, decisions[av], advice[b])
         return decisions
+
+    def perceive(self, histories: Mapping[str, History]) -> Inputs:
+        """As the agent's; of an encoder, which both networks have, the latents in place of the maps."""
+        inputs = super().perceive(histories)
+        if not isinstance(self.vfn.maps, EncodedMaps):
+            return inputs
+        memory = self._memory(self.vfn)
+        assert memory is not None
+        with torch.inference_mode():
+            latents = memory.frames(inputs.scene.agents, inputs.states.maps).flatten(2)
+        return inputs._replace(states=inputs.states._replace(maps=latents.to(torch.float16)))
 
     def values(self, inputs: Inputs) -> Floats32:
         """The learner's values for learning AVs, the frozen ones for the others."""
@@ -153,12 +166,12 @@ class Explorer(PredictionAware):
         preferred = int(np.argmax(decision.q))
         # where every action is unsafe the demonstrator knows no better either
         best = -np.inf if unsafe.all() else advice[~unsafe].max()
-        newest = history.kinematics[-1]
+        newest, maps, past = history.kinematics[-1], states.maps[b].numpy(), self.observation.frames
         mission = history.valid[-1] & (newest[:, IS_MISSION] > 0.5)
         close = mission & (np.hypot(newest[:, 0], newest[:, 1]) < self.explore.near)
         now = {
-            "frames": history.velocity_map[-self._stride if recorded["frames"] else 0 :].copy(),
-            "ahead": states.maps[b, self.observation.frames :].numpy().copy(),
+            "frames": maps[past - self._stride if recorded["frames"] else 0 : past].copy(),
+            "ahead": maps[past:].copy(),
             "kinematics": to_numpy(states.kinematics[b]).astype(np.float16),
             "situation": to_numpy(states.situation[b]),
             "unsafe": unsafe,

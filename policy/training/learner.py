@@ -28,7 +28,8 @@ class Learner(Optimized):
         self.config, self.device = config, device
         self.online: VFN = seeded(lambda: VFN(vfn), seed)
         self.online.to(device=device, memory_format=self.online.layout)  # type: ignore[call-overload]
-        adam = torch.optim.Adam(self.online.parameters(), lr=config.learning_rate)
+        learning = [p for p in self.online.parameters() if p.requires_grad]  # an encoder does not
+        adam = torch.optim.Adam(learning, lr=config.learning_rate)
         super().__init__({"online": self.online}, adam, config.clip)
         self.updates = 0
 

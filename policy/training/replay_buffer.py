@@ -27,10 +27,13 @@ class ReplayConfig:
     correcting: float = 0.0  # where the demonstrator would not go on as commanded
     interaction: float = 0.25  # near a mission vehicle, or vetoed
     relabel: float = 0.5  # share of a batch that is learned for another SVO than it was driven with
+    drop: float = 0.0  # of each branch (maps, kinematics, situation) of each sample: zeros in its place
     phi: tuple[float, float] = (0.0, 90.0)  # deg, what relabelling draws from; equal bounds: one SVO only
 
     def __post_init__(self) -> None:
         """Raises BadInput when the shares leave nothing to share."""
+        if not 0.0 <= self.drop < 1.0:
+            raise BadInput("must be a share below 1", field="drop", value=self.drop)
         if min(self.rare) < 0.0 or sum(self.rare) > 1.0:
             problem = "must be shares of a batch: none below 0, together at most 1"
             raise BadInput(problem, field="yielding, correcting, interaction", value=self.rare)
@@ -53,6 +56,7 @@ class Batch(NamedTuple):
     allowed: torch.Tensor  # [B,A] bool, actions that were safe in `later` (all, where none was)
     vetoed: torch.Tensor  # [B] the action the prioritizer refused in `now`, or -1
     wrong: torch.Tensor  # [B,A] bool, not demonstrated in `now` (for the drive's SVO alone)
+    keep: torch.Tensor | None = None  # [B,3] `VFN.forward`
 
 
 class Advised(NamedTuple):
@@ -109,7 +113,12 @@ class ReplayBuffer:
             np.stack([trajectory.wrong[t] for trajectory, t in now]) & ~relabelled[:, None],
         )
         tensors = (torch.from_numpy(array).to(device) for array in arrays)
-        return Batch(states(now, phi, device), states(later, phi, device), *tensors)
+        batch = Batch(states(now, phi, device), states(later, phi, device), *tensors)
+        if c.drop > 0.0:
+            kept = rng.random((len(now), 3)) >= c.drop
+            kept |= ~kept.any(1, keepdims=True)  # nobody decides on nothing
+            batch = batch._replace(keep=torch.from_numpy(kept.astype(np.float32)).to(device))
+        return batch
 
     def advised(self, rng: np.random.Generator, with_maps: bool, device: str = "cpu") -> Advised:
         """States for learning from demonstrations alone, for the SVO they were driven with.

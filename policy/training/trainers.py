@@ -4,17 +4,22 @@ Both learn from demonstrations first, where their configuration wants it.
 """
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
+from cosim.errors import BadInput
 from cosim.seeding import generator, subseed
+from policy import checkpoint
+from policy.networks.extractors import EncodedMaps
 from policy.networks.vfn import VfnConfig
 from policy.training.a2c import A2cLearner
-from policy.training.curriculum import VfnTraining, interpolated
+from policy.training.curriculum import VfnTraining, interpolated, judged
 from policy.training.ddqn import DdqnLearner
 from policy.training.experience import Trajectory
 from policy.training.learner import Learner, Metrics, mean_metrics
 from policy.training.replay_buffer import ReplayBuffer
+from policy.training.sight import encoder
 
 
 class Trainer:
@@ -76,7 +81,7 @@ class OffPolicyTrainer(Trainer):
 
     def epsilon(self, k: int) -> float:
         """Share of random actions: all, while the replay buffer is filled."""
-        return 1.0 if self._prefilling else super().epsilon(k)
+        return 1.0 if self._prefilling and not self.config.first else super().epsilon(k)
 
     def guided(self, k: int) -> float:
         """Share of the episodes that the demonstrator drives."""
@@ -94,7 +99,12 @@ class OffPolicyTrainer(Trainer):
             losses.append(learner.update(self.replay.sample(rng, self.device)))
             if learner.imitates and self.kinematic:  # without kinematics an update costs no more
                 agrees.append(self._imitate(rng, False))
-        return _named(mean_metrics(losses)) | ({"agrees": float(np.mean(agrees))} if agrees else {})
+        effects = {}
+        if judged(self.config, k):  # what the network looks at, while it learns
+            past = self.replay.trajectories[0].past
+            found = learner.effects(self.replay.sample(rng, self.device), past)
+            effects = {f"effect/{name}": value for name, value in found.items()}
+        return _named(mean_metrics(losses)) | ({"agrees": float(np.mean(agrees))} if agrees else {}) | effects
 
 
 class OnPolicyTrainer(Trainer):
@@ -121,11 +131,21 @@ class OnPolicyTrainer(Trainer):
 
 
 def make_trainer(config: VfnTraining, vfn: VfnConfig, device: str) -> Trainer:
-    """The one of `config.learning`."""
+    """The one of `config.learning`. Raises BadInput, WeightsMismatch for weights to begin with."""
     seed = subseed(config.seed, "network") % 2**31
+    trainer: Trainer
     if config.learning == "a2c":
-        return OnPolicyTrainer(config, vfn, A2cLearner(vfn, config.a2c, seed, device), device)
-    return OffPolicyTrainer(config, vfn, DdqnLearner(vfn, config.ddqn, seed, device), device)
+        trainer = OnPolicyTrainer(config, vfn, A2cLearner(vfn, config.a2c, seed, device), device)
+    else:
+        trainer = OffPolicyTrainer(config, vfn, DdqnLearner(vfn, config.ddqn, seed, device), device)
+    online = trainer.learner.online
+    if isinstance(online.maps, EncodedMaps):
+        if not config.encoder:
+            raise BadInput("an encoder that was taught to see is needed", field="training.encoder", value="")
+        online.maps.encoder.load_state_dict(encoder(config.encoder, online.maps.encoder.config))
+    if config.first:
+        checkpoint.load(Path(config.first), {"vfn": online}, {"vfn": vfn})
+    return trainer
 
 
 def _named(metrics: Metrics) -> Metrics:

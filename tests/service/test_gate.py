@@ -58,5 +58,6 @@ def test_a_server_that_cannot_start_says_why(tmp_path: Path, capsys: pytest.Capt
         assert "another server is working in it" in capsys.readouterr().err
         assert main(["serve", "--data", str(tmp_path / "other"), "--port", port]) == 2
         assert f"--port={port}: cannot listen there: address already in use" in capsys.readouterr().err
+    assert server.process.returncode == 0  # ended by SIGTERM, in order
     assert main(["serve", "--data", str(tmp_path / "x"), "--port", "0", "--database", "nonsense"]) == 2
     assert "--database='nonsense': is no database URL" in capsys.readouterr().err

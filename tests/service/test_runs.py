@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import csv
 import io
+import os
 from typing import Any
 
 import pytest
 
 from cosim.batch.store import Store
+from cosim.cli.main import main
 from tests.service.servers import Server
 
 SHORT: dict[str, Any] = {"scenario": "merge", "demand": "contested", "duration": 2, "warmup": 1}
@@ -146,19 +148,25 @@ def test_a_request_that_is_too_large_is_refused(server: Server) -> None:
 
 def test_a_killed_server_loses_no_run_and_drives_none_twice(tmp_path_factory: pytest.TempPathFactory) -> None:
     data = tmp_path_factory.mktemp("killed") / "data"
+    url = os.environ.get("COSIM_TEST_DATABASE")  # an empty PostgreSQL, in place of SQLite
+    flags = ("--workers", "2", *(("--database", url) if url else ()))
     seeds = range(200000, 200020)
-    with Server(data, "--workers", "2") as server:
+    with Server(data.with_name("undisturbed"), "--workers", "2") as server:
         run = server.submit(**SHORT, seeds=f"{seeds.start}:{seeds.stop}")
         assert server.wait(run)["status"] == "finished"
         undisturbed = server.hashes(run)
-    server = Server(data, "--workers", "2")
+    server = Server(data, *flags)
     runs = {seed: server.submit(**SHORT, seeds=f"{seed}:{seed + 1}") for seed in seeds}
     server.wait(runs[seeds[2]])
     server.kill()
-    with Server(data, "--workers", "2") as server:
+    with Server(data, *flags) as server:
         for run in runs.values():
             assert server.wait(run)["status"] == "finished"
         assert {k: v for run in runs.values() for k, v in server.hashes(run).items()} == undisturbed
+        if url:
+            assert main(["serve", "--data", f"{data}-2", "--port", "0", "--database", url]) == 2
         for run in runs.values():
-            with Store.in_folder(data / "runs" / run) as store:
+            with Store.in_folder(data / "runs" / run, url) as store:
                 assert len(store.rows()) == 1
+                assert server.http.delete(f"/api/runs/{run}").status_code == 204
+                assert url is None or not store.rows()

@@ -6,6 +6,7 @@ import subprocess
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ import sumo
 from cosim.episode import Episode
 from cosim.geometry import gap_ahead
 from cosim.scenario import Fleet, Scenario, load
+from cosim.simulation.backend import sumo as sumo_calls
 from cosim.simulation.sumo import SumoSimulator
 from cosim.types import COMPACT, Actor, EpisodeResult, Kind, Preset, Snapshot
 from cosim.workers.worker import Worker
@@ -47,6 +49,11 @@ MIXED = """
     <person id="one" depart="0" departPos="130" type="ped"><walk from="ab" to="ba" arrivalPos="30"/></person>
     <person id="back" depart="0" departPos="90"><walk from="bd" to="bc" arrivalPos="40"/></person>
 """
+COMING = """
+    <personFlow id="f" begin="1" period="4" number="5000" departPos="100" type="ped">
+        <walk from="ab" to="ab" arrivalPos="112"/>
+    </personFlow>
+"""
 # on the roadway of bd, which has no sidewalk, 30 m ahead of the AV
 IN_THE_WAY = """
     <vehicle id="av" type="av" depart="0" departPos="5" departSpeed="10"><route edges="bd"/></vehicle>
@@ -66,6 +73,27 @@ class Street:
         for _ in range(round(seconds / 0.4)):
             found += self._simulator.advance([])[1]
         return found
+
+    def persons(self, seconds: float) -> tuple[list[Snapshot], list[set[str]], int]:
+        """The frames at the end of each decision, who SUMO says is there then, and how often it was asked."""
+        get, asked = sumo_calls.person, 0
+
+        def listed() -> tuple[str, ...]:
+            nonlocal asked
+            asked += 1
+            found: tuple[str, ...] = get.getIDList()
+            return found
+
+        sumo_calls.person = SimpleNamespace(**{**vars(get), "getIDList": listed})
+        try:
+            self._simulator.reset(0)
+            told = [
+                (self._simulator.advance([])[1][-1], {f"person:{i}" for i in get.getIDList()})
+                for _ in range(round(seconds / 0.4))
+            ]
+        finally:
+            sumo_calls.person = get
+        return [frame for frame, _ in told], [there for _, there in told], asked
 
     def episode(self) -> EpisodeResult:
         episode = Episode(self._scenario, self._simulator, COMPACT)
@@ -135,6 +163,15 @@ def test_walking_persons_are_rows_and_those_in_vehicles_or_waiting_are_not(stree
     }
     assert first.vehicles.ids == ("bus", "lorry", "one")
     assert first.vehicles.signals is first.signals
+
+
+@pytest.mark.parametrize("street", [COMING], indirect=True)
+def test_sumo_is_asked_for_the_persons_of_a_flow_only_when_one_comes_or_goes(street: Worker) -> None:
+    frames, there, asked = street.call("persons", 60.0)
+    assert [set(frame.ids) for frame in frames] == there
+    assert len(set.union(*there)) == 15
+    assert len(there[-1]) < 5, "they arrive"
+    assert 15 < asked < 40, "of 300 frames"
 
 
 @pytest.mark.parametrize("street", [MIXED], indirect=True)

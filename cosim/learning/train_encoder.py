@@ -1,0 +1,154 @@
+"""Training of the frame encoder on drives of its own: `cosim train encoder`."""
+
+import argparse
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from cosim.episode import run_episode
+from cosim.errors import BadInput
+from cosim.files import prepare_folder
+from cosim.host import Host, Hosts
+from cosim.learning.configuration import configuration
+from cosim.learning.prediction_data import spread
+from cosim.scenario import load, place
+from cosim.seeding import TRAINING_SEEDS, TUNING_SEEDS, generator
+from cosim.types import Decision, History, MetaAction, PolicyContext
+from cosim.workers.engines import LocalEngine
+from cosim.workers.memory import keep_freed_memory
+from cosim.workers.progress import Progress
+from cosim.workers.tasks import Task
+from policy.agents.approaches import AgentConfig
+from policy.agents.prediction_aware import PredictionAware
+from policy.training import loop as supervised
+from policy.training import sight
+from policy.training.config import agent_config
+from policy.training.networks import use_threads
+from policy.training.sight import Seen, SightTask, SightTraining
+from sumo_scenarios import names
+
+HELD = 3.0  # decisions for which a random action is held on average
+
+
+class Watcher(PredictionAware):
+    """Keeps what AVs see and what they know; SUMO drives them, or random actions that the prioritizer allows.
+
+    Args:
+        agent: sizes, chain and prioritizer.
+        training: how often it looks, at how many AVs.
+    """
+
+    def __init__(self, agent: AgentConfig, training: SightTraining) -> None:
+        super().__init__("vfn-p", agent)
+        self._training = training
+
+    def watch(self, world: int, seed: int, acts: bool) -> None:
+        """A new drive in the scenario number `world`; `acts`: the AVs are driven at random."""
+        self._world, self._acts, self._rng = world, acts, generator(seed, "watch")
+        self._held: dict[str, MetaAction] = {}
+        self._count = 0
+        self.parts: list[Seen] = []
+
+    def reset(self, context: PolicyContext) -> None:
+        """A new episode; every time to collision is worked out, whoever keeps the distance."""
+        super().reset(context)
+        self._safety = self.config.safety
+
+    def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
+        """Looks now and then; what it decided is held meanwhile."""
+        self._count += 1
+        if not histories:
+            return {}
+        if self._count % self._training.every == 0:
+            self._look(histories)
+        return {av: Decision(self._held.get(av, MetaAction.IDLE)) for av in histories} if self._acts else {}
+
+    def _look(self, histories: Mapping[str, History]) -> None:
+        inputs = self.perceive(histories)
+        agents, actions = inputs.scene.agents, len(MetaAction)
+        decided = self.choose(self._rng.random((len(agents), actions)).astype(np.float32), inputs)
+        for av in agents:
+            if av not in self._held or self._rng.random() < self._training.every / HELD / 2.0:
+                self._held[av] = decided[av].action
+        rows = self._rng.permutation(len(agents))[: self._training.avs]
+        past, states = self.observation.frames, inputs.states
+        maps, kinematics, situation = (part.numpy()[rows] for part in states[:3])
+        ttc = np.array([decided[agents[row]].ttc for row in rows], np.float32)
+        later = self._rng.integers(past, maps.shape[1], size=len(rows))
+        self.parts.append(sight.seen(maps, kinematics, situation, ttc, past, later, self._world))
+
+
+class Watching(Hosts):
+    """Runs in a worker: one drive, and what was seen in it."""
+
+    def __init__(self, agent: AgentConfig, training: SightTraining) -> None:
+        super().__init__()
+        self._watcher = Watcher(agent, training)
+
+    def run(
+        self, world: str, index: int, demand: str, seed: int, errors: str, progress: Any = None
+    ) -> list[Seen]:
+        """Every second drive by its seed is driven at random, the others by SUMO."""
+
+        def build() -> Host:
+            return Host(load(world, demand=[demand], errors=errors or None), self._watcher, math.pi / 4)
+
+        host = self.host((world, demand, errors), build)
+        self._watcher.watch(index, seed, acts=seed // 2 % 2 == 1)
+        run_episode(host.episode, self._watcher, seed, svo=host.svo, progress=progress)
+        return self._watcher.parts
+
+
+def gather(
+    agent: AgentConfig, training: SightTraining, worlds: Sequence[str], seeds: range, workers: int, title: str
+) -> Seen:
+    """What is seen in drives with `seeds` of every demand of `worlds`; humans err in every second one."""
+    tasks = [
+        Task(f"{world}/{demand}/{seed}", f"{world}/{demand}/{errors}", (world, index, demand, seed, errors))
+        for index, world in enumerate(worlds)
+        for demand in load(world).demands or {}
+        for errors in dict.fromkeys(("", training.errors))
+        for seed in seeds
+        if (seed % 2 == 1) == bool(errors)
+    ]
+    each = spread(LocalEngine(Watching, (agent, training), workers=workers), tasks, title)
+    return sight.joined([part for parts in each for part in parts])
+
+
+def train(args: argparse.Namespace) -> int:
+    """`cosim train encoder`. Raises BadInput for whatever is wrong before anything is driven."""
+    for flag in ("policy", "iterations", "reward", "errors"):
+        if getattr(args, flag):
+            raise BadInput("is not for the encoder", field=f"--{flag}", value=getattr(args, flag))
+    file = configuration(args.config).file
+    training, agent = file.sight, agent_config("vfn-p", file)
+    worlds = [place(w) for w in args.scenario if w != "all"] or list(names())
+    folder = prepare_folder(args.out)
+    keep_freed_memory()
+    use_threads(args.threads)
+    seen = gather(agent, training, worlds, TRAINING_SEEDS[: training.drives], args.workers, "learns from")
+    checked = gather(agent, training, worlds, TUNING_SEEDS[: training.validation], args.workers, "checks on")
+    task = SightTask(file.encoder, training, seen, checked, args.device)
+    about = {
+        "scenarios": worlds,
+        "frames": {"training": len(seen.maps), "validation": len(checked.maps)},
+        "sight": asdict(training),
+    }
+    layout = {"encoder": asdict(file.encoder), **about}
+    with Progress("train encoder", "updates") as progress:
+        log = supervised.train(
+            task, training.loop, folder, layout=layout, resume=args.resume, progress=progress
+        )
+    weights = folder / "encoder.safetensors"
+    explained = sight.explained(checked.readings, task.read_all(checked.maps))
+    measured = {"R2 on tuning seeds": {name: round(value, 3) for name, value in explained.items()}}
+    sight.save(weights, task.network, measured, about)
+    supervised.write_log(weights.with_suffix(".csv"), log)
+    for name, value in explained.items():
+        print(f"  {value:6.2f}  {name}")
+    print(f"encoder: {training.loop.updates} updates on {len(seen.maps):,} frames")
+    print(f"  {weights}")
+    return 0

@@ -1,0 +1,228 @@
+"""Teaches the frame encoder to see: labels that the simulation gives for nothing, from maps alone.
+
+Of every perceived frame the AV knows what its map should tell: the next vehicles on three lanes, where the
+lanes end, where the mission vehicle is, and the time to collision of every action. Of every frame, predicted
+ones too, the kinematic rows say who is ahead and behind in the AV's own frame.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from cosim.seeding import generator
+from cosim.types import IS_MISSION, Bytes, Floats, Floats32, Ints, MetaAction
+from policy import checkpoint
+from policy.inputs.situation import PER_LANE
+from policy.inputs.tensors import KINEMATIC_SCALE, apart, to_numpy
+from policy.networks.frame_encoder import EncoderConfig, Sight
+from policy.networks.seeded import first_weights
+from policy.training.loop import LoopConfig, Task, one_cycle
+
+LANE, HALF = 3.2, 1.6  # m between centre lines, and from one to its lane's edge
+AHEAD = 100.0  # m, further away all gaps are alike
+ALONG, ACROSS, BRISK = 125.0, 16.0, 15.0  # m, m and m/s: scales of the mission vehicle's place and speed
+TTC = 5.0  # s, later contacts are all alike
+
+SIDES = ("left", "own", "right")
+BANDS = tuple(
+    f"{what} {where}, {side} band"
+    for side in SIDES
+    for where in ("ahead", "behind")
+    for what in ("gap", "speed")
+)
+MISSION = tuple(f"mission vehicle, {what}" for what in ("presence", "along", "across", "speed"))
+LANES = tuple(
+    f"{what}, {side} lane"
+    for side in SIDES
+    for what in ("existence", "dead end", "end", "gap ahead", "speed ahead", "gap behind", "speed behind")
+)
+ACTIONS = tuple(f"time to collision, {action.name.lower()}" for action in MetaAction)
+READINGS = (*BANDS, *MISSION, *LANES, *ACTIONS)
+_OF_LANE = (0, 1, 2, *range(PER_LANE - 4, PER_LANE))  # of `policy.inputs.situation`'s numbers of a lane
+_OWN = 7  # of its numbers come before the lanes
+
+
+class Seen(NamedTuple):
+    """n frames and what their maps should tell."""
+
+    maps: Bytes  # [n,C,H,W]
+    readings: Floats32  # [n,READINGS]; nan where there is nothing to tell
+    world: Ints  # [n] index of the scenario
+
+    def at(self, rows: Ints | slice) -> "Seen":
+        """Some of the frames."""
+        return Seen(self.maps[rows], self.readings[rows], self.world[rows])
+
+
+@dataclass(frozen=True, slots=True)
+class SightTraining:
+    """How the encoder is trained, and on what."""
+
+    drives: int = 20  # of every world and demand
+    validation: int = 4  # the same, on tuning seeds
+    every: int = 3  # decisions between two moments of a drive: neighbours are nearly the same
+    avs: int = 4  # at each of them
+    errors: str = "stress"  # of the human drivers in every second drive
+    batch: int = 128  # frames
+    rate: float = 1e-3
+    seed: int = 0
+    loop: LoopConfig = field(
+        default_factory=lambda: LoopConfig(updates=8000, log_every=200, validate_every=1000)
+    )
+
+
+def bands(kinematics: Floats) -> Floats:
+    """[n,R,F+1] scaled rows of n frames, the ego in row 0 -> [n,BANDS + MISSION] in the ego's frame.
+
+    A mission vehicle that is not there has a presence of 0 and no place (nan).
+    """
+    rows = kinematics[..., :-1] * KINEMATIC_SCALE
+    there = kinematics[..., -1] > 0.5
+    ego, others = rows[:, :1], rows[:, 1:]
+    known = there[:, 1:] & there[:, :1]
+    dx, dy = others[..., 0] - ego[..., 0], others[..., 1] - ego[..., 1]
+    c, s = np.cos(ego[..., 3]), np.sin(ego[..., 3])
+    x, y, speed = c * dx + s * dy, c * dy - s * dx, others[..., 2] - ego[..., 2]
+    out = []
+    for side in (1, 0, -1):
+        inside = known & (np.abs(y - side * LANE) < HALF)
+        for direction in (1.0, -1.0):
+            gap = np.where(inside & (direction * x > 0.0), direction * x, np.inf)
+            near = gap.argmin(1)[:, None]
+            nearest = np.take_along_axis(gap, near, 1)[:, 0]
+            theirs = np.take_along_axis(speed, near, 1)[:, 0]
+            out += [np.minimum(nearest, AHEAD) / AHEAD, np.where(nearest < AHEAD, theirs / BRISK, 0.0)]
+    mission = known & (others[..., IS_MISSION] > 0.5) & (np.abs(x) < ALONG) & (np.abs(y) < ACROSS)
+    which = np.where(mission, np.hypot(x, y), np.inf).argmin(1)[:, None]
+    present = mission.any(1)
+    place = [
+        np.where(present, np.take_along_axis(value, which, 1)[:, 0] / scale, np.nan)
+        for value, scale in ((x, ALONG), (y, ACROSS), (speed, BRISK))
+    ]
+    return np.stack([*out, present.astype(np.float64), *place], 1)
+
+
+def lanes(situation: Floats32) -> Floats32:
+    """[n,SITUATION_INPUTS] -> [n,LANES]: what a map shows of it."""
+    each = situation[:, _OWN : _OWN + 3 * PER_LANE].reshape(len(situation), 3, PER_LANE)[..., _OF_LANE]
+    return np.asarray(each.reshape(len(situation), -1), np.float32)
+
+
+def seen(
+    maps: Bytes, kinematics: Floats32, situation: Floats32, ttc: Floats32, past: int, later: Ints, world: int
+) -> Seen:
+    """Two frames of each of B AVs: the newest perceived one, and one that it predicts.
+
+    Args:
+        maps: [B,T,C,H,W], the first `past` frames perceived.
+        kinematics: [B,T,R,F+1] scaled.
+        situation: [B,SITUATION_INPUTS].
+        ttc: [B,A] s, of every action.
+        past: N.
+        later: [B] which predicted frame.
+        world: index of the scenario.
+    """
+    count = len(maps)
+    at, rows = np.concatenate([np.full(count, past - 1), later]), np.tile(np.arange(count), 2)
+    known = np.concatenate([lanes(situation), np.minimum(ttc, TTC) / TTC], 1)
+    known = np.concatenate([known, np.full_like(known, np.nan)])
+    readings = np.concatenate([bands(kinematics[rows, at]), known], 1)
+    return Seen(maps[rows, at], readings.astype(np.float32), np.full(2 * count, world))
+
+
+def joined(parts: Sequence[Seen]) -> Seen:
+    """One after the other."""
+    return Seen(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+class SightTask(Task):
+    """Training of encoder and readings by the squared error of what is known.
+
+    Args:
+        config: layout of the encoder.
+        training: batch size, learning rate, seed.
+        train, validation: frames.
+        device: of torch.
+    """
+
+    network: Sight
+
+    def __init__(
+        self,
+        config: EncoderConfig,
+        training: SightTraining,
+        train: Seen,
+        validation: Seen,
+        device: str = "cpu",
+    ) -> None:
+        self._training, self._train, self._device = training, train, device
+        self.network = first_weights(lambda: Sight(config, len(READINGS)), training.seed).to(device)
+        self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        spread = np.ma.masked_invalid(train.readings).std(0).filled(0.0)
+        self._weight = torch.from_numpy(1.0 / np.maximum(spread, 0.05) ** 2).to(device, torch.float32)
+        adam = torch.optim.Adam(self.network.parameters(), lr=training.rate)
+        blocks = [validation.at(slice(k, k + 256)) for k in range(0, len(validation.maps), 256)]
+        schedule = partial(one_cycle, updates=training.loop.updates, rate=training.rate)
+        super().__init__(self.network, adam, schedule, [(b, len(b.maps)) for b in blocks], 1.0)
+
+    def batch(self, number: int) -> Seen:
+        """See `Task.batch`."""
+        t = self._training
+        rows = generator(t.seed, "batch", str(number)).integers(len(self._train.maps), size=t.batch)
+        return self._train.at(rows)
+
+    def losses(self, batch: Seen) -> dict[str, torch.Tensor]:
+        """See `Task.losses`; each reading's error counts in units of its own variance."""
+        wanted = torch.from_numpy(batch.readings).to(self._device)
+        known = wanted.isfinite()
+        error = (self.read(batch.maps) - wanted.nan_to_num()) ** 2 * known * self._weight
+        return {"loss": error.sum() / known.sum().clamp_min(1)}
+
+    def read(self, maps: Bytes) -> torch.Tensor:
+        """Readings [n,READINGS] of maps [n,C,H,W]."""
+        planes = apart(torch.from_numpy(maps).to(self._device))
+        out: torch.Tensor = self.network(planes.contiguous(memory_format=torch.channels_last))
+        return out
+
+    def read_all(self, maps: Bytes) -> Floats32:
+        """`read` of many, as an array."""
+        with torch.inference_mode():
+            return np.concatenate([to_numpy(self.read(maps[k : k + 256])) for k in range(0, len(maps), 256)])
+
+
+def save(path: Path, network: Sight, measured: Mapping[str, Any], data: Mapping[str, Any]) -> None:
+    """Weights and card of an encoder with its readings."""
+    checkpoint.save(path, {"sight": network}, {"sight": _layout(network.encoder.config)}, measured, data)
+
+
+def load(path: Path, config: EncoderConfig) -> Sight:
+    """What `save` wrote. Raises BadInput, WeightsMismatch."""
+    network = Sight(config, len(READINGS))
+    checkpoint.load(path, {"sight": network}, {"sight": _layout(config)})
+    return network.eval()
+
+
+def encoder(name: str, config: EncoderConfig) -> dict[str, torch.Tensor]:
+    """The state of an encoder that ships, or of a file. Raises BadInput, WeightsMismatch."""
+    shipped = checkpoint.SHIPPED / f"{name}.safetensors"
+    return load(shipped if shipped.is_file() else Path(name), config).encoder.state_dict()
+
+
+def _layout(config: EncoderConfig) -> dict[str, Any]:
+    return {"layout": asdict(config), "readings": list(READINGS)}
+
+
+def explained(wanted: Floats32, found: Floats32) -> Mapping[str, float]:
+    """R2 of every reading that varies in [n,READINGS]: 1 is all, 0 no more than its mean."""
+    out = {}
+    for name, truth, guess in zip(READINGS, wanted.T, found.T, strict=True):
+        known = np.isfinite(truth)
+        spread = float(np.square(truth[known] - truth[known].mean()).sum()) if known.sum() > 1 else 0.0
+        if spread > 1e-3 * known.sum():
+            out[name] = 1.0 - float(np.square(truth[known] - guess[known]).sum()) / spread
+    return out

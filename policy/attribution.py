@@ -10,9 +10,13 @@ import numpy as np
 import torch
 
 from cosim.types import Decision, Floats, Floats32, Ints, PolicyContext
+from policy.agents.approaches import AgentConfig
 from policy.agents.prediction_aware import Inputs, PredictionAware
 from policy.inputs.tensors import States, svo_tensor, to_numpy
+from policy.networks.vfn import VFN
 
+ZEROED, PRESENT, OTHERS = "zeroed", "as at present", "another AV's"
+BLIND = "map branch", "its last layer zero"
 ANGLES = (0, 90)  # degrees that replace phi: the egoist's, and the other end
 
 
@@ -22,8 +26,10 @@ Arguments = tuple[torch.Tensor | None, torch.Tensor, torch.Tensor, torch.Tensor]
 SUMS = ("decisions", "choices_changed", "unmasked_changed", "mean_abs_dq", "spread")
 
 
-def questions(states: States, past: int, kinematics: bool) -> Iterator[tuple[str, str, Arguments]]:
-    """Every replacement of every input: (input, replacement, what the network is asked with).
+def questions(
+    states: States, past: int, kinematics: bool, only: tuple[str, str] | None = None
+) -> Iterator[tuple[str, str, Arguments]]:
+    """Every replacement of every input, or `only` one: (input, replacement, what the network is asked with).
 
     Args:
         states: what B AVs that decide together see; the first `past` frames of maps and kinematics have been
@@ -37,19 +43,24 @@ def questions(states: States, past: int, kinematics: bool) -> Iterator[tuple[str
     spans = {"past ": slice(past), "predicted ": slice(past, None), "all ": slice(None)}
     for field in ("maps", "kinematics", "situation") if kinematics else ("maps",):
         whole: torch.Tensor = getattr(states, field)
-        ways = {"zeroed": torch.zeros_like(whole)}
+        ways = {ZEROED: torch.zeros_like(whole)}
         if field != "situation":
-            ways["as at present"] = whole[:, past - 1 : past].expand_as(whole)
+            ways[PRESENT] = whole[:, past - 1 : past].expand_as(whole)
         if len(whole) > 1:
-            ways["another AV's"] = whole.roll(1, 0)
+            ways[OTHERS] = whole.roll(1, 0)
         predicts = field != "situation" and whole.shape[1] > past
         for span, part in spans.items() if predicts else (("", slice(None)),):
             for how, other in ways.items():
+                if only not in (None, (span + field, how)):
+                    continue
                 changed = whole.clone()
                 changed[:, part] = other[:, part]
                 yield span + field, how, states._replace(**{field: changed})
-    yield "map branch", "its last layer zero", (None, *states[1:])
+    if only in (None, BLIND):
+        yield *BLIND, (None, *states[1:])
     for angle in ANGLES:
+        if only not in (None, ("phi", f"{angle} degrees")):
+            continue
         phi = svo_tensor(math.radians(angle), len(states.phi))
         yield "phi", f"{angle} degrees", states._replace(phi=phi)
 
@@ -58,6 +69,37 @@ def answer(agent: PredictionAware, arguments: Arguments) -> Floats32:
     """The action values [B,A] that the agent's network gives."""
     with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=agent.config.bf16):
         return to_numpy(agent.vfn(*arguments))
+
+
+def replacements(network: VFN, past: int) -> list[tuple[str, str]]:
+    """The (input, replacement) with which episodes are driven: what is left when an input tells nothing.
+
+    Another AV's of the same instant is an input as the network knows them; zeros are none. Predictions are
+    also replaced by the present.
+    """
+    kinematics = network.kinematics is not None
+    fields = ("maps", "kinematics") if kinematics else ("maps",)
+    predicts = network.config.frames > past
+    found = [(f"all {field}" if predicts else field, OTHERS) for field in fields]
+    if predicts:
+        found += [(f"predicted {field}", how) for field in fields for how in (OTHERS, PRESENT)]
+    return [*found, *([("situation", OTHERS)] if kinematics else []), BLIND, ("phi", f"{ANGLES[0]} degrees")]
+
+
+class Replaced(PredictionAware):
+    """Drives by what its network answers with one input replaced; `what` None: by the network as it is."""
+
+    def __init__(self, name: str, config: AgentConfig, what: tuple[str, str] | None) -> None:
+        super().__init__(name, config)
+        self._what = what
+
+    def values(self, inputs: Inputs) -> Floats32:
+        """The action values [B,A]; an AV that decides alone has no other's input and keeps its own."""
+        if self._what is not None:
+            past, kinematics = self.observation.frames, self.vfn.kinematics is not None
+            for _, _, arguments in questions(inputs.states, past, kinematics, self._what):
+                return answer(self, arguments)
+        return super().values(inputs)
 
 
 class Questioned(PredictionAware):

@@ -88,7 +88,7 @@ def _add_attribution(kinds: arguments.SubCommands) -> None:
         "attribution",
         help="which inputs of a value network change its choices",
         description="Drive episodes as `cosim run` does; at every decision ask the same network again with "
-        "one input replaced. Writes attribution.csv, .md and .png.",
+        "one input replaced. Writes attribution.csv, .md and .png, and closed_loop.csv with --closed-loop.",
     )
     arguments.add(command, "--policy", action="append", required=True)
     arguments.add(command, "--scenario", "--out", required=True)
@@ -96,6 +96,10 @@ def _add_attribution(kinds: arguments.SubCommands) -> None:
     arguments.add(command, "--seeds", type=arguments.seeds, required=True)
     arguments.add(command, "--svo", default=45.0)
     arguments.add(command, "--duration")
+    arguments.add(command, "--errors")
+    command.add_argument(
+        "--closed-loop", action="store_true", help="also drive whole episodes with each input replaced"
+    )
     arguments.add(command, "--workers", default=1)
     command.set_defaults(work=work_attribution)
 
@@ -110,6 +114,7 @@ def work_attribution(args: argparse.Namespace) -> int:
 
     out = prepare_folder(args.out)
     what = (args.policy, args.scenario, args.demand, args.seeds, args.svo, args.duration)
-    attribution(out, *what, workers=args.workers, command="cosim " + shlex.join(sys.argv[1:]))
+    how = {"errors": args.errors, "closed_loop": args.closed_loop, "workers": args.workers}
+    attribution(out, *what, **how, command="cosim " + shlex.join(sys.argv[1:]))
     print((out / PAGE).read_text(encoding="utf-8"))
     return 0

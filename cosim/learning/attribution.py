@@ -1,4 +1,4 @@
-"""`cosim bench attribution`: drives episodes and counts which inputs of the value network change a choice."""
+"""`cosim bench attribution`: which inputs of a value network change a choice, and which change the drive."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple
@@ -11,19 +11,23 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cosim.batch.episode_runner import EpisodeRunner
+from cosim.batch.matrix import Plan
 from cosim.batch.record import planned
 from cosim.errors import BadInput
 from cosim.files import write_csv
 from cosim.learning.prediction_data import spread
 from cosim.policies import make
-from cosim.report.statistics import share
+from cosim.report.statistics import mean, paired_mean, paired_share, share
 from cosim.scenario.episode_id import EpisodeId
 from cosim.workers.engines import LocalEngine
 from cosim.workers.tasks import Progress
 from policy.agents.prediction_aware import PredictionAware
-from policy.attribution import SUMS, Questioned
+from policy.attribution import SUMS, Questioned, Replaced, replacements
 
 PAGE, TABLE, PICTURE = "attribution.md", "attribution.csv", "attribution.png"
+DRIVEN = "closed_loop.csv"
+SHARED = ("crashed", "mission_success")  # figures of an episode that are yes or no, and those that are not:
+FIGURES = ("av_near_misses_ttc", "hard_brakings_av", "dt_mean_m", "dt_av_m", "dt_mission_m")
 SHARES = ("choices_changed", "unmasked_changed")
 HEAD = (
     "| input | replacement | decisions | choices changed | best valued changed | mean abs dq | spread |",
@@ -61,6 +65,19 @@ class Asking(EpisodeRunner):
         return super().run(case, warnings, outputs, progress) | {"answers": self._agent.answers}
 
 
+class Replacing(EpisodeRunner):
+    """Hosted by an engine's worker: drives by what the network answers with one input replaced."""
+
+    def __init__(self, what: tuple[str, str] | None) -> None:
+        super().__init__()
+        self._what = what
+
+    def policy(self, case: EpisodeId) -> Replaced:
+        """The policy of `case`, with that input replaced."""
+        agent = questioned(case.policy)
+        return Replaced(agent.name, agent.config, self._what)
+
+
 def attribution(
     out: Path,
     policies: Sequence[str],
@@ -70,23 +87,86 @@ def attribution(
     svo_deg: float = 45.0,
     duration: float | None = None,
     *,
+    errors: str | None = None,
+    closed_loop: bool = False,
     workers: int = 1,
     command: str = "",
 ) -> None:
     """Drive and ask; writes TABLE, PICTURE and PAGE into `out`.
 
+    `closed_loop`: also drives every episode with each of `policy.attribution.replacements`: DRIVEN, and a
+    part of PAGE. `errors`: of the human drivers.
+
     Raises BadInput as `cosim.batch.record.planned`, and for a policy without a value network.
     """
     for policy in policies:
         questioned(policy)
-    plan = planned([scenario], [demand], [], policies, seeds, svo_deg, duration)
+    plan = planned([scenario], [demand], [], policies, seeds, svo_deg, duration, errors=errors)
     tasks = [cell.task(case) for cell, case in plan.cases()]
     driven = spread(LocalEngine(Asking, workers=workers), tasks, "attribution")
     names = dict.fromkeys(episode["policy"] for episode in driven)
     tables = {name: table([e for e in driven if e["policy"] == name]) for name in names}
     write_csv(out / TABLE, [{"policy": policy} | row for policy, rows in tables.items() for row in rows])
     draw(out / PICTURE, tables)
-    (out / PAGE).write_text(markdown(driven, tables, command), encoding="utf-8")
+    page = markdown(driven, tables, command)
+    if closed_loop:
+        rows = closed(plan, workers)
+        write_csv(out / DRIVEN, rows)
+        page += "\n" + closed_markdown(rows)
+    (out / PAGE).write_text(page, encoding="utf-8")
+
+
+def closed(plan: Plan, workers: int = 1) -> list[dict[str, Any]]:
+    """A row per policy, replacement (none first) and episode: SHARED and FIGURES."""
+    rows = []
+    for cell in plan.cells:
+        agent = questioned(cell.case.policy)
+        tasks = [one.task(case) for one, case in plan.cases() if one is cell]
+        for what in (None, *replacements(agent.vfn, agent.observation.frames)):
+            name, how = what or ("nothing", "")
+            engine = LocalEngine(Replacing, (what,), workers=workers)
+            for driven in spread(engine, tasks, f"{name} {how}".strip()):
+                about = {
+                    "policy": driven["policy"],
+                    "input": name,
+                    "replacement": how,
+                    "seed": driven["seed"],
+                }
+                rows.append(about | {figure: driven[figure] for figure in (*SHARED, *FIGURES)})
+    return rows
+
+
+def closed_markdown(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The drives with replaced inputs against those without, paired, as a document."""
+    page = ["## Driven with an input replaced", ""]
+    page += [
+        "Whole episodes on equal seeds; differences to the drive with all inputs as they are, with 95 %",
+        "intervals (Tango's for shares, BCa bootstrap over pairs for means).",
+        "",
+    ]
+    for policy, mine in groupby(rows, itemgetter("policy")):
+        drives = {key: list(part) for key, part in groupby(mine, itemgetter("input", "replacement"))}
+        base = drives.pop(("nothing", ""))
+        page += [f"### {policy}, {len(base)} episodes", ""]
+        page += [f"| input | replacement | {' | '.join((*SHARED, *FIGURES))} |"]
+        page += ["|---|---|" + "---:|" * len((*SHARED, *FIGURES))]
+        own = [f"{sum(bool(r[figure]) for r in base)} of {len(base)}" for figure in SHARED]
+        own += [mean(_numbers(base, figure)).text(1) for figure in FIGURES]
+        page += [f"| nothing | | {' | '.join(own)} |"]
+        for (name, how), part in drives.items():
+            cells = [
+                paired_share([bool(r[f]) for r in base], [bool(r[f]) for r in part]).text(0, 100.0) + " pp"
+                for f in SHARED
+            ]
+            cells += [paired_mean(_numbers(base, f), _numbers(part, f)).text(1) for f in FIGURES]
+            page += [f"| {name} | {how} | {' | '.join(cells)} |"]
+        page.append("")
+    return "\n".join(page).rstrip() + "\n"
+
+
+def _numbers(rows: Sequence[Mapping[str, Any]], figure: str) -> list[float]:
+    """One figure of all episodes; nan where it is NA."""
+    return [float("nan") if row[figure] is None else float(row[figure]) for row in rows]
 
 
 def table(driven: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

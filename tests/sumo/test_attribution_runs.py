@@ -56,6 +56,28 @@ def test_the_command_writes_table_page_and_picture(
     assert (tmp_path / "attribution.png").stat().st_size > 1000
 
 
+def test_driving_with_an_input_replaced_is_compared_with_driving_by_all_of_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--policy", "vfn", "--scenario", "merge", "--demand", "contested", "--closed-loop"]
+    words += ["--seeds", "150000:150001", "--duration", "1.2", "--errors", "stress"]
+    assert main(["bench", "attribution", *words, "--out", str(tmp_path)]) == 0
+    with (tmp_path / "closed_loop.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["input"], row["replacement"]) for row in rows] == [
+        ("nothing", ""),
+        ("maps", "another AV's"),
+        ("kinematics", "another AV's"),
+        ("situation", "another AV's"),
+        ("map branch", "its last layer zero"),
+        ("phi", "0 degrees"),
+    ]
+    assert {row["seed"] for row in rows} == {"150000"}
+    text = capsys.readouterr().out
+    assert "### vfn, 1 episodes" in text
+    assert "| map branch | its last layer zero |" in text
+
+
 def test_a_policy_that_has_no_network_is_bad_input(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -14,7 +14,7 @@ from cosim.errors import BadInput
 from cosim.learning.attribution import markdown, questioned, table
 from cosim.types import MetaAction, PolicyContext, Timing
 from policy.agents.approaches import compact
-from policy.attribution import SUMS, Questioned, answer, questions
+from policy.attribution import OTHERS, SUMS, Questioned, Replaced, answer, questions, replacements
 from policy.inputs.tensors import States
 
 ROAD = straight_road(3)
@@ -72,6 +72,23 @@ def _keys(name: str) -> list[tuple[str, str]]:
     agent = untrained(name)
     driven(agent)
     return list(agent.answers)
+
+
+def test_an_agent_drives_by_what_it_answers_with_an_input_replaced() -> None:
+    base = led_by(untrained(), -2)  # cos(phi): Accelerate at 45 degrees, Idle at 90
+    config = dataclasses.replace(compact("vfn-p"), vfn_weights=None, hpn_weights=None)
+    ways = [(None, "ACCELERATE"), (("phi", "90 degrees"), "IDLE"), (("situation", OTHERS), "ACCELERATE")]
+    for what, action in ways:
+        agent = Replaced("vfn-p", config, what)
+        agent.vfn.load_state_dict(base.vfn.state_dict())
+        agent.reset(PolicyContext(ROAD, Timing(), agent.observation, math.pi / 4, np.random.default_rng(0)))
+        decisions = agent.decide(histories(ROAD, FREE, agent.observation))
+        assert {d.action.name for d in decisions.values()} == {action}, what
+    base.reset(PolicyContext(ROAD, Timing(), base.observation, math.pi / 4, np.random.default_rng(0)))
+    states = base.perceive(histories(ROAD, FREE, base.observation)).states
+    whole = replacements(base.vfn, base.observation.frames)
+    assert set(whole) <= {(name, how) for name, how, _ in questions(states, base.observation.frames, True)}
+    assert ("predicted maps", "as at present") in whole
 
 
 def test_an_av_that_decides_alone_has_no_other_to_swap_with() -> None:

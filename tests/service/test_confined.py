@@ -1,0 +1,164 @@
+"""What a confined process may do, tried from inside; an upload that ends its process is refused."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cosim.errors import BadInput, SimulationCrashed
+from cosim.service import landlock, uploads
+from cosim.service.confined import Room, allow_processor_time
+from cosim.service.settings import DataFolder, Limits, Settings
+from cosim.service.uploads import Uploads
+from cosim.workers.worker import Worker
+from tests.service.test_uploads import GOOD, archive
+
+
+class Captive:
+    """Tries things in its room."""
+
+    def __init__(self, room: Room) -> None:
+        room.enter()
+
+    def refused(self, port: int, outside: str, inside: str) -> dict[str, bool]:
+        """What must not be possible -> whether it is refused."""
+        secret, own = Path(outside), Path(inside)
+        attempts: dict[str, Callable[[], Any]] = {
+            "reading": secret.read_bytes,
+            "writing": lambda: secret.write_bytes(b"x"),
+            "listing": lambda: [*secret.parent.iterdir()],
+            "making": lambda: secret.with_name("other").touch(),
+            "removing": secret.unlink,
+            "a link to read it by": lambda: _through_a_link(own, secret),
+            "writing into its upload": lambda: own.joinpath("upload", "new").touch(),
+            "connecting": lambda: socket.create_connection(("127.0.0.1", port), timeout=5.0).close(),
+            "listening": lambda: socket.create_server(("127.0.0.1", 0)).close(),
+            "a program of its own": lambda: _program(own / "room"),
+            "ending the server": lambda: os.kill(os.getppid(), signal.SIGUSR1),
+        }
+        needs = {"connecting": 4, "listening": 4, "ending the server": 6}  # of Landlock
+        known = [name for name in attempts if needs.get(name, 1) <= landlock.version()]
+        return {name: _fails(attempts[name]) for name in known}
+
+    def spin(self) -> None:
+        """For ever."""
+        allow_processor_time(1.0)
+        while True:
+            pass
+
+    def fill(self, folder: str, size: int) -> str:
+        """What becomes of a file of so many bytes."""
+        try:
+            with Path(folder, "big").open("wb") as file:
+                for _ in range(0, size, 1 << 20):
+                    file.write(bytes(1 << 20))
+        except OSError as error:
+            return str(error.strerror)
+        return "written"
+
+    def hoard(self, size: int) -> str:
+        """What becomes of so many bytes of memory."""
+        try:
+            return str(len(bytearray(size)))
+        except MemoryError:
+            return "no memory"
+
+
+def _fails(attempt: Callable[[], Any]) -> bool:
+    try:
+        attempt()
+    except (OSError, subprocess.SubprocessError):
+        return True
+    return False
+
+
+def _through_a_link(own: Path, secret: Path) -> None:
+    link = own / "room" / "link"
+    link.symlink_to(secret)
+    link.read_bytes()
+
+
+def _program(folder: Path) -> None:
+    script = folder / "script"
+    script.write_text("#!/bin/sh\ntrue\n")
+    script.chmod(0o755)
+    subprocess.run([str(script)], check=True)
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Path:
+    for name in ("upload", "room", "scratch", "others"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "others" / "secret").write_text("of somebody else")
+    return tmp_path
+
+
+def room(place: Path, limits: Limits = Limits()) -> Room:
+    return Room(str(place / "scratch"), (str(place / "upload"),), (str(place / "room"),), limits)
+
+
+def test_a_confined_process_has_no_way_out(place: Path) -> None:
+    signal.signal(signal.SIGUSR1, signal.SIG_IGN)
+    try:
+        with socket.create_server(("127.0.0.1", 0)) as somebody, Worker(Captive, room(place)) as worker:
+            port = somebody.getsockname()[1]
+            found = worker.call("refused", port, str(place / "others" / "secret"), str(place))
+    finally:
+        signal.signal(signal.SIGUSR1, signal.SIG_DFL)
+    assert [name for name, refused in found.items() if not refused] == []
+    assert (place / "others" / "secret").read_text() == "of somebody else"
+
+
+def test_processor_time_memory_and_files_are_limited(place: Path) -> None:
+    limits = Limits(file=3 << 20, memory=4 << 30)
+    with Worker(Captive, room(place, limits)) as worker:
+        assert worker.call("fill", str(place / "room"), 8 << 20) == "File too large"
+        assert worker.call("hoard", 8 << 30) == "no memory"
+        with pytest.raises(SimulationCrashed, match="SIGXCPU"):
+            worker.call("spin")
+
+
+class Killed:
+    """An examination that ends its process as a net that kills SUMO does, or that never ends."""
+
+    def __init__(self, room: Room) -> None:
+        room.enter()
+
+    def scenario(self, config: str) -> None:
+        """As the upload wants it."""
+        print("Error: the net is broken", file=sys.stderr, flush=True)
+        os.kill(os.getpid(), signal.SIGSEGV)
+
+
+class Endless(Killed):
+    def scenario(self, config: str) -> None:
+        signal.pause()
+
+
+@pytest.mark.parametrize(
+    ("examiner", "limit", "says"),
+    [
+        (Killed, 120.0, "ends the process that reads it: .*SIGSEGV.*the net is broken"),
+        (Endless, 5.0, "takes more than 5 s"),
+    ],
+)
+def test_an_upload_that_ends_or_stops_its_process_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, examiner: type, limit: float, says: str
+) -> None:
+    monkeypatch.setattr(uploads, "Examiner", examiner)
+    sent = tmp_path / "sent.zip"
+    sent.write_bytes(archive(GOOD))
+    with DataFolder(str(tmp_path / "data")) as folder:
+        kept = Uploads(Settings(folder.path, limits=Limits(check=limit)))
+        with pytest.raises(BadInput, match=says):
+            kept.add(sent, "scenario", "")
+        assert kept.all() == []
+        assert [*(folder.path / "uploads").iterdir(), *(folder.path / "scratch").iterdir()] == []

@@ -154,7 +154,8 @@ def runs_router(runs: Runs, replays: Replays, uploads: Uploads) -> APIRouter:
 
     @router.get("/compare", summary="Two runs, or two policies, on equal seeds: what `cosim compare` says")
     def compare(a: Side, b: Side, fail_on: Texts = [], across: Texts = []) -> dict[str, Any]:  # noqa: B006
-        plain([*fail_on, *across])
+        for text in (*fail_on, *across):
+            plain(text, "fail_on" if text in fail_on else "across")
         for side in (a, b):
             file(side[:12], SUMMARY)
         return runs.compare(a, b, fail_on, across)

@@ -95,6 +95,39 @@ def test_the_next_seed_and_another_scenario_by_keyboard(tab: Tab) -> None:
     assert tab.tell("replay.data.stopLines.length > 0")
 
 
+def test_a_run_is_submitted_and_finishes_and_two_policies_are_compared(
+    browser: Browser, server: Server
+) -> None:
+    tab = Tab(browser)
+    tab.page.goto(f"{server.url}/runs")
+    tab.until("document.querySelector('#by').options.length > 3")
+    tab.page.keyboard.press("a")
+    evil = "<img src=x onerror=alert(1)>"
+    for name, value in {"name": evil, "count": "2", "duration": "2"}.items():
+        tab.page.fill(f"#run [name={name}]", value)
+    tab.page.locator("#run [name=policy]").select_option(["idm", "altruist-rule"])
+    tab.page.click("#submit")
+    tab.until("document.querySelector('#one h2') && document.querySelectorAll('#one table').length === 2")
+    assert tab.page.inner_text("#one h2") == evil  # a text, whatever it holds
+    assert tab.page.locator("#one .chip").inner_text() == "finished"
+    assert tab.page.locator("#one .scroll").first.locator("tr").count() == 3
+    link = tab.page.locator("#one a", has_text="replay").first.get_attribute("href") or ""
+    assert link.startswith("/api/runs/")
+    own = f"Array.from(document.querySelector('#b').options).findIndex((o) => o.text.includes({evil!r}) && "
+    tab.page.locator("#a").select_option(index=tab.tell(f"{own}o.value.endsWith(':idm'))"))
+    tab.page.locator("#b").select_option(index=tab.tell(f"{own}o.value.endsWith(':altruist-rule'))"))
+    tab.page.click("#set-against")
+    tab.until("document.querySelector('#verdict table')")
+    assert "2 pairs" in tab.page.inner_text("#verdict")
+    assert tab.page.locator("#verdict td", has_text="0 of 2").count() >= 2
+    tab.page.fill("#find", "nobody calls it that")
+    assert tab.page.locator("#list li").count() == 0
+    tab.page.fill("#find", "onerror")
+    assert tab.page.locator("#list li").count() == 1
+    assert tab.wrong == []
+    tab.close()
+
+
 def test_it_fits_a_telephone_in_the_dark(browser: Browser, server: Server) -> None:
     tab = Tab(browser, wide=420, high=800, dark=True)
     tab.page.goto(server.url)
@@ -103,5 +136,8 @@ def test_it_fits_a_telephone_in_the_dark(browser: Browser, server: Server) -> No
     assert tab.tell("document.documentElement.scrollWidth") <= 420
     assert tab.tell("document.documentElement.classList.contains('dark')")
     assert tab.page.locator("#scene").bounding_box()["height"] > 150  # type: ignore[index]
+    tab.page.goto(f"{server.url}/runs")
+    tab.until("document.querySelectorAll('#list li').length || !document.querySelector('#none').hidden")
+    assert tab.tell("document.documentElement.scrollWidth") <= 420
     assert tab.wrong == []
     tab.close()

@@ -38,6 +38,7 @@ from cosim.road.too_close import described, too_close
 from cosim.scenario import Fleet, load
 from cosim.scenario.vet import vetted
 from cosim.simulation.collisions import direction, only_a_tail, the_nets
+from cosim.simulation.convert import PERSON
 from cosim.types import Kind, Snapshot, Timing
 from cosim.workers.worker import Worker
 
@@ -84,8 +85,8 @@ LAW = {
 LOOKED_AT = {  # (net, collider, victim) -> what the pictures show
     ("fkk_in", "1_horizontal.0", "2_left.0"): (
         "the net's: the car stands where `:gneJ21_12_0` ends, the place inside the junction at which the net"
-        " lets it wait, and the 2.6 m wide articulated lorry, a stiff box of 16 m here, grazes its corner by"
-        " 0.2 m while both are on their own centre lines"
+        " lets it wait, and its front reaches into the way of the lorry, a stiff box of 16 m that turns past"
+        " it at 13.9 m/s; each is on its own centre line"
     ),
     ("grid6", "bottomTop2.17", "topBottom.17"): (
         "the net's: the junction `gneJ17` is of SUMO's type unregulated, nobody heeds anybody there, and the"
@@ -93,6 +94,7 @@ LOOKED_AT = {  # (net, collider, victim) -> what the pictures show
     ),
 }
 MEASURED = ("depth, m", "askew, degrees", "apart, m", "slower one, m/s")  # of an overlap
+ALIKE: dict[tuple[str, str, str, str, str], str] = {}  # (net, collider, victim, kind, source) -> the same
 TAIL, NET = "one stands askew", "the lanes lie too close"  # why boxes overlap that have not collided
 
 
@@ -345,9 +347,7 @@ def kept(document: dict[str, Any], run: Run) -> dict[str, Any]:
 
 def explained(collision: dict[str, Any]) -> str:
     """One collision in a sentence: what happened, who saw it, whose it is."""
-    collider, victim = (
-        f"{'AV' if collision[f'{who}_is_av'] else 'HV'} `{collision[who]}`" for who in ("collider", "victim")
-    )
+    collider, victim = (f"{_kind(collision, who)} `{collision[who]}`" for who in ("collider", "victim"))
     seen = "SUMO" if collision["source"] == "sumo" else "our boxes alone"
     if collision["kind"] == "insertion":
         what, whose = f"SUMO put {collider} and {victim} onto one another", "the demand's"
@@ -359,6 +359,32 @@ def explained(collision: dict[str, Any]) -> str:
         )
     where = f"`{collision['lane']}`" if collision["lane"] else "off the lanes"
     return f"{collision['time']:,.1f} s, {where}: {what}; seen by {seen}; counted as {whose}"
+
+
+def _kind(collision: dict[str, Any], who: str) -> str:
+    """What the collider or victim is: an AV, an HV or a person."""
+    person = collision[who].startswith(PERSON)
+    return "person" if person else "AV" if collision[f"{who}_is_av"] else "HV"
+
+
+def _collisions(run: Run, one: dict[str, Any]) -> Iterator[str]:
+    """A line per collision; of more than `LISTED` of one kind the first of them, and how many there were."""
+    alike: dict[tuple[str, ...], list[dict[str, Any]]] = {}
+    for c in one["collision_list"]:
+        sort = _kind(c, "collider"), _kind(c, "victim"), c["kind"], c["source"]
+        alike.setdefault(sort, []).append(c)
+    name = f"- {run.config.stem}, {run.policy}, seed {run.seed}: "
+    for (collider, victim, kind, source), found in alike.items():
+        yield from (f"{name}{explained(c)}{_seen(run, c)}" for c in found[:LISTED])
+        seen = ALIKE.get((run.config.stem, collider, victim, kind, source))
+        if len(found) > LISTED:
+            lanes = Counter(c["lane"] or "off the lanes" for c in found).most_common()
+            where = ", ".join(f"`{lane}` {n}" for lane, n in lanes)
+            yield f"{name}{len(found)} of this sort ({collider} into {victim}, {kind}) in all: {where}" + (
+                f". Looked at: {seen}" if seen else ""
+            )
+        elif seen:
+            yield f"{name}{collider} into {victim}, {kind}. Looked at: {seen}"
 
 
 def page(runs: Sequence[Run], found: Sequence[dict[str, Any] | str | None], command: str) -> list[str]:
@@ -402,11 +428,7 @@ def page(runs: Sequence[Run], found: Sequence[dict[str, Any] | str | None], comm
         curve = ", ".join(f"{mb} ({n})" for _, n, mb in one["memory_curve"][:CURVE])
         lines += [f"- {run.config.stem}, {run.policy}, seed {run.seed}: {curve}"] if curve else []
     lines += ["", "## Every collision", ""]
-    collisions = [
-        f"- {run.config.stem}, {run.policy}, seed {run.seed}: {explained(c)}{_seen(run, c)}"
-        for run, one in driven
-        for c in one["collision_list"]
-    ]
+    collisions = [line for run, one in driven for line in _collisions(run, one)]
     lines += collisions or ["None."]
     lines += [*_overlaps(driven), *_offences(driven)]
     lines += ["", "## Lanes too close together", ""]

@@ -66,15 +66,12 @@ class CollisionDetector:
             if frozenset(names) in self._seen or any(n not in bodies for n in names[: 1 if person else 2]):
                 continue
             self._seen.add(frozenset(names))
-            if person:
-                names = names if c.colliderSpeed > HALTING else names[::-1]
-            else:
-                pair = _poses(names, bodies)
-                # of two AVs that drive SUMO's order stays: to blame is an AV either way
-                avs = all(bodies[name].kind == Kind.AV for name in names)
-                if pair is not None and not (avs and np.min(pair.speed) > HALTING):
-                    first = mover(self._poses_before(names, pair, now), pair)
-                    names = names[::-1] if first == 1 else names
+            pair = _poses(c.collider, c.victim, person)
+            # of two AVs that drive SUMO's order stays: to blame is an AV either way
+            avs = not person and all(bodies[name].kind == Kind.AV for name in names)
+            if pair is not None and not (avs and np.min(pair.speed) > HALTING):
+                first = mover(self._poses_before(names, pair, now), pair)
+                names = names[::-1] if first == 1 else names
             try:
                 x, y = sumo.vehicle.getPosition(c.collider)[:2]
             except sumo.TraCIException:
@@ -278,18 +275,19 @@ def _end(snapshot: Snapshot, row: int, share: float) -> Floats:
     return np.array([snapshot.x[row] + along * np.cos(heading), snapshot.y[row] + along * np.sin(heading)])
 
 
-def _poses(names: Sequence[str], bodies: dict[str, Body]) -> Boxes | None:
-    """[2] where two vehicles are now; None when one has left the road."""
-    get = sumo.vehicle
+def _poses(vehicle: str, other: str, person: bool) -> Boxes | None:
+    """[2] where a vehicle and another one, or a person, are now; None when one has left the road."""
+    rows = []
     try:
-        front = np.array([get.getPosition(name)[:2] for name in names], np.float64)
-        angle = np.array([get.getAngle(name) for name in names], np.float64)
-        speed = np.array([get.getSpeed(name) for name in names], np.float64)
+        for get, name in ((sumo.vehicle, vehicle), (sumo.person if person else sumo.vehicle, other)):
+            x, y = get.getPosition(name)[:2]
+            rows.append(
+                (x, y, get.getAngle(name), get.getLength(name), get.getWidth(name), get.getSpeed(name))
+            )
     except sumo.TraCIException:
         return None
-    length = np.array([bodies[name].length for name in names])
-    width = np.array([bodies[name].width for name in names])
-    return Boxes(*centres(front[:, 0], front[:, 1], angle, 0.5 * length), length, width, speed)
+    x, y, angle, length, width, speed = np.array(rows, np.float64).T
+    return Boxes(*centres(x, y, angle, 0.5 * length), length, width, speed)
 
 
 def only_a_tail(snapshot: Snapshot, road: RoadMap, i: int, j: int) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from cosim.geometry import Boxes
 from cosim.road import Link, RoadMap, Rule
 from cosim.road.lane import Lane
 from cosim.road.too_close import heed_each_other, too_close
+from cosim.simulation import collisions
 from cosim.simulation.collisions import CUT_IN_WINDOW, CollisionDetector, mover
 from cosim.simulation.commands import Commander, Controlled
 from cosim.simulation.convert import Body
@@ -287,6 +289,55 @@ def test_a_person_is_hit_on_a_crossing_and_not_on_a_walking_area(edge: str, hits
         place=np.array([0, -2 - road.contact.edges[edge]], np.int32),
     )
     assert len(CollisionDetector().from_boxes(here, road, bodies("av"), {})) == hits
+
+
+class Touching:
+    """SUMO's calls as they answer while a vehicle and a person touch on a crossing."""
+
+    TraCIException = LookupError
+
+    def __init__(self, vehicle: Pose, person: Pose) -> None:
+        self.vehicle, self.person = OnePose(vehicle, 5.0, 2.0), OnePose(person, 0.2, 0.5)
+        said = SimpleNamespace(
+            type="crossing", collider="av", victim="p", colliderSpeed=vehicle[3], lane=":J_c0_0"
+        )
+        self.simulation = SimpleNamespace(
+            getCollidingVehiclesNumber=lambda: 1, getCollisions=lambda: (said,), getTime=lambda: 1.0
+        )
+
+
+class OnePose:
+    """Getters of one vehicle or person: SUMO's front bumper and degrees clockwise from north."""
+
+    def __init__(self, pose: Pose, length: float, width: float) -> None:
+        x, y, heading, speed = pose
+        ahead = 0.5 * length
+        front = x + ahead * np.cos(np.radians(heading)), y + ahead * np.sin(np.radians(heading))
+        said = {"Position": front, "Angle": 90.0 - heading, "Speed": speed, "Length": length, "Width": width}
+        for name, value in said.items():
+            setattr(self, f"get{name}", lambda _, value=value: value)
+
+
+@pytest.mark.parametrize(
+    ("person", "collider"),
+    [((-2.4, 1.05, -90.0, 1.2), "person:p"), ((2.5, 0.0, 90.0, 1.2), "av")],
+    ids=["walks into the tail of one that drives by", "is walked over"],
+)
+def test_of_a_person_and_a_moving_car_the_one_that_moved_into_the_other_is_the_collider(
+    monkeypatch: pytest.MonkeyPatch, person: Pose, collider: str
+) -> None:
+    car: Pose = (0.0, 0.0, 0.0, 3.0)
+    monkeypatch.setattr(collisions, "sumo", Touching(car, person))
+    detector = CollisionDetector()
+    then = earlier(drawn(car, person))
+    before = {
+        name: (then.x[k], then.y[k], *(car, person)[k][2:]) for k, name in enumerate(("av", "person:p"))
+    }
+    seen = replace(scene(0.8, before), length=np.array([5.0, 0.2]), width=np.array([2.0, 0.5]))
+    detector.from_boxes(seen, ROAD, bodies("av", "person:p"), {})
+    (hit,) = detector.from_sumo(bodies("av"), {}, 1.0)
+    assert hit.collider == collider
+    assert hit.av_caused == (collider == "av")
 
 
 def test_lanes_too_close_together_are_found_and_lanes_that_meet_are_not() -> None:

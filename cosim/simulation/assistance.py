@@ -4,6 +4,9 @@ In every step the car drives the slower of two speeds: what the agent wishes, co
 driver (speed mode 31) allows for signals, right of way, limits, persons and whoever drives ahead. Where that
 is slower, SUMO drives by itself, so that it brakes as hard as it must. Between AVs gaps are asked for and
 given (V2V), because SUMO's cooperation ends where a speed is commanded.
+
+A human close behind may not be looking: the car then keeps a longer headway, and as soon as the one behind
+closes in without braking it uses that room up, later and harder on its own brakes, until he brakes.
 """
 
 import math
@@ -16,7 +19,8 @@ from cosim.simulation.commands import Commander, Controlled
 from cosim.simulation.fleet import set_type
 from cosim.types import Intervention, Preset
 
-LAWFUL_TYPE = "cosim.av.lawful"  # sumo_scenarios/types.add.xml: an IDM that brakes comfortably
+# sumo_scenarios/types.add.xml: an IDM that brakes comfortably, and one that brakes late
+LAWFUL_TYPE, LATE_TYPE = "cosim.av.lawful", "cosim.av.late"
 CORRECTED = 1.0  # m/s2 more braking than asked for: from there on the car drives otherwise than commanded
 STALLED = 0.2, 1.5  # m/s2, or so little acceleration where so much was asked for
 RESPITE = 2.0  # s without a correction: the next one is a new one
@@ -29,6 +33,14 @@ LOOKS = 0.4  # s between looks at right of way and blocked lane changes
 GAP = 2.0, 1.0  # m and s: the gap given to who changes lanes
 YIELDING = 2.0, 1.0  # m/s2 and m/s: how hard, and down to what, an AV slows for who asked
 PATIENCE = 10.0  # s
+# s of waiting at a line from and until which an AV that only AVs keep there grows impatient, and how much
+WAITS = (15.0, 40.0), (0.3, 1.0)
+CLOSE = 60.0  # m behind
+HEADWAY = 0.8, 1.8  # s to the leader; with a human that close behind
+CLOSES = 3.0, 2.0, 0.5  # s to contact, m/s2 that would avoid it, and the share of it of who heeds
+ROOM = (1.5, 0.2), (3.0, 0.5)  # s to contact, s to the leader that it makes do with; between them linear
+FLEES = 1.0  # s that this lasts at least
+RETURNS = 0.1, 0.2  # s of headway won back per s, below and above `HEADWAY`
 
 STRATEGIC, BLOCKED = 8, 512 + 1024 + 2048 + 4096 + 8192  # bits of SUMO's lane-change state
 
@@ -46,7 +58,12 @@ class Assisted(Controlled):
     corrected: float = -math.inf  # s, when the car last drove otherwise
     gap_for: str = ""  # who asked for a gap
     gives_way: bool = False  # at the next junction, or in this one
+    waited: float = 0.0  # s, to give way
+    impatience: float = WAITS[1][0]
     crosses: float = 0.0  # s left of `CROSSES`
+    headway: float = HEADWAY[0]  # s
+    late: bool = False  # whether it brakes late
+    flees: float = -math.inf  # s, until when it makes room for who does not brake behind it
     idled: float = 0.0  # s, for which the agent has asked for less than `KEEPS_MOVING`
 
     @property
@@ -64,12 +81,16 @@ class Assistance(Commander):
         super().__init__(Preset.LAWFUL, step)
         self._looked = -math.inf  # s
         self._begun: list[Intervention] = []
+        self._standing_gaps: dict[str, float] = {}  # human -> m
 
     def drive(self) -> None:
         """Before every simulation step: the agent's wish where it is the slower one, else SUMO's driver."""
         get = sumo.vehicle
+        now = sumo.simulation.getTime()
         for name, state in self.controlled.items():
             speed = get.getSpeed(name)
+            self._mind_follower(name, speed, state, now)
+            flees = now < state.flees
             # what SUMO's driver did in the last step, or would have done
             allowed = get.getSpeedWithoutTraCI(name) if state.ours else speed
             slower = allowed < state.wish - 1e-3
@@ -79,20 +100,22 @@ class Assistance(Commander):
             state.idled = state.idled + self._step if state.target < KEEPS_MOVING else 0.0
             inside = get.getRoadID(name).startswith(":")
             state.crosses = CROSSES if inside and state.gives_way else state.crosses - self._step
-            if state.crosses > 0.0:
+            if flees:
+                target = math.inf
+            elif state.crosses > 0.0:
                 target = state.limit
             elif inside or state.idled > PATIENCE:
                 target = max(target, min(KEEPS_MOVING, state.limit))
             target = min(target, get.getAllowedSpeed(name))
             state.raw, state.accel = wished_accel(speed, target, state.accel, self._step)
-            if state.gap_for:
+            if state.gap_for and not flees:
                 state.accel = min(state.accel, self._yielding(name, speed, state))
             state.wish, state.speed = max(speed + state.accel * self._step, 0.0), speed
-            if not slower:
+            if not (slower or flees):
                 get.setSpeed(name, state.wish)
             elif state.ours:
                 get.setSpeed(name, -1.0)
-            state.ours = not slower
+            state.ours = not (slower or flees)
 
     def observe(self, now: float) -> list[Intervention]:
         """After every simulation step, at `now` (s): where the car began to drive otherwise than asked."""
@@ -122,12 +145,13 @@ class Assistance(Commander):
 
     def _take_over(self, name: str) -> Assisted:
         get = sumo.vehicle
-        set_type(name, _lawful(get.getTypeID(name)))
+        set_type(name, _lawful(get.getTypeID(name), LAWFUL_TYPE))
         get.setSpeedFactor(name, min(get.getSpeedFactor(name), 1.0))
         return Assisted(0.0, speed=get.getSpeed(name), lateral=get.getLateralLanePosition(name))
 
     def _hand_back(self, name: str) -> None:
         """It keeps its comfortable driver."""
+        set_type(name, _lawful(sumo.vehicle.getTypeID(name), LAWFUL_TYPE))
 
     def _forbidden(self, name: str, lane: str, offset: int) -> str | None:
         why = super()._forbidden(name, lane, offset)
@@ -136,6 +160,53 @@ class Assistance(Commander):
             if why is not None:
                 self._begun.append(Intervention(sumo.simulation.getTime(), name, why))
         return why
+
+    def _mind_follower(self, name: str, speed: float, state: Assisted, now: float) -> None:
+        """Keep a headway by who follows; use it up while he closes in and does not brake."""
+        get = sumo.vehicle
+        follower, gap = get.getFollower(name, CLOSE)
+        human = bool(follower) and follower not in self.controlled
+        if human:
+            gap += self._standing_gap(follower)
+        contact = self._contact(name, speed, follower, max(gap, 0.1)) if human else math.inf
+        if contact < CLOSES[0]:
+            if now >= state.flees:
+                self._begun.append(Intervention(now, name, "emergency: vehicle behind"))
+            state.flees = now + FLEES
+            (soon, least), (later, most) = ROOM
+            left = min(max((contact - soon) / (later - soon), 0.0), 1.0)
+            headway = min(least + left * (most - least), state.headway)
+        elif now < state.flees:
+            return
+        else:
+            short = state.headway < HEADWAY[0]
+            own = HEADWAY[human and gap < CLOSE]
+            headway = min(state.headway + RETURNS[not short] * self._step, own)
+        late = headway < HEADWAY[0]
+        if late != state.late:
+            state.late, state.impatience = late, WAITS[1][0]
+            set_type(name, _lawful(get.getTypeID(name), LATE_TYPE if late else LAWFUL_TYPE))
+        elif headway == state.headway:
+            return
+        state.headway = headway
+        get.setTau(name, headway)
+
+    def _contact(self, name: str, speed: float, follower: str, gap: float) -> float:
+        """s until a follower `gap` m behind is here; inf where he brakes, or need not yet."""
+        get = sumo.vehicle
+        closing = get.getSpeed(follower) - speed
+        if closing <= 0.0 or gap >= CLOSES[0] * closing:
+            return math.inf
+        _, least, heeds = CLOSES
+        asked = closing**2 / (2.0 * gap) + max(-get.getAcceleration(name), 0.0)
+        return math.inf if asked < least or -get.getAcceleration(follower) > heeds * asked else gap / closing
+
+    def _standing_gap(self, name: str) -> float:
+        """m, which SUMO takes off a follower's gap."""
+        found = self._standing_gaps.get(name)
+        if found is None:
+            found = self._standing_gaps[name] = float(sumo.vehicle.getMinGap(name))
+        return found
 
     def _look(self) -> None:
         """Who has to give way; and who must change lanes and cannot asks the AV behind to make room (V2V)."""
@@ -146,12 +217,30 @@ class Assistance(Commander):
             if not get.getRoadID(name).startswith(":"):
                 links = get.getNextLinks(name)
                 state.gives_way = bool(links) and not links[0][1]
+                self._wait(name, state)
             for side in (1, -1):
                 wanted = get.getLaneChangeState(name, side)[0]
                 if wanted & STRATEGIC and wanted & BLOCKED:
                     # of two that block one another the one that asks first goes first
                     followers = get.getNeighbors(name, 0 if side > 0 else 1)
                     self._give([other for other, _ in followers], name)
+
+    def _wait(self, name: str, state: Assisted) -> None:
+        """Who waits long at a line takes shorter gaps of AVs, which see it and brake comfortably."""
+        get = sumo.vehicle
+        (begins, ends), (least, most) = WAITS
+        waits = state.gives_way and get.getSpeed(name) < KEEPS_MOVING
+        state.waited = state.waited + LOOKS if waits else 0.0
+        impatience = least
+        if state.waited > begins:
+            foes = {foe[0] for foe in get.getJunctionFoes(name, NOTICE) if foe[7]}
+            if foes <= self.controlled.keys():
+                share = min((state.waited - begins) / (ends - begins), 1.0)
+                impatience += share * (most - least)
+        if impatience != state.impatience:
+            state.impatience = impatience
+            # its type is its own since `set_type`
+            sumo.vehicletype.setImpatience(get.getTypeID(name), impatience)
 
     def _give(self, asked: list[str], name: str) -> None:
         for other in asked:
@@ -174,11 +263,11 @@ class Assistance(Commander):
         return float(max(slower - speed, -brakes))
 
 
-def _lawful(own: str) -> str:
-    """The type of a commanded AV whose own one is this; outputs name both (`type_names`)."""
-    name = f"{own.partition('@')[0].partition('/')[0]}/{Preset.LAWFUL}"
+def _lawful(own: str, base: str) -> str:
+    """The type of a commanded AV whose own one is this, driving as `base`; outputs name it (`type_names`)."""
+    name = f"{own.partition('@')[0].partition('/')[0]}/{base.rpartition('.')[2]}"
     if name not in sumo.vehicletype.getIDList():
-        sumo.vehicletype.copy(LAWFUL_TYPE, name)
+        sumo.vehicletype.copy(base, name)
     return name
 
 

@@ -40,9 +40,10 @@ AVS = {
     "getRouteIndex": tc.VAR_ROUTE_INDEX,
 }
 # Asked of all AVs at once when one is asked about: variable, the form of its parameters, all of them.
-AT_TIMES: Mapping[str, tuple[int, str, Sequence[tuple[int, ...]]]] = {
+AT_TIMES: Mapping[str, tuple[int, str, Sequence[tuple[float, ...]]]] = {
     "getLaneChangeState": (tc.CMD_CHANGELANE, "i", ((1,), (-1,))),
     "getNextLinks": (tc.VAR_NEXT_LINKS, "", ((),)),
+    "getFollower": (tc.VAR_FOLLOWER, "d", ((60.0,),)),
 }
 LIGHTS = {
     "getRedYellowGreenState": tc.TL_RED_YELLOW_GREEN_STATE,
@@ -66,7 +67,7 @@ _TYPES = (tc.POSITION_2D, *[tc.TYPE_DOUBLE] * 4, tc.TYPE_STRING)
 _HEADS = tuple(bytes((variable, 0, kind)) for variable, kind in zip(VEHICLES.values(), _TYPES, strict=True))
 Row = tuple[tuple[float, float], float, float, float, float, str]  # the values, in their order
 # Commands that change nothing of the above before the next step; after any other one SUMO is asked anew.
-LATER = {"setSpeed", "setSpeedMode", "setLaneChangeMode", "changeLaneRelative"}
+LATER = {"setSpeed", "setTau", "setSpeedMode", "setLaneChangeMode", "changeLaneRelative"}
 
 
 class Client:
@@ -338,9 +339,9 @@ class _Vehicles(_Domain):
         return found
 
     def _common_getter(
-        self, variable: int, form: str, every: Sequence[tuple[int, ...]]
+        self, variable: int, form: str, every: Sequence[tuple[float, ...]]
     ) -> Callable[..., Any]:
-        def get(vehicle: str, *parameters: int) -> Any:
+        def get(vehicle: str, *parameters: float) -> Any:
             key = (variable, vehicle, *parameters)
             if key not in self._told:
                 avs = {vehicle, *(self._avs & set(self.getIDList()))}

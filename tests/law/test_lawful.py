@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import Start, vehicle
 
 from cosim.control import COMFORT, JERK, lawful_speed, wished_accel
 from cosim.host import Host
 from cosim.road.rules import RulesAhead
 from cosim.scenario import chosen_fleet, load
+from cosim.scenario.human_errors import levels
+from cosim.scenario.vet import vetted
+from cosim.simulation import assistance
 from cosim.types import (
+    Command,
     Decision,
     EpisodeResult,
     History,
@@ -79,6 +85,43 @@ def test_nobody_stands_for_ever_though_the_agent_only_brakes(law_worlds: dict[st
 
 def test_keep_lane_always_drives_unguarded() -> None:
     assert drive("merge", "keep-lane").preset == Preset.UNGUARDED
+
+
+class Unheeding(Host):
+    """A host whose AVs drive without regard to who follows."""
+
+    def run(self, *args: object, **options: object) -> EpisodeResult:
+        assistance.CLOSE = 0.0
+        return super().run(*args, **options)  # type: ignore[arg-type]
+
+
+def hit_from_behind(host: type[Host], seeds: Sequence[int]) -> list[bool]:
+    """Whether an AV was hit by a human, in each of these episodes of drivers who err."""
+    scenario = load("intersection", demand=["contested"], preset=Preset.LAWFUL)
+    scenario = vetted(replace(scenario, errors=levels()["stress"]))
+    with Worker(host, scenario, Always(MetaAction.ACCELERATE), math.pi / 4) as worker:
+        found: list[EpisodeResult] = [worker.call("run", seed) for seed in seeds]
+    return [any(c.victim_is_av and not c.collider_is_av for c in result.collisions) for result in found]
+
+
+def test_the_car_makes_room_for_who_closes_in_and_does_not_brake() -> None:
+    seeds = (100_103, 100_111, 100_115, 100_124)
+    assert hit_from_behind(Unheeding, seeds) == [True] * 4
+    assert hit_from_behind(Host, seeds) == [False] * 4
+
+
+def test_the_headway_is_longer_with_a_human_close_behind(start: Start) -> None:
+    gaps = []
+    for behind in ([], [vehicle("close", "hv", 75.0, speed=15.0, more='speedFactor="0.6"')]):
+        ahead = vehicle("ahead", "hv", 130.0, speed=15.0, more='speedFactor="0.6"')
+        worker = start([ahead, vehicle("av", "av", 100.0, speed=15.0), *behind], preset=Preset.LAWFUL)
+        for _ in range(50):
+            frame = worker.call("advance", [Command("av", 30.0, 0, 0.4)])[1][-1]
+        place = {name: frame.lane_position[row] for name, row in frame.row.items()}
+        gaps.append(place["ahead"] - 5.0 - place["av"])
+    alone, followed = gaps
+    assert 12.0 < alone < 20.0
+    assert followed > alone + 5.0
 
 
 def test_what_the_agent_wishes_is_comfortable_and_its_jerk_bounded() -> None:

@@ -1,14 +1,18 @@
 """The server's application: its parts, its routes, and one form for whatever goes wrong."""
 
 import contextlib
+import errno
 import json
 import logging
+import os
 from collections.abc import AsyncIterator
 from typing import Any
 
 from fastapi import APIRouter, FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
+from sqlalchemy.exc import SQLAlchemyError
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 
 import sumo_scenarios
 from cosim import __version__
@@ -92,6 +96,8 @@ def create(settings: Settings) -> FastAPI:
             413: "too large",
             422: "bad input: field and value are named",
             429: "the server is at its limit",
+            503: "the database does not answer",
+            507: "the server's disk is full",
         }.items()
     }
     # no pages of documentation: they would fetch their code from elsewhere
@@ -126,10 +132,28 @@ def _answer_problems(app: FastAPI, settings: Settings) -> None:
             return answer(error.status, str(error))
         if isinstance(error, BadInput):
             e = shown(error, settings)
+            if os.strerror(errno.ENOSPC).lower() in e.problem:
+                return answer(507, e.problem)
             value = e.value if isinstance(e.value, str | int | float | bool | None) else repr(e.value)
             return answer(422, e.problem, e.field, value, e.file)
         log.error("a request failed", extra={"error": str(error)})
         return answer(500, str(error))
+
+    @app.exception_handler(OSError)
+    def storage(_: Request, error: OSError) -> Response:
+        log.error("a request failed", extra={"error": str(error)})
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            return answer(507, "the server's disk is full")
+        return answer(500, f"the server's files: {error.strerror or type(error).__name__}")
+
+    @app.exception_handler(ClientDisconnect)
+    def gone(_: Request, __: ClientDisconnect) -> Response:
+        return answer(400, "the client went away")
+
+    @app.exception_handler(SQLAlchemyError)
+    def database(_: Request, error: SQLAlchemyError) -> Response:
+        log.error("a request failed", extra={"error": str(error.__cause__ or error)})
+        return answer(503, "the server's database cannot be reached or written now")
 
     @app.exception_handler(RequestValidationError)
     def malformed(_: Request, error: RequestValidationError) -> Response:

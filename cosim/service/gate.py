@@ -58,6 +58,20 @@ class Gate:
                 message["headers"] = [*message.get("headers", ()), *HEADERS]
             await send(message)
 
+        try:
+            await self._pass(scope, headers, receive, send, answered)
+        except Exception:
+            if status or scope["type"] != "http":
+                raise
+            log.exception("a fault of the server's own", extra={"path": scope["path"]})
+            await _refuse(scope, answered, 500, "a fault of the server's own: its log has more")
+        finally:
+            self._note(scope, status, time.perf_counter() - began)
+
+    async def _pass(
+        self, scope: Scope, headers: dict[bytes, bytes], receive: Receive, send: Send, answered: Send
+    ) -> None:
+        """Refuse the request or pass it on."""
         refused = self._refused(scope, headers)
         if refused is not None and refused[0] == 401 and scope["path"] in PAGES:
             await answered(
@@ -79,7 +93,6 @@ class Gate:
                 await _refuse(scope, answered, 413 if length > 0 else 400, problem)
             else:
                 await self._app(scope, _limited(receive, most), answered)
-        self._note(scope, status, time.perf_counter() - began)
 
     def _refused(self, scope: Scope, headers: dict[bytes, bytes]) -> tuple[int, str] | None:
         """The status and why; None when the request may pass."""

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import re
 import shutil
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+from sqlalchemy.exc import SQLAlchemyError
 
 import sumo_scenarios
 from cosim.batch import execution
@@ -33,18 +36,20 @@ from cosim.workers.ray_engine import RayEngine
 from cosim.workers.supervisor import Limits as WorkerLimits
 
 ENDING = 10.0  # s that runs may take to end when the server does
+RETRY = 5.0  # s until a database that could not be used is tried again
 ACTIVE = 8  # runs that are driven at once on the processes of this machine
 REPORT, SUMMARY = "report.html", "summary.json"
 OUTPUTS = "outputs"  # the folder of SUMO's own
+T = TypeVar("T")
 log = logging.getLogger("cosim.service")
 
 
 class Drive:
     """One run while it is driven."""
 
-    def __init__(self, episodes: int, done: int) -> None:
-        self.episodes, self.done = episodes, done
-        self.before = done  # driven by an earlier server
+    def __init__(self) -> None:
+        self.episodes = self.done = 0
+        self.before = 0  # driven by an earlier server
         self.began = time.monotonic()
         self.cancelled = threading.Event()
         self.engine: Engine | None = None
@@ -199,9 +204,9 @@ class Runs:
         self.get(run)
         with self._changed:
             if run in self._queue:
+                self._jobs.set(run, status=CANCELLED, ended=now())
                 self._queue.remove(run)
                 self._plans.pop(run, None)
-                self._jobs.set(run, status=CANCELLED, ended=now())
                 return self.get(run)
             drive = self._drives.get(run)
         if drive is None:
@@ -277,19 +282,18 @@ class Runs:
                     return
                 run = self._queue.popleft()
                 plan = self._plans.pop(run, None)
-                job = self.get(run)
-                drive = self._drives[run] = Drive(job.episodes, 0)
+                drive = self._drives[run] = Drive()
             try:
-                self._run(job, plan, drive)
-            except Exception:  # the database is gone
+                self._run(self._patiently(self.get, run), plan, drive)
+            except Exception:  # the database was gone until the server's end
                 log.exception("run lost until the next start", extra={"run": run})
             finally:
                 self._drives.pop(run, None)
 
     def _run(self, job: Job, plan: Plan | None, drive: Drive) -> None:
         """Drive one run and note what became of it."""
-        run = job.run
-        self._jobs.set(run, status=RUNNING, began=job.began or now())
+        run, drive.episodes = job.run, job.episodes
+        self._patiently(self._jobs.set, run, status=RUNNING, began=job.began or now())
         log.info("run began", extra={"run": run})
         status, error = FINISHED, None
         try:
@@ -298,8 +302,11 @@ class Runs:
                 status, error = FAILED, "\n".join(faults)
         except Cancelled:
             status = CANCELLED
-        except CosimError as problem:
-            status, error = FAILED, str(problem)
+        except BadInput as problem:
+            status, error = FAILED, str(shown(problem, self._settings))
+        except CosimError as problem:  # a store names its database, and the command line's way to go on
+            text = re.sub(r"\w[\w+]*://\S+?: ", "the database: ", str(problem))
+            status, error = FAILED, text.replace(" (--resume goes on from here)", "")
         except Exception as problem:
             log.exception("a fault of the server's own", extra={"run": run})
             status, error = FAILED, f"a fault of the server's own: {type(problem).__name__}"
@@ -307,9 +314,21 @@ class Runs:
             return
         for part in self.folder(run).glob(f"{OUTPUTS}/*/{DRAFT}"):
             shutil.rmtree(part, ignore_errors=True)
-        self._jobs.set(run, status=status, error=error, ended=now(), done=drive.done)
+        self._patiently(self._jobs.set, run, status=status, error=error, ended=now(), done=drive.done)
         seconds = round(time.monotonic() - drive.began, 3)
         log.info("run ended", extra={"run": run, "status": status, "seconds": seconds})
+
+    def _patiently(self, ask: Callable[..., T], *arguments: Any, **values: Any) -> T:
+        """What the database answers, as soon as it does; raises SQLAlchemyError if the server ends before."""
+        while True:
+            try:
+                return ask(*arguments, **values)
+            except SQLAlchemyError as error:
+                log.error("the database cannot be used", extra={"error": str(error.__cause__ or error)})
+                with self._changed:
+                    if self._closed:
+                        raise
+                    self._changed.wait(timeout=RETRY)
 
     def _episodes(self, job: Job, plan: Plan | None, drive: Drive) -> list[str]:
         """Drive what is left of a run, write its tables and report; the faults of our own code."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import hmac
 import json
 import logging
@@ -31,6 +32,7 @@ HEADERS = (
     (b"referrer-policy", b"no-referrer"),
     (b"x-frame-options", b"SAMEORIGIN"),
 )
+PAUSE = 60.0  # s
 log = logging.getLogger("cosim.service.http")
 
 
@@ -98,7 +100,7 @@ class Gate:
         """The status and why; None when the request may pass."""
         host = headers.get(b"host", b"").decode("latin-1")
         origin = headers.get(b"origin")
-        if origin is not None and urlsplit(origin.decode("latin-1")).netloc != host:
+        if origin is not None and _netloc(origin.decode("latin-1")) != host:
             return 403, "requests from pages of another origin are refused"
         if self._token is None:
             try:
@@ -143,13 +145,24 @@ def cookie_of(token: str) -> str:
     return hmac.new(token.encode(), b"cosim page", "sha256").hexdigest()
 
 
+def _netloc(origin: str) -> str | None:
+    try:
+        return urlsplit(origin).netloc
+    except ValueError:
+        return None
+
+
 def _limited(receive: Receive, most: int) -> Receive:
-    """`receive`, which raises HTTPException (413) behind `most` bytes."""
-    got = 0
+    """`receive`, which raises HTTPException behind `most` bytes (413), after `PAUSE` s without any (408)."""
+    got, whole = 0, False
 
     async def limited() -> Message:
-        nonlocal got
-        message = await receive()
+        nonlocal got, whole
+        try:
+            message = await asyncio.wait_for(receive(), None if whole else PAUSE)
+        except TimeoutError:
+            raise HTTPException(408, f"nothing of the request came for {PAUSE:g} s") from None
+        whole = not message.get("more_body", False)
         got += len(message.get("body", b""))
         if got > most:
             raise HTTPException(413, f"at most {most} bytes are taken")

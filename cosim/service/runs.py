@@ -228,8 +228,12 @@ class Runs:
     def rows(self, run: str) -> list[dict[str, Any]]:
         """The rows so far, as `cosim evaluate` keeps them."""
         self.get(run)
-        with self._store(run) as store:
-            return store.rows()
+        try:
+            with self._store(run) as store:
+                return store.rows()
+        except BadInput:
+            self.get(run)  # raises NotFound: it was removed meanwhile
+            raise
 
     def files(self, run: str) -> dict[str, Path]:
         """The files of a run by their names: those of `cosim evaluate`, and SUMO's own outputs."""
@@ -256,7 +260,10 @@ class Runs:
         if self._settings.database is not None:
             with contextlib.suppress(CosimError), self._store(run) as store:
                 store.remove()
-        shutil.rmtree(self.folder(run), ignore_errors=True)
+        gone = self._settings.scratch / run
+        with contextlib.suppress(OSError):  # moved first: who reads it meanwhile makes no file in it again
+            self.folder(run).rename(gone)
+        shutil.rmtree(gone, ignore_errors=True)
 
     def _engine(self, confined: Room | None = None, *, probes: bool = False) -> Engine:
         """Of one run, or of `probes`; in a room its processes are confined."""

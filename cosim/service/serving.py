@@ -1,10 +1,12 @@
 """Starts the application on a socket and ends it in order."""
 
+import asyncio
 import contextlib
 import socket
 from typing import Any, TextIO
 
 import uvicorn
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from cosim.errors import BadInput
 from cosim.files import cannot
@@ -14,6 +16,52 @@ from cosim.service.settings import TOKEN, DataFolder, Settings
 
 MESSAGE = 4096  # bytes of what a page asks for
 KEEP_ALIVE = 120  # s: a driver may think for a while between two decisions
+HEAD, HEAD_TIME = 1 << 16, 30.0  # bytes, s
+
+
+class Bounded(HttpToolsProtocol):
+    """A request's head has at most `HEAD` bytes and `HEAD_TIME` s; then the connection is closed."""
+
+    _left = HEAD
+    _timer: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """A head may begin."""
+        super().connection_made(transport)
+        self._expect()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """None can come."""
+        self._arrived()
+        super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        """Some of a head, or of what comes after it."""
+        super().data_received(data)
+        if self._timer is not None:
+            self._left -= len(data)
+            if self._left < 0:
+                self.transport.close()
+
+    def on_message_begin(self) -> None:
+        """The parser's: a head begins."""
+        super().on_message_begin()
+        self._expect()
+
+    def on_headers_complete(self) -> None:
+        """The parser's: it is whole."""
+        self._arrived()
+        super().on_headers_complete()
+
+    def _expect(self) -> None:
+        self._arrived()
+        self._left = HEAD
+        self._timer = self.loop.call_later(HEAD_TIME, self.transport.close)
+
+    def _arrived(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
 
 
 def serve(data: str, *, host: str, port: int, said: TextIO, **settings: Any) -> int:
@@ -37,6 +85,7 @@ def serve(data: str, *, host: str, port: int, said: TextIO, **settings: Any) -> 
             print(f"cosim: http://{shown}:{port} ({asks})", file=said, flush=True)
             config = uvicorn.Config(
                 app,
+                http=Bounded,
                 log_config=None,
                 access_log=False,
                 server_header=False,

@@ -15,6 +15,7 @@ SECRET = "a-secret-of-the-tests"
 
 def test_pages_of_other_origins_and_other_names_are_refused(server: Server) -> None:
     assert server.http.get("/api/runs", headers={"Origin": "http://evil.example"}).status_code == 403
+    assert server.http.get("/api/runs", headers={"Origin": "http://["}).status_code == 403
     assert server.http.get("/api/runs", headers={"Host": "evil.example"}).status_code == 403
     assert server.http.get("/api/runs", headers={"Origin": server.url}).status_code == 200
 

@@ -9,6 +9,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -107,6 +108,27 @@ def test_a_fault_of_ours_is_a_problem_document(client: httpx.Client, monkeypatch
     assert (answer.status_code, answer.json()["field"]) == (500, None)
     assert "secret" not in answer.text
     assert 'route="/api/runs",status="500"' in client.get("/metrics").text
+
+
+def test_a_head_without_end_is_cut_off(server: Server) -> None:
+    host, port = server.url.removeprefix("http://").split(":")
+    with socket.create_connection((host, int(port)), timeout=60.0) as one:
+        one.sendall(f"GET /health HTTP/1.1\r\nHost: {host}\r\nX: ".encode())
+        with pytest.raises(ConnectionError):
+            one.sendall(bytes(100_000_000).replace(b"\0", b"x"))
+
+
+def test_a_run_that_is_removed_while_it_is_read_leaves_nothing(server: Server) -> None:
+    for _ in range(5):
+        run = server.submit(**SHORT, seeds="200000:201000")
+        server.http.post(f"/api/runs/{run}/cancel")
+        server.wait(run)
+        with ThreadPoolExecutor(6) as asking:
+            paths = ["rows", "report", "files", "summary"]
+            answers = [asking.submit(server.http.get, f"/api/runs/{run}/{path}") for path in paths]
+            answers += [asking.submit(server.http.delete, f"/api/runs/{run}") for _ in range(2)]
+        assert {answer.result().status_code for answer in answers} <= {200, 204, 404, 409}
+        assert not (server.data / "runs" / run).exists()
 
 
 def test_clients_that_send_slowly_or_go_away_keep_nobody_waiting(server: Server) -> None:

@@ -1,12 +1,21 @@
 """Every policy that `--policy` can name: those that ship, weights of a training, a user's own code."""
 
 from pathlib import Path
+from typing import Protocol
 
 from cosim.errors import BadInput
 from cosim.policies.own import own
 from cosim.scenario.policy_name import WEIGHTS, read
 from cosim.types import Policy
 from policy import agents
+
+
+class Explainer(Protocol):
+    """Tells which inputs a choice hangs on, decision by decision (`policy.attribution.Explainer`)."""
+
+    asked: str | None  # the AV
+    uses: tuple[tuple[str, str, int, float], ...]  # input, replacement, action then, mean |dQ|
+
 
 NAMES = tuple(agents.POLICIES)  # of those that ship
 
@@ -28,6 +37,14 @@ def check(text: str) -> None:
         config(Path(name.place))
     else:
         name.code.load("--policy")
+
+
+def explainer(policy: Policy) -> Explainer | None:
+    """What tells which inputs a choice of this policy hangs on; None where it has no value network."""
+    from policy.agents.prediction_aware import PredictionAware
+    from policy.attribution import Explainer as Asking
+
+    return Asking(policy) if isinstance(policy, PredictionAware) else None
 
 
 def make(text: str) -> Policy:

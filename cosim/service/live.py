@@ -103,19 +103,25 @@ class Viewer:
 class Live:
     """The viewers of one session.
 
-    `drive(s)` carries out one decision unless the episode is over or that far; `reset(seed)` begins another.
+    `drive(s)` carries out one decision unless the episode is over or that far; `reset(seed)` begins another;
+    `explain(av)` has this AV's choices explained.
     """
 
     def __init__(
-        self, stage: Stage, drive: Callable[[float], bool], reset: Callable[[int | None], None]
+        self,
+        stage: Stage,
+        drive: Callable[[float], bool],
+        reset: Callable[[int | None], None],
+        explain: Callable[[str | None], None],
     ) -> None:
-        self._stage, self._drive, self._reset = stage, drive, reset
+        self._stage, self._drive, self._reset, self._explain = stage, drive, reset, explain
         self._changed = threading.Condition()
         self._viewers: list[Viewer] = []
         self._scene: Scene | None = None
         self._lasting: list[str] = []
         self._step = ""  # the newest
         self._begin: list[int | None] = []  # seeds that were asked for
+        self._explained: list[str | None] = []  # AVs that were asked for
         self._driver: threading.Thread | None = None
         self.program = False  # whether requests drive it
 
@@ -173,6 +179,12 @@ class Live:
                 viewer.until = 0.0
             self._go()
 
+    def ask_explained(self, av: str | None) -> None:
+        """From the next decision on tell which inputs this AV's choices hang on; None: nobody's."""
+        with self._changed:
+            self._explained.append(av)
+            self._go()
+
     def end(self, reason: str) -> None:
         """The session has ended."""
         self.say({"ended": reason}, end=True)
@@ -204,15 +216,19 @@ class Live:
         """A thread while somebody watches: drive as far as is asked for."""
         while True:
             with self._changed:
-                while self._viewers and not self._begin and not self._until:
+                while self._viewers and not (self._begin or self._explained or self._until):
                     self._changed.wait()
                 if not self._viewers:
                     self._driver = None
                     self._begin.clear()
+                    self._explained.clear()
                     return
-                seed, until = (self._begin[-1:], self._until)
+                seed, av, until = self._begin[-1:], self._explained[-1:], self._until
                 self._begin.clear()
+                self._explained.clear()
             try:
+                if av:
+                    self._explain(av[0])
                 if seed:
                     self._reset(seed[0])
                     continue

@@ -23,6 +23,7 @@ class Asked(BaseModel):
     until: float | None = Field(None, ge=0.0, le=1e9)  # drive up to so many s of the episode
     begin: StrictInt | None = Field(None, ge=0, lt=2**62)  # the episode of this seed
     next: bool = False  # the episode after the last
+    explain: str | None = Field(None, max_length=200)  # the AV whose choices are explained; "": nobody
 
 
 def live_router(sessions: Sessions) -> APIRouter:
@@ -58,6 +59,8 @@ def live_router(sessions: Sessions) -> APIRouter:
 
 
 def _answer(one: Open, viewer: Viewer, asked: Asked) -> None:
+    if asked.explain is not None:
+        one.live.ask_explained(asked.explain or None)
     if one.live.program:  # two drivers would be one too many
         return
     if asked.begin is not None or asked.next:

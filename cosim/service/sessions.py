@@ -76,6 +76,10 @@ class Served(Session):
         found: tuple[list[str], str] = self._call("drawn")
         return found
 
+    def explain(self, av: str | None) -> None:
+        """Tell which inputs this AV's choices hang on; None: nobody's."""
+        self._call("explain", av)
+
     def unwatched(self) -> None:
         """Nobody looks any more."""
         self._call("unwatched")
@@ -99,7 +103,7 @@ class Open:
         self._lock = threading.Lock()
         self._used = time.monotonic()
         self.ended = False
-        self.live = session.live = Live(session, self._drive, self._reset)
+        self.live = session.live = Live(session, self._drive, self._reset, self._explain)
 
     @contextlib.contextmanager
     def using(self) -> Iterator[Served]:
@@ -151,6 +155,10 @@ class Open:
             if on:
                 self.act({}, [])
         return on
+
+    def _explain(self, av: str | None) -> None:
+        with self.using() as session:
+            session.explain(av)
 
     def _reset(self, seed: int | None) -> None:
         with self.using() as session:

@@ -13,6 +13,7 @@ import numpy as np
 
 from cosim.envs.host import SessionHost
 from cosim.episode import Episode, Hook, Step
+from cosim.policies import Explainer, explainer
 from cosim.recording.recorder import Choice
 from cosim.report.replay.packing import (
     DrawnRoad,
@@ -71,10 +72,16 @@ class Picture:
     """One episode for those who watch it."""
 
     def __init__(
-        self, road: DrawnRoad, policy: Policy, simulator: Simulator, notes: Notes, svo: float
+        self,
+        road: DrawnRoad,
+        policy: Policy,
+        simulator: Simulator,
+        notes: Notes,
+        svo: float,
+        explained: Explainer | None,
     ) -> None:
         self._road, self._policy, self._simulator, self._notes = road, policy, simulator, notes
-        self._svo = svo
+        self._svo, self._explained = svo, explained
         self._names = Names()
         self._told = dict.fromkeys(("words", "collisions", "violations", "interventions", "errors"), 0)
         self.lasting: list[str] = []  # not told yet
@@ -105,6 +112,10 @@ class Picture:
             "frames": frames,
             **self._now(episode),
         }
+        explained = self._explained
+        if explained is not None and explained.uses and explained.asked in self._names.vehicles:
+            uses = [[name, how, action, round(dq, 4)] for name, how, action, dq in explained.uses]
+            found["uses"] = [self._names.vehicles[explained.asked], uses]
         if forecast is not None:
             found["interval"] = forecast_interval(forecast)
         if episode.over or episode.steps % FIGURES_EVERY == 0:
@@ -180,6 +191,7 @@ class WatchedHost(SessionHost):
         super().__init__(*arguments)
         self._notes = Notes()
         self.hooks = (self._notes,)
+        self._explainer = explainer(self.policy)
         self._road: DrawnRoad | None = None
 
     def scene(self) -> Scene:
@@ -188,9 +200,14 @@ class WatchedHost(SessionHost):
         if self._road is None:
             s = self.simulator
             self._road = DrawnRoad(s.road, s.goal_lanes, len(self.episode.snapshot.signals))
-        picture = Picture(self._road, self.policy, self.simulator, self._notes, self.svo)
+        picture = Picture(self._road, self.policy, self.simulator, self._notes, self.svo, self._explainer)
         self._notes.picture = picture
         return picture.begin(self.episode)
+
+    def explain(self, av: str | None) -> None:
+        """Tell from the next decision on which inputs this AV's choices hang on; None: nobody's."""
+        if self._explainer is not None:
+            self._explainer.asked, self._explainer.uses = av, ()
 
     def drawn(self) -> tuple[list[str], str]:
         """What the last decision brought: what stays, and its step. After `scene` in the same episode."""
@@ -201,6 +218,7 @@ class WatchedHost(SessionHost):
     def unwatched(self) -> None:
         """Nobody looks any more."""
         self._notes.picture = None
+        self.explain(None)
 
 
 def tally(ended: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -104,6 +104,31 @@ def test_what_a_page_draws_of_an_explained_decision_is_told(server: Server) -> N
     assert ["words", None] in lasting
 
 
+def test_a_choice_is_explained_and_stays_what_it_was(server: Server) -> None:
+    session = opened(server, policy="vfn-p", duration=2.0)
+    hashes, uses = [], []
+    with watching(server, session) as socket:
+        for _ in range(2):
+            socket.send(json.dumps({"begin": 200_000}))
+            head = told(socket)
+            vehicles = [row for kind, row in head["add"] if kind == "vehicles"]
+            number = next(k for k, row in enumerate(vehicles) if row[1] == 1)
+            socket.send(json.dumps({"until": 100.0}))
+            _, steps = drawn(socket, 100.0)
+            hashes.append(steps[-1]["facts"]["trace_hash"])
+            uses.append([step["uses"] for step in steps if "uses" in step])
+            socket.send(json.dumps({"explain": vehicles[number][0]}))
+    server.http.delete(f"/api/sessions/{session}")
+    assert hashes[0] == hashes[1]
+    assert (uses[0], len(uses[1])) == ([], 5)
+    assert {row[0] for row in uses[1]} == {number}
+    inputs = [(name, how) for name, how, _, _ in uses[1][0][1]]
+    assert ("phi", "0 degrees") in inputs
+    assert ("map branch", "its last layer zero") in inputs
+    assert all(0 <= action < 5 and change >= 0.0 for _, rows in uses[1] for _, _, action, change in rows)
+    assert any(change > 0.0 for _, rows in uses[1] for _, _, _, change in rows)
+
+
 def test_a_program_s_session_is_watched_by_many_and_driven_by_it_alone(server: Server) -> None:
     words = {name: value for name, value in WORDS.items() if name != "scenario"}
     with client.open(server.url, "merge", **words) as session:

@@ -4,6 +4,7 @@ const KEPT = 400_000; // vehicle frames; of more the older half is forgotten
 const FORECASTS = 250; // decisions whose predictions are kept
 
 let catalogue = null, session = null, socket = null, player = null, road = null, data = null;
+let explains = false, explained = ""; // whether the chosen AV's choices are to be explained; whose are
 let asked = 0, wanted = true, behind = false; // s asked for; whether it plays when an episode begins; whether the user looks back
 
 const live = {
@@ -25,10 +26,16 @@ const live = {
   dark: () => THEME.dark,
   darken: (on) => { THEME.dark = on; },
   keys: [["r", "this seed again", () => $("again").click()], ["e", "the next seed", () => $("next").click()],
-    ["s", "another scenario", () => $("other").click()]],
+    ["x", "why the chosen AV chose so: what each input changes", () => $("why").click()], ["s", "another scenario", () => $("other").click()]],
 };
 
 function send(message) { if (socket && socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message)); }
+
+// Has the choices of the chosen AV explained, where that is wanted.
+function explain() {
+  const chosen = player && player.state.chosen, av = explains && chosen && chosen.av ? chosen.id : "";
+  if (av !== explained) { explained = av; send({ explain: av }); }
+}
 
 function say(text, bad = false) {
   $("said").textContent = text; $("said").hidden = !text; $("said").classList.toggle("bad", bad);
@@ -51,6 +58,7 @@ function told(message) {
   let figures = begins;
   for (const step of message.steps || []) figures = addStep(step) || figures;
   if (begins) begin(); else player.grown();
+  explain();
   if (figures) { fillFigures(data); fillHead(data); fillTally(); }
 }
 
@@ -60,6 +68,10 @@ function addStep(step) {
     const [t, choices, forecast] = step.decided;
     if (step.interval) data.forecastInterval = step.interval;
     addDecisions(data, t, choices, forecast);
+    if (step.uses) {
+      const of = data.vehicles[step.uses[0]].choices;
+      if (of.length) of[of.length - 1].uses = step.uses[1];
+    }
     if (data.forecasts.length > FORECASTS) data.forecasts[data.forecasts.length - FORECASTS - 1] = null;
   }
   for (const frame of step.frames) addFrame(frame);
@@ -144,7 +156,7 @@ function fillTally() {
 
 function watch(found, seed) {
   if (socket) { socket.onclose = null; socket.close(); }
-  session = found; road = null; wanted = true;
+  session = found; road = null; wanted = true; explained = "";
   history.replaceState(null, "", `#session=${session.id}`);
   for (const id of ["again", "next", "on"]) $(id).disabled = session.program;
   socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/api/sessions/${session.id}/live`);
@@ -210,6 +222,7 @@ async function main() {
   $("theme").onclick = () => { THEME.dark = !THEME.dark; };
   $("again").onclick = () => { wanted = true; send({ begin: data.facts.seed }); };
   $("next").onclick = () => { wanted = true; send({ next: true }); };
+  $("why").onchange = (event) => { explains = event.target.checked; explain(); };
   $("other").onclick = () => { if ($("start").hidden) { if (player) player.play(false); offer(); $("go").focus(); } else if (session) $("start").hidden = true; };
   try {
     catalogue = await ask("/api/catalogue");

@@ -69,6 +69,20 @@ function fillChoice(state, box, choice, corrected) {
     table.append(row);
   });
   box.append(table);
+  if (choice.uses) fillUses(box, choice);
+}
+
+// What the choice hangs on: what it becomes when the network is asked again with one input replaced.
+function fillUses(box, choice) {
+  const table = element("table"), head = element("tr");
+  for (const name of ["without", "replaced by", "choice", "|\u0394Q|"]) head.append(element("th", name));
+  table.append(head);
+  for (const [input, how, action, dq] of [...choice.uses].sort((a, b) => b[3] - a[3])) {
+    const row = element("tr", undefined, action === choice.action ? "" : "changed");
+    row.append(element("td", input), element("td", how), element("td", action === choice.action ? "same" : ACTIONS[action]), element("td", number(dq, 3)));
+    table.append(row);
+  }
+  box.append(element("p", "What the choice hangs on:", "quiet"), table);
 }
 
 // Speed and target over the whole episode, the actions beneath; a click jumps there.

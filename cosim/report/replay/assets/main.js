@@ -1,6 +1,7 @@
 // Time, keys and pointer: what the user does, and one picture per animation frame.
 
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4, 8];
+const BESIDE = 100; // ms between two drawings of what stands beside the scene, while it plays
 const BIN = 4; // pixels of the time line that share a bar
 const KEYS = [["space", "play, pause"], ["\u2190 \u2192", "one frame (shift: 2 s)"], ["home end", "first, last moment"],
   ["[ ]", "event before, after"], ["< >", "slower, faster"], ["+ \u2212", "zoom (or the wheel)"], ["0", "the whole net"],
@@ -17,7 +18,7 @@ function start(data, live = null) {
     data, view, map, chart, t: 0, playing: false, rate: 1, chosen: null, following: false, labels: false, hidden: new Set(),
     predictions: true, events: [], shown: [], c: null, dirty: true, live,
   };
-  let net = null;
+  let net = null, beside = 0; // ms, when what stands beside the scene was last drawn
 
   state.choose = (vehicle, follow = state.following) => {
     state.chosen = vehicle; state.following = Boolean(vehicle) && follow;
@@ -71,8 +72,11 @@ function start(data, live = null) {
       const s = state.following && state.chosen && stateOf(data, state.chosen, state.t);
       if (s) { view.x = s.x; view.y = s.y; }
       drawScene(scene.getContext("2d"), state);
-      drawMap($$("map"), state); drawChart($$("chart"), state); drawTimeline();
-      fillDetails(state); markEvent(state);
+      if (!state.playing || now - beside > BESIDE) { // what changes slowly
+        beside = now;
+        drawMap($$("map"), state); drawChart($$("chart"), state); drawTimeline();
+        fillDetails(state); markEvent(state);
+      }
       $$("follow").classList.toggle("on", state.following);
       $$("clock").textContent = `${state.t.toFixed(1)} / ${spanOf(data).toFixed(1)} s`;
       $$("predictions").checked = state.predictions; $$("labels").checked = state.labels;

@@ -14,10 +14,12 @@ pytestmark = needed
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    """One for all."""
+def browser(server: Server) -> Iterator[Browser]:
+    """One for all; its sessions are closed in the end."""
     with launched() as found:
         yield found
+    for one in server.http.get("/api/sessions").json():
+        server.http.delete(f"/api/sessions/{one['id']}")
 
 
 @pytest.fixture(scope="module")

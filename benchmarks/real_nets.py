@@ -94,7 +94,25 @@ LOOKED_AT = {  # (net, collider, victim) -> what the pictures show
     ),
 }
 MEASURED = ("depth, m", "askew, degrees", "apart, m", "slower one, m/s")  # of an overlap
-ALIKE: dict[tuple[str, str, str, str, str], str] = {}  # (net, collider, victim, kind, source) -> the same
+WALKED_THROUGH = (
+    "SUMO's: the vehicle stands on a crossing, in a queue that does not move, and the persons walk through it"
+    " at their own pace (the first of these, in pictures)"
+)
+ALIKE = {  # (net, collider, victim, kind, source) -> what the pictures show of the first of a sort
+    ("fokr_bs_demo", "HV", "HV", "junction", "sumo"): (
+        "SUMO's drivers': a car turns across a bicycle's way and heeds it too late (54,689.1 s, 55,110.8 s,"
+        " 55,917.6 s), and a bicycle starts from the head of a queue into the way of a car (55,912.4 s)"
+    ),
+    ("fokr_bs_demo", "person", "HV", "crossing", "sumo"): WALKED_THROUGH,
+    ("fokr_bs_demo", "person", "AV", "crossing", "sumo"): WALKED_THROUGH,
+    ("fokr_bs_demo", "HV", "person", "crossing", "sumo"): (
+        "SUMO's drivers': bicycles of a queue that moves at 1 m/s roll into persons who walk through it"
+    ),
+    ("fokr_bs_demo", "person", "AV", "overlap", "box"): (
+        "only the places: each of the persons is on one of the crossings `:38_c0` and `:38_c4`, within 1.3 m"
+        " of its centre line, where SUMO reports others of the same kind"
+    ),
+}
 TAIL, NET = "one stands askew", "the lanes lie too close"  # why boxes overlap that have not collided
 
 
@@ -398,8 +416,7 @@ def page(runs: Sequence[Run], found: Sequence[dict[str, Any] | str | None], comm
         "",
         f"Made by `{command}`: the games of the `eclipse-sumo` package",
         f"(`pip install cosim-sumo[tools]`), driven as they stand, {PENETRATION:.0%} of the vehicles AVs.",
-        f"What each drive gave is in `{KEPT.relative_to('docs/results')}`;",
-        "`--runs FOLDER` drives all of it anew.",
+        f"What each drive gave is in `{KEPT.relative_to('docs/results')}`; `--runs FOLDER` drives all anew.",
         f"A10KW is a motorway interchange with bridges; driven to its end with {', '.join(big)}.",
         f"Memory: of the simulation's process, after {SETTLED:g} s and at the end.",
         "Time factor: simulated s per s that passed, other programs on the machine included; over the steps",
@@ -445,6 +462,14 @@ def page(runs: Sequence[Run], found: Sequence[dict[str, Any] | str | None], comm
     if refused:
         lines += ["", "## Not driven", ""]
         lines += [f"- {run.config.stem}, {run.policy}, seed {run.seed}: {one}" for run, one in refused]
+    missing: dict[tuple[str, str], list[str]] = {}
+    for run, it in zip(runs, found, strict=True):
+        whole_ = isinstance(it, str) or (it and _simulated(it) >= min(run.duration or _end(it), LONGEST))
+        if not whole_:
+            missing.setdefault((run.config.stem, run.policy), []).append(f"{run.seed}")
+    if missing:
+        lines += ["", "## Not yet driven to the end", ""]
+        lines += [f"- {net}, {policy}, seeds {', '.join(seeds)}" for (net, policy), seeds in missing.items()]
     return [
         *lines,
         "",

@@ -15,6 +15,7 @@ import itertools
 import json
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
@@ -249,6 +250,10 @@ def shown(rows: Sequence[Row]) -> list[str]:
 
 def page(rows: Sequence[Row], preset: str, seeds: range, command: str) -> list[str]:
     """docs/results/law.md"""
+    found = tables(rows)
+    verdicts = [line.rpartition(" | ")[2].strip(" |") for line in found if line.startswith("| ")]
+    asked = [verdict for verdict in verdicts if verdict == "met" or verdict.startswith("missed: ")]
+    missed = Counter(name for v in asked for name in v.removeprefix("missed: ").split(", ") if v != "met")
     return [
         "# The law of the road",
         "",
@@ -263,7 +268,11 @@ def page(rows: Sequence[Row], preset: str, seeds: range, command: str) -> list[s
         "`idm`'s, hard brakings of AVs at most twice `idm`'s or one in two episodes (these three not of",
         "`random`). Missed targets are bold.",
         "",
-        *tables(rows),
+        f"{asked.count('met')} of {len(asked)} rows of arms meet all of it; missed: "
+        + (", ".join(f"{name} in {count}" for name, count in missed.most_common()) or "none")
+        + ".",
+        "",
+        *found,
     ]
 
 

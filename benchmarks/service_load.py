@@ -93,7 +93,7 @@ def _measure(pages: list[Page], pid: int, log: Path, wrong: list[str], minutes: 
     print(f"| {' | '.join(HEADS)} |\n|{'---|' * len(HEADS)}", flush=True)
     began = time.monotonic()
     before = [_drawn(page) for page in pages]
-    minute, rates, driven = 0, list[float](), 0.0
+    minute, rates, driven, since = 0, list[float](), 0.0, began
     while time.monotonic() - began < 60.0 * minutes:
         pages[0].wait_for_timeout(10_000)
         now = [_drawn(page) for page in pages]
@@ -111,11 +111,11 @@ def _measure(pages: list[Page], pid: int, log: Path, wrong: list[str], minutes: 
         faults = [*wrong, *(line for line in log.read_text().splitlines() if '"level": "info"' not in line)]
         row = (
             str(minute), f"{sum(rates) / len(rates):.1f}", f"{min(rates):.1f}",
-            f"{60.0 - driven / len(pages):.0f}", f"{min(vehicles)}",
+            f"{time.monotonic() - since - driven / len(pages):.0f}", f"{min(vehicles)}",
             f"{own:.0f}", f"{others:.0f}", f"{heap:.0f}", str(len(faults[1:])),
         )  # fmt: skip
         print(f"| {' | '.join(row)} |", flush=True)
-        rates, driven = [], 0.0
+        rates, driven, since = [], 0.0, time.monotonic()
     for fault in [*wrong][:10]:
         print(fault)
 

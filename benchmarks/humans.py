@@ -4,9 +4,9 @@
     python -m benchmarks.humans --taken-away [--episodes 30]
 
 The first drives the same test seeds in every world, each in the demand of `DEMAND`, and goes on where it
-stopped; further policies may be added later. The second, on tuning seeds, drives AVs that always ask for more
-speed, and takes the parts of the car's answer to who follows away, one by one. Each writes its own part of
-docs/results/humans.md.
+stopped, also with more episodes (in blocks of 20) or further policies. The second, on tuning seeds, drives
+AVs that always ask for more speed, takes the parts of the car's answer to who follows away, one by one, and
+prints what comes of it; the first writes its table into docs/results/humans.md.
 """
 
 from __future__ import annotations
@@ -43,6 +43,7 @@ DEMAND = {
     "highway": "dense",
 }
 LEVEL, IDM = "stress", "idm"
+BLOCK = 20  # seeds that are driven together
 COLUMNS = (
     *("world", "demand", "pairs", "policy", "an AV in a collision", "idm", "difference, pp", "p"),
     *("an AV caused one", "distance of all, m", "more than idm, m", "hard brakings of AVs", "idm"),
@@ -101,11 +102,12 @@ def taken_away(episodes: int) -> list[str]:
     return lines
 
 
-def rows_of(folder: Path, policy: str) -> dict[tuple[str, int], Row]:
-    """(World, seed) -> row, of the demands of `DEMAND`."""
+def rows_of(runs: Path, policy: str) -> dict[tuple[str, int], Row]:
+    """(World, seed) -> row, of the demands of `DEMAND`, from all run folders below `runs`."""
     return {
         (str(row["scenario"]), int(row["seed"])): row
-        for row in run_folder.read(folder).rows
+        for store in sorted(runs.glob("*/store.sqlite"))
+        for row in run_folder.read(store.parent).rows
         if (row["policy"], row["errors"], row["status"]) == (policy, LEVEL, OK)
         and row["demand"] == DEMAND[str(row["scenario"])]
     }
@@ -140,34 +142,41 @@ def _counted(hits: int, count: int) -> str:
     return f"{hits}: {statistics.share(hits, count).text(1, 100.0)} %"
 
 
+def drive(policy: str, demand: str, seeds: range, runs: Path, workers: str) -> None:
+    """These episodes in all worlds of this demand; a run folder of their own, which is gone on with."""
+    worlds = [word for name, d in DEMAND.items() if d == demand for word in ("--scenario", name)]
+    which = ["--demand", demand, "--policy", policy, "--preset", Preset.LAWFUL, "--errors", LEVEL]
+    folder = runs / f"{demand}-{policy}-{seeds.start}"
+    running = ["--seeds", f"{seeds.start}:{seeds.stop}", "--no-report", "--workers", workers]
+    code = cosim(["evaluate", *worlds, *which, *running, "--resume", "--out", str(folder)])
+    if code:
+        raise SystemExit(code)
+
+
 def paired(policies: Sequence[str], episodes: int, runs: Path, workers: str) -> list[str]:
-    """Drive what is missing; a line a world and policy, and one of all together."""
-    seeds = f"{FIRST_TEST_SEED}:{FIRST_TEST_SEED + episodes}"
-    wanted = [word for name in (IDM, *policies) for word in ("--policy", name)]
-    for demand in dict.fromkeys(DEMAND.values()):
-        worlds = [w for name, d in DEMAND.items() if d == demand for w in ("--scenario", name)]
-        which = [*worlds, "--demand", demand, *wanted, "--preset", Preset.LAWFUL, "--errors", LEVEL]
-        running = ["--seeds", seeds, "--resume", "--no-report", "--workers", workers]
-        code = cosim(["evaluate", *which, *running, "--out", str(runs / demand)])
-        if code:
-            raise SystemExit(code)
-    rows = {
-        name: {key: row for d in set(DEMAND.values()) for key, row in rows_of(runs / d, name).items()}
-        for name in (IDM, *policies)
-    }
+    """Drive what is missing, block by block; a line a world and policy, and one of all together."""
+    for first in range(FIRST_TEST_SEED, FIRST_TEST_SEED + episodes, BLOCK):
+        seeds = range(first, first + BLOCK)
+        for policy in (IDM, *policies):
+            held = rows_of(runs, policy)
+            for demand in dict.fromkeys(DEMAND.values()):
+                worlds = [world for world, d in DEMAND.items() if d == demand]
+                if any((world, seed) not in held for world in worlds for seed in seeds):
+                    drive(policy, demand, seeds, runs, workers)
+    rows = {name: rows_of(runs, name) for name in (IDM, *policies)}
     lines = [markdown_row(COLUMNS), markdown_row(["---"] * len(COLUMNS))]
     for policy in policies:
         lines += [markdown_row(line(w, policy, rows[policy], rows[IDM])) for w in (*DEMAND, "")]
-    return [f"Seeds {seeds}.", "", *lines]
+    return lines
 
 
 def main() -> None:
-    """Make one part of the page."""
+    """Make the page's table, or print the other one."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--taken-away", action="store_true")
-    parser.add_argument("--episodes", type=int, default=None)
+    parser.add_argument("--episodes", type=int, help="a world; default 400, of --taken-away 30")
     parser.add_argument("--policy", nargs="+", default=["vfn-p"])
     parser.add_argument("--runs", type=Path, default=Path("runs/humans"), help="where episodes are kept")
     parser.add_argument("--workers", default="2")
@@ -175,7 +184,6 @@ def main() -> None:
     args = parser.parse_args()
     if args.taken_away:
         lines = taken_away(args.episodes or 30)
-        fill(args.page, "taken away", lines)
     else:
         lines = paired(args.policy, args.episodes or 400, args.runs, args.workers)
         fill(args.page, "paired", lines)

@@ -20,6 +20,7 @@ from benchmarks.tables import markdown_row, write_page
 from cosim.errors import CosimError
 from cosim.learning.configuration import configuration
 from cosim.learning.train_encoder import gather
+from cosim.seeding import FIRST_TEST_SEED
 from policy.checkpoint import SHIPPED
 from policy.inputs.tensors import apart, to_numpy
 from policy.training import sight
@@ -27,7 +28,6 @@ from policy.training.config import agent_config
 from policy.training.sight import ACTIONS, BANDS, LANES, MISSION, READINGS, Seen
 from sumo_scenarios import names
 
-FIRST = 200_000  # of the test seeds
 GROUPS = {
     "Lanes, perceived frames": (LANES, False),
     "Own frame, perceived frames": (BANDS, False),
@@ -44,7 +44,7 @@ def page(found: Seen, readings: np.ndarray, worlds: Sequence[str], drives: int, 
     counts = ", ".join(f"{w} {int((found.world == k).sum()):,}" for k, w in enumerate(worlds))
     lines = ["# What the encoder sees", "", f"Made by `{command}`.", ""]
     lines += [
-        f"{drives} drives of every demand, seeds from {FIRST}, half of them with humans who err,",
+        f"{drives} drives of every demand, seeds from {FIRST_TEST_SEED}, half of them with humans who err,",
         "AVs driven by SUMO and by random actions that the prioritizer allows. R2 of what the encoder",
         "reads off one map, with nothing else beside it: 1 is all, 0 no more than the mean of the world.",
         f"Blank: the same everywhere in that world. Frames: {counts}; every second one is a predicted",
@@ -76,7 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     file, worlds = configuration("compact").file, list(names())
     try:
         network = sight.load(args.weights, file.encoder)
-        seeds = range(FIRST, FIRST + args.drives)
+        seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + args.drives)
         found = gather(agent_config("vfn-p", file), file.sight, worlds, seeds, args.workers, "drives")
         with torch.inference_mode():
             parts = [found.maps[k : k + 256] for k in range(0, len(found.maps), 256)]

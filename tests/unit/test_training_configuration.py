@@ -19,7 +19,7 @@ def written(folder: Path, name: str, text: str) -> str:
     return str(file)
 
 
-@pytest.mark.parametrize("name", ["compact", "maps", "paper", "smoke"])
+@pytest.mark.parametrize("name", ["compact", "maps", "paper", "rewards", "smoke"])
 def test_what_ships_can_be_read_and_written_whole(name: str, tmp_path: Path) -> None:
     found = configuration(name)
     whole = written(tmp_path, "whole", yaml.safe_dump(found.values))
@@ -70,3 +70,12 @@ def test_a_network_of_maps_alone_refuses_channels_that_it_cannot_read(tmp_path: 
     assert agent_config("vfn-p", file).vfn.channels == 3
     with pytest.raises(BadInput, match=r"observation\.channels='av, hv, road': conv2d-dqn sees maps alone"):
         agent_config("conv2d-dqn", file)
+
+
+@pytest.mark.parametrize("name", ["paper", "rewards"])
+def test_where_no_demonstrator_is_promised_none_drives_is_imitated_or_chooses_samples(name: str) -> None:
+    file = configuration(name).file
+    training = file.training
+    assert not file.explore.advised
+    assert max(training.guided) == training.ddqn.imitation == training.warm_up == 0
+    assert training.replay.yielding == training.replay.correcting == 0.0

@@ -22,6 +22,7 @@ from pathlib import Path
 from sumo_scenarios import names
 
 RESULTS = Path("docs/results")
+LEARNED = "docs/results/trainings/rewards-0"
 PREDICTED = (  # what `cosim bench predict` leaves of figures
     *("position_error.png", "map_error.png", "hpn_training.png"),
     *("data/position_error.csv", "data/interval_coverage.csv", "data/map_error.csv", "data/map_gain.csv"),
@@ -126,6 +127,13 @@ def seeing(place: Place) -> list[list[str]]:
     ]
 
 
+def learned(place: Place) -> list[list[str]]:
+    """What the network that learned from rewards alone does."""
+    flags = ["--errors", "none", "--worlds", "merge"] if place.small else []
+    flags += ["--episodes", "1" if place.small else "10", "--runs", str(place.work / "learned_runs")]
+    return [["benchmarks.learned", LEARNED, *flags, "--out", str(place.out / "learned.md")]]
+
+
 def behaviors(place: Place) -> list[list[str]]:
     """How faithfully LC2013 drives Table II."""
     flags = ["--report", "--scale", "0.002" if place.small else "1"]
@@ -186,6 +194,7 @@ PAGES = (
         drop=("*.md", "*.png", "*.csv"),
     ),
     Page("seeing", seeing, ("seeing.md",)),
+    Page("learned", learned, ("learned.md",)),
     Page("real_nets", real_nets, ("real_nets.md",)),
     Page("behaviors", behaviors, ("behaviors.md",)),
     Page(

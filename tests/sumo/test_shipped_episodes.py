@@ -51,3 +51,13 @@ def test_they_are_of_an_unguarded_fleet_without_anything_of_a_machine() -> None:
     assert {row["status"] for row in run.rows} == {"ok"}
     assert not {"timings", "total_s"} & set(run.rows[0])
     assert '"/' not in (FOLDER / shipped.MANIFEST).read_text()  # no path of whoever drove them
+
+
+def test_what_collisions_tell_today_besides_is_no_difference() -> None:
+    row = {"key": "k", "policy": "p", "scenario": "w", "demand": "d", "seed": 1, "status": "ok"}
+    before = row | {"collision_list": '[{"collider": "a", "victim": "b"}]'}
+    today = row | {"collision_list": '[{"collider": "a", "victim": "b", "human_error_involved": false}]'}
+    other = row | {"collision_list": '[{"collider": "b", "victim": "a", "human_error_involved": false}]'}
+    assert episodes._differences(before, today) == []
+    assert len(episodes._differences(before, other)) == 1
+    assert len(episodes._differences(before, row | {"collision_list": "[]"})) == 1

@@ -32,7 +32,7 @@ def test_every_measured_page_is_rebuilt_and_not_measured_twice(
 
 def test_every_page_figure_and_picture_of_the_results_is_made_by_make_results() -> None:
     driven = [job.name for job in JOBS] + [learning.NAME]
-    pages = {f"{name}.md" for name in driven} | {"README.md"}
+    pages = {f"{name}.md" for name in driven} | {"README.md", "humans.md"}  # its table is filled in place
     pages |= {file for page in measured.PAGES for file in page.files if file.endswith(".md")}
     tables = {f"data/{name}.csv" for name in driven}
     tables |= {file for page in measured.PAGES for file in page.files if file.endswith(".csv")}

@@ -34,9 +34,9 @@ SAID_FIRST = (
     "use their maps, past or predicted: what a map shows changes none of their choices, or hardly one",
     "(`docs/results/attribution.md`, by `cosim bench attribution --policy vfn-p --scenario merge --demand",
     "contested --seeds 150000:150006 --out DIR`). So `vfn-p` against `vfn` does not measure what predicted",
-    "maps are worth. All value networks learned from a scripted demonstrator (`docs/training.md`); none was",
-    "trained on rewards alone. On real networks with signals the preset `unguarded` drives unlawfully,",
-    "through red lights and faster than lanes allow.",
+    "maps are worth. All of them learned from a scripted demonstrator (`docs/training.md`); what a network",
+    "learns from rewards alone, looking at its maps, stands in `docs/results/learned.md`. On real networks",
+    "with signals the preset `unguarded` drives unlawfully, through red lights and faster than lanes allow.",
 )
 STYLE: Any = {"svg.fonttype": "none", "svg.hashsalt": "cosim", "font.size": 9.0}  # equal figures, equal file
 

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from benchmarks.tables import markdown_row, write_page
 from cosim.errors import CosimError
@@ -22,7 +21,6 @@ from cosim.learning.configuration import configuration
 from cosim.learning.train_encoder import gather
 from cosim.seeding import FIRST_TEST_SEED
 from policy.checkpoint import SHIPPED
-from policy.inputs.tensors import apart, to_numpy
 from policy.training import sight
 from policy.training.config import agent_config
 from policy.training.sight import ACTIONS, BANDS, LANES, MISSION, READINGS, Seen
@@ -78,11 +76,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         network = sight.load(args.weights, file.encoder)
         seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + args.drives)
         found = gather(agent_config("vfn-p", file), file.sight, worlds, seeds, args.workers, "drives")
-        with torch.inference_mode():
-            parts = [found.maps[k : k + 256] for k in range(0, len(found.maps), 256)]
-            readings = np.concatenate([to_numpy(network(apart(torch.from_numpy(maps)))) for maps in parts])
         command = f"python -m benchmarks.seeing --drives {args.drives}"
-        write_page(args.out, page(found, readings, worlds, args.drives, command))
+        write_page(args.out, page(found, sight.read_all(network, found.maps), worlds, args.drives, command))
     except CosimError as error:
         print(f"seeing: {error}", file=sys.stderr)
         return error.exit_code

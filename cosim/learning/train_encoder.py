@@ -143,7 +143,7 @@ def train(args: argparse.Namespace) -> int:
             task, training.loop, folder, layout=layout, resume=args.resume, progress=progress
         )
     weights = folder / "encoder.safetensors"
-    explained = sight.explained(checked.readings, task.read_all(checked.maps))
+    explained = sight.explained(checked.readings, sight.read_all(task.network, checked.maps, args.device))
     measured = {"R2 on tuning seeds": {name: round(value, 3) for name, value in explained.items()}}
     sight.save(weights, task.network, measured, about)
     supervised.write_log(weights.with_suffix(".csv"), log)

@@ -18,8 +18,9 @@ LOOK_AHEAD = np.array([20.0, 50.0, 100.0])  # m, where the candidate centre line
 FAR = 200.0  # m: lane ends and conflict zones further away are all alike
 NEAR = 100.0  # m: neighbours further away are
 FAST = 30.0  # m/s
+OWN = 7  # numbers of the command, before the lanes
 PER_LANE = 3 + 2 * len(LOOK_AHEAD) + 4
-SITUATION_INPUTS = 7 + 3 * PER_LANE + 6
+SITUATION_INPUTS = OWN + 3 * PER_LANE + 6
 
 
 def situation(histories: Sequence[History], road: RoadMap, shared: bool) -> Floats32:

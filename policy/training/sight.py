@@ -17,7 +17,8 @@ import torch
 from cosim.seeding import generator
 from cosim.types import IS_MISSION, Bytes, Floats, Floats32, Ints, MetaAction
 from policy import checkpoint
-from policy.inputs.situation import PER_LANE
+from policy.agents.approaches import shipped
+from policy.inputs.situation import OWN, PER_LANE
 from policy.inputs.tensors import KINEMATIC_SCALE, apart, to_numpy
 from policy.networks.frame_encoder import EncoderConfig, Sight
 from policy.networks.seeded import first_weights
@@ -44,7 +45,6 @@ LANES = tuple(
 ACTIONS = tuple(f"time to collision, {action.name.lower()}" for action in MetaAction)
 READINGS = (*BANDS, *MISSION, *LANES, *ACTIONS)
 _OF_LANE = (0, 1, 2, *range(PER_LANE - 4, PER_LANE))  # of `policy.inputs.situation`'s numbers of a lane
-_OWN = 7  # of its numbers come before the lanes
 
 
 class Seen(NamedTuple):
@@ -109,7 +109,7 @@ def bands(kinematics: Floats) -> Floats:
 
 def lanes(situation: Floats32) -> Floats32:
     """[n,SITUATION_INPUTS] -> [n,LANES]: what a map shows of it."""
-    each = situation[:, _OWN : _OWN + 3 * PER_LANE].reshape(len(situation), 3, PER_LANE)[..., _OF_LANE]
+    each = situation[:, OWN : OWN + 3 * PER_LANE].reshape(len(situation), 3, PER_LANE)[..., _OF_LANE]
     return np.asarray(each.reshape(len(situation), -1), np.float32)
 
 
@@ -180,19 +180,24 @@ class SightTask(Task):
         """See `Task.losses`; each reading's error counts in units of its own variance."""
         wanted = torch.from_numpy(batch.readings).to(self._device)
         known = wanted.isfinite()
-        error = (self.read(batch.maps) - wanted.nan_to_num()) ** 2 * known * self._weight
+        error = (
+            (read(self.network, batch.maps, self._device) - wanted.nan_to_num()) ** 2 * known * self._weight
+        )
         return {"loss": error.sum() / known.sum().clamp_min(1)}
 
-    def read(self, maps: Bytes) -> torch.Tensor:
-        """Readings [n,READINGS] of maps [n,C,H,W]."""
-        planes = apart(torch.from_numpy(maps).to(self._device))
-        out: torch.Tensor = self.network(planes.contiguous(memory_format=torch.channels_last))
-        return out
 
-    def read_all(self, maps: Bytes) -> Floats32:
-        """`read` of many, as an array."""
-        with torch.inference_mode():
-            return np.concatenate([to_numpy(self.read(maps[k : k + 256])) for k in range(0, len(maps), 256)])
+def read(network: Sight, maps: Bytes, device: str = "cpu") -> torch.Tensor:
+    """Readings [n,READINGS] of maps [n,C,H,W]."""
+    planes = apart(torch.from_numpy(maps).to(device))
+    out: torch.Tensor = network(planes.contiguous(memory_format=torch.channels_last))
+    return out
+
+
+def read_all(network: Sight, maps: Bytes, device: str = "cpu") -> Floats32:
+    """`read` of many, as an array."""
+    with torch.inference_mode():
+        parts = [read(network, maps[k : k + 256], device) for k in range(0, len(maps), 256)]
+        return np.concatenate(list(map(to_numpy, parts)))
 
 
 def save(path: Path, network: Sight, measured: Mapping[str, Any], data: Mapping[str, Any]) -> None:
@@ -209,8 +214,7 @@ def load(path: Path, config: EncoderConfig) -> Sight:
 
 def encoder(name: str, config: EncoderConfig) -> dict[str, torch.Tensor]:
     """The state of an encoder that ships, or of a file. Raises BadInput, WeightsMismatch."""
-    shipped = checkpoint.SHIPPED / f"{name}.safetensors"
-    return load(shipped if shipped.is_file() else Path(name), config).encoder.state_dict()
+    return load(shipped(name) or Path(name), config).encoder.state_dict()
 
 
 def _layout(config: EncoderConfig) -> dict[str, Any]:

@@ -109,10 +109,10 @@ def test_it_learns_to_read_a_gap_off_the_map_and_nothing_off_an_empty_one(tmp_pa
     for number in range(250):
         task.update(number)
     unseen = drawn(200)
-    r2 = sight.explained(unseen.readings, task.read_all(unseen.maps))
+    r2 = sight.explained(unseen.readings, sight.read_all(task.network, unseen.maps))
     assert set(r2) == {"gap ahead, own band"}, "what is never known has no R2"
     assert r2["gap ahead, own band"] > 0.8
-    blind = sight.explained(unseen.readings, task.read_all(np.zeros_like(unseen.maps)))
+    blind = sight.explained(unseen.readings, sight.read_all(task.network, np.zeros_like(unseen.maps)))
     assert blind["gap ahead, own band"] < 0.1, "it reads the map"
     sight.save(tmp_path / "e.safetensors", task.network, {}, {})
     again = sight.load(tmp_path / "e.safetensors", SMALL)

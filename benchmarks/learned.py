@@ -80,6 +80,12 @@ def against(rows: Mapping[Arm, Mapping[int, Row]], first: Arm, other: Arm) -> st
     return f"- less {other[0]} at {other[1]:g} degrees ({len(seeds)} pairs): {'; '.join(parts)}."
 
 
+def drivers(runs: Path) -> str:
+    """Who drives beside the AVs."""
+    rows = run_folder.read(runs / MINE).rows
+    return ", ".join(sorted({f"{row['behavior']} drivers (`{row['driver_model']}`)" for row in rows}))
+
+
 def page(runs: Path, policy: str, levels: Sequence[str], about: Sequence[str]) -> list[str]:
     """The Markdown page of whatever has been driven."""
     name = label(read(policy).text)
@@ -140,7 +146,8 @@ def main() -> None:
         if code:
             raise SystemExit(code)
     about = [
-        f"`{args.demand}`, seeds {seeds}, preset `lawful`, in the worlds with a mission vehicle.",
+        f"`{args.demand}`, {drivers(args.runs)}, seeds {seeds}, preset `lawful`, in the worlds with a mission"
+        " vehicle.",
         "Shares with Wilson's, means and paired differences with bootstrap and Tango's 95 % intervals; p by",
         "McNemar, one test a world and figure, not corrected for how many there are.",
         "",

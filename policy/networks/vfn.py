@@ -13,7 +13,7 @@ from torch import nn
 from torch.nn import functional
 
 from cosim.types import IS_MISSION, MetaAction
-from policy.inputs.situation import SITUATION_INPUTS
+from policy.inputs.situation import OWN, SITUATION_INPUTS
 from policy.inputs.tensors import APART, KINEMATIC_INPUTS, apart, unit
 from policy.networks.extractors import Conv2dMaps, Conv3dMaps, EncodedMaps, FrameMemory, Strides
 from policy.networks.frame_encoder import EncoderConfig
@@ -35,6 +35,7 @@ class VfnConfig:
     joined: int = 256  # T, Table 1
     kinematic: int = 64  # features of a vehicle; 0: maps and phi are all the network sees, read by `apart`
     situation: int = 64  # width of the branch of what the ego knows besides; goes with `kinematic`
+    others: bool = True  # False: they are seen in maps alone; beside those stand the ego's own speed and command
     extractor: Literal["conv3d", "conv2d", "frames"] = (
         "conv3d"  # frames: a trained `FrameEncoder`, then all at once
     )
@@ -84,7 +85,8 @@ class VFN(nn.Module):
         super().__init__()
         self.config = c = config
         # without kinematics the same must be found in pixels
-        channels, read = (c.channels, unit) if c.kinematic else (APART, apart)
+        rows = c.kinematic if c.others else 0
+        channels, read = (c.channels, unit) if rows else (APART, apart)
         shape = c.frames, channels, c.height, c.width
         if c.extractor == "frames":
             self.maps: Any = EncodedMaps(c.frames, EncoderConfig(c.height, c.width, latent=c.latent))
@@ -93,18 +95,17 @@ class VFN(nn.Module):
         else:
             self.maps = Conv3dMaps(*shape, c.features, c.strides, read)
         self.hidden = nn.Linear(int(self.maps.flat), c.hidden)
-        self.kinematics = None
-        if c.kinematic:
-            self.kinematics = Vehicles(c.frames, c.kinematic)
+        self.kinematics = Vehicles(c.frames, rows) if rows else None
+        own = c.situation if c.kinematic else 0
+        if own:
             # a branch of its own: what few numbers say about the ego's way and command must not drown
             self.situation = nn.Sequential(
-                nn.Linear(SITUATION_INPUTS, c.situation),
+                nn.Linear(SITUATION_INPUTS if rows else OWN, c.situation),
                 nn.ReLU(),
                 nn.Linear(c.situation, c.situation),
                 nn.ReLU(),
             )
-        own = c.situation if c.kinematic else 0
-        self.joined = nn.Linear(c.hidden + 3 * c.kinematic + own + 2, c.joined)
+        self.joined = nn.Linear(c.hidden + 3 * rows + own + 2, c.joined)
         self.value = nn.Linear(c.joined, len(MetaAction))
         self.state = nn.Linear(c.joined, 1) if c.critic or c.dueling else None
         for head in (self.value, self.state) if self.state is not None else (self.value,):
@@ -136,6 +137,8 @@ class VFN(nn.Module):
             parts = [functional.relu(self.hidden(seen))]
         if self.kinematics is not None:
             parts += [self.kinematics(kinematics), self.situation(situation)]
+        elif self.config.kinematic:
+            parts.append(self.situation(situation[:, :OWN]))
         if keep is not None:
             parts = [part * keep[:, k : k + 1] for k, part in enumerate(parts)]
         return functional.relu(self.joined(torch.cat([*parts, phi], 1)))
@@ -157,7 +160,8 @@ class VFN(nn.Module):
             kinematics: [B,T,R,F+1] scaled, the mask last (`policy.inputs.tensors.kinematic_tensor`).
             situation: [B,SITUATION_INPUTS] (`policy.inputs.situation.situation`).
             phi: [B,2] cosine and sine of the SVO (`policy.inputs.tensors.svo_tensor`).
-            keep: [B,3] 1 or 0: the branches of maps, kinematics and situation, or zeros in place of each.
+            keep: [B,3] 1 or 0: the branches of maps, kinematics and situation, those there are, or zeros in
+                place of each.
 
         Returns:
             q: [B,5] value of each `MetaAction`.

@@ -19,7 +19,7 @@ from cosim.rewards import read as read_reward
 from cosim.scenario import ALWAYS, Scenario
 from cosim.scenario.manifest import POLICY_FILES, digests
 from cosim.scenario.sumo_outputs import drafts
-from cosim.types import EpisodeResult, Metric, ObservationConfig, Policy, Simulator
+from cosim.types import EpisodeResult, LooksAhead, Metric, ObservationConfig, Policy, Simulator
 from cosim.workers.determinism import make_torch_deterministic
 
 SimulatorFactory = Callable[[Scenario, Mapping[str, str], int], Simulator]  # ..., AV parameters, frames kept
@@ -61,6 +61,8 @@ class Host:
         self._policy_files = digests([*getattr(self.policy, "files", ()), *own])
         make_torch_deterministic()
         self.simulator = (simulator or sumo)(scenario, self.policy.av_parameters, wanted.frames)
+        if isinstance(self.policy, LooksAhead):
+            self.policy.looks_ahead(self.simulator.ahead)
         self.episode = Episode(scenario, self.simulator, wanted, measured)
 
     def policy_files(self) -> dict[str, str]:

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from enum import IntEnum
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -423,6 +423,17 @@ class Policy(Protocol):
         """One decision per AV it wants to command; an AV left out is driven by SUMO's IDM."""
 
 
+LookAhead = Callable[[int], Sequence[Snapshot]]  # so many frames ahead (`Simulator.ahead`)
+
+
+@runtime_checkable
+class LooksAhead(Protocol):
+    """A policy that asks the simulation itself what will come: an oracle, a planner with a perfect model."""
+
+    def looks_ahead(self, look: LookAhead) -> None:
+        """`look(n)`, once an episode has begun: the next n frames (`Simulator.ahead`)."""
+
+
 class Simulator(Protocol):
     """The world behind the loop: SUMO (`cosim.simulation.sumo`) or the in-memory fake."""
 
@@ -434,6 +445,12 @@ class Simulator(Protocol):
 
     def advance(self, commands: Sequence[Command]) -> tuple[tuple[Receipt, ...], tuple[Snapshot, ...]]:
         """Hold the commands for one decision; one snapshot per frame, the newest last."""
+
+    def ahead(
+        self, frames: int, commands: Sequence[Command] = (), *, errors: bool = False
+    ) -> tuple[Snapshot, ...]:
+        """What would come if the AVs went on as they are commanded, those of `commands` as these say; nothing
+        changes. `errors`: whether human errors that have not begun may begin."""
 
     def route(self, vehicle: str) -> tuple[str, ...]:
         """The edges the vehicle still has to drive, its present edge first (own route knowledge)."""

@@ -4,7 +4,7 @@ Nothing here changes how the agent drives: the plain network is asked on whole m
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from policy.networks.vfn import VFN
 
 ZEROED, PRESENT, OTHERS = "zeroed", "as at present", "another AV's"
 BLIND = "map branch", "its last layer zero"
+ORACLE = "prediction", "the fair oracle's"  # in closed loop alone: an agent of its own
 ANGLES = (0, 90)  # degrees that replace phi: the egoist's, and the other end
 
 
@@ -27,21 +28,21 @@ SUMS = ("decisions", "choices_changed", "unmasked_changed", "mean_abs_dq", "spre
 
 
 def questions(
-    states: States, past: int, kinematics: bool, only: tuple[str, str] | None = None
+    states: States, past: int, fields: Sequence[str], only: tuple[str, str] | None = None
 ) -> Iterator[tuple[str, str, Arguments]]:
     """Every replacement of every input, or `only` one: (input, replacement, what the network is asked with).
 
     Args:
         states: what B AVs that decide together see; the first `past` frames of maps and kinematics have been
             perceived, the others are predicted.
-        kinematics: whether the network takes kinematics and situation at all.
+        fields: what the network takes (`network_inputs`).
 
     Zeroed; as at present: the newest perceived frame in place of every other one; another AV's of the same
     instant: that of the next row, where there are at least two. Without maps the layer that reads the
     convolutions' output is as if its weights were zero (`VFN.forward`).
     """
     spans = {"past ": slice(past), "predicted ": slice(past, None), "all ": slice(None)}
-    for field in ("maps", "kinematics", "situation") if kinematics else ("maps",):
+    for field in fields:
         whole: torch.Tensor = getattr(states, field)
         ways = {ZEROED: torch.zeros_like(whole)}
         if field != "situation":
@@ -65,6 +66,12 @@ def questions(
         yield "phi", f"{angle} degrees", states._replace(phi=phi)
 
 
+def network_inputs(network: VFN) -> tuple[str, ...]:
+    """Which of `States` it takes, phi apart."""
+    kinematics = ("kinematics",) if network.kinematics is not None else ()
+    return ("maps", *kinematics, *(("situation",) if network.config.kinematic else ()))
+
+
 def answer(agent: PredictionAware, arguments: Arguments) -> Floats32:
     """The action values [B,A] that the agent's network gives."""
     with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=agent.config.bf16):
@@ -77,13 +84,13 @@ def replacements(network: VFN, past: int) -> list[tuple[str, str]]:
     Another AV's of the same instant is an input as the network knows them; zeros are none. Predictions are
     also replaced by the present.
     """
-    kinematics = network.kinematics is not None
-    fields = ("maps", "kinematics") if kinematics else ("maps",)
-    predicts = network.config.frames > past
-    found = [(f"all {field}" if predicts else field, OTHERS) for field in fields]
-    if predicts:
-        found += [(f"predicted {field}", how) for field in fields for how in (OTHERS, PRESENT)]
-    return [*found, *([("situation", OTHERS)] if kinematics else []), BLIND, ("phi", f"{ANGLES[0]} degrees")]
+    found, predicts = [], network.config.frames > past
+    for field in network_inputs(network):
+        whole = field if field == "situation" or not predicts else f"all {field}"
+        found.append((whole, OTHERS))
+        if whole != field:
+            found += [(f"predicted {field}", how) for how in (OTHERS, PRESENT)]
+    return [*found, BLIND, ("phi", f"{ANGLES[0]} degrees")]
 
 
 class Replaced(PredictionAware):
@@ -96,8 +103,8 @@ class Replaced(PredictionAware):
     def values(self, inputs: Inputs) -> Floats32:
         """The action values [B,A]; an AV that decides alone has no other's input and keeps its own."""
         if self._what is not None:
-            past, kinematics = self.observation.frames, self.vfn.kinematics is not None
-            for _, _, arguments in questions(inputs.states, past, kinematics, self._what):
+            past, fields = self.observation.frames, network_inputs(self.vfn)
+            for _, _, arguments in questions(inputs.states, past, fields, self._what):
                 return answer(self, arguments)
         return super().values(inputs)
 
@@ -114,9 +121,7 @@ class Questioned(PredictionAware):
         """As the agent's, after the questions."""
         states, plain = inputs.states, answer(self, inputs.states)
         chosen, ordered = self._actions(plain, inputs), np.sort(plain, 1)
-        for name, how, arguments in questions(
-            states, self.observation.frames, self.vfn.kinematics is not None
-        ):
+        for name, how, arguments in questions(states, self.observation.frames, network_inputs(self.vfn)):
             other = answer(self, arguments)
             same = np.array_equal(other, plain)  # spares the prioritizer
             sums = (
@@ -162,9 +167,9 @@ class Explainer:
         pair = [here, (here + 1) % len(agents)][: len(agents)]  # another AV's inputs are the next one's
         states = States(*(column[pair] for column in inputs.states))
         plain, found = answer(agent, states)[0], []
-        past, kinematics = agent.observation.frames, agent.vfn.kinematics is not None
+        past, fields = agent.observation.frames, network_inputs(agent.vfn)
         for what in replacements(agent.vfn, past):
-            for name, how, arguments in questions(states, past, kinematics, what):
+            for name, how, arguments in questions(states, past, fields, what):
                 row, action = answer(agent, arguments)[0], decisions[self.asked].action
                 if (np.argsort(row) != np.argsort(q[here])).any():  # else the prioritizer says the same
                     agent._asked, other = dict(before), q.copy()

@@ -22,7 +22,11 @@ from policy.safety import SafetyConfig
 
 PERCEPTION = 125.0  # m, what an AV's own sensors reach (definitions.md)
 # options that shipped episodes do not name: their defaults are what was done without them
-NEWER = {"observation": ("road_version", "signal_timing"), "safety": ("assisted",), "vfn": ("latent", "others")}
+NEWER = {
+    "observation": ("road_version", "signal_timing"),
+    "safety": ("assisted",),
+    "vfn": ("latent", "others"),
+}
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,8 +21,9 @@ from cosim.report.statistics import mean, paired_mean, paired_share, share
 from cosim.scenario.episode_id import EpisodeId
 from cosim.workers.engines import LocalEngine
 from cosim.workers.tasks import Progress
+from policy.agents.oracle import Oracle
 from policy.agents.prediction_aware import PredictionAware
-from policy.attribution import SUMS, Questioned, Replaced, replacements
+from policy.attribution import ORACLE, SUMS, Questioned, Replaced, replacements
 
 PAGE, TABLE, PICTURE = "attribution.md", "attribution.csv", "attribution.png"
 DRIVEN = "closed_loop.csv"
@@ -72,9 +73,11 @@ class Replacing(EpisodeRunner):
         super().__init__()
         self._what = what
 
-    def policy(self, case: EpisodeId) -> Replaced:
+    def policy(self, case: EpisodeId) -> PredictionAware:
         """The policy of `case`, with that input replaced."""
         agent = questioned(case.policy)
+        if self._what == ORACLE:
+            return Oracle(agent.name, agent.config)
         return Replaced(agent.name, agent.config, self._what)
 
 
@@ -122,7 +125,7 @@ def closed(plan: Plan, workers: int = 1) -> list[dict[str, Any]]:
     for cell in plan.cells:
         agent = questioned(cell.case.policy)
         tasks = [one.task(case) for one, case in plan.cases() if one is cell]
-        for what in (None, *replacements(agent.vfn, agent.observation.frames)):
+        for what in (None, *replacements(agent.vfn, agent.observation.frames), ORACLE):
             name, how = what or ("nothing", "")
             engine = LocalEngine(Replacing, (what,), workers=workers)
             for driven in spread(engine, tasks, f"{name} {how}".strip()):

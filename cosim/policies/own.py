@@ -10,7 +10,16 @@ from cosim.errors import BadInput
 from cosim.files.code import guarded
 from cosim.observation.view import View, views
 from cosim.scenario.policy_name import PolicyName
-from cosim.types import COMPACT, Decision, History, MetaAction, ObservationConfig, PolicyContext
+from cosim.types import (
+    COMPACT,
+    Decision,
+    History,
+    LookAhead,
+    LooksAhead,
+    MetaAction,
+    ObservationConfig,
+    PolicyContext,
+)
 
 NEEDED = ("observation", "reset", "decide")  # of `cosim.types.Policy`; the rest has defaults
 ACTIONS = f"0 to {len(MetaAction) - 1}"
@@ -46,6 +55,11 @@ class OwnPolicy:
             if not path.is_file():
                 raise self._wrong("no such file", f"{name.member}.files", str(path))
         self.files = tuple(f for f in (file, *more) if f is not None)
+
+    def looks_ahead(self, look: LookAhead) -> None:
+        """His, if he has one (`cosim.types.LooksAhead`)."""
+        if isinstance(self._inner, LooksAhead):
+            guarded(self._place, "looks_ahead", self._inner.looks_ahead, look)
 
     def reset(self, context: PolicyContext) -> None:
         """A new episode begins."""

@@ -1,5 +1,6 @@
 """An in-memory Simulator without SUMO: a straight road, IDM followers, commanded AVs. For your tests."""
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -71,13 +72,25 @@ class FakeSimulator:
             if v.id not in named:
                 v.target = None  # handed back to IDM, as in SUMO
         receipts = tuple(self._take(c) for c in commands)
-        per_frame = round(self._timing.frame / self._timing.step)
-        frames = []
-        for k in range(1, round(self._timing.decision / self._timing.step) + 1):
-            self._step()
-            if k % per_frame == 0:
-                frames.append(self._snapshot())
-        return receipts, tuple(frames)
+        return receipts, self._drive(round(self._timing.decision / self._timing.frame))
+
+    def ahead(
+        self, frames: int, commands: Sequence[Command] = (), *, errors: bool = False
+    ) -> tuple[Snapshot, ...]:
+        """The next frames; nobody errs."""
+        other = copy.copy(self)
+        other._vehicles, other._hit = copy.deepcopy(self._vehicles), set(self._hit)
+        for command in commands:
+            other._take(command)
+        return other._drive(frames)
+
+    def _drive(self, frames: int) -> tuple[Snapshot, ...]:
+        found = []
+        for _ in range(frames):
+            for _ in range(round(self._timing.frame / self._timing.step)):
+                self._step()
+            found.append(self._snapshot())
+        return tuple(found)
 
     def route(self, vehicle: str) -> tuple[str, ...]:
         """The one edge there is."""

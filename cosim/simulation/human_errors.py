@@ -117,6 +117,10 @@ class HumanErrors:
         """The counted time begins: the first trials are a second later."""
         self._next = now + 1.0
 
+    def hold(self) -> None:
+        """No further error begins."""
+        self._next = None
+
     def depart(self, name: str, body: Body) -> None:
         """A vehicle has departed."""
         if body.kind == Kind.AV:

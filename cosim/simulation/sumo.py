@@ -4,6 +4,7 @@ import re
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from cosim.simulation.convert import Body, SnapshotReader, read_road, struggling
 from cosim.simulation.drivers import Drivers
 from cosim.simulation.entries import EntryWatcher
 from cosim.simulation.fleet import Fleet
+from cosim.simulation.fork import forked
 from cosim.simulation.human_errors import HumanErrors
 from cosim.simulation.stderr import SumoStderr
 from cosim.simulation.xerces import keep_initialized
@@ -152,6 +154,38 @@ class SumoSimulator:
                     frames.append(self._snapshot())
             receipts = self._commander.confirm(receipts, commands)
         return receipts, tuple(frames)
+
+    def ahead(
+        self, frames: int, commands: Sequence[Command] = (), *, errors: bool = False
+    ) -> tuple[Snapshot, ...]:
+        """The next `frames` frames if every AV went on as it is commanded, those of `commands` as these say.
+
+        SUMO drives on in a copy of this process (`cosim.simulation.fork`); here nothing changes. `errors`:
+        whether human errors that have not begun may begin; those under way go on.
+
+        Raises SimulationError, and BadInput where the copy would write SUMO's outputs too, or speak to the
+        programs that share the simulation.
+        """
+        if self._outputs or self._SHARED:
+            why = "other programs share it" if self._SHARED else "SUMO writes outputs of its own"
+            raise BadInput(f"nobody can look ahead in this simulation: {why}", file=self._scenario.config)
+        return forked(partial(self._drive_on, frames, commands, errors))
+
+    def _drive_on(self, frames: int, commands: Sequence[Command], errors: bool) -> tuple[Snapshot, ...]:
+        """In the copy."""
+        if self._errors is not None and not errors:
+            self._errors.hold()
+        found = []
+        with self._stderr:
+            now = sumo.simulation.getTime()
+            for command in commands:
+                self._commander.take(command, now)
+            for k in range(1, frames * self._steps_per_frame + 1):
+                self._commander.drive()
+                self._step()
+                if k % self._steps_per_frame == 0:
+                    found.append(self._snapshot())
+        return tuple(found)
 
     def route(self, vehicle: str) -> tuple[str, ...]:
         """The edges still ahead, the present one first."""

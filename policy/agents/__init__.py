@@ -45,6 +45,7 @@ POLICIES: dict[str, Callable[[], Policy]] = {
     "random": partial(_made, "random", "Random"),
     "altruist-rule": partial(_made, "altruist_rule", "AltruistRule"),
     **{name: partial(_made, "prediction_aware", "PredictionAware", name) for name in APPROACHES},
+    "vfn-p-oracle": partial(_made, "oracle", "Oracle", "vfn-p"),  # its predictions come true
 }
 
 

@@ -35,10 +35,8 @@ class VfnConfig:
     joined: int = 256  # T, Table 1
     kinematic: int = 64  # features of a vehicle; 0: maps and phi are all the network sees, read by `apart`
     situation: int = 64  # width of the branch of what the ego knows besides; goes with `kinematic`
-    others: bool = True  # False: they are seen in maps alone; beside those stand the ego's own speed and command
-    extractor: Literal["conv3d", "conv2d", "frames"] = (
-        "conv3d"  # frames: a trained `FrameEncoder`, then all at once
-    )
+    others: bool = True  # False: they are seen in maps alone, beside the ego's own speed and command
+    extractor: Literal["conv3d", "conv2d", "frames"] = "conv3d"  # frames: each by a trained `FrameEncoder`
     latent: int = 128  # numbers a frame becomes (extractor `frames`)
     dueling: bool = True  # q = state value + advantage: how good the moment is drowns what an action changes
     critic: bool = False  # True: action preferences and a state value (A2C), not action values

@@ -71,6 +71,7 @@ def test_driving_with_an_input_replaced_is_compared_with_driving_by_all_of_them(
         ("situation", "another AV's"),
         ("map branch", "its last layer zero"),
         ("phi", "0 degrees"),
+        ("prediction", "the fair oracle's"),
     ]
     assert {row["seed"] for row in rows} == {"150000"}
     text = capsys.readouterr().out

@@ -90,3 +90,16 @@ def test_the_road_is_straight_lanes_side_by_side_from_the_right() -> None:
     assert [lane.shape[0, 1] for lane in road.lanes] == pytest.approx([1.6, 4.8, 8.0])
     assert [(lane.left, lane.right) for lane in road.lanes] == [(1, -1), (2, 0), (-1, 1)]
     assert road.lanes[0].width == LANE_WIDTH
+
+
+def test_looking_ahead_tells_what_comes_and_changes_nothing() -> None:
+    world = FakeSimulator([FakeVehicle("a", 100.0, 0, 20.0, is_av=True), FakeVehicle("h", 60.0, 0, 20.0)])
+    world.reset(0)
+    faster = Command("a", 28.0, 0, 0.4)
+    foreseen = world.ahead(4, [faster])
+    again = world.ahead(4, [faster])
+    came = drive(world, 0.8, faster)
+    for frame, same, real in zip(foreseen, again, came, strict=True):
+        assert (frame.x == same.x).all()
+        assert (frame.x == real.x).all()
+        assert frame.time == real.time

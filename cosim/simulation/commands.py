@@ -176,6 +176,13 @@ def hand_back(name: str) -> None:
     sumo.vehicle.setLaneChangeMode(name, SUMO_LANE_CHANGE_MODE)
 
 
+def force(name: str, accel: float, step: float) -> None:
+    """For one step of `step` s the vehicle accelerates by `accel` m/s2, whatever its own safety says."""
+    sumo.vehicle.setSpeedMode(name, SPEED_MODE[Preset.UNGUARDED])
+    sumo.vehicle.setDecel(name, MAX_DECEL)
+    sumo.vehicle.setSpeed(name, max(sumo.vehicle.getSpeed(name) + max(accel, -MAX_DECEL) * step, 0.0))
+
+
 def _forbidden(name: str, lane: str, offset: int) -> str | None:
     """Why the road does not let vehicle `name` on `lane` change by `offset` lanes; None if it does."""
     if lane.startswith(":"):

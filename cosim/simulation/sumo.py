@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import libsumo
@@ -23,7 +24,7 @@ from cosim.scenario.sumocfg import time_of
 from cosim.simulation.assistance import Assistance
 from cosim.simulation.backend import sumo
 from cosim.simulation.collisions import CollisionDetector, Wrecks
-from cosim.simulation.commands import Commander
+from cosim.simulation.commands import Commander, force
 from cosim.simulation.convert import Body, SnapshotReader, read_road, struggling_lanes
 from cosim.simulation.drivers import Drivers
 from cosim.simulation.entries import EntryWatcher
@@ -156,12 +157,18 @@ class SumoSimulator:
         return receipts, tuple(frames)
 
     def ahead(
-        self, frames: int, commands: Sequence[Command] = (), *, errors: bool = False
+        self,
+        frames: int,
+        commands: Sequence[Command] = (),
+        *,
+        errors: bool = False,
+        forced: Mapping[str, float] = MappingProxyType({}),
     ) -> tuple[Snapshot, ...]:
         """The next `frames` frames if every AV went on as it is commanded, those of `commands` as these say.
 
         SUMO drives on in a copy of this process (`cosim.simulation.fork`); here nothing changes. `errors`:
-        whether human errors that have not begun may begin; those under way go on.
+        whether human errors that have not begun may begin; those under way go on. `forced`: AVs that
+        accelerate by so many m/s2 (down to -`MAX_DECEL`), whatever they are commanded or their car would do.
 
         Raises SimulationError, and BadInput where the copy would write SUMO's outputs too, or speak to the
         programs that share the simulation.
@@ -169,9 +176,11 @@ class SumoSimulator:
         if self._outputs or self._SHARED:
             why = "other programs share it" if self._SHARED else "SUMO writes outputs of its own"
             raise BadInput(f"nobody can look ahead in this simulation: {why}", file=self._scenario.config)
-        return forked(partial(self._drive_on, frames, commands, errors))
+        return forked(partial(self._drive_on, frames, commands, errors, forced))
 
-    def _drive_on(self, frames: int, commands: Sequence[Command], errors: bool) -> tuple[Snapshot, ...]:
+    def _drive_on(
+        self, frames: int, commands: Sequence[Command], errors: bool, forced: Mapping[str, float]
+    ) -> tuple[Snapshot, ...]:
         """In the copy."""
         if self._errors is not None and not errors:
             self._errors.hold()
@@ -182,6 +191,8 @@ class SumoSimulator:
                 self._commander.take(command, now)
             for k in range(1, frames * self._steps_per_frame + 1):
                 self._commander.drive()
+                for name in forced.keys() & set(sumo.vehicle.getIDList()):
+                    force(name, forced[name], self._scenario.timing.step)
                 self._step()
                 if k % self._steps_per_frame == 0:
                     found.append(self._snapshot())

@@ -16,6 +16,7 @@ import argparse
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,7 @@ from cosim.learning.prediction_data import spread
 from cosim.report import statistics
 from cosim.rewards import RewardConfig
 from cosim.scenario.episode_id import EpisodeId
-from cosim.types import Floats32, MetaAction, Policy, PolicyContext
+from cosim.types import Floats32, MetaAction, Policy, PolicyContext, Preset
 from cosim.workers.engines import LocalEngine
 from cosim.workers.tasks import Progress, Task
 from policy.agents import make
@@ -44,7 +45,7 @@ from policy.training.config import agent_config
 from policy.training.explorer import Explorer
 
 DEMANDS = {"contested": "moderate", "dense": "mixed"}  # demand -> drivers
-COMPACT = configuration("compact").file
+COMPACT, REWARDS = (configuration(name).file for name in ("compact", "rewards"))
 TRIED = {
     "P: 1/d, a mission vehicle counts 1": RewardConfig(mission=1.0),
     "1/d, mission 20": RewardConfig(),
@@ -57,6 +58,7 @@ LEARNED = {
     "P's equation (6), defaults of `RewardConfig`: 1/d, mission 20": RewardConfig(),
     "T's equation (2), defaults: no decay, mission 20, own maneuvers cost": RewardConfig(variant="t"),
     "compact.yaml: no decay, 250 m, social 0.02, mission 150": COMPACT.reward,
+    f"rewards.yaml: the same, mission {REWARDS.reward.mission:g}": REWARDS.reward,
 }
 DEMONSTRATED_PHI, PHI = 60.0, 45.0  # degrees at which drives are paid
 WANTED, AGENT = "altruist-rule", "vfn-p"
@@ -178,7 +180,8 @@ def balance(worlds: Sequence[str], seeds: range, command: str, workers: int) -> 
 def by_way(worlds: Sequence[str], seeds: range, command: str, workers: int) -> list[str]:
     """Mean reward of every way of driving under every reward, and whether the wanted way earns most."""
     keys = list(itertools.product(WAYS, worlds, DEMANDS))
-    cases = [case_of(*key, PHI).with_seed(seed) for key in keys for seed in seeds]
+    cells = [replace(case_of(*key, PHI), preset=Preset.LAWFUL) for key in keys]
+    cases = [cell.with_seed(seed) for cell in cells for seed in seeds]
     found = driven(cases, LEARNED, PHI, workers)
     drives = {key: found[k * len(seeds) : (k + 1) * len(seeds)] for k, key in enumerate(keys)}
     lines = [
@@ -186,11 +189,10 @@ def by_way(worlds: Sequence[str], seeds: range, command: str, workers: int) -> l
         "",
         f"`{command}`:",
         f"all AVs drive one way, on the same {len(seeds)} tuning seeds a world and demand, `contested` among",
-        "moderate and `dense` among mixed drivers (`lc2013`, preset `unguarded`). Mean reward per AV and",
+        "moderate and `dense` among mixed drivers (`lc2013`, preset `lawful`). Mean reward per AV and",
         "decision at phi 45 degrees with bootstrap 95 % interval over episodes; the decisions that a crash",
-        "leaves undriven have earned nothing. Crawling is guarded by the safety prioritizer, `keep-lane` by",
-        "nobody; `idm`, and `altruist-rule` where it commands nothing, are driven by SUMO, so that their",
-        "maneuvers cost nothing under T's reward.",
+        "leaves undriven have earned nothing. `keep-lane` is `unguarded` always; `idm`, and `altruist-rule`",
+        "where it commands nothing, are driven by SUMO: their maneuvers cost nothing under T's reward.",
         f"The way that is wanted in `contested` is `{WANTED}`: the last line of each table says whether it",
         "earns more than the best of the other scripted ways (by mean), and how much, paired.",
         "",

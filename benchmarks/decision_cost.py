@@ -3,9 +3,9 @@
     python -m benchmarks.decision_cost [--avs 25 50 100] [--decisions 40] [--real] [--out FILE.md] [--profile]
 
 A grid of signalised junctions is built by netgenerate, and one vehicle in five is an AV: each drives a
-random walk of `WALK` edges, so that all of them stay on the road. SUMO drives everybody and `vfn-p` decides
+random walk of `WALK` edges, so that all of them stay on the road. SUMO drives everybody and the policy decides
 beside it (nothing is carried out), so that the traffic is the same whatever the policy is. Medians over
-decisions, in a process of its own. `--real`: A10KW of the `eclipse-sumo` package, driven by `vfn-p` for as
+decisions, in a process of its own. `--real`: A10KW of the `eclipse-sumo` package, driven by the policy for as
 long as at most 100 AVs are on the road. `--profile`: cProfile's table instead. Ratios are to a fixed piece of
 work that is timed between decisions.
 """
@@ -39,7 +39,7 @@ from cosim.seeding import TUNING_SEEDS
 from cosim.workers.memory import keep_freed_memory
 from cosim.workers.worker import Worker
 
-POLICY = "vfn-p"
+POLICY = "vfn-p-demonstrated"
 TARGET_MS = 4.0  # a decision, per AV
 AVS = (25, 50, 100)
 SHARE = 5  # one vehicle in so many is an AV

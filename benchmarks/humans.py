@@ -1,6 +1,6 @@
 """AVs of preset `lawful` among humans who err (`--errors stress`), beside plain `idm`.
 
-    python -m benchmarks.humans [--episodes 400] [--policy vfn-p ...] [--runs runs/humans] [--workers 2]
+    python -m benchmarks.humans [--episodes 400] [--policy NAME ...] [--runs runs/humans] [--workers 2]
     python -m benchmarks.humans --taken-away [--episodes 30]
 
 The first drives the same test seeds in every world, each in the demand of `DEMAND`, and goes on where it
@@ -177,7 +177,7 @@ def main() -> None:
     )
     parser.add_argument("--taken-away", action="store_true")
     parser.add_argument("--episodes", type=int, help="a world; default 400, of --taken-away 30")
-    parser.add_argument("--policy", nargs="+", default=["vfn-p"])
+    parser.add_argument("--policy", nargs="+", default=["vfn-p-demonstrated"])
     parser.add_argument("--runs", type=Path, default=Path("runs/humans"), help="where episodes are kept")
     parser.add_argument("--workers", default="2")
     parser.add_argument("--page", type=Path, default=PAGE)

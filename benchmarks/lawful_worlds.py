@@ -2,8 +2,8 @@
 
     python -m benchmarks.lawful_worlds [--episodes 100] [--runs runs/lawful] [--workers 2] [--out PAGE]
 
-`vfn-p` and `idm` drive `dense` from test seed 200,000 on; the same command goes on where it stopped. The
-episodes of `vfn-p` in `unguarded` ship (docs/results/episodes). Writes
+`vfn-p-demonstrated` drives `dense` from test seed 200,000 on; the same command goes on where it stopped. The
+episodes in `unguarded` ship (docs/results/episodes). Writes
 docs/results/lawful_worlds.md.
 """
 
@@ -24,7 +24,7 @@ from cosim.workers.tasks import OK
 
 PAGE = Path("docs/results/lawful_worlds.md")
 SHIPPED = Path("docs/results/episodes")
-FEWER, POLICY = 3.0, "vfn-p"  # how many times fewer hard brakings are asked for
+FEWER, POLICY = 3.0, "vfn-p-demonstrated"  # how many times fewer hard brakings are asked for
 COLUMNS = (
     "world", "episodes", "crashed", "hard brakings of AVs", "of it in unguarded", "distance of all, m",
     "less that in unguarded, m", "mission", "in unguarded", "interventions", "targets",
@@ -102,7 +102,7 @@ def main() -> None:
         [
             "# Our worlds in preset `lawful`",
             "",
-            f"`vfn-p` with the weights that ship, `dense`, mixed drivers (`lc2013`), seeds {seeds}; the same",
+            f"`{POLICY}`, `dense`, mixed drivers (`lc2013`), seeds {seeds}; the same",
             "seeds in `unguarded` (shipped episodes). There AVs drive up to the limit + 2 m/s, in `lawful`",
             "up to the limit: where the road is free that alone is a shorter way. Targets: no crash, a third",
             "of the hard brakings at most, the distance of all not below (interval).",

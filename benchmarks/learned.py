@@ -4,7 +4,7 @@
         [--seeds-from 200000] [--runs runs/learned] [--workers 2] [--out docs/results/learned.md]
 
 POLICY (a name, weights or a training's folder) drives at 60 degrees and at 0, beside `idm`, `altruist-rule`
-and the demonstrated `vfn-p` at 60 degrees, in preset `lawful`. The same command goes on where it stopped.
+and `vfn-p-demonstrated` at 60 degrees, in preset `lawful`. The same command goes on where it stopped.
 """
 
 import argparse
@@ -24,7 +24,7 @@ PAGE = Path("docs/results/learned.md")
 WORLDS = ("merge", "exit", "roundabout", "intersection")  # those with a mission vehicle
 SVO = 60
 MINE, THEIRS = "network", "others"  # folders of runs
-OTHERS = ("idm", "altruist-rule", "vfn-p")
+OTHERS = ("idm", "altruist-rule", "vfn-p-demonstrated")
 COLUMNS = (
     "arm", "episodes", "mission vehicle served", "its time, s", "episodes with an AV in a collision",
     "AV-caused", "distance of the mission vehicle, m", "of AVs, m", "of all, m", "hard brakings of AVs",

@@ -115,8 +115,14 @@ def reward_by_driving(place: Place) -> list[list[str]]:
 def attribution(place: Place) -> list[list[str]]:
     """Which inputs the shipped value networks use."""
     flags = ["--scenario", "merge", "--demand", "contested", "--workers", "2"]
-    flags += ["--policy", "vfn-p", "--seeds", "150000:150001" if place.small else "150000:150006"]
-    flags += ["--duration", "2"] if place.small else ["--policy", "vfn", "--policy", "vfn-p-egoistic"]
+    flags += [
+        "--policy",
+        "vfn-p-demonstrated",
+        "--seeds",
+        "150000:150001" if place.small else "150000:150006",
+    ]
+    others = ["--policy", "vfn-demonstrated", "--policy", "vfn-p-egoistic"]
+    flags += ["--duration", "2"] if place.small else others
     return [["cosim.cli.main", "bench", "attribution", *flags, "--out", str(place.work / "attribution")]]
 
 

@@ -23,19 +23,31 @@ from policy.checkpoint import SHIPPED, read_card
 
 Card = Mapping[str, Any]
 RESULTS = Path("docs/results")
+HEAD = 2  # lines of a table before its rows
 FIGURES = ("collision_rate", "mission_success_rate", "dt_mean_m")
 MAPS_UNUSED = (
-    "It does not use its maps, past or predicted: with every map zeroed 0.1 % of the choices of `vfn-p` "
-    "change (1,172 decisions, contested merge). A difference between `vfn-p` and `vfn` says nothing about "
-    "prediction."
+    "It does not use its maps, past or predicted: with every map zeroed 0.1 % of the choices of "
+    "`vfn-p-demonstrated` change (1,172 decisions, contested merge). A difference between that and "
+    "`vfn-demonstrated` says nothing about prediction."
 )
 MAPS_ONLY = "It sees nothing but maps, brakes for whatever is near, and has been trained for minutes only."
-DRIVING_LIMITS = (
+LAWLESS = (
+    "It knows no traffic light, no speed limit of a junction's lane, no pedestrian and no bicycle; in "
+    "`unguarded` it drives through red lights."
+)
+DEMONSTRATED = (
     "It learned from a scripted demonstrator (`altruist-rule` and a cruise rule, docs/training.md) as well "
     "as from rewards, and chooses as that does in most states: what rewards added is not measured apart.",
-    "The human drivers of its training never err. It knows no traffic light, no speed limit of a junction's "
-    "lane, no pedestrian and no bicycle; in `unguarded` it drives through red lights.",
+    f"The human drivers of its training never err. {LAWLESS}",
 )
+LIMITS = {  # by the configuration of the training
+    "compact": (MAPS_UNUSED, *DEMONSTRATED),
+    "maps": (MAPS_ONLY, *DEMONSTRATED),
+    "rewards": (
+        "It learned from rewards alone, in preset `lawful`: what it does in `unguarded` it never tried.",
+        LAWLESS,
+    ),
+}
 PREDICTING_LIMITS = (
     "It learned from the five worlds alone, with drivers who follow IDM and LC2013 or MOBIL and never err; "
     "nothing is known of its error on recorded traffic or on other roads.",
@@ -65,10 +77,12 @@ def driving(name: str, card: Card) -> Iterator[str]:
     log = [json.loads(line) for line in (folder / "log.jsonl").read_text("utf-8").splitlines()]
     log = [row for row in log if row["iteration"] <= card["measured"]["iteration"]]
     training, last = data["training"], log[-1]
+    layout, rewards = card["configs"]["vfn"], approach.config == "rewards"
     sees = "kinematics, situation and maps" if approach.kinematics else "maps"
+    sees = sees if layout.get("others", True) else "its own speed and command, and maps"
     predicted = ", predicted maps among them" if approach.predicted_maps else ""
     mask = "no safety prioritizer" if approach.mask == "none" else f"prioritizer on `{approach.mask}`"
-    yield f"- Chooses an AV's meta-action from {sees}{predicted}; {approach.extractor}, {mask}."
+    yield f"- Chooses an AV's meta-action from {sees}{predicted}; {layout['extractor']}, {mask}."
     phis = ", ".join(f"{phi:g}" for phi in training["svo"])
     yield (
         f"- Data: {len(log) * training['episodes']} episodes of {', '.join(data['scenarios'])} up to the "
@@ -81,18 +95,24 @@ def driving(name: str, card: Card) -> Iterator[str]:
     )
     what = "a2c" if approach.learning == "a2c" else "vfn"
     yield (
-        f"- Training: `cosim train {what} --policy {name} --scenario all --seed {training['seed']} "
-        f"--iterations {training['iterations']} --config {folder.as_posix()}/config.yaml --out runs/{name}`"
+        f"- Training: `cosim train {what} --policy {name}{'' if rewards else ' --scenario all'} "
+        f"--seed {training['seed']} --iterations {training['iterations']} "
+        f"--config {folder.as_posix()}/config.yaml --out runs/{name}`"
     )
     hours = sum(row["iteration_s"] for row in log) / 3600
     yield (
         f"- Shipped: iteration {last['iteration']}, after {last['updates']:,} updates and {hours:.1f} h "
-        f"by its log; highest mean reward in {training['validation']} validation drives a case, tuning seeds."
+        "by its log"
+        + (
+            f"; highest mean reward in {training['validation']} validation drives a case, tuning seeds."
+            if "valid/reward" in last
+            else "."
+        )
     )
-    yield from ("- Measured (test seeds, preset `unguarded`):", "", *measured(name), "")
-    yield from (
-        f"- Limit: {text}" for text in (MAPS_UNUSED if approach.kinematics else MAPS_ONLY, *DRIVING_LIMITS)
-    )
+    table = list(measured(name))
+    if len(table) > HEAD:
+        yield from ("- Measured (test seeds, preset `unguarded`):", "", *table, "")
+    yield from (f"- Limit: {text}" for text in LIMITS[approach.config])
 
 
 def measured(name: str) -> Iterator[str]:

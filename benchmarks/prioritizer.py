@@ -4,7 +4,7 @@
 
 Tuning seeds (100,000 on): what is compared here may change the defaults. Three agents ask the prioritizer:
 one to which every action is worth the same (`cruise`: keeps lane and speed while it may), one whose
-preferences are `random`, and vfn-p once trained.
+preferences are `random`, and vfn-p-demonstrated once trained.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 
 from benchmarks.arms import differences, of_world
 from benchmarks.papers.agents import Agent, missing
+from benchmarks.papers.claims import VFN_P
 from benchmarks.papers.driving import Order, Results, Settings
 from benchmarks.papers.pages import Job, heading, save
 from benchmarks.tables import (
@@ -37,9 +38,9 @@ WORLDS = ("merge", "intersection")  # one where lanes meet, one where ways cross
 EPISODES = 6  # a world and setting; --scale for more
 DEFAULT = SafetyConfig()
 AGENTS = {
-    "cruise": Agent("cruise", "vfn-p", preference="none"),
-    "random": Agent("random", "vfn-p", preference="random"),
-    "vfn-p": Agent("vfn-p"),
+    "cruise": Agent("cruise", VFN_P, preference="none"),
+    "random": Agent("random", VFN_P, preference="random"),
+    VFN_P: Agent(VFN_P),
 }
 COLUMNS = (
     "collision_rate",

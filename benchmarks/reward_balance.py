@@ -61,14 +61,14 @@ LEARNED = {
     f"rewards.yaml: the same, mission {REWARDS.reward.mission:g}": REWARDS.reward,
 }
 DEMONSTRATED_PHI, PHI = 60.0, 45.0  # degrees at which drives are paid
-WANTED, AGENT = "altruist-rule", "vfn-p"
+WANTED, AGENT = "altruist-rule", "vfn-p-demonstrated"
 
 
 class Demonstrated(Explorer):
     """The demonstrator drives every AV, guarded by the mask, as in a guided episode of the training."""
 
     def __init__(self) -> None:
-        super().__init__("demonstrator", agent_config("vfn-p", COMPACT), COMPACT.explore)
+        super().__init__("demonstrator", agent_config(AGENT, COMPACT), COMPACT.explore)
 
     def reset(self, context: PolicyContext) -> None:
         """A new episode."""
@@ -80,7 +80,7 @@ class Crawl(Unled):
     """Every AV at about `speed` m/s, guarded by the mask; it commands Accelerate or Decelerate to keep it."""
 
     def __init__(self, speed: float) -> None:
-        super().__init__(f"crawl at {speed:g} m/s", compact("vfn-p"))
+        super().__init__(f"crawl at {speed:g} m/s", compact(AGENT))
         self._speed = speed
 
     def values(self, inputs: Inputs) -> Floats32:

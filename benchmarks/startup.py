@@ -18,10 +18,11 @@ from pathlib import Path
 
 IMPORTS = ("-c", "import numpy, libsumo")
 TORCH = ("-c", "import torch")
+POLICY = "vfn-p-demonstrated"
 RUN = ("-m", "cosim.cli.main", "run", "merge", "--json")
 SHORT = (*RUN, "--policy", "idm", "--demand", "free")
-NETWORK = (*RUN, "--policy", "vfn-p")
-TARGET = {"idm": 5.0, "vfn-p": 2.0}
+NETWORK = (*RUN, "--policy", POLICY)
+TARGET = {"idm": 5.0, POLICY: 2.0}
 
 PAGE = """# How long a short command takes to start
 
@@ -35,7 +36,7 @@ medians of {rounds} rounds (range). Ratios are formed within a round. Compare ra
 | ... of which the episode | {driven} s |  |
 | times importing numpy and libsumo | {idm} | at most {most_idm:g}: {held_idm} |
 | `python -c "import torch"` | {torch} s |  |
-| `cosim run merge --policy vfn-p` | {network} s |  |
+| `cosim run merge --policy {policy}` | {network} s |  |
 | ... of which the episode | {episode} s |  |
 | times its episode and the import of torch together | {vfn} | at most {most_vfn:g}: {held_vfn} |
 """
@@ -54,7 +55,7 @@ def one_round() -> dict[str, float]:
     short, quick = timed(SHORT)
     network, slow = timed(NETWORK)
     driven, episode = (json.loads(text)["timings"]["total_s"] for text in (quick, slow))
-    ratios = {"idm": short / imports, "vfn-p": network / (episode + torch)}
+    ratios = {"idm": short / imports, POLICY: network / (episode + torch)}
     seconds = {"imports": imports, "torch": torch, "short": short, "network": network}
     return seconds | {"driven": driven, "episode": episode} | ratios
 
@@ -72,12 +73,13 @@ def page(rounds: list[dict[str, float]]) -> str:
     }
     return PAGE.format(
         rounds=len(rounds),
+        policy=POLICY,
         most_idm=TARGET["idm"],
-        most_vfn=TARGET["vfn-p"],
+        most_vfn=TARGET[POLICY],
         held_idm=held["idm"],
-        held_vfn=held["vfn-p"],
-        vfn=figure("vfn-p"),
-        **{name: figure(name) for name in rounds[0] if name != "vfn-p"},
+        held_vfn=held[POLICY],
+        vfn=figure(POLICY),
+        **{name: figure(name) for name in rounds[0] if name != POLICY},
     )
 
 

@@ -61,8 +61,9 @@ class Agent:
             return self.made_by
         approach, name = APPROACHES[self.base], self.base
         what = "a2c" if approach.learning == "a2c" else "vfn"
-        schedule = "" if approach.kinematics else " --config maps"
-        return f"cosim train {what} --policy {name}{schedule} --scenario all --out runs/{name}"
+        schedule = "" if approach.config == "compact" else f" --config {approach.config}"
+        worlds = "" if approach.config == "rewards" else " --scenario all"  # `rewards` names its own
+        return f"cosim train {what} --policy {name}{schedule}{worlds} --out runs/{name}"
 
 
 def config(agent: Agent, untrained: bool = False) -> AgentConfig:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+# our networks that stand for P's VFN and VFN + P in every table
+VFN, VFN_P = "vfn-demonstrated", "vfn-p-demonstrated"
 APPROACHES = (
     "conv2d-dqn",
     "conv3d-a2c",
     "conv3d-dqn",
     "safe-dqn",
-    "vfn",
-    "vfn-p",
+    VFN,
+    VFN_P,
 )  # P, Table III, top to bottom
 
 # P, Table III: crashes in % of episodes under mixed behaviours; world -> approach.

@@ -2,7 +2,7 @@
 
     python -m benchmarks.papers.conditions [--scale 1] [--scenario merge] [--dry-run]
 
-The network is that of vfn-p, trained with all its senses; nothing is trained again for a table of this page.
+The network was trained with all its senses; nothing is trained again for a table of this page.
 T's worst case: every HV an egoist (Table II's aggressive drivers, politeness 0).
 """
 
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from benchmarks.arms import differences, of_world
 from benchmarks.papers.agents import PERCEPTION, Agent
+from benchmarks.papers.claims import VFN_P
 from benchmarks.papers.driving import Order, Results, Settings
 from benchmarks.papers.pages import Job, heading, save
 from benchmarks.tables import (
@@ -23,7 +24,7 @@ from benchmarks.tables import (
 )
 from cosim.report.figures import RATES, Measure
 
-AGENT = "vfn-p"
+AGENT = VFN_P
 RANGES = (25.0, 50.0, 75.0, PERCEPTION)  # m
 SENSED = (("merge", "contested", "moderate"), ("intersection", "dense", "mixed"))
 DRIVEN_BY = ("conservative", "moderate", "aggressive")  # HVs, in the contested merge

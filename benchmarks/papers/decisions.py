@@ -1,4 +1,4 @@
-"""What the learned decisions are worth: vfn-p against its egoistic twin, the scripted altruist and IDM.
+"""What the learned decisions are worth: our VFN + P against its egoistic twin, the scripted altruist and IDM.
 
     python -m benchmarks.papers.decisions [--scale 1] [--scenario merge] [--dry-run]
 
@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from benchmarks import targets
 from benchmarks.arms import differences, of_world
 from benchmarks.papers.agents import Agent
+from benchmarks.papers.claims import VFN, VFN_P
 from benchmarks.papers.driving import WORLDS, Order, Results, Settings
 from benchmarks.papers.pages import Job, heading, save
 from benchmarks.tables import (
@@ -32,10 +33,10 @@ from cosim.report.statistics import Figure
 
 DENSE, CONTESTED = 300, 100  # episodes a world
 TWIN = "vfn-p-egoistic"
-AGENTS = ("vfn-p", "vfn", TWIN, "altruist-rule", "idm", "keep-lane")
+AGENTS = (VFN_P, VFN, TWIN, "altruist-rule", "idm", "keep-lane")
 ELSEWHERE = {  # (agent, demand) that this page does without
     ("keep-lane", "contested"),  # nobody needs to see how hard that traffic is
-    ("vfn", "dense"),  # Table III has it, with more episodes
+    (VFN, "dense"),  # Table III has it, with more episodes
 }
 BEHAVIOR = {"dense": "mixed", "contested": "moderate"}  # definitions.md, Demand and behaviour
 DIFFERENCES = (
@@ -100,7 +101,7 @@ def write(results: Results, settings: Settings) -> None:
 
 def found_targets(runs: Runs, worlds: Sequence[str], names: Mapping[str, str]) -> Iterator[Finding]:
     """Every target whose arms were driven; `names`: arm -> as the tables show it."""
-    parts = Arms(*(names.get(a, "") for a in ("vfn-p", TWIN, "idm", "altruist-rule")))
+    parts = Arms(*(names.get(a, "") for a in (VFN_P, TWIN, "idm", "altruist-rule")))
     if {parts.agent, parts.idm} <= runs["dense"].keys():
         yield from targets.dense(runs["dense"], worlds, parts)
     if set(parts) <= runs["contested"].keys():
@@ -110,7 +111,7 @@ def found_targets(runs: Runs, worlds: Sequence[str], names: Mapping[str, str]) -
 def target_lines(findings: Sequence[Finding]) -> list[str]:
     """The targets: first which are missed, then all of them with their figures."""
     if not findings:
-        return ["The targets need `vfn-p`, its twin, `altruist-rule` and `idm`: not driven yet.", ""]
+        return [f"The targets need `{VFN_P}`, its twin, `altruist-rule` and `idm`: not driven yet.", ""]
     missed = [f"- {f.world}, {f.demand}: {f.target} ({f.found})" for f in findings if not f.met]
     first = f"{len(findings) - len(missed)} of {len(findings)} are met by their value"
     return [
@@ -124,7 +125,7 @@ def target_lines(findings: Sequence[Finding]) -> list[str]:
 
 def headline(runs: Runs, worlds: Sequence[str], names: Mapping[str, str]) -> list[str]:
     """T's claim, tested in both demands."""
-    agent, twin = names.get("vfn-p", ""), names.get(TWIN, "")
+    agent, twin = names.get(VFN_P, ""), names.get(TWIN, "")
     tested = [
         finding
         for demand, arms in runs.items()
@@ -150,7 +151,7 @@ def figures(runs: Runs, worlds: Sequence[str], names: Mapping[str, str]) -> list
             if not any(of_world(run, world) for run in arms.values()):
                 continue
             page += [f"## {world}, {demand}", "", f"Drivers {BEHAVIOR[demand]}.", "", *table(world, arms)]
-            agent = names.get("vfn-p", "")
+            agent = names.get(VFN_P, "")
             compared = {
                 f"{agent} - {other}": differences(arms[other], arms[agent])[world]
                 for other in _others(names)
@@ -164,7 +165,7 @@ def figures(runs: Runs, worlds: Sequence[str], names: Mapping[str, str]) -> list
 def csv_lines(runs: Runs, worlds: Sequence[str], names: Mapping[str, str]) -> list[Line]:
     """Every figure and every paired difference of the page."""
     lines: list[Line] = []
-    agent = names.get("vfn-p", "")
+    agent = names.get(VFN_P, "")
     for demand, arms in runs.items():
         lines += lines_of(demand, worlds, arms, COLUMNS)
         for other in _others(names):
@@ -188,7 +189,7 @@ def panels(runs: Runs, worlds: Sequence[str]) -> dict[str, dict[str, dict[str, F
 
 
 def _others(names: Mapping[str, str]) -> list[str]:
-    return [names[name] for name in ("idm", TWIN, "altruist-rule", "vfn") if name in names]
+    return [names[name] for name in ("idm", TWIN, "altruist-rule", VFN) if name in names]
 
 
 def _findings(findings: Sequence[Finding], what: str, verdict: str) -> list[str]:

@@ -16,6 +16,7 @@ import yaml
 
 from benchmarks.arms import differences
 from benchmarks.papers.agents import Agent
+from benchmarks.papers.claims import VFN, VFN_P
 from benchmarks.papers.driving import TRAININGS, Order, Results, Settings
 from benchmarks.papers.pages import Job, heading, save
 from benchmarks.tables import (
@@ -33,7 +34,7 @@ from cosim.report.run_folder import Run
 from cosim.report.statistics import Figure
 
 BEHAVIORS = ("conservative", "aggressive", "mixed")
-APPROACHES = ("vfn", "vfn-p")  # without and with prediction
+APPROACHES = (VFN, VFN_P)  # without and with prediction
 SAME, CROSSED = 300, 100  # episodes where test is as training, and where it is not
 WORLD, DEMAND = "merge", "dense"
 FIGURES = ("collision_rate", "av_caused_collision_rate", "dt_mean_m", "mission_success_rate", "veto_rate")

@@ -28,15 +28,17 @@ from cosim.seeding import FIRST_TEST_SEED
 from cosim.workers.tasks import OK
 from policy.checkpoint import read_card
 
-# Until the networks are replaced: first on every page that drives them, in results/README.md and the README.
+# First on every page that drives networks, in results/README.md and the README.
 SAID_FIRST = (
-    "**Until the networks are replaced:** the value networks of `vfn-p`, `vfn` and `vfn-p-egoistic` do not",
-    "use their maps, past or predicted: what a map shows changes none of their choices, or hardly one",
-    "(`docs/results/attribution.md`, by `cosim bench attribution --policy vfn-p --scenario merge --demand",
-    "contested --seeds 150000:150006 --out DIR`). So `vfn-p` against `vfn` does not measure what predicted",
-    "maps are worth. All of them learned from a scripted demonstrator (`docs/training.md`); what a network",
-    "learns from rewards alone, looking at its maps, stands in `docs/results/learned.md`. On real networks",
-    "with signals the preset `unguarded` drives unlawfully, through red lights and faster than lanes allow.",
+    "**The tables show networks of a demonstrator:** `vfn-p-demonstrated`, `vfn-demonstrated` and",
+    "`vfn-p-egoistic` learned from a script (`docs/training.md`) and do not use their maps, past or",
+    "predicted: what a map shows changes none of their choices, or hardly one",
+    "(`docs/results/attribution.md`, by `cosim bench attribution --policy vfn-p-demonstrated --scenario",
+    "merge --demand contested --seeds 150000:150006 --out DIR`). So the first against the second does not",
+    "measure what predicted maps are worth. `vfn-p` and `vfn`, which learned from rewards alone and see",
+    "other vehicles in their maps alone, are not in the tables yet; what a network learns from rewards",
+    "alone stands in `docs/results/learned.md`. On real networks with signals the preset `unguarded`",
+    "drives unlawfully, through red lights and faster than lanes allow.",
 )
 STYLE: Any = {"svg.fonttype": "none", "svg.hashsalt": "cosim", "font.size": 9.0}  # equal figures, equal file
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from benchmarks.arms import differences, of_world
 from benchmarks.papers.agents import Agent
+from benchmarks.papers.claims import VFN_P
 from benchmarks.papers.driving import Driven, Order, Results, Settings
 from benchmarks.papers.pages import Job, drawing, heading, save, save_picture
 from benchmarks.tables import Line, difference_lines, difference_table, found, lines_of, table
@@ -20,7 +21,7 @@ from cosim.report.figures import Measure
 from cosim.report.run_folder import Run
 
 PHIS = (0.0, 15.0, 30.0, 45.0, 60.0, 75.0, 90.0)  # degrees: from egoist to pure altruist
-AGENT = "vfn-p"
+AGENT = VFN_P
 YARDSTICKS = (("vfn-p-egoistic", 0.0), ("idm", 45.0), ("altruist-rule", 45.0))
 DEMAND, BEHAVIOR = "contested", "moderate"
 EPISODES = 100

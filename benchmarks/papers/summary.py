@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NamedTuple
 
-from benchmarks.papers.claims import APPROACHES, MERGING_ALTRUISTIC, MERGING_EGOISTIC, TABLE_3
+from benchmarks.papers.claims import APPROACHES, MERGING_ALTRUISTIC, MERGING_EGOISTIC, TABLE_3, VFN, VFN_P
 from benchmarks.papers.driving import WORLDS, Settings, add_arguments, settings_of
 from benchmarks.papers.figure9 import BEHAVIORS
 from benchmarks.papers.guide import OVERTAKES, SLOWS, YIELDS
@@ -116,11 +116,11 @@ def crashes(out: Path) -> str:
     lines = Lines(out, "table3")
     parts, below = [], 0
     for world in WORLDS:
-        line = lines.get("collision_rate", "vfn-p", scenario=world)
+        line = lines.get("collision_rate", VFN_P, scenario=world)
         if line is None:
             parts.append(f"{world} {NOT_RUN}")
             continue
-        less = 100.0 * line.high < TABLE_3[world]["vfn-p"]
+        less = 100.0 * line.high < TABLE_3[world][VFN_P]
         below += less
         parts.append(f"{world} {line.text(100.0, 2, ' %')}{', below' if less else ''}")
     if all(part.endswith(NOT_RUN) for part in parts):
@@ -134,7 +134,7 @@ def fewest(out: Path) -> str:
     parts = []
     for world in WORLDS:
         pairs = {
-            other: lines.get("collision_rate", "vfn-p", scenario=world, against=other)
+            other: lines.get("collision_rate", VFN_P, scenario=world, against=other)
             for other in APPROACHES[:-1]
         }
         if any(line is None for line in pairs.values()):
@@ -155,7 +155,7 @@ def prediction_gain(out: Path) -> str:
     """P, Table III: VFN against VFN + P."""
     lines = Lines(out, "table3")
     return _parts(
-        (world, lines.get("collision_rate", "vfn-p", scenario=world, against="vfn"), 100.0, 2, " points")
+        (world, lines.get("collision_rate", VFN_P, scenario=world, against=VFN), 100.0, 2, " points")
         for world in WORLDS
     )
 
@@ -168,10 +168,10 @@ def behaviors(out: Path) -> str:
             b,
             lines.get(
                 "collision_rate",
-                f"vfn-p, {b}",
+                f"{VFN_P}, {b}",
                 scenario="merge",
                 demand=f"dense, {b}",
-                against=f"vfn, {b}",
+                against=f"{VFN}, {b}",
             ),
             100.0,
             1,
@@ -212,7 +212,7 @@ def merging(out: Path) -> str:
     lines = Lines(out, "t_figures")
     return _parts(
         (name, lines.get("dt_mission_m", arm, scenario="merge", demand=T_TRAFFIC), 1.0, 0, " m")
-        for name, arm in (("egoistic", "vfn-p-egoistic"), ("altruistic", "vfn-p"))
+        for name, arm in (("egoistic", "vfn-p-egoistic"), ("altruistic", VFN_P))
     )
 
 
@@ -223,7 +223,7 @@ def altruism(out: Path) -> str:
         _parts(
             (
                 f"{demand.split(',')[0]}: {name}",
-                lines.get(figure, "vfn-p", scenario="merge", demand=demand, against="vfn-p-egoistic"),
+                lines.get(figure, VFN_P, scenario="merge", demand=demand, against="vfn-p-egoistic"),
                 scale,
                 1,
                 unit,
@@ -243,7 +243,7 @@ def samples(out: Path) -> str:
     """T, figure 8: how many episodes of each kind."""
     lines = Lines(out, "t_figure8")
     shares = []
-    for arm, demand in (("vfn-p", T_TRAFFIC), ("altruist-rule", "dense, mixed")):
+    for arm, demand in ((VFN_P, T_TRAFFIC), ("altruist-rule", "dense, mixed")):
         kinds = _parts(
             (kind, lines.get(kind, arm, scenario="merge", demand=demand), 100.0, 0, " %")
             for kind in (SLOWS, YIELDS, OVERTAKES)
@@ -259,7 +259,13 @@ def payment(out: Path) -> str:
     parts = []
     for world in ("merge", "exit", "roundabout", "intersection"):
         gains = _parts(
-            (name, lines.get(figure, "vfn-p, phi 45", scenario=world, against="vfn-p, phi 0"), 1.0, 0, " m")
+            (
+                name,
+                lines.get(figure, f"{VFN_P}, phi 45", scenario=world, against=f"{VFN_P}, phi 0"),
+                1.0,
+                0,
+                " m",
+            )
             for name, figure in (("AVs", "dt_av_m"), ("HVs", "dt_hv_m"), ("mission", "dt_mission_m"))
         )
         if gains != NOT_RUN:
@@ -268,7 +274,7 @@ def payment(out: Path) -> str:
 
 
 T_TRAFFIC = "contested, moderate"
-_P3 = ", ".join(f"{world} {TABLE_3[world]['vfn-p']}" for world in WORLDS)
+_P3 = ", ".join(f"{world} {TABLE_3[world][VFN_P]}" for world in WORLDS)
 CLAIMS = (
     Claim("P, Table III", f"VFN + P crashes in {_P3} % of episodes", "table3.md", crashes),
     Claim("P, Table III", "VFN + P crashes least of the six in every world", "table3.md", fewest),

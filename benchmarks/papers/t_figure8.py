@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.papers.agents import Agent
+from benchmarks.papers.claims import VFN_P
 from benchmarks.papers.driving import (
     SVO,
     Driven,
@@ -48,7 +49,7 @@ from cosim.workers.progress import Progress
 from cosim.workers.tasks import OK, Task
 
 FOLDER = "guide"  # in settings.runs
-AGENTS = ("vfn-p", "altruist-rule")  # the learned altruist, and what a scripted one does
+AGENTS = (VFN_P, "altruist-rule")  # the learned altruist, and what a scripted one does
 # demand and HVs; T's is the first. In most dense episodes no AV is near where the mission vehicle merges
 TRAFFIC = {("contested", "moderate"): 100, ("dense", "mixed"): 300}
 WANTED = (SLOWS, YIELDS, OVERTAKES)  # T's three samples, from left to right

@@ -1,6 +1,6 @@
 """T's figures 5, 6, 7: how far the merging vehicle comes; crashes, distance, merges; all that over training.
 
-    python -m benchmarks.papers.t_figures [--scale 1] [--training vfn-p=runs/vfn-p] [--dry-run]
+    python -m benchmarks.papers.t_figures [--scale 1] [--training conv3d-a2c=runs/a2c] [--dry-run]
 
 Egoistic against altruistic as T has it, each trained apart; beside them the scripted altruist, SUMO's own
 IDM and the approach that learns as T's does. Figure 8 is `benchmarks.papers.t_figure8`.
@@ -16,7 +16,7 @@ import numpy as np
 from benchmarks import learning_curves
 from benchmarks.arms import differences
 from benchmarks.papers.agents import Agent
-from benchmarks.papers.claims import MERGING_ALTRUISTIC, MERGING_EGOISTIC
+from benchmarks.papers.claims import MERGING_ALTRUISTIC, MERGING_EGOISTIC, VFN_P
 from benchmarks.papers.driving import SVO, Order, Results, Settings
 from benchmarks.papers.pages import Job, drawing, heading, save, save_picture
 from benchmarks.tables import Line, difference_lines, difference_table, lines_of, markdown_row, table
@@ -26,7 +26,7 @@ from cosim.report.statistics import quantile, share
 from cosim.types import Floats
 from cosim.workers.tasks import OK
 
-ALTRUIST, EGOIST = "vfn-p", "vfn-p-egoistic"
+ALTRUIST, EGOIST = VFN_P, "vfn-p-egoistic"
 EPISODES = 300  # T: 3,000 test episodes
 ARMS = ((EGOIST, 0.0), (ALTRUIST, SVO), ("conv3d-a2c", SVO), ("idm", SVO), ("altruist-rule", SVO))
 TRAFFIC = (("contested", "moderate"), ("dense", "mixed"))

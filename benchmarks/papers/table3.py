@@ -11,7 +11,7 @@ import numpy as np
 
 from benchmarks.arms import differences, of_world
 from benchmarks.papers.agents import Agent
-from benchmarks.papers.claims import APPROACHES, TABLE_3
+from benchmarks.papers.claims import APPROACHES, TABLE_3, VFN, VFN_P
 from benchmarks.papers.driving import WORLDS, Order, Results, Settings
 from benchmarks.papers.pages import Job, drawing, heading, save, save_picture
 from benchmarks.tables import difference_lines, difference_table, found, lines_of, markdown_row, table
@@ -20,21 +20,21 @@ from cosim.report.run_folder import Run
 from cosim.report.statistics import Figure, share
 from cosim.workers.tasks import OK
 
-MOST = 1000  # episodes a world of vfn and vfn-p: 1 % against 2 % needs many
+MOST = 1000  # episodes a world of VFN and VFN + P: 1 % against 2 % needs many
 OTHERS = 300  # of the baselines
 FEW = 100  # of the ablation and the references
 REFERENCES = ("keep-lane", "idm")  # how hard the traffic is; what SUMO's own driver makes of it
 FIGURES = ("collision_rate", "av_caused_collision_rate", "dt_mean_m", "mission_success_rate", "veto_rate")
 COMPARED = ("collision_rate", "av_caused_collision_rate", "dt_mean_m", "mission_success_rate")
 
-# Predicted maps yes or no x mask none, constant speed, Gaussian process; `vfn-p` and `vfn` are two of them.
+# Predicted maps yes or no x mask none, constant speed, Gaussian process; VFN_P and VFN are two of them.
 ABLATION = (
-    Agent("maps, no mask", "vfn-p", mask="none"),
-    Agent("maps, mask cs", "vfn-p", mask="cs"),
-    Agent("vfn-p"),
-    Agent("no maps, no mask", "vfn", mask="none"),
-    Agent("vfn"),
-    Agent("no maps, mask gp", "vfn", mask="gp-indirect"),
+    Agent("maps, no mask", VFN_P, mask="none"),
+    Agent("maps, mask cs", VFN_P, mask="cs"),
+    Agent(VFN_P),
+    Agent("no maps, no mask", VFN, mask="none"),
+    Agent(VFN),
+    Agent("no maps, mask gp", VFN, mask="gp-indirect"),
 )
 TRAINING = (
     "",
@@ -43,8 +43,8 @@ TRAINING = (
 )
 ABLATED = (
     "Ablation: predicted maps yes or no, mask none, constant speed or Gaussian process. The networks are",
-    "those of `vfn-p` (maps) and `vfn` (no maps), each trained with its own mask; with maps, the mask's",
-    "predictor is the chain's too.",
+    f"those of `{VFN_P}` (maps) and `{VFN}` (no maps), each trained with its own mask;",
+    "with maps, the mask's predictor is the chain's too.",
     "",
 )
 
@@ -55,14 +55,14 @@ def orders() -> list[Order]:
     wanted |= {Agent(name): OTHERS for name in APPROACHES}
     found = []
     for world in WORLDS:
-        wanted |= {Agent(name): enough(world) for name in ("vfn", "vfn-p")}
+        wanted |= {Agent(name): enough(world) for name in (VFN, VFN_P)}
         found += [Order(agent, world, "dense", "mixed", episodes) for agent, episodes in wanted.items()]
     return found
 
 
 def enough(world: str) -> int:
-    """MOST, or as many hundreds as it takes that the bound of none crashed lies below P's figure of vfn-p."""
-    claimed = TABLE_3[world]["vfn-p"] / 100.0
+    """MOST, or as many hundreds as it takes that the bound of none crashed lies below P's of VFN + P."""
+    claimed = TABLE_3[world][VFN_P] / 100.0
     return next(n for n in itertools.count(MOST, 100) if share(0, n).high < claimed)
 
 
@@ -83,7 +83,7 @@ def write(results: Results, settings: Settings) -> None:
         page += fewest(runs, names, worlds)
     for world in worlds:
         page += [f"## {world}", "", *table(world, six, FIGURES)]
-        ours = names.get("vfn-p")
+        ours = names.get(VFN_P)
         others = [names[a] for a in APPROACHES[:-1] if a in names]
         if ours and others:
             pairs = {other: differences(runs[other], runs[ours]) for other in others}
@@ -177,7 +177,7 @@ def _picture(runs: dict[str, Run], names: dict[str, str], worlds: list[str], set
                 label=label,
             )
             if arm in APPROACHES:
-                claimed = "P's figures" if w == 0 and arm == "vfn-p" else None
+                claimed = "P's figures" if w == 0 and arm == VFN_P else None
                 axes.plot(w + shift, TABLE_3[world][arm], "x", ms=5, color="0.4", label=claimed)
     axes.set_xticks(range(len(worlds)), worlds)
     axes.set(ylabel="episodes with a crash, %", yscale="symlog", ylim=(0.0, 110.0))

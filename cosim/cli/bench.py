@@ -10,7 +10,7 @@ from cosim.scenario import BEHAVIORS
 from cosim.scenario.behaviors import AS_IS
 
 DEMANDS = ("dense", "contested")
-POLICIES = ("idm", "altruist-rule", "vfn")
+POLICIES = ("idm", "altruist-rule", "vfn-demonstrated")
 
 
 def add(commands: arguments.SubCommands) -> None:

@@ -8,11 +8,10 @@ from cosim.errors import BadInput
 from cosim.files.yaml_input import dataclass_from
 from cosim.scenario.policy_name import PolicyName
 from cosim.types import COMPACT, PAPER, ObservationConfig
-from policy.agents.approaches import APPROACHES, AgentConfig, configure, shipped
+from policy.agents.approaches import APPROACHES, AgentConfig, configure, shipped, vfn_of
 from policy.agents.prediction_aware import PredictionAware
 from policy.checkpoint import read_card, sha256
 from policy.networks.hpn import HpnConfig
-from policy.networks.vfn import VfnConfig
 from policy.prediction.chain import ChainConfig
 from policy.prediction.traffic import TrafficConfig
 from policy.safety import SafetyConfig
@@ -40,7 +39,7 @@ def config(weights: Path) -> AgentConfig:
     def section(kind: type[Section], name: str) -> Section:
         return dataclass_from(kind, about.get(name, {}), file, f"data.{name}")
 
-    vfn = dataclass_from(VfnConfig, card["configs"]["vfn"], file, "configs.vfn")
+    vfn = vfn_of(card, file)
     # a card without an observation is of one of the two sizes that ship
     seen = PAPER if vfn.height == PAPER.height else COMPACT
     if "observation" in about:

@@ -19,16 +19,21 @@ class Approach:
     predicted_maps: bool = True
     mask: Literal["gp-indirect", "cs", "none"] = "gp-indirect"
     learning: Literal["ddqn", "a2c"] = "ddqn"
+    config: Literal["compact", "maps", "rewards"] = "compact"  # of `cosim train`, for the weights that ship
 
 
 APPROACHES = {
-    "vfn-p": Approach(),
-    "vfn": Approach(predicted_maps=False, mask="cs"),
-    "vfn-p-egoistic": Approach(),  # the twin: the same agent, trained with phi = 0
-    "safe-dqn": Approach(kinematics=False, predicted_maps=False, mask="cs"),
-    "conv3d-dqn": Approach(kinematics=False, predicted_maps=False, mask="none"),
-    "conv3d-a2c": Approach(kinematics=False, predicted_maps=False, mask="none", learning="a2c"),
-    "conv2d-dqn": Approach("conv2d", kinematics=False, predicted_maps=False, mask="none"),
+    "vfn-p": Approach(config="rewards"),
+    "vfn": Approach(predicted_maps=False, mask="cs", config="rewards"),
+    "vfn-p-demonstrated": Approach(),  # the same two, from a scripted demonstrator
+    "vfn-demonstrated": Approach(predicted_maps=False, mask="cs"),
+    "vfn-p-egoistic": Approach(),  # the demonstrated one's twin: trained with phi = 0
+    "safe-dqn": Approach(kinematics=False, predicted_maps=False, mask="cs", config="maps"),
+    "conv3d-dqn": Approach(kinematics=False, predicted_maps=False, mask="none", config="maps"),
+    "conv3d-a2c": Approach(
+        kinematics=False, predicted_maps=False, mask="none", learning="a2c", config="maps"
+    ),
+    "conv2d-dqn": Approach("conv2d", kinematics=False, predicted_maps=False, mask="none", config="maps"),
 }
 
 

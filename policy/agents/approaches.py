@@ -1,12 +1,15 @@
 """The approaches of Table III as configurations of one agent: what each network sees, and what masks it."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from cosim.errors import BadInput
+from cosim.files.yaml_input import dataclass_from
 from cosim.types import COMPACT, PAPER, ObservationConfig
 from policy.agents import APPROACHES as APPROACHES
-from policy.checkpoint import SHIPPED
+from policy.checkpoint import SHIPPED, read_card
 from policy.inputs.tensors import APART_OF
 from policy.networks.hpn import HpnConfig
 from policy.networks.vfn import TABLE_1, VfnConfig
@@ -36,9 +39,12 @@ class AgentConfig:
 
 
 def compact(name: str) -> AgentConfig:
-    """The compact configuration of an approach, with the weights that are shipped for it."""
-    config = configure(name, COMPACT, ChainConfig(), HpnConfig(), VfnConfig())
-    return replace(config, vfn_weights=shipped(name), hpn_weights=shipped("hpn"))
+    """The compact configuration of an approach, with the weights that are shipped for it and, as their card
+    says it, the layout of its network."""
+    weights = shipped(name)
+    layout = VfnConfig() if weights is None else vfn_of(read_card(weights), weights.with_suffix(".json"))
+    config = configure(name, COMPACT, ChainConfig(), HpnConfig(), layout)
+    return replace(config, vfn_weights=weights, hpn_weights=shipped("hpn"))
 
 
 def paper(name: str) -> AgentConfig:
@@ -82,6 +88,11 @@ def configure(
             critic=approach.learning == "a2c",
         ),
     )
+
+
+def vfn_of(card: Mapping[str, Any], file: Path) -> VfnConfig:
+    """The layout of the value network that the card `file` is of. Raises BadInput naming it and the field."""
+    return dataclass_from(VfnConfig, card["configs"].get("vfn", {}), file, "configs.vfn")
 
 
 def shipped(name: str) -> Path | None:

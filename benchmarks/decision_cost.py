@@ -3,7 +3,7 @@
     python -m benchmarks.decision_cost [--avs 25 50 100] [--decisions 40] [--real] [--out FILE.md] [--profile]
 
 A grid of signalised junctions is built by netgenerate, and one vehicle in five is an AV: each drives a
-random walk of `WALK` edges, so that all of them stay on the road. SUMO drives everybody and the policy decides
+random walk of `WALK` edges, so that all of them stay on the road. SUMO drives everybody, the policy decides
 beside it (nothing is carried out), so that the traffic is the same whatever the policy is. Medians over
 decisions, in a process of its own. `--real`: A10KW of the `eclipse-sumo` package, driven by the policy for as
 long as at most 100 AVs are on the road. `--profile`: cProfile's table instead. Ratios are to a fixed piece of

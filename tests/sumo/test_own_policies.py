@@ -22,7 +22,7 @@ from cosim.policies import check, make
 from cosim.policies.trained import config
 from cosim.types import COMPACT
 from policy import checkpoint
-from policy.agents.approaches import compact
+from policy.agents.approaches import APPROACHES, compact
 from policy.checkpoint import SHIPPED
 from policy.networks.vfn import VFN
 from policy.training.config import agent_config
@@ -110,7 +110,7 @@ def test_weights_of_a_training_drive_as_the_same_weights_that_ship(tmp_path: Pat
     assert hashes[0] == hashes[1] != []
 
 
-@pytest.mark.parametrize("name", ["vfn-p", "vfn", "safe-dqn", "conv3d-a2c", "conv2d-dqn", "vfn-p-egoistic"])
+@pytest.mark.parametrize("name", APPROACHES)
 def test_the_card_of_what_ships_says_all_of_its_agent(name: str) -> None:
     assert config(SHIPPED / f"{name}.safetensors") == compact(name)
 

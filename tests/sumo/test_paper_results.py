@@ -25,6 +25,7 @@ from benchmarks.papers import (
     table3,
 )
 from benchmarks.papers.agents import Agent, missing
+from benchmarks.papers.claims import VFN_P
 from benchmarks.papers.driving import Order, Settings, drive
 from benchmarks.papers.pages import Job, run_jobs
 from cosim.errors import BadInput
@@ -52,7 +53,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Any:
             workers=1,
             untrained=True,
             duration=1.2,
-            trainings={"vfn-p": (_training(folder / "vfn-p"),)},
+            trainings={VFN_P: (_training(folder / VFN_P),)},
         )
         drive([order for job in JOBS for order in job.orders()], settings, "small")
         run_jobs(JOBS, settings)
@@ -106,7 +107,7 @@ def test_table_3_holds_every_approach_beside_the_unguarded_fleet(small: Settings
 
 def test_the_curves_of_learning_are_drawn_from_the_logs(small: Settings) -> None:
     text = page(small, "learning")
-    assert "| vfn-p | ? | 40 | training drives | crashed, % | 100.0 | 0.0 |" in text
+    assert f"| {VFN_P} | ? | 40 | training drives | crashed, % | 100.0 | 0.0 |" in text
     assert (small.out / "learning.png").stat().st_size > 1000
     assert len(lines(small, "learning")) == 3 * 21  # figures x points
 
@@ -237,7 +238,7 @@ def test_the_course_of_training_is_drawn_where_there_is_a_log_and_missed_where_t
 ) -> None:
     text = page(small, "t_figures")
     assert "t_figure7.png" in text
-    assert "- vfn-p: not run yet" not in text
+    assert f"- {VFN_P}: not run yet" not in text
     assert "- conv3d-a2c: not run yet (`cosim train a2c --policy conv3d-a2c" in text
 
 
@@ -257,11 +258,11 @@ def test_the_summary_says_untrained_and_not_run_yet(small: Settings, tmp_path: P
 def test_missing_weights_are_said_in_one_line_with_the_command_that_makes_them(
     tmp_path: Path, capfd: Any
 ) -> None:
-    agent = figure9.agent("vfn-p", "aggressive")
+    agent = figure9.agent(VFN_P, "aggressive")
     why = missing(replace(agent, weights=str(tmp_path / "none.safetensors")))
     assert why is not None
     assert "none.safetensors" in why
-    assert "cosim train vfn --policy vfn-p --config" in why
+    assert f"cosim train vfn --policy {VFN_P} --config" in why
     settings = Settings(runs=tmp_path / "runs", out=tmp_path, scenarios=("merge",), scale=1e-6)
     absent = Order(replace(agent, weights="nowhere.safetensors"), "merge", "dense", "mixed", 1)
     found = drive([absent], settings, "figure9")

@@ -14,14 +14,24 @@ from cosim.errors import BadInput
 from cosim.learning.attribution import markdown, questioned, table
 from cosim.types import MetaAction, PolicyContext, Timing
 from policy.agents.approaches import compact
-from policy.attribution import OTHERS, SUMS, Questioned, Replaced, answer, questions, replacements
+from policy.attribution import (
+    OTHERS,
+    SUMS,
+    Questioned,
+    Replaced,
+    answer,
+    network_inputs,
+    questions,
+    replacements,
+)
 from policy.inputs.tensors import States
 
 ROAD = straight_road(3)
 FREE = [Car("a", 300.0, 1, 20.0, is_av=True), Car("b", 100.0, 1, 20.0, is_av=True)]  # 200 m apart, alike
+ALL = ("maps", "kinematics", "situation")  # what a network may take
 
 
-def untrained(name: str = "vfn-p") -> Questioned:
+def untrained(name: str = "vfn-p-demonstrated") -> Questioned:
     return Questioned(name, dataclasses.replace(compact(name), vfn_weights=None, hpn_weights=None))
 
 
@@ -61,10 +71,16 @@ def test_a_network_that_reads_phi_alone_uses_nothing_else() -> None:
 
 
 def test_every_input_is_replaced_where_the_approach_has_it() -> None:
-    whole = {": ".join(key).split(":")[0] for key in _keys("vfn-p")}
+    whole = {": ".join(key).split(":")[0] for key in _keys("vfn-p-demonstrated")}
     framed = {f"{span} {what}" for span in ("past", "predicted", "all") for what in ("maps", "kinematics")}
     assert whole == framed | {"situation", "map branch", "phi"}
-    assert {name for name, _ in _keys("vfn")} == {"maps", "kinematics", "situation", "map branch", "phi"}
+    assert {name for name, _ in _keys("vfn-demonstrated")} == {
+        "maps",
+        "kinematics",
+        "situation",
+        "map branch",
+        "phi",
+    }
     assert {name for name, _ in _keys("safe-dqn")} == {"maps", "map branch", "phi"}
 
 
@@ -76,10 +92,10 @@ def _keys(name: str) -> list[tuple[str, str]]:
 
 def test_an_agent_drives_by_what_it_answers_with_an_input_replaced() -> None:
     base = led_by(untrained(), -2)  # cos(phi): Accelerate at 45 degrees, Idle at 90
-    config = dataclasses.replace(compact("vfn-p"), vfn_weights=None, hpn_weights=None)
+    config = dataclasses.replace(compact("vfn-p-demonstrated"), vfn_weights=None, hpn_weights=None)
     ways = [(None, "ACCELERATE"), (("phi", "90 degrees"), "IDLE"), (("situation", OTHERS), "ACCELERATE")]
     for what, action in ways:
-        agent = Replaced("vfn-p", config, what)
+        agent = Replaced("vfn-p-demonstrated", config, what)
         agent.vfn.load_state_dict(base.vfn.state_dict())
         agent.reset(PolicyContext(ROAD, Timing(), agent.observation, math.pi / 4, np.random.default_rng(0)))
         decisions = agent.decide(histories(ROAD, FREE, agent.observation))
@@ -87,12 +103,13 @@ def test_an_agent_drives_by_what_it_answers_with_an_input_replaced() -> None:
     base.reset(PolicyContext(ROAD, Timing(), base.observation, math.pi / 4, np.random.default_rng(0)))
     states = base.perceive(histories(ROAD, FREE, base.observation)).states
     whole = replacements(base.vfn, base.observation.frames)
-    assert set(whole) <= {(name, how) for name, how, _ in questions(states, base.observation.frames, True)}
+    asked = questions(states, base.observation.frames, network_inputs(base.vfn))
+    assert set(whole) <= {(name, how) for name, how, _ in asked}
     assert ("predicted maps", "as at present") in whole
 
 
 def test_an_av_that_decides_alone_has_no_other_to_swap_with() -> None:
-    assert not [key for key in driven(untrained("vfn"), cars=FREE[:1]) if "another" in key]
+    assert not [key for key in driven(untrained("vfn-demonstrated"), cars=FREE[:1]) if "another" in key]
 
 
 def test_swapping_avs_that_see_the_same_changes_nothing() -> None:
@@ -101,7 +118,7 @@ def test_swapping_avs_that_see_the_same_changes_nothing() -> None:
         torch.randint(0, 255, (1, 14, 4, 32, 128), dtype=torch.uint8).expand(2, -1, -1, -1, -1),
         *(torch.rand(1, *size).expand(2, *size) for size in ((14, 16, 9), (58,), (2,))),
     )
-    swapped = [states for _, how, states in questions(twins, 10, True) if how == "another AV's"]
+    swapped = [states for _, how, states in questions(twins, 10, ALL) if how == "another AV's"]
     assert len(swapped) == 7
     for states in swapped:
         assert all(torch.equal(mine, theirs) for mine, theirs in zip(states, twins, strict=True))
@@ -113,7 +130,7 @@ def test_replacements_touch_their_own_frames_and_nothing_else() -> None:
         torch.randint(1, 255, (3, 14, 4, 8, 8), dtype=torch.uint8),
         *(torch.rand(3, *size) for size in ((14, 16, 9), (58,), (2,))),
     )
-    asked = {(name, how): found for name, how, found in questions(states, 10, True)}
+    asked = {(name, how): found for name, how, found in questions(states, 10, ALL)}
     zeroed, present = asked["predicted maps", "zeroed"][0], asked["predicted maps", "as at present"][0]
     assert torch.equal(zeroed[:, :10], states.maps[:, :10])
     assert not zeroed[:, 10:].any()
@@ -127,7 +144,7 @@ def test_replacements_touch_their_own_frames_and_nothing_else() -> None:
 
 
 def test_no_maps_is_the_last_layer_of_their_branch_at_zero() -> None:
-    agent = Questioned("vfn-p")
+    agent = Questioned("vfn-p-demonstrated")
     agent.reset(PolicyContext(ROAD, Timing(), agent.observation, 0.0, np.random.default_rng(0)))
     states = agent.perceive(histories(ROAD, FREE, agent.observation)).states
     without = answer(agent, (None, *states[1:]))

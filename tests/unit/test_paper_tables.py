@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.papers import guide, summary, table3
-from benchmarks.papers.claims import APPROACHES
+from benchmarks.papers.claims import APPROACHES, VFN, VFN_P
 from benchmarks.papers.driving import Settings
 from benchmarks.papers.guide import NONE, OTHER, OVERTAKES, SLOWS, YIELDS, guided
 from benchmarks.papers.pages import SAID_FIRST
@@ -37,11 +37,11 @@ def run(crashed: list[int], n: int, first: int = 200_000) -> Run:
 
 
 def test_below_the_paper_is_said_only_when_the_upper_bound_is() -> None:
-    names = {"vfn-p": "vfn-p", "vfn": "vfn", "safe-dqn": "safe-dqn"}
-    runs = {"vfn-p": run([], 1000), "vfn": run([1], 100), "safe-dqn": run([], 100)}
+    names = {name: name for name in (VFN_P, VFN, "safe-dqn")}
+    runs = {VFN_P: run([], 1000), VFN: run([1], 100), "safe-dqn": run([], 100)}
     rows = {line.split(" | ")[0]: line for line in table3.against_p(runs, names, ["merge"])}
-    assert "0/1000 = 0.00 (0.00 to 0.38), below P's 1.04" in rows["| vfn-p"]
-    assert "not below P's 1.96" in rows["| vfn"]  # 1 % is less than 1.96 %, but may well be 5 %
+    assert "0/1000 = 0.00 (0.00 to 0.38), below P's 1.04" in rows[f"| {VFN_P}"]
+    assert "not below P's 1.96" in rows[f"| {VFN}"]  # 1 % is less than 1.96 %, but may well be 5 %
     assert "not below P's 1.95" in rows["| safe-dqn"]  # none of 100 may still be 3.7 %
     assert "not run yet (P 29.12)" in rows["| conv2d-dqn"]
 
@@ -50,7 +50,7 @@ def test_there_are_episodes_enough_that_a_crash_free_agent_can_lie_below_the_pap
     for world, claimed in table3.TABLE_3.items():
         n = table3.enough(world)
         assert n >= table3.MOST
-        name = "vfn-p"
+        name = VFN_P
         line = table3.against_p({name: of_world(world, n)}, {name: name}, [world])[-2]
         assert f", below P's {claimed[name]}" in line
     assert table3.enough("highway") == 1300
@@ -62,22 +62,22 @@ def of_world(world: str, n: int) -> Run:
 
 
 def test_the_fewest_crashes_are_counted_on_common_seeds_and_ties_are_named() -> None:
-    runs = {"vfn": run([0, 1], 10), "vfn-p": run([2, 700], 1000), "safe-dqn": run([5], 10)}
-    assert table3.crashes_in_common(runs, "merge") == ({"vfn": 2, "vfn-p": 1, "safe-dqn": 1}, 10)
+    runs = {VFN: run([0, 1], 10), VFN_P: run([2, 700], 1000), "safe-dqn": run([5], 10)}
+    assert table3.crashes_in_common(runs, "merge") == ({VFN: 2, VFN_P: 1, "safe-dqn": 1}, 10)
     names = {name: name for name in runs}
     lines = table3.fewest(runs, names, ["merge"])
-    assert any("merge: `safe-dqn`, `vfn-p` (tie) with 1 of 10" in line for line in lines)
+    assert any(f"merge: `safe-dqn`, `{VFN_P}` (tie) with 1 of 10" in line for line in lines)
     assert "3 of 6 approaches" in lines[0]
 
 
 def test_the_summary_is_filled_from_the_csv_and_from_nothing_else(tmp_path: Path) -> None:
     (tmp_path / "data").mkdir()
     name = "collision_rate"
-    lines = [Line("dense", "merge", "vfn-p", "", name, "share", 0.005, 0.002, 0.009, 1000, 0, None)]
+    lines = [Line("dense", "merge", VFN_P, "", name, "share", 0.005, 0.002, 0.009, 1000, 0, None)]
     for other in APPROACHES[:-1]:
-        value = 0.0 if other == "vfn" else -0.01
+        value = 0.0 if other == VFN else -0.01
         figures = (value, -0.02, 0.01, 300, 0, 0.5)
-        lines.append(Line("dense", "merge", "vfn-p", other, name, "share", *figures))
+        lines.append(Line("dense", "merge", VFN_P, other, name, "share", *figures))
     write_csv(tmp_path / "data" / "table3.csv", lines)
     summary.write(Settings(out=tmp_path))
     rows = [
@@ -87,7 +87,7 @@ def test_the_summary_is_filled_from_the_csv_and_from_nothing_else(tmp_path: Path
     ]
     assert "merge 0.50 % (0.20 to 0.90), n 1000, below" in rows[0]
     assert "below in 1 of 5 worlds" in rows[0]
-    assert "| merge: yes, tied with vfn |" in rows[1]
+    assert f"| merge: yes, tied with {VFN} |" in rows[1]
     assert "| merge +0.00 points (-2.00 to +1.00), n 300 |" in rows[2]
     assert "untrained" not in "".join(rows)
 

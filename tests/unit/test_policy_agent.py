@@ -41,7 +41,7 @@ def decide(agent: PredictionAware) -> dict[str, Decision]:
     return agent.decide(histories(ROAD, CARS, agent.observation))
 
 
-@pytest.mark.parametrize("name", ["vfn-p", "vfn"])
+@pytest.mark.parametrize("name", ["vfn-p", "vfn", "vfn-p-demonstrated", "vfn-demonstrated"])
 def test_every_av_gets_an_explained_decision(name: str) -> None:
     agent = untrained(name)
     assert agent.label == "untrained"
@@ -132,6 +132,14 @@ def test_every_approach_is_a_policy_and_sees_what_table_iii_says() -> None:
         assert config.vfn.frames == (14 if name.startswith("vfn-p") else 10)
         assert bool(config.vfn.kinematic) == name.startswith("vfn")
         assert config.mask == name.startswith(("vfn", "safe"))
+
+
+def test_what_learned_from_rewards_alone_sees_others_in_its_maps_alone() -> None:
+    for name in ("vfn-p", "vfn"):
+        now, before = compact(name).vfn, compact(f"{name}-demonstrated").vfn
+        assert (now.extractor, now.others) == ("frames", False)
+        assert (before.extractor, before.others) == ("conv3d", True)
+    assert paper("vfn-p").vfn == paper("vfn-p-demonstrated").vfn, "a layout that ships is its card's alone"
 
 
 def test_without_a_mask_the_best_valued_action_is_taken() -> None:

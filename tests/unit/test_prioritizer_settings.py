@@ -12,6 +12,7 @@ from policy_scenes import Car, histories, straight_road
 from benchmarks import agent as agent_costs
 from benchmarks import prioritizer
 from benchmarks.papers.agents import build, config, fingerprint
+from benchmarks.papers.claims import VFN_P
 from benchmarks.unled import Unled
 from cosim.types import Decision, MetaAction, PolicyContext, Timing
 from policy.agents.approaches import compact
@@ -68,7 +69,7 @@ def test_every_setting_is_another_agent_and_the_default_is_the_shipped_one() -> 
     prints = [str(fingerprint(s.applied(cruise))) for s in prioritizer.SETTINGS]
     assert len(set(prints)) == len(prints)
     assert config(prioritizer.SETTINGS[0].applied(cruise)).safety == SafetyConfig()
-    assert prioritizer.SETTINGS[0].applied(prioritizer.AGENTS["vfn-p"]) == prioritizer.AGENTS["vfn-p"]
+    assert prioritizer.SETTINGS[0].applied(prioritizer.AGENTS[VFN_P]) == prioritizer.AGENTS[VFN_P]
     strict = next(s for s in prioritizer.SETTINGS if s.name == "safe_th 4 s").applied(cruise)
     made = build(strict)
     assert isinstance(made, Unled)

@@ -16,6 +16,7 @@ from benchmarks import altruism, targets
 from benchmarks.arms import differences
 from benchmarks.papers import decisions
 from benchmarks.papers.agents import Agent
+from benchmarks.papers.claims import VFN_P
 from benchmarks.papers.driving import Driven, Order, Results, Settings
 from benchmarks.tables import difference_table, table
 from benchmarks.targets import Arms
@@ -23,7 +24,7 @@ from cosim.report.run_folder import Run
 from cosim.report.statistics import Figure
 
 NOTES = {"units": run_rows.UNITS, "better": run_rows.BETTER}
-PARTS = Arms("vfn-p", "vfn-p-egoistic")
+PARTS = Arms(VFN_P, "vfn-p-egoistic")
 EPISODES = 100
 
 
@@ -50,7 +51,7 @@ def contested(world: str, **success: int) -> dict[str, Run]:
     """Runs in which so many missions were fulfilled; AVs give up distance as they yield."""
     found = {}
     for name, hits in success.items():
-        policy = {"twin": "vfn-p-egoistic", "rule": "altruist-rule", "agent": "vfn-p"}.get(name, name)
+        policy = {"twin": "vfn-p-egoistic", "rule": "altruist-rule", "agent": VFN_P}.get(name, name)
         served = first(hits)
         found[policy] = run(
             rows(
@@ -131,9 +132,9 @@ def test_above_the_twin_needs_more_than_chance(twin: int, verdict: str) -> None:
 
 def test_crashes_and_lost_distance_are_judged_in_every_world() -> None:
     worlds = ["merge", "roundabout"]
-    agent = [rows("vfn-p", w, "dense", crashed=first(2), dt_mean_m=[790.0] * EPISODES) for w in worlds]
+    agent = [rows(VFN_P, w, "dense", crashed=first(2), dt_mean_m=[790.0] * EPISODES) for w in worlds]
     idm = [rows("idm", w, "dense", dt_mean_m=[800.0 + k % 2 for k in range(EPISODES)]) for w in worlds]
-    runs = {"vfn-p": run(*agent), "idm": run(*idm)}
+    runs = {VFN_P: run(*agent), "idm": run(*idm)}
     verdicts = {(f.world, f.target): f.verdict for f in targets.dense(runs, worlds, PARTS)}
     assert verdicts["merge", "crashes in at most 1 %"].startswith("**missed**; the interval")
     assert verdicts["roundabout", "crashes in at most 3 %"].startswith("met; the interval")
@@ -144,7 +145,7 @@ def test_the_headline_is_given_either_way() -> None:
     twin = run(
         rows("vfn-p-egoistic", "merge", crashed=first(30), dt_mean_m=[700.0 + k % 3 for k in range(100)])
     )
-    agent = run(rows("vfn-p", "merge", crashed=first(2), dt_mean_m=[690.0 + k % 3 for k in range(100)]))
+    agent = run(rows(VFN_P, "merge", crashed=first(2), dt_mean_m=[690.0 + k % 3 for k in range(100)]))
     verdicts = {f.target: f.verdict for f in targets.altruists_against_twin("dense", twin, agent, ["merge"])}
     assert verdicts == {
         "altruists crash less": "shown",
@@ -165,7 +166,7 @@ def agent_like(one: Run) -> Run:
 def test_tables_leave_out_what_applies_to_nobody_and_count_what_failed() -> None:
     broken = rows("idm", "merge")
     broken[0] |= {"status": "sim_crash", "crashed": None}
-    runs = {"idm": run(broken), "vfn-p": run(rows("vfn-p", "merge", veto_rate=[0.25] * EPISODES))}
+    runs = {"idm": run(broken), VFN_P: run(rows(VFN_P, "merge", veto_rate=[0.25] * EPISODES))}
     lines = table("merge", runs, ("collision_rate", "veto_rate"))
     assert lines[0] == "|  | C% | vetoed | not comparable |"
     assert lines[2].startswith("| idm | 0.0 % (0.0 to 3.7), 0/99 | - | 0, 1 failed |")
@@ -178,7 +179,7 @@ def test_tables_leave_out_what_applies_to_nobody_and_count_what_failed() -> None
 
 def test_differences_can_be_read_down_or_across() -> None:
     runs = contested("merge", agent=97, twin=20, idm=4, rule=95)
-    compared = {name: differences(runs[name], runs["vfn-p"])["merge"] for name in ("idm", "altruist-rule")}
+    compared = {name: differences(runs[name], runs[VFN_P])["merge"] for name in ("idm", "altruist-rule")}
     across = difference_table(compared, ("mission_success_rate", "dt_av_m", "veto_rate"))
     assert across[0] == "|  | idm | altruist-rule |"
     assert [line.split(" | ")[0] for line in across[2:4]] == ["| mission success", "| DT AVs"]
@@ -213,7 +214,7 @@ def test_the_page_names_what_is_missed_before_any_table(tmp_path: Path) -> None:
     with (tmp_path / "data" / "decisions.csv").open() as file:
         lines = list(csv.DictReader(file))
     own = next(
-        x for x in lines if (x["arm"], x["figure"], x["against"]) == ("vfn-p", "mission_success_rate", "")
+        x for x in lines if (x["arm"], x["figure"], x["against"]) == (VFN_P, "mission_success_rate", "")
     )
     assert (float(own["value"]), own["n"]) == (0.7, "100")
     pair = next(x for x in lines if (x["against"], x["figure"]) == ("idm", "mission_success_rate"))

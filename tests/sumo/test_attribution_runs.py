@@ -15,7 +15,7 @@ from cosim.workers.worker import Worker
 
 
 def test_who_is_asked_drives_the_same_episode() -> None:
-    plan = planned(["merge"], ["contested"], [], ["vfn-p"], range(150000, 150001), duration=3.2)
+    plan = planned(["merge"], ["contested"], [], ["vfn-p-demonstrated"], range(150000, 150001), duration=3.2)
     ((_, case),) = plan.cases()
     hashes = []
     for host in (EpisodeRunner, Asking):
@@ -33,7 +33,7 @@ def test_the_command_writes_table_page_and_picture(
 ) -> None:
     words = [
         "--policy",
-        "vfn",
+        "vfn-demonstrated",
         "--scenario",
         "merge",
         "--demand",
@@ -46,11 +46,13 @@ def test_the_command_writes_table_page_and_picture(
     assert main(["bench", "attribution", *words, "--out", str(tmp_path)]) == 0
     with (tmp_path / "attribution.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert {row["policy"] for row in rows} == {"vfn"}
+    assert {row["policy"] for row in rows} == {"vfn-demonstrated"}
     assert len({(row["input"], row["replacement"]) for row in rows}) == len(rows) == 11
     text = (tmp_path / "attribution.md").read_text()
     assert text in capsys.readouterr().out
-    assert text.startswith("# Which inputs the value networks use\n\n- `vfn`: inputs that change no choice")
+    assert text.startswith(
+        "# Which inputs the value networks use\n\n- `vfn-demonstrated`: inputs that change no choice"
+    )
     assert "preset `lawful`" in text
     assert "2 episodes a policy" in text
     assert (tmp_path / "attribution.png").stat().st_size > 1000
@@ -59,7 +61,7 @@ def test_the_command_writes_table_page_and_picture(
 def test_driving_with_an_input_replaced_is_compared_with_driving_by_all_of_them(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["--policy", "vfn", "--scenario", "merge", "--demand", "contested", "--closed-loop"]
+    words = ["--policy", "vfn-demonstrated", "--scenario", "merge", "--demand", "contested", "--closed-loop"]
     words += ["--seeds", "150000:150001", "--duration", "1.2", "--errors", "stress"]
     assert main(["bench", "attribution", *words, "--out", str(tmp_path)]) == 0
     with (tmp_path / "closed_loop.csv").open(newline="") as file:
@@ -75,7 +77,7 @@ def test_driving_with_an_input_replaced_is_compared_with_driving_by_all_of_them(
     ]
     assert {row["seed"] for row in rows} == {"150000"}
     text = capsys.readouterr().out
-    assert "### vfn, 1 episodes" in text
+    assert "### vfn-demonstrated, 1 episodes" in text
     assert "| map branch | its last layer zero |" in text
 
 

@@ -112,6 +112,8 @@ def driving(name: str, card: Card) -> Iterator[str]:
     table = list(measured(name))
     if len(table) > HEAD:
         yield from ("- Measured (test seeds, preset `unguarded`):", "", *table, "")
+    else:
+        yield "- Measured: in no table of docs/results yet."
     yield from (f"- Limit: {text}" for text in LIMITS[approach.config])
 
 

@@ -17,6 +17,7 @@ class DdqnConfig:
     """Optimisation. Defaults: P, Table I."""
 
     learning_rate: float = 5e-4
+    last_rate: float | None = None  # of the last iteration, fallen to over the last third; None: constant
     target_every: int = 300  # updates between copies of the online network
     r_unsafe: float = -5.0  # value of an action that the prioritizer refused: a crash's (Alg. 4, line 13)
     scale: float = 0.1  # of all rewards: action values of the order of 1
@@ -30,6 +31,8 @@ class DdqnConfig:
         in_range(
             self, positive="learning_rate target_every scale clip", not_negative="refused imitation margin"
         )
+        if self.last_rate is not None:
+            in_range(self, positive="last_rate")
 
 
 class DdqnLearner(Learner):
@@ -63,7 +66,7 @@ class DdqnLearner(Learner):
             worth = torch.full_like(value, c.r_unsafe * c.scale)
             unsafe = functional.smooth_l1_loss(value, worth, reduction="sum") * (c.refused / len(q))
         imitation = c.imitation * self._margin(q, batch.possible, batch.wrong)
-        self.step(td + unsafe + imitation)
+        self.step(td + unsafe + imitation, self.rate)
         self.updates += 1
         if self.updates % c.target_every == 0:
             self.update_target()

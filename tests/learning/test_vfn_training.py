@@ -33,6 +33,7 @@ from policy.training.ddqn import DdqnConfig, DdqnLearner
 from policy.training.experience import Trajectory
 from policy.training.explorer import ExploreConfig, Explorer
 from policy.training.replay_buffer import ReplayBuffer, ReplayConfig
+from policy.training.trainers import rate
 from policy.training.vfn import TrainingRun
 
 torch.set_num_threads(1)
@@ -475,3 +476,20 @@ def test_another_configuration_is_not_gone_on_with(tmp_path: Path) -> None:
     other = TrainingRun(replace(SHORT, updates=5), TINY, Pretend(), tmp_path)
     with pytest.raises(BadInput, match="updates"):
         other.resume()
+
+
+def test_the_learning_rate_falls_over_the_last_third() -> None:
+    training = replace(SHORT, iterations=300, ddqn=replace(SHORT.ddqn, learning_rate=5e-4, last_rate=2e-4))
+    rates = [rate(training, k) for k in range(300)]
+    assert rates[:199] == [5e-4] * 199
+    assert rates[249] == pytest.approx(3.5e-4)
+    assert rates[299] == pytest.approx(2e-4)
+    assert rate(replace(training, ddqn=replace(training.ddqn, last_rate=None)), 299) == 5e-4
+
+
+def test_a_run_of_before_goes_on_with_the_defaults_of_newer_options(tmp_path: Path) -> None:
+    TrainingRun(replace(SHORT, iterations=2), TINY, Pretend(), tmp_path).run()
+    state = json.loads((tmp_path / "state.json").read_text())
+    del state["config"]["ddqn"]["last_rate"]
+    (tmp_path / "state.json").write_text(json.dumps(state))
+    assert TrainingRun(SHORT, TINY, Pretend(), tmp_path).resume()

@@ -493,3 +493,28 @@ def test_a_run_of_before_goes_on_with_the_defaults_of_newer_options(tmp_path: Pa
     del state["config"]["ddqn"]["last_rate"]
     (tmp_path / "state.json").write_text(json.dumps(state))
     assert TrainingRun(SHORT, TINY, Pretend(), tmp_path).resume()
+
+
+def test_values_that_are_apart_are_weighed_by_phi() -> None:
+    """Accelerating pays oneself 2, decelerating the others 2: whoever minds them chooses otherwise."""
+    rng, drives = np.random.default_rng(3), []
+    pays = {MetaAction.ACCELERATE: (2.0, 0.0, 0.0), MetaAction.DECELERATE: (0.0, 1.0, 1.0)}
+    for _ in range(60):
+        action = int(rng.integers(5))
+        terms = [pays.get(MetaAction(action), (0.0, 0.0, 0.0))]
+        drives.append(trajectory([action], terms, situation=[0, 0], ending="crashed"))
+    replay = ReplayBuffer(ReplayConfig(batch=64, n_step=1, relabel=1.0))
+    replay.add(drives)
+    learner = DdqnLearner(replace(TINY, parts=2), DdqnConfig(learning_rate=3e-3), seed=0)
+    draws = np.random.default_rng(0)
+    for _ in range(250):
+        learner.update(replay.sample(draws))
+    batch = replay.sample(draws)
+    phi = torch.deg2rad(torch.tensor([0.0, 30.0, 60.0, 90.0]))
+    now = batch.now._replace(phi=torch.stack([phi.cos(), phi.sin()], 1).repeat(16, 1))
+    with torch.no_grad():
+        apart, q = learner.online.apart(*now)[:4], learner.online(*now)[:4]
+    fast, slow = int(MetaAction.ACCELERATE), int(MetaAction.DECELERATE)
+    assert q.argmax(1).tolist() == [fast, fast, slow, slow]
+    assert apart[:, 0, fast].tolist() == pytest.approx([0.2] * 4, abs=0.05)  # reward x 0.1
+    assert apart[:, 1, slow].tolist() == pytest.approx([0.2] * 4, abs=0.05)

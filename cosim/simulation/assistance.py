@@ -33,13 +33,15 @@ LOOKS = 0.4  # s between looks at right of way and blocked lane changes
 GAP = 2.0, 1.0  # m and s: the gap given to who changes lanes
 YIELDING = 2.0, 1.0  # m/s2 and m/s: how hard, and down to what, an AV slows for who asked
 PATIENCE = 10.0  # s
-# s of waiting at a line from and until which an AV that only AVs keep there grows impatient, and how much
-WAITS = (15.0, 40.0), (0.3, 1.0)
+DECIDES = 30.0  # m before a line at which it gives way: from there on it looks who comes
+WAITS = 15.0, 40.0  # s of waiting at a line from and until which an AV grows impatient
+IMPATIENCE = (0.8, 1.0), (0.0, 0.4)  # at first and then, where AVs alone come, and where humans do
 CLOSE = 60.0  # m behind
 HEADWAY = 0.8, 1.8  # s to the leader; with a human that close behind
 CLOSES = 3.0, 2.0, 0.5  # s to contact, m/s2 that would avoid it, and the share of it of who heeds
 ROOM = (1.5, 0.2), (3.0, 0.5)  # s to contact, s to the leader that it makes do with; between them linear
 FLEES = 1.0  # s that this lasts at least
+STOPS = 0.3  # s to the leader at walking pace and below
 RETURNS = 0.1, 0.2  # s of headway won back per s, below and above `HEADWAY`
 
 STRATEGIC, BLOCKED = 8, 512 + 1024 + 2048 + 4096 + 8192  # bits of SUMO's lane-change state
@@ -59,9 +61,10 @@ class Assisted(Controlled):
     gap_for: str = ""  # who asked for a gap
     gives_way: bool = False  # at the next junction, or in this one
     waited: float = 0.0  # s, to give way
-    impatience: float = WAITS[1][0]
+    impatience: float = IMPATIENCE[0][0]
     crosses: float = 0.0  # s left of `CROSSES`
     headway: float = HEADWAY[0]  # s
+    tau: float = HEADWAY[0]  # s, its driver's, shorter at low speed
     late: bool = False  # whether it brakes late
     flees: float = -math.inf  # s, until when it makes room for who does not brake behind it
     idled: float = 0.0  # s, for which the agent has asked for less than `KEEPS_MOVING`
@@ -99,7 +102,8 @@ class Assistance(Commander):
             target = min(state.goal(speed, COMFORT_TIME), state.limit)
             state.idled = state.idled + self._step if state.target < KEEPS_MOVING else 0.0
             inside = get.getRoadID(name).startswith(":")
-            state.crosses = CROSSES if inside and state.gives_way else state.crosses - self._step
+            swift = inside and state.gives_way  # as SUMO's driver, whose acceleration its gap was judged by
+            state.crosses = CROSSES if swift else state.crosses - self._step
             if flees:
                 target = math.inf
             elif state.crosses > 0.0:
@@ -111,11 +115,12 @@ class Assistance(Commander):
             if state.gap_for and not flees:
                 state.accel = min(state.accel, self._yielding(name, speed, state))
             state.wish, state.speed = max(speed + state.accel * self._step, 0.0), speed
-            if not (slower or flees):
+            ours = not (slower or flees or swift)
+            if ours:
                 get.setSpeed(name, state.wish)
             elif state.ours:
                 get.setSpeed(name, -1.0)
-            state.ours = not (slower or flees)
+            state.ours = ours
 
     def observe(self, now: float) -> list[Intervention]:
         """After every simulation step, at `now` (s): where the car began to drive otherwise than asked."""
@@ -182,14 +187,16 @@ class Assistance(Commander):
             short = state.headway < HEADWAY[0]
             own = HEADWAY[human and gap < CLOSE]
             headway = min(state.headway + RETURNS[not short] * self._step, own)
-        late = headway < HEADWAY[0]
+        state.headway, late = headway, headway < HEADWAY[0]
+        # an IDM nears a line with speed = distance / headway: so it stops, and does not creep there
+        tau = min(headway, max(STOPS, speed / COMFORT))
         if late != state.late:
-            state.late, state.impatience = late, WAITS[1][0]
+            state.late, state.impatience = late, IMPATIENCE[0][0]
             set_type(name, _lawful(get.getTypeID(name), LATE_TYPE if late else LAWFUL_TYPE))
-        elif headway == state.headway:
+        elif tau == state.tau:
             return
-        state.headway = headway
-        get.setTau(name, headway)
+        state.tau = tau
+        get.setTau(name, tau)
 
     def _contact(self, name: str, speed: float, follower: str, gap: float) -> float:
         """s until a follower `gap` m behind is here; inf where he brakes, or need not yet."""
@@ -226,21 +233,35 @@ class Assistance(Commander):
                     self._give([other for other, _ in followers], name)
 
     def _wait(self, name: str, state: Assisted) -> None:
-        """Who waits long at a line takes shorter gaps of AVs, which see it and brake comfortably."""
+        """Before humans it waits for a gap that nobody brakes for; AVs see it, and brake comfortably."""
         get = sumo.vehicle
-        (begins, ends), (least, most) = WAITS
+        begins, ends = WAITS
         waits = state.gives_way and get.getSpeed(name) < KEEPS_MOVING
         state.waited = state.waited + LOOKS if waits else 0.0
-        impatience = least
-        if state.waited > begins:
-            foes = {foe[0] for foe in get.getJunctionFoes(name, NOTICE) if foe[7]}
-            if foes <= self.controlled.keys():
-                share = min((state.waited - begins) / (ends - begins), 1.0)
-                impatience += share * (most - least)
+        least, most = IMPATIENCE[state.gives_way and self._meets_humans(name)]
+        share = min(max((state.waited - begins) / (ends - begins), 0.0), 1.0)
+        impatience = least + share * (most - least)
         if impatience != state.impatience:
             state.impatience = impatience
             # its type is its own since `set_type`
             sumo.vehicletype.setImpatience(get.getTypeID(name), impatience)
+
+    def _meets_humans(self, name: str) -> bool:
+        """Whether anybody but AVs comes to the junction that is at most `DECIDES` ahead, from elsewhere.
+
+        `getJunctionFoes` leaves out some who have priority.
+        """
+        get = sumo.vehicle
+        if sumo.lane.getLength(get.getLaneID(name)) - get.getLanePosition(name) > DECIDES:
+            return False
+        own = get.getRoadID(name)
+        others = sumo.junction.getIncomingEdges(sumo.edge.getToJunction(own))
+        return any(
+            other not in self.controlled
+            for edge in others
+            if edge != own
+            for other in sumo.edge.getLastStepVehicleIDs(edge)
+        )
 
     def _give(self, asked: list[str], name: str) -> None:
         for other in asked:

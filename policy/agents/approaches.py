@@ -85,6 +85,7 @@ def configure(
             extractor="frames" if encoded else approach.extractor,
             kinematic=vfn.kinematic if approach.kinematics else 0,
             dueling=vfn.dueling and approach.learning != "a2c",
+            parts=1 if approach.learning == "a2c" else vfn.parts,
             critic=approach.learning == "a2c",
         ),
     )

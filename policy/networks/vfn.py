@@ -39,6 +39,7 @@ class VfnConfig:
     extractor: Literal["conv3d", "conv2d", "frames"] = "conv3d"  # frames: each by a trained `FrameEncoder`
     latent: int = 128  # numbers a frame becomes (extractor `frames`)
     dueling: bool = True  # q = state value + advantage: how good the moment is drowns what an action changes
+    parts: int = 1  # 2: what an action brings oneself and what it brings the others are valued apart
     critic: bool = False  # True: action preferences and a state value (A2C), not action values
 
 
@@ -104,8 +105,8 @@ class VFN(nn.Module):
                 nn.ReLU(),
             )
         self.joined = nn.Linear(c.hidden + 3 * rows + own + 2, c.joined)
-        self.value = nn.Linear(c.joined, len(MetaAction))
-        self.state = nn.Linear(c.joined, 1) if c.critic or c.dueling else None
+        self.value = nn.Linear(c.joined, len(MetaAction) * c.parts)
+        self.state = nn.Linear(c.joined, c.parts) if c.critic or c.dueling else None
         for head in (self.value, self.state) if self.state is not None else (self.value,):
             for parameter in head.parameters():
                 nn.init.zeros_(parameter)
@@ -164,10 +165,23 @@ class VFN(nn.Module):
         Returns:
             q: [B,5] value of each `MetaAction`.
         """
+        q = self.apart(maps, kinematics, situation, phi, keep)
+        return q[:, 0] if self.config.parts == 1 else (q * phi[..., None]).sum(1)
+
+    def apart(
+        self,
+        maps: torch.Tensor | Frames | None,
+        kinematics: torch.Tensor,
+        situation: torch.Tensor,
+        phi: torch.Tensor,
+        keep: torch.Tensor | None = None,
+    ) -> torch.Tensor:
+        """Values [B,parts,5] of what the reward weighs with cos and sin of phi (P, equation 6; with one part:
+        of all of it). The driver of that phi is valued in both. Arguments as in `forward`."""
         z = self.features(maps, kinematics, situation, phi, keep)
-        q: torch.Tensor = self.value(z)
+        q: torch.Tensor = self.value(z).view(len(phi), self.config.parts, len(MetaAction))
         if self.config.dueling and self.state is not None:
-            q = q - q.mean(1, keepdim=True) + self.state(z)
+            q = q - q.mean(2, keepdim=True) + self.state(z)[..., None]
         return q
 
     def actor_critic(

@@ -17,6 +17,7 @@ class DdqnConfig:
     """Optimisation. Defaults: P, Table I."""
 
     learning_rate: float = 5e-4
+    last_rate: float | None = None  # of the last iteration, fallen to over the last third; None: constant
     target_every: int = 300  # updates between copies of the online network
     r_unsafe: float = -5.0  # value of an action that the prioritizer refused: a crash's (Alg. 4, line 13)
     scale: float = 0.1  # of all rewards: action values of the order of 1
@@ -30,6 +31,8 @@ class DdqnConfig:
         in_range(
             self, positive="learning_rate target_every scale clip", not_negative="refused imitation margin"
         )
+        if self.last_rate is not None:
+            in_range(self, positive="last_rate")
 
 
 class DdqnLearner(Learner):
@@ -43,19 +46,23 @@ class DdqnLearner(Learner):
         self._networks["target"] = self.target
 
     def update(self, batch: Batch) -> Metrics:
-        """One step of double Q-learning with masked targets (P, equations 2 and 3; algorithm 4).
+        """One step of double Q-learning with masked targets (P, equations 2 and 3; algorithm 4); each part of
+        the values learns from its own part of the return.
 
         Returns `td` (Huber loss of the n-step error), `unsafe` (loss of the refused actions), `imitation`
         (of the demonstrated ones) and `q` (mean value of the actions carried out).
         """
         c = self.config
+        one = self.online.config.parts == 1
         with torch.no_grad():
-            best = self.online(*batch.later).masked_fill(~batch.allowed, -torch.inf).argmax(1, keepdim=True)
-            later = self.target(*batch.later).gather(1, best)[:, 0]
-            goal = batch.reward * c.scale + batch.discount * later
-        q = self.online(*batch.now, batch.keep)
-        chosen = q.gather(1, batch.action[:, None])[:, 0]
+            best = self.online(*batch.later).masked_fill(~batch.allowed, -torch.inf).argmax(1)
+            later = _taken(self.target.apart(*batch.later), best)
+            gained = batch.reward[:, None] if one else batch.parts
+            goal = gained * c.scale + batch.discount[:, None] * later
+        apart = self.online.apart(*batch.now, batch.keep)
+        chosen = _taken(apart, batch.action)
         td = functional.smooth_l1_loss(chosen, goal)
+        q = apart[:, 0] if one else (apart * batch.now.phi[..., None]).sum(1)
         refused = batch.vetoed >= 0
         unsafe = q.new_zeros(())
         if bool(refused.any()):  # stored as terminal with reward r_unsafe (Alg. 4)
@@ -63,7 +70,7 @@ class DdqnLearner(Learner):
             worth = torch.full_like(value, c.r_unsafe * c.scale)
             unsafe = functional.smooth_l1_loss(value, worth, reduction="sum") * (c.refused / len(q))
         imitation = c.imitation * self._margin(q, batch.possible, batch.wrong)
-        self.step(td + unsafe + imitation)
+        self.step(td + unsafe + imitation, self.rate)
         self.updates += 1
         if self.updates % c.target_every == 0:
             self.update_target()
@@ -117,3 +124,8 @@ class DdqnLearner(Learner):
         known, bad = q.masked_fill(~possible, -torch.inf)[advised], wrong[advised]
         lead = (known + self.config.margin * bad).amax(1) - known.masked_fill(bad, -torch.inf).amax(1)
         return lead.sum() / len(q)
+
+
+def _taken(apart: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+    """[B,parts] of the values [B,parts,A]: those of each action [B]."""
+    return apart.gather(2, action[:, None, None].expand(-1, apart.shape[1], 1))[..., 0]

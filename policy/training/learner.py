@@ -32,6 +32,7 @@ class Learner(Optimized):
         adam = torch.optim.Adam(learning, lr=config.learning_rate)
         super().__init__({"online": self.online}, adam, config.clip)
         self.updates = 0
+        self.rate: float | None = None  # of the next updates; None: the configuration's
 
     @property
     def imitates(self) -> bool:

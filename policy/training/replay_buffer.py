@@ -56,6 +56,7 @@ class Batch(NamedTuple):
     allowed: torch.Tensor  # [B,A] bool, actions that were safe in `later` (all, where none was)
     vetoed: torch.Tensor  # [B] the action the prioritizer refused in `now`, or -1
     wrong: torch.Tensor  # [B,A] bool, not demonstrated in `now` (for the drive's SVO alone)
+    parts: torch.Tensor  # [B,2] the same return's own part and the others', not weighed by phi
     keep: torch.Tensor | None = None  # [B,3] `VFN.forward`
 
 
@@ -98,8 +99,11 @@ class ReplayBuffer:
         weights = np.stack([np.cos(phi), np.sin(phi), np.sin(phi)], 1)  # [B,3] of the reward's terms
         later = [(trajectory, min(t + c.n_step, len(trajectory))) for trajectory, t in now]
         reward, discount = np.zeros((2, len(now)), np.float32)
+        parts = np.zeros((len(now), 2), np.float32)
         for b, ((trajectory, t), (_, end)) in enumerate(zip(now, later, strict=True)):
-            reward[b] = c.gamma ** np.arange(end - t) @ (trajectory.terms[t:end] @ weights[b])
+            fading, terms = c.gamma ** np.arange(end - t), trajectory.terms[t:end]
+            reward[b] = fading @ (terms @ weights[b])
+            parts[b] = fading @ terms[:, 0], fading @ terms[:, 1:].sum(1)
             if end < len(trajectory) or trajectory.ending != "crashed":
                 discount[b] = c.gamma ** (end - t)
         safe = ~np.stack([trajectory.unsafe[t] for trajectory, t in later])
@@ -111,6 +115,7 @@ class ReplayBuffer:
             safe | ~safe.any(1, keepdims=True),
             np.array([trajectory.vetoed[t] for trajectory, t in now], np.int64),
             np.stack([trajectory.wrong[t] for trajectory, t in now]) & ~relabelled[:, None],
+            parts,
         )
         tensors = (torch.from_numpy(array).to(device) for array in arrays)
         batch = Batch(states(now, phi, device), states(later, phi, device), *tensors)

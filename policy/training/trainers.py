@@ -92,6 +92,7 @@ class OffPolicyTrainer(Trainer):
         if self._prefilling:
             return {}
         learner, rng = self.learner, self._warm_up(k)
+        learner.rate = rate(self.config, k)
         if not learner.updates:
             learner.update_target()
         losses, agrees = [], []
@@ -105,6 +106,13 @@ class OffPolicyTrainer(Trainer):
             found = learner.effects(self.replay.sample(rng, self.device), past)
             effects = {f"effect/{name}": value for name, value in found.items()}
         return _named(mean_metrics(losses)) | ({"agrees": float(np.mean(agrees))} if agrees else {}) | effects
+
+
+def rate(config: VfnTraining, k: int) -> float:
+    """Learning rate of iteration `k`: falls linearly over the last third, where it has a last value."""
+    c, share = config.ddqn, 3.0 * (k + 1) / config.iterations - 2.0
+    last = c.learning_rate if c.last_rate is None else c.last_rate
+    return c.learning_rate + (last - c.learning_rate) * min(max(share, 0.0), 1.0)
 
 
 class OnPolicyTrainer(Trainer):

@@ -182,8 +182,7 @@ class TrainingRun:
             return False
         state = read_json(file)
         mine = json.loads(json.dumps(asdict(self.config)))
-        # a folder of before has the defaults of what it did not know
-        theirs = json.loads(json.dumps(asdict(VfnTraining()))) | state["config"]
+        theirs = checkpoint.filled(state["config"], json.loads(json.dumps(asdict(VfnTraining()))))
         differs = [name for name in mine if mine[name] != theirs[name] and name != "iterations"]
         if differs:
             raise BadInput("was trained with another configuration", file=file, field=", ".join(differs))

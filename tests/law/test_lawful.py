@@ -51,10 +51,17 @@ class Always:
         return {av: Decision(self.action) for av in histories}
 
 
-def drive(what: Path | str, policy: object, preset: str = Preset.LAWFUL, share: float = 1.0) -> EpisodeResult:
-    scenario = load(str(what), preset=preset, fleet=chosen_fleet(None, None, share), duration=60.0)
+def drive(
+    what: Path | str,
+    policy: object,
+    preset: str = Preset.LAWFUL,
+    share: float = 1.0,
+    seed: int = SEED,
+    duration: float = 60.0,
+) -> EpisodeResult:
+    scenario = load(str(what), preset=preset, fleet=chosen_fleet(None, None, share), duration=duration)
     with Worker(Host, scenario, policy, math.pi / 4) as worker:
-        result: EpisodeResult = worker.call("run", SEED)
+        result: EpisodeResult = worker.call("run", seed)
     return result
 
 
@@ -122,6 +129,28 @@ def test_the_headway_is_longer_with_a_human_close_behind(start: Start) -> None:
     alone, followed = gaps
     assert 12.0 < alone < 20.0
     assert followed > alone + 5.0
+
+
+def test_from_a_stop_sign_it_enters_no_gap_that_a_human_has_to_brake_for(law_worlds: dict[str, Path]) -> None:
+    accelerate = Always(MetaAction.ACCELERATE)
+    result = drive(law_worlds["stop_signs"], accelerate, share=0.2, seed=100_013, duration=90.0)
+
+    assert result.value("right_of_way_violations") == 0
+
+
+def test_it_comes_to_a_stop_comfortably_and_does_not_creep_there(start: Start) -> None:
+    standing = vehicle("standing", "hv", 150.0, speed=0.0, more='speedFactor="0.001"')
+    worker = start([standing, vehicle("av", "av", 60.0, speed=10.0)], preset=Preset.LAWFUL)
+    speeds = []
+    for _ in range(50):
+        frames = worker.call("advance", [Command("av", 30.0, 0, 0.4)])[1]
+        speeds += [frame.speed[frame.row["av"]] for frame in frames]
+
+    frame = 2.0 * STEP  # s
+    slow = [v for v in speeds if v < 2.0]
+    assert slow[-1] < 0.1
+    assert np.diff(slow).min() > -2.0 * frame
+    assert sum(v > 0.1 for v in slow) * frame < 2.2  # s; 0.8 s to the leader throughout would take longer
 
 
 def test_what_the_agent_wishes_is_comfortable_and_its_jerk_bounded() -> None:

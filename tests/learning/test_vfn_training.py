@@ -33,6 +33,7 @@ from policy.training.ddqn import DdqnConfig, DdqnLearner
 from policy.training.experience import Trajectory
 from policy.training.explorer import ExploreConfig, Explorer
 from policy.training.replay_buffer import ReplayBuffer, ReplayConfig
+from policy.training.trainers import rate
 from policy.training.vfn import TrainingRun
 
 torch.set_num_threads(1)
@@ -475,3 +476,45 @@ def test_another_configuration_is_not_gone_on_with(tmp_path: Path) -> None:
     other = TrainingRun(replace(SHORT, updates=5), TINY, Pretend(), tmp_path)
     with pytest.raises(BadInput, match="updates"):
         other.resume()
+
+
+def test_the_learning_rate_falls_over_the_last_third() -> None:
+    training = replace(SHORT, iterations=300, ddqn=replace(SHORT.ddqn, learning_rate=5e-4, last_rate=2e-4))
+    rates = [rate(training, k) for k in range(300)]
+    assert rates[:199] == [5e-4] * 199
+    assert rates[249] == pytest.approx(3.5e-4)
+    assert rates[299] == pytest.approx(2e-4)
+    assert rate(replace(training, ddqn=replace(training.ddqn, last_rate=None)), 299) == 5e-4
+
+
+def test_a_run_of_before_goes_on_with_the_defaults_of_newer_options(tmp_path: Path) -> None:
+    TrainingRun(replace(SHORT, iterations=2), TINY, Pretend(), tmp_path).run()
+    state = json.loads((tmp_path / "state.json").read_text())
+    del state["config"]["ddqn"]["last_rate"]
+    (tmp_path / "state.json").write_text(json.dumps(state))
+    assert TrainingRun(SHORT, TINY, Pretend(), tmp_path).resume()
+
+
+def test_values_that_are_apart_are_weighed_by_phi() -> None:
+    """Accelerating pays oneself 2, decelerating the others 2: whoever minds them chooses otherwise."""
+    rng, drives = np.random.default_rng(3), []
+    pays = {MetaAction.ACCELERATE: (2.0, 0.0, 0.0), MetaAction.DECELERATE: (0.0, 1.0, 1.0)}
+    for _ in range(60):
+        action = int(rng.integers(5))
+        terms = [pays.get(MetaAction(action), (0.0, 0.0, 0.0))]
+        drives.append(trajectory([action], terms, situation=[0, 0], ending="crashed"))
+    replay = ReplayBuffer(ReplayConfig(batch=64, n_step=1, relabel=1.0))
+    replay.add(drives)
+    learner = DdqnLearner(replace(TINY, parts=2), DdqnConfig(learning_rate=3e-3), seed=0)
+    draws = np.random.default_rng(0)
+    for _ in range(250):
+        learner.update(replay.sample(draws))
+    batch = replay.sample(draws)
+    phi = torch.deg2rad(torch.tensor([0.0, 30.0, 60.0, 90.0]))
+    now = batch.now._replace(phi=torch.stack([phi.cos(), phi.sin()], 1).repeat(16, 1))
+    with torch.no_grad():
+        apart, q = learner.online.apart(*now)[:4], learner.online(*now)[:4]
+    fast, slow = int(MetaAction.ACCELERATE), int(MetaAction.DECELERATE)
+    assert q.argmax(1).tolist() == [fast, fast, slow, slow]
+    assert apart[:, 0, fast].tolist() == pytest.approx([0.2] * 4, abs=0.05)  # reward x 0.1
+    assert apart[:, 1, slow].tolist() == pytest.approx([0.2] * 4, abs=0.05)

@@ -101,19 +101,21 @@ def driving(name: str, card: Card) -> Iterator[str]:
     )
     hours = sum(row["iteration_s"] for row in log) / 3600
     yield (
-        f"- Shipped: iteration {last['iteration']}, after {last['updates']:,} updates and {hours:.1f} h "
-        "by its log"
+        f"- Shipped: iteration {card['measured']['iteration']}, after {last['updates']:,} updates and "
+        f"{hours:.1f} h by its log"
         + (
             f"; highest mean reward in {training['validation']} validation drives a case, tuning seeds."
-            if "valid/reward" in last
-            else "."
+            if "validation" in card["measured"]
+            else ", its last."
         )
     )
     table = list(measured(name))
     if len(table) > HEAD:
         yield from ("- Measured (test seeds, preset `unguarded`):", "", *table, "")
     else:
-        yield "- Measured: in no table of docs/results yet."
+        driven = f"| {name} at " in (RESULTS / "learned.md").read_text(encoding="utf-8")
+        where = "on test seeds, preset `lawful`: docs/results/learned.md" if driven else "in no table yet"
+        yield f"- Measured {where}."
     yield from (f"- Limit: {text}" for text in LIMITS[approach.config])
 
 

@@ -151,7 +151,8 @@ def main() -> None:
         "Shares with Wilson's, means and paired differences with bootstrap and Tango's 95 % intervals; p by",
         "McNemar, one test a world and figure, not corrected for how many there are.",
         "",
-        f"Made by `python -m benchmarks.learned {args.policy} --episodes {args.episodes}`.",
+        f"Made by `python -m benchmarks.learned {args.policy} --episodes {args.episodes} "
+        f"--errors {' '.join(args.errors)}`.",
     ]
     write_page(args.out, page(args.runs, args.policy, args.errors, about))
     print(args.out.read_text())

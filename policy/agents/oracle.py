@@ -29,6 +29,8 @@ class Oracle(PredictionAware):
 
     def __init__(self, name: str, config: AgentConfig | None = None) -> None:
         super().__init__(name, config)
+        if config is None:  # the one that ships
+            self.name = f"{name}-oracle"
         self.hpn = None  # nothing is left to be corrected
 
     def looks_ahead(self, look: LookAhead) -> None:

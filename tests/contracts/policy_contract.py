@@ -15,7 +15,16 @@ from cosim.control import to_commands
 from cosim.observation.observer import Observer
 from cosim.seeding import generator
 from cosim.simulation.fake import FakeSimulator, FakeVehicle
-from cosim.types import Decision, History, MetaAction, ObservationConfig, Policy, PolicyContext, Timing
+from cosim.types import (
+    Decision,
+    History,
+    LooksAhead,
+    MetaAction,
+    ObservationConfig,
+    Policy,
+    PolicyContext,
+    Timing,
+)
 
 TIMING = Timing()
 
@@ -38,6 +47,7 @@ def episode(policy: Policy, seed: int, decisions: int = 8) -> list[dict[str, Dec
     """What the policy decides in `traffic`."""
     world = traffic()
     observer = Observer(world.road, policy.observation)
+    shown(policy, world)
     policy.reset(context(world, policy.observation, seed))
     frames = world.reset(0)
     chosen = []
@@ -49,6 +59,12 @@ def episode(policy: Policy, seed: int, decisions: int = 8) -> list[dict[str, Dec
         check(chosen[-1], histories)
         _, frames = world.advance(to_commands(chosen[-1], histories, TIMING.decision))
     return chosen
+
+
+def shown(policy: Policy, world: FakeSimulator) -> None:
+    """A policy that looks ahead may: as a host does it."""
+    if isinstance(policy, LooksAhead):
+        policy.looks_ahead(world.ahead)
 
 
 def context(world: FakeSimulator, observation: ObservationConfig, seed: int) -> PolicyContext:
@@ -96,6 +112,7 @@ class PolicyContract:
     def test_what_it_is_shown_stays_as_it_was(self, policy: Policy) -> None:
         world = traffic()
         observer = Observer(world.road, policy.observation)
+        shown(policy, world)
         policy.reset(context(world, policy.observation, 0))
         for frame in world.reset(0):
             observer.add(frame)

@@ -28,7 +28,7 @@ from benchmarks.tables import markdown_row
 from cosim.batch.episode_runner import EpisodeRunner
 from cosim.batch.record import planned
 from cosim.cli.arguments import seeds as seeds_of
-from cosim.control import MAX_DECEL
+from cosim.control import COMFORT, MAX_DECEL
 from cosim.episode import Episode, Hook, Step
 from cosim.files import write_csv
 from cosim.learning.prediction_data import spread
@@ -40,18 +40,15 @@ from cosim.workers.engines import LocalEngine
 from cosim.workers.tasks import Progress, Task
 
 AFTER = 3.0  # s
-REMEMBERED = 5.0  # s after its end in which an error still has a part
 # what the AV does -> the acceleration in m/s2 that is forced, or the side it changes to
 ANSWERS: dict[str, float | int] = {
     "brakes hard": -MAX_DECEL,
-    "brakes": -2.8,
-    "speeds up": 2.8,
+    "brakes": -COMFORT,
+    "speeds up": COMFORT,
     "goes left": 1,
     "goes right": -1,
 }
 ROWS = Path("docs/results/data/avoidable.csv")
-
-
 COLUMNS = (
     *("world", "demand", "policy", "episodes", "an AV in a collision", "a human erred", "avoidable"),
     *("by braking hard", "by braking", "by speeding up", "by changing lanes", "s before, median"),
@@ -75,6 +72,8 @@ class Outcome:
 
 def error_of(collision: Collision, begun: Sequence[HumanError]) -> HumanError | None:
     """The last error with a part in it: of one of both, or of somebody before one of them."""
+    from cosim.simulation.human_errors import REMEMBERED  # libsumo: in the worker's process alone
+
     pair = collision.collider, collision.victim
     mine = [
         e

@@ -56,6 +56,7 @@ WRONG_DEMAND = re.compile(
     r"[Ii]nvalid depart|Departure \w+ .*for vehicle|has no valid route|No connection between edge|[Pp]erson '"
 )
 GIVES_UP = "max-depart-delay"  # SUMO drops vehicles that waited so long, without a message
+NOBODY: Mapping[str, float] = MappingProxyType({})
 
 _in_use = False
 
@@ -143,18 +144,26 @@ class SumoSimulator:
 
     def advance(self, commands: Sequence[Command]) -> tuple[tuple[Receipt, ...], tuple[Snapshot, ...]]:
         """Hold the commands for one decision; one snapshot per frame. Raises SimulationError."""
-        frames = []
         with self._stderr:
             now = sumo.simulation.getTime()
             self._commander.release(commands)
             receipts = tuple(self._commander.take(c, now) for c in commands)
-            for k in range(1, self._steps_per_decision + 1):
-                self._commander.drive()
-                self._step()
-                if k % self._steps_per_frame == 0:
-                    frames.append(self._snapshot())
+            frames = self._drive(self._steps_per_decision)
             receipts = self._commander.confirm(receipts, commands)
-        return receipts, tuple(frames)
+        return receipts, frames
+
+    def _drive(self, steps: int, forced: Mapping[str, float] = NOBODY) -> tuple[Snapshot, ...]:
+        """As commanded; one snapshot per frame. `forced`: see `ahead`."""
+        frames = []
+        for k in range(1, steps + 1):
+            self._commander.drive()
+            if forced:
+                for name in forced.keys() & set(sumo.vehicle.getIDList()):
+                    force(name, forced[name], self._scenario.timing.step)
+            self._step()
+            if k % self._steps_per_frame == 0:
+                frames.append(self._snapshot())
+        return tuple(frames)
 
     def ahead(
         self,
@@ -162,7 +171,7 @@ class SumoSimulator:
         commands: Sequence[Command] = (),
         *,
         errors: bool = False,
-        forced: Mapping[str, float] = MappingProxyType({}),
+        forced: Mapping[str, float] = NOBODY,
     ) -> tuple[Snapshot, ...]:
         """The next `frames` frames if every AV went on as it is commanded, those of `commands` as these say.
 
@@ -184,19 +193,11 @@ class SumoSimulator:
         """In the copy."""
         if self._errors is not None and not errors:
             self._errors.hold()
-        found = []
         with self._stderr:
             now = sumo.simulation.getTime()
             for command in commands:
                 self._commander.take(command, now)
-            for k in range(1, frames * self._steps_per_frame + 1):
-                self._commander.drive()
-                for name in forced.keys() & set(sumo.vehicle.getIDList()):
-                    force(name, forced[name], self._scenario.timing.step)
-                self._step()
-                if k % self._steps_per_frame == 0:
-                    found.append(self._snapshot())
-        return tuple(found)
+            return self._drive(frames * self._steps_per_frame, forced)
 
     def route(self, vehicle: str) -> tuple[str, ...]:
         """The edges still ahead, the present one first."""

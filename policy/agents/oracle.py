@@ -18,9 +18,8 @@ STATE = (X, Y, SPEED, HEADING)
 class Oracle(PredictionAware):
     """Drives by the same networks; the simulation itself says where everybody will be.
 
-    Fair: the AVs hold what they are commanded, human errors that have not begun do not begin. No predictor
-    that learns from the same histories can be expected to do better by knowing less. Predicted maps are drawn
-    as they will be seen, without the shading that stands for doubt.
+    Fair: the AVs hold what they are commanded, and human errors that have not begun do not begin, as no
+    predictor can know of them. Predicted maps are drawn without the shading that stands for doubt.
 
     Args:
         name: the approach.

@@ -165,24 +165,20 @@ class VFN(nn.Module):
         Returns:
             q: [B,5] value of each `MetaAction`.
         """
-        q = self.apart(maps, kinematics, situation, phi, keep)
-        return q[:, 0] if self.config.parts == 1 else (q * phi[..., None]).sum(1)
+        return self.weighed(self.apart(maps, kinematics, situation, phi, keep), phi)
 
-    def apart(
-        self,
-        maps: torch.Tensor | Frames | None,
-        kinematics: torch.Tensor,
-        situation: torch.Tensor,
-        phi: torch.Tensor,
-        keep: torch.Tensor | None = None,
-    ) -> torch.Tensor:
+    def apart(self, *inputs: Any) -> torch.Tensor:
         """Values [B,parts,5] of what the reward weighs with cos and sin of phi (P, equation 6; with one part:
-        of all of it). The driver of that phi is valued in both. Arguments as in `forward`."""
-        z = self.features(maps, kinematics, situation, phi, keep)
-        q: torch.Tensor = self.value(z).view(len(phi), self.config.parts, len(MetaAction))
+        of all of it), for who drives by that phi. Arguments as in `forward`."""
+        z = self.features(*inputs)
+        q: torch.Tensor = self.value(z).view(len(z), self.config.parts, len(MetaAction))
         if self.config.dueling and self.state is not None:
             q = q - q.mean(2, keepdim=True) + self.state(z)[..., None]
         return q
+
+    def weighed(self, apart: torch.Tensor, phi: torch.Tensor) -> torch.Tensor:
+        """Action values [B,5] of their parts [B,parts,5]; phi [B,2]."""
+        return apart[:, 0] if self.config.parts == 1 else (apart * phi[..., None]).sum(1)
 
     def actor_critic(
         self,

@@ -53,16 +53,15 @@ class DdqnLearner(Learner):
         (of the demonstrated ones) and `q` (mean value of the actions carried out).
         """
         c = self.config
-        one = self.online.config.parts == 1
         with torch.no_grad():
             best = self.online(*batch.later).masked_fill(~batch.allowed, -torch.inf).argmax(1)
             later = _taken(self.target.apart(*batch.later), best)
-            gained = batch.reward[:, None] if one else batch.parts
+            gained = batch.reward[:, None] if self.online.config.parts == 1 else batch.parts
             goal = gained * c.scale + batch.discount[:, None] * later
         apart = self.online.apart(*batch.now, batch.keep)
         chosen = _taken(apart, batch.action)
         td = functional.smooth_l1_loss(chosen, goal)
-        q = apart[:, 0] if one else (apart * batch.now.phi[..., None]).sum(1)
+        q = self.online.weighed(apart, batch.now.phi)
         refused = batch.vetoed >= 0
         unsafe = q.new_zeros(())
         if bool(refused.any()):  # stored as terminal with reward r_unsafe (Alg. 4)
@@ -74,7 +73,12 @@ class DdqnLearner(Learner):
         self.updates += 1
         if self.updates % c.target_every == 0:
             self.update_target()
-        losses = {"td": td, "unsafe": unsafe, "imitation": imitation, "q": chosen.mean()}
+        losses = {
+            "td": td,
+            "unsafe": unsafe,
+            "imitation": imitation,
+            "q": q.gather(1, batch.action[:, None]).mean(),
+        }
         return {name: float(value.detach()) for name, value in losses.items()}
 
     def imitate(self, batch: Advised) -> float:

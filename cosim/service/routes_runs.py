@@ -126,7 +126,8 @@ def runs_router(runs: Runs, replays: Replays, uploads: Uploads) -> APIRouter:
     @router.get("/runs/{run}/summary", summary="Figures per cell with intervals, of a run that has finished")
     def summary(run: RunId) -> dict[str, Any]:
         file(run, SUMMARY)
-        found: dict[str, Any] = json.loads((runs.folder(run) / SUMMARY).read_text("utf-8"))
+        with runs.reading(run) as folder:
+            found: dict[str, Any] = json.loads((folder / SUMMARY).read_text("utf-8"))
         return found
 
     @router.get("/runs/{run}/report", summary="The report: one HTML file", response_class=FileResponse)
@@ -146,7 +147,8 @@ def runs_router(runs: Runs, replays: Replays, uploads: Uploads) -> APIRouter:
 
     @router.get("/runs/{run}/files", summary="The files of a run")
     def files(run: RunId) -> list[FileEntry]:
-        return [FileEntry(name=name, bytes=path.stat().st_size) for name, path in runs.files(run).items()]
+        with runs.reading(run):
+            return [FileEntry(name=name, bytes=path.stat().st_size) for name, path in runs.files(run).items()]
 
     @router.get("/runs/{run}/files/{name:path}", summary="One file of a run", response_class=FileResponse)
     def artefact(run: RunId, name: Annotated[str, Path(examples=["episodes.csv"])]) -> Response:

@@ -9,7 +9,7 @@ import shutil
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -227,24 +227,28 @@ class Runs:
 
     def rows(self, run: str) -> list[dict[str, Any]]:
         """The rows so far, as `cosim evaluate` keeps them."""
-        self.get(run)
-        try:
-            with self._store(run) as store:
-                return store.rows()
-        except BadInput:
-            self.get(run)  # raises NotFound: it was removed meanwhile
-            raise
+        with self.reading(run), self._store(run) as store:
+            return store.rows()
 
     def files(self, run: str) -> dict[str, Path]:
         """The files of a run by their names: those of `cosim evaluate`, and SUMO's own outputs."""
-        self.get(run)
-        folder = self.folder(run)
-        found = [*folder.glob("*.*"), *(folder / OUTPUTS).glob("*/*.xml")]
+        with self.reading(run) as folder:
+            found = [*folder.glob("*.*"), *(folder / OUTPUTS).glob("*/*.xml")]
         return {
             str(path.relative_to(folder)): path
             for path in sorted(found)
             if path.is_file() and not path.is_symlink() and not path.name.startswith((FILE, "."))
         }
+
+    @contextlib.contextmanager
+    def reading(self, run: str) -> Iterator[Path]:
+        """Its folder, to be read. Raises NotFound, also when it is removed meanwhile."""
+        self.get(run)
+        try:
+            yield self.folder(run)
+        except (BadInput, OSError, SQLAlchemyError):
+            self.get(run)
+            raise
 
     def folder(self, run: str) -> Path:
         """Where it keeps its files."""

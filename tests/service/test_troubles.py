@@ -131,6 +131,19 @@ def test_a_run_that_is_removed_while_it_is_read_leaves_nothing(server: Server) -
         assert not (server.data / "runs" / run).exists()
 
 
+def test_a_run_whose_folder_goes_while_it_is_listed_is_not_there(
+    client: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = ended(client, client.post("/api/runs", json=SHORT).json()["id"])["id"]
+
+    def goes(*_: object) -> None:
+        assert client.delete(f"/api/runs/{run}").status_code == 204
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
+
+    monkeypatch.setattr(Path, "glob", goes)
+    assert client.get(f"/api/runs/{run}/files").status_code == 404
+
+
 def test_clients_that_send_slowly_or_go_away_keep_nobody_waiting(server: Server) -> None:
     host, port = server.url.removeprefix("http://").split(":")
     slow = [socket.create_connection((host, int(port))) for _ in range(200)]

@@ -1,15 +1,16 @@
 """Which inputs a value network uses: it is asked again with one input replaced (a counterfactual).
 
-Nothing here changes how the agent drives: the plain network is asked on whole maps, without its memory.
+Nothing here changes how the agent drives. Where an encoder makes latents of maps, latents are replaced: each
+is of one frame, so that another frame's latent is what another frame's map becomes.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 import torch
 
-from cosim.types import Decision, Floats, Floats32, Ints, PolicyContext
+from cosim.types import Decision, Floats, Floats32, History, Ints, PolicyContext
 from policy.agents.approaches import AgentConfig
 from policy.agents.prediction_aware import Inputs, PredictionAware
 from policy.inputs.tensors import States, svo_tensor, to_numpy
@@ -28,23 +29,24 @@ SUMS = ("decisions", "choices_changed", "unmasked_changed", "mean_abs_dq", "spre
 
 
 def questions(
-    states: States, past: int, fields: Sequence[str], only: tuple[str, str] | None = None
+    network: VFN, states: States, past: int, only: tuple[str, str] | None = None
 ) -> Iterator[tuple[str, str, Arguments]]:
     """Every replacement of every input, or `only` one: (input, replacement, what the network is asked with).
 
     Args:
+        network: who is asked.
         states: what B AVs that decide together see; the first `past` frames of maps and kinematics have been
             perceived, the others are predicted.
-        fields: what the network takes (`network_inputs`).
 
     Zeroed; as at present: the newest perceived frame in place of every other one; another AV's of the same
     instant: that of the next row, where there are at least two. Without maps the layer that reads the
     convolutions' output is as if its weights were zero (`VFN.forward`).
     """
     spans = {"past ": slice(past), "predicted ": slice(past, None), "all ": slice(None)}
-    for field in fields:
+    for field in network_inputs(network):
         whole: torch.Tensor = getattr(states, field)
-        ways = {ZEROED: torch.zeros_like(whole)}
+        encoded = field == "maps" and whole.dim() == 3
+        ways = {ZEROED: network.maps.blank.expand_as(whole) if encoded else torch.zeros_like(whole)}
         if field != "situation":
             ways[PRESENT] = whole[:, past - 1 : past].expand_as(whole)
         if len(whole) > 1:
@@ -93,7 +95,15 @@ def replacements(network: VFN, past: int) -> list[tuple[str, str]]:
     return [*found, BLIND, ("phi", f"{ANGLES[0]} degrees")]
 
 
-class Replaced(PredictionAware):
+class _Encoding(PredictionAware):
+    """Perceives latents in place of maps where its network has an encoder."""
+
+    def perceive(self, histories: Mapping[str, History]) -> Inputs:
+        """As the agent's."""
+        return self.encoded(super().perceive(histories))
+
+
+class Replaced(_Encoding):
     """Drives by what its network answers with one input replaced; `what` None: by the network as it is."""
 
     def __init__(self, name: str, config: AgentConfig, what: tuple[str, str] | None) -> None:
@@ -103,13 +113,12 @@ class Replaced(PredictionAware):
     def values(self, inputs: Inputs) -> Floats32:
         """The action values [B,A]; an AV that decides alone has no other's input and keeps its own."""
         if self._what is not None:
-            past, fields = self.observation.frames, network_inputs(self.vfn)
-            for _, _, arguments in questions(inputs.states, past, fields, self._what):
+            for _, _, arguments in questions(self.vfn, inputs.states, self.observation.frames, self._what):
                 return answer(self, arguments)
         return super().values(inputs)
 
 
-class Questioned(PredictionAware):
+class Questioned(_Encoding):
     """Drives as the agent does; `answers` holds the episode's SUMS by input and replacement."""
 
     def reset(self, context: PolicyContext) -> None:
@@ -121,7 +130,7 @@ class Questioned(PredictionAware):
         """As the agent's, after the questions."""
         states, plain = inputs.states, answer(self, inputs.states)
         chosen, ordered = self._actions(plain, inputs), np.sort(plain, 1)
-        for name, how, arguments in questions(states, self.observation.frames, network_inputs(self.vfn)):
+        for name, how, arguments in questions(self.vfn, states, self.observation.frames):
             other = answer(self, arguments)
             same = np.array_equal(other, plain)  # spares the prioritizer
             sums = (
@@ -167,9 +176,9 @@ class Explainer:
         pair = [here, (here + 1) % len(agents)][: len(agents)]  # another AV's inputs are the next one's
         states = States(*(column[pair] for column in inputs.states))
         plain, found = answer(agent, states)[0], []
-        past, fields = agent.observation.frames, network_inputs(agent.vfn)
+        past = agent.observation.frames
         for what in replacements(agent.vfn, past):
-            for name, how, arguments in questions(states, past, fields, what):
+            for name, how, arguments in questions(agent.vfn, states, past, what):
                 row, action = answer(agent, arguments)[0], decisions[self.asked].action
                 if (np.argsort(row) != np.argsort(q[here])).any():  # else the prioritizer says the same
                     agent._asked, other = dict(before), q.copy()

@@ -90,8 +90,8 @@ def _add_attribution(kinds: arguments.SubCommands) -> None:
         description="Drive episodes as `cosim run` does; at every decision ask the same network again with "
         "one input replaced. Writes attribution.csv, .md and .png, and closed_loop.csv with --closed-loop.",
     )
-    arguments.add(command, "--policy", action="append", required=True)
-    arguments.add(command, "--scenario", "--out", required=True)
+    arguments.add(command, "--policy", "--scenario", action="append", required=True)
+    arguments.add(command, "--out", required=True)
     arguments.add(command, "--demand", default="")
     arguments.add(command, "--seeds", type=arguments.seeds, required=True)
     arguments.add(command, "--svo", default=45.0)
@@ -99,6 +99,9 @@ def _add_attribution(kinds: arguments.SubCommands) -> None:
     arguments.add(command, "--errors")
     command.add_argument(
         "--closed-loop", action="store_true", help="also drive whole episodes with each input replaced"
+    )
+    command.add_argument(
+        "--by", default="dt_mission_m", metavar="FIGURE", help="of closed_loop.csv: which one is tested"
     )
     arguments.add(command, "--workers", default=1)
     command.set_defaults(work=work_attribution)
@@ -114,7 +117,7 @@ def work_attribution(args: argparse.Namespace) -> int:
 
     out = prepare_folder(args.out)
     what = (args.policy, args.scenario, args.demand, args.seeds, args.svo, args.duration)
-    how = {"errors": args.errors, "closed_loop": args.closed_loop, "workers": args.workers}
+    how = {"errors": args.errors, "closed_loop": args.closed_loop, "by": args.by, "workers": args.workers}
     attribution(out, *what, **how, command="cosim " + shlex.join(sys.argv[1:]))
     print((out / PAGE).read_text(encoding="utf-8"))
     return 0

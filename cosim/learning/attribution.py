@@ -1,6 +1,6 @@
 """`cosim bench attribution`: which inputs of a value network change a choice, and which change the drive."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import astuple
 from itertools import groupby
 from operator import itemgetter
@@ -17,7 +17,7 @@ from cosim.errors import BadInput
 from cosim.files import write_csv
 from cosim.learning.prediction_data import spread
 from cosim.policies import make
-from cosim.report.statistics import mean, paired_mean, paired_share, share
+from cosim.report.statistics import holm, mean, paired_mean, paired_share, share, signed_rank
 from cosim.scenario.episode_id import EpisodeId
 from cosim.workers.engines import LocalEngine
 from cosim.workers.tasks import Progress
@@ -28,7 +28,9 @@ from policy.attribution import ORACLE, SUMS, Questioned, Replaced, replacements
 PAGE, TABLE, PICTURE = "attribution.md", "attribution.csv", "attribution.png"
 DRIVEN = "closed_loop.csv"
 SHARED = ("crashed", "mission_success")  # figures of an episode that are yes or no, and those that are not:
-FIGURES = ("av_near_misses_ttc", "hard_brakings_av", "dt_mean_m", "dt_av_m", "dt_mission_m")
+FIGURES = ("mission_time_s", "av_near_misses_ttc", "hard_brakings_av", "dt_mean_m", "dt_av_m", "dt_mission_m")
+BY = "dt_mission_m"  # the one that is tested
+NOTHING = "nothing", ""  # is replaced
 SHARES = ("choices_changed", "unmasked_changed")
 HEAD = (
     "| input | replacement | decisions | choices changed | best valued changed | mean abs dq | spread |",
@@ -84,7 +86,7 @@ class Replacing(EpisodeRunner):
 def attribution(
     out: Path,
     policies: Sequence[str],
-    scenario: str,
+    scenarios: Sequence[str],
     demand: str,
     seeds: range,
     svo_deg: float = 45.0,
@@ -92,19 +94,23 @@ def attribution(
     *,
     errors: str | None = None,
     closed_loop: bool = False,
+    by: str = BY,
     workers: int = 1,
     command: str = "",
 ) -> None:
     """Drive and ask; writes TABLE, PICTURE and PAGE into `out`.
 
     `closed_loop`: also drives every episode with each of `policy.attribution.replacements`: DRIVEN, and a
-    part of PAGE. `errors`: of the human drivers.
+    part of PAGE, where the worlds are tested by the figure `by`. `errors`: of the human drivers.
 
-    Raises BadInput as `cosim.batch.record.planned`, and for a policy without a value network.
+    Raises BadInput as `cosim.batch.record.planned`, for a policy without a value network, and for a figure
+    that is none of FIGURES.
     """
+    if by not in FIGURES:
+        raise BadInput(f"is none of {', '.join(FIGURES)}", field="--by", value=by)
     for policy in policies:
         questioned(policy)
-    plan = planned([scenario], [demand], [], policies, seeds, svo_deg, duration, errors=errors)
+    plan = planned(scenarios, [demand], [], policies, seeds, svo_deg, duration, errors=errors)
     tasks = [cell.task(case) for cell, case in plan.cases()]
     driven = spread(LocalEngine(Asking, workers=workers), tasks, "attribution")
     names = dict.fromkeys(episode["policy"] for episode in driven)
@@ -113,58 +119,88 @@ def attribution(
     draw(out / PICTURE, tables)
     page = markdown(driven, tables, command)
     if closed_loop:
-        rows = closed(plan, workers)
-        write_csv(out / DRIVEN, rows)
-        page += "\n" + closed_markdown(rows)
+        rows: list[dict[str, Any]] = []
+        for part in closed(plan, workers):
+            rows += part
+            write_csv(out / DRIVEN, rows)
+        page += "\n" + closed_markdown(rows, by)
     (out / PAGE).write_text(page, encoding="utf-8")
 
 
-def closed(plan: Plan, workers: int = 1) -> list[dict[str, Any]]:
-    """A row per policy, replacement (none first) and episode: SHARED and FIGURES."""
-    rows = []
+def closed(plan: Plan, workers: int = 1) -> Iterator[list[dict[str, Any]]]:
+    """Per policy, world and replacement (none first): a row per episode, SHARED and FIGURES."""
     for cell in plan.cells:
         agent = questioned(cell.case.policy)
         tasks = [one.task(case) for one, case in plan.cases() if one is cell]
-        for what in (None, *replacements(agent.vfn, agent.observation.frames), ORACLE):
-            name, how = what or ("nothing", "")
-            engine = LocalEngine(Replacing, (what,), workers=workers)
-            for driven in spread(engine, tasks, f"{name} {how}".strip()):
-                about = {
-                    "policy": driven["policy"],
-                    "input": name,
-                    "replacement": how,
-                    "seed": driven["seed"],
-                }
-                rows.append(about | {figure: driven[figure] for figure in (*SHARED, *FIGURES)})
-    return rows
+        for what in (NOTHING, *replacements(agent.vfn, agent.observation.frames), ORACLE):
+            engine = LocalEngine(Replacing, (None if what is NOTHING else what,), workers=workers)
+            driven = spread(engine, tasks, f"{cell.case.what}: {' '.join(what).strip()}")
+            keys = ("policy", "scenario", "seed", *SHARED, *FIGURES)
+            yield [
+                dict(zip(("input", "replacement"), what, strict=True)) | {key: episode[key] for key in keys}
+                for episode in driven
+            ]
 
 
-def closed_markdown(rows: Sequence[Mapping[str, Any]]) -> str:
+def closed_markdown(rows: Sequence[Mapping[str, Any]], by: str = BY) -> str:
     """The drives with replaced inputs against those without, paired, as a document."""
     page = ["## Driven with an input replaced", ""]
     page += [
         "Whole episodes on equal seeds; differences to the drive with all inputs as they are, with 95 %",
         "intervals (Tango's for shares, BCa bootstrap over pairs for means).",
+        f"p: of `{by}` by Wilcoxon's signed ranks, over the worlds by Holm's method.",
         "",
     ]
-    for policy, mine in groupby(rows, itemgetter("policy")):
-        drives = {key: list(part) for key, part in groupby(mine, itemgetter("input", "replacement"))}
-        base = drives.pop(("nothing", ""))
-        page += [f"### {policy}, {len(base)} episodes", ""]
-        page += [f"| input | replacement | {' | '.join((*SHARED, *FIGURES))} |"]
-        page += ["|---|---|" + "---:|" * len((*SHARED, *FIGURES))]
-        own = [f"{sum(bool(r[figure]) for r in base)} of {len(base)}" for figure in SHARED]
-        own += [mean(_numbers(base, figure)).text(1) for figure in FIGURES]
-        page += [f"| nothing | | {' | '.join(own)} |"]
-        for (name, how), part in drives.items():
-            cells = [
-                paired_share([bool(r[f]) for r in base], [bool(r[f]) for r in part]).text(0, 100.0) + " pp"
-                for f in SHARED
-            ]
-            cells += [paired_mean(_numbers(base, f), _numbers(part, f)).text(1) for f in FIGURES]
-            page += [f"| {name} | {how} | {' | '.join(cells)} |"]
-        page.append("")
+    policies = dict.fromkeys(row["policy"] for row in rows)
+    worlds = dict.fromkeys(row["scenario"] for row in rows)
+    for policy in policies:
+        drives = {
+            world: {
+                key: list(part)
+                for key, part in groupby(
+                    [row for row in rows if (row["policy"], row["scenario"]) == (policy, world)],
+                    itemgetter("input", "replacement"),
+                )
+            }
+            for world in worlds
+        }
+        tested = _tested(drives, by)
+        for world, arms in drives.items():
+            base = arms[NOTHING]
+            page += [f"### {policy}, {world}, {len(base)} episodes", ""]
+            page += [f"| input | replacement | {' | '.join((*SHARED, *FIGURES))} | p |"]
+            page += ["|---|---|" + "---:|" * (len((*SHARED, *FIGURES)) + 1)]
+            own = [f"{sum(bool(r[figure]) for r in base)} of {len(base)}" for figure in SHARED]
+            own += [mean(_numbers(base, figure)).text(1) for figure in FIGURES]
+            page += [f"| nothing | | {' | '.join(own)} | |"]
+            for key, part in arms.items():
+                if key == NOTHING:
+                    continue
+                cells = [
+                    paired_share([bool(r[f]) for r in base], [bool(r[f]) for r in part]).text(0, 100.0)
+                    + " pp"
+                    for f in SHARED
+                ]
+                cells += [paired_mean(_numbers(base, f), _numbers(part, f)).text(1) for f in FIGURES]
+                page += [f"| {' | '.join(key)} | {' | '.join(cells)} | {tested[world][key]:.2g} |"]
+            page.append("")
     return "\n".join(page).rstrip() + "\n"
+
+
+Arm = tuple[str, str]  # input, replacement
+
+
+def _tested(
+    drives: Mapping[str, Mapping[Arm, Sequence[Mapping[str, Any]]]], by: str
+) -> dict[str, dict[Arm, float]]:
+    """World -> arm -> p of `by` against the drives with nothing replaced, over the worlds by Holm."""
+    out: dict[str, dict[Arm, float]] = {world: {} for world in drives}
+    for key in dict.fromkeys(key for arms in drives.values() for key in arms if key != NOTHING):
+        worlds = [world for world, arms in drives.items() if key in arms]
+        p = [signed_rank(*(_numbers(drives[w][arm], by) for arm in (NOTHING, key))) for w in worlds]
+        for world, value in zip(worlds, holm(p), strict=True):
+            out[world][key] = value
+    return out
 
 
 def _numbers(rows: Sequence[Mapping[str, Any]], figure: str) -> list[float]:
@@ -208,10 +244,13 @@ def markdown(
         page += [f"  Largest share of the choices that a replacement changes: {', '.join(some) or '0 %'}."]
     e = driven[0]
     drivers = (
-        f"HVs {e['behavior']} ({e['driver_model']}), preset `{e['preset']}`, phi {e['svo_deg']:g} degrees"
+        f"HVs {e['behavior']} ({e['driver_model']}), errors `{e['errors'] or 'none'}`, "
+        f"preset `{e['preset']}`,"
+        f" phi {e['svo_deg']:g} degrees"
     )
     count = len(driven) // len(tables)
-    about = f"World `{e['scenario']}`, demand `{e['demand']}`, {drivers}; {count} episodes a policy."
+    worlds = ", ".join(f"`{world}`" for world in dict.fromkeys(one["scenario"] for one in driven))
+    about = f"World {worlds}; demand `{e['demand']}`, {drivers}; {count} episodes a policy."
     page += ["", f"`{command}`", "", about, METHOD, "", f"![choices changed]({PICTURE})", ""]
     for policy, rows in tables.items():
         page += [f"## {policy}", "", *HEAD]

@@ -176,6 +176,24 @@ def mcnemar(lost: int, gained: int) -> float:
     return float(stats.binomtest(gained, lost + gained, 0.5).pvalue)
 
 
+def signed_rank(before: Sequence[float] | Array, after: Sequence[float] | Array) -> float:
+    """Two-sided p of "pairs change either way alike" (Wilcoxon 1945, ties by Pratt); 1 when none changes.
+
+    Pairs with a nan are left out.
+    """
+    change = _known(np.asarray(after, np.float64) - np.asarray(before, np.float64))
+    return float(stats.wilcoxon(change, zero_method="pratt").pvalue) if change.any() else 1.0
+
+
+def holm(p: Sequence[float]) -> list[float]:
+    """Each p as if it had been the only test: below 0.05 means so for all of them together (Holm 1979)."""
+    order = np.argsort(p)
+    steps = np.minimum(1.0, np.asarray(p)[order] * np.arange(len(p), 0, -1))
+    out = np.empty(len(p))
+    out[order] = np.maximum.accumulate(steps)
+    return [float(x) for x in out]
+
+
 def paired_mean(before: Sequence[float] | Array, after: Sequence[float] | Array, seed: int = 0) -> Figure:
     """Mean of the differences after - before, BCa bootstrap over pairs; pairs with a nan are left out."""
     difference = np.asarray(after, np.float64) - np.asarray(before, np.float64)

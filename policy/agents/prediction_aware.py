@@ -25,7 +25,7 @@ from policy.agents.approaches import AgentConfig, compact, shipped
 from policy.checkpoint import load
 from policy.inputs.scene import Scene, join
 from policy.inputs.tensors import States, pixels, situation_tensor, svo_tensor, to_batch, to_numpy
-from policy.networks.extractors import FrameMemory
+from policy.networks.extractors import EncodedMaps, FrameMemory
 from policy.networks.hpn import HPN
 from policy.networks.seeded import seeded
 from policy.networks.vfn import VFN, Frames
@@ -130,6 +130,16 @@ class PredictionAware:
                 kinematics = torch.cat([kinematics, ahead.kinematics], 1)
         known = situation_tensor(scene.histories, context.road, scene.shared)
         return Inputs(scene, States(maps, kinematics, known, svo_tensor(context.svo, len(known))), traffic)
+
+    def encoded(self, inputs: Inputs) -> Inputs:
+        """With the latents [B,T,L] of the maps in their place, where the value network has an encoder."""
+        if not isinstance(self.vfn.maps, EncodedMaps):
+            return inputs
+        memory, states = self._memory(self.vfn), inputs.states
+        assert memory is not None
+        with torch.inference_mode():
+            latents = memory.frames(inputs.scene.agents, states.maps).flatten(2)
+        return inputs._replace(states=states._replace(maps=latents))
 
     def foresee(self, histories: Mapping[str, History]) -> tuple[Scene, Traffic, KinematicForecast]:
         """What all AVs see together, and where everybody in it will be."""

@@ -9,7 +9,7 @@ from torch import nn
 from torch.nn import functional
 
 from cosim.types import Bytes, Floats32
-from policy.inputs.tensors import apart, to_numpy, unit
+from policy.inputs.tensors import APART, apart, to_numpy, unit
 from policy.networks.frame_encoder import EncoderConfig, FrameEncoder
 
 Strides = Literal["literal", "temporal"]
@@ -94,6 +94,13 @@ class EncodedMaps(nn.Module):
         if maps.dim() == 3:
             return maps.flatten(1).to(torch.float32)
         return self.frames(maps.flatten(0, 1)).view(len(maps), -1)
+
+    @property
+    def blank(self) -> torch.Tensor:
+        """The latent [L] of a map in which nothing is drawn."""
+        c = self.encoder.config
+        latent: torch.Tensor = self.encoder(torch.zeros(1, APART, c.height, c.width))[0]
+        return latent
 
     def frames(self, maps: torch.Tensor) -> torch.Tensor:
         """Latents of single frames: [n,C,H,W] -> [n,L,1,1]."""

@@ -13,7 +13,6 @@ from cosim.types import IS_MISSION, Decision, Floats32, History, MetaAction
 from policy.agents.approaches import AgentConfig
 from policy.agents.prediction_aware import Inputs, PredictionAware
 from policy.inputs.tensors import States, to_numpy
-from policy.networks.extractors import EncodedMaps
 from policy.networks.vfn import VFN
 from policy.training.demonstrator import AS_GOOD, YIELD, Demonstrator
 from policy.training.experience import Ending, Trajectory
@@ -87,14 +86,11 @@ class Explorer(PredictionAware):
 
     def perceive(self, histories: Mapping[str, History]) -> Inputs:
         """As the agent's; of an encoder, which both networks have, the latents in place of the maps."""
-        inputs = super().perceive(histories)
-        if not isinstance(self.vfn.maps, EncodedMaps):
-            return inputs
-        memory = self._memory(self.vfn)
-        assert memory is not None
-        with torch.inference_mode():
-            latents = memory.frames(inputs.scene.agents, inputs.states.maps).flatten(2)
-        return inputs._replace(states=inputs.states._replace(maps=latents.to(torch.float16)))
+        inputs = self.encoded(super().perceive(histories))
+        maps = inputs.states.maps
+        if maps.is_floating_point():  # as they are kept
+            maps = maps.to(torch.float16)
+        return inputs._replace(states=inputs.states._replace(maps=maps))
 
     def values(self, inputs: Inputs) -> Floats32:
         """The learner's values for learning AVs, the frozen ones for the others."""

@@ -11,16 +11,16 @@ import torch
 from policy_scenes import Car, histories, straight_road
 
 from cosim.errors import BadInput
-from cosim.learning.attribution import markdown, questioned, table
+from cosim.learning.attribution import FIGURES, SHARED, closed_markdown, markdown, questioned, table
 from cosim.types import MetaAction, PolicyContext, Timing
 from policy.agents.approaches import compact
+from policy.agents.prediction_aware import PredictionAware
 from policy.attribution import (
     OTHERS,
     SUMS,
     Questioned,
     Replaced,
     answer,
-    network_inputs,
     questions,
     replacements,
 )
@@ -28,7 +28,7 @@ from policy.inputs.tensors import States
 
 ROAD = straight_road(3)
 FREE = [Car("a", 300.0, 1, 20.0, is_av=True), Car("b", 100.0, 1, 20.0, is_av=True)]  # 200 m apart, alike
-ALL = ("maps", "kinematics", "situation")  # what a network may take
+NETWORK = Questioned("vfn-p-demonstrated").vfn  # takes maps, kinematics and situation
 
 
 def untrained(name: str = "vfn-p-demonstrated") -> Questioned:
@@ -103,7 +103,7 @@ def test_an_agent_drives_by_what_it_answers_with_an_input_replaced() -> None:
     base.reset(PolicyContext(ROAD, Timing(), base.observation, math.pi / 4, np.random.default_rng(0)))
     states = base.perceive(histories(ROAD, FREE, base.observation)).states
     whole = replacements(base.vfn, base.observation.frames)
-    asked = questions(states, base.observation.frames, network_inputs(base.vfn))
+    asked = questions(base.vfn, states, base.observation.frames)
     assert set(whole) <= {(name, how) for name, how, _ in asked}
     assert ("predicted maps", "as at present") in whole
 
@@ -118,7 +118,7 @@ def test_swapping_avs_that_see_the_same_changes_nothing() -> None:
         torch.randint(0, 255, (1, 14, 4, 32, 128), dtype=torch.uint8).expand(2, -1, -1, -1, -1),
         *(torch.rand(1, *size).expand(2, *size) for size in ((14, 16, 9), (58,), (2,))),
     )
-    swapped = [states for _, how, states in questions(twins, 10, ALL) if how == "another AV's"]
+    swapped = [states for _, how, states in questions(NETWORK, twins, 10) if how == "another AV's"]
     assert len(swapped) == 7
     for states in swapped:
         assert all(torch.equal(mine, theirs) for mine, theirs in zip(states, twins, strict=True))
@@ -130,7 +130,7 @@ def test_replacements_touch_their_own_frames_and_nothing_else() -> None:
         torch.randint(1, 255, (3, 14, 4, 8, 8), dtype=torch.uint8),
         *(torch.rand(3, *size) for size in ((14, 16, 9), (58,), (2,))),
     )
-    asked = {(name, how): found for name, how, found in questions(states, 10, ALL)}
+    asked = {(name, how): found for name, how, found in questions(NETWORK, states, 10)}
     zeroed, present = asked["predicted maps", "zeroed"][0], asked["predicted maps", "as at present"][0]
     assert torch.equal(zeroed[:, :10], states.maps[:, :10])
     assert not zeroed[:, 10:].any()
@@ -165,7 +165,14 @@ def test_the_questions_do_not_disturb_the_memory_of_commanded_lane_changes() -> 
 
 
 def test_shares_are_those_of_the_decisions_of_all_episodes_and_the_page_says_what_is_unused() -> None:
-    about = {"scenario": "w", "demand": "d", "behavior": "mixed", "driver_model": "m", "preset": "p"}
+    about = {
+        "scenario": "w",
+        "demand": "d",
+        "behavior": "mixed",
+        "driver_model": "m",
+        "preset": "p",
+        "errors": None,
+    }
     keys = [("maps", "zeroed"), ("maps", "another AV's"), ("phi", "0 degrees")]
     sums = [[10, 0, 0, 0.0, 5.0], [8, 0, 0, 0.0, 4.0], [10, 3, 4, 2.0, 5.0]]
     answers = [dict(zip(keys, map(np.array, sums), strict=True)) for _ in range(2)]
@@ -180,6 +187,42 @@ def test_shares_are_those_of_the_decisions_of_all_episodes_and_the_page_says_wha
     assert "`x`: inputs that change no choice, whatever replaces them: maps." in page
     assert "phi 30 %" in page
     assert "2 episodes a policy" in page
+
+
+def test_what_an_encoder_makes_of_maps_is_replaced_as_the_maps_are() -> None:
+    agent = Questioned("vfn-p")
+    agent.reset(PolicyContext(ROAD, Timing(), agent.observation, 0.0, np.random.default_rng(0)))
+    seen = histories(ROAD, FREE, agent.observation)
+    past = agent.observation.frames
+    maps, latents = PredictionAware.perceive(agent, seen).states, agent.perceive(seen).states
+    assert (maps.maps.dim(), latents.maps.dim()) == (5, 3)
+    pairs = list(zip(*(questions(agent.vfn, states, past) for states in (maps, latents)), strict=True))
+    assert len(pairs) > 10
+    for (*asked, of_maps), (*same, of_latents) in pairs:
+        assert asked == same
+        np.testing.assert_allclose(
+            answer(agent, of_latents), answer(agent, of_maps), atol=1e-5, err_msg=str(asked)
+        )
+
+
+def test_drives_are_compared_world_by_world_and_tested_over_all_of_them() -> None:
+    def rows(world: str, lost: float) -> list[dict[str, object]]:
+        figures = dict.fromkeys(FIGURES, 1.0)
+        return [
+            {"policy": "x", "scenario": world, "input": what, "replacement": how, "seed": k}
+            | dict.fromkeys(SHARED, False)
+            | figures
+            | {"dt_mission_m": 500.0 + k - (lost + k if what else 0.0)}
+            for what, how in (("", ""), ("maps", OTHERS))
+            for k in range(8)
+        ]
+
+    found = [row | {"input": row["input"] or "nothing"} for row in rows("a", 9.0) + rows("b", 0.0)]
+    page = closed_markdown(found)
+    assert page.index("### x, a, 8 episodes") < page.index("### x, b, 8 episodes")
+    lines = [line for line in page.splitlines() if line.startswith("| maps")]
+    p = [float(line.split("|")[-2]) for line in lines]
+    assert p == pytest.approx([2 * 2 / 2**8, 0.016], abs=5e-4)
 
 
 def test_a_policy_without_a_network_is_refused() -> None:

@@ -12,6 +12,7 @@ from benchmarks.behaviors import median_of_blocks
 from cosim.report.statistics import (
     Figure,
     discordant,
+    holm,
     mcnemar,
     mean,
     paired_change,
@@ -24,6 +25,7 @@ from cosim.report.statistics import (
     rate,
     rule_of_three,
     share,
+    signed_rank,
 )
 
 Z = 1.959963984540054
@@ -75,6 +77,13 @@ def test_pairs_that_never_differ_still_leave_doubt() -> None:
     bound = Z * Z / (20 + Z * Z)  # Tango's interval in closed form when no pair is discordant
     assert (found.low, found.value, found.high) == pytest.approx((-bound, 0.0, bound))
     assert mcnemar(0, 0) == 1.0
+
+
+def test_ranks_of_differences_by_wilcoxon_and_many_tests_by_holm() -> None:
+    assert signed_rank(range(6), [k + 1 + k**2 for k in range(6)]) == pytest.approx(2 / 2**6)
+    assert signed_rank([1.0, 2.0, math.nan], [1.0, 2.0, 5.0]) == 1.0
+    assert holm([0.04, 0.01, 0.03]) == pytest.approx([0.06, 0.03, 0.06])
+    assert holm([0.9, 0.8]) == [1.0, 1.0]
 
 
 def test_interval_of_paired_shares_is_symmetric_and_stays_within_one() -> None:

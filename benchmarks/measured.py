@@ -22,11 +22,14 @@ from pathlib import Path
 from sumo_scenarios import names
 
 RESULTS = Path("docs/results")
-LEARNED = "docs/results/trainings/rewards-0"
+LEARNED = "vfn-p"
 PREDICTED = (  # what `cosim bench predict` leaves of figures
     *("position_error.png", "map_error.png", "hpn_training.png"),
     *("data/position_error.csv", "data/interval_coverage.csv", "data/map_error.csv", "data/map_gain.csv"),
 )
+
+
+USES = ("attribution.md", "attribution.png", "attribution.csv", "closed_loop.csv")
 
 
 @dataclass(frozen=True)
@@ -126,6 +129,28 @@ def attribution(place: Place) -> list[list[str]]:
     return [["cosim.cli.main", "bench", "attribution", *flags, "--out", str(place.work / "attribution")]]
 
 
+def uses(place: Place) -> list[list[str]]:
+    """What drives lose when an input of the network that learned from rewards alone is replaced."""
+    worlds = ("merge",) if place.small else ("merge", "exit", "roundabout", "intersection")
+    flags = ["--policy", LEARNED, "--demand", "contested", "--svo", "60", "--workers", "2", "--closed-loop"]
+    flags += [word for world in worlds for word in ("--scenario", world)]
+    flags += ["--seeds", "200000:200001", "--duration", "2"] if place.small else ["--seeds", "200000:200010"]
+    return [
+        ["cosim.cli.main", "bench", "attribution", *flags, *errors, "--out", str(place.out / folder)]
+        for folder, errors in (
+            ("uses", []),
+            ("uses_stress", ["--errors", "stress", "--by", "av_near_misses_ttc"]),
+        )
+    ]
+
+
+def turn(place: Place) -> list[list[str]]:
+    """At which phi it begins to yield."""
+    flags = ["--worlds", "merge", "--episodes", "1"] if place.small else []
+    flags += ["--rows", str(place.out / "data" / "turn.csv"), "--workers", "2"]
+    return [["benchmarks.turn", *flags, "--out", str(place.out / "turn.md")]]
+
+
 def seeing(place: Place) -> list[list[str]]:
     """What the frame encoder reads off a map."""
     return [
@@ -199,6 +224,8 @@ PAGES = (
         ("attribution.md", "attribution.png", "data/attribution.csv"),
         drop=("*.md", "*.png", "*.csv"),
     ),
+    Page("uses", uses, tuple(f"{f}/{n}" for f in ("uses", "uses_stress") for n in USES)),
+    Page("turn", turn, ("turn.md", "turn.svg", "data/turn.csv")),
     Page("seeing", seeing, ("seeing.md",)),
     Page("learned", learned, ("learned.md",)),
     Page("real_nets", real_nets, ("real_nets.md",)),

@@ -1,0 +1,259 @@
+"""At which phi AVs begin to yield, and at which one their reward begins to ask for it.
+
+    python -m benchmarks.turn [--policy vfn-p] [--episodes 10] [--workers 2]
+
+One network drives every contested world with a mission vehicle on equal test seeds at phi 0, 15, ... 90
+degrees, preset `lawful`, without human errors. The turn is the angle at which the share of mission vehicles
+that are let in crosses half of what it changes from 0 to 90 degrees. The reward is cos(phi) own + sin(phi)
+others' (P, equation 6), so that of two ways of driving the kinder one earns more from the angle on at which
+tan(phi) = own reward lost / others' reward gained: the break-even of the drives at 0 and at 90 degrees.
+Rows are kept in --rows, and not driven twice.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.papers.pages import drawing, save_picture
+from benchmarks.reward_balance import REWARDS
+from benchmarks.tables import markdown_row, write_page
+from benchmarks.worlds import WITH_MISSION
+from cosim.batch.episode_runner import EpisodeRunner
+from cosim.batch.record import planned
+from cosim.cli.arguments import seeds as seeds_of
+from cosim.episode import Episode, Step
+from cosim.files import write_csv
+from cosim.host import Earnings
+from cosim.learning.prediction_data import spread
+from cosim.report.statistics import CONFIDENCE, RESAMPLES, Figure, holm, mean, paired_mean, share, signed_rank
+from cosim.scenario.episode_id import EpisodeId
+from cosim.seeding import FIRST_TEST_SEED
+from cosim.types import Floats, Ints
+from cosim.workers.engines import LocalEngine
+from cosim.workers.tasks import Progress, Task
+
+PAGE, ROWS = Path("docs/results/turn.md"), Path("docs/results/data/turn.csv")
+PICTURE = "turn.svg"
+DEMAND = "contested"
+PHIS = (0.0, 15.0, 30.0, 45.0, 60.0, 75.0, 90.0)  # degrees
+COLUMNS = (
+    *("phi", "episodes", "let in", "its time, s", "of AVs, m", "of all, m"),
+    *("own reward", "others' reward", "its time, p", "of AVs, p"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """One episode."""
+
+    policy: str
+    world: str
+    phi: float  # degrees
+    seed: int
+    served: bool
+    time: float  # s until the mission vehicle was let in; the episode's duration where it was not
+    av_m: float  # mean distance of the AVs
+    all_m: float
+    own: float  # reward per AV and decision, of cos(phi)
+    others: float  # and of sin(phi)
+    crashed: bool
+
+
+class Parts(Earnings):
+    """What the AVs earn themselves and by others, before it is weighed."""
+
+    def __init__(self) -> None:
+        super().__init__(REWARDS.reward, 0.0)
+        self.own: list[float] = []
+        self.others: list[float] = []
+
+    def on_step(self, episode: Episode, step: Step) -> None:
+        """One decision of every AV that was on the road."""
+        for terms in self.pay(step, step.before.avs).values():
+            self.own.append(terms.ego)
+            self.others.append(terms.av_social + terms.hv_social)
+
+
+class Earning(EpisodeRunner):
+    """Hosted by an engine's worker."""
+
+    def run(self, case: EpisodeId, progress: Progress) -> Drive:  # type: ignore[override]
+        """Drives and adds up both parts of the reward."""
+        host, parts = self.open(case, ()), Parts()
+        result = host.run(case.seed, progress, hooks=[parts]).document()
+        time = result["mission_time_s"] if result["mission_success"] else host.episode.scenario.duration
+        return Drive(
+            *(case.policy, result["scenario"], case.svo_deg, case.seed),
+            *(bool(result["mission_success"]), float(time), result["dt_av_m"], result["dt_mean_m"]),
+            *(float(np.mean(parts.own)), float(np.mean(parts.others)), bool(result["crashed"])),
+        )
+
+
+def columns(drives: Sequence[Drive], name: str) -> Floats:
+    """One figure [episodes, PHIS], by seeds that were driven at all of them."""
+    found: dict[int, dict[float, float]] = {}
+    for drive in drives:
+        found.setdefault(drive.seed, {})[drive.phi] = float(getattr(drive, name))
+    whole = [seed for seed, by_phi in sorted(found.items()) if set(PHIS) <= set(by_phi)]
+    return np.array([[found[seed][phi] for phi in PHIS] for seed in whole]).reshape(-1, len(PHIS))
+
+
+def break_even(own: Floats, others: Floats) -> float:
+    """Degrees from which on driving as at 90 degrees earns more than driving as at 0; nan: at none or always.
+
+    Both [..., PHIS], means over episodes.
+    """
+    lost, gained = own[0] - own[-1], others[-1] - others[0]
+    return math.degrees(math.atan2(lost, gained)) if lost >= 0.0 and gained > 0.0 else math.nan
+
+
+def turn(served: Floats) -> float:
+    """Degrees at which the share [PHIS] first crosses the middle between its ends; nan: it does not rise."""
+    middle = 0.5 * (served[0] + served[-1])
+    if not served[-1] > served[0]:
+        return math.nan
+    for (low, high), (before, after) in zip(pairwise(PHIS), pairwise(served), strict=True):
+        if before <= middle < after:
+            return low + (high - low) * float((middle - before) / (after - before))
+    return math.nan
+
+
+def resampled(statistic: Callable[..., float], *figures: Floats) -> Figure:
+    """A statistic of means over episodes, with the percentile bootstrap's interval over episodes (seeds)."""
+    rng, count = np.random.default_rng(0), len(figures[0])
+    draws: Ints = rng.integers(0, count, (RESAMPLES, count))
+    found = np.array([statistic(*(figure[rows].mean(0) for figure in figures)) for rows in draws])
+    tail = 50.0 * (1.0 - CONFIDENCE)
+    known = found[~np.isnan(found)]
+    if len(known) < CONFIDENCE * RESAMPLES:
+        return Figure(float(statistic(*(f.mean(0) for f in figures))), math.nan, math.nan)
+    low, high = np.percentile(known, [tail, 100.0 - tail])
+    return Figure(float(statistic(*(f.mean(0) for f in figures))), float(low), float(high))
+
+
+def table(drives: Sequence[Drive]) -> list[str]:
+    """One world: a line per phi, with tests of the step from the phi before."""
+    time, av, every, own, others = (columns(drives, n) for n in ("time", "av_m", "all_m", "own", "others"))
+    served = columns(drives, "served")
+    steps = range(1, len(PHIS))
+    later, shorter = (holm([signed_rank(f[:, k - 1], f[:, k]) for k in steps]) for f in (time, av))
+    lines = [markdown_row(COLUMNS), markdown_row(["---"] * len(COLUMNS))]
+    for k, phi in enumerate(PHIS):
+        tested = ["", ""]
+        if k:
+            tested = [
+                f"{paired_mean(f[:, k - 1], f[:, k]).value:+.1f}, {p[k - 1]:.2g}"
+                for f, p in ((time, later), (av, shorter))
+            ]
+        let_in = share(int(served[:, k].sum()), len(served)).text(0, 100.0)
+        figures = [mean(f[:, k]).text(d) for f, d in ((time, 1), (av, 0), (every, 0), (own, 3), (others, 3))]
+        lines.append(markdown_row([f"{phi:g}", str(len(served)), f"{let_in} %", *figures, *tested]))
+    return lines
+
+
+def verdict(drives: Sequence[Drive]) -> str:
+    """Turn and break-even in a sentence."""
+    served, own, others = (columns(drives, n) for n in ("served", "own", "others"))
+    turns, even = resampled(turn, served), resampled(break_even, own, others)
+    crashed = sum(drive.crashed for drive in drives)
+    inside = turns.low <= even.value <= turns.high
+    said = "holds" if inside else "does not hold"
+    return (
+        f"Turn {turns.text(0)} degrees, break-even of the reward {even.text(0)} degrees: the turn's interval "
+        f"{said} it. Episodes with a crash: {crashed} of {len(drives)}."
+    )
+
+
+def picture(drives: Mapping[str, Sequence[Drive]], path: Path) -> str:
+    """A panel per world: share let in and the AVs' distance over phi, and the break-even (Markdown)."""
+    drawn = drawing(3.2 * len(drives), 3.0)
+    panels = drawn.subplots(1, len(drives), squeeze=False, sharey=True)[0]
+    for axes, (world, mine) in zip(panels, drives.items(), strict=True):
+        served, av = columns(mine, "served"), columns(mine, "av_m")
+        shares = [share(int(column.sum()), len(column)) for column in served.T]
+        bars = np.array([[s.value - s.low, s.high - s.value] for s in shares]).T.clip(0.0)
+        axes.errorbar(PHIS, [s.value for s in shares], bars, fmt="o-", ms=4, label="let in")
+        axes.plot(PHIS, av.mean(0) / av[:, 0].mean(), "s--", ms=3, label="AVs' distance, of that at 0")
+        even = resampled(break_even, columns(mine, "own"), columns(mine, "others"))
+        if even.known:
+            axes.axvline(even.value, color="C3", lw=1.0, label="break-even of the reward")
+            axes.axvspan(even.low, even.high, color="C3", alpha=0.15)
+        axes.set(title=world, xlabel="phi, degrees", ylim=(-0.05, 1.1), xticks=PHIS)
+        axes.grid(alpha=0.3)
+    panels[0].legend(fontsize="x-small")
+    return save_picture(drawn, path)
+
+
+def read(path: Path) -> dict[tuple[str, str, float, int], Drive]:
+    """What was driven before."""
+    if not path.is_file():
+        return {}
+    made: dict[str, Callable[[str], Any]]
+    made = {"str": str, "float": float, "int": int, "bool": "True".__eq__}
+    with path.open(newline="") as file:
+        rows = [
+            Drive(*(made[str(f.type)](row[f.name]) for f in fields(Drive))) for row in csv.DictReader(file)
+        ]
+    return {(d.policy, d.world, d.phi, d.seed): d for d in rows}
+
+
+def main() -> None:
+    """Drive what is missing, write rows, picture and page."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--policy", default="vfn-p")
+    parser.add_argument("--episodes", type=int, default=10)
+    parser.add_argument("--seeds", type=seeds_of, help="in place of --episodes of the test seeds")
+    parser.add_argument("--worlds", nargs="+", default=list(WITH_MISSION), choices=WITH_MISSION)
+    parser.add_argument("--rows", type=Path, default=ROWS)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--out", type=Path, default=PAGE)
+    args = parser.parse_args()
+    seeds = args.seeds or range(FIRST_TEST_SEED, FIRST_TEST_SEED + args.episodes)
+    done = read(args.rows)
+    for world in args.worlds:
+        cases = [
+            case
+            for phi in PHIS
+            for _, case in planned([world], [DEMAND], [], [args.policy], seeds, phi).cases()
+            if (case.policy, world, phi, case.seed) not in done
+        ]
+        tasks = [Task(case.key, case.cell, (case,)) for case in cases]
+        for drive in spread(LocalEngine(Earning, workers=args.workers), tasks, world):
+            done[drive.policy, drive.world, drive.phi, drive.seed] = drive
+        write_csv(args.rows, [asdict(done[key]) for key in sorted(done)])
+    drives = {
+        world: [d for d in done.values() if d.world == world and d.policy == args.policy and d.seed in seeds]
+        for world in args.worlds
+    }
+    lines = [
+        *("# At which phi the AVs begin to yield", ""),
+        f"Made by `python -m benchmarks.turn --policy {args.policy} --episodes {len(seeds)}`: seeds "
+        f"{seeds.start}:{seeds.stop},",
+        f"`{DEMAND}`, moderate drivers (`lc2013`), errors `none`, preset `lawful`. Equal seeds at every phi;",
+        "shares with Wilson's, means with bootstrap 95 % intervals. A mission vehicle that is not let in",
+        "counts with the episode's whole duration. Rewards are those of `rewards.yaml`, per AV and decision,",
+        "before they are weighed. p: the step from the phi before, mean difference and Wilcoxon's signed",
+        "ranks, over the six steps by Holm's method. Turn: where the share let in crosses the middle between",
+        "0 and 90 degrees; break-even: where driving as at 90 degrees begins to earn more than as at 0;",
+        "both with bootstrap intervals over seeds.",
+        *("", picture(drives, args.out.parent / PICTURE), ""),
+    ]
+    for world, mine in drives.items():
+        lines += [f"## {world}", "", *table(mine), "", verdict(mine), ""]
+    write_page(args.out, lines)
+    print(args.out.read_text())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,47 @@
+"""Where drives turn with phi, and where their reward does."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from benchmarks.turn import PHIS, Drive, break_even, columns, resampled, table, turn, verdict
+
+
+def drive(phi: float, seed: int, served: bool) -> Drive:
+    own, others = (1.0, 1.0) if served else (2.0, 0.0)
+    return Drive("x", "merge", phi, seed, served, 20.0 if served else 50.0, 500.0, 600.0, own, others, False)
+
+
+DRIVES = [drive(phi, seed, phi >= (30.0 if seed % 2 else 45.0)) for phi in PHIS for seed in range(12)]
+
+
+def test_the_reward_breaks_even_where_what_is_lost_weighs_as_much_as_what_is_gained() -> None:
+    ends = np.zeros(len(PHIS) - 2)
+    own, others = np.array([2.0, *ends, 1.0]), np.array([0.0, *ends, 1.0])
+    assert break_even(own, others) == pytest.approx(45.0)
+    assert break_even(own, 3.0 * others) == pytest.approx(math.degrees(math.atan(1 / 3)))
+    assert math.isnan(break_even(own, -others)), "kindness that helps nobody"
+
+
+def test_the_turn_is_where_half_of_the_change_is_reached() -> None:
+    served = np.array([0.0, 0.0, 0.5, 1.0, 1.0, 1.0, 1.0])
+    assert turn(served) == pytest.approx(30.0)
+    assert turn(0.2 + 0.5 * served) == pytest.approx(30.0)
+    assert math.isnan(turn(served[::-1]))
+
+
+def test_a_page_compares_episodes_of_equal_seeds() -> None:
+    alone = drive(0.0, 99, False)
+    assert columns([*DRIVES, alone], "served").shape == (12, len(PHIS)), "driven at one phi alone"
+    found = resampled(turn, columns(DRIVES, "served"))
+    assert found.value == pytest.approx(30.0)
+    assert found.low < 30.0 < found.high
+    lines = table(DRIVES)
+    assert len(lines) == 2 + len(PHIS)
+    assert "| 0: 0 (0 to 24) % |" in lines[2].replace("| 0 | 12 | ", "| 0: ")
+    assert "-15.0, 0." in lines[4], "half of the seeds turn at 30 degrees"
+    assert "Turn 30 (" in verdict(DRIVES)
+    assert "break-even of the reward 45 (45 to 45) degrees" in verdict(DRIVES)

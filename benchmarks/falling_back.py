@@ -1,11 +1,11 @@
-"""Does it pay an AV to fall back to where it sees whoever needs help? A reward that counts who is near may say so.
+"""Does it pay one AV to drive slower than it could? A reward that counts who is near may say so.
 
     python -m benchmarks.falling_back [--seeds 150100:150106] [--out docs/results/falling_back.md]
 
 All AVs drive by `altruist-rule`, and again on the same seed with one of them at 60 % of its first speed, if
-nothing is in its way. What that one earns per decision at phi 60 degrees, under rewards that count neighbours
-within 250 m, and all vehicles. Where the slow one earns more, agents that learn from that reward fall back one
-by one, though all of them together lose by it.
+nothing is in its way. What that one earns per decision at phi 60 degrees, under rewards that count who is
+within 250 m, and all vehicles: where an AV is slow, it stays beside a mission vehicle for longer, and is paid
+for how fast that one drives. The clearer falling back costs, the sooner it is unlearned.
 """
 
 from __future__ import annotations
@@ -136,8 +136,9 @@ def main() -> None:
         f" --avs {args.avs}`: `contested`,",
         f"moderate drivers (`lc2013`), errors `none`, preset `lawful`, {len(args.seeds)} tuning seeds and"
         f" {args.avs} AVs of each.",
-        f"All AVs drive by `altruist-rule`; what one of them gains by driving at {SLOW:g} of its first speed, per",
-        f"decision at phi {PHI:g} degrees (mean of pairs, bootstrap 95 % interval), of what it earns otherwise.",
+        f"All drive by `altruist-rule`; what one AV gains by driving at {SLOW:g} of its first speed,",
+        f"per decision at phi {PHI:g} degrees (mean of pairs, bootstrap 95 % interval), of what it earns",
+        "otherwise.",
         "",
     ]
     write_page(args.out, [*about, *lines])

@@ -31,7 +31,9 @@ class DdqnConfig:
     def __post_init__(self) -> None:
         """Raises BadInput for a number out of range."""
         in_range(
-            self, positive="learning_rate target_every scale clip", not_negative="refused imitation margin shrink"
+            self,
+            positive="learning_rate target_every scale clip",
+            not_negative="refused imitation margin shrink",
         )
         if self.last_rate is not None:
             in_range(self, positive="last_rate")
@@ -52,8 +54,8 @@ class DdqnLearner(Learner):
         the values learns from its own part of the return.
 
         Returns `td` (Huber loss of the n-step error), `unsafe` (loss of the refused actions), `imitation`
-        (of the demonstrated ones), `spread` (mean square of what actions change in the last part) and `q` (mean
-        value of the actions carried out).
+        (of the demonstrated ones), `spread` (mean square of what actions change in the last part) and `q`
+        (mean value of the actions carried out).
         """
         c = self.config
         with torch.no_grad():

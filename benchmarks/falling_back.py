@@ -53,17 +53,17 @@ class OneSlower(AltruistRule):
 
     def __init__(self, who: int, slow: bool) -> None:
         self._who, self._slow = who, slow
-        self.chosen: str | None = None
+        self.chosen = ""
 
     def reset(self, context: PolicyContext) -> None:
         """A new episode."""
         super().reset(context)
-        self.chosen, self._wanted = None, 0.0
+        self.chosen, self._wanted = "", 0.0
 
     def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
         """The rule's, and the slow one's."""
         decisions = super().decide(histories)
-        if self.chosen is None and histories:
+        if not self.chosen and histories:
             self.chosen = sorted(histories)[self._who % len(histories)]
             self._wanted = SLOW * histories[self.chosen].ego_speed
         if self._slow and self.chosen in histories:

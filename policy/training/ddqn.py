@@ -25,15 +25,13 @@ class DdqnConfig:
     clip: float = 10.0  # largest gradient norm
     imitation: float = 1.0  # weight of the demonstrations: their action is worth more than any other,
     margin: float = 0.3  # by this much (large-margin loss of deep Q-learning from demonstrations)
-    shrink: float = 0.0  # weight of the squared differences that actions make to the last part of the values:
-    # what an AV's next action does to fifty others is mostly noise, and noise outweighs its own speed
 
     def __post_init__(self) -> None:
         """Raises BadInput for a number out of range."""
         in_range(
             self,
             positive="learning_rate target_every scale clip",
-            not_negative="refused imitation margin shrink",
+            not_negative="refused imitation margin",
         )
         if self.last_rate is not None:
             in_range(self, positive="last_rate")
@@ -54,8 +52,7 @@ class DdqnLearner(Learner):
         the values learns from its own part of the return.
 
         Returns `td` (Huber loss of the n-step error), `unsafe` (loss of the refused actions), `imitation`
-        (of the demonstrated ones), `spread` (mean square of what actions change in the last part) and `q`
-        (mean value of the actions carried out).
+        (of the demonstrated ones) and `q` (mean value of the actions carried out).
         """
         c = self.config
         with torch.no_grad():
@@ -74,8 +71,7 @@ class DdqnLearner(Learner):
             worth = torch.full_like(value, c.r_unsafe * c.scale)
             unsafe = functional.smooth_l1_loss(value, worth, reduction="sum") * (c.refused / len(q))
         imitation = c.imitation * self._margin(q, batch.possible, batch.wrong)
-        spread = (apart[:, -1] - apart[:, -1].mean(1, keepdim=True)).square().mean()
-        self.step(td + unsafe + imitation + c.shrink * spread, self.rate)
+        self.step(td + unsafe + imitation, self.rate)
         self.updates += 1
         if self.updates % c.target_every == 0:
             self.update_target()
@@ -83,7 +79,6 @@ class DdqnLearner(Learner):
             "td": td,
             "unsafe": unsafe,
             "imitation": imitation,
-            "spread": spread,
             "q": q.gather(1, batch.action[:, None]).mean(),
         }
         return {name: float(value.detach()) for name, value in losses.items()}

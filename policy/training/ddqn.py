@@ -29,9 +29,7 @@ class DdqnConfig:
     def __post_init__(self) -> None:
         """Raises BadInput for a number out of range."""
         in_range(
-            self,
-            positive="learning_rate target_every scale clip",
-            not_negative="refused imitation margin",
+            self, positive="learning_rate target_every scale clip", not_negative="refused imitation margin"
         )
         if self.last_rate is not None:
             in_range(self, positive="last_rate")

@@ -165,11 +165,14 @@ def verdict(drives: Sequence[Drive]) -> str:
     served, own, others = (columns(drives, n) for n in ("served", "own", "others"))
     turns, even = resampled(turn, served), resampled(break_even, own, others)
     crashed = sum(drive.crashed for drive in drives)
-    inside = turns.low <= even.value <= turns.high
-    said = "holds" if inside else "does not hold"
+    said = (
+        "the turn's interval holds it" if turns.low <= even.value <= turns.high else "the interval misses it"
+    )
+    if math.isnan(turns.low):
+        said = "too few seeds for an interval of the turn"
     return (
-        f"Turn {turns.text(0)} degrees, break-even of the reward {even.text(0)} degrees: the turn's interval "
-        f"{said} it. Episodes with a crash: {crashed} of {len(drives)}."
+        f"Turn {turns.text(0)} degrees, break-even of the reward {even.text(0)} degrees: {said}. Episodes with a"
+        f" crash: {crashed} of {len(drives)}."
     )
 
 

@@ -171,8 +171,8 @@ def verdict(drives: Sequence[Drive]) -> str:
     if math.isnan(turns.low):
         said = "too few seeds for an interval of the turn"
     return (
-        f"Turn {turns.text(0)} degrees, break-even of the reward {even.text(0)} degrees: {said}. Episodes with a"
-        f" crash: {crashed} of {len(drives)}."
+        f"Turn {turns.text(0)} degrees, break-even of the reward {even.text(0)} degrees: {said}. Episodes"
+        f" with a crash: {crashed} of {len(drives)}."
     )
 
 

@@ -77,7 +77,7 @@ def test_driving_with_an_input_replaced_is_compared_with_driving_by_all_of_them(
     ]
     assert {row["seed"] for row in rows} == {"150000"}
     text = capsys.readouterr().out
-    assert "### vfn-demonstrated, 1 episodes" in text
+    assert "### vfn-demonstrated, merge, 1 episodes" in text
     assert "| map branch | its last layer zero |" in text
 
 

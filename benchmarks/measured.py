@@ -29,9 +29,6 @@ PREDICTED = (  # what `cosim bench predict` leaves of figures
 )
 
 
-USES = ("attribution.md", "attribution.png", "attribution.csv", "closed_loop.csv")
-
-
 @dataclass(frozen=True)
 class Place:
     """Where one run of a page's commands reads and writes."""
@@ -129,21 +126,6 @@ def attribution(place: Place) -> list[list[str]]:
     return [["cosim.cli.main", "bench", "attribution", *flags, "--out", str(place.work / "attribution")]]
 
 
-def uses(place: Place) -> list[list[str]]:
-    """What drives lose when an input of the network that learned from rewards alone is replaced."""
-    worlds = ("merge",) if place.small else ("merge", "exit", "roundabout", "intersection")
-    flags = ["--policy", LEARNED, "--demand", "contested", "--svo", "60", "--workers", "2", "--closed-loop"]
-    flags += [word for world in worlds for word in ("--scenario", world)]
-    flags += ["--seeds", "200000:200001", "--duration", "2"] if place.small else ["--seeds", "200000:200010"]
-    return [
-        ["cosim.cli.main", "bench", "attribution", *flags, *errors, "--out", str(place.out / folder)]
-        for folder, errors in (
-            ("uses", []),
-            ("uses_stress", ["--errors", "stress", "--by", "av_near_misses_ttc"]),
-        )
-    ]
-
-
 def turn(place: Place) -> list[list[str]]:
     """At which phi it begins to yield."""
     flags = ["--worlds", "merge", "--episodes", "1"] if place.small else []
@@ -224,7 +206,6 @@ PAGES = (
         ("attribution.md", "attribution.png", "data/attribution.csv"),
         drop=("*.md", "*.png", "*.csv"),
     ),
-    Page("uses", uses, tuple(f"{f}/{n}" for f in ("uses", "uses_stress") for n in USES)),
     Page("turn", turn, ("turn.md", "turn.svg", "data/turn.csv")),
     Page("seeing", seeing, ("seeing.md",)),
     Page("learned", learned, ("learned.md",)),

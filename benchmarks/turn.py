@@ -131,13 +131,14 @@ def resampled(statistic: Callable[..., float], *figures: Floats) -> Figure:
     """A statistic of means over episodes, with the percentile bootstrap's interval over episodes (seeds)."""
     rng, count = np.random.default_rng(0), len(figures[0])
     draws: Ints = rng.integers(0, count, (RESAMPLES, count))
+    value = float(statistic(*(figure.mean(0) for figure in figures)))
     found = np.array([statistic(*(figure[rows].mean(0) for figure in figures)) for rows in draws])
-    tail = 50.0 * (1.0 - CONFIDENCE)
     known = found[~np.isnan(found)]
     if len(known) < CONFIDENCE * RESAMPLES:
-        return Figure(float(statistic(*(f.mean(0) for f in figures))), math.nan, math.nan)
+        return Figure(value, math.nan, math.nan)
+    tail = 50.0 * (1.0 - CONFIDENCE)
     low, high = np.percentile(known, [tail, 100.0 - tail])
-    return Figure(float(statistic(*(f.mean(0) for f in figures))), float(low), float(high))
+    return Figure(value, float(low), float(high))
 
 
 def table(drives: Sequence[Drive]) -> list[str]:
@@ -223,6 +224,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=PAGE)
     args = parser.parse_args()
     seeds = args.seeds or range(FIRST_TEST_SEED, FIRST_TEST_SEED + args.episodes)
+    asked = f"--seeds {seeds.start}:{seeds.stop}" if args.seeds else f"--episodes {args.episodes}"
     done = read(args.rows)
     for world in args.worlds:
         cases = [
@@ -241,8 +243,7 @@ def main() -> None:
     }
     lines = [
         *("# At which phi the AVs begin to yield", ""),
-        f"Made by `python -m benchmarks.turn --policy {args.policy} --episodes {len(seeds)}`: seeds "
-        f"{seeds.start}:{seeds.stop},",
+        f"Made by `python -m benchmarks.turn --policy {args.policy} {asked}`: seeds {seeds.start}:{seeds.stop},",
         f"`{DEMAND}`, moderate drivers (`lc2013`), errors `none`, preset `lawful`. Equal seeds at every phi;",
         "shares with Wilson's, means with bootstrap 95 % intervals. A mission vehicle that is not let in",
         "counts with the episode's whole duration. Rewards are those of `rewards.yaml`, per AV and decision,",

@@ -243,7 +243,8 @@ def main() -> None:
     }
     lines = [
         *("# At which phi the AVs begin to yield", ""),
-        f"Made by `python -m benchmarks.turn --policy {args.policy} {asked}`: seeds {seeds.start}:{seeds.stop},",
+        f"Made by `python -m benchmarks.turn --policy {args.policy} {asked}`: "
+        f"seeds {seeds.start}:{seeds.stop},",
         f"`{DEMAND}`, moderate drivers (`lc2013`), errors `none`, preset `lawful`. Equal seeds at every phi;",
         "shares with Wilson's, means with bootstrap 95 % intervals. A mission vehicle that is not let in",
         "counts with the episode's whole duration. Rewards are those of `rewards.yaml`, per AV and decision,",

@@ -1,10 +1,12 @@
 """What a network learned: let in or not, waiting, distances, crashes, against the others on equal seeds.
 
     python -m benchmarks.learned POLICY [--episodes 20] [--demand contested] [--errors none stress]
-        [--seeds-from 200000] [--runs runs/learned] [--workers 2] [--out docs/results/learned.md]
+        [--others idm altruist-rule] [--seeds-from 200000] [--runs runs/learned] [--workers 2]
+        [--out docs/results/learned.md]
 
 POLICY (a name, weights or a training's folder) drives at 60 degrees and at 0, beside `idm`, `altruist-rule`
-and `vfn-p-demonstrated` at 60 degrees, in preset `lawful`. The same command goes on where it stopped.
+and `vfn-p-demonstrated` (or `--others`) at 60 degrees, in preset `lawful`. The same command goes on where it
+stopped.
 """
 
 import argparse
@@ -74,9 +76,10 @@ def against(rows: Mapping[Arm, Mapping[int, Row]], first: Arm, other: Arm) -> st
         ("mission_time_s", "its time"),
         ("dt_av_m", "distance of AVs"),
         ("dt_mean_m", "of all"),
+        ("av_near_misses_ttc", "near-misses of AVs"),
     ):
-        unit = "s" if name.endswith("_s") else "m"
-        parts.append(f"{what} {statistics.paired_mean(of(theirs, name), of(mine, name)).text(1)} {unit}")
+        unit = {"s": " s", "m": " m"}.get(name.rpartition("_")[2], "")
+        parts.append(f"{what} {statistics.paired_mean(of(theirs, name), of(mine, name)).text(1)}{unit}")
     return f"- less {other[0]} at {other[1]:g} degrees ({len(seeds)} pairs): {'; '.join(parts)}."
 
 
@@ -86,11 +89,13 @@ def drivers(runs: Path) -> str:
     return ", ".join(sorted({f"{row['behavior']} drivers (`{row['driver_model']}`)" for row in rows}))
 
 
-def page(runs: Path, policy: str, levels: Sequence[str], about: Sequence[str]) -> list[str]:
+def page(
+    runs: Path, policy: str, others: Sequence[str], levels: Sequence[str], about: Sequence[str]
+) -> list[str]:
     """The Markdown page of whatever has been driven."""
     name = label(read(policy).text)
     first, twin = (name, float(SVO)), (name, 0.0)
-    arms: list[Arm] = [first, twin, *((other, float(SVO)) for other in OTHERS)]
+    arms: list[Arm] = [first, twin, *((other, float(SVO)) for other in others)]
     kept = [r for part in (MINE, THEIRS) for r in run_folder.read(runs / part).rows if r["status"] == OK]
     lines = ["# What a network learned", "", *about, ""]
     for level in levels:
@@ -124,6 +129,7 @@ def main() -> None:
     )
     parser.add_argument("policy")
     parser.add_argument("--episodes", type=int, default=20)
+    parser.add_argument("--others", nargs="+", default=list(OTHERS), metavar="NAME", help="beside it")
     parser.add_argument("--demand", default="contested")
     parser.add_argument("--errors", nargs="+", default=["none", "stress"])
     parser.add_argument("--worlds", nargs="+", default=list(WORLDS), choices=WORLDS)
@@ -137,14 +143,15 @@ def main() -> None:
     where += [word for level in args.errors for word in ("--errors", level)]
     which = ["--demand", args.demand, "--seeds", seeds, "--workers", args.workers, "--resume"]
     for part, policies, phi in (
-        (MINE, (args.policy,), ("0", str(SVO))),
-        (THEIRS, OTHERS, (str(SVO),)),
+        (MINE, [args.policy], ("0", str(SVO))),
+        (THEIRS, args.others, (str(SVO),)),
     ):
         words = [word for policy in policies for word in ("--policy", policy)]
         words += [word for degrees in phi for word in ("--svo", degrees)]
         code = cosim(["evaluate", *where, *words, *which, "--out", str(args.runs / part)])
         if code:
             raise SystemExit(code)
+    beside = "" if tuple(args.others) == OTHERS else f" --others {' '.join(args.others)}"
     about = [
         f"`{args.demand}`, {drivers(args.runs)}, seeds {seeds}, preset `lawful`, in the worlds with a mission"
         " vehicle.",
@@ -152,9 +159,9 @@ def main() -> None:
         "McNemar, one test a world and figure, not corrected for how many there are.",
         "",
         f"Made by `python -m benchmarks.learned {args.policy} --episodes {args.episodes} "
-        f"--errors {' '.join(args.errors)}`.",
+        f"--errors {' '.join(args.errors)}{beside}`.",
     ]
-    write_page(args.out, page(args.runs, args.policy, args.errors, about))
+    write_page(args.out, page(args.runs, args.policy, args.others, args.errors, about))
     print(args.out.read_text())
 
 

@@ -34,7 +34,7 @@ def test_arms_are_paired_on_equal_seeds(monkeypatch: pytest.MonkeyPatch, tmp_pat
     theirs = [row("idm", 60.0, seed, seed == 5) for seed in range(2, 9)]
     parts = {"network": mine, "others": theirs}
     monkeypatch.setattr(run_folder, "read", lambda folder: SimpleNamespace(rows=parts[folder.name]))
-    page = "\n".join(learned.page(Path("runs"), f"net={weights}", ["none", "stress"], ["about"]))
+    page = "\n".join(learned.page(Path("runs"), f"net={weights}", ["idm"], ["none", "stress"], ["about"]))
     assert "## merge, errors `none`" in page
     assert "stress" not in page, "nothing was driven there"
     assert "## exit" not in page

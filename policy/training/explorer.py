@@ -1,6 +1,5 @@
 """The agent while it learns: explores, and records the trajectories of its learning AVs."""
 
-import math
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ from cosim.rewards import RewardTerms
 from cosim.types import IS_MISSION, Decision, Floats32, History, MetaAction
 from policy.agents.approaches import AgentConfig
 from policy.agents.prediction_aware import Inputs, PredictionAware
-from policy.inputs.tensors import States, svo_tensor, to_numpy
+from policy.inputs.tensors import States, to_numpy
 from policy.networks.vfn import VFN
 from policy.training.demonstrator import AS_GOOD, YIELD, Demonstrator
 from policy.training.experience import Ending, Trajectory
@@ -30,7 +29,6 @@ class ExploreConfig:
     sample: bool = False  # actions drawn from the network's preferences (A2C), not epsilon-greedy
     advised: bool = True  # whether the demonstrator is asked in every state; one that is imitated is
     near: float = 60.0  # m to the mission vehicle within which a decision counts as interaction
-    own_svo: tuple[float, ...] = ()  # deg, drawn from by each AV of a recorded drive; (): the drive's
 
 
 class Explorer(PredictionAware):
@@ -66,8 +64,6 @@ class Explorer(PredictionAware):
         self._demonstrator.reset(self._context)
         self.learning: dict[str, dict[str, list[Any]]] = {}  # AV -> field of `Trajectory` -> values so far
         self._repeated: dict[str, int] = {}  # random action that an AV keeps for a while
-        self._mixed = record and bool(self.explore.own_svo)
-        self._phi: dict[str, float] = {}  # rad, of each AV, where each has its own
         self.done: list[Trajectory] = []
 
     def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
@@ -91,12 +87,10 @@ class Explorer(PredictionAware):
     def perceive(self, histories: Mapping[str, History]) -> Inputs:
         """As the agent's; of an encoder, which both networks have, the latents in place of the maps."""
         inputs = self.encoded(super().perceive(histories))
-        maps, phi = inputs.states.maps, inputs.states.phi
+        maps = inputs.states.maps
         if maps.is_floating_point():  # as they are kept
             maps = maps.to(torch.float16)
-        if self._mixed:
-            phi = torch.cat([svo_tensor(self._svo(av), 1) for av in inputs.scene.agents])
-        return inputs._replace(states=inputs.states._replace(maps=maps, phi=phi))
+        return inputs._replace(states=inputs.states._replace(maps=maps))
 
     def values(self, inputs: Inputs) -> Floats32:
         """The learner's values for learning AVs, the frozen ones for the others."""
@@ -126,13 +120,6 @@ class Explorer(PredictionAware):
         return self.done
 
     # ---- inside ----
-
-    def _svo(self, av: str) -> float:
-        """rad, the orientation that `av` drives with."""
-        if self._mixed and av not in self._phi:
-            drawn = self._rng.integers(len(self.explore.own_svo))
-            self._phi[av] = math.radians(self.explore.own_svo[drawn])
-        return self._phi.get(av, self._context.svo)
 
     def _choose_learners(self, inputs: Inputs) -> None:
         """Those who see a mission vehicle first, then any."""
@@ -218,7 +205,7 @@ class Explorer(PredictionAware):
                 av=av,
                 stride=self._stride,
                 frames=frames,
-                phi=self._svo(av),
+                phi=self._context.svo,
                 ending=ending,
                 **arrays,
             )

@@ -338,24 +338,6 @@ def test_what_is_stored_is_what_was_seen() -> None:
         assert (t.terms[:, 0] > 0).all()  # it drove
 
 
-def test_each_av_may_drive_and_be_paid_by_an_orientation_of_its_own() -> None:
-    one, told = agent(learners=8), []
-    one.explore = replace(one.explore, own_svo=(0.0, 60.0))
-    perceived = one.perceive
-    one.perceive = lambda histories: told.append(perceived(histories)) or told[-1]  # type: ignore[assignment,func-returns-value]
-    vehicles = [FakeVehicle(f"av{k}", 100.0 + 60.0 * k, k % 2, 20.0, is_av=True) for k in range(8)]
-    drive = Drive(Lesson("fake"), 5, 0.7, 0.0, "", "", True)
-    drove = drive_episode(fake_episode(*vehicles), one, drive, RewardConfig())
-    own = {t.av: t.phi for t in drove.trajectories}
-    assert set(own.values()) == {0.0, np.radians(60.0)}
-    for inputs in told:
-        for av, direction in zip(inputs.scene.agents, inputs.states.phi.tolist(), strict=True):
-            assert direction == pytest.approx([np.cos(own[av]), np.sin(own[av])])
-    watched = drive_episode(fake_episode(*vehicles), one, drive._replace(record=False), RewardConfig())
-    assert not watched.trajectories
-    assert told[-1].states.phi[:, 0].tolist() == pytest.approx([np.cos(0.7)] * 8), "judged by the drive's"
-
-
 def test_a_crashed_av_ends_its_drive_and_the_others_are_cut() -> None:
     one = agent()
     episode = fake_episode(

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch.nn import functional
 
-from cosim.errors import BadInput, in_range
+from cosim.errors import in_range
 from policy.networks.vfn import VfnConfig
 from policy.training.learner import Learner, Metrics
 from policy.training.replay_buffer import Advised, Batch
@@ -23,7 +23,6 @@ class DdqnConfig:
     scale: float = 0.1  # of all rewards: action values of the order of 1
     refused: float = 1.0  # weight of the refused actions' loss
     clip: float = 10.0  # largest gradient norm
-    action_gap: float = 0.0  # alpha of advantage learning: actions differ 1 / (1 - alpha) times as much
     imitation: float = 1.0  # weight of the demonstrations: their action is worth more than any other,
     margin: float = 0.3  # by this much (large-margin loss of deep Q-learning from demonstrations)
 
@@ -34,8 +33,6 @@ class DdqnConfig:
         )
         if self.last_rate is not None:
             in_range(self, positive="last_rate")
-        if not 0.0 <= self.action_gap < 1.0:
-            raise BadInput("must be a share below 1", field="action_gap", value=self.action_gap)
 
 
 class DdqnLearner(Learner):
@@ -50,9 +47,7 @@ class DdqnLearner(Learner):
 
     def update(self, batch: Batch) -> Metrics:
         """One step of double Q-learning with masked targets (P, equations 2 and 3; algorithm 4); each part of
-        the values learns from its own part of the return. With `action_gap` by advantage learning: one
-        decision changes little, so the difference between actions is made 1 / (1 - alpha) times as large
-        (Baird 1999; Bellemare et al. 2016, Increasing the Action Gap).
+        the values learns from its own part of the return.
 
         Returns `td` (Huber loss of the n-step error), `unsafe` (loss of the refused actions), `imitation`
         (of the demonstrated ones) and `q` (mean value of the actions carried out).
@@ -63,11 +58,6 @@ class DdqnLearner(Learner):
             later = _taken(self.target.apart(*batch.later), best)
             gained = batch.reward[:, None] if self.online.config.parts == 1 else batch.parts
             goal = gained * c.scale + batch.discount[:, None] * later
-            if c.action_gap > 0.0:
-                known = self.target.apart(*batch.now)
-                safe = batch.possible | ~batch.possible.any(1, keepdim=True)
-                first = self.target.weighed(known, batch.now.phi).masked_fill(~safe, -torch.inf).argmax(1)
-                goal -= c.action_gap * (_taken(known, first) - _taken(known, batch.action))
         apart = self.online.apart(*batch.now, batch.keep)
         chosen = _taken(apart, batch.action)
         td = functional.smooth_l1_loss(chosen, goal)

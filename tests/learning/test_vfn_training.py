@@ -171,27 +171,6 @@ def test_a_corridor_is_walked_to_its_end() -> None:
     assert losses["td"] < 0.01
 
 
-def test_advantage_learning_widens_the_difference_between_actions_and_keeps_the_best() -> None:
-    """One decision, then the end: accelerating pays 1, anything else 0.8; the difference grows fourfold."""
-    rng, drives = np.random.default_rng(3), []
-    for _ in range(60):
-        action = int(rng.integers(5))
-        pays = 10.0 if action == MetaAction.ACCELERATE else 8.0
-        drives.append(trajectory([action], [(pays, 0.0, 0.0)], situation=[0, 0], ending="crashed"))
-    replay = ReplayBuffer(ReplayConfig(batch=64, n_step=1, relabel=0.0))
-    replay.add(drives)
-    learner = DdqnLearner(TINY, DdqnConfig(learning_rate=3e-3, target_every=20, action_gap=0.75), seed=0)
-    draws = np.random.default_rng(0)
-    for _ in range(600):
-        learner.update(replay.sample(draws))
-    with torch.no_grad():
-        q = learner.online(*replay.sample(draws).now)[0].tolist()
-    fast = int(MetaAction.ACCELERATE)
-    assert q[fast] == pytest.approx(1.0, abs=0.05), "what the best action is worth stays"
-    others = [value for action, value in enumerate(q) if action != fast]
-    assert others == pytest.approx([1.0 - 0.2 / (1.0 - 0.75)] * 4, abs=0.1)
-
-
 def test_what_the_prioritizer_masks_is_not_hoped_for() -> None:
     """The next state's best action is masked: its value must not enter the target."""
     unsafe = np.zeros((2, 5), np.bool_)

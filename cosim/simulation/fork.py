@@ -16,7 +16,7 @@ def forked(work: Callable[[], Answer]) -> Answer:
 
     libsumo holds its state in memory, so a copy of the process is a copy of the simulation (SUMO's own
     saveState leaves lane changes under way and the states of car-following models out). The copy has one
-    thread: `work` must not use torch. Its answer is pickled.
+    thread: `work` may use torch only where that has one thread too. Its answer is pickled.
 
     Raises what `work` raised, if that is a CosimError; else SimulationError.
     """

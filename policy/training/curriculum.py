@@ -7,6 +7,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from cosim.errors import in_range
 from cosim.seeding import TRAINING_SEEDS, TUNING_SEEDS, subseed, uniform
 from cosim.types import Preset
 from policy.training.a2c import A2cConfig
@@ -23,6 +24,19 @@ class Lesson:
     demand: str = "contested"
     behavior: str | None = None  # None: the demand's default
     weight: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class ForkConfig:
+    """Copies of the simulation in which one AV does otherwise (`cosim.learning.forks`)."""
+
+    count: int = 0  # a drive
+    held: int = 6  # decisions for which the other action is held
+    horizon: int = 40  # decisions over which the difference that it makes is summed up
+
+    def __post_init__(self) -> None:
+        """Raises BadInput for a number out of range."""
+        in_range(self, positive="held horizon", not_negative="count")
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +73,7 @@ class VfnTraining:
     )
     first: str = ""  # weights to begin with, a file; "": drawn from the seed
     code: tuple[str, ...] = ()  # their files and SHA-256
+    forks: ForkConfig = field(default_factory=ForkConfig)
     replay: ReplayConfig = field(default_factory=ReplayConfig)
     ddqn: DdqnConfig = field(default_factory=DdqnConfig)
     a2c: A2cConfig = field(default_factory=A2cConfig)
@@ -77,6 +92,8 @@ class Drive(NamedTuple):
     guided: bool = False  # by the demonstrator
     errors: str = ""  # of the human drivers
     preset: str = Preset.UNGUARDED
+    forks: ForkConfig = ForkConfig()
+    gamma: float = 1.0  # that what forks change is discounted with
 
 
 class Drove(NamedTuple):
@@ -103,6 +120,8 @@ def drives(c: VfnTraining, k: int, weights: str, frozen: str, epsilon: float, gu
                 guided=draws[2] < guided,
                 errors=c.errors if uniform(c.seed, "errors", str(k), str(j)) < c.erring else "",
                 preset=c.preset,
+                forks=c.forks,
+                gamma=c.replay.gamma,
             )
         )
     return drawn

@@ -9,7 +9,7 @@ from torch.nn import functional
 from cosim.errors import in_range
 from policy.networks.vfn import VfnConfig
 from policy.training.learner import Learner, Metrics
-from policy.training.replay_buffer import Advised, Batch
+from policy.training.replay_buffer import Advised, Batch, Compared
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,6 +23,7 @@ class DdqnConfig:
     scale: float = 0.1  # of all rewards: action values of the order of 1
     refused: float = 1.0  # weight of the refused actions' loss
     clip: float = 10.0  # largest gradient norm
+    forked: float = 1.0  # weight of what copies of the simulation say of two actions, where there are any
     imitation: float = 1.0  # weight of the demonstrations: their action is worth more than any other,
     margin: float = 0.3  # by this much (large-margin loss of deep Q-learning from demonstrations)
 
@@ -45,12 +46,13 @@ class DdqnLearner(Learner):
         self.target = deepcopy(self.online)
         self._networks["target"] = self.target
 
-    def update(self, batch: Batch) -> Metrics:
+    def update(self, batch: Batch, compared: Compared | None = None) -> Metrics:
         """One step of double Q-learning with masked targets (P, equations 2 and 3; algorithm 4); each part of
-        the values learns from its own part of the return.
+        the values learns from its own part of the return. The difference between the values of two actions learns
+        from copies of the simulation too, where there are any.
 
         Returns `td` (Huber loss of the n-step error), `unsafe` (loss of the refused actions), `imitation`
-        (of the demonstrated ones) and `q` (mean value of the actions carried out).
+        (of the demonstrated ones), `forked` (of the differences) and `q` (mean value of the actions carried out).
         """
         c = self.config
         with torch.no_grad():
@@ -69,7 +71,10 @@ class DdqnLearner(Learner):
             worth = torch.full_like(value, c.r_unsafe * c.scale)
             unsafe = functional.smooth_l1_loss(value, worth, reduction="sum") * (c.refused / len(q))
         imitation = c.imitation * self._margin(q, batch.possible, batch.wrong)
-        self.step(td + unsafe + imitation, self.rate)
+        forked = q.new_zeros(())
+        if compared is not None:
+            forked = c.forked * functional.smooth_l1_loss(*self._differences(compared))
+        self.step(td + unsafe + imitation + forked, self.rate)
         self.updates += 1
         if self.updates % c.target_every == 0:
             self.update_target()
@@ -77,6 +82,7 @@ class DdqnLearner(Learner):
             "td": td,
             "unsafe": unsafe,
             "imitation": imitation,
+            "forked": forked,
             "q": q.gather(1, batch.action[:, None]).mean(),
         }
         return {name: float(value.detach()) for name, value in losses.items()}
@@ -113,9 +119,26 @@ class DdqnLearner(Learner):
                 found[name] = float((q.argmax(1) != choice).float().mean())
         return found
 
+    def foretold(self, compared: Compared) -> float:
+        """How often the network knows whether the action tried is the better one: the share of what is at stake."""
+        with torch.no_grad():
+            now = compared.now
+            found, true = (self.online.weighed(d[..., None], now.phi) for d in self._differences(compared))
+        stake = true.abs()
+        return float((stake * (found.sign() == true.sign())).sum() / stake.sum().clamp(min=1e-9))
+
     def update_target(self) -> None:
         """The target network becomes the online one."""
         self.target.load_state_dict(self.online.state_dict())
+
+    def _differences(self, compared: Compared) -> tuple[torch.Tensor, torch.Tensor]:
+        """[B,parts] what the action tried is worth more, by the network and by the copy."""
+        apart = self.online.apart(*compared.now)
+        gain = compared.gain
+        if self.online.config.parts == 1:
+            gain = (gain * compared.now.phi).sum(1, keepdim=True)
+        found = _taken(apart, compared.tried) - _taken(apart, compared.action)
+        return found, gain * self.config.scale
 
     def _margin(self, q: torch.Tensor, possible: torch.Tensor, wrong: torch.Tensor) -> torch.Tensor:
         """Large-margin loss: among what was safe, the best demonstrated action leads the others by `margin`.

@@ -43,6 +43,9 @@ class Trajectory:
     yielding: Bools  # [D] the demonstrator would have yielded to a mission vehicle here
     phi: float  # rad, the SVO it acted with
     ending: Ending
+    # of copies of the simulation in which this AV did otherwise for some decisions (`ForkConfig`); None: no copy
+    tried: npt.NDArray[np.int8] | None = None  # [D] what it did, -1: no copy
+    gain: Floats32 | None = None  # [D,2] how much more that brought oneself, and the others
 
     def __len__(self) -> int:
         return len(self.action)
@@ -92,7 +95,12 @@ def states_without_maps(
 
 def save(path: Path, trajectories: list[Trajectory]) -> None:
     """Write trajectories to one compressed .npz, whole or not at all: nothing in it is ever unpickled."""
-    arrays = {f"{k}.{name}": value for k, one in enumerate(trajectories) for name, value in vars(one).items()}
+    arrays = {
+        f"{k}.{name}": value
+        for k, one in enumerate(trajectories)
+        for name, value in vars(one).items()
+        if value is not None
+    }
     # mostly zeros: level 1 will do
     deflated = partial(zipfile.ZipFile, compression=zipfile.ZIP_DEFLATED, compresslevel=1)
     with whole(path) as draft, deflated(draft, "w") as file:
@@ -107,8 +115,9 @@ def load(path: Path) -> list[Trajectory]:
         return [
             Trajectory(
                 **{
-                    name: value if (value := file[f"{k}.{name}"]).ndim else value.item()
+                    name: value if (value := file[key]).ndim else value.item()
                     for name in Trajectory.__dataclass_fields__
+                    if (key := f"{k}.{name}") in file
                 }
             )
             for k in range(int(file["count"]))

@@ -64,6 +64,7 @@ class Explorer(PredictionAware):
         self._demonstrator.reset(self._context)
         self.learning: dict[str, dict[str, list[Any]]] = {}  # AV -> field of `Trajectory` -> values so far
         self._repeated: dict[str, int] = {}  # random action that an AV keeps for a while
+        self._held: dict[str, tuple[MetaAction, int]] = {}  # one that is set, and for how many decisions more
         self.done: list[Trajectory] = []
 
     def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
@@ -119,6 +120,14 @@ class Explorer(PredictionAware):
             self._close(av, "cut", again=False)
         return self.done
 
+    def recorded(self, av: str) -> int:
+        """How many decisions of the learning AV `av` are paid already."""
+        return len(self.learning[av]["terms"])
+
+    def hold(self, av: str, action: MetaAction, count: int) -> None:
+        """The learning AV `av` prefers `action` for its next `count` decisions."""
+        self._held[av] = action, count
+
     # ---- inside ----
 
     def _choose_learners(self, inputs: Inputs) -> None:
@@ -142,6 +151,12 @@ class Explorer(PredictionAware):
             if av not in self.learning:
                 continue
             draws = self._rng.random(2)
+            action, more = self._held.pop(av, (None, 0))
+            if action is not None:
+                q[b, action] = q[b].max() + 1.0
+                if more > 1:
+                    self._held[av] = action, more - 1
+                continue
             if av in self._repeated and draws[0] < 1.0 / self.explore.repeat:
                 del self._repeated[av]
             # started so often that a share epsilon of the decisions is random

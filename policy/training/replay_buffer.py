@@ -1,6 +1,7 @@
 """Replay buffer of whole trajectories: n-step samples, in fixed parts from rare and common moments."""
 
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -26,6 +27,7 @@ class ReplayConfig:
     yielding: float = 0.25  # where the demonstrator would have yielded; one AV in ten does, for some seconds
     correcting: float = 0.0  # where the demonstrator would not go on as commanded
     interaction: float = 0.25  # near a mission vehicle, or vetoed
+    forked: int = 0  # states a batch with an action that a copy of the simulation tried (`ForkConfig`)
     relabel: float = 0.5  # share of a batch that is learned for another SVO than it was driven with
     drop: float = 0.0  # of each branch (maps, kinematics, situation) of each sample: zeros in its place
     phi: tuple[float, float] = (0.0, 90.0)  # deg, what relabelling draws from; equal bounds: one SVO only
@@ -68,6 +70,15 @@ class Advised(NamedTuple):
     wrong: torch.Tensor  # [B,A] bool, those of them that the demonstrator would not have taken
 
 
+class Compared(NamedTuple):
+    """B states in which a copy of the simulation did otherwise."""
+
+    now: States
+    action: torch.Tensor  # [B] carried out
+    tried: torch.Tensor  # [B] in the copy
+    gain: torch.Tensor  # [B,2] what that brought more: oneself, and the others
+
+
 class ReplayBuffer:
     """Newest trajectories up to `capacity` decisions."""
 
@@ -75,6 +86,7 @@ class ReplayBuffer:
         self.config = config
         self.trajectories: deque[Trajectory] = deque()
         self.size = 0
+        self._tried: list[tuple[Trajectory, int]] | None = None
         self._index: list[Ints] | None = None  # [*,2] (trajectory, t): the rare moments, then the rest
 
     def add(self, trajectories: list[Trajectory]) -> int:
@@ -85,7 +97,7 @@ class ReplayBuffer:
         while self.size > self.config.capacity and len(self.trajectories) > 1:
             self.size -= len(self.trajectories.popleft())
             dropped += 1
-        self._index = None
+        self._index = self._tried = None
         return dropped
 
     def sample(self, rng: np.random.Generator, device: str = "cpu") -> Batch:
@@ -139,6 +151,17 @@ class ReplayBuffer:
         )
         return Advised(inputs, possible, wrong)
 
+    def compared(self, rng: np.random.Generator, device: str = "cpu") -> Compared | None:
+        """States with an action tried in a copy; None while there is none."""
+        if not self.config.forked:
+            return None
+        if self._tried is None:
+            self._tried = places_tried(self.trajectories)
+        if not self._tried:
+            return None
+        drawn = rng.integers(len(self._tried), size=self.config.forked)
+        return comparisons([self._tried[k] for k in drawn], device)
+
     def _picks(self, rng: np.random.Generator, count: int) -> list[tuple[Trajectory, int]]:
         """`count` places (trajectory, t), with replacement, in the configured parts."""
         if not self.size:
@@ -172,3 +195,22 @@ class ReplayBuffer:
                 rest &= ~mine
             self._index.append(every[rest])
         return self._index
+
+
+def places_tried(trajectories: Iterable[Trajectory]) -> list[tuple[Trajectory, int]]:
+    """Where a copy of the simulation did otherwise."""
+    return [
+        (one, int(t)) for one in trajectories if one.tried is not None for t in np.flatnonzero(one.tried >= 0)
+    ]
+
+
+def comparisons(places: list[tuple[Trajectory, int]], device: str = "cpu") -> Compared:
+    """What was found there, for the SVO of the drive."""
+    arrays = (
+        np.array([one.action[t] for one, t in places], np.int64),
+        np.array([one.tried[t] for one, t in places if one.tried is not None], np.int64),
+        np.stack([one.gain[t] for one, t in places if one.gain is not None]),
+    )
+    phi = np.array([one.phi for one, _ in places], np.float32)
+    action, tried, gain = (torch.from_numpy(array).to(device) for array in arrays)
+    return Compared(states(places, phi, device), action, tried, gain)

@@ -18,7 +18,7 @@ from policy.training.curriculum import VfnTraining, interpolated, judged
 from policy.training.ddqn import DdqnLearner
 from policy.training.experience import Trajectory
 from policy.training.learner import Learner, Metrics, mean_metrics
-from policy.training.replay_buffer import ReplayBuffer
+from policy.training.replay_buffer import ReplayBuffer, comparisons, places_tried
 from policy.training.sight import encoder
 
 
@@ -97,7 +97,8 @@ class OffPolicyTrainer(Trainer):
             learner.update_target()
         losses, agrees = [], []
         for _ in range(self.config.updates):
-            losses.append(learner.update(self.replay.sample(rng, self.device)))
+            batch = self.replay.sample(rng, self.device)
+            losses.append(learner.update(batch, self.replay.compared(rng, self.device)))
             if learner.imitates and self.kinematic:  # without kinematics an update costs no more
                 agrees.append(self._imitate(rng, False))
         effects = {}
@@ -106,6 +107,11 @@ class OffPolicyTrainer(Trainer):
             found = learner.effects(self.replay.sample(rng, self.device), past)
             effects = {f"effect/{name}": value for name, value in found.items()}
         return _named(mean_metrics(losses)) | ({"agrees": float(np.mean(agrees))} if agrees else {}) | effects
+
+    def learn_afterwards(self, k: int, drives: Sequence[Trajectory], kept: bool) -> Metrics:
+        """Nothing; how much of what copies of these drives found it had known."""
+        places = places_tried(drives)
+        return {"foretold": self.learner.foretold(comparisons(places, self.device))} if places else {}
 
 
 def rate(config: VfnTraining, k: int) -> float:

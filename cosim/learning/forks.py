@@ -1,0 +1,104 @@
+"""What one AV's other action would have changed, driven in copies of the simulation.
+
+A decision of 0.4 s changes little, and what everybody else does meanwhile changes much: the difference between
+two actions drowns in the returns of a replay buffer. In a copy of the simulation where one AV alone does
+otherwise, everybody else driving by the same policy and the same draws, nearly all of that cancels (the vine
+procedure with common random numbers: Schulman et al. 2015, Trust Region Policy Optimization, section 5.2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from cosim.episode import Episode, Hook, Step
+from cosim.seeding import generator
+from cosim.simulation.fork import forked
+from cosim.types import Floats32, MetaAction
+from policy.training.curriculum import Drive
+from policy.training.experience import Trajectory
+from policy.training.explorer import Explorer
+
+SIDEWAYS = (MetaAction.LANE_LEFT, MetaAction.LANE_RIGHT)
+RARELY = 0.2  # weight of a lane change among the other actions: most are the same refused one
+
+Tried = tuple[str, int, MetaAction, Floats32]  # AV, its decision, action, [H,3] reward terms from there on
+
+
+class Forks(Hook):
+    """At drawn decisions of a drive one learning AV does otherwise for some decisions, in a copy.
+
+    Goes behind the hook that pays the agent. `compared` adds to the drive's trajectories what was found.
+    """
+
+    def __init__(self, agent: Explorer, drive: Drive) -> None:
+        self._agent, self._drive = agent, drive
+
+    def on_start(self, episode: Episode) -> None:
+        """Draw when."""
+        self._rng = generator(episode.seed, "forks")
+        timing = episode.scenario.timing
+        planned = round(episode.scenario.duration / timing.decision)
+        count = min(self._drive.forks.count, planned - 1)
+        self._at = set((1 + self._rng.permutation(planned - 1)[:count]).tolist())
+        self._tried: list[Tried] = []
+
+    def on_step(self, episode: Episode, step: Step) -> None:
+        """A copy, if it is time."""
+        if episode.steps not in self._at or episode.over:
+            return
+        known = sorted(self._agent.learning.keys() & episode.histories.keys())
+        if known:
+            av, seed = known[self._rng.integers(len(known))], int(self._rng.integers(2**32))
+            found = forked(lambda: self._otherwise(episode, av, np.random.default_rng(seed)))
+            if found is not None:
+                self._tried.append(found)
+
+    def compared(self, trajectories: Sequence[Trajectory]) -> list[Trajectory]:
+        """The trajectories, with the actions tried and what they brought more."""
+        forks, gamma = self._drive.forks, self._drive.gamma
+        by_av = {one.av: one for one in trajectories}
+        for av, t, action, terms in self._tried:
+            one = by_av.get(av)
+            if one is None or t >= len(one) or action == one.action[t]:
+                continue
+            if one.tried is None or one.gain is None:
+                nothing = np.full(len(one), -1, np.int8), np.zeros((len(one), 2), np.float32)
+                one = by_av[av] = replace(one, tried=nothing[0], gain=nothing[1])
+            assert one.tried is not None
+            assert one.gain is not None
+            one.tried[t] = action
+            one.gain[t] = _worth(terms, gamma) - _worth(one.terms[t : t + forks.horizon], gamma)
+        return [by_av[one.av] for one in trajectories]
+
+    def _otherwise(self, episode: Episode, av: str, rng: np.random.Generator) -> Tried | None:
+        """In the copy: drive on with another action of `av`; None where it has no other that is safe."""
+        agent, forks = self._agent, self._drive.forks
+        self._at = set()
+        t = agent.recorded(av)
+        decisions = agent.decide(episode.histories)
+        decision = decisions[av]
+        weights = np.array([RARELY if a in SIDEWAYS else 1.0 for a in MetaAction])
+        weights[decision.action] = 0.0
+        if decision.unsafe is not None:
+            weights[decision.unsafe] = 0.0
+        if not weights.any():
+            return None
+        action = MetaAction(rng.choice(len(weights), p=weights / weights.sum()))
+        agent.hold(av, action, forks.held - 1)
+        episode.advance({**decisions, av: decision._replace(action=action)})
+        for _ in range(forks.horizon - 1):
+            if episode.over or av not in agent.learning:
+                break
+            episode.advance(agent.decide(episode.histories))
+        agent.decide(episode.histories)  # the last state
+        (mine,) = (one for one in agent.finish() if one.av == av)
+        return av, t, action, mine.terms[t : t + forks.horizon]
+
+
+def _worth(terms: Floats32, gamma: float) -> Floats32:
+    """[2] the discounted sums of reward terms [H,3]: one's own, and the others'."""
+    fading = gamma ** np.arange(len(terms))
+    return np.array((fading @ terms[:, 0], fading @ terms[:, 1:].sum(1)), np.float32)

@@ -28,11 +28,11 @@ from policy.prediction.chain import ChainConfig
 from policy.safety import SafetyConfig
 from policy.training import experience
 from policy.training.a2c import A2cConfig, A2cLearner
-from policy.training.curriculum import Drive, Drove, Lesson, VfnTraining
+from policy.training.curriculum import Drive, Drove, ForkConfig, Lesson, VfnTraining
 from policy.training.ddqn import DdqnConfig, DdqnLearner
 from policy.training.experience import Trajectory
 from policy.training.explorer import ExploreConfig, Explorer
-from policy.training.replay_buffer import ReplayBuffer, ReplayConfig
+from policy.training.replay_buffer import ReplayBuffer, ReplayConfig, comparisons, places_tried
 from policy.training.trainers import rate
 from policy.training.vfn import TrainingRun
 
@@ -315,6 +315,71 @@ def test_what_is_stored_is_what_was_seen() -> None:
         for k in range(21):
             assert np.array_equal(t.maps(k)[0], one.seen[k][t.av])
         assert (t.terms[:, 0] > 0).all()  # it drove
+
+
+def test_copies_of_the_simulation_tell_what_another_action_brings_and_change_nothing() -> None:
+    """Alone on the road whoever brakes for 2.4 s loses own distance; nobody else gains or loses by it."""
+    one = agent()
+    episode = fake_episode(
+        FakeVehicle("a", 100.0, 0, 20.0, is_av=True),
+        FakeVehicle("b", 900.0, 1, 20.0, is_av=True),
+    )
+    drive = Drive(Lesson("fake"), 5, 0.7, 0.0, "", "", True, gamma=0.97)
+    plain = drive_episode(episode, one, drive, RewardConfig(perception_range=50.0))
+    forked = drive._replace(forks=ForkConfig(count=12, held=6, horizon=10))
+    drove = drive_episode(episode, one, forked, RewardConfig(perception_range=50.0))
+    for before, after in zip(plain.trajectories, drove.trajectories, strict=True):
+        assert np.array_equal(before.action, after.action)
+        assert np.array_equal(before.terms, after.terms)
+        assert np.array_equal(before.frames, after.frames)
+    places = places_tried(drove.trajectories)
+    assert 6 <= len(places) <= 12
+    braked = [
+        (t.gain[k], t.terms[k : k + 10, 0].sum())
+        for t, k in places
+        if t.gain is not None and t.tried is not None and t.tried[k] == MetaAction.DECELERATE
+    ]
+    assert braked
+    for gain, whole in braked:
+        assert -whole < gain[0] < -0.01 * whole
+    assert all(abs(t.gain[k, 1]) < 1e-6 for t, k in places if t.gain is not None)
+    assert all(t.tried[k] != t.action[k] for t, k in places if t.tried is not None)
+
+
+def test_a_learner_learns_from_copies_which_action_pays_oneself_and_which_the_others() -> None:
+    """The returns of the drives say nothing: every decision pays alike."""
+    tried, fast, slow = np.full(1, -1, np.int8), int(MetaAction.ACCELERATE), int(MetaAction.DECELERATE)
+    drives = []
+    for action, gain in ((fast, (2.0, 0.0)), (slow, (0.0, 3.0))):
+        one = trajectory([int(MetaAction.IDLE)], [(1.0, 0.0, 0.0)], situation=[0, 0], ending="crashed")
+        found = np.array([gain], np.float32)
+        drives.append(replace(one, tried=np.full_like(tried, action), gain=found, phi=np.radians(45.0)))
+    replay = ReplayBuffer(ReplayConfig(batch=16, forked=16, n_step=1))
+    replay.add(drives)
+    draws = np.random.default_rng(0)
+    learner = DdqnLearner(replace(TINY, parts=2), DdqnConfig(learning_rate=3e-3), seed=0)
+    places = places_tried(drives)
+    for _ in range(300):
+        losses = learner.update(replay.sample(draws), replay.compared(draws))
+    assert losses["forked"] < 1e-3
+    assert learner.foretold(comparisons(places)) == 1.0
+    now = comparisons(places[:1]).now
+    with torch.no_grad():
+        apart = learner.online.apart(*now)[0]
+    change = (apart - apart[:, MetaAction.IDLE][:, None])[:, [fast, slow]].flatten().tolist()
+    assert change == pytest.approx([0.2, 0.0, 0.0, 0.3], abs=0.03)  # reward x 0.1
+    assert ReplayBuffer(ReplayConfig()).compared(draws) is None
+
+
+def test_what_copies_found_is_stored(tmp_path: Path) -> None:
+    plain = trajectory([1, 3], [(1.0, 0.0, 0.0)] * 2)
+    one = replace(plain, tried=np.array([-1, 4], np.int8), gain=np.ones((2, 2), np.float32))
+    experience.save(tmp_path / "a.npz", [plain, one])
+    before, again = experience.load(tmp_path / "a.npz")
+    assert before.tried is None
+    assert again.tried is not None
+    assert again.tried.tolist() == [-1, 4]
+    assert places_tried([before, again]) == [(again, 1)]
 
 
 def test_a_crashed_av_ends_its_drive_and_the_others_are_cut() -> None:

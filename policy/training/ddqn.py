@@ -7,7 +7,7 @@ import torch
 from torch.nn import functional
 
 from cosim.errors import in_range
-from policy.networks.vfn import VfnConfig
+from policy.networks.vfn import VFN, VfnConfig
 from policy.training.learner import Learner, Metrics
 from policy.training.replay_buffer import Advised, Batch, Compared
 
@@ -48,11 +48,12 @@ class DdqnLearner(Learner):
 
     def update(self, batch: Batch, compared: Compared | None = None) -> Metrics:
         """One step of double Q-learning with masked targets (P, equations 2 and 3; algorithm 4); each part of
-        the values learns from its own part of the return. The difference between the values of two actions learns
-        from copies of the simulation too, where there are any.
+        the values learns from its own part of the return. The difference between the values of two actions
+        learns from copies of the simulation too, where there are any.
 
         Returns `td` (Huber loss of the n-step error), `unsafe` (loss of the refused actions), `imitation`
-        (of the demonstrated ones), `forked` (of the differences) and `q` (mean value of the actions carried out).
+        (of the demonstrated ones), `forked` (of the differences) and `q` (mean value of the actions carried
+        out).
         """
         c = self.config
         with torch.no_grad():
@@ -73,7 +74,7 @@ class DdqnLearner(Learner):
         imitation = c.imitation * self._margin(q, batch.possible, batch.wrong)
         forked = q.new_zeros(())
         if compared is not None:
-            forked = c.forked * functional.smooth_l1_loss(*self._differences(compared))
+            forked = c.forked * functional.smooth_l1_loss(*differences(self.online, compared, c.scale))
         self.step(td + unsafe + imitation + forked, self.rate)
         self.updates += 1
         if self.updates % c.target_every == 0:
@@ -120,25 +121,18 @@ class DdqnLearner(Learner):
         return found
 
     def foretold(self, compared: Compared) -> float:
-        """How often the network knows whether the action tried is the better one: the share of what is at stake."""
+        """The share of what is at stake for which the network knows whether the action tried is better."""
         with torch.no_grad():
             now = compared.now
-            found, true = (self.online.weighed(d[..., None], now.phi) for d in self._differences(compared))
+            found, true = (
+                self.online.weighed(d[..., None], now.phi) for d in differences(self.online, compared)
+            )
         stake = true.abs()
         return float((stake * (found.sign() == true.sign())).sum() / stake.sum().clamp(min=1e-9))
 
     def update_target(self) -> None:
         """The target network becomes the online one."""
         self.target.load_state_dict(self.online.state_dict())
-
-    def _differences(self, compared: Compared) -> tuple[torch.Tensor, torch.Tensor]:
-        """[B,parts] what the action tried is worth more, by the network and by the copy."""
-        apart = self.online.apart(*compared.now)
-        gain = compared.gain
-        if self.online.config.parts == 1:
-            gain = (gain * compared.now.phi).sum(1, keepdim=True)
-        found = _taken(apart, compared.tried) - _taken(apart, compared.action)
-        return found, gain * self.config.scale
 
     def _margin(self, q: torch.Tensor, possible: torch.Tensor, wrong: torch.Tensor) -> torch.Tensor:
         """Large-margin loss: among what was safe, the best demonstrated action leads the others by `margin`.
@@ -151,6 +145,24 @@ class DdqnLearner(Learner):
         known, bad = q.masked_fill(~possible, -torch.inf)[advised], wrong[advised]
         lead = (known + self.config.margin * bad).amax(1) - known.masked_fill(bad, -torch.inf).amax(1)
         return lead.sum() / len(q)
+
+
+def differences(network: VFN, compared: Compared, scale: float = 1.0) -> tuple[torch.Tensor, torch.Tensor]:
+    """[B,parts] what the action tried is worth more than the one carried out.
+
+    Args:
+        network: whose values are asked.
+        compared: B states.
+        scale: of rewards.
+
+    Returns:
+        By the network's values, and by the copy of the simulation.
+    """
+    apart = network.apart(*compared.now)
+    gain = compared.gain
+    if network.config.parts == 1:
+        gain = (gain * compared.now.phi).sum(1, keepdim=True)
+    return _taken(apart, compared.tried) - _taken(apart, compared.action), gain * scale
 
 
 def _taken(apart: torch.Tensor, action: torch.Tensor) -> torch.Tensor:

@@ -43,7 +43,7 @@ class Trajectory:
     yielding: Bools  # [D] the demonstrator would have yielded to a mission vehicle here
     phi: float  # rad, the SVO it acted with
     ending: Ending
-    # of copies of the simulation in which this AV did otherwise for some decisions (`ForkConfig`); None: no copy
+    # of copies of the simulation in which this AV did otherwise for a while (`ForkConfig`); None: no copy
     tried: npt.NDArray[np.int8] | None = None  # [D] what it did, -1: no copy
     gain: Floats32 | None = None  # [D,2] how much more that brought oneself, and the others
 

@@ -29,11 +29,12 @@ def page_router(settings: Settings) -> APIRouter:
         "live.js": (JS, _script(*map(asset, VIEWER), _own("common.js"), _own("live.js"))),
         "runs.js": (JS, _script(asset("text.js"), _own("common.js"), _own("runs.js"))),
     }
+    head = _own("head.html").rstrip()
     live = Template(_own("live.html")).substitute(
-        viewer=viewer(nav=_own("nav.html"), stage=_own("start.html"), aside=_own("tally.html"))
+        head=head, viewer=viewer(nav=_own("nav.html"), stage=_own("start.html"), aside=_own("tally.html"))
     )
-    runs = Template(_own("runs.html")).substitute(nav=_own("nav.html"))
-    form = _own("login.html")
+    runs = Template(_own("runs.html")).substitute(head=head, nav=_own("nav.html"))
+    form = Template(_own("login.html"))
 
     def answer(kind: str, text: str, status: int = 200) -> Response:
         headers = {"Content-Security-Policy": CSP, "Cache-Control": "no-cache"}
@@ -55,14 +56,14 @@ def page_router(settings: Settings) -> APIRouter:
 
     @router.get("/login")
     def ask() -> Response:
-        return answer(HTML, Template(form).substitute(said=""))
+        return answer(HTML, form.substitute(head=head, said=""))
 
     @router.post("/login")
     async def enter(request: Request) -> Response:
         given = parse_qs((await request.body()).decode("utf-8", "replace")).get("token", [""])[0].strip()
         token = settings.token or ""
         if token and not hmac.compare_digest(given.encode(), token.encode()):
-            return answer(HTML, Template(form).substitute(said="That is not the token."), 401)
+            return answer(HTML, form.substitute(head=head, said="That is not the token."), 401)
         found = Response(status_code=303, headers={"Location": "/"})
         if token:
             secure = request.url.scheme == "https"

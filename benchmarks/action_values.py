@@ -1,7 +1,7 @@
-"""What another action would have changed, and whether the value network knew.
+"""What another action would have changed: how good an agent's choices are, one by one.
 
     python -m benchmarks.action_values POLICY [POLICY ...] [--seeds 150200:150205] [--copies 12]
-        [--demand contested] [--errors none] [--svo 60] [--workers 2] [--out FILE]
+        [--worlds merge] [--demand contested] [--errors none] [--svo 60] [--workers 2] [--out FILE]
 
 POLICY (a name, weights or a training's folder) drives every world with a mission vehicle. At drawn decisions
 one AV does otherwise for 2.4 s in a copy of the simulation, everybody else as before by the same draws
@@ -26,6 +26,7 @@ from benchmarks.worlds import WITH_MISSION
 from cosim.cli.arguments import seeds as seeds_of
 from cosim.learning.rollouts import Rollouts
 from cosim.policies import make
+from cosim.report.statistics import NA
 from cosim.rewards.svo import RewardP
 from cosim.scenario.policy_name import label, read
 from cosim.types import Preset
@@ -38,8 +39,8 @@ from policy.training.replay_buffer import comparisons, places_tried
 EVERYBODY = 1_000  # AVs that are recorded
 MATTERS = 0.1  # reward from which on the choice counts as one that matters
 COLUMNS = (
-    *("policy", "episodes", "copies", "of which matter", "mean difference there", "known"),
-    *("lost a decision, of all copies", "correlation"),
+    *("policy", "episodes", "copies", "of which matter", "mean difference there", "chosen rightly"),
+    *("lost a decision, of all copies", "correlation with the values"),
 )
 
 
@@ -70,16 +71,17 @@ def row(policy: str, episodes: Sequence[Drawn]) -> str:
 
     def stakes(one: Drawn) -> tuple[float, float]:
         counts = np.abs(one.true) * (np.abs(one.true) > MATTERS)
-        return float((counts * (np.sign(one.true) == np.sign(one.found))).sum()), float(counts.sum())
+        return float((counts * (one.true < 0.0)).sum()), float(counts.sum())
 
     right, whole = (np.array(sums) for sums in zip(*map(stakes, episodes), strict=True))
-    known = resampled(lambda a, b: float(100.0 * a / b) if b > 0.0 else math.nan, right, whole)
-    lost = resampled(float, np.array([np.maximum(one.true, 0.0).mean() for one in episodes if len(one.true)]))
+    rightly = resampled(lambda a, b: float(100.0 * a / b) if b > 0.0 else math.nan, right, whole)
+    each = [np.maximum(one.true, 0.0).mean() for one in episodes if len(one.true)]
+    lost = resampled(float, np.array(each)) if each else NA
     correlation = float(np.corrcoef(true, found)[0, 1]) if len(true) > 1 else math.nan
     size = np.abs(true[matter]).mean() if matter.any() else math.nan
     cells = (
         *(policy, str(len(episodes)), str(len(true)), str(int(matter.sum())), f"{size:.2f}"),
-        *(f"{known.text(0)} %", lost.text(3), f"{correlation:.2f}"),
+        *(f"{rightly.text(0)} %", lost.text(3), f"{correlation:.2f}"),
     )
     return markdown_row(cells)
 
@@ -92,13 +94,14 @@ def main() -> None:
     parser.add_argument("policy", nargs="+")
     parser.add_argument("--seeds", default="150200:150205")
     parser.add_argument("--copies", type=int, default=12, help="an episode")
+    parser.add_argument("--worlds", nargs="+", default=list(WITH_MISSION), choices=WITH_MISSION)
     parser.add_argument("--demand", default="contested")
     parser.add_argument("--errors", default="none")
     parser.add_argument("--svo", type=float, default=60.0)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
-    tables: dict[str, list[str]] = {world: [] for world in WITH_MISSION}
+    tables: dict[str, list[str]] = {world: [] for world in args.worlds}
     for text in args.policy:
         agent = make(read(text).text)
         if not isinstance(agent, PredictionAware) or agent.config.vfn_weights is None:
@@ -114,27 +117,31 @@ def main() -> None:
                     forks=ForkConfig(args.copies, horizon=30),
                     gamma=0.97,
                 )
-                for world in WITH_MISSION
+                for world in args.worlds
                 for seed in seeds_of(args.seeds)
             ]
             driven = [actors.submit(drive) for drive in drives]
             found = [judged(agent, future.result()) for future in driven]
-        for world in WITH_MISSION:
+        for world in args.worlds:
             mine = [one for drive, one in zip(drives, found, strict=True) if drive.lesson.scenario == world]
             tables[world].append(row(label(text), mine))
+    where = "" if args.worlds == list(WITH_MISSION) else f" --worlds {' '.join(args.worlds)}"
     flags = f"--seeds {args.seeds} --copies {args.copies} --demand {args.demand}"
+    flags += f" --errors {args.errors} --svo {args.svo:g}{where}"
     names = " ".join(map(label, args.policy))
     lines = [
-        "# What another action would have changed, and whether the value network knew",
+        "# What another action would have changed",
         "",
-        f"`python -m benchmarks.action_values {names} {flags} --errors {args.errors} --svo {args.svo:g}`:",
+        f"`python -m benchmarks.action_values {names} {flags}`:",
         f"`{args.demand}`, its own drivers (`lc2013`), preset `lawful`, errors `{args.errors}`. At drawn",
         "decisions one AV does otherwise for 2.4 s in a copy of the simulation; what the 12 s from there on",
         "bring more or less, discounted, is the true difference, in units of reward; it matters above"
         f" {MATTERS}.",
-        "*Known*: the share of what is at stake for which the network's values say rightly which of the two",
-        "actions is better; who knows nothing has 50. *Lost*: what the better of the two would have brought",
-        "more, 0 where the agent chose it. 95 % intervals: bootstrap over episodes.",
+        "*Chosen rightly*: the share of what is at stake where the agent's own choice was the better one.",
+        "*Lost*: what the other action would have brought more, 0 where the agent chose rightly."
+        " *Correlation*",
+        "of the true difference with that of the network's values: whether it knows how much is at stake.",
+        "95 % intervals: bootstrap over episodes. What two AVs together could change no copy shows.",
         "",
     ]
     for world, rows in tables.items():

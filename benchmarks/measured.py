@@ -126,6 +126,13 @@ def attribution(place: Place) -> list[list[str]]:
     return [["cosim.cli.main", "bench", "attribution", *flags, "--out", str(place.work / "attribution")]]
 
 
+def action_values(place: Place) -> list[list[str]]:
+    """How good its choices are, one by one."""
+    few = ["--seeds", "150200:150201", "--copies", "1", "--worlds", "merge"] if place.small else []
+    flags = [LEARNED, *([] if place.small else ["vfn-p-demonstrated"]), *few]
+    return [["benchmarks.action_values", *flags, "--out", str(place.out / "action_values.md")]]
+
+
 def turn(place: Place) -> list[list[str]]:
     """At which phi it begins to yield."""
     flags = ["--worlds", "merge", "--episodes", "1"] if place.small else []
@@ -206,6 +213,7 @@ PAGES = (
         ("attribution.md", "attribution.png", "data/attribution.csv"),
         drop=("*.md", "*.png", "*.csv"),
     ),
+    Page("action_values", action_values, ("action_values.md",)),
     Page("turn", turn, ("turn.md", "turn.svg", "data/turn.csv")),
     Page("seeing", seeing, ("seeing.md",)),
     Page("learned", learned, ("learned.md",)),

@@ -1,0 +1,25 @@
+"""The page of what another action would have changed adds up what was at stake, not how often."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from benchmarks.action_values import Drawn, row
+
+
+def cells(*episodes: Drawn) -> list[str]:
+    return [cell.strip() for cell in row("net", episodes).strip("|").split("|")]
+
+
+def test_what_was_at_stake_is_added_up() -> None:
+    right = Drawn(true=np.array([-3.0, -0.01]), found=np.array([-0.3, -0.2]))
+    wrong = Drawn(true=np.array([1.0, 0.0]), found=np.array([-0.1, -0.2]))
+    name, episodes, copies, matter, size, rightly, lost, _ = cells(right, wrong)
+    assert (name, episodes, copies, matter, size) == ("net", "2", "4", "2", "2.00")
+    assert rightly.startswith("75 ("), "3 of 4 at stake; what matters to nobody does not count"
+    assert lost.startswith("0.250 ("), "half a unit in one of two episodes"
+
+
+def test_drives_without_copies_say_nothing() -> None:
+    none = Drawn(np.zeros(0), np.zeros(0))
+    assert cells(none)[2:] == ["0", "0", "nan", "- %", "-", "nan"]

@@ -1,9 +1,9 @@
 """What one AV's other action would have changed, driven in copies of the simulation.
 
-A decision of 0.4 s changes little, and what everybody else does meanwhile changes much: the difference between
-two actions drowns in the returns of a replay buffer. In a copy of the simulation where one AV alone does
-otherwise, everybody else driving by the same policy and the same draws, nearly all of that cancels (the vine
-procedure with common random numbers: Schulman et al. 2015, Trust Region Policy Optimization, section 5.2).
+A decision of 0.4 s changes little, and what everybody else does meanwhile changes much: the difference
+between two actions drowns in the returns of a replay buffer. In a copy of the simulation where one AV alone
+does otherwise, everybody else driving by the same policy and the same draws, nearly all of that cancels (the
+vine procedure with common random numbers: Schulman et al. 2015, Trust Region Policy Optimization, 5.2).
 """
 
 from __future__ import annotations

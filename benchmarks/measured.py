@@ -29,6 +29,9 @@ PREDICTED = (  # what `cosim bench predict` leaves of figures
 )
 
 
+USES = ("attribution.md", "attribution.png", "attribution.csv", "closed_loop.csv")
+
+
 @dataclass(frozen=True)
 class Place:
     """Where one run of a page's commands reads and writes."""
@@ -126,6 +129,15 @@ def attribution(place: Place) -> list[list[str]]:
     return [["cosim.cli.main", "bench", "attribution", *flags, "--out", str(place.work / "attribution")]]
 
 
+def uses(place: Place) -> list[list[str]]:
+    """What drives lose when an input of the network that learned from rewards alone is replaced."""
+    worlds = ("merge",) if place.small else ("merge", "exit", "roundabout", "intersection")
+    flags = ["--policy", LEARNED, "--demand", "contested", "--svo", "60", "--workers", "2", "--closed-loop"]
+    flags += [word for world in worlds for word in ("--scenario", world)]
+    flags += ["--seeds", "200000:200001", "--duration", "2"] if place.small else ["--seeds", "200000:200010"]
+    return [["cosim.cli.main", "bench", "attribution", *flags, "--out", str(place.out / "uses")]]
+
+
 def action_values(place: Place) -> list[list[str]]:
     """How good its choices are, one by one."""
     few = ["--seeds", "150200:150201", "--copies", "1", "--worlds", "merge"] if place.small else []
@@ -213,6 +225,7 @@ PAGES = (
         ("attribution.md", "attribution.png", "data/attribution.csv"),
         drop=("*.md", "*.png", "*.csv"),
     ),
+    Page("uses", uses, tuple(f"uses/{name}" for name in USES)),
     Page("action_values", action_values, ("action_values.md",)),
     Page("turn", turn, ("turn.md", "turn.svg", "data/turn.csv")),
     Page("seeing", seeing, ("seeing.md",)),

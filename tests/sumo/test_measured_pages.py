@@ -36,9 +36,11 @@ def test_every_page_figure_and_picture_of_the_results_is_made_by_make_results() 
     pages |= {file for page in measured.PAGES for file in page.files if file.endswith(".md")}
     tables = {f"data/{name}.csv" for name in driven}
     tables |= {file for page in measured.PAGES for file in page.files if file.endswith(".csv")}
-    shown = set(
-        re.findall(r"\]\(([^)]+\.(?:png|svg))\)", "".join(p.read_text() for p in RESULTS.glob("*.md")))
-    )
+    shown = {
+        str((page.parent / picture).relative_to(RESULTS))
+        for page in (*RESULTS.glob("*.md"), *RESULTS.glob("uses/*.md"))
+        for picture in re.findall(r"\]\(([^)]+\.(?:png|svg))\)", page.read_text())
+    }
     files = {str(path.relative_to(RESULTS)) for path in RESULTS.rglob("*") if path.is_file()}
     files = {file for file in files if not file.startswith(("trainings/", "episodes/", "data/real_nets/"))}
     assert files - tables - shown == pages

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from cosim.episode import Episode, Hook, Step
+from cosim.episode import Episode, Hook, Step, go_on
 from cosim.seeding import generator
 from cosim.simulation.fork import forked
 from cosim.types import Floats32, MetaAction
@@ -88,12 +88,8 @@ class Forks(Hook):
             return None
         action = MetaAction(rng.choice(len(weights), p=weights / weights.sum()))
         agent.hold(av, action, forks.held - 1)
-        episode.advance({**decisions, av: decision._replace(action=action)})
-        for _ in range(forks.horizon - 1):
-            if episode.over or av not in agent.learning:
-                break
-            episode.advance(agent.decide(episode.histories))
-        agent.decide(episode.histories)  # the last state
+        changed = {**decisions, av: decision._replace(action=action)}
+        go_on(episode, agent, changed, forks.horizon)
         (mine,) = (one for one in agent.finish() if one.av == av)
         return av, t, action, mine.terms[t : t + forks.horizon]
 

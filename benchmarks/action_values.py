@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.reward_balance import REWARDS
+from benchmarks.reward_balance import DEMANDS, REWARDS
 from benchmarks.tables import markdown_row, write_page
 from benchmarks.turn import resampled
 from benchmarks.worlds import WITH_MISSION
@@ -95,7 +95,7 @@ def main() -> None:
     parser.add_argument("--seeds", default="150200:150205")
     parser.add_argument("--copies", type=int, default=12, help="an episode")
     parser.add_argument("--worlds", nargs="+", default=list(WITH_MISSION), choices=WITH_MISSION)
-    parser.add_argument("--demand", default="contested")
+    parser.add_argument("--demand", default="contested", choices=DEMANDS)
     parser.add_argument("--errors", default="none")
     parser.add_argument("--svo", type=float, default=60.0)
     parser.add_argument("--workers", type=int, default=2)
@@ -133,7 +133,8 @@ def main() -> None:
         "# What another action would have changed",
         "",
         f"`python -m benchmarks.action_values {names} {flags}`:",
-        f"`{args.demand}`, its own drivers (`lc2013`), preset `lawful`, errors `{args.errors}`. At drawn",
+        f"`{args.demand}`, {DEMANDS[args.demand]} drivers (`lc2013`), preset `lawful`, errors `{args.errors}`."
+        " At drawn",
         "decisions one AV does otherwise for 2.4 s in a copy of the simulation; what the 12 s from there on",
         "bring more or less, discounted, is the true difference, in units of reward; it matters above"
         f" {MATTERS}.",

@@ -22,7 +22,7 @@ from policy.training.experience import Trajectory
 from policy.training.explorer import Explorer
 
 SIDEWAYS = (MetaAction.LANE_LEFT, MetaAction.LANE_RIGHT)
-RARELY = 0.2  # weight of a lane change among the other actions: most are the same refused one
+RARELY = 0.2  # a lane change is tried so often where an action that keeps the lane is tried once
 
 Tried = tuple[str, int, MetaAction, Floats32]  # AV, its decision, action, [H,3] reward terms from there on
 

@@ -16,13 +16,18 @@ def names() -> tuple[str, ...]:
     return tuple(sorted(p.parent.name for p in ROOT.glob("*/scenario.yaml")))
 
 
+def practice() -> tuple[str, ...]:
+    """Names of the roads that networks practise on beside the worlds, sorted: `practice/NAME`."""
+    return tuple(sorted(f"practice/{p.parent.name}" for p in ROOT.glob("practice/*/scenario.yaml")))
+
+
 def folder(name: str) -> Path:
-    """The folder of the world `name`.
+    """The folder of the world, or of the practice roads, called `name`.
 
     Raises:
         BadInput: there is no such world; the sentence names the nearest one there is.
     """
-    known = names()
+    known = (*names(), *practice())
     if name in known:
         return ROOT / name
     raise BadInput(f"no such scenario{hint(name, known)}", field="scenario", value=name)

@@ -84,7 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     chosen: list[str] = parser.parse_args(arguments).worlds
     try:
         # A new world has sources before it has a scenario.yaml: take any folder with `plain/`.
-        all_worlds = sorted(p.parent for p in ROOT.glob("*/plain") if any(p.glob("*.nod.xml")))
+        all_worlds = sorted(p.parent for p in ROOT.glob("**/plain") if any(p.glob("*.nod.xml")))
         worlds = [w for w in all_worlds if w.name in chosen] if chosen else all_worlds
         for name in set(chosen) - {w.name for w in worlds}:
             folder(name)  # raises, with the nearest name

@@ -132,7 +132,8 @@ class Collision:
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """An AV's front bumper passed a stop line in this simulation step."""
+    """An AV's front bumper passed a stop line in this simulation step, or the end of the place behind it at
+    which the net lets it wait inside the junction."""
 
     time: float  # s, the end of the step
     vehicle: str
@@ -144,6 +145,7 @@ class Entry:
     yellow_distance: float = 0.0  # m to the line and
     yellow_speed: float = 0.0  # m/s of the vehicle at that instant; inf if it was not on the road yet
     foes: tuple[tuple[str, int], ...] = ()  # who has the right of way within 100 m, each with its link
+    inside: bool = False  # passed the place inside, not the line
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,10 @@ from cosim.types import Entry, Metric, Offence, Snapshot
 COMFORTABLE = 3.0  # m/s2: who could stop at yellow with this must
 STOPPED = 0.5  # m/s, at most, within the last 10 m before a stop sign
 HARD = 3.0 + 1e-3  # m/s2 (who brakes with just 3 brakes comfortably): nobody with the right of way is made to
-LEADER = 30.0  # m: a vehicle that near ahead is what one brakes for
+LEADER = (
+    30.0,
+    10.0,
+)  # m: a vehicle that near ahead, or so near beyond where `COMFORTABLE` stops it, is braked for
 SIGNS = (Rule.STOP, Rule.ALL_WAY_STOP)
 BY_TURNS = (Rule.EQUAL, Rule.ALL_WAY_STOP, Rule.ZIPPER)  # all wait for one another: only collisions count
 GOES = frozenset(map(ord, "GgoO"))  # states of a signal that lets go, or is off
@@ -59,11 +62,13 @@ class StopLines(AvCounts):
             self._open = [entry for entry in self._open if self._goes_on(entry, snapshot)]
         self._before, self._last = self._last, snapshot
         for entry in snapshot.events.entries:
-            if ran_red(entry):
+            if entry.inside:  # where it waited, or might have, nobody had to brake for it
+                self._open = [e for e in self._open if e.vehicle != entry.vehicle]
+            elif ran_red(entry):
                 self._red += 1
                 light = "yellow" if entry.state in "yY" else "red"
                 self._tell(entry, entry.time, f"ran a {light} light")
-            if ran_stop(entry, self._links[entry.link]):
+            if not entry.inside and ran_stop(entry, self._links[entry.link]):
                 self._stop += 1
                 self._tell(entry, entry.time, f"passed a stop sign at {entry.least_speed:.1f} m/s")
             if entry.foes and self._undecided(entry, snapshot):
@@ -78,7 +83,8 @@ class StopLines(AvCounts):
 
     def _goes_on(self, entry: Entry, now: Snapshot) -> bool:
         """Whether the entry is still to be followed; counts it when a foe has begun to brake hard for it."""
-        if self._links[entry.link].rule not in BY_TURNS:
+        waits = not entry.inside and self._ways.may_wait(entry.link)
+        if self._links[entry.link].rule not in BY_TURNS and not waits:
             for foe, link in entry.foes:
                 if self._made_to_brake(foe, link, entry.vehicle, now):
                     self._way += 1
@@ -131,6 +137,10 @@ class Ways:
         beyond = lanes[lane].edge != lanes[self._road.links[link].target].edge
         return beyond or bool(now.lane_position[row] >= now.length[row])
 
+    def may_wait(self, link: int) -> bool:
+        """Whether the net has a place inside the junction, at which who takes the link waits for others."""
+        return len(self._inside(link)) > 1
+
     def excused(self, link: int, now: Snapshot, row: int, av: int) -> bool:
         """Whether a vehicle on the way of `link` has another reason to brake than the one in row `av`."""
         lane, inside = int(now.lane[row]), self._inside(link)
@@ -143,14 +153,24 @@ class Ways:
             if 0 <= signal < len(now.signals) and int(now.signals[signal]) not in GOES:
                 return True
             ahead = (lane, *inside) if lane == self._road.links[link].origin else (lane,)
+        near, more = LEADER
+        near = max(near, float(now.speed[row]) ** 2 / (2.0 * COMFORTABLE) + more)
         start = -float(now.lane_position[row])  # m from its front bumper to the start of the lane
+        rest = start + self._road.lanes[lane].length
+        stretches = []  # lane, m to its start, whether only who is not wholly on it is in the way
         for k in ahead:
-            for other in (now.lane == k).nonzero()[0].tolist():
-                gap = start + float(now.lane_position[other] - now.length[other])
-                in_front = start + now.lane_position[other] > 0.0
-                if other not in (row, av) and in_front and gap <= LEADER:
-                    return True
+            stretches.append((k, start, False))
             start += self._road.lanes[k].length
+        if lane not in inside:
+            others = self._road.lanes[lane].successors
+            stretches += [(k, rest, True) for k in others if k not in ahead]
+        for k, start, leaves in stretches:
+            for other in (now.lane == k).nonzero()[0].tolist():
+                front, length = start + float(now.lane_position[other]), float(now.length[other])
+                if other in (row, av) or (leaves and front - start >= length):
+                    continue
+                if front > 0.0 and front - length <= near:
+                    return True
         return False
 
     def _internal(self, link: int) -> tuple[int, ...]:

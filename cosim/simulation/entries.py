@@ -29,10 +29,12 @@ EPSILON = 1e-6
 
 
 class Passed(NamedTuple):
-    """A stop line passed: its link, and m from the line to the start of the lane the AV is on now."""
+    """A stop line passed, or the place behind it where the net lets one wait (`inside`): its link, and m from
+    there to the start of the lane the AV is on now."""
 
     link: int
     beyond: float
+    inside: bool
 
 
 @dataclass(slots=True)
@@ -151,6 +153,9 @@ class EntryWatcher:
     def _entry(
         self, name: str, av: Watched, passed: Passed, position: float, speed: float, now: float
     ) -> Entry:
+        if passed.inside:
+            foes = self._foes(passed.link, name)
+            return Entry(now, name, passed.link, "", speed, speed, foes=foes, inside=True)
         link = self._road.links[passed.link]
         line = self._odometer_of(name) - passed.beyond - position  # the odometer at the line, m
         last = [v for at, v in av.trail if line - LAST - EPSILON <= at]
@@ -253,6 +258,8 @@ class EntryWatcher:
         heap = [
             (0.0, lanes[k.origin].edge) for k, matters in zip(links, self._matters, strict=True) if matters
         ]
+        heap += [(0.0, lanes[waiting].edge) for waiting, _ in self._left]
+        heapq.heapify(heap)
         while heap:
             free, edge = heapq.heappop(heap)
             if edge in shortest:
@@ -262,6 +269,16 @@ class EntryWatcher:
                 if origin not in shortest:
                     heapq.heappush(heap, (free + length[edge], origin))
         return [shortest.get(lane.edge, math.inf) for lane in lanes]
+
+    @cached_property
+    def _left(self) -> dict[tuple[int, int], int]:
+        """(internal lane at whose end one may wait for those with the right of way, the next one) -> link."""
+        lanes, found = self._road.lanes, {}
+        for number, link in enumerate(self._road.links):
+            following = next(iter(lanes[link.via].successors), -1) if link.via >= 0 and link.foes else -1
+            if following >= 0 and lanes[following].internal:
+                found[link.via, following] = number
+        return found
 
     @cached_property
     def _origins(self) -> list[list[int]]:
@@ -325,7 +342,9 @@ class EntryWatcher:
             before = came[lane]
             link = self._road.link_of.get((before, lane), -1)
             if link >= 0 and self._matters[link]:
-                found.append(Passed(link, beyond))
+                found.append(Passed(link, beyond, False))
+            elif (before, lane) in self._left:
+                found.append(Passed(self._left[before, lane], beyond, True))
             if lanes[before].edge != lanes[lane].edge:
                 beyond += lanes[before].length
             lane = before

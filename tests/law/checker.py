@@ -30,7 +30,8 @@ HARD = 3.0 + 1e-3  # m/s2; who brakes with just 3 brakes comfortably, and output
 STOPPED = 0.5  # m/s, at most, before a stop line
 STOP_REACH = 10.0  # m before the line in which it has to be that slow
 FOE_REACH = 100.0  # m before a junction
-LEADER_REACH = 30.0  # m
+LEADER_REACH = 30.0  # m, or
+STOP_ROOM = 10.0  # m more than it takes to stop comfortably
 STANDING = 0.1  # m/s, at most
 SLOWING = 0.1  # m/s2
 PATIENCE = 60.0  # s
@@ -311,7 +312,12 @@ class Checker:
                     if least > STOPPED:
                         self._found("stop_sign", av, row, link, f"at least {least:.2f} m/s")
                         self.law.stop_sign_violations += 1
-                foe = self._wronged(av, row, link, time)
+                # where the net lets it wait inside, nobody is made to brake before it goes on from there
+                waits = len(link.via) > 1 and bool(link.yields)
+                goes = self._goes_on(av, row, link) if waits else row
+                foe = self._wronged(av, row, link, time, until=goes) if waits else ""
+                if goes is not None and not foe:
+                    foe = self._wronged(av, goes, link, self.times[av.first + goes])
                 if foe:
                     self._found("right_of_way", av, row, link, foe)
                     self.law.right_of_way_violations += 1
@@ -322,9 +328,20 @@ class Checker:
         row = av.row(int(np.searchsorted(self.times, begin - 1e-6)) - 1)
         return row >= 0 and bool(line - av.driven[row] >= av.speed[row] ** 2 / (2.0 * COMFORTABLE))
 
-    def _wronged(self, av: Track, row: int, link: Link, time: float) -> str:
-        """The first foe with the right of way that the entry touched or made to brake hard; "" if none."""
-        begin, end = av.first + row, self._left(av, row, link)
+    @staticmethod
+    def _goes_on(av: Track, row: int, link: Link) -> int | None:
+        """The row in which the front of an AV that entered in `row` leaves the first lane inside."""
+        rows = (r for r in range(row, len(av.lane)) if av.lane[r] not in (link.via[0], link.origin))
+        return next(rows, None)
+
+    def _wronged(self, av: Track, row: int, link: Link, time: float, until: int | None = -1) -> str:
+        """The first foe with the right of way that the entry touched or made to brake hard; "" if none.
+
+        `until`: the row from which on it is looked at anew (None: never), before which only touching counts.
+        """
+        waits, begin, end = until != -1, av.first + row, self._left(av, row, link)
+        if waits and until is not None:
+            end = av.first + until
         if self.net.state(link, time) == "G":
             return ""
         frames = range(begin + FRAME + _until_end(begin), end + 1, FRAME)  # the steps that end them
@@ -332,8 +349,8 @@ class Checker:
             until = [t for t in self.touched.get(frozenset((av.id, foe.id)), ()) if t >= time - 1e-6]
             if until and until[0] <= self.times[end] + 1e-6:
                 return f"{foe.id} touched"
-            if link.state in "w=Z" and link.signal is None:
-                continue  # by turns
+            if waits or (link.state in "w=Z" and link.signal is None):
+                continue  # or by turns
             for k in frames:
                 if foe.brakes(k) and not foe.brakes(k - FRAME) and not self._excused(foe, k, other, av.id):
                     return f"{foe.id} braked hard until {self.times[k] + av.step:.1f} s"
@@ -388,10 +405,11 @@ class Checker:
         return []
 
     def _excused(self, foe: Track, k: int, link: Link, av: str) -> bool:
-        """Whether a foe on the way of `link` has another reason to brake: its signal, somebody else at most
-        `LEADER_REACH` ahead on its lane or link, or that it is past the junction."""
+        """Whether a foe on the way of `link` has another reason to brake: its signal, somebody else near
+        ahead on its lane or link or turning off its lane, or that it is past the junction."""
         row = foe.row(k)
         lane, gone = foe.lane[row], -foe.pos[row]
+        reach = max(LEADER_REACH, foe.speed[row] ** 2 / (2.0 * COMFORTABLE) + STOP_ROOM)
         if _edge(lane) == _edge(link.target):
             return True
         if lane in link.via:
@@ -400,9 +418,15 @@ class Checker:
             if self.net.state(link, self.times[k]) not in GREEN | {""}:
                 return True
             lanes = (lane, *link.via) if lane == link.origin else (lane,)
+        if not lane.startswith(":"):  # who turns off its lane, and has not left it wholly
+            rest = self.net.lanes[lane].length + gone
+            for other in self.net.of_lane[lane]:
+                for pos, name in self.on_lane[k].get(other.via[0], ()) if other.via else ():
+                    if name not in (foe.id, av) and pos < BODY and rest + pos <= reach + BODY:
+                        return True
         for one in lanes:
             for pos, name in self.on_lane[k].get(one, ()):
-                if name not in (foe.id, av) and 0.0 < gone + pos <= LEADER_REACH + BODY:
+                if name not in (foe.id, av) and 0.0 < gone + pos <= reach + BODY:
                     return True
             gone += self.net.lanes[one].length
         return False

@@ -25,7 +25,8 @@ class Drive:
 
     def compare(self, speed_mode: int) -> tuple[list[Any], list[Any]]:
         """What the watcher reports, and what a look at everybody in every step finds: s, id, lane inside,
-        least speed m/s, the signal's state, and the foes inside the junction."""
+        least speed m/s, the signal's state, and the foes inside the junction; of who leaves the place where
+        one waits inside, the speed, and "inside" for the state."""
         import libsumo
 
         from cosim.simulation.convert import read_road
@@ -47,7 +48,7 @@ class Drive:
                 here = road.lanes[road.links[entry.link].via].start
                 inside = {name for name, _ in entry.foes if self._junction(road, name) == here}
                 what = entry.vehicle, road.links[entry.link].via, round(max(entry.least_speed, SLOW), 3)
-                seen.append((now, *what, entry.state, sorted(inside)))
+                seen.append((now, *what, "inside" if entry.inside else entry.state, sorted(inside)))
             for name in get.getIDList():
                 lane = road.index[get.getLaneID(name)]
                 was, before[name] = before.get(name, lane), lane
@@ -58,21 +59,33 @@ class Drive:
                     line = get.getDistance(name) - get.getLanePosition(name)
                     least = min(v for at, v in last[name] if at >= line - 10.0)
                     state = self._state(road, link.signal)
-                    inside = set()
-                    for foe in link.foes if state != "G" else ():
-                        if self._state(road, road.links[foe].signal) in ("r", "u"):
-                            continue
-                        ways, way = [], road.links[foe].via
-                        while road.lanes[way].internal:
-                            ways.append(road.lanes[way].id)
-                            way = road.lanes[way].successors[0]
-                        inside |= {n for w in ways for n in libsumo.lane.getLastStepVehicleIDs(w)}
+                    inside = self._inside(road, link) if state != "G" else set()
                     if link.signal >= 0 or link.foes:
                         found.append(
                             (now, name, lane, round(max(least, SLOW), 3), state, sorted(inside - {name}))
                         )
+                elif via.internal and lane in road.lanes[was].successors:
+                    link = next((link for link in road.links if link.via == was), None)
+                    if link is not None and link.foes:
+                        speed = round(max(get.getSpeed(name), SLOW), 3)
+                        foes = sorted(self._inside(road, link) - {name})
+                        found.append((now, name, was, speed, "inside", foes))
                 last.setdefault(name, []).append((get.getDistance(name), get.getSpeed(name)))
         return sorted(seen), sorted(found)
+
+    def _inside(self, road: Any, link: Any) -> set[str]:
+        """Who is inside the junction on the way of a link with the right of way over this one."""
+        import libsumo
+
+        inside: set[str] = set()
+        for foe in link.foes:
+            if self._state(road, road.links[foe].signal) in ("r", "u"):
+                continue
+            way = road.links[foe].via
+            while road.lanes[way].internal:
+                inside |= set(libsumo.lane.getLastStepVehicleIDs(road.lanes[way].id))
+                way = road.lanes[way].successors[0]
+        return inside
 
     @staticmethod
     def _junction(road: Any, name: str) -> str:

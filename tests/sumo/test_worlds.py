@@ -15,11 +15,12 @@ from cosim.scenario.vet import vet
 from cosim.simulation.sumo import SumoSimulator
 from cosim.types import Kind, Snapshot
 from cosim.workers.worker import Worker
-from sumo_scenarios import folder, names
+from sumo_scenarios import folder, names, practice
 from sumo_scenarios.build import net_text
 
 WORLDS = names()
-DEMANDS = [(world, demand) for world in WORLDS for demand in load(world).demands or ()]
+ROADS = (*WORLDS, *practice())
+DEMANDS = [(world, demand) for world in ROADS for demand in load(world).demands or ()]
 
 
 def first_frames(scenario: Scenario, seeds: tuple[int, ...]) -> list[Snapshot]:
@@ -28,7 +29,7 @@ def first_frames(scenario: Scenario, seeds: tuple[int, ...]) -> list[Snapshot]:
         return [worker.call("reset", seed)[-1] for seed in seeds]
 
 
-@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("world", ROADS)
 def test_the_net_is_the_one_its_plain_sources_build(world: str) -> None:
     assert net_text(folder(world)) == (folder(world) / "net.net.xml").read_text()
 

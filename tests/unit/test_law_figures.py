@@ -152,8 +152,11 @@ def met(
     collision: int = -1,
     start: float = 50.0,
     where: int = MAJOR,
+    road: RoadMap | None = None,
+    goes_on: int = -1,
 ) -> int:
-    """An AV enters in frame 1 before a foe with these speeds in frames 0, 1, 2, ...; violations counted."""
+    """An AV enters in frame 1 before a foe with these speeds in frames 0, 1, 2, ..., and leaves the place
+    inside in frame `goes_on`; violations counted."""
     entry = Entry(0.2, "av", MINOR_LINK, "g" * bool(signals), 8.0, 8.0, foes=(("foe", MAJOR_LINK),))
     hit = Collision(0.2 * collision, "foe", "av", False, True, "collision", "sumo", "", 0.0, 0.0)
     frames, position = [], start
@@ -161,9 +164,10 @@ def met(
         position += FRAME * speed
         me = av(MINOR, 99.0, 8.0) if k == 0 else av(INSIDE_MINOR, min(1.5 * k, 9.9), 8.0)
         here = {"av": av(MINOR_OUT, 6.0, 8.0) if k >= left_after else me, "foe": At(where, position, speed)}
-        happened = Events((hit,) * (k == collision), entries=(entry,) * (k == 1))
+        went = replace(entry, time=FRAME * k, inside=True)
+        happened = Events((hit,) * (k == collision), entries=(entry,) * (k == 1) + (went,) * (k == goes_on))
         frames.append(frame(FRAME * k, here | dict(others), happened, signals))
-    found = figures(frames, crossing(rule, bool(signals)))["right_of_way_violations"]
+    found = figures(frames, road or crossing(rule, bool(signals)))["right_of_way_violations"]
     assert isinstance(found, int)
     return found
 
@@ -194,6 +198,31 @@ def test_a_leader_within_30_m_excuses_the_braking(position: float, count: int) -
 def test_a_leader_inside_the_junction_excuses_the_braking_but_not_the_av_itself() -> None:
     assert met(HARD, others={"leader": At(INSIDE_MAJOR, 2.0)}, start=60.0) == 0
     assert met(HARD, others={"beside": At(INSIDE_MINOR, 2.0)}, start=60.0) == 1
+
+
+def test_who_turns_off_the_foes_lane_and_is_still_on_it_excuses_the_braking() -> None:
+    """A way of two meters that leaves the foe's lane: of 5 m of car 3 m or nothing are on the lane."""
+    road = crossing()
+    turning = Lane(":j_3_0", ":j_3", 0, np.zeros((2, 2)), 9.0, 3.2, 15.0, (), internal=True, start="j")
+    lanes = [replace(one, successors=(4, 6)) if k == MAJOR else one for k, one in enumerate(road.lanes)]
+    road = replace(road, lanes=(*lanes, turning))
+    assert met(HARD, others={"turns": At(6, 2.0)}, start=60.0, road=road) == 0
+    assert met(HARD, others={"turns": At(6, 5.5)}, start=60.0, road=road) == 1
+
+
+def test_a_fast_foe_brakes_for_a_leader_as_far_ahead_as_it_stops_comfortably() -> None:
+    """From 20 m/s: 67 m and 10 m. The foe is near 39 m then, the leader's rear bumper at 95 m."""
+    fast = (20.0, 20.0, 20.0, 19.2, 18.4)
+    assert met(fast, others={"leader": At(MAJOR, 100.0, 12.0)}, start=25.0) == 0
+    assert met(fast, start=25.0) == 1
+
+
+def test_where_one_may_wait_inside_the_right_of_way_is_decided_there() -> None:
+    road = crossing(cont=True)
+    assert met(HARD, road=road) == 0
+    assert met(HARD, road=road, goes_on=1) == 1
+    assert met(HARD, road=road, goes_on=3) == 0, "who braked before it went on did not brake for that"
+    assert met((12.0,) * 5, road=road, collision=3) == 1, "touching counts from the line on"
 
 
 def test_a_foe_past_the_junction_brakes_for_something_else() -> None:

@@ -71,7 +71,8 @@ class Standing(AvCounts):
         return self._road.lanes[number].start
 
     def _reasons(self, s: Snapshot, standing: Sequence[int]) -> frozenset[int]:
-        """The rows among `standing` that have a reason to stand: they, or the head of their queue."""
+        """The rows among `standing` that have a reason to stand: they, or the head of their queue, who needs
+        none unless it is an AV."""
         queued = np.flatnonzero((s.speed < STANDING) | (s.accel < BRAKES))
         _, leaders = gap_ahead(s, self._road.straight_on, queued, QUEUE)
         ahead = dict(
@@ -86,7 +87,8 @@ class Standing(AvCounts):
                 queue.append(row)
                 if (lane := lanes[row]) not in waits:
                     waits[lane] = self._at_signal(s, lane)
-                found[row] = waits[lane] or s.ids[row] in planned
+                alone = ahead[row] not in ahead and s.kind[row] != AV
+                found[row] = waits[lane] or s.ids[row] in planned or alone
                 if found[row]:
                     break
                 row = ahead[row]

@@ -12,6 +12,8 @@ closes in without braking it uses that room up, later and harder on its own brak
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
 from cosim.control import COMFORT, COMFORT_TIME, wished_accel
 from cosim.road.rules import RED, YELLOW
 from cosim.simulation.backend import sumo
@@ -34,8 +36,9 @@ GAP = 2.0, 1.0  # m and s: the gap given to who changes lanes
 YIELDING = 2.0, 1.0  # m/s2 and m/s: how hard, and down to what, an AV slows for who asked
 PATIENCE = 10.0  # s
 DECIDES = 30.0  # m before a line at which it gives way: from there on it looks who comes
-WAITS = 15.0, 40.0  # s of waiting at a line from and until which an AV grows impatient
-IMPATIENCE = (0.8, 1.0), (0.0, 0.4)  # at first and then, where AVs alone come, and where humans do
+AT_LINE = 5.0  # m: who is further away stands in a queue
+WAITS = 15.0, 40.0, 55.0  # s of waiting at a line, and how impatient an AV is by then
+IMPATIENCE = (0.8, 1.0, 1.0), (0.0, 0.4, 1.0)  # where AVs alone come, and where humans do
 CLOSE = 60.0  # m behind
 HEADWAY = 0.8, 1.8  # s to the leader; with a human that close behind
 CLOSES = 3.0, 2.0, 0.5  # s to contact, m/s2 that would avoid it, and the share of it of who heeds
@@ -235,12 +238,11 @@ class Assistance(Commander):
     def _wait(self, name: str, state: Assisted) -> None:
         """Before humans it waits for a gap that nobody brakes for; AVs see it, and brake comfortably."""
         get = sumo.vehicle
-        begins, ends = WAITS
-        waits = state.gives_way and get.getSpeed(name) < KEEPS_MOVING
+        away = sumo.lane.getLength(get.getLaneID(name)) - get.getLanePosition(name)
+        waits = state.gives_way and away < AT_LINE and get.getSpeed(name) < KEEPS_MOVING
         state.waited = state.waited + LOOKS if waits else 0.0
-        least, most = IMPATIENCE[state.gives_way and self._meets_humans(name)]
-        share = min(max((state.waited - begins) / (ends - begins), 0.0), 1.0)
-        impatience = least + share * (most - least)
+        grows = IMPATIENCE[state.gives_way and self._meets_humans(name)]
+        impatience = float(np.interp(state.waited, WAITS, grows))
         if impatience != state.impatience:
             state.impatience = impatience
             # its type is its own since `set_type`

@@ -445,20 +445,23 @@ class Checker:
                 return
 
     def _waits(self, track: Track, k: int, seen: set[str]) -> bool:
-        """Whether a red or yellow signal, or a queue before one, is ahead of it in its lane."""
+        """Whether a red or yellow signal, or a queue before one or behind a human, is ahead in its lane."""
         row, seen = track.row(k), seen | {track.id}
         lane = track.lane[row]
         if any(self.net.state(link, self.times[k]) in RED | YELLOW for link in self.net.of_lane[lane]):
             return True
+        free = True
         for pos, name in self.on_lane[k].get(lane, ()):
-            ahead = self.tracks[name]
-            if name in seen or not 0.0 < pos - track.pos[row] <= QUEUE_GAP + BODY:
+            if name == track.id or not 0.0 < pos - track.pos[row] <= QUEUE_GAP + BODY:
                 continue
+            ahead = self.tracks[name]
             r = ahead.row(k)
             slows = r > 0 and ahead.speed[r - 1] - ahead.speed[r] > SLOWING * track.step
-            if (ahead.speed[r] < STANDING or slows) and self._waits(ahead, k, seen):
-                return True
-        return False
+            if ahead.speed[r] < STANDING or slows:
+                free = False
+                if name not in seen and self._waits(ahead, k, seen):
+                    return True
+        return free and not track.is_av
 
     def _entered(self, av: Track, row: int) -> list[tuple[Link, float]]:
         """The links whose stop lines its front passed in this step, each with how far it is beyond (m)."""

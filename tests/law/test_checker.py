@@ -233,8 +233,10 @@ def test_who_waits_for_red_or_behind_who_waits_for_it_is_not_stuck(tmp_path: Pat
     queue = {"a": (AV, "s", 185.0, steady(0.0, 70.0)), "b": (HV, "s", 198.0, steady(0.0, 70.0))}
 
     assert drive(tmp_path, queue, program=red).avs_stuck == 0
-    assert drive(tmp_path, queue, program=green).avs_stuck == 1
-    assert drive(tmp_path, queue).avs_stuck == 1  # who stands behind somebody that stands without cause
+    assert drive(tmp_path, queue, program=green).avs_stuck == 0, "behind a human, who needs no reason"
+    queue["b"] = (AV, *queue["b"][1:])
+    assert drive(tmp_path, queue, program=green).avs_stuck == 2
+    assert drive(tmp_path, queue).avs_stuck == 2, "who stands behind somebody that stands without cause"
 
 
 def test_trips_brakings_and_distance_are_counted(tmp_path: Path) -> None:

@@ -288,10 +288,13 @@ def test_red_and_yellow_are_reasons_to_stand(signals: str, count: int) -> None:
 
 
 def test_a_queue_is_a_reason_to_stand_if_its_head_has_one() -> None:
-    queue = {"b": At(MINOR, 60.0), "c": At(MINOR, 70.0)}
+    queue = {"b": At(MINOR, 60.0), "c": av(MINOR, 70.0)}
     road = crossing(signals=True)
     assert standing(MINOR, 70.0, road, queue, signals="rG")["avs_stuck"] == 0
-    assert standing(MINOR, 70.0, road, queue, signals="GG")["avs_stuck"] == 1
+    assert standing(MINOR, 70.0, road, queue, signals="GG")["avs_stuck"] == 2
+    assert standing(MINOR, 70.0, road, queue | {"c": At(MINOR, 70.0)}, signals="GG")["avs_stuck"] == 0, (
+        "a human at its head needs no reason"
+    )
     assert (
         standing(MINOR, 70.0, road, {"bus": At(MINOR, 60.0)}, events=Events(stopped=("bus",)))["avs_stuck"]
         == 0

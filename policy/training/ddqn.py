@@ -24,13 +24,18 @@ class DdqnConfig:
     refused: float = 1.0  # weight of the refused actions' loss
     clip: float = 10.0  # largest gradient norm
     forked: float = 1.0  # weight of what copies of the simulation say of two actions, where there are any
+    shrink: float = (
+        0.0  # weight of how much the actions' values differ: what nothing speaks for counts as nothing
+    )
     imitation: float = 1.0  # weight of the demonstrations: their action is worth more than any other,
     margin: float = 0.3  # by this much (large-margin loss of deep Q-learning from demonstrations)
 
     def __post_init__(self) -> None:
         """Raises BadInput for a number out of range."""
         in_range(
-            self, positive="learning_rate target_every scale clip", not_negative="refused imitation margin"
+            self,
+            positive="learning_rate target_every scale clip",
+            not_negative="refused shrink imitation margin",
         )
         if self.last_rate is not None:
             in_range(self, positive="last_rate")
@@ -52,7 +57,8 @@ class DdqnLearner(Learner):
         learns from copies of the simulation too, where there are any.
 
         Returns `td` (Huber loss of the n-step error), `unsafe` (loss of the refused actions), `imitation`
-        (of the demonstrated ones), `forked` (of the differences) and `q` (mean value of the actions carried
+        (of the demonstrated ones), `forked` (of the differences), `spread` (mean square of what the values of
+        an action's parts differ by from their mean over all actions) and `q` (mean value of the actions carried
         out).
         """
         c = self.config
@@ -75,7 +81,8 @@ class DdqnLearner(Learner):
         forked = q.new_zeros(())
         if compared is not None:
             forked = c.forked * functional.smooth_l1_loss(*differences(self.online, compared, c.scale))
-        self.step(td + unsafe + imitation + forked, self.rate)
+        spread = (apart - apart.mean(2, keepdim=True)).square().mean()
+        self.step(td + unsafe + imitation + forked + c.shrink * spread, self.rate)
         self.updates += 1
         if self.updates % c.target_every == 0:
             self.update_target()
@@ -84,6 +91,7 @@ class DdqnLearner(Learner):
             "unsafe": unsafe,
             "imitation": imitation,
             "forked": forked,
+            "spread": spread,
             "q": q.gather(1, batch.action[:, None]).mean(),
         }
         return {name: float(value.detach()) for name, value in losses.items()}

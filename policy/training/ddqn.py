@@ -24,9 +24,7 @@ class DdqnConfig:
     refused: float = 1.0  # weight of the refused actions' loss
     clip: float = 10.0  # largest gradient norm
     forked: float = 1.0  # weight of what copies of the simulation say of two actions, where there are any
-    shrink: float = (
-        0.0  # weight of how much the actions' values differ: what nothing speaks for counts as nothing
-    )
+    shrink: float = 0.0  # weight of how much actions differ in value: what nothing speaks for is nothing
     imitation: float = 1.0  # weight of the demonstrations: their action is worth more than any other,
     margin: float = 0.3  # by this much (large-margin loss of deep Q-learning from demonstrations)
 
@@ -57,9 +55,9 @@ class DdqnLearner(Learner):
         learns from copies of the simulation too, where there are any.
 
         Returns `td` (Huber loss of the n-step error), `unsafe` (loss of the refused actions), `imitation`
-        (of the demonstrated ones), `forked` (of the differences), `spread` (mean square of what the values of
-        an action's parts differ by from their mean over all actions) and `q` (mean value of the actions carried
-        out).
+        (of the demonstrated ones), `forked` (of the differences), `spread` (mean square by which the parts of
+        an action's value differ from their means over all actions) and `q` (mean value of the actions
+        carried out).
         """
         c = self.config
         with torch.no_grad():

@@ -186,6 +186,27 @@ def test_what_the_prioritizer_masks_is_not_hoped_for() -> None:
     assert td == pytest.approx(0.5 * 1.0**2)  # goal 0.5 * 2 against q = 0; with the masked one it were 49.5
 
 
+def test_actions_that_nothing_speaks_for_are_worth_the_same() -> None:
+    """Accelerate pays 10, all others nothing; by chance Decelerate was paid once in a while as well."""
+    rng, drives = np.random.default_rng(3), []
+    for _ in range(60):
+        action = int(rng.integers(5))
+        paid = 10.0 if action == MetaAction.ACCELERATE else float(rng.normal(0.0, 10.0))
+        drives.append(trajectory([action], [(paid, 0.0, 0.0)], ending="crashed"))
+    replay = ReplayBuffer(ReplayConfig(batch=32, n_step=1, relabel=0.0))
+    replay.add(drives)
+    spread = {}
+    for shrink in (0.0, 0.5):
+        learner = DdqnLearner(TINY, DdqnConfig(learning_rate=3e-3, shrink=shrink), seed=0)
+        draws = np.random.default_rng(0)
+        for _ in range(150):
+            spread[shrink] = learner.update(replay.sample(draws))["spread"]
+        with torch.no_grad():
+            q = learner.online(*experience.states([(drives[0], 0)], np.zeros(1, np.float32)))[0]
+        assert q.argmax() == MetaAction.ACCELERATE
+    assert 0.0 < spread[0.5] < 0.5 * spread[0.0]
+
+
 def test_a_refused_action_is_worth_a_crash() -> None:
     one = trajectory([1], [(0.0, 0.0, 0.0)], vetoed=[3])
     learner = DdqnLearner(TINY, DdqnConfig(learning_rate=1e-2), seed=1)

@@ -32,7 +32,7 @@ from cosim.scenario.policy_name import label, read
 from cosim.types import Preset
 from policy.agents.prediction_aware import PredictionAware
 from policy.training.curriculum import Drive, Drove, ForkConfig, Lesson
-from policy.training.ddqn import differences
+from policy.training.ddqn import DdqnConfig, differences
 from policy.training.explorer import ExploreConfig
 from policy.training.replay_buffer import comparisons, places_tried
 
@@ -41,6 +41,7 @@ MATTERS = 0.1  # reward from which on the choice counts as one that matters
 COLUMNS = (
     *("policy", "episodes", "copies", "of which matter", "mean difference there", "chosen rightly"),
     *("lost a decision, of all copies", "correlation with the values"),
+    *("mean size for oneself: true, valued", "for the others: true, valued"),
 )
 
 
@@ -49,6 +50,7 @@ class Drawn(NamedTuple):
 
     true: np.ndarray  # [n] what the other action brought more
     found: np.ndarray  # [n] by the network's values
+    apart: np.ndarray = np.zeros((2, 0, 2))  # both [n,2] before they are weighed: for oneself, and the others
 
 
 def judged(agent: PredictionAware, drove: Drove) -> Drawn:
@@ -57,11 +59,11 @@ def judged(agent: PredictionAware, drove: Drove) -> Drawn:
     if not places:
         return Drawn(np.zeros(0), np.zeros(0))
     compared = comparisons(places)
-    found, true = (
-        agent.vfn.weighed(d[..., None], compared.now.phi)[:, 0].detach().numpy()
-        for d in differences(agent.vfn, compared)
-    )
-    return Drawn(true, found)
+    parts = [d.detach() for d in differences(agent.vfn, compared)]
+    found, true = (agent.vfn.weighed(d[..., None], compared.now.phi)[:, 0].numpy() for d in parts)
+    if agent.vfn.config.parts == 1:
+        return Drawn(true, found)
+    return Drawn(true, found, np.stack([parts[1].numpy(), parts[0].numpy() / DdqnConfig().scale]))
 
 
 def row(policy: str, episodes: Sequence[Drawn]) -> str:
@@ -79,9 +81,11 @@ def row(policy: str, episodes: Sequence[Drawn]) -> str:
     lost = resampled(float, np.array(each)) if each else NA
     correlation = float(np.corrcoef(true, found)[0, 1]) if len(true) > 1 else math.nan
     size = np.abs(true[matter]).mean() if matter.any() else math.nan
+    sizes = np.abs(np.concatenate([one.apart for one in episodes], 1))
+    apart = [f"{a:.2f}, {b:.2f}" for a, b in sizes.mean(1).T] if sizes.size else ["-", "-"]
     cells = (
         *(policy, str(len(episodes)), str(len(true)), str(int(matter.sum())), f"{size:.2f}"),
-        *(f"{rightly.text(0)} %", lost.text(3), f"{correlation:.2f}"),
+        *(f"{rightly.text(0)} %", lost.text(3), f"{correlation:.2f}", *apart),
     )
     return markdown_row(cells)
 
@@ -133,8 +137,8 @@ def main() -> None:
         "# What another action would have changed",
         "",
         f"`python -m benchmarks.action_values {names} {flags}`:",
-        f"`{args.demand}`, {DEMANDS[args.demand]} drivers (`lc2013`), preset `lawful`, errors `{args.errors}`."
-        " At drawn",
+        f"`{args.demand}`, {DEMANDS[args.demand]} drivers (`lc2013`), preset `lawful`, errors"
+        f" `{args.errors}`. At drawn",
         "decisions one AV does otherwise for 2.4 s in a copy of the simulation; what the 12 s from there on",
         "bring more or less, discounted, is the true difference, in units of reward; it matters above"
         f" {MATTERS}.",
@@ -142,6 +146,9 @@ def main() -> None:
         "*Lost*: what the other action would have brought more, 0 where the agent chose rightly."
         " *Correlation*",
         "of the true difference with that of the network's values: whether it knows how much is at stake.",
+        "*For oneself* and *for the others*: the mean size of the difference's two parts, before phi weighs",
+        "them, by the copies and by a network that values them apart: one that values what is not there",
+        "chooses by chance.",
         "95 % intervals: bootstrap over episodes. What two AVs together could change no copy shows.",
         "",
     ]

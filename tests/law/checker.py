@@ -346,8 +346,8 @@ class Checker:
             return ""
         frames = range(begin + FRAME + _until_end(begin), end + 1, FRAME)  # the steps that end them
         for foe, other in self._foes(av, begin, link, time):
-            until = [t for t in self.touched.get(frozenset((av.id, foe.id)), ()) if t >= time - 1e-6]
-            if until and until[0] <= self.times[end] + 1e-6:
+            touched = [t for t in self.touched.get(frozenset((av.id, foe.id)), ()) if t >= time - 1e-6]
+            if touched and touched[0] <= self.times[end] + 1e-6:
                 return f"{foe.id} touched"
             if waits or (link.state in "w=Z" and link.signal is None):
                 continue  # or by turns

@@ -50,7 +50,7 @@ class StopLines(AvCounts):
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         super().reset(first, context)
-        self._ways = Ways(context.road)
+        self._road, self._ways = context.road, Ways(context.road)
         self._links = context.road.links
         self._before, self._last = first, first
         self._open: list[Entry] = []
@@ -83,7 +83,7 @@ class StopLines(AvCounts):
 
     def _goes_on(self, entry: Entry, now: Snapshot) -> bool:
         """Whether the entry is still to be followed; counts it when a foe has begun to brake hard for it."""
-        waits = not entry.inside and self._ways.may_wait(entry.link)
+        waits = not entry.inside and self._road.waits_inside(self._links[entry.link].via)
         if self._links[entry.link].rule not in BY_TURNS and not waits:
             for foe, link in entry.foes:
                 if self._made_to_brake(foe, link, entry.vehicle, now):
@@ -136,10 +136,6 @@ class Ways:
             return lane not in self._inside(link)
         beyond = lanes[lane].edge != lanes[self._road.links[link].target].edge
         return beyond or bool(now.lane_position[row] >= now.length[row])
-
-    def may_wait(self, link: int) -> bool:
-        """Whether the net has a place inside the junction, at which who takes the link waits for others."""
-        return len(self._inside(link)) > 1
 
     def excused(self, link: int, now: Snapshot, row: int, av: int) -> bool:
         """Whether a vehicle on the way of `link` has another reason to brake than the one in row `av`."""

@@ -258,7 +258,7 @@ class EntryWatcher:
         heap = [
             (0.0, lanes[k.origin].edge) for k, matters in zip(links, self._matters, strict=True) if matters
         ]
-        heap += [(0.0, lanes[waiting].edge) for waiting, _ in self._left]
+        heap += [(0.0, lanes[waiting].edge) for waiting, _ in self._goes_on]
         heapq.heapify(heap)
         while heap:
             free, edge = heapq.heappop(heap)
@@ -271,13 +271,12 @@ class EntryWatcher:
         return [shortest.get(lane.edge, math.inf) for lane in lanes]
 
     @cached_property
-    def _left(self) -> dict[tuple[int, int], int]:
+    def _goes_on(self) -> dict[tuple[int, int], int]:
         """(internal lane at whose end one may wait for those with the right of way, the next one) -> link."""
-        lanes, found = self._road.lanes, {}
+        found = {}
         for number, link in enumerate(self._road.links):
-            following = next(iter(lanes[link.via].successors), -1) if link.via >= 0 and link.foes else -1
-            if following >= 0 and lanes[following].internal:
-                found[link.via, following] = number
+            if link.foes and self._road.waits_inside(link.via):
+                found[link.via, self._road.lanes[link.via].successors[0]] = number
         return found
 
     @cached_property
@@ -343,8 +342,8 @@ class EntryWatcher:
             link = self._road.link_of.get((before, lane), -1)
             if link >= 0 and self._matters[link]:
                 found.append(Passed(link, beyond, False))
-            elif (before, lane) in self._left:
-                found.append(Passed(self._left[before, lane], beyond, True))
+            elif (before, lane) in self._goes_on:
+                found.append(Passed(self._goes_on[before, lane], beyond, True))
             if lanes[before].edge != lanes[lane].edge:
                 beyond += lanes[before].length
             lane = before

@@ -21,6 +21,11 @@ def practice() -> tuple[str, ...]:
     return tuple(sorted(f"practice/{p.parent.name}" for p in ROOT.glob("practice/*/scenario.yaml")))
 
 
+def ships(name: str) -> bool:
+    """Whether a world or practice roads that ship are called so."""
+    return name in names() or name in practice()
+
+
 def folder(name: str) -> Path:
     """The folder of the world, or of the practice roads, called `name`.
 

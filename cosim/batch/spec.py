@@ -166,7 +166,9 @@ def _expand(item: str, folder: Path, file: object, field: str, kind: str) -> Ite
 def _files(name: str, folder: Path, file: object, field: str) -> tuple[str, ...]:
     """The files that match, sorted and absolute; a name that is neither file nor glob stays as it is."""
     path = folder / os.path.expanduser(name)
-    if name not in sumo_scenarios.names() and is_there(path):
+    if sumo_scenarios.ships(name):
+        return (name,)
+    if is_there(path):
         return (str(path.absolute()),)
     if _GLOB.search(name):
         found = sorted(str(Path(hit).absolute()) for hit in glob.iglob(str(path), recursive=True))
@@ -181,7 +183,7 @@ def _files(name: str, folder: Path, file: object, field: str) -> tuple[str, ...]
 
 def _checked(spec: Spec, file: object) -> Spec:
     """What can be said without opening a scenario."""
-    known = sumo_scenarios.names()
+    known = (*sumo_scenarios.names(), *sumo_scenarios.practice())
     for name in spec.scenario:
         if name not in known and not os.path.isabs(name):
             raise BadInput(f"no such scenario{hint(name, known)}", file=file, field="scenario", value=name)

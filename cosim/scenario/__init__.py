@@ -175,7 +175,7 @@ def load(
         BadInput: names file (or option), field and value, with the nearest name where one is near.
     """
     chosen = sumocfg.command_line(options)
-    if _ships(what):
+    if sumo_scenarios.ships(what):
         scenario = _world(sumo_scenarios.folder(what))
     elif is_there(Path(what) / DEFINITION):
         scenario = _world(Path(os.path.abspath(what)))
@@ -213,7 +213,7 @@ def chosen_preset(what: str, policy: str, preset: str | None) -> str:
     A policy of `ALWAYS` has one of its own; without a word a user's world decides, else it is `lawful`.
     """
     own = ALWAYS.get(policy) or preset
-    if own is None and not _ships(what) and is_there(Path(what) / DEFINITION):
+    if own is None and not sumo_scenarios.ships(what) and is_there(Path(what) / DEFINITION):
         return _world(Path(os.path.abspath(what))).preset
     return own or Preset.LAWFUL
 
@@ -234,13 +234,9 @@ class _WorldFile:
     conflict_zones: tuple[Zone, ...] = ()
 
 
-def _ships(what: str) -> bool:
-    return what in sumo_scenarios.names() or what in sumo_scenarios.practice()
-
-
 def place(what: str) -> str:
     """`what` as it is found from anywhere: a folder or file by its absolute path, a world's name as it is."""
-    is_path = not _ships(what) and is_there(Path(what))
+    is_path = not sumo_scenarios.ships(what) and is_there(Path(what))
     return os.path.abspath(what) if is_path else what
 
 

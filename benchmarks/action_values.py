@@ -2,11 +2,15 @@
 
     python -m benchmarks.action_values POLICY [POLICY ...] [--seeds 150200:150205] [--copies 12]
         [--worlds merge] [--demand contested] [--errors none] [--svo 60] [--workers 2] [--out FILE]
+    python -m benchmarks.action_values POLICY [POLICY ...] --run DIR
 
 POLICY (a name, weights or a training's folder) drives every world with a mission vehicle. At drawn decisions
 one AV does otherwise for 2.4 s in a copy of the simulation, everybody else as before by the same draws
 (`cosim.learning.forks`); what the 12 s from there on bring more or less is the true difference between the
 two actions, in units of the reward of `--config rewards`. Tuning seeds by default.
+
+With `--run` nothing is driven: several networks are compared by the same copies, those that a training with
+`training.forks` drove (its folder's `replay`). What that training's own network says of them it has learned.
 """
 
 from __future__ import annotations
@@ -24,6 +28,7 @@ from benchmarks.tables import markdown_row, write_page
 from benchmarks.turn import resampled
 from benchmarks.worlds import WITH_MISSION
 from cosim.cli.arguments import seeds as seeds_of
+from cosim.errors import BadInput
 from cosim.learning.rollouts import Rollouts
 from cosim.policies import make
 from cosim.report.statistics import NA
@@ -31,8 +36,9 @@ from cosim.rewards.svo import RewardP
 from cosim.scenario.policy_name import label, read
 from cosim.types import Preset
 from policy.agents.prediction_aware import PredictionAware
-from policy.training.curriculum import Drive, Drove, ForkConfig, Lesson
+from policy.training.curriculum import Drive, ForkConfig, Lesson
 from policy.training.ddqn import DdqnConfig, differences
+from policy.training.experience import Trajectory, load
 from policy.training.explorer import ExploreConfig
 from policy.training.replay_buffer import comparisons, places_tried
 
@@ -41,7 +47,7 @@ MATTERS = 0.1  # reward from which on the choice counts as one that matters
 COLUMNS = (
     *("policy", "episodes", "copies", "of which matter", "mean difference there", "chosen rightly"),
     *("lost a decision, of all copies", "correlation with the values"),
-    *("mean size for oneself: true, valued", "for the others: true, valued"),
+    *("for oneself: mean size true, valued, correlation", "for the others: the same"),
 )
 
 
@@ -52,10 +58,15 @@ class Drawn(NamedTuple):
     found: np.ndarray  # [n] by the network's values
     apart: np.ndarray = np.zeros((2, 0, 2))  # both [n,2] before they are weighed: for oneself, and the others
 
+    def by_values(self) -> Drawn:
+        """The same as if the action of the higher value had been chosen, whoever drove."""
+        side = np.where(self.found > 0.0, -1.0, 1.0)
+        return Drawn(self.true * side, self.found * side, self.apart * side[:, None])
 
-def judged(agent: PredictionAware, drove: Drove) -> Drawn:
+
+def judged(agent: PredictionAware, trajectories: Sequence[Trajectory]) -> Drawn:
     """What the network says of an episode's copies."""
-    places = places_tried(drove.trajectories)
+    places = places_tried(trajectories)
     if not places:
         return Drawn(np.zeros(0), np.zeros(0))
     compared = comparisons(places)
@@ -81,13 +92,48 @@ def row(policy: str, episodes: Sequence[Drawn]) -> str:
     lost = resampled(float, np.array(each)) if each else NA
     correlation = float(np.corrcoef(true, found)[0, 1]) if len(true) > 1 else math.nan
     size = np.abs(true[matter]).mean() if matter.any() else math.nan
-    sizes = np.abs(np.concatenate([one.apart for one in episodes], 1))
-    apart = [f"{a:.2f}, {b:.2f}" for a, b in sizes.mean(1).T] if sizes.size else ["-", "-"]
+    parts = np.concatenate([one.apart for one in episodes], 1)
+    apart = [_both(*parts[:, :, k]) for k in range(2)] if parts.size else ["-", "-"]
     cells = (
         *(policy, str(len(episodes)), str(len(true)), str(int(matter.sum())), f"{size:.2f}"),
         *(f"{rightly.text(0)} %", lost.text(3), f"{correlation:.2f}", *apart),
     )
     return markdown_row(cells)
+
+
+def _both(true: np.ndarray, found: np.ndarray) -> str:
+    sizes = f"{np.abs(true).mean():.2f}, {np.abs(found).mean():.2f}"
+    return f"{sizes}, {np.corrcoef(true, found)[0, 1]:.2f}" if true.std() and found.std() else sizes
+
+
+def _network(text: str) -> PredictionAware | None:
+    agent = make(read(text).text)
+    if isinstance(agent, PredictionAware) and agent.config.vfn_weights is not None:
+        return agent
+    return None
+
+
+def of_run(policies: Sequence[str], replay: Path) -> list[str]:
+    """The table of the copies that a training drove, by world and demand."""
+    episodes: dict[str, list[Trajectory]] = {}
+    for file in sorted(replay.glob("*.npz")):
+        for one in load(file):
+            episodes.setdefault(one.episode, []).append(one)
+    lines: dict[str, list[str]] = {}
+    for text in policies:
+        agent = _network(text)
+        if agent is None:
+            raise BadInput("has no value network", field="POLICY", value=text)
+        found: dict[str, list[Drawn]] = {}
+        for name, trajectories in episodes.items():
+            place = "practice" if name.startswith("practice/") else name.rpartition("/")[0]
+            found.setdefault(place, []).append(judged(agent, trajectories).by_values())
+        for place in sorted(found):
+            lines.setdefault(place, []).append(row(label(text), found[place]))
+    page = [f"Copies in `{replay}`.", ""]
+    for place, rows in lines.items():
+        page += [f"## {place}", "", markdown_row(COLUMNS), markdown_row(["---"] * len(COLUMNS)), *rows, ""]
+    return page
 
 
 def main() -> None:
@@ -104,11 +150,15 @@ def main() -> None:
     parser.add_argument("--svo", type=float, default=60.0)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--out", type=Path)
+    parser.add_argument("--run", type=Path, help="folder of a training that drove copies: judge those")
     args = parser.parse_args()
+    if args.run:
+        print("\n".join(of_run(args.policy, args.run / "replay")))
+        return
     tables: dict[str, list[str]] = {world: [] for world in args.worlds}
     for text in args.policy:
-        agent = make(read(text).text)
-        if not isinstance(agent, PredictionAware) or agent.config.vfn_weights is None:
+        agent = _network(text)
+        if agent is None:
             parser.error(f"{text} has no value network")
         weights, explore = str(agent.config.vfn_weights), ExploreConfig(EVERYBODY, advised=False)
         with Rollouts(args.workers, agent.name, agent.config, explore, RewardP(REWARDS.reward)) as actors:
@@ -125,7 +175,7 @@ def main() -> None:
                 for seed in seeds_of(args.seeds)
             ]
             driven = [actors.submit(drive) for drive in drives]
-            found = [judged(agent, future.result()) for future in driven]
+            found = [judged(agent, future.result().trajectories) for future in driven]
         for world in args.worlds:
             mine = [one for drive, one in zip(drives, found, strict=True) if drive.lesson.scenario == world]
             tables[world].append(row(label(text), mine))
@@ -147,8 +197,8 @@ def main() -> None:
         " *Correlation*",
         "of the true difference with that of the network's values: whether it knows how much is at stake.",
         "*For oneself* and *for the others*: the mean size of the difference's two parts, before phi weighs",
-        "them, by the copies and by a network that values them apart: one that values what is not there",
-        "chooses by chance.",
+        "them, by the copies and by a network that values them apart, and the correlation of both: one that",
+        "values what is not there chooses by chance.",
         "95 % intervals: bootstrap over episodes. What two AVs together could change no copy shows.",
         "",
     ]

@@ -18,6 +18,7 @@ class A2cConfig:
     """Optimisation. T gives none of these: usual values."""
 
     learning_rate: float = 3e-4
+    weight_decay: float = 0.0  # of AdamW: what every weight loses of itself in an update, times the rate
     n_step: int = 8  # as the DDQN's (docs/training.md); 1 is the papers'
     gamma: float = 0.97  # a decision of 0.4 s
     batch: int = 64
@@ -29,7 +30,11 @@ class A2cConfig:
 
     def __post_init__(self) -> None:
         """Raises BadInput for a number out of range."""
-        in_range(self, positive="learning_rate n_step gamma batch scale clip", not_negative="imitation")
+        in_range(
+            self,
+            positive="learning_rate n_step gamma batch scale clip",
+            not_negative="weight_decay imitation",
+        )
 
 
 class A2cLearner(Learner):

@@ -18,13 +18,13 @@ class DdqnConfig:
 
     learning_rate: float = 5e-4
     last_rate: float | None = None  # of the last iteration, fallen to over the last third; None: constant
+    weight_decay: float = 0.0  # of AdamW: what every weight loses of itself in an update, times the rate
     target_every: int = 300  # updates between copies of the online network
     r_unsafe: float = -5.0  # value of an action that the prioritizer refused: a crash's (Alg. 4, line 13)
     scale: float = 0.1  # of all rewards: action values of the order of 1
     refused: float = 1.0  # weight of the refused actions' loss
     clip: float = 10.0  # largest gradient norm
     forked: float = 1.0  # weight of what copies of the simulation say of two actions, where there are any
-    shrink: float = 0.0  # weight of how much actions differ in value: what nothing speaks for is nothing
     imitation: float = 1.0  # weight of the demonstrations: their action is worth more than any other,
     margin: float = 0.3  # by this much (large-margin loss of deep Q-learning from demonstrations)
 
@@ -33,7 +33,7 @@ class DdqnConfig:
         in_range(
             self,
             positive="learning_rate target_every scale clip",
-            not_negative="refused shrink imitation margin",
+            not_negative="weight_decay refused imitation margin",
         )
         if self.last_rate is not None:
             in_range(self, positive="last_rate")
@@ -55,9 +55,8 @@ class DdqnLearner(Learner):
         learns from copies of the simulation too, where there are any.
 
         Returns `td` (Huber loss of the n-step error), `unsafe` (loss of the refused actions), `imitation`
-        (of the demonstrated ones), `forked` (of the differences), `spread` (mean square by which the parts of
-        an action's value differ from their means over all actions) and `q` (mean value of the actions
-        carried out).
+        (of the demonstrated ones), `forked` (of the differences) and `q` (mean value of the actions carried
+        out).
         """
         c = self.config
         with torch.no_grad():
@@ -79,8 +78,7 @@ class DdqnLearner(Learner):
         forked = q.new_zeros(())
         if compared is not None:
             forked = c.forked * functional.smooth_l1_loss(*differences(self.online, compared, c.scale))
-        spread = (apart - apart.mean(2, keepdim=True)).square().mean()
-        self.step(td + unsafe + imitation + forked + c.shrink * spread, self.rate)
+        self.step(td + unsafe + imitation + forked, self.rate)
         self.updates += 1
         if self.updates % c.target_every == 0:
             self.update_target()
@@ -89,7 +87,6 @@ class DdqnLearner(Learner):
             "unsafe": unsafe,
             "imitation": imitation,
             "forked": forked,
-            "spread": spread,
             "q": q.gather(1, batch.action[:, None]).mean(),
         }
         return {name: float(value.detach()) for name, value in losses.items()}

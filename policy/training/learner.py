@@ -19,7 +19,7 @@ class Learner(Optimized):
 
     Args:
         vfn: layout of the network.
-        config: optimisation; both kinds have `learning_rate`, `clip` and `imitation`.
+        config: optimisation; both kinds have `learning_rate`, `weight_decay`, `clip` and `imitation`.
         seed: of the first weights.
         device: of torch.
     """
@@ -29,7 +29,7 @@ class Learner(Optimized):
         self.online: VFN = seeded(lambda: VFN(vfn), seed)
         self.online.to(device=device, memory_format=self.online.layout)  # type: ignore[call-overload]
         learning = [p for p in self.online.parameters() if p.requires_grad]  # an encoder does not
-        adam = torch.optim.Adam(learning, lr=config.learning_rate)
+        adam = torch.optim.AdamW(learning, lr=config.learning_rate, weight_decay=config.weight_decay)
         super().__init__({"online": self.online}, adam, config.clip)
         self.updates = 0
         self.rate: float | None = None  # of the next updates; None: the configuration's

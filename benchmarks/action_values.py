@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,7 +28,6 @@ from benchmarks.tables import markdown_row, write_page
 from benchmarks.turn import resampled
 from benchmarks.worlds import WITH_MISSION
 from cosim.cli.arguments import seeds as seeds_of
-from cosim.errors import BadInput
 from cosim.learning.rollouts import Rollouts
 from cosim.policies import make
 from cosim.report.statistics import NA
@@ -106,34 +105,31 @@ def _both(true: np.ndarray, found: np.ndarray) -> str:
     return f"{sizes}, {np.corrcoef(true, found)[0, 1]:.2f}" if true.std() and found.std() else sizes
 
 
-def _network(text: str) -> PredictionAware | None:
-    agent = make(read(text).text)
-    if isinstance(agent, PredictionAware) and agent.config.vfn_weights is not None:
-        return agent
-    return None
+def of_run(agents: Mapping[str, PredictionAware], files: Sequence[Path]) -> dict[str, list[str]]:
+    """The lines of every world and demand, practice roads together, of copies that a training drove.
 
-
-def of_run(policies: Sequence[str], replay: Path) -> list[str]:
-    """The table of the copies that a training drove, by world and demand."""
+    Args:
+        agents: label -> the agent whose network is judged.
+        files: of the training's replay.
+    """
     episodes: dict[str, list[Trajectory]] = {}
-    for file in sorted(replay.glob("*.npz")):
+    for file in files:
         for one in load(file):
             episodes.setdefault(one.episode, []).append(one)
-    lines: dict[str, list[str]] = {}
-    for text in policies:
-        agent = _network(text)
-        if agent is None:
-            raise BadInput("has no value network", field="POLICY", value=text)
-        found: dict[str, list[Drawn]] = {}
-        for name, trajectories in episodes.items():
-            place = "practice" if name.startswith("practice/") else name.rpartition("/")[0]
-            found.setdefault(place, []).append(judged(agent, trajectories).by_values())
-        for place in sorted(found):
-            lines.setdefault(place, []).append(row(label(text), found[place]))
-    page = [f"Copies in `{replay}`.", ""]
-    for place, rows in lines.items():
-        page += [f"## {place}", "", markdown_row(COLUMNS), markdown_row(["---"] * len(COLUMNS)), *rows, ""]
-    return page
+    places: dict[str, list[list[Trajectory]]] = {}
+    for name, trajectories in sorted(episodes.items()):
+        place = "practice" if name.startswith("practice/") else name.rpartition("/")[0]
+        places.setdefault(place, []).append(trajectories)
+    return {
+        place: [row(name, [judged(agent, t).by_values() for t in driven]) for name, agent in agents.items()]
+        for place, driven in places.items()
+    }
+
+
+def page(tables: Mapping[str, Sequence[str]]) -> list[str]:
+    """The tables under their titles."""
+    head = markdown_row(COLUMNS), markdown_row(["---"] * len(COLUMNS))
+    return [line for title, rows in tables.items() for line in (f"## {title}", "", *head, *rows, "")]
 
 
 def main() -> None:
@@ -152,14 +148,20 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     parser.add_argument("--run", type=Path, help="folder of a training that drove copies: judge those")
     args = parser.parse_args()
+    agents: dict[str, PredictionAware] = {}
+    for text in args.policy:
+        agent = make(read(text).text)
+        if not isinstance(agent, PredictionAware) or agent.config.vfn_weights is None:
+            parser.error(f"{text} has no value network")
+        agents[label(text)] = agent
     if args.run:
-        print("\n".join(of_run(args.policy, args.run / "replay")))
+        files = sorted((args.run / "replay").glob("*.npz"))
+        if not files:
+            parser.error(f"argument --run: {args.run} holds no drives of a training (replay/*.npz)")
+        print("\n".join([f"Copies of the training in `{args.run}`.", "", *page(of_run(agents, files))]))
         return
     tables: dict[str, list[str]] = {world: [] for world in args.worlds}
-    for text in args.policy:
-        agent = _network(text)
-        if agent is None:
-            parser.error(f"{text} has no value network")
+    for name, agent in agents.items():
         weights, explore = str(agent.config.vfn_weights), ExploreConfig(EVERYBODY, advised=False)
         with Rollouts(args.workers, agent.name, agent.config, explore, RewardP(REWARDS.reward)) as actors:
             drives = [
@@ -178,11 +180,11 @@ def main() -> None:
             found = [judged(agent, future.result().trajectories) for future in driven]
         for world in args.worlds:
             mine = [one for drive, one in zip(drives, found, strict=True) if drive.lesson.scenario == world]
-            tables[world].append(row(label(text), mine))
+            tables[world].append(row(name, mine))
     where = "" if args.worlds == list(WITH_MISSION) else f" --worlds {' '.join(args.worlds)}"
     flags = f"--seeds {args.seeds} --copies {args.copies} --demand {args.demand}"
     flags += f" --errors {args.errors} --svo {args.svo:g}{where}"
-    names = " ".join(map(label, args.policy))
+    names = " ".join(agents)
     lines = [
         "# What another action would have changed",
         "",
@@ -202,8 +204,7 @@ def main() -> None:
         "95 % intervals: bootstrap over episodes. What two AVs together could change no copy shows.",
         "",
     ]
-    for world, rows in tables.items():
-        lines += [f"## {world}", "", markdown_row(COLUMNS), markdown_row(["---"] * len(COLUMNS)), *rows, ""]
+    lines += page(tables)
     if args.out:
         write_page(args.out, lines)
     else:

@@ -20,13 +20,15 @@ class DdqnConfig:
     last_rate: float | None = None  # of the last iteration, fallen to over the last third; None: constant
     weight_decay: float = 0.0  # of AdamW: what every weight loses of itself in an update, times the rate
     target_every: int = 300  # updates between copies of the online network
-    r_unsafe: float = -5.0  # value of an action that the prioritizer refused: a crash's (Alg. 4, line 13)
+    # value of the preferred action that the prioritizer refused: a crash's (Alg. 4, line 13). None: whatever it
+    # masks is worth less than the best of what it allows by `margin`, and no more is asked
+    r_unsafe: float | None = -5.0
     scale: float = 0.1  # of all rewards: action values of the order of 1
     refused: float = 1.0  # weight of the refused actions' loss
     clip: float = 10.0  # largest gradient norm
     forked: float = 1.0  # weight of what copies of the simulation say of two actions, where there are any
     imitation: float = 1.0  # weight of the demonstrations: their action is worth more than any other,
-    margin: float = 0.3  # by this much (large-margin loss of deep Q-learning from demonstrations)
+    margin: float = 0.3  # by this much, in scaled rewards (large-margin loss of deep Q-learning from demonstrations)
 
     def __post_init__(self) -> None:
         """Raises BadInput for a number out of range."""
@@ -68,12 +70,7 @@ class DdqnLearner(Learner):
         chosen = _taken(apart, batch.action)
         td = functional.smooth_l1_loss(chosen, goal)
         q = self.online.weighed(apart, batch.now.phi)
-        refused = batch.vetoed >= 0
-        unsafe = q.new_zeros(())
-        if bool(refused.any()):  # stored as terminal with reward r_unsafe (Alg. 4)
-            value = q[refused].gather(1, batch.vetoed[refused][:, None])[:, 0]
-            worth = torch.full_like(value, c.r_unsafe * c.scale)
-            unsafe = functional.smooth_l1_loss(value, worth, reduction="sum") * (c.refused / len(q))
+        unsafe = c.refused * self._refused(q, batch)
         imitation = c.imitation * self._margin(q, batch.possible, batch.wrong)
         forked = q.new_zeros(())
         if compared is not None:
@@ -136,6 +133,18 @@ class DdqnLearner(Learner):
     def update_target(self) -> None:
         """The target network becomes the online one."""
         self.target.load_state_dict(self.online.state_dict())
+
+    def _refused(self, q: torch.Tensor, batch: Batch) -> torch.Tensor:
+        """Loss of what the prioritizer refused in `now`: see `DdqnConfig.r_unsafe`."""
+        c = self.config
+        if c.r_unsafe is None:
+            allowed = batch.possible | ~batch.possible.any(1, keepdim=True)
+            best = q.detach().masked_fill(~allowed, -torch.inf).amax(1, keepdim=True)
+            return functional.relu(q - best + c.margin)[~allowed].sum() / len(q)
+        refused = batch.vetoed >= 0  # stored as terminal with reward r_unsafe (Alg. 4)
+        value = q[refused].gather(1, batch.vetoed[refused][:, None])[:, 0]
+        worth = torch.full_like(value, c.r_unsafe * c.scale)
+        return functional.smooth_l1_loss(value, worth, reduction="sum") / len(q)
 
     def _margin(self, q: torch.Tensor, possible: torch.Tensor, wrong: torch.Tensor) -> torch.Tensor:
         """Large-margin loss: among what was safe, the best demonstrated action leads the others by `margin`.

@@ -220,6 +220,23 @@ def test_a_refused_action_is_worth_a_crash() -> None:
     assert q[1].item() > -0.1
 
 
+def test_or_no_more_than_less_than_the_best_that_is_allowed() -> None:
+    """Both lane changes are masked; where everything is, nothing is asked."""
+    unsafe = np.zeros((3, 5), np.bool_)
+    unsafe[0, [MetaAction.LANE_LEFT, MetaAction.LANE_RIGHT]] = unsafe[1] = True
+    one = trajectory([1, 1], [(0.0, 0.0, 0.0)] * 2, unsafe=unsafe)
+    learner = DdqnLearner(TINY, DdqnConfig(learning_rate=1e-2, r_unsafe=None, margin=0.2), seed=1)
+    replay, _ = only(ReplayConfig(batch=16, n_step=1, relabel=0.0), one)
+    rng = np.random.default_rng(0)
+    for _ in range(150):
+        losses = learner.update(replay.sample(rng))
+    with torch.no_grad():
+        q = learner.online(*experience.states([(one, 0)], np.zeros(1, np.float32)))[0]
+    refused, allowed = q[unsafe[0]], q[~unsafe[0]]
+    assert losses["unsafe"] == pytest.approx(0.0, abs=0.01)
+    assert bool(((allowed.max() - refused > 0.19) & (allowed.max() - refused < 0.4)).all())
+
+
 def test_the_demonstrated_action_leads_by_the_margin_where_no_reward_speaks_for_it() -> None:
     """An AV idled and was rewarded; the demonstrator would have braked."""
     one = trajectory([1], [(1.0, 0.0, 0.0)], ending="crashed")

@@ -6,9 +6,10 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from cosim.geometry.compiled import compiled
 from cosim.geometry.raster import PIXEL_LOWEST, PIXEL_SPAN, PIXEL_SPEED
 from cosim.road import RoadMap
-from cosim.types import KINEMATIC_FEATURES, Bools, Floats, Floats32, History
+from cosim.types import KINEMATIC_FEATURES, Bools, Bytes, Floats, Floats32, History
 from policy.inputs.situation import situation
 
 # Scales that bring every kinematic feature to about [-1, 1]: row range, map half width, motorway speed,
@@ -21,6 +22,12 @@ APART = 5  # channels of `apart`: AV, HV, road, ego or mission vehicle, relative
 STILL = 255 * (PIXEL_LOWEST + PIXEL_SPAN / 2)  # pixel of a vehicle as fast as the ego
 _LEVEL = np.float32(1.0 / 255.0)
 BRISK = 255 * PIXEL_SPAN / (2 * PIXEL_SPEED) * 15.0  # what 15 m/s of relative speed add to it: 1 in `apart`
+# relative speed [256] of a vehicle's pixel, 0 of none
+_RELATIVE = np.where(
+    np.arange(256) > 0,
+    (np.arange(256, dtype=np.float32) - np.float32(STILL)) * np.float32(1.0 / BRISK),
+    np.float32(0.0),
+)
 
 
 class States(NamedTuple):
@@ -93,8 +100,21 @@ def apart(maps: torch.Tensor) -> torch.Tensor:
     A pixel's brightness says both at once, and 5 m/s more is a shade brighter: convolutions find it sooner
     where a vehicle is 1 whatever its speed, and relative speed stands in a channel of its own.
     """
-    vehicles = torch.maximum(maps[:, 0], maps[:, 1])
-    out = torch.empty(len(maps), APART, *maps.shape[2:], device=maps.device)
-    out[:, :4] = maps.clamp(max=1)
-    out[:, 4] = vehicles.to(torch.float32).sub_(STILL).mul_(1.0 / BRISK).mul_(vehicles.clamp(max=1))
-    return out
+    if maps.device.type != "cpu":
+        present = maps.clamp(max=1).to(torch.float32)
+        speed = torch.from_numpy(_RELATIVE).to(maps.device)[torch.maximum(maps[:, 0], maps[:, 1]).long()]
+        return torch.cat([present, speed[:, None]], 1)
+    planes = np.empty((len(maps), *maps.shape[2:], APART), np.float32)
+    _apart(maps.numpy(), planes)
+    return torch.from_numpy(planes).permute(0, 3, 1, 2)
+
+
+@compiled
+def _apart(maps: Bytes, planes: Floats32) -> None:
+    """Fills `planes` [B,H,W,APART], channels last as convolutions read them, in one pass over memory."""
+    for b in range(planes.shape[0]):
+        for y in range(planes.shape[1]):
+            for x in range(planes.shape[2]):
+                for c in range(4):
+                    planes[b, y, x, c] = 1.0 if maps[b, c, y, x] else 0.0
+                planes[b, y, x, 4] = _RELATIVE[max(maps[b, 0, y, x], maps[b, 1, y, x])]

@@ -32,11 +32,11 @@ class FrameEncoder(nn.Module):
         first, second, third = c.features
         self.layers = nn.Sequential(
             nn.Conv2d(APART, first, (4, 8), (2, 4), (1, 2)),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
             nn.Conv2d(first, second, 4, 2, 1),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
             nn.Conv2d(second, third, 3, (2, 1), 1),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
         )
         rows = (c.height // 4 + 1) // 2
         self.latent = nn.Linear(third * rows * (c.width // 8), c.latent)

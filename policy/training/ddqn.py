@@ -20,15 +20,15 @@ class DdqnConfig:
     last_rate: float | None = None  # of the last iteration, fallen to over the last third; None: constant
     weight_decay: float = 0.0  # of AdamW: what every weight loses of itself in an update, times the rate
     target_every: int = 300  # updates between copies of the online network
-    # value of the preferred action that the prioritizer refused: a crash's (Alg. 4, line 13). None: whatever it
-    # masks is worth less than the best of what it allows by `margin`, and no more is asked
+    # value of the preferred action that the prioritizer refused: a crash's (Alg. 4, line 13). None: whatever
+    # it masks is worth less than the best of what it allows by `margin`, and no more is asked
     r_unsafe: float | None = -5.0
     scale: float = 0.1  # of all rewards: action values of the order of 1
     refused: float = 1.0  # weight of the refused actions' loss
     clip: float = 10.0  # largest gradient norm
     forked: float = 1.0  # weight of what copies of the simulation say of two actions, where there are any
     imitation: float = 1.0  # weight of the demonstrations: their action is worth more than any other,
-    margin: float = 0.3  # by this much, in scaled rewards (large-margin loss of deep Q-learning from demonstrations)
+    margin: float = 0.3  # by this much, scaled (large-margin loss of deep Q-learning from demonstrations)
 
     def __post_init__(self) -> None:
         """Raises BadInput for a number out of range."""

@@ -280,15 +280,6 @@ class EntryWatcher:
         return found
 
     @cached_property
-    def _origins(self) -> list[list[int]]:
-        """[l] the lanes that lead to a lane."""
-        found: list[list[int]] = [[] for _ in self._road.lanes]
-        for k, lane in enumerate(self._road.lanes):
-            for successor in lane.successors:
-                found[successor].append(k)
-        return found
-
-    @cached_property
     def _beside(self) -> dict[str, list[int]]:
         """Edge -> its lanes."""
         found: dict[str, list[int]] = {}
@@ -368,7 +359,7 @@ class EntryWatcher:
             left[edge] = reach
             for lane in self._beside[edge]:
                 more = reach - lanes[lane].length
-                waiting += [(lanes[origin].edge, more) for origin in self._origins[lane]]
+                waiting += [(lanes[origin].edge, more) for origin in self._road.before[lane]]
         inside = lanes[links[number].via].start if links[number].via >= 0 else ""
         return tuple(
             (lane, lanes[lane].length - reach)

@@ -1,0 +1,133 @@
+"""What a value network drives into without the safety prioritizer and without the car's own braking.
+
+    python -m benchmarks.alone [--episodes 20] [--demand dense] [--seeds-from 200000] [--runs runs/alone]
+        [--workers 2] [--out docs/results/alone.md]
+
+Preset `unguarded`, no mask: the best valued action is carried out. The same command goes on where it stopped.
+"""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from benchmarks.papers.agents import Agent, build
+from benchmarks.tables import markdown_row, write_page
+from cosim.cli.main import main as cosim
+from cosim.report import run_folder, statistics
+from cosim.report.figures import Row
+from cosim.seeding import FIRST_TEST_SEED
+from cosim.types import Policy
+from cosim.workers.tasks import OK
+from sumo_scenarios import names
+
+PAGE = Path("docs/results/alone.md")
+SVO = 60
+EVERY = "all worlds"
+ARMS = ("vfn_p", "vfn", "vfn_p_demonstrated")  # functions of this module
+COLUMNS = (
+    "world", "network", "episodes", "with an AV in a collision", "AV-caused", "distance of all, m",
+    "less vfn-p-demonstrated, points",
+)  # fmt: skip
+
+
+def vfn_p() -> Policy:
+    """`vfn-p` without the mask."""
+    return build(Agent("vfn-p alone", "vfn-p", mask="none"))
+
+
+def vfn() -> Policy:
+    """`vfn` without the mask."""
+    return build(Agent("vfn alone", "vfn", mask="none"))
+
+
+def vfn_p_demonstrated() -> Policy:
+    """`vfn-p-demonstrated` without the mask."""
+    return build(Agent("vfn-p-demonstrated alone", "vfn-p-demonstrated", mask="none"))
+
+
+def table(rows: Sequence[Row]) -> list[str]:
+    """The Markdown table of whatever has been driven: world by world, then all worlds together."""
+    lines = [markdown_row(COLUMNS), markdown_row(["---"] * len(COLUMNS))]
+    worlds = list(dict.fromkeys(str(row["scenario"]) for row in rows))
+    for world in [*worlds, EVERY]:
+        of = {
+            arm: {
+                (row["scenario"], row["seed"]): row
+                for row in rows
+                if row["policy"] == _label(arm) and world in (row["scenario"], EVERY)
+            }
+            for arm in ARMS
+        }
+        before = of[ARMS[-1]]
+        for arm in ARMS:
+            mine = list(of[arm].values())
+            if not mine:
+                continue
+            pairs = sorted(of[arm].keys() & before.keys(), key=str)
+            crashed, theirs = ([_crashed(part[key]) for key in pairs] for part in (of[arm], before))
+            distance = [float(row["dt_mean_m"]) for row in mine]
+            lines.append(
+                markdown_row(
+                    [
+                        world,
+                        _label(arm),
+                        str(len(mine)),
+                        _share([_crashed(row) for row in mine]),
+                        _share([bool(row["av_caused_collisions"]) for row in mine]),
+                        statistics.mean(distance).text(0),
+                        statistics.paired_share(theirs, crashed).text(0, 100.0) if arm != ARMS[-1] else "",
+                    ]
+                )
+            )
+    return lines
+
+
+def _label(arm: str) -> str:
+    return f"{arm.replace('_', '-')}-alone"
+
+
+def _crashed(row: Row) -> bool:
+    return bool(row["av_involved_collisions"])
+
+
+def _share(hits: Sequence[bool]) -> str:
+    return f"{statistics.share(sum(hits), len(hits)).text(0, 100.0)} %"
+
+
+def main() -> None:
+    """Drive what is missing, write the page."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--episodes", type=int, default=20)
+    parser.add_argument("--demand", default="dense")
+    parser.add_argument("--seeds-from", type=int, default=FIRST_TEST_SEED)
+    parser.add_argument("--runs", type=Path, default=Path("runs/alone"), help="where episodes are kept")
+    parser.add_argument("--workers", default="2")
+    parser.add_argument("--out", type=Path, default=PAGE)
+    args = parser.parse_args()
+    seeds = f"{args.seeds_from}:{args.seeds_from + args.episodes}"
+    words = [word for world in names() for word in ("--scenario", world)]
+    words += [word for arm in ARMS for word in ("--policy", f"{_label(arm)}=benchmarks.alone:{arm}")]
+    words += ["--demand", args.demand, "--seeds", seeds, "--svo", str(SVO), "--preset", "unguarded"]
+    code = cosim(["evaluate", *words, "--workers", args.workers, "--resume", "--out", str(args.runs)])
+    if code:
+        raise SystemExit(code)
+    rows = [row for row in run_folder.read(args.runs).rows if row["status"] == OK]
+    drivers = sorted({f"{row['behavior']} drivers (`{row['driver_model']}`)" for row in rows})
+    about = [
+        "# A network alone",
+        "",
+        f"Made by `python -m benchmarks.alone --episodes {args.episodes} --demand {args.demand}`:",
+        f"seeds {seeds}, {', '.join(drivers)}, errors `none`, phi {SVO} degrees, preset",
+        "`unguarded`. No action is masked and no car brakes by itself: what the network values best is",
+        "carried out. Shares of episodes with Wilson's, means with bootstrap, paired differences with",
+        "Tango's 95 % intervals.",
+        "",
+    ]
+    write_page(args.out, [*about, *table(rows)])
+    print(args.out.read_text())
+
+
+if __name__ == "__main__":
+    main()

@@ -24,6 +24,7 @@ class Lesson:
     demand: str = "contested"
     behavior: str | None = None  # None: the demand's default
     weight: float = 1.0
+    preset: str = ""  # what the car does by itself; "": as in the others (`VfnTraining.preset`)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,9 +109,10 @@ def drives(c: VfnTraining, k: int, weights: str, frozen: str, epsilon: float, gu
     drawn = []
     for j in range(c.episodes):
         draws = [uniform(c.seed, name, str(k), str(j)) for name in ("lesson", "svo", "guided")]
+        lesson = _drawn(c.lessons, draws[0])
         drawn.append(
             Drive(
-                _drawn(c.lessons, draws[0]),
+                lesson,
                 (k * c.episodes + j + subseed(c.seed, "episodes")) % len(TRAINING_SEEDS),
                 math.radians(c.svo[int(draws[1] * len(c.svo))]),
                 epsilon,
@@ -119,7 +121,7 @@ def drives(c: VfnTraining, k: int, weights: str, frozen: str, epsilon: float, gu
                 record=True,
                 guided=draws[2] < guided,
                 errors=c.errors if uniform(c.seed, "errors", str(k), str(j)) < c.erring else "",
-                preset=c.preset,
+                preset=lesson.preset or c.preset,
                 forks=c.forks,
                 gamma=c.replay.gamma,
             )
@@ -145,7 +147,7 @@ def validation(c: VfnTraining, weights: str) -> list[Drive]:
             weights,
             record=False,
             errors=c.errors if c.erring == 1.0 or j % 2 else "",
-            preset=c.preset,
+            preset=lesson.preset or c.preset,
         )
         for lesson in c.lessons
         for j in range(c.validation)

@@ -121,6 +121,7 @@ class TrainingRun:
         means, count = _means("valid", figures), self.config.validation
         for at, lesson in enumerate(self.config.lessons):
             name = f"valid/{Path(lesson.scenario).name}-{lesson.demand}"
+            name += f"-{lesson.preset}" if lesson.preset else ""
             means |= _means(name, figures[at * count : (at + 1) * count])
         if means["valid/reward"] > self.best:
             self.best = means["valid/reward"]

@@ -259,3 +259,11 @@ def test_humans_err_in_a_share_of_the_drives_and_in_every_second_validation() ->
     assert 70 < drawn.count("stress") < 130
     assert [d.errors for d in validation(c, "")] == ["", "stress", "", "stress"]
     assert {d.errors for d in drives(replace(c, erring=1.0), 0, "", "", 0.0, 0.0)} == {"stress"}
+
+
+def test_a_lesson_may_name_its_own_preset() -> None:
+    lessons = (Lesson("merge"), Lesson("merge", "dense", preset="unguarded"))
+    c = VfnTraining(lessons=lessons, validation=1, preset="lawful")
+    drawn = {(d.lesson.demand, d.preset) for k in range(20) for d in drives(c, k, "", "", 0.0, 0.0)}
+    judged = {(d.lesson.demand, d.preset) for d in validation(c, "")}
+    assert drawn == judged == {("contested", "lawful"), ("dense", "unguarded")}

@@ -1,7 +1,7 @@
 """What a value network drives into without the safety prioritizer and without the car's own braking.
 
-    python -m benchmarks.alone [--episodes 20] [--demand dense] [--seeds-from 200000] [--runs runs/alone]
-        [--workers 2] [--out docs/results/alone.md]
+    python -m benchmarks.alone [--episodes 20] [--demand dense] [--worlds merge ...] [--seeds-from 200000]
+        [--runs runs/alone] [--workers 2] [--out docs/results/alone.md]
 
 Preset `unguarded`, no mask: the best valued action is carried out. The same command goes on where it stopped.
 """
@@ -101,13 +101,14 @@ def main() -> None:
     )
     parser.add_argument("--episodes", type=int, default=20)
     parser.add_argument("--demand", default="dense")
+    parser.add_argument("--worlds", nargs="+", default=names(), choices=names())
     parser.add_argument("--seeds-from", type=int, default=FIRST_TEST_SEED)
     parser.add_argument("--runs", type=Path, default=Path("runs/alone"), help="where episodes are kept")
     parser.add_argument("--workers", default="2")
     parser.add_argument("--out", type=Path, default=PAGE)
     args = parser.parse_args()
     seeds = f"{args.seeds_from}:{args.seeds_from + args.episodes}"
-    words = [word for world in names() for word in ("--scenario", world)]
+    words = [word for world in args.worlds for word in ("--scenario", world)]
     words += [word for arm in ARMS for word in ("--policy", f"{_label(arm)}=benchmarks.alone:{arm}")]
     words += ["--demand", args.demand, "--seeds", seeds, "--svo", str(SVO), "--preset", "unguarded"]
     code = cosim(["evaluate", *words, "--workers", args.workers, "--resume", "--out", str(args.runs)])

@@ -167,6 +167,13 @@ def learned(place: Place) -> list[list[str]]:
     return [["benchmarks.learned", LEARNED, *flags, "--out", str(place.out / "learned.md")]]
 
 
+def alone(place: Place) -> list[list[str]]:
+    """What networks drive into without the mask."""
+    flags = ["--episodes", "1" if place.small else "20", "--runs", str(place.work / "alone_runs")]
+    flags += ["--worlds", "merge"] if place.small else []
+    return [["benchmarks.alone", *flags, "--out", str(place.out / "alone.md")]]
+
+
 def behaviors(place: Place) -> list[list[str]]:
     """How faithfully LC2013 drives Table II."""
     flags = ["--report", "--scale", "0.002" if place.small else "1"]
@@ -231,6 +238,7 @@ PAGES = (
     Page("turn", turn, ("turn.md", "turn.svg", "data/turn.csv")),
     Page("seeing", seeing, ("seeing.md",)),
     Page("learned", learned, ("learned.md",)),
+    Page("alone", alone, ("alone.md",)),
     Page("real_nets", real_nets, ("real_nets.md",)),
     Page("behaviors", behaviors, ("behaviors.md",)),
     Page(

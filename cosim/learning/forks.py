@@ -1,9 +1,10 @@
-"""What one AV's other action would have changed, driven in copies of the simulation.
+"""What another action would have changed, driven in copies of the simulation.
 
 A decision of 0.4 s changes little, and what everybody else does meanwhile changes much: the difference
 between two actions drowns in the returns of a replay buffer. In a copy of the simulation where one AV alone
 does otherwise, everybody else driving by the same policy and the same draws, nearly all of that cancels (the
 vine procedure with common random numbers: Schulman et al. 2015, Trust Region Policy Optimization, 5.2).
+Where nobody gets in unless two slow down, one alone shows nothing: `ForkConfig.together` lets several.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ Tried = tuple[str, int, MetaAction, Floats32]  # AV, its decision, action, [H,3]
 
 
 class Forks(Hook):
-    """At drawn decisions of a drive one learning AV does otherwise for some decisions, in a copy.
+    """At drawn decisions of a drive learning AVs do otherwise for some decisions, in a copy.
 
     Goes behind the hook that pays the agent. `compared` adds to the drive's trajectories what was found.
     """
@@ -51,10 +52,11 @@ class Forks(Hook):
             return
         known = sorted(self._agent.learning.keys() & episode.histories.keys())
         if known:
-            av, seed = known[self._rng.integers(len(known))], int(self._rng.integers(2**32))
-            found = forked(lambda: self._otherwise(episode, av, np.random.default_rng(seed)))
-            if found is not None:
-                self._tried.append(found)
+            rng, together = self._rng, self._drive.forks.together
+            avs, seed = [known.pop(rng.integers(len(known)))], int(rng.integers(2**32))
+            if together > 1:
+                avs += rng.permutation(known)[: rng.integers(together)].tolist()
+            self._tried += forked(lambda: self._otherwise(episode, avs, np.random.default_rng(seed)))
 
     def compared(self, trajectories: Sequence[Trajectory]) -> list[Trajectory]:
         """The trajectories, with the actions tried and what they brought more."""
@@ -73,25 +75,31 @@ class Forks(Hook):
             one.gain[t] = _worth(terms, gamma) - _worth(one.terms[t : t + forks.horizon], gamma)
         return [by_av[one.av] for one in trajectories]
 
-    def _otherwise(self, episode: Episode, av: str, rng: np.random.Generator) -> Tried | None:
-        """In the copy: drive on with another action of `av`; None where it has no other that is safe."""
+    def _otherwise(self, episode: Episode, avs: Sequence[str], rng: np.random.Generator) -> list[Tried]:
+        """In the copy: drive on with another action of the first of `avs` that has one that is safe, the same
+        for the others of them where it is another and safe; nothing where nobody has one."""
         agent, forks = self._agent, self._drive.forks
         self._at = set()
-        t = agent.recorded(av)
         decisions = agent.decide(episode.histories)
-        decision = decisions[av]
-        weights = np.array([RARELY if a in SIDEWAYS else 1.0 for a in MetaAction])
-        weights[decision.action] = 0.0
-        if decision.unsafe is not None:
-            weights[decision.unsafe] = 0.0
-        if not weights.any():
-            return None
-        action = MetaAction(rng.choice(len(weights), p=weights / weights.sum()))
-        agent.hold(av, action, forks.held - 1)
-        changed = {**decisions, av: decision._replace(action=action)}
+        changed, action = dict(decisions), None
+        for av in avs:
+            decision = decisions[av]
+            weights = np.array([RARELY if a in SIDEWAYS else 1.0 for a in MetaAction])
+            weights[decision.action] = 0.0
+            if decision.unsafe is not None:
+                weights[decision.unsafe] = 0.0
+            if action is None and weights.any():
+                action = MetaAction(rng.choice(len(weights), p=weights / weights.sum()))
+            if action is not None and weights[action]:
+                changed[av] = decision._replace(action=action)
+        tried = {av: agent.recorded(av) for av in avs if changed[av] is not decisions[av]}
+        if action is None:
+            return []
+        for av in tried:
+            agent.hold(av, action, forks.held - 1)
         go_on(episode, agent, changed, forks.horizon)
-        (mine,) = (one for one in agent.finish() if one.av == av)
-        return av, t, action, mine.terms[t : t + forks.horizon]
+        mine = {one.av: one for one in agent.finish()}
+        return [(av, t, action, mine[av].terms[t : t + forks.horizon]) for av, t in tried.items()]
 
 
 def _worth(terms: Floats32, gamma: float) -> Floats32:

@@ -29,15 +29,16 @@ class Lesson:
 
 @dataclass(frozen=True, slots=True)
 class ForkConfig:
-    """Copies of the simulation in which one AV does otherwise (`cosim.learning.forks`)."""
+    """Copies of the simulation in which AVs do otherwise (`cosim.learning.forks`)."""
 
     count: int = 0  # a drive
     held: int = 6  # decisions for which the other action is held
     horizon: int = 40  # decisions over which the difference that it makes is summed up
+    together: int = 1  # AVs that do so in one copy: as many as drawn, from 1 to this
 
     def __post_init__(self) -> None:
         """Raises BadInput for a number out of range."""
-        in_range(self, positive="held horizon", not_negative="count")
+        in_range(self, positive="held horizon together", not_negative="count")
 
 
 @dataclass(frozen=True, slots=True)

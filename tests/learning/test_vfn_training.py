@@ -385,6 +385,22 @@ def test_copies_of_the_simulation_tell_what_another_action_brings_and_change_not
     assert all(t.tried[k] != t.action[k] for t, k in places if t.tried is not None)
 
 
+def test_in_some_copies_two_do_the_same_at_once() -> None:
+    one = agent()
+    episode = fake_episode(
+        FakeVehicle("a", 100.0, 0, 20.0, is_av=True),
+        FakeVehicle("b", 900.0, 1, 20.0, is_av=True),
+    )
+    forks = ForkConfig(count=12, held=6, horizon=10, together=2)
+    drive = Drive(Lesson("fake"), 5, 0.7, 0.0, "", "", True, gamma=0.97, forks=forks)
+    a, b = drive_episode(episode, one, drive, RewardConfig(perception_range=50.0)).trajectories
+    assert a.tried is not None
+    assert b.tried is not None
+    both = (a.tried >= 0) & (b.tried >= 0)
+    assert 0 < both.sum() < (np.maximum(a.tried, b.tried) >= 0).sum()
+    assert np.array_equal(a.tried[both], b.tried[both])
+
+
 def test_a_learner_learns_from_copies_which_action_pays_oneself_and_which_the_others() -> None:
     """The returns of the drives say nothing: every decision pays alike."""
     tried, fast, slow = np.full(1, -1, np.int8), int(MetaAction.ACCELERATE), int(MetaAction.DECELERATE)

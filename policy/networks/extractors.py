@@ -171,6 +171,6 @@ class Conv2dMaps(nn.Module):
         """[B,T,C,H,W] -> [B,flat]."""
         b, t = maps.shape[:2]
         seen = self.read(maps.flatten(0, 1))
-        picture = seen.view(b, t * seen.shape[1], *seen.shape[2:])
+        picture = seen.reshape(b, t * seen.shape[1], *seen.shape[2:])
         out: torch.Tensor = self.layers(picture).flatten(1)
         return out

@@ -8,21 +8,20 @@ Preset `unguarded`, no mask: the best valued action is carried out. The same com
 
 import argparse
 from collections.abc import Sequence
-from pathlib import Path
 
+from benchmarks.learned import asked, drivers, options, share
 from benchmarks.papers.agents import Agent, build
 from benchmarks.tables import markdown_row, write_page
 from cosim.cli.main import main as cosim
 from cosim.report import run_folder, statistics
 from cosim.report.figures import Row
-from cosim.seeding import FIRST_TEST_SEED
 from cosim.types import Policy
 from cosim.workers.tasks import OK
 from sumo_scenarios import names
 
-PAGE = Path("docs/results/alone.md")
 SVO = 60
 EVERY = "all worlds"
+CRASHED = "av_involved_collisions"
 ARMS = ("vfn_p", "vfn", "vfn_p_demonstrated")  # functions of this module
 COLUMNS = (
     "world", "network", "episodes", "with an AV in a collision", "AV-caused", "distance of all, m",
@@ -64,7 +63,7 @@ def table(rows: Sequence[Row]) -> list[str]:
             if not mine:
                 continue
             pairs = sorted(of[arm].keys() & before.keys(), key=str)
-            crashed, theirs = ([_crashed(part[key]) for key in pairs] for part in (of[arm], before))
+            crashed, theirs = ([bool(part[key][CRASHED]) for key in pairs] for part in (of[arm], before))
             distance = [float(row["dt_mean_m"]) for row in mine]
             lines.append(
                 markdown_row(
@@ -72,8 +71,8 @@ def table(rows: Sequence[Row]) -> list[str]:
                         world,
                         _label(arm),
                         str(len(mine)),
-                        _share([_crashed(row) for row in mine]),
-                        _share([bool(row["av_caused_collisions"]) for row in mine]),
+                        share(mine, CRASHED),
+                        share(mine, "av_caused_collisions"),
                         statistics.mean(distance).text(0),
                         statistics.paired_share(theirs, crashed).text(0, 100.0) if arm != ARMS[-1] else "",
                     ]
@@ -86,26 +85,12 @@ def _label(arm: str) -> str:
     return f"{arm.replace('_', '-')}-alone"
 
 
-def _crashed(row: Row) -> bool:
-    return bool(row["av_involved_collisions"])
-
-
-def _share(hits: Sequence[bool]) -> str:
-    return f"{statistics.share(sum(hits), len(hits)).text(0, 100.0)} %"
-
-
 def main() -> None:
     """Drive what is missing, write the page."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--episodes", type=int, default=20)
-    parser.add_argument("--demand", default="dense")
-    parser.add_argument("--worlds", nargs="+", default=names(), choices=names())
-    parser.add_argument("--seeds-from", type=int, default=FIRST_TEST_SEED)
-    parser.add_argument("--runs", type=Path, default=Path("runs/alone"), help="where episodes are kept")
-    parser.add_argument("--workers", default="2")
-    parser.add_argument("--out", type=Path, default=PAGE)
+    options(parser, "alone", "dense", names())
     args = parser.parse_args()
     seeds = f"{args.seeds_from}:{args.seeds_from + args.episodes}"
     words = [word for world in args.worlds for word in ("--scenario", world)]
@@ -115,12 +100,11 @@ def main() -> None:
     if code:
         raise SystemExit(code)
     rows = [row for row in run_folder.read(args.runs).rows if row["status"] == OK]
-    drivers = sorted({f"{row['behavior']} drivers (`{row['driver_model']}`)" for row in rows})
     about = [
         "# A network alone",
         "",
-        f"Made by `python -m benchmarks.alone --episodes {args.episodes} --demand {args.demand}`:",
-        f"seeds {seeds}, {', '.join(drivers)}, errors `none`, phi {SVO} degrees, preset",
+        f"Made by `python -m benchmarks.alone{asked(parser, args)}`: `{args.demand}`,",
+        f"seeds {seeds}, {drivers(rows)}, errors `none`, phi {SVO} degrees, preset",
         "`unguarded`. No action is masked and no car brakes by itself: what the network values best is",
         "carried out. Shares of episodes with Wilson's, means with bootstrap, paired differences with",
         "Tango's 95 % intervals.",

@@ -22,7 +22,6 @@ from cosim.scenario.policy_name import label, read
 from cosim.seeding import FIRST_TEST_SEED
 from cosim.workers.tasks import OK
 
-PAGE = Path("docs/results/learned.md")
 WORLDS = ("merge", "exit", "roundabout", "intersection")  # those with a mission vehicle
 SVO = 60
 MINE, THEIRS = "network", "others"  # folders of runs
@@ -41,12 +40,17 @@ def of(rows: Sequence[Row], name: str) -> list[float]:
     return [math.nan if row.get(name) is None else float(row[name]) for row in rows]
 
 
+def share(rows: Sequence[Row], name: str) -> str:
+    """The share of episodes with this figure, of those where it is not NA, with its interval."""
+    hits = [bool(row[name]) for row in rows if row.get(name) is not None]
+    return f"{statistics.share(sum(hits), len(hits)).text(0, 100.0)} %" if hits else "-"
+
+
 def line(arm: str, rows: Sequence[Row]) -> list[str]:
     """The cells of one arm in one world."""
 
     def shares(name: str) -> str:
-        hits = [bool(row[name]) for row in rows if row.get(name) is not None]
-        return f"{statistics.share(sum(hits), len(hits)).text(0, 100.0)} %" if hits else "-"
+        return share(rows, name)
 
     def means(name: str, digits: int = 0) -> str:
         return statistics.mean(of(rows, name)).text(digits)
@@ -83,9 +87,8 @@ def against(rows: Mapping[Arm, Mapping[int, Row]], first: Arm, other: Arm) -> st
     return f"- less {other[0]} at {other[1]:g} degrees ({len(seeds)} pairs): {'; '.join(parts)}."
 
 
-def drivers(runs: Path) -> str:
+def drivers(rows: Sequence[Row]) -> str:
     """Who drives beside the AVs."""
-    rows = run_folder.read(runs / MINE).rows
     return ", ".join(sorted({f"{row['behavior']} drivers (`{row['driver_model']}`)" for row in rows}))
 
 
@@ -122,21 +125,40 @@ def page(
     return lines
 
 
+def options(parser: argparse.ArgumentParser, name: str, demand: str, worlds: Sequence[str]) -> None:
+    """What a page `name` of episodes on test seeds is asked for, with its usual demand and worlds."""
+    parser.add_argument("--episodes", type=int, default=20)
+    parser.add_argument("--demand", default=demand)
+    parser.add_argument("--worlds", nargs="+", default=list(worlds), choices=worlds)
+    parser.add_argument("--seeds-from", type=int, default=FIRST_TEST_SEED)
+    parser.add_argument("--runs", type=Path, default=Path("runs", name), help="where episodes are kept")
+    parser.add_argument("--workers", default="2")
+    parser.add_argument("--out", type=Path, default=Path("docs/results", f"{name}.md"))
+
+
+ASKED = ("episodes", "demand", "errors", "worlds", "seeds_from", "others")
+
+
+def asked(parser: argparse.ArgumentParser, args: argparse.Namespace) -> str:
+    """The options that say which episodes, as far as they are not the usual ones; a space before each."""
+    words = []
+    for name in ASKED:
+        value = getattr(args, name, None)
+        if value != parser.get_default(name):
+            text = " ".join(value) if isinstance(value, list) else value
+            words.append(f" --{name.replace('_', '-')} {text}")
+    return "".join(words)
+
+
 def main() -> None:
     """Drive what is missing, write the page."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("policy")
-    parser.add_argument("--episodes", type=int, default=20)
     parser.add_argument("--others", nargs="+", default=list(OTHERS), metavar="NAME", help="beside it")
-    parser.add_argument("--demand", default="contested")
     parser.add_argument("--errors", nargs="+", default=["none", "stress"])
-    parser.add_argument("--worlds", nargs="+", default=list(WORLDS), choices=WORLDS)
-    parser.add_argument("--seeds-from", type=int, default=FIRST_TEST_SEED)
-    parser.add_argument("--runs", type=Path, default=Path("runs/learned"), help="where episodes are kept")
-    parser.add_argument("--workers", default="2")
-    parser.add_argument("--out", type=Path, default=PAGE)
+    options(parser, "learned", "contested", WORLDS)
     args = parser.parse_args()
     seeds = f"{args.seeds_from}:{args.seeds_from + args.episodes}"
     where = [word for world in args.worlds for word in ("--scenario", world)]
@@ -151,15 +173,14 @@ def main() -> None:
         code = cosim(["evaluate", *where, *words, *which, "--out", str(args.runs / part)])
         if code:
             raise SystemExit(code)
-    beside = "" if tuple(args.others) == OTHERS else f" --others {' '.join(args.others)}"
+    rows = run_folder.read(args.runs / MINE).rows
     about = [
-        f"`{args.demand}`, {drivers(args.runs)}, seeds {seeds}, preset `lawful`, in the worlds with a mission"
+        f"`{args.demand}`, {drivers(rows)}, seeds {seeds}, preset `lawful`, in the worlds with a mission"
         " vehicle.",
         "Shares with Wilson's, means and paired differences with bootstrap and Tango's 95 % intervals; p by",
         "McNemar, one test a world and figure, not corrected for how many there are.",
         "",
-        f"Made by `python -m benchmarks.learned {args.policy} --episodes {args.episodes} "
-        f"--errors {' '.join(args.errors)}{beside}`.",
+        f"Made by `python -m benchmarks.learned {args.policy}{asked(parser, args)}`.",
     ]
     write_page(args.out, page(args.runs, args.policy, args.others, args.errors, about))
     print(args.out.read_text())

@@ -17,7 +17,7 @@ import numpy as np
 from cosim.episode import Episode, Hook, Step, go_on
 from cosim.seeding import generator
 from cosim.simulation.fork import forked
-from cosim.types import Floats32, MetaAction
+from cosim.types import Decision, Floats, Floats32, MetaAction
 from policy.training.curriculum import Drive
 from policy.training.experience import Trajectory
 from policy.training.explorer import Explorer
@@ -81,25 +81,27 @@ class Forks(Hook):
         agent, forks = self._agent, self._drive.forks
         self._at = set()
         decisions = agent.decide(episode.histories)
-        changed, action = dict(decisions), None
-        for av in avs:
-            decision = decisions[av]
-            weights = np.array([RARELY if a in SIDEWAYS else 1.0 for a in MetaAction])
-            weights[decision.action] = 0.0
-            if decision.unsafe is not None:
-                weights[decision.unsafe] = 0.0
-            if action is None and weights.any():
-                action = MetaAction(rng.choice(len(weights), p=weights / weights.sum()))
-            if action is not None and weights[action]:
-                changed[av] = decision._replace(action=action)
-        tried = {av: agent.recorded(av) for av in avs if changed[av] is not decisions[av]}
-        if action is None:
+        chances = {av: _chances(decisions[av]) for av in avs}
+        first = next((c for c in chances.values() if c.any()), None)
+        if first is None:
             return []
+        action = MetaAction(rng.choice(len(first), p=first / first.sum()))
+        tried = {av: agent.recorded(av) for av, c in chances.items() if c[action]}
         for av in tried:
             agent.hold(av, action, forks.held - 1)
+        changed = {**decisions, **{av: decisions[av]._replace(action=action) for av in tried}}
         go_on(episode, agent, changed, forks.horizon)
         mine = {one.av: one for one in agent.finish()}
         return [(av, t, action, mine[av].terms[t : t + forks.horizon]) for av, t in tried.items()]
+
+
+def _chances(decision: Decision) -> Floats:
+    """[A] how often each action is tried where `decision` was taken: only others, and safe ones."""
+    chances = np.array([RARELY if a in SIDEWAYS else 1.0 for a in MetaAction])
+    chances[decision.action] = 0.0
+    if decision.unsafe is not None:
+        chances[decision.unsafe] = 0.0
+    return chances
 
 
 def _worth(terms: Floats32, gamma: float) -> Floats32:

@@ -22,7 +22,7 @@ APART = 5  # channels of `apart`: AV, HV, road, ego or mission vehicle, relative
 STILL = 255 * (PIXEL_LOWEST + PIXEL_SPAN / 2)  # pixel of a vehicle as fast as the ego
 _LEVEL = np.float32(1.0 / 255.0)
 BRISK = 255 * PIXEL_SPAN / (2 * PIXEL_SPEED) * 15.0  # what 15 m/s of relative speed add to it: 1 in `apart`
-# relative speed [256] of a vehicle's pixel, 0 of none
+# [256] relative speed, in 15 m/s, of a vehicle's pixel; 0 of none
 _RELATIVE = np.where(
     np.arange(256) > 0,
     (np.arange(256, dtype=np.float32) - np.float32(STILL)) * np.float32(1.0 / BRISK),
@@ -115,6 +115,6 @@ def _apart(maps: Bytes, planes: Floats32) -> None:
     for b in range(planes.shape[0]):
         for y in range(planes.shape[1]):
             for x in range(planes.shape[2]):
-                for c in range(4):
+                for c in range(APART - 1):
                     planes[b, y, x, c] = 1.0 if maps[b, c, y, x] else 0.0
                 planes[b, y, x, 4] = _RELATIVE[max(maps[b, 0, y, x], maps[b, 1, y, x])]

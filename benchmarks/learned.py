@@ -96,9 +96,9 @@ def page(
     runs: Path, policy: str, others: Sequence[str], levels: Sequence[str], about: Sequence[str]
 ) -> list[str]:
     """The Markdown page of whatever has been driven."""
-    name = label(read(policy).text)
+    name, *beside = (label(read(one).text) for one in (policy, *others))
     first, twin = (name, float(SVO)), (name, 0.0)
-    arms: list[Arm] = [first, twin, *((other, float(SVO)) for other in others)]
+    arms: list[Arm] = [first, twin, *((other, float(SVO)) for other in beside)]
     kept = [r for part in (MINE, THEIRS) for r in run_folder.read(runs / part).rows if r["status"] == OK]
     lines = ["# What a network learned", "", *about, ""]
     for level in levels:

@@ -74,7 +74,7 @@ def load(path: Path, networks: Mapping[str, nn.Module], configs: Mapping[str, An
     """
     card = read_card(path)
     for name, config in configs.items():
-        wanted, stated = _plain(config), card.get("configs", {}).get(name)
+        wanted, stated = plain(config), card.get("configs", {}).get(name)
         if isinstance(stated, dict):
             stated = filled(stated, _defaults(config))
         if stated != wanted:
@@ -119,7 +119,7 @@ def sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _plain(config: Any) -> Any:
+def plain(config: Any) -> Any:
     """A configuration as JSON has it."""
     return json.loads(json.dumps(asdict(config) if is_dataclass(config) else config))  # type: ignore[arg-type]
 
@@ -130,7 +130,7 @@ def _defaults(config: Any) -> dict[str, Any]:
         return {}
     made = {f.name: f.default_factory() for f in fields(config) if f.default_factory is not MISSING}
     made |= {f.name: f.default for f in fields(config) if f.default is not MISSING}
-    return {name: _plain(value) for name, value in made.items()}
+    return {name: plain(value) for name, value in made.items()}
 
 
 def filled(found: dict[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:

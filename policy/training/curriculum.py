@@ -42,6 +42,20 @@ class ForkConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class EnsembleConfig:
+    """Several networks that learn from all that was driven, and one that is taught their mean
+    (`policy.training.ensemble`)."""
+
+    networks: int = 0  # 0: none
+    updates: int = 5_000  # of each, from the weights that the training began with
+    distillation: int = 5_000  # updates of the one that is taught
+
+    def __post_init__(self) -> None:
+        """Raises BadInput for a number out of range."""
+        in_range(self, positive="updates distillation", not_negative="networks")
+
+
+@dataclass(frozen=True, slots=True)
 class VfnTraining:
     """One training run. Defaults: what trains on two CPU cores (docs/training.md)."""
 
@@ -76,6 +90,7 @@ class VfnTraining:
     first: str = ""  # weights to begin with, a file; "": drawn from the seed
     code: tuple[str, ...] = ()  # their files and SHA-256
     forks: ForkConfig = field(default_factory=ForkConfig)
+    ensemble: EnsembleConfig = field(default_factory=EnsembleConfig)  # after the last iteration
     replay: ReplayConfig = field(default_factory=ReplayConfig)
     ddqn: DdqnConfig = field(default_factory=DdqnConfig)
     a2c: A2cConfig = field(default_factory=A2cConfig)

@@ -25,7 +25,10 @@ from policy import checkpoint
 from policy.networks.vfn import VFN, VfnConfig
 from policy.training import curriculum, experience
 from policy.training.curriculum import Drive, Drove, VfnTraining
+from policy.training.ensemble import Ensemble
 from policy.training.trainers import make_trainer
+
+LATER = ("iterations", "ensemble")  # what a run that goes on may be given otherwise
 
 
 class Actors(Protocol):
@@ -60,12 +63,12 @@ class TrainingRun:
         about: Mapping[str, Any] | None = None,
     ) -> None:
         self.config, self.vfn, self.folder = config, vfn, folder
-        self._actors, self._log, self._about = actors, log, dict(about or {})
+        self._actors, self._log, self._about, self._device = actors, log, dict(about or {}), device
         self.trainer = make_trainer(config, vfn, device)
         self._files: list[tuple[str, int]] = []  # of the replay buffer, oldest first, and their trajectories
         self._gone = 0  # trajectories of the oldest file that have left the replay buffer already
         self.iteration, self.best = 0, -math.inf
-        for name in ("replay", "weights"):
+        for name in ("replay", "weights", "ensemble"):
             (folder / name).mkdir(parents=True, exist_ok=True)
 
     # ---- the loop ----
@@ -97,7 +100,8 @@ class TrainingRun:
                 **_means("train", [d.figures for d in drove]),
             }
             if judging:
-                record |= self._judge(k, [f.result().figures for f in judging])
+                measured, file = {"iteration": k}, Path(self._weights(k))
+                record |= self._judge([f.result().figures for f in judging], file, measured)
             record["iteration_s"] = time.perf_counter() - began
             self._write(record)
             self.iteration += 1
@@ -105,6 +109,18 @@ class TrainingRun:
                 self.save()
             if progress is not None:
                 progress(self.iteration, c.iterations)
+
+    def distill(self, progress: Callable[[float, float], None] | None = None) -> dict[str, Any]:
+        """Teach one network the mean of an ensemble (`VfnTraining.ensemble`); it is judged as the others are.
+
+        Returns how well it knows the mean, and its validation.
+        """
+        c = self.config
+        replay, folder = self.trainer.replay, self.folder / "ensemble"
+        file = Ensemble(c, self.vfn, replay, folder, self._about, self._device).run(progress)
+        known: dict[str, Any] = checkpoint.read_card(file)["measured"]
+        judging = [self._actors.submit(drive) for drive in curriculum.validation(c, str(file))]
+        return known | self._judge([f.result().figures for f in judging], file, known)
 
     def _keep(self, k: int, drove: Sequence[Drove]) -> None:
         """Into the replay buffer; files whose trajectories have all left it go with the next checkpoint."""
@@ -116,8 +132,10 @@ class TrainingRun:
             while self._files and self._gone >= self._files[0][1]:
                 self._gone -= self._files.pop(0)[1]
 
-    def _judge(self, k: int, figures: list[dict[str, float | None]]) -> dict[str, Any]:
-        """Validation of the weights that iteration `k` began with; the best are kept."""
+    def _judge(
+        self, figures: list[dict[str, float | None]], source: Path, measured: dict[str, Any]
+    ) -> dict[str, Any]:
+        """What the weights in `source` drove in validation; the best are kept, with what was measured."""
         means, count = _means("valid", figures), self.config.validation
         for at, lesson in enumerate(self.config.lessons):
             name = f"valid/{Path(lesson.scenario).name}-{lesson.demand}"
@@ -125,12 +143,9 @@ class TrainingRun:
             means |= _means(name, figures[at * count : (at + 1) * count])
         if means["valid/reward"] > self.best:
             self.best = means["valid/reward"]
-            measured = {
-                "iteration": k,
-                "validation": means,
-                "tuning_seeds": [TUNING_SEEDS.start, self.config.validation],
-            }
-            source, networks, configs = Path(self._weights(k)), {"vfn": VFN(self.vfn)}, {"vfn": self.vfn}
+            seeds = [TUNING_SEEDS.start, self.config.validation]
+            measured = {**measured, "validation": means, "tuning_seeds": seeds}
+            networks, configs = {"vfn": VFN(self.vfn)}, {"vfn": self.vfn}
             card = checkpoint.load(source, networks, configs)
             checkpoint.save(self.folder / "best.safetensors", networks, configs, measured, card["data"])
         return means
@@ -184,7 +199,7 @@ class TrainingRun:
         state = read_json(file)
         mine = json.loads(json.dumps(asdict(self.config)))
         theirs = checkpoint.filled(state["config"], json.loads(json.dumps(asdict(VfnTraining()))))
-        differs = [name for name in mine if mine[name] != theirs[name] and name != "iterations"]
+        differs = [name for name in mine if mine[name] != theirs[name] and name not in LATER]
         if differs:
             raise BadInput("was trained with another configuration", file=file, field=", ".join(differs))
         self.iteration, self._gone = state["iteration"], state["gone"]

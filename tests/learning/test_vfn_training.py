@@ -20,15 +20,16 @@ from cosim.scenario import Mission, Scenario
 from cosim.seeding import generator
 from cosim.simulation.fake import FakeSimulator, FakeVehicle
 from cosim.types import SMOKE, MetaAction
+from policy import checkpoint
 from policy.agents.approaches import AgentConfig
 from policy.inputs.situation import SITUATION_INPUTS
 from policy.inputs.tensors import KINEMATIC_INPUTS
-from policy.networks.vfn import VfnConfig
+from policy.networks.vfn import VFN, VfnConfig
 from policy.prediction.chain import ChainConfig
 from policy.safety import SafetyConfig
 from policy.training import experience
 from policy.training.a2c import A2cConfig, A2cLearner
-from policy.training.curriculum import Drive, Drove, ForkConfig, Lesson, VfnTraining
+from policy.training.curriculum import Drive, Drove, EnsembleConfig, ForkConfig, Lesson, VfnTraining
 from policy.training.ddqn import DdqnConfig, DdqnLearner
 from policy.training.experience import Trajectory
 from policy.training.explorer import ExploreConfig, Explorer
@@ -596,6 +597,49 @@ def test_another_configuration_is_not_gone_on_with(tmp_path: Path) -> None:
     other = TrainingRun(replace(SHORT, updates=5), TINY, Pretend(), tmp_path)
     with pytest.raises(BadInput, match="updates"):
         other.resume()
+
+
+TAUGHT = replace(SHORT, ensemble=EnsembleConfig(networks=2, updates=30, distillation=300))
+
+
+def test_one_network_is_taught_what_several_value_on_average(tmp_path: Path) -> None:
+    run = TrainingRun(TAUGHT, TINY, Pretend(), tmp_path)
+    run.run()
+    found = run.distill()
+    assert found["agrees"] > 0.8  # of five actions whose worth is chance
+    assert found["lost"] < 0.02
+    folder = tmp_path / "ensemble"
+    networks = []
+    for name in ("network-0", "network-1", "distilled"):
+        networks.append(VFN(TINY))
+        checkpoint.load(folder / f"{name}.safetensors", {"vfn": networks[-1]}, {"vfn": TINY})
+    now = run.trainer.replay.sample(generator(0, "states")).now
+    with torch.no_grad():
+        one, other, pupil = (network.apart(*now) for network in networks)
+    mean = (one + other) / 2
+    assert (one - other).abs().mean() > 3 * (pupil - mean).abs().mean()
+
+
+def test_a_killed_ensemble_goes_on_with_the_networks_that_it_has(tmp_path: Path) -> None:
+    run = TrainingRun(TAUGHT, TINY, Pretend(), tmp_path)
+    run.run()
+
+    def die(done: float, _: float) -> None:
+        if done == 45:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run.distill(die)
+    first = tmp_path / "ensemble" / "network-0.safetensors"
+    assert [path.name for path in first.parent.glob("*.safetensors")] == [first.name]
+    written = first.stat().st_mtime_ns
+    again = TrainingRun(TAUGHT, TINY, Pretend(), tmp_path)
+    assert again.resume()
+    again.distill()
+    assert first.stat().st_mtime_ns == written
+    other = replace(TAUGHT, ensemble=replace(TAUGHT.ensemble, updates=31))
+    with pytest.raises(BadInput, match="another configuration"):
+        TrainingRun(other, TINY, Pretend(), tmp_path).distill()
 
 
 def test_the_learning_rate_falls_over_the_last_third() -> None:

@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from benchmarks.tables import markdown_row, write_page
+from benchmarks.worlds import WITH_MISSION
 from cosim.cli.main import main as cosim
 from cosim.report import run_folder, statistics
 from cosim.report.figures import Row
@@ -22,7 +23,6 @@ from cosim.scenario.policy_name import label, read
 from cosim.seeding import FIRST_TEST_SEED
 from cosim.workers.tasks import OK
 
-WORLDS = ("merge", "exit", "roundabout", "intersection")  # those with a mission vehicle
 SVO = 60
 MINE, THEIRS = "network", "others"  # folders of runs
 OTHERS = ("idm", "altruist-rule", "vfn-p-demonstrated")
@@ -102,7 +102,7 @@ def page(
     kept = [r for part in (MINE, THEIRS) for r in run_folder.read(runs / part).rows if r["status"] == OK]
     lines = ["# What a network learned", "", *about, ""]
     for level in levels:
-        for world in WORLDS:
+        for world in WITH_MISSION:
             found: dict[Arm, dict[int, Row]] = {
                 arm: {
                     int(row["seed"]): row
@@ -158,7 +158,7 @@ def main() -> None:
     parser.add_argument("policy")
     parser.add_argument("--others", nargs="+", default=list(OTHERS), metavar="NAME", help="beside it")
     parser.add_argument("--errors", nargs="+", default=["none", "stress"])
-    options(parser, "learned", "contested", WORLDS)
+    options(parser, "learned", "contested", WITH_MISSION)
     args = parser.parse_args()
     seeds = f"{args.seeds_from}:{args.seeds_from + args.episodes}"
     where = [word for world in args.worlds for word in ("--scenario", world)]

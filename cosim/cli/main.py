@@ -11,7 +11,9 @@ from collections.abc import Iterator, Sequence
 
 from cosim import __version__
 from cosim.cli import COMMANDS
-from cosim.errors import BadInput, CosimError
+from cosim.errors import BadInput, CosimError, hint
+
+WITHOUT_FLAG = ("--scenario", "--world")  # what commands of one scenario take as their first word
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -23,7 +25,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         cut = arguments.index("--")
         arguments, options = arguments[:cut], arguments[cut + 1 :]
     try:
-        args = parser(*arguments[:1]).parse_args(arguments)
+        args = _parsed(arguments)
         args.sumo_options = options
         if options and not getattr(args, "passes_on", False):
             problem = "only `cosim run` passes options on to SUMO; else they belong into the .sumocfg"
@@ -43,6 +45,29 @@ def main(argv: Sequence[str] | None = None) -> int:
         traceback.print_exc()
         print("cosim: this is a fault of cosim's own: please report it with the lines above", file=sys.stderr)
         return CosimError.exit_code
+
+
+def _parsed(arguments: list[str]) -> argparse.Namespace:
+    """Raises BadInput, with the nearest flag that there is, for words that no command takes."""
+    top = parser(*arguments[:1])
+    args, unknown = top.parse_known_args(arguments)
+    if not unknown:
+        return args
+    word, command = unknown[0], _command(top, arguments[0])
+    flag = word.partition("=")[0]
+    if not flag.startswith("-"):
+        raise BadInput(f"is one word too many for cosim {arguments[0]}", field="argument", value=word)
+    if flag in WITHOUT_FLAG and any(action.dest == "what" for action in command._actions):
+        raise BadInput(f"is given without a flag: cosim {arguments[0]} NAME", field=flag)
+    known = [name for action in command._actions for name in action.option_strings]
+    raise BadInput(f"cosim {arguments[0]} has no such flag{hint(flag, known)}", field=flag)
+
+
+def _command(top: argparse.ArgumentParser, name: str) -> argparse.ArgumentParser:
+    """The parser of one command."""
+    found = [a.choices for a in top._actions if isinstance(a, argparse._SubParsersAction)]
+    command: argparse.ArgumentParser = found[0][name]
+    return command
 
 
 @contextlib.contextmanager

@@ -45,9 +45,8 @@ def train(args: argparse.Namespace) -> int:
     if not usable(args.device):
         raise BadInput("torch has no such device here", field="--device", value=args.device)
     training = _scheduled(file.training, args, name)
-    if training.ensemble.networks and learning == "a2c":
-        networks = training.ensemble.networks
-        raise BadInput("is for networks that keep a replay buffer", field="training.ensemble", value=networks)
+    if training.ensemble and learning == "a2c":
+        raise BadInput("is for networks that keep a replay buffer", field="training.ensemble")
     for lesson in training.lessons:
         load(lesson.scenario, demand=[lesson.demand], behavior=lesson.behavior)
     folder = prepare_folder(args.out)
@@ -73,7 +72,7 @@ def train(args: argparse.Namespace) -> int:
         if args.resume and not run.resume():
             print("nothing to resume: starting anew", file=sys.stderr)
         run.run(progress)
-        if training.ensemble.networks:
+        if training.ensemble:
             with Progress(f"distill {name}", "updates") as progress:
                 run.distill(progress)
     # as `--policy` wants the folder: a bare word would be a policy that ships

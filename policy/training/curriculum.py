@@ -46,13 +46,20 @@ class EnsembleConfig:
     """Several networks that learn from all that was driven, and one that is taught their mean
     (`policy.training.ensemble`)."""
 
-    networks: int = 0  # 0: none
+    networks: int = 0  # that learn from the replay buffer
     updates: int = 5_000  # of each, from the weights that the training began with
+    teachers: tuple[str, ...] = ()  # files of weights that count in the mean besides; one twice: twice
     distillation: int = 5_000  # updates of the one that is taught
+    refused: float = 1.0  # weight of the refused actions' loss, in place of `DdqnConfig.refused`
+    n_step: int = 8  # in place of `ReplayConfig.n_step`
 
     def __post_init__(self) -> None:
         """Raises BadInput for a number out of range."""
-        in_range(self, positive="updates distillation", not_negative="networks")
+        in_range(self, positive="updates distillation n_step", not_negative="networks refused")
+
+    def __bool__(self) -> bool:
+        """Whether there is anything to learn from."""
+        return bool(self.networks or self.teachers)
 
 
 @dataclass(frozen=True, slots=True)

@@ -70,7 +70,7 @@ class DdqnLearner(Learner):
         chosen = _taken(apart, batch.action)
         td = functional.smooth_l1_loss(chosen, goal)
         q = self.online.weighed(apart, batch.now.phi)
-        unsafe = c.refused * self._refused(q, batch)
+        unsafe = self.refused(q, batch.possible) if c.r_unsafe is None else self._crashes(q, batch)
         imitation = c.imitation * self._margin(q, batch.possible, batch.wrong)
         forked = q.new_zeros(())
         if compared is not None:
@@ -134,17 +134,26 @@ class DdqnLearner(Learner):
         """The target network becomes the online one."""
         self.target.load_state_dict(self.online.state_dict())
 
-    def _refused(self, q: torch.Tensor, batch: Batch) -> torch.Tensor:
-        """Loss of what the prioritizer refused in `now`: see `DdqnConfig.r_unsafe`."""
+    def refused(self, q: torch.Tensor, possible: torch.Tensor) -> torch.Tensor:
+        """Loss of what the prioritizer masks, which is worth less than the best it allows by `margin`.
+
+        Args:
+            q: [B,A] values.
+            possible: [B,A] bool, what it allows.
+        """
         c = self.config
-        if c.r_unsafe is None:
-            allowed = batch.possible | ~batch.possible.any(1, keepdim=True)
-            best = q.detach().masked_fill(~allowed, -torch.inf).amax(1, keepdim=True)
-            return functional.relu(q - best + c.margin)[~allowed].sum() / len(q)
-        refused = batch.vetoed >= 0  # stored as terminal with reward r_unsafe (Alg. 4)
+        allowed = possible | ~possible.any(1, keepdim=True)
+        best = q.detach().masked_fill(~allowed, -torch.inf).amax(1, keepdim=True)
+        return c.refused * functional.relu(q - best + c.margin)[~allowed].sum() / len(q)
+
+    def _crashes(self, q: torch.Tensor, batch: Batch) -> torch.Tensor:
+        """Loss of the preferred actions that the prioritizer refused: each is worth `r_unsafe` (Alg. 4)."""
+        c = self.config
+        assert c.r_unsafe is not None
+        refused = batch.vetoed >= 0
         value = q[refused].gather(1, batch.vetoed[refused][:, None])[:, 0]
         worth = torch.full_like(value, c.r_unsafe * c.scale)
-        return functional.smooth_l1_loss(value, worth, reduction="sum") / len(q)
+        return c.refused * functional.smooth_l1_loss(value, worth, reduction="sum") / len(q)
 
     def _margin(self, q: torch.Tensor, possible: torch.Tensor, wrong: torch.Tensor) -> torch.Tensor:
         """Large-margin loss: among what was safe, the best demonstrated action leads the others by `margin`.

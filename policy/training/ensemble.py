@@ -47,26 +47,31 @@ class Ensemble:
         about: dict[str, Any],
         device: str = "cpu",
     ) -> None:
-        self.config, self.vfn, self.replay, self.folder = config, vfn, replay, folder
+        c = config.ensemble
+        self.config, self.vfn, self.folder = config, vfn, folder
+        self.replay = ReplayBuffer(replace(config.replay, n_step=c.n_step))
+        self.replay.add(list(replay.trajectories))
+        self._learning = replace(config, ddqn=replace(config.ddqn, refused=c.refused))
         self._about, self._device = {**about, "training": asdict(config)}, device
 
     def run(self, progress: Callable[[float, float], None] | None = None) -> Path:
         """All of it; the file of the network that was taught.
 
-        Raises BadInput when the folder holds an ensemble of another configuration.
+        Raises BadInput when the folder holds an ensemble of another configuration; WeightsMismatch for a
+        teacher of another layout.
         """
-        c = self.config.ensemble
+        c, path = self.config.ensemble, self.folder / RESULT
         total = c.networks * c.updates + c.distillation
 
         def shown(done: int) -> None:
             if progress is not None:
                 progress(done, total)
 
-        networks = [self._network(k, shown) for k in range(c.networks)]
-        path = self.folder / RESULT
+        teachers = [self._read(Path(file)) for file in c.teachers]
+        teachers += [self._network(k, shown) for k in range(c.networks)]
         if not self._finished(path):
             pupil = self._learner("pupil")
-            measured = self._taught(pupil, networks, lambda k: shown(c.networks * c.updates + k))
+            measured = self._taught(pupil, teachers, lambda k: shown(c.networks * c.updates + k))
             checkpoint.save(path, {"vfn": pupil.online}, {"vfn": self.vfn}, measured, self._about)
         shown(total)
         return path
@@ -74,15 +79,13 @@ class Ensemble:
     def _network(self, k: int, shown: Callable[[int], None]) -> VFN:
         """The `k`-th network, learned from the replay buffer or read."""
         c, path = self.config.ensemble, self.folder / f"network-{k}.safetensors"
-        learner = self._learner(str(k))
         if self._finished(path):
-            checkpoint.load(path, {"vfn": learner.online}, {"vfn": self.vfn})
-            return learner.online
+            return self._read(path)
+        learner = self._learner(str(k))
         learner.update_target()
-        rng, schedule = generator(self.config.seed, "ensemble", str(k)), self._schedule(c.updates)
-        losses = []
+        rng, losses = generator(self.config.seed, "ensemble", str(k)), []
         for update in range(c.updates):
-            learner.rate = rate(schedule, update)
+            learner.rate = self._rate(update, c.updates)
             batch = self.replay.sample(rng, self._device)
             losses.append(learner.update(batch, self.replay.compared(rng, self._device)))
             shown(k * c.updates + update)
@@ -90,30 +93,37 @@ class Ensemble:
         checkpoint.save(path, {"vfn": learner.online}, {"vfn": self.vfn}, measured, self._about)
         return learner.online
 
-    def _taught(self, pupil: DdqnLearner, networks: list[VFN], shown: Callable[[int], None]) -> Metrics:
+    def _taught(self, pupil: DdqnLearner, teachers: list[VFN], shown: Callable[[int], None]) -> Metrics:
         """Teach it the mean; how well it knows it, over the last tenth of the updates (`lesson`)."""
         c = self.config.ensemble
-        rng, schedule = generator(self.config.seed, "distillation"), self._schedule(c.distillation)
-        known = []
+        rng, known = generator(self.config.seed, "distillation"), []
         for update in range(c.distillation):
             batch = self.replay.advised(rng, True, self._device)
             with torch.no_grad():
-                mean = torch.stack([network.apart(*batch.now) for network in networks]).mean(0)
-            loss, found = lesson(pupil.online, mean, batch.now, batch.possible)
-            pupil.step(loss, rate(schedule, update))
-            known.append(found)
+                mean = torch.stack([network.apart(*batch.now) for network in teachers]).mean(0)
+            mine = pupil.online.apart(*batch.now)
+            q = pupil.online.weighed(mine, batch.now[3])
+            refused = pupil.refused(q, batch.possible)
+            pupil.step(lesson(mine, mean, batch.possible) + refused, self._rate(update, c.distillation))
+            wanted = pupil.online.weighed(mean, batch.now[3])
+            known.append({"refused": float(refused.detach()), **knows(q.detach(), wanted, batch.possible)})
             shown(update)
         return mean_metrics(known[-max(c.distillation // 10, 1) :])
 
     def _learner(self, name: str) -> DdqnLearner:
         """As the training began, but for the seed of what is drawn."""
         seed = subseed(self.config.seed, f"ensemble/{name}") % 2**31
-        learner = make_trainer(replace(self.config, seed=seed), self.vfn, self._device).learner
+        learner = make_trainer(replace(self._learning, seed=seed), self.vfn, self._device).learner
         assert isinstance(learner, DdqnLearner)
         return learner
 
-    def _schedule(self, updates: int) -> VfnTraining:
-        return replace(self.config, iterations=updates)
+    def _read(self, path: Path) -> VFN:
+        network = VFN(self.vfn)
+        checkpoint.load(path, {"vfn": network}, {"vfn": self.vfn})
+        return network.to(self._device)
+
+    def _rate(self, update: int, updates: int) -> float:
+        return rate(replace(self.config, iterations=updates), update)
 
     def _finished(self, path: Path) -> bool:
         if not path.is_file():
@@ -123,30 +133,37 @@ class Ensemble:
         return True
 
 
-def lesson(pupil: VFN, mean: torch.Tensor, now: Any, possible: torch.Tensor) -> tuple[torch.Tensor, Metrics]:
-    """Loss of a pupil that is to value as `mean` does.
+def lesson(mine: torch.Tensor, mean: torch.Tensor, possible: torch.Tensor) -> torch.Tensor:
+    """Loss of a pupil that is to value as its teachers do on average; what is refused it learns elsewhere.
 
     Args:
-        pupil: who learns.
-        mean: [B,parts,A] values.
-        now: `States` of B states.
+        mine: [B,parts,A] its values.
+        mean: [B,parts,A] those of its teachers.
         possible: [B,A] bool, actions that are safe.
 
     Returns:
         The mean squared error of the state values plus `DIFFERENCES` times that of what one action is worth
-        more than another, which is what is driven by and much smaller; and `agrees`, the share of states in
-        which the pupil chooses as the mean does, and `lost`, what its choice is worth less on average.
+        more than another, which is what is driven by and much smaller.
     """
-    mine = pupil.apart(*now)
-    error = mine - mean
-    level = error.mean(2, keepdim=True)
-    loss = level.square().mean() + DIFFERENCES * (error - level).square().mean()
-    with torch.no_grad():
-        allowed = possible | ~possible.any(1, keepdim=True)
-        theirs, own = (
-            pupil.weighed(apart, now[3]).masked_fill(~allowed, -torch.inf) for apart in (mean, mine)
-        )
-        chosen = theirs.gather(1, own.argmax(1, keepdim=True))[:, 0]
-        best = theirs.amax(1)
-        found = {"agrees": float((chosen == best).float().mean()), "lost": float((best - chosen).mean())}
-    return loss, found
+    counted = _allowed(possible)[:, None].float()  # [B,1,A]
+    error = (mine - mean) * counted
+    level = error.sum(2, keepdim=True) / counted.sum(2, keepdim=True)
+    apart = (error - level) * counted
+    return level.square().mean() + DIFFERENCES * apart.square().mean()
+
+
+def knows(q: torch.Tensor, wanted: torch.Tensor, possible: torch.Tensor) -> Metrics:
+    """How well values [B,A] choose by the values `wanted` [B,A], among what is `possible` [B,A].
+
+    Returns `agrees`, the share of states in which both choose the same, and `lost`, what the choice is worth
+    less on average.
+    """
+    best, choice = (v.masked_fill(~_allowed(possible), -torch.inf).max(1) for v in (wanted, q))
+    found = wanted.gather(1, choice.indices[:, None])[:, 0]
+    agrees = (choice.indices == best.indices).float().mean()
+    return {"agrees": float(agrees), "lost": float((best.values - found).mean())}
+
+
+def _allowed(possible: torch.Tensor) -> torch.Tensor:
+    """Everything, where nothing is safe."""
+    return possible | ~possible.any(1, keepdim=True)

@@ -620,6 +620,27 @@ def test_one_network_is_taught_what_several_value_on_average(tmp_path: Path) -> 
     assert (one - other).abs().mean() > 3 * (pupil - mean).abs().mean()
 
 
+def test_a_teacher_counts_beside_them_and_what_is_refused_comes_last(tmp_path: Path) -> None:
+    masked = np.zeros((13, 5), np.bool_)
+    masked[:, MetaAction.ACCELERATE] = True
+    drive = replace(trajectory([0, 1, 2, 4] * 3, [(1.0, 0.0, 0.0)] * 12, unsafe=masked), phi=0.5)
+    teacher = VFN(TINY)
+    teacher.value.bias.data[MetaAction.ACCELERATE] = 1.0  # it likes best what is refused here
+    checkpoint.save(tmp_path / "teacher.safetensors", {"vfn": teacher}, {"vfn": TINY})
+    ensemble = EnsembleConfig(
+        teachers=(str(tmp_path / "teacher.safetensors"),), distillation=400, refused=3.0
+    )
+    run = TrainingRun(replace(SHORT, ensemble=ensemble), TINY, Pretend(), tmp_path / "run")
+    run.trainer.replay.add([drive])
+    run.distill()
+    pupil = VFN(TINY)
+    checkpoint.load(tmp_path / "run" / "ensemble" / "distilled.safetensors", {"vfn": pupil}, {"vfn": TINY})
+    q = pupil(*run.trainer.replay.sample(generator(0, "states")).now).detach()
+    others = q[:, [a for a in MetaAction if a != MetaAction.ACCELERATE]]
+    assert (q[:, MetaAction.ACCELERATE] < others.amin(1) - 0.2).all()  # `DdqnConfig.margin` is 0.3
+    assert others.std(1).max() < 0.05  # the teacher's: alike
+
+
 def test_a_killed_ensemble_goes_on_with_the_networks_that_it_has(tmp_path: Path) -> None:
     run = TrainingRun(TAUGHT, TINY, Pretend(), tmp_path)
     run.run()

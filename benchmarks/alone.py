@@ -1,12 +1,14 @@
 """What a value network drives into without the safety prioritizer and without the car's own braking.
 
     python -m benchmarks.alone [--episodes 20] [--demand dense] [--worlds merge ...] [--seeds-from 200000]
-        [--runs runs/alone] [--workers 2] [--out docs/results/alone.md]
+        [--weights FILE] [--runs runs/alone] [--workers 2] [--out docs/results/alone.md]
 
-Preset `unguarded`, no mask: the best valued action is carried out. The same command goes on where it stopped.
+Preset `unguarded`, no mask: the best valued action is carried out. FILE is a network of the layout of `vfn-p`
+that drives too. The same command goes on where it stopped.
 """
 
 import argparse
+import os
 from collections.abc import Sequence
 
 from benchmarks.learned import asked, drivers, options, share
@@ -22,11 +24,17 @@ from sumo_scenarios import names
 SVO = 60
 EVERY = "all worlds"
 CRASHED = "av_involved_collisions"
-ARMS = ("vfn_p", "vfn", "vfn_p_demonstrated")  # functions of this module
+WEIGHTS = "COSIM_ALONE_WEIGHTS"  # the environment variable that names the file to the workers
+ARMS = ("given", "vfn_p", "vfn", "vfn_p_demonstrated")  # functions of this module
 COLUMNS = (
     "world", "network", "episodes", "with an AV in a collision", "AV-caused", "distance of all, m",
     "less vfn-p-demonstrated, points",
 )  # fmt: skip
+
+
+def given() -> Policy:
+    """The network of `--weights` without the mask."""
+    return build(Agent("given alone", "vfn-p", weights=os.environ[WEIGHTS], mask="none"))
 
 
 def vfn_p() -> Policy:
@@ -91,10 +99,14 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     options(parser, "alone", "dense", names())
+    parser.add_argument("--weights", metavar="FILE", help="a further network: `given-alone`")
     args = parser.parse_args()
+    if args.weights:
+        os.environ[WEIGHTS] = args.weights
     seeds = f"{args.seeds_from}:{args.seeds_from + args.episodes}"
+    arms = ARMS if args.weights else ARMS[1:]
     words = [word for world in args.worlds for word in ("--scenario", world)]
-    words += [word for arm in ARMS for word in ("--policy", f"{_label(arm)}=benchmarks.alone:{arm}")]
+    words += [word for arm in arms for word in ("--policy", f"{_label(arm)}=benchmarks.alone:{arm}")]
     words += ["--demand", args.demand, "--seeds", seeds, "--svo", str(SVO), "--preset", "unguarded"]
     code = cosim(["evaluate", *words, "--workers", args.workers, "--resume", "--out", str(args.runs)])
     if code:

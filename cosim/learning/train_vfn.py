@@ -24,6 +24,7 @@ from policy.agents.approaches import APPROACHES
 from policy.checkpoint import sha256
 from policy.training.config import agent_config
 from policy.training.curriculum import Lesson, VfnTraining
+from policy.training.ensemble import RESULT
 from policy.training.loop import tensorboard
 from policy.training.networks import usable, use_threads
 from policy.training.vfn import TrainingRun
@@ -74,7 +75,9 @@ def train(args: argparse.Namespace) -> int:
         run.run(progress)
         if training.ensemble:
             with Progress(f"distill {name}", "updates") as progress:
-                run.distill(progress)
+                taught = run.distill(progress)
+    if training.ensemble:
+        print(f"  {run.folder / 'ensemble' / RESULT}, validation reward {taught['valid/reward']:.3f}")
     # as `--policy` wants the folder: a bare word would be a policy that ships
     typed = shlex.quote(args.out if "/" in args.out else f"./{args.out}")
     best = f", best validation reward {run.best:.3f}" if math.isfinite(run.best) else ""

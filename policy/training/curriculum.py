@@ -52,6 +52,7 @@ class EnsembleConfig:
     distillation: int = 5_000  # updates of the one that is taught
     refused: float = 1.0  # weight of the refused actions' loss, in place of `DdqnConfig.refused`
     n_step: int = 8  # in place of `ReplayConfig.n_step`
+    drives: tuple[str, ...] = ()  # SCENARIO/DEMAND whose drives count once more; named twice: twice more
 
     def __post_init__(self) -> None:
         """Raises BadInput for a number out of range."""

@@ -50,7 +50,9 @@ class Ensemble:
         c = config.ensemble
         self.config, self.vfn, self.folder = config, vfn, folder
         self.replay = ReplayBuffer(replace(config.replay, n_step=c.n_step))
-        self.replay.add(list(replay.trajectories))
+        driven = list(replay.trajectories)
+        more = [one for name in c.drives for one in driven if one.episode.rpartition("/")[0] == name]
+        self.replay.add([*driven, *more])
         self._learning = replace(config, ddqn=replace(config.ddqn, refused=c.refused))
         self._about, self._device = {**about, "training": asdict(config)}, device
 

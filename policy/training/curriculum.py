@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from cosim.errors import in_range
+from cosim.errors import BadInput, in_range
 from cosim.seeding import TRAINING_SEEDS, TUNING_SEEDS, subseed, uniform
 from cosim.types import Preset
 from policy.training.a2c import A2cConfig
@@ -102,6 +102,17 @@ class VfnTraining:
     replay: ReplayConfig = field(default_factory=ReplayConfig)
     ddqn: DdqnConfig = field(default_factory=DdqnConfig)
     a2c: A2cConfig = field(default_factory=A2cConfig)
+
+    def __post_init__(self) -> None:
+        """Raises BadInput for drives of the ensemble that no lesson drives."""
+        driven = {f"{lesson.scenario}/{lesson.demand}" for lesson in self.lessons}
+        for name in self.ensemble.drives:
+            if name not in driven:
+                raise BadInput(
+                    f"no lesson drives it; lessons: {', '.join(sorted(driven))}",
+                    field="training.ensemble.drives",
+                    value=name,
+                )
 
 
 class Drive(NamedTuple):

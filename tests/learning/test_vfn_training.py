@@ -4,6 +4,7 @@ the same seed twice gives the same losses, and a killed run goes on exactly."""
 from __future__ import annotations
 
 import json
+from collections import Counter
 from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
@@ -31,6 +32,7 @@ from policy.training import experience
 from policy.training.a2c import A2cConfig, A2cLearner
 from policy.training.curriculum import Drive, Drove, EnsembleConfig, ForkConfig, Lesson, VfnTraining
 from policy.training.ddqn import DdqnConfig, DdqnLearner
+from policy.training.ensemble import Ensemble
 from policy.training.experience import Trajectory
 from policy.training.explorer import ExploreConfig, Explorer
 from policy.training.replay_buffer import ReplayBuffer, ReplayConfig, comparisons, places_tried
@@ -639,6 +641,24 @@ def test_a_teacher_counts_beside_them_and_what_is_refused_comes_last(tmp_path: P
     others = q[:, [a for a in MetaAction if a != MetaAction.ACCELERATE]]
     assert (q[:, MetaAction.ACCELERATE] < others.amin(1) - 0.2).all()  # `DdqnConfig.margin` is 0.3
     assert others.std(1).max() < 0.05  # the teacher's: alike
+
+
+def test_drives_that_are_named_count_more(tmp_path: Path) -> None:
+    drives = ("merge/contested", "merge/contested")
+    named = replace(SHORT, ensemble=EnsembleConfig(networks=1, drives=drives))
+    run = TrainingRun(named, TINY, Pretend(), tmp_path)
+    one, other = (trajectory([0, 1], [(1.0, 0.0, 0.0)] * 2) for _ in range(2))
+    run.trainer.replay.add(
+        [replace(one, episode="merge/contested/7"), replace(other, episode="merge/sparse/7")]
+    )
+    ensemble = Ensemble(named, TINY, run.trainer.replay, tmp_path, {})
+    counts = Counter(drive.episode for drive in ensemble.replay.trajectories)
+    assert counts == {"merge/contested/7": 3, "merge/sparse/7": 1}
+
+
+def test_drives_that_no_lesson_drives_are_named_in_one_error() -> None:
+    with pytest.raises(BadInput, match=r"training.ensemble.drives.*exit/dense.*merge/"):
+        replace(SHORT, ensemble=EnsembleConfig(networks=1, drives=("exit/dense",)))
 
 
 def test_a_killed_ensemble_goes_on_with_the_networks_that_it_has(tmp_path: Path) -> None:

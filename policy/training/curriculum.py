@@ -52,6 +52,7 @@ class EnsembleConfig:
     distillation: int = 5_000  # updates of the one that is taught
     refused: float = 1.0  # weight of the refused actions' loss, in place of `DdqnConfig.refused`
     n_step: int = 8  # in place of `ReplayConfig.n_step`
+    specialists: tuple[str, ...] = ()  # SCENARIO/DEMAND=FILE: this file alone teaches what was driven there
     drives: tuple[str, ...] = ()  # SCENARIO/DEMAND whose drives count once more; named twice: twice more
 
     def __post_init__(self) -> None:
@@ -104,15 +105,14 @@ class VfnTraining:
     a2c: A2cConfig = field(default_factory=A2cConfig)
 
     def __post_init__(self) -> None:
-        """Raises BadInput for drives of the ensemble that no lesson drives."""
+        """Raises BadInput for worlds of the ensemble that no lesson drives."""
         driven = {f"{lesson.scenario}/{lesson.demand}" for lesson in self.lessons}
-        for name in self.ensemble.drives:
+        named = [("drives", name, name) for name in self.ensemble.drives]
+        named += [("specialists", one, one.partition("=")[0]) for one in self.ensemble.specialists]
+        for part, value, name in named:
             if name not in driven:
-                raise BadInput(
-                    f"no lesson drives it; lessons: {', '.join(sorted(driven))}",
-                    field="training.ensemble.drives",
-                    value=name,
-                )
+                problem = f"no lesson drives it; lessons: {', '.join(sorted(driven))}"
+                raise BadInput(problem, field=f"training.ensemble.{part}", value=value)
 
 
 class Drive(NamedTuple):

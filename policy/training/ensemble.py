@@ -8,7 +8,7 @@ a network that begins as they did is taught the mean (distillation of an ensembl
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
@@ -19,11 +19,29 @@ from policy.networks.vfn import VFN, VfnConfig
 from policy.training.curriculum import VfnTraining
 from policy.training.ddqn import DdqnLearner
 from policy.training.learner import Metrics, mean_metrics
-from policy.training.replay_buffer import ReplayBuffer
+from policy.training.replay_buffer import Advised, ReplayBuffer
 from policy.training.trainers import make_trainer, rate
 
 RESULT = "distilled.safetensors"
 DIFFERENCES = 10.0  # what an error in the difference of two actions counts more than one in the state's value
+
+
+class Teachers(NamedTuple):
+    """Whose values are taught."""
+
+    everywhere: list[VFN]  # their mean
+    specialists: dict[str, VFN]  # by SCENARIO/DEMAND: there this one's alone
+
+    @torch.no_grad()
+    def values(self, batch: Advised) -> torch.Tensor:
+        """[B,parts,A] for these states."""
+        worlds = [label.rpartition("/")[0] for label in batch.episodes]
+        values = torch.stack([network.apart(*batch.now) for network in self.everywhere]).mean(0)
+        for world, network in self.specialists.items():
+            here = torch.tensor([name == world for name in worlds], device=values.device)
+            if here.any():
+                values = torch.where(here[:, None, None], network.apart(*batch.now), values)
+        return values
 
 
 class Ensemble:
@@ -73,7 +91,10 @@ class Ensemble:
         teachers += [self._network(k, shown) for k in range(c.networks)]
         if not self._finished(path):
             pupil = self._learner("pupil")
-            measured = self._taught(pupil, teachers, lambda k: shown(c.networks * c.updates + k))
+            special = (one.partition("=") for one in c.specialists)
+            specialists = {world: self._read(Path(file)) for world, _, file in special}
+            taught = Teachers(teachers, specialists)
+            measured = self._taught(pupil, taught, lambda k: shown(c.networks * c.updates + k))
             checkpoint.save(path, {"vfn": pupil.online}, {"vfn": self.vfn}, measured, self._about)
         shown(total)
         return path
@@ -95,14 +116,13 @@ class Ensemble:
         checkpoint.save(path, {"vfn": learner.online}, {"vfn": self.vfn}, measured, self._about)
         return learner.online
 
-    def _taught(self, pupil: DdqnLearner, teachers: list[VFN], shown: Callable[[int], None]) -> Metrics:
+    def _taught(self, pupil: DdqnLearner, teachers: Teachers, shown: Callable[[int], None]) -> Metrics:
         """Teach it the mean; how well it knows it, over the last tenth of the updates (`lesson`)."""
         c = self.config.ensemble
         rng, known = generator(self.config.seed, "distillation"), []
         for update in range(c.distillation):
             batch = self.replay.advised(rng, True, self._device)
-            with torch.no_grad():
-                mean = torch.stack([network.apart(*batch.now) for network in teachers]).mean(0)
+            mean = teachers.values(batch)
             mine = pupil.online.apart(*batch.now)
             q = pupil.online.weighed(mine, batch.now[3])
             refused = pupil.refused(q, batch.possible)

@@ -32,7 +32,7 @@ from policy.training import experience
 from policy.training.a2c import A2cConfig, A2cLearner
 from policy.training.curriculum import Drive, Drove, EnsembleConfig, ForkConfig, Lesson, VfnTraining
 from policy.training.ddqn import DdqnConfig, DdqnLearner
-from policy.training.ensemble import Ensemble
+from policy.training.ensemble import Ensemble, Teachers
 from policy.training.experience import Trajectory
 from policy.training.explorer import ExploreConfig, Explorer
 from policy.training.replay_buffer import ReplayBuffer, ReplayConfig, comparisons, places_tried
@@ -656,9 +656,30 @@ def test_drives_that_are_named_count_more(tmp_path: Path) -> None:
     assert counts == {"merge/contested/7": 3, "merge/sparse/7": 1}
 
 
-def test_drives_that_no_lesson_drives_are_named_in_one_error() -> None:
-    with pytest.raises(BadInput, match=r"training.ensemble.drives.*exit/dense.*merge/"):
-        replace(SHORT, ensemble=EnsembleConfig(networks=1, drives=("exit/dense",)))
+@pytest.mark.parametrize(("part", "value"), [("drives", "exit/dense"), ("specialists", "exit/dense=a.b")])
+def test_worlds_that_no_lesson_drives_are_named_in_one_error(part: str, value: str) -> None:
+    with pytest.raises(BadInput, match=rf"training.ensemble.{part}='{value}': .*merge/contested"):
+        replace(SHORT, ensemble=replace(EnsembleConfig(networks=1), **{part: (value,)}))
+
+
+def test_a_specialist_alone_teaches_what_was_driven_in_its_world(tmp_path: Path) -> None:
+    drive = trajectory([0, 1, 2, 4] * 3, [(1.0, 0.0, 0.0)] * 12)
+    files = []
+    for name, action in (("brakes", MetaAction.DECELERATE), ("hurries", MetaAction.ACCELERATE)):
+        teacher = VFN(TINY)
+        teacher.value.bias.data[action] = 9.0
+        files.append(str(tmp_path / f"{name}.safetensors"))
+        checkpoint.save(Path(files[-1]), {"vfn": teacher}, {"vfn": TINY})
+    replay = ReplayBuffer(ReplayConfig(batch=64))
+    replay.add([replace(drive, episode=f"{world}/contested/7") for world in ("merge", "exit")])
+    networks = [VFN(TINY) for _ in files]
+    for network, file in zip(networks, files, strict=True):
+        checkpoint.load(Path(file), {"vfn": network}, {"vfn": TINY})
+    batch = replay.advised(generator(0, "drawn"), True)
+    best = Teachers(networks[:1], {"exit/contested": networks[1]}).values(batch).sum(1).argmax(1)
+    wanted = {"merge/contested/7": MetaAction.DECELERATE, "exit/contested/7": MetaAction.ACCELERATE}
+    assert best.tolist() == [wanted[label] for label in batch.episodes]
+    assert len(set(best.tolist())) == 2
 
 
 def test_a_killed_ensemble_goes_on_with_the_networks_that_it_has(tmp_path: Path) -> None:

@@ -43,11 +43,10 @@ DEMONSTRATED = (
 LIMITS = {  # by the configuration of the training
     "compact": (MAPS_UNUSED, *DEMONSTRATED),
     "maps": (MAPS_ONLY, *DEMONSTRATED),
-    "rewards": (
-        "It learned from rewards alone, in preset `lawful`: what it does in `unguarded` it never tried.",
-        LAWLESS,
-    ),
+    "rewards": (LAWLESS,),
 }
+LAWFUL_ONLY = "It learned from rewards alone, in preset `lawful`: what it does in `unguarded` it never tried."
+TRAINED = {"vfn-p": "reflex-0"}  # the folder of its training's log, where that is not NAME-0
 PREDICTING_LIMITS = (
     "It learned from the five worlds alone, with drivers who follow IDM and LC2013 or MOBIL and never err; "
     "nothing is known of its error on recorded traffic or on other roads.",
@@ -73,9 +72,11 @@ def page() -> list[str]:
 
 def driving(name: str, card: Card) -> Iterator[str]:
     """The lines about a value network or a baseline of Table III."""
-    data, approach, folder = card["data"], APPROACHES[name], RESULTS / "trainings" / f"{name}-0"
+    data, approach = card["data"], APPROACHES[name]
+    folder = RESULTS / "trainings" / TRAINED.get(name, f"{name}-0")
     log = [json.loads(line) for line in (folder / "log.jsonl").read_text("utf-8").splitlines()]
-    log = [row for row in log if row["iteration"] <= card["measured"]["iteration"]]
+    shipped = card["measured"].get("iteration")  # none: what its ensemble taught, after the last one
+    log = log if shipped is None else [row for row in log if row["iteration"] <= shipped]
     training, last = data["training"], log[-1]
     layout, rewards = card["configs"]["vfn"], approach.config == "rewards"
     sees = "kinematics, situation and maps" if approach.kinematics else "maps"
@@ -99,16 +100,22 @@ def driving(name: str, card: Card) -> Iterator[str]:
         f"--seed {training['seed']} --iterations {training['iterations']} "
         f"--config {folder.as_posix()}/config.yaml --out runs/{name}`"
     )
+    if training.get("first"):
+        yield f"- Began with: `{training['first']}`."
     hours = sum(row["iteration_s"] for row in log) / 3600
-    yield (
-        f"- Shipped: iteration {card['measured']['iteration']}, after {last['updates']:,} updates and "
-        f"{hours:.1f} h by its log"
-        + (
-            f"; highest mean reward in {training['validation']} validation drives a case, tuning seeds."
-            if "validation" in card["measured"]
-            else ", its last."
+    made = f"after {last['updates']:,} updates and {hours:.1f} h by its log"
+    if shipped is None:
+        yield (
+            f"- Shipped: what the ensemble taught (`training.ensemble`, docs/training.md), {made}; it "
+            f"chooses as its teachers do in {card['measured']['agrees']:.0%} of the states."
         )
-    )
+    elif "validation" in card["measured"]:
+        yield (
+            f"- Shipped: iteration {shipped}, {made}; highest mean reward in {training['validation']} "
+            "validation drives a case, tuning seeds."
+        )
+    else:
+        yield f"- Shipped: iteration {shipped}, {made}, its last."
     table = list(measured(name))
     if len(table) > HEAD:
         yield from ("- Measured (test seeds, preset `unguarded`):", "", *table, "")
@@ -116,6 +123,8 @@ def driving(name: str, card: Card) -> Iterator[str]:
         driven = f"| {name} at " in (RESULTS / "learned.md").read_text(encoding="utf-8")
         where = "on test seeds, preset `lawful`: docs/results/learned.md" if driven else "in no table yet"
         yield f"- Measured {where}."
+    if rewards and not any(lesson.get("preset") for lesson in training["lessons"]):
+        yield f"- Limit: {LAWFUL_ONLY}"
     yield from (f"- Limit: {text}" for text in LIMITS[approach.config])
 
 

@@ -7,16 +7,18 @@ degrees, preset `lawful`, without human errors. The turn is the angle at which t
 that are let in crosses half of what it changes from 0 to 90 degrees. The reward is cos(phi) own + sin(phi)
 others' (P, equation 6), so that of two ways of driving the kinder one earns more from the angle on at which
 tan(phi) = own reward lost / others' reward gained: the break-even of the drives at 0 and at 90 degrees.
-Rows are kept in --rows, and not driven twice.
+Rows are kept in --rows, and not driven twice; those of other weights under the policy's name are driven anew.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import hashlib
+import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -34,8 +36,10 @@ from cosim.episode import Episode, Step
 from cosim.files import write_csv
 from cosim.host import Earnings
 from cosim.learning.prediction_data import spread
+from cosim.policies import make
 from cosim.report.statistics import CONFIDENCE, RESAMPLES, Figure, holm, mean, paired_mean, share, signed_rank
 from cosim.scenario.episode_id import EpisodeId
+from cosim.scenario.manifest import digests
 from cosim.seeding import FIRST_TEST_SEED
 from cosim.types import Floats, Ints
 from cosim.workers.engines import LocalEngine
@@ -66,6 +70,7 @@ class Drive:
     own: float  # reward per AV and decision, of cos(phi)
     others: float  # and of sin(phi)
     crashed: bool
+    weights: str = ""  # what tells the policy's files apart
 
 
 class Parts(Earnings):
@@ -205,9 +210,16 @@ def read(path: Path) -> dict[tuple[str, str, float, int], Drive]:
     made = {"str": str, "float": float, "int": int, "bool": "True".__eq__}
     with path.open(newline="") as file:
         rows = [
-            Drive(*(made[str(f.type)](row[f.name]) for f in fields(Drive))) for row in csv.DictReader(file)
+            Drive(**{f.name: made[str(f.type)](row[f.name]) for f in fields(Drive) if f.name in row})
+            for row in csv.DictReader(file)
         ]
     return {(d.policy, d.world, d.phi, d.seed): d for d in rows}
+
+
+def weights_of(policy: str) -> str:
+    """Twelve digits that tell the files of a policy apart; none where it has none."""
+    files = digests(getattr(make(policy), "files", ()))
+    return hashlib.sha256(json.dumps(sorted(files.items())).encode()).hexdigest()[:12] if files else ""
 
 
 def main() -> None:
@@ -225,7 +237,8 @@ def main() -> None:
     args = parser.parse_args()
     seeds = args.seeds or range(FIRST_TEST_SEED, FIRST_TEST_SEED + args.episodes)
     asked = f"--seeds {seeds.start}:{seeds.stop}" if args.seeds else f"--episodes {args.episodes}"
-    done = read(args.rows)
+    weights = weights_of(args.policy)
+    done = {k: d for k, d in read(args.rows).items() if d.policy != args.policy or d.weights == weights}
     for world in args.worlds:
         cases = [
             case
@@ -235,7 +248,8 @@ def main() -> None:
         ]
         tasks = [Task(case.key, case.cell, (case,)) for case in cases]
         for drive in spread(LocalEngine(Earning, workers=args.workers), tasks, world):
-            done[drive.policy, drive.world, drive.phi, drive.seed] = drive
+            key = (drive.policy, drive.world, drive.phi, drive.seed)
+            done[key] = replace(drive, weights=weights)
         write_csv(args.rows, [asdict(done[key]) for key in sorted(done)])
     drives = {
         world: [d for d in done.values() if d.world == world and d.policy == args.policy and d.seed in seeds]

@@ -3,11 +3,25 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from benchmarks.turn import PHIS, Drive, break_even, columns, resampled, table, turn, verdict
+from benchmarks.turn import (
+    PHIS,
+    Drive,
+    break_even,
+    columns,
+    read,
+    resampled,
+    table,
+    turn,
+    verdict,
+    weights_of,
+)
+from cosim.files import write_csv
 
 
 def drive(phi: float, seed: int, served: bool) -> Drive:
@@ -45,3 +59,14 @@ def test_a_page_compares_episodes_of_equal_seeds() -> None:
     assert "-15.0, 0." in lines[4], "half of the seeds turn at 30 degrees"
     assert "Turn 30 (" in verdict(DRIVES)
     assert "break-even of the reward 45 (45 to 45) degrees" in verdict(DRIVES)
+
+
+def test_rows_say_which_weights_drove(tmp_path: Path) -> None:
+    assert weights_of("idm") == ""
+    assert len({weights_of(name) for name in ("vfn-p", "vfn", "vfn-p-demonstrated")}) == 3
+    driven = replace(DRIVES[0], weights=weights_of("vfn"))
+    write_csv(tmp_path / "new.csv", [asdict(driven)])
+    before = {k: v for k, v in asdict(driven).items() if k != "weights"}
+    write_csv(tmp_path / "before.csv", [before])
+    assert list(read(tmp_path / "new.csv").values()) == [driven]
+    assert list(read(tmp_path / "before.csv").values()) == [replace(driven, weights="")]

@@ -177,7 +177,7 @@ def main() -> None:
     )
     parser.add_argument("--taken-away", action="store_true")
     parser.add_argument("--episodes", type=int, help="a world; default 400, of --taken-away 30")
-    parser.add_argument("--policy", nargs="+", default=["vfn-p-demonstrated"])
+    parser.add_argument("--policy", nargs="+", default=["vfn-p"])
     parser.add_argument("--runs", type=Path, default=Path("runs/humans"), help="where episodes are kept")
     parser.add_argument("--workers", default="2")
     parser.add_argument("--page", type=Path, default=PAGE)

@@ -1,18 +1,21 @@
-"""The tables of docs/human_errors.md: rates, what `stress` does to IDM AVs, how often humans alone crash.
+"""The tables of docs/human_errors.md: rates, what `stress` does to IDM AVs, crashes of humans alone, cost.
 
-    python -m benchmarks.error_levels [rates] [stress] [alone] [--episodes 40] [--page docs/human_errors.md]
+    python -m benchmarks.error_levels [rates] [stress] [alone] [cost] [--episodes 40] [--page PAGE]
 
 `stress`: AVs driven by SUMO's IDM, tuning seeds, every world, dense and contested. `alone`: nobody is an AV,
 errors of `field` at raised rates, in which brute force sees crashes; what happens is scaled back: errors that
 crash by themselves by the factor of their rate, and those that need two errors (an inattentive follower
-behind somebody who brakes hard or cuts in) by the product of both factors. Each table stands between a pair
-of markers in the page; `rates` only reads sumo_scenarios/errors.yaml.
+behind somebody who brakes hard or cuts in) by the product of both factors. `cost`: processor time of episodes
+in which every error of `stress` is drawn and none begins, so that they drive what those without errors do,
+against these, in turns. Each table stands between a pair of markers in the page; `rates` only reads
+sumo_scenarios/errors.yaml.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
+import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -24,16 +27,18 @@ from benchmarks.tables import markdown_row
 from cosim.episode import Episode, Hook, Step
 from cosim.files import whole
 from cosim.host import Host
-from cosim.report.statistics import share
+from cosim.report.statistics import paired_change, share
 from cosim.scenario import Fleet, load
 from cosim.scenario.human_errors import KINDS, Errors, Kinds, levels
 from cosim.scenario.vet import vetted
 from cosim.seeding import TUNING_SEEDS
 from cosim.types import EpisodeResult
+from cosim.workers.worker import Worker
 
 PAGE = Path("docs/human_errors.md")
 DEMANDS = ("dense", "contested")
 MILLION = 1e6  # km
+RARE = 1e-15  # rate of an error that is drawn and never begins
 
 
 class Raised(NamedTuple):
@@ -175,6 +180,46 @@ def alone(episodes: int) -> list[str]:
     return [*lines, markdown_row(["together", "", "", "", "", f"{total:.2g}"])]
 
 
+def cost(episodes: int) -> list[str]:
+    """What drawing takes: the same drives with trials of every kind, none of which begins an error."""
+    base = levels()["stress"]
+    drawn = Errors(
+        "drawn", "", Kinds(**{k: replace(getattr(base.kinds, k), rate=RARE) for k in KINDS}), base.file
+    )
+    heads = ["world", "demand", "episodes", "s without", "s with", "more, %"]
+    lines = [markdown_row(heads), markdown_row(["---"] * len(heads))]
+    every: list[tuple[float, float]] = []
+    for world, demand in places():
+        scenario = load(world, demand=[demand])
+        worlds = [vetted(replace(scenario, errors=errors)) for errors in (None, drawn)]
+        took: list[tuple[float, float]] = []
+        with Worker(Timed, worlds[0], "idm", 0.0) as one, Worker(Timed, worlds[1], "idm", 0.0) as other:
+            for seed in TUNING_SEEDS[: episodes + 1]:
+                (without, before), (with_, after) = (w.call("timed", seed) for w in (one, other))
+                assert before == after, "an error has begun"
+                took.append((without, with_))
+        every += took[1:]  # nothing is warm in the first one
+        lines.append(_cost_row(world, demand, took[1:]))
+    return [*lines, _cost_row("together", "", every)]
+
+
+class Timed(Host):
+    """Hosted by a worker's process, for SUMO drives one simulation in each."""
+
+    def timed(self, seed: int) -> tuple[float, str]:
+        """Processor time (s) of an episode, and the hash of its trace."""
+        begin = time.process_time()
+        result = self.run(seed)
+        return time.process_time() - begin, result.trace_hash
+
+
+def _cost_row(world: str, demand: str, took: Sequence[tuple[float, float]]) -> str:
+    without, with_ = (list(each) for each in zip(*took, strict=True))
+    more = paired_change(without, with_).text(1, 100.0)
+    means = (f"{sum(each) / len(each):.3f}" for each in (without, with_))
+    return markdown_row([world, demand, str(len(took)), *means, more])
+
+
 def _raised(kind: Any, by: float) -> Any:
     return replace(kind, rate=min(kind.rate * by, 1.0))
 
@@ -200,13 +245,13 @@ def fill(page: Path, name: str, lines: Sequence[str]) -> None:
         draft.write_text("\n".join([before + begin, *lines, end + after]), encoding="utf-8")
 
 
-TABLES = {"stress": stress, "alone": alone}
+TABLES = {"stress": stress, "alone": alone, "cost": cost}
 
 
 def main() -> None:
     """Make the tables that are asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("tables", nargs="*", choices=("rates", "stress", "alone"), default=["rates"])
+    parser.add_argument("tables", nargs="*", choices=("rates", *TABLES), default=["rates"])
     parser.add_argument("--episodes", type=int, default=40)
     parser.add_argument("--page", type=Path, default=PAGE)
     args = parser.parse_args()

@@ -29,14 +29,16 @@ from cosim.cli.main import main as cosim
 from cosim.report import crash_rate, run_folder, wording
 from cosim.report.figures import CRASHES, INCIDENCES, Row, weights
 from cosim.report.statistics import effective, pooled_rate
-from cosim.scenario.tilt import ALL, OTHER, Tilt, shipped
+from cosim.scenario.tilt import ALL, OTHER, SECOND, Tilt, shipped
 from cosim.seeding import FIRST_TEST_SEED, TUNING_SEEDS
 from cosim.workers.tasks import OK
 
 Array = npt.NDArray[np.float64]
-FIRST = 1.0  # errors a tilted episode that the first tilt aims at, if none ended the trials
+FIRST = 1.0  # errors a tilted episode that the first tilts aim at, if none ended the trials
 MEET = 0.75  # share of them that meets an AV first
-DURING = 10.0  # the second error has a tenth of the time and of the drivers of the first
+FOLLOW = 0.5  # second errors that they aim at, where a first one has begun
+BALANCED = 2  # rounds in which all kinds are made equally frequent, before crashes are looked at
+DURING = 10.0  # at first the second error has a tenth of the time and of the drivers of the first
 PAGE = Path("docs/results/estimate.md")
 INTERVALS = 400
 REAL = ("exit", "contested", "stress")  # world, demand, errors: AVs crash so often that brute force sees it
@@ -75,12 +77,21 @@ def trials(rows: Sequence[Row]) -> dict[str, Array]:
 
 
 def balanced(rows: Sequence[Row], before: Tilt) -> Tilt:
-    """`FIRST` errors an episode, `MEET` of them meeting an AV; in either share every kind equally often."""
+    """`FIRST` errors an episode, `MEET` of them meeting an AV, `FOLLOW` second ones; of each every kind as
+    often as the others."""
     factors: dict[str, float] = {}
-    for meets, share in ((True, MEET), (False, 1.0 - MEET)):
-        expected = {n: e.mean() for n, (_, e) in trials(rows).items() if n.endswith(OTHER) != meets}
-        factors |= {n: max(FIRST * share / len(expected) / e, 1.0) for n, e in expected.items()}
+    found = trials(rows)
+    begun = np.sum([b for n, (b, _) in found.items() if not n.endswith(SECOND)], 0) > 0
+    for ending, aim in (("", FIRST * MEET), (OTHER, FIRST * (1.0 - MEET)), (SECOND, FOLLOW)):
+        of = begun if ending == SECOND else np.ones(len(rows), bool)  # episodes that could show them
+        expected = {n: e[of].mean() for n, (_, e) in found.items() if ending == ending_of(n)}
+        factors |= {n: max(aim / len(expected) / e, 1.0) for n, e in expected.items() if e > 0.0}
     return replace(before, factors=factors)
+
+
+def ending_of(name: str) -> str:
+    """What of a `cosim.scenario.tilt.case` follows the kind."""
+    return "." + name.partition(".")[2] if "." in name else ""
 
 
 def crossed(rows: Sequence[Row], before: Tilt) -> Tilt:
@@ -108,7 +119,7 @@ def tune(world: str, demand: str, errors: str, runs: Path, episodes: int, rounds
         rows = drive(runs / f"{world}-{k}", world, demand, errors, tilt, seeds, workers)
         crashes = np.array(weights(rows))[[row["av_involved_collisions"] > 0 for row in rows]]
         print(f"round {k}: {len(crashes)} crashes, effective {effective(crashes):.1f}, {len(rows)} episodes")
-        tilt = crossed(rows, tilt) if k else balanced(rows, tilt)
+        tilt = balanced(rows, tilt) if k < BALANCED else crossed(rows, tilt)
         tilt = replace(tilt, factors={name: float(f"{f:.2g}") for name, f in tilt.factors.items()})
         print(tilt.text())
     return tilt

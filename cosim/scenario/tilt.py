@@ -17,7 +17,8 @@ MOST = 0.5  # of a tilted probability: both outcomes of a trial stay likely
 UNTILTED = 0.1  # share of episodes that are drawn as errors happen: no episode weighs more than 1 / UNTILTED
 ALL = "all"  # kinds that are not named
 OTHER = ".other"  # errors that do not meet an AV first
-CASES = tuple(kind + ending for kind in (*KINDS, ALL) for ending in ("", OTHER))
+SECOND = ".second"  # of those near somebody who errs, whomever they meet
+CASES = tuple(kind + ending for kind in (*KINDS, ALL) for ending in ("", OTHER, SECOND))
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,20 +30,24 @@ class Tilt:
     """
 
     factors: Mapping[str, float] = field(default_factory=dict)  # `case` -> factor, 1 or more
-    during: float = 1.0  # times that, for a second error near somebody who errs
+    during: float = 1.0  # times that of the first, for a second error whose own factor is not named
     untilted: float = UNTILTED
 
     def raises(self, kind: str) -> bool:
         """Whether any trial of this kind is tilted."""
-        return self.during > 1.0 or any(self._factor(kind + ending) > 1.0 for ending in ("", OTHER))
+        endings = "", OTHER, SECOND
+        return self.during > 1.0 or any((self._factor(kind, e) or 1.0) > 1.0 for e in endings)
 
-    def rate(self, what: str, p: float, during: bool = False) -> float:
-        """q, the tilted probability of a trial of the `case` that is p as it happens."""
-        return max(p, min(p * self._factor(what) * (self.during if during else 1.0), MOST))
+    def rate(self, kind: str, p: float, meets_av: bool = True, second: bool = False) -> float:
+        """q, the tilted probability of a trial that is p as it happens."""
+        factor = self._factor(kind, SECOND) if second else None
+        if factor is None:
+            first = self._factor(kind, "" if meets_av else OTHER) or 1.0
+            factor = first * (self.during if second else 1.0)
+        return max(p, min(p * factor, MOST))
 
-    def _factor(self, what: str) -> float:
-        names = what, ALL + OTHER * what.endswith(OTHER)
-        return next((self.factors[name] for name in names if name in self.factors), 1.0)
+    def _factor(self, kind: str, ending: str) -> float | None:
+        return self.factors.get(kind + ending, self.factors.get(ALL + ending))
 
     def drawn(self, seed: int) -> bool:
         """Whether the episode of this seed is drawn from the tilted probabilities."""
@@ -58,9 +63,9 @@ class Tilt:
         return ",".join(f"{name}={value:g}" for name, value in named)
 
 
-def case(kind: str, meets_av: bool) -> str:
-    """What a factor is for: a kind, with `OTHER` where its error does not meet an AV first."""
-    return kind if meets_av else kind + OTHER
+def case(kind: str, meets_av: bool, second: bool = False) -> str:
+    """What a factor is for: a kind; with `OTHER` its errors that do not meet an AV first."""
+    return kind + (SECOND if second else "" if meets_av else OTHER)
 
 
 def log_ratio(p: float, q: float, begins: bool) -> float:

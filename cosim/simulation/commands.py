@@ -87,7 +87,7 @@ class Commander:
 
     def _hand_back(self, name: str) -> None:
         """Take back what `_take_over` gave."""
-        sumo.vehicle.setDecel(name, AV_IDM["Decel"])
+        sumo.vehicle.setDecel(name, AV_IDM["decel"])
 
     def _changes(self, name: str, state: Controlled, offset: int, now: float) -> None:
         state.change = offset

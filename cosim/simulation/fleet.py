@@ -1,8 +1,10 @@
 """Decides which vehicles are AVs and mission vehicles, and gives each departed vehicle its driver."""
 
+import math
 import re
 from collections.abc import Mapping
 
+from cosim.errors import BadInput
 from cosim.scenario import Scenario
 from cosim.scenario.behaviors import AS_IS
 from cosim.scenario.vet_rules import NOT_CARS
@@ -14,7 +16,7 @@ from cosim.simulation.drivers import IDM_TYPE, Drivers
 from cosim.types import Actor, Kind, Preset
 
 # definitions.md, Vehicles: what an AV drives with while it has no command (egoistic IDM).
-AV_IDM = {"Tau": 0.8, "MinGap": 2.0, "Accel": 3.0, "Decel": 7.0}
+AV_IDM = {"tau": 0.8, "minGap": 2.0, "accel": 3.0, "decel": 7.0}  # s, m, m/s2
 AV_LANE_CHANGE = {
     "laneChangeModel.lcCooperative": "0",
     "laneChangeModel.lcCooperativeSpeed": "0",
@@ -30,7 +32,9 @@ class Fleet:
     def __init__(self, scenario: Scenario, drivers: Drivers, av_parameters: Mapping[str, str]) -> None:
         self._scenario = scenario
         self._drivers = drivers
-        self._av_parameters = av_parameters
+        self._idm = {name: _number(name, av_parameters.get(name, usual)) for name, usual in AV_IDM.items()}
+        others = {key: text for key, text in av_parameters.items() if key not in AV_IDM}
+        self._av_parameters = {**AV_LANE_CHANGE, **others}
         self._av_types: dict[str, str] = {}  # a vehicle's own type -> the type of such an AV
 
     def depart(self, vehicle: str, seed: int) -> Body:
@@ -40,9 +44,9 @@ class Fleet:
         is_av = not mission and self._is_av(vehicle, seed)
         if is_av:
             self._take_av_type(vehicle)
-            for name, value in AV_IDM.items():
-                getattr(get, f"set{name}")(vehicle, value)
-            for key, text in {**AV_LANE_CHANGE, **self._av_parameters}.items():
+            for name, value in self._idm.items():  # SUMO ignores these silently in `setParameter`
+                getattr(get, f"set{name[0].upper()}{name[1:]}")(vehicle, value)
+            for key, text in self._av_parameters.items():
                 get.setParameter(vehicle, key, text)
         elif s.behavior != AS_IS:
             self._drivers.apply(vehicle)
@@ -90,3 +94,14 @@ def set_type(vehicle: str, name: str) -> None:
     get.setType(vehicle, name)
     for field, value in kept.items():
         getattr(get, f"set{field}")(vehicle, value)
+
+
+def _number(name: str, text: str | float) -> float:
+    """The value of one of `AV_IDM`. Raises BadInput."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value < math.inf:
+        raise BadInput("must be a number above 0", field=f"av_parameters.{name}", value=text)
+    return value

@@ -98,7 +98,7 @@ class HumanErrors:
         self._near: frozenset[str] = frozenset()  # whose trials are weighed
         self._during: frozenset[str] = frozenset()  # of these, near somebody who errs
         self._begun = 0  # errors from raised probabilities
-        self.weighed: dict[str, list[float]] = {}  # `case` -> first errors begun, sum of p until then
+        self.weighed: dict[str, list[float]] = {}  # `case` -> errors begun, sum of p of its trials
         self._streams: dict[str, Any] = {}  # HV on the road -> [k] its streams of draws
         self._erring: dict[str, Erring] = {}
         self._ended: dict[str, float] = {}  # who erred before -> s, when that ended
@@ -214,15 +214,14 @@ class HumanErrors:
         assert self._tilt is not None
         if not self._is_weighed(who):
             return p
-        what = case(kind, whom in self._avs or kind in MEET_ANYBODY)
-        q = self._tilt.rate(what, p, self._begun > 0)
+        meets_av, second = whom in self._avs or kind in MEET_ANYBODY, self._begun > 0
+        q = self._tilt.rate(kind, p, meets_av, second)
         held = q if self._tilted else p
         begins = bool(drawn < held)
         self.log_ratio += log_ratio(p, q, begins)
-        if not self._begun:
-            counted = self.weighed.setdefault(what, [0, 0.0])
-            counted[0] += begins
-            counted[1] += float(p)
+        counted = self.weighed.setdefault(case(kind, meets_av, second), [0, 0.0])
+        counted[0] += begins
+        counted[1] += float(p)
         self._begun += begins and q > p
         return held
 

@@ -19,7 +19,7 @@ from cosim.scenario.vet_net import read_net
 from cosim.simulation.backend import sumo
 from cosim.simulation.client import Client
 from cosim.simulation.drivers import IDM_TYPE, Drivers
-from cosim.simulation.fleet import AV_LANE_CHANGE, Fleet, set_type
+from cosim.simulation.fleet import Fleet, set_type
 from cosim.simulation.net import NetReader
 from cosim.simulation.sumo import DEFAULTS, FORCED, GIVES_UP, SumoSimulator
 from cosim.types import OnCollision, Snapshot, Timing
@@ -101,12 +101,11 @@ class LentFleet(Fleet):
 
     def __init__(self, scenario: Scenario, drivers: Drivers, av_parameters: Mapping[str, str]) -> None:
         super().__init__(scenario, drivers, av_parameters)
-        self._changed = {**AV_LANE_CHANGE, **av_parameters}
         self._own: dict[str, tuple[str, float, dict[str, str]]] = {}  # AV -> type, speed factor, parameters
 
     def _take_av_type(self, vehicle: str) -> None:
         get = sumo.vehicle
-        parameters = {key: get.getParameter(vehicle, key) for key in self._changed}
+        parameters = {key: get.getParameter(vehicle, key) for key in self._av_parameters}
         self._own[vehicle] = get.getTypeID(vehicle), get.getSpeedFactor(vehicle), parameters
         super()._take_av_type(vehicle)
 

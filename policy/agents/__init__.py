@@ -45,6 +45,7 @@ def _made(module: str, kind: str, *arguments: str) -> Policy:
 
 POLICIES: dict[str, Callable[[], Policy]] = {
     "idm": partial(_made, "idm", "Idm"),
+    **{f"idm-{gap}": partial(_made, "idm", "IdmHeadway", gap) for gap in ("1.5", "2.2")},  # s of headway
     "idm-courteous": partial(_made, "idm", "IdmCourteous"),
     "keep-lane": partial(_made, "keep_lane", "KeepLane"),
     "random": partial(_made, "random", "Random"),

@@ -52,3 +52,11 @@ class IdmCourteous(Idm):
         "laneChangeModel.lcCooperative": "1",
         "laneChangeModel.lcCooperativeSpeed": "1",
     }
+
+
+class IdmHeadway(Idm):
+    """`idm` with a time headway of its own, s: more careful than 0.8 s, and as egoistic."""
+
+    def __init__(self, time_gap: str) -> None:
+        self.name = f"idm-{time_gap}"
+        self.av_parameters = {"tau": time_gap}

@@ -91,6 +91,16 @@ def test_a_tilt_is_written_as_it_is_read() -> None:
     assert found.rate("cut_in", 0.1) == 0.5  # no trial becomes certain
     assert found.rate("cut_in", 0.7) == 0.7
     assert found.rate("red_light", 0.1) == 0.1
+
+
+def test_a_second_error_has_a_factor_of_its_own_or_that_of_the_first_times_during() -> None:
+    found = tilt.read("cut_in=30,inattention=2,inattention.second=900,during=10")
+    assert found.rate("cut_in", 1e-4, True, True) == pytest.approx(0.03)
+    assert found.rate("inattention", 1e-4, True, True) == pytest.approx(0.09)
+    assert found.rate("inattention", 1e-4) == pytest.approx(2e-4)
+    assert tilt.read("all.second=50").rate("stalled_car", 1e-4, False, True) == pytest.approx(5e-3)
+    assert tilt.read("all.second=50").raises("stalled_car")
+    assert tilt.case("cut_in", True, True) == tilt.case("cut_in", False, True) == "cut_in.second"
     assert tilt.log_ratio(0.1, 0.1, True) == 0.0
 
 

@@ -1,0 +1,187 @@
+"""Every policy that ships among humans who err (`--errors stress`), in all worlds, dense and contested.
+
+    python -m benchmarks.humans_policies [--episodes 20] [--policy NAME ...] [--runs runs/humans_policies]
+
+All policies drive the same test seeds in preset `lawful` (`keep-lane` always `unguarded`). The
+command goes on where it stopped, also with more episodes (in blocks of 20) or further policies, and writes
+its tables and pictures into docs/results/humans.md: who is in collisions, how near the others come, and who
+erred in front of whom.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from benchmarks.error_levels import fill
+from benchmarks.humans import BLOCK, IDM, LEVEL, PAGE
+from benchmarks.tables import markdown_row, picture
+from benchmarks.worlds import WORLDS
+from cosim.cli.main import main as cosim
+from cosim.report import run_folder, statistics, wording
+from cosim.report.figures import INCIDENCES, Row
+from cosim.seeding import FIRST_TEST_SEED
+from cosim.types import Preset
+from cosim.workers.tasks import OK
+
+POLICIES = (
+    *("keep-lane", "idm", "idm-1.5", "idm-2.2", "altruist-rule", "vfn-p", "vfn", "vfn-p-demonstrated"),
+    *("vfn-demonstrated", "vfn-p-egoistic", "safe-dqn", "conv3d-dqn", "conv3d-a2c", "conv2d-dqn"),
+)
+DEMANDS = ("dense", "contested")
+NEAR = {
+    "av_near_misses_ttc_per_av_hour": "TTC below 1.5 s",
+    "av_near_misses_drac_per_av_hour": "DRAC above 3.35 m/s2",
+    "av_near_misses_pet_per_av_hour": "PET below 1 s",
+}
+COLUMNS = (
+    *("policy", *WORLDS, "together", "less idm, pp", "p", "AV-caused", "let in"),
+    *("distance of all, m", "of AVs, m", "hard brakings of AVs"),
+)
+# who erred, of the first collision of an AV -> the column's head
+ROLES = {
+    "collider": "an erring human drives into an AV",
+    "victim": "an AV drives into an erring human",
+    "ahead": "one of both is behind an erring human",
+    "nobody": "nobody erred",
+}
+
+
+def drive(policy: str, seeds: range, runs: Path, workers: str) -> None:
+    """These episodes of one policy in all worlds and demands; what is there already is not driven again."""
+    matrix = [word for name in WORLDS for word in ("--scenario", name)]
+    matrix += [word for name in DEMANDS for word in ("--demand", name)]
+    matrix += ["--policy", policy, "--preset", Preset.LAWFUL, "--errors", LEVEL]
+    running = ["--seeds", f"{seeds.start}:{seeds.stop}", "--no-report", "--workers", workers, "--resume"]
+    code = cosim(["evaluate", *matrix, *running, "--out", str(runs / f"{policy}-{seeds.start}")])
+    if code:
+        raise SystemExit(code)
+
+
+def read(runs: Path, policies: Sequence[str], seeds: range) -> dict[str, dict[tuple[str, str, int], Row]]:
+    """Policy -> (demand, world, seed) -> row."""
+    found: dict[str, dict[tuple[str, str, int], Row]] = {}
+    for policy in policies:
+        folders = [runs / f"{policy}-{first}" for first in seeds[::BLOCK]]
+        rows = [row for folder in folders for row in run_folder.read(folder).rows if row["status"] == OK]
+        found[policy] = {(str(r["demand"]), str(r["scenario"]), int(r["seed"])): r for r in rows}
+    return found
+
+
+def hit(row: Row) -> bool:
+    """Whether an AV is in a collision."""
+    return bool(row["av_involved_collisions"])
+
+
+def line(policy: str, mine: Mapping[tuple[str, int], Row], idm: Mapping[tuple[str, int], Row]) -> list[str]:
+    """One policy's cells in one demand, both by (world, seed)."""
+    rows = [*mine.values()]
+    each = {world: [hit(row) for key, row in mine.items() if key[0] == world] for world in WORLDS}
+    hits, count = sum(map(hit, rows)), len(rows)
+    pairs = sorted(mine.keys() & idm.keys())
+    before, after = ([hit(side[key]) for key in pairs] for side in (idm, mine))
+    less = ["", ""]
+    if policy != IDM:
+        p = statistics.mcnemar(*statistics.discordant(before, after))
+        less = [statistics.paired_share(before, after).text(1, 100.0), f"{p:.2g}"]
+    caused = sum(bool(row["av_caused_collisions"]) for row in rows)
+    served = [bool(row["mission_success"]) for row in rows if row["mission_success"] is not None]
+
+    def mean(name: str, digits: int = 0) -> str:
+        return statistics.mean([float(row[name]) for row in rows if row[name] is not None]).text(digits)
+
+    return [
+        *(policy, *(f"{sum(found)} of {len(found)}" for found in each.values())),
+        *(f"{statistics.share(hits, count).text(1, 100.0)} %", *less),
+        f"{statistics.share(caused, count).text(1, 100.0)} %",
+        f"{statistics.share(sum(served), len(served)).text(0, 100.0)} %",
+        *(mean("dt_mean_m"), mean("dt_av_m"), mean("hard_brakings_av", 1)),
+    ]
+
+
+def near(policy: str, rows: Sequence[Row]) -> list[str]:
+    """Near-misses per AV-hour, with intervals."""
+    return [policy, *(wording.interval(INCIDENCES[name].figure(rows), INCIDENCES[name]) for name in NEAR)]
+
+
+def who_erred(row: Row) -> tuple[str, str]:
+    """(Role of `ROLES`, kind of error, "" where unknown) of the first collision of an AV."""
+    collisions, errors = (json.loads(row[name]) for name in ("collision_list", "human_error_list"))
+    found = [c for c in collisions if c["collider_is_av"] or c["victim_is_av"]]
+    first = min((c for c in found if c["kind"] != "insertion"), key=lambda c: float(c["time"]))
+    if not first["human_error_involved"]:
+        return "nobody", ""
+    pair = {first["collider"]: "collider", first["victim"]: "victim"}
+    erred = [(time, kind, who) for kind, who, time in errors if who in pair and time <= first["time"]]
+    if not erred:
+        return "ahead", ""
+    _, kind, who = max(erred)
+    return pair[who], kind
+
+
+def roles(policy: str, rows: Sequence[Row]) -> list[str]:
+    """How often an AV's collision came about in which way, and by which errors most."""
+    found = [who_erred(row) for row in rows if hit(row)]
+    by_role, by_kind = Counter(role for role, _ in found), Counter(kind for _, kind in found if kind)
+    kinds = ", ".join(f"{count} {kind}" for kind, count in by_kind.most_common())
+    return [policy, str(len(found)), *(str(by_role[role]) for role in ROLES), kinds]
+
+
+def tables(found: Mapping[str, Mapping[tuple[str, str, int], Row]]) -> list[str]:
+    """All tables of the page."""
+    lines = []
+    for demand in DEMANDS:
+        of = {p: {k[1:]: row for k, row in rows.items() if k[0] == demand} for p, rows in found.items()}
+        lines += [f"### {demand}", "", markdown_row(COLUMNS), markdown_row(["---"] * len(COLUMNS))]
+        lines += [markdown_row(line(policy, rows, of[IDM])) for policy, rows in of.items()]
+        lines.append("")
+    heads = ("policy", *NEAR.values())
+    lines += ["### Near-misses of AVs per AV-hour", "", markdown_row(heads)]
+    lines += [markdown_row(["---"] * len(heads))]
+    lines += [markdown_row(near(policy, [*rows.values()])) for policy, rows in found.items()]
+    heads = ("policy", "first collisions of an AV", *ROLES.values(), "kinds, of both who collided")
+    lines += ["", "### Who erred in front of whom", "", markdown_row(heads)]
+    lines += [markdown_row(["---"] * len(heads))]
+    return lines + [markdown_row(roles(policy, [*rows.values()])) for policy, rows in found.items()]
+
+
+def draw(found: Mapping[str, Mapping[tuple[str, str, int], Row]], path: Path) -> str:
+    """Share of episodes with an AV in a collision, a panel per demand (Markdown)."""
+    panels: dict[str, dict[str, dict[str, statistics.Figure]]] = {}
+    for demand in DEMANDS:
+        arms = panels[f"an AV in a collision, {demand}"] = {}
+        for policy, rows in found.items():
+            of = {w: [hit(r) for k, r in rows.items() if k[:2] == (demand, w)] for w in WORLDS}
+            arms[policy] = {w: statistics.share(sum(hits), len(hits)) for w, hits in of.items()}
+    picture(path, panels, percent=[*panels])
+    return f"![episodes with an AV in a collision]({path.name})"
+
+
+def main() -> None:
+    """Drive what is missing, then fill the page."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--episodes", type=int, default=20, help="a world and demand")
+    parser.add_argument("--policy", nargs="+", default=list(POLICIES))
+    parser.add_argument("--runs", type=Path, default=Path("runs/humans_policies"))
+    parser.add_argument("--workers", default="2")
+    parser.add_argument("--page", type=Path, default=PAGE)
+    args = parser.parse_args()
+    policies = list(dict.fromkeys([IDM, *args.policy]))
+    seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + args.episodes)
+    for first in seeds[::BLOCK]:
+        for policy in policies:
+            drive(policy, range(first, min(first + BLOCK, seeds.stop)), args.runs, args.workers)
+    found = read(args.runs, policies, seeds)
+    found = {policy: found[policy] for policy in (*POLICIES, *policies) if policy in found}
+    shown = draw(found, args.page.with_name("humans_policies.png"))
+    fill(args.page, "policies", ["", shown, "", *tables(found)])
+    print("\n".join(tables(found)))
+
+
+if __name__ == "__main__":
+    main()

@@ -149,15 +149,18 @@ def tables(found: Mapping[str, Mapping[tuple[str, str, int], Row]]) -> list[str]
 
 
 def draw(found: Mapping[str, Mapping[tuple[str, str, int], Row]], path: Path) -> str:
-    """Share of episodes with an AV in a collision, a panel per demand (Markdown)."""
+    """Shares of episodes with an AV in a collision, and with one that an AV caused, by policy (Markdown)."""
     panels: dict[str, dict[str, dict[str, statistics.Figure]]] = {}
-    for demand in DEMANDS:
-        arms = panels[f"an AV in a collision, {demand}"] = {}
-        for policy, rows in found.items():
-            of = {w: [hit(r) for k, r in rows.items() if k[:2] == (demand, w)] for w in WORLDS}
-            arms[policy] = {w: statistics.share(sum(hits), len(hits)) for w, hits in of.items()}
+    for title, name in (
+        ("episodes with an AV in a collision", "av_involved_collisions"),
+        ("episodes with a collision that an AV caused", "av_caused_collisions"),
+    ):
+        arms = panels[title] = {}
+        for demand in DEMANDS:
+            of = {p: [bool(r[name]) for k, r in rows.items() if k[0] == demand] for p, rows in found.items()}
+            arms[demand] = {policy: statistics.share(sum(hits), len(hits)) for policy, hits in of.items()}
     picture(path, panels, percent=[*panels])
-    return f"![episodes with an AV in a collision]({path.name})"
+    return f"![who is in collisions]({path.name})"
 
 
 def main() -> None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from conftest import Start, vehicle
 
 import cosim
+from cosim.errors import BadInput
 from cosim.geometry import boxes, overlapping_pairs
 from cosim.scenario import Scenario, load
 from cosim.simulation.sumo import SumoSimulator
@@ -100,6 +103,24 @@ def test_a_command_for_a_car_that_is_not_there_says_so(start: Start) -> None:
     worker = start([vehicle("a", "av", 100.0)])
     (receipts,), _ = drive(worker, [Command("ghost", 20.0, 0, HOLD)])
     assert receipts == (Receipt("ghost", False, "not on the road"),)
+
+
+def test_an_av_that_nobody_commands_keeps_the_headway_that_its_policy_names(start: Start) -> None:
+    cars = [vehicle(f"leader{lane}", "av", 150.0, lane, speed=10.0) for lane in (0, 1)]  # nobody overtakes
+    slow = [Command(f"leader{lane}", 10.0, 0, HOLD) for lane in (0, 1)]
+    gaps = []  # m, bumper to bumper
+    for headway in ("0.8", "2.2"):
+        simulator = partial(SumoSimulator, av_parameters={"tau": headway})
+        worker = start([*cars, vehicle("a", "av", 110.0, speed=10.0)], simulator)
+        _, frames = drive(worker, slow, 50)
+        gaps.append(of(frames, "leader0", "x")[-1] - of(frames, "a", "x")[-1] - 5.0)
+    free = 1.0 - (10.0 / 25.0) ** 4  # IDM's gap at a constant speed is wider by the root of it
+    assert gaps == pytest.approx([(2.0 + 8.0) / np.sqrt(free), (2.0 + 22.0) / np.sqrt(free)], abs=0.5)
+
+
+def test_an_av_parameter_that_is_no_number_is_refused_by_name(start: Start) -> None:
+    with pytest.raises(BadInput, match=r"av_parameters\.tau='soon': must be a number above 0"):
+        start([vehicle("a", "av", 100.0)], partial(SumoSimulator, av_parameters={"tau": "soon"}))
 
 
 def test_unguarded_the_agent_can_run_into_a_stopped_car_and_is_blamed_once(start: Start) -> None:

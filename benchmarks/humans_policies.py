@@ -19,7 +19,7 @@ from pathlib import Path
 from benchmarks.error_levels import fill
 from benchmarks.humans import BLOCK, IDM, LEVEL, PAGE
 from benchmarks.tables import markdown_row, picture
-from benchmarks.worlds import WORLDS
+from benchmarks.worlds import WITH_MISSION, WORLDS
 from cosim.cli.main import main as cosim
 from cosim.report import run_folder, statistics, wording
 from cosim.report.figures import INCIDENCES, Row
@@ -41,6 +41,10 @@ COLUMNS = (
     *("policy", *WORLDS, "together", "less idm, pp", "p", "AV-caused", "let in"),
     *("distance of all, m", "of AVs, m", "hard brakings of AVs"),
 )
+ALTRUISTS = {
+    "altruist-rule": "idm",
+    "vfn-p-demonstrated": "vfn-p-egoistic",
+}  # altruists: egoists
 # who erred, of the first collision of an AV -> the column's head
 ROLES = {
     "collider": "an erring human drives into an AV",
@@ -48,6 +52,9 @@ ROLES = {
     "ahead": "one of both is behind an erring human",
     "nobody": "nobody erred",
 }
+
+
+Key = tuple[str, str, int]  # demand, world, seed
 
 
 def drive(policy: str, seeds: range, runs: Path, workers: str) -> None:
@@ -61,9 +68,9 @@ def drive(policy: str, seeds: range, runs: Path, workers: str) -> None:
         raise SystemExit(code)
 
 
-def read(runs: Path, policies: Sequence[str], seeds: range) -> dict[str, dict[tuple[str, str, int], Row]]:
-    """Policy -> (demand, world, seed) -> row."""
-    found: dict[str, dict[tuple[str, str, int], Row]] = {}
+def read(runs: Path, policies: Sequence[str], seeds: range) -> dict[str, dict[Key, Row]]:
+    """Policy -> rows."""
+    found: dict[str, dict[Key, Row]] = {}
     for policy in policies:
         folders = [runs / f"{policy}-{first}" for first in seeds[::BLOCK]]
         rows = [row for folder in folders for row in run_folder.read(folder).rows if row["status"] == OK]
@@ -130,7 +137,26 @@ def roles(policy: str, rows: Sequence[Row]) -> list[str]:
     return [policy, str(len(found)), *(str(by_role[role]) for role in ROLES), kinds]
 
 
-def tables(found: Mapping[str, Mapping[tuple[str, str, int], Row]]) -> list[str]:
+def headline(altruist: str, egoist: str, world: str, found: Mapping[str, Mapping[Key, Row]]) -> list[str]:
+    """T's figure 6 in one contested world: altruists against egoists, on equal seeds."""
+    of = [{k[2]: r for k, r in found[p].items() if k[:2] == ("contested", world)} for p in (altruist, egoist)]
+    seeds = sorted(of[0].keys() & of[1].keys())
+    kind, selfish = ([side[seed] for seed in seeds] for side in of)
+
+    def less(name: str) -> list[str]:
+        now, then = ([bool(row[name]) for row in side] for side in (kind, selfish))
+        p = statistics.mcnemar(*statistics.discordant(then, now))
+        change = statistics.paired_share(then, now).text(0, 100.0)
+        return [f"{sum(now)}, {sum(then)}: {change} points, p {p:.2g}"]
+
+    before, after = ([float(row["dt_mean_m"]) for row in side] for side in (selfish, kind))
+    return [
+        *(world, altruist, egoist, str(len(seeds)), *less("crashed"), *less("mission_success")),
+        statistics.paired_mean(before, after).text(0),
+    ]
+
+
+def tables(found: Mapping[str, Mapping[Key, Row]]) -> list[str]:
     """All tables of the page."""
     lines = []
     for demand in DEMANDS:
@@ -138,17 +164,22 @@ def tables(found: Mapping[str, Mapping[tuple[str, str, int], Row]]) -> list[str]
         lines += [f"### {demand}", "", markdown_row(COLUMNS), markdown_row(["---"] * len(COLUMNS))]
         lines += [markdown_row(line(policy, rows, of[IDM])) for policy, rows in of.items()]
         lines.append("")
-    heads = ("policy", *NEAR.values())
+    heads: Sequence[str] = ("policy", *NEAR.values())
     lines += ["### Near-misses of AVs per AV-hour", "", markdown_row(heads)]
     lines += [markdown_row(["---"] * len(heads))]
     lines += [markdown_row(near(policy, [*rows.values()])) for policy, rows in found.items()]
     heads = ("policy", "first collisions of an AV", *ROLES.values(), "kinds, of both who collided")
     lines += ["", "### Who erred in front of whom", "", markdown_row(heads)]
     lines += [markdown_row(["---"] * len(heads))]
-    return lines + [markdown_row(roles(policy, [*rows.values()])) for policy, rows in found.items()]
+    lines += [markdown_row(roles(policy, [*rows.values()])) for policy, rows in found.items()]
+    heads = ("world", "altruists", "egoists", "pairs", "crashed", "let in", "distance of all: more m")
+    lines += ["", "### Altruists against egoists, contested", "", markdown_row(heads)]
+    lines += [markdown_row(["---"] * len(heads))]
+    both = [pair for pair in ALTRUISTS.items() if found.keys() >= {*pair}]
+    return lines + [markdown_row(headline(*pair, w, found)) for w in WITH_MISSION for pair in both]
 
 
-def draw(found: Mapping[str, Mapping[tuple[str, str, int], Row]], path: Path) -> str:
+def draw(found: Mapping[str, Mapping[Key, Row]], path: Path) -> str:
     """Shares of episodes with an AV in a collision, and with one that an AV caused, by policy (Markdown)."""
     panels: dict[str, dict[str, dict[str, statistics.Figure]]] = {}
     for title, name in (

@@ -1,12 +1,13 @@
 """At which phi AVs begin to yield, and at which one their reward begins to ask for it.
 
-    python -m benchmarks.turn [--policy vfn-p] [--episodes 10] [--workers 2]
+    python -m benchmarks.turn [--policy vfn-p] [--episodes 10] [--errors none] [--out PAGE] [--workers 2]
 
 One network drives every contested world with a mission vehicle on equal test seeds at phi 0, 15, ... 90
-degrees, preset `lawful`, without human errors. The turn is the angle at which the share of mission vehicles
-that are let in crosses half of what it changes from 0 to 90 degrees. The reward is cos(phi) own + sin(phi)
-others' (P, equation 6), so that of two ways of driving the kinder one earns more from the angle on at which
-tan(phi) = own reward lost / others' reward gained: the break-even of the drives at 0 and at 90 degrees.
+degrees, preset `lawful`, without human errors or (with a page and rows of its own) with them. The turn is the
+angle at which the share of mission vehicles that are let in crosses half of what it changes from 0 to 90
+degrees. The reward is cos(phi) own + sin(phi) others' (P, equation 6), so that of two ways of driving the
+kinder one earns more from the angle on at which tan(phi) = own reward lost / others' reward gained: the
+break-even of the drives at 0 and at 90 degrees.
 Rows are kept in --rows, and not driven twice; those of other weights under the policy's name are driven anew.
 """
 
@@ -39,14 +40,14 @@ from cosim.learning.prediction_data import spread
 from cosim.policies import make
 from cosim.report.statistics import CONFIDENCE, RESAMPLES, Figure, holm, mean, paired_mean, share, signed_rank
 from cosim.scenario.episode_id import EpisodeId
+from cosim.scenario.human_errors import NONE
 from cosim.scenario.manifest import digests
 from cosim.seeding import FIRST_TEST_SEED
 from cosim.types import Floats, Ints
 from cosim.workers.engines import LocalEngine
 from cosim.workers.tasks import Progress, Task
 
-PAGE, ROWS = Path("docs/results/turn.md"), Path("docs/results/data/turn.csv")
-PICTURE = "turn.svg"
+RESULTS = Path("docs/results")
 DEMAND = "contested"
 PHIS = (0.0, 15.0, 30.0, 45.0, 60.0, 75.0, 90.0)  # degrees
 COLUMNS = (
@@ -231,26 +232,31 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=10)
     parser.add_argument("--seeds", type=seeds_of, help="in place of --episodes of the test seeds")
     parser.add_argument("--worlds", nargs="+", default=list(WITH_MISSION), choices=WITH_MISSION)
-    parser.add_argument("--rows", type=Path, default=ROWS)
+    parser.add_argument("--errors", default=NONE, help="of human drivers: none, field, stress or a file")
+    parser.add_argument("--rows", type=Path, help="default docs/results/data/turn.csv")
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--out", type=Path, default=PAGE)
+    parser.add_argument("--out", type=Path, help="default docs/results/turn.md, with errors turn_ERRORS.md")
     args = parser.parse_args()
+    name = "turn" if args.errors == NONE else f"turn_{Path(args.errors).stem}"
+    out, kept = args.out or RESULTS / f"{name}.md", args.rows or RESULTS / "data" / f"{name}.csv"
     seeds = args.seeds or range(FIRST_TEST_SEED, FIRST_TEST_SEED + args.episodes)
     asked = f"--seeds {seeds.start}:{seeds.stop}" if args.seeds else f"--episodes {args.episodes}"
+    asked += "" if args.errors == NONE else f" --errors {args.errors}"
     weights = weights_of(args.policy)
-    done = {k: d for k, d in read(args.rows).items() if d.policy != args.policy or d.weights == weights}
+    done = {k: d for k, d in read(kept).items() if d.policy != args.policy or d.weights == weights}
     for world in args.worlds:
+        matrix: Any = ([world], [DEMAND], [], [args.policy])
         cases = [
             case
             for phi in PHIS
-            for _, case in planned([world], [DEMAND], [], [args.policy], seeds, phi).cases()
+            for _, case in planned(*matrix, seeds, phi, errors=args.errors).cases()
             if (case.policy, world, phi, case.seed) not in done
         ]
         tasks = [Task(case.key, case.cell, (case,)) for case in cases]
         for drive in spread(LocalEngine(Earning, workers=args.workers), tasks, world):
             key = (drive.policy, drive.world, drive.phi, drive.seed)
             done[key] = replace(drive, weights=weights)
-        write_csv(args.rows, [asdict(done[key]) for key in sorted(done)])
+        write_csv(kept, [asdict(done[key]) for key in sorted(done)])
     drives = {
         world: [d for d in done.values() if d.world == world and d.policy == args.policy and d.seed in seeds]
         for world in args.worlds
@@ -259,19 +265,19 @@ def main() -> None:
         *("# At which phi the AVs begin to yield", ""),
         f"Made by `python -m benchmarks.turn --policy {args.policy} {asked}`: "
         f"seeds {seeds.start}:{seeds.stop},",
-        f"`{DEMAND}`, moderate drivers (`lc2013`), errors `none`, preset `lawful`. Equal seeds at every phi;",
-        "shares with Wilson's, means with bootstrap 95 % intervals. A mission vehicle that is not let in",
-        "counts with the episode's whole duration. Rewards are those of `rewards.yaml`, per AV and decision,",
+        f"`{DEMAND}`, moderate drivers (`lc2013`), errors `{args.errors}`, preset `lawful`. Equal seeds at",
+        "every phi; shares with Wilson's, means with bootstrap 95 % intervals. A mission vehicle that is",
+        "not let in counts with the episode's whole duration. Rewards are those of `rewards.yaml`, per AV and decision,",
         "before they are weighed. p: the step from the phi before, mean difference and Wilcoxon's signed",
         "ranks, over the six steps by Holm's method. Turn: where the share let in crosses the middle between",
         "0 and 90 degrees; break-even: where driving as at 90 degrees begins to earn more than as at 0;",
         "both with bootstrap intervals over seeds.",
-        *("", picture(drives, args.out.parent / PICTURE), ""),
+        *("", picture(drives, out.with_suffix(".svg")), ""),
     ]
     for world, mine in drives.items():
         lines += [f"## {world}", "", *table(mine), "", verdict(mine), ""]
-    write_page(args.out, lines)
-    print(args.out.read_text())
+    write_page(out, lines)
+    print(out.read_text())
 
 
 if __name__ == "__main__":

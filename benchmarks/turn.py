@@ -20,6 +20,7 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -245,11 +246,11 @@ def main() -> None:
     weights = weights_of(args.policy)
     done = {k: d for k, d in read(kept).items() if d.policy != args.policy or d.weights == weights}
     for world in args.worlds:
-        matrix: Any = ([world], [DEMAND], [], [args.policy])
+        plan = partial(planned, [world], [DEMAND], [], [args.policy], seeds, errors=args.errors)
         cases = [
             case
             for phi in PHIS
-            for _, case in planned(*matrix, seeds, phi, errors=args.errors).cases()
+            for _, case in plan(phi).cases()
             if (case.policy, world, phi, case.seed) not in done
         ]
         tasks = [Task(case.key, case.cell, (case,)) for case in cases]
@@ -267,11 +268,11 @@ def main() -> None:
         f"seeds {seeds.start}:{seeds.stop},",
         f"`{DEMAND}`, moderate drivers (`lc2013`), errors `{args.errors}`, preset `lawful`. Equal seeds at",
         "every phi; shares with Wilson's, means with bootstrap 95 % intervals. A mission vehicle that is",
-        "not let in counts with the episode's whole duration. Rewards are those of `rewards.yaml`, per AV and decision,",
-        "before they are weighed. p: the step from the phi before, mean difference and Wilcoxon's signed",
-        "ranks, over the six steps by Holm's method. Turn: where the share let in crosses the middle between",
-        "0 and 90 degrees; break-even: where driving as at 90 degrees begins to earn more than as at 0;",
-        "both with bootstrap intervals over seeds.",
+        "not let in counts with the episode's whole duration. Rewards are those of `rewards.yaml`, per AV",
+        "and decision, before they are weighed. p: the step from the phi before, mean difference and",
+        "Wilcoxon's signed ranks, over the six steps by Holm's method. Turn: where the share let in crosses",
+        "the middle between 0 and 90 degrees; break-even: where driving as at 90 degrees begins to earn more",
+        "than as at 0; both with bootstrap intervals over seeds.",
         *("", picture(drives, out.with_suffix(".svg")), ""),
     ]
     for world, mine in drives.items():

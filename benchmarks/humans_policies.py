@@ -23,12 +23,16 @@ from benchmarks.worlds import WITH_MISSION, WORLDS
 from cosim.cli.main import main as cosim
 from cosim.report import run_folder, statistics, wording
 from cosim.report.figures import INCIDENCES, Row
+from cosim.scenario.policy_name import read as read_name
 from cosim.seeding import FIRST_TEST_SEED
 from cosim.types import Preset
 from cosim.workers.tasks import OK
 
+CAR = "car-alone=benchmarks/humans.py:Accelerate"  # it always asks for more speed: the rest is the car's own
+    "car-alone=benchmarks/humans.py:Accelerate"  # asks for more speed, always: what is left is the car's own
+)
 POLICIES = (
-    *("keep-lane", "idm", "idm-1.5", "idm-2.2", "altruist-rule", "vfn-p", "vfn", "vfn-p-demonstrated"),
+    *(CAR, "keep-lane", "idm", "idm-1.5", "idm-2.2", "altruist-rule", "vfn-p", "vfn", "vfn-p-demonstrated"),
     *("vfn-demonstrated", "vfn-p-egoistic", "safe-dqn", "conv3d-dqn", "conv3d-a2c", "conv2d-dqn"),
 )
 DEMANDS = ("dense", "contested")
@@ -54,6 +58,11 @@ ROLES = {
 }
 
 
+def label(policy: str) -> str:
+    """What tables and folders call it."""
+    return read_name(policy).label
+
+
 Key = tuple[str, str, int]  # demand, world, seed
 
 
@@ -63,7 +72,8 @@ def drive(policy: str, seeds: range, runs: Path, workers: str) -> None:
     matrix += [word for name in DEMANDS for word in ("--demand", name)]
     matrix += ["--policy", policy, "--preset", Preset.LAWFUL, "--errors", LEVEL]
     running = ["--seeds", f"{seeds.start}:{seeds.stop}", "--no-report", "--workers", workers, "--resume"]
-    code = cosim(["evaluate", *matrix, *running, "--out", str(runs / f"{policy}-{seeds.start}")])
+    out = runs / f"{label(policy)}-{seeds.start}"
+    code = cosim(["evaluate", *matrix, *running, "--out", str(out)])
     if code:
         raise SystemExit(code)
 
@@ -72,9 +82,9 @@ def read(runs: Path, policies: Sequence[str], seeds: range) -> dict[str, dict[Ke
     """Policy -> rows."""
     found: dict[str, dict[Key, Row]] = {}
     for policy in policies:
-        folders = [runs / f"{policy}-{first}" for first in seeds[::BLOCK]]
+        folders = [runs / f"{label(policy)}-{first}" for first in seeds[::BLOCK]]
         rows = [row for folder in folders for row in run_folder.read(folder).rows if row["status"] == OK]
-        found[policy] = {(str(r["demand"]), str(r["scenario"]), int(r["seed"])): r for r in rows}
+        found[label(policy)] = {(str(r["demand"]), str(r["scenario"]), int(r["seed"])): r for r in rows}
     return found
 
 
@@ -211,7 +221,7 @@ def main() -> None:
         for policy in policies:
             drive(policy, range(first, min(first + BLOCK, seeds.stop)), args.runs, args.workers)
     found = read(args.runs, policies, seeds)
-    found = {policy: found[policy] for policy in (*POLICIES, *policies) if policy in found}
+    found = {name: found[name] for name in map(label, (*POLICIES, *policies)) if name in found}
     shown = draw(found, args.page.with_name("humans_policies.png"))
     fill(args.page, "policies", ["", shown, "", *tables(found)])
     print("\n".join(tables(found)))

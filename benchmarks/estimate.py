@@ -34,9 +34,9 @@ from cosim.seeding import FIRST_TEST_SEED, TUNING_SEEDS
 from cosim.workers.tasks import OK
 
 Array = npt.NDArray[np.float64]
-FIRST = 1.0  # errors a tilted episode that the first tilts aim at, if none ended the trials
+FIRST = 0.4  # errors a tilted episode that the first tilts aim at: few, so that the rare ones find room
 MEET = 0.75  # share of them that meets an AV first
-FOLLOW = 0.5  # second errors that they aim at, where a first one has begun
+FOLLOW = 8.0  # second errors, if none ended the trials, where a first one has begun: both must coincide
 BALANCED = 2  # rounds in which all kinds are made equally frequent, before crashes are looked at
 DURING = 10.0  # at first the second error has a tenth of the time and of the drivers of the first
 PAGE = Path("docs/results/estimate.md")

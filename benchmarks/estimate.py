@@ -36,7 +36,8 @@ from cosim.workers.tasks import OK
 Array = npt.NDArray[np.float64]
 FIRST = 0.4  # errors a tilted episode that the first tilts aim at: few, so that the rare ones find room
 MEET = 0.75  # share of them that meets an AV first
-FOLLOW = 8.0  # second errors, if none ended the trials, where a first one has begun: both must coincide
+FOLLOW = 0.3  # second errors, if none ended the trials, where a first one has begun
+FOLLOWING = ("inattention", "hard_braking")  # what meets another error within seconds: a lapse, or before one
 BALANCED = 2  # rounds in which all kinds are made equally frequent, before crashes are looked at
 DURING = 10.0  # at first the second error has a tenth of the time and of the drivers of the first
 PAGE = Path("docs/results/estimate.md")
@@ -77,21 +78,24 @@ def trials(rows: Sequence[Row]) -> dict[str, Array]:
 
 
 def balanced(rows: Sequence[Row], before: Tilt) -> Tilt:
-    """`FIRST` errors an episode, `MEET` of them meeting an AV, `FOLLOW` second ones; of each every kind as
-    often as the others."""
+    """`FIRST` errors an episode, `MEET` of them meeting an AV, every kind as often as the next, and `FOLLOW`
+    second ones of the kinds `FOLLOWING`."""
     factors: dict[str, float] = {}
     found = trials(rows)
     begun = np.sum([b for n, (b, _) in found.items() if not n.endswith(SECOND)], 0) > 0
     for ending, aim in (("", FIRST * MEET), (OTHER, FIRST * (1.0 - MEET)), (SECOND, FOLLOW)):
         of = begun if ending == SECOND else np.ones(len(rows), bool)  # episodes that could show them
-        expected = {n: e[of].mean() for n, (_, e) in found.items() if ending == ending_of(n)}
+        names = [n for n in found if ending == ending_of(n)]
+        if ending == SECOND:
+            names = [n for n in names if n.removesuffix(SECOND) in FOLLOWING]
+        expected = {n: found[n][1][of].mean() for n in names}
         factors |= {n: max(aim / len(expected) / e, 1.0) for n, e in expected.items() if e > 0.0}
-    return replace(before, factors=factors)
+    return replace(before, factors=factors, during=1.0)
 
 
 def ending_of(name: str) -> str:
     """What of a `cosim.scenario.tilt.case` follows the kind."""
-    return "." + name.partition(".")[2] if "." in name else ""
+    return "".join(name.partition(".")[1:])
 
 
 def crossed(rows: Sequence[Row], before: Tilt) -> Tilt:

@@ -43,6 +43,7 @@ COLUMNS = (
     *("policy", *WORLDS, "together", "less idm, pp", "p", "AV-caused", "let in"),
     *("distance of all, m", "of AVs, m", "hard brakings of AVs"),
 )
+RECENT = {"stalled_car": 135.0}  # s an error may have a part in what follows, at most; others 15
 ALTRUISTS = {
     "altruist-rule": "idm",
     "vfn-p-demonstrated": "vfn-p-egoistic",
@@ -130,7 +131,11 @@ def who_erred(row: Row) -> tuple[str, str]:
     if not first["human_error_involved"]:
         return "nobody", ""
     pair = {first["collider"]: "collider", first["victim"]: "victim"}
-    erred = [(time, kind, who) for kind, who, time in errors if who in pair and time <= first["time"]]
+    erred = [
+        (time, kind, who)
+        for kind, who, time in errors
+        if who in pair and 0.0 <= first["time"] - time <= RECENT.get(kind, 15.0)
+    ]
     if not erred:
         return "ahead", ""
     _, kind, who = max(erred)

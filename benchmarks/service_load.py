@@ -12,10 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
 import shutil
-import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -26,6 +23,7 @@ from typing import Any
 from playwright.sync_api import Page, sync_playwright
 
 from cosim.errors import CosimError
+from tests.service.servers import Server
 
 DECISION = 0.4  # s
 COUNT = """() => {
@@ -55,37 +53,26 @@ def main() -> None:
     chromium = shutil.which("chromium") or shutil.which("google-chrome")
     if chromium is None:
         raise SystemExit("no Chromium is installed: apt-get install chromium")
-    with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
-        log = Path(folder, "log")
-        with log.open("w") as file:
-            command = [
-                sys.executable,
-                "-m",
-                "cosim.cli.main",
-                "serve",
-                "--port",
-                "0",
-                "--data",
-                f"{folder}/data",
-            ]
-            server = subprocess.Popen(command, stderr=file)
-        stop, wrong = threading.Event(), list[str]()
+    stop, wrong = threading.Event(), list[str]()
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        sync_playwright() as playwright,
+        Server(Path(folder, "data")) as server,
+    ):
         try:
-            url = _address(log, server)
+            url = server.url
             threads = [threading.Thread(target=_program, args=(url, args.policy, stop, wrong)) for _ in "ab"]
             for thread in threads:
                 thread.start()
             browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
             pages = [_page(browser.new_context().new_page(), url, args.policy, wrong) for _ in "ab"]
-            _measure(pages, server.pid, log, wrong, args.minutes)
+            _measure(pages, server.process.pid, server.log, wrong, args.minutes)
             stop.set()
             browser.close()
             for thread in threads:
                 thread.join()
         finally:
             stop.set()
-            server.terminate()
-            server.wait(timeout=60.0)
 
 
 def _measure(pages: list[Page], pid: int, log: Path, wrong: list[str], minutes: float) -> None:
@@ -166,17 +153,6 @@ def _program(url: str, policy: str, stop: threading.Event, wrong: list[str]) -> 
         ask("DELETE", path)
     except (OSError, CosimError, ValueError) as error:
         wrong.append(f"program: {error}")
-
-
-def _address(log: Path, server: subprocess.Popen[bytes]) -> str:
-    """Where it serves, once it does."""
-    while (
-        not (found := re.search(r"http://\S+", log.read_text())) or "startup complete" not in log.read_text()
-    ):
-        if server.poll() is not None:
-            raise SystemExit(log.read_text())
-        time.sleep(0.1)
-    return found[0]
 
 
 def _memory(pid: int) -> tuple[float, float]:

@@ -72,14 +72,7 @@ class Outcome:
 
 def error_of(collision: Collision, begun: Sequence[HumanError]) -> HumanError | None:
     """The last error with a part in it: of one of both, or of somebody before one of them."""
-    from cosim.simulation.human_errors import REMEMBERED  # libsumo: in the worker's process alone
-
-    pair = collision.collider, collision.victim
-    mine = [
-        e
-        for e in begun
-        if e.time <= collision.time <= e.until + REMEMBERED and (e.who in pair or e.near in pair)
-    ]
+    mine = [e for e in begun if e.had_a_part(collision)]
     return max(mine, key=lambda e: e.time, default=None)
 
 

@@ -166,6 +166,9 @@ class Intervention:
     reason: str  # one of `cosim.control.REASONS`
 
 
+REMEMBERED = 5.0  # s after its end in which a human error still has a part in a collision
+
+
 @dataclass(frozen=True, slots=True)
 class HumanError:
     """A human driver, or a person on foot, began to err (docs/definitions.md, Human errors)."""
@@ -176,6 +179,12 @@ class HumanError:
     until: float  # s, when it ends as planned
     what: str  # in words, of which the driver is the subject
     near: str = ""  # whom it meets first: the vehicle behind, beside or with the right of way
+
+    def had_a_part(self, collision: Collision) -> bool:
+        """Whether one of both erred or met who did, until the collision or `REMEMBERED` s before."""
+        pair = collision.collider, collision.victim
+        in_time = self.time <= collision.time <= self.until + REMEMBERED
+        return in_time and (self.who in pair or self.near in pair)
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cosim.files import cannot, whole
-from cosim.types import EpisodeResult, Metric
+from cosim.types import Collision, EpisodeResult, HumanError, Metric
 
 # Columns that the table of an episode shows -> the measure of them that reports and comparisons show first.
 FIRST = {
@@ -64,7 +64,7 @@ def table(result: EpisodeResult, *, first: bool = True) -> str:
     lines += near_miss_lines(result) + law_lines(result)
     for c in result.collisions:
         who = f"{c.kind}, {'AV-caused' if c.av_caused else 'not AV-caused'}"
-        who += ", a human had erred" * c.human_error_involved
+        who += _error(c, result.errors_begun)
         lines.append(
             f"  collision at {_clock(c.time, result)}: {c.collider} hit {c.victim} on {c.lane} ({who})"
         )
@@ -74,6 +74,15 @@ def table(result: EpisodeResult, *, first: bool = True) -> str:
     times = ", ".join(f"{name.removesuffix('_s')} {value:.2f} s" for name, value in result.timings.items())
     lines.append(f"  time spent               {times}")
     return "\n".join(lines)
+
+
+def _error(collision: Collision, begun: Sequence[HumanError]) -> str:
+    """The last human error with a part in a collision, in words; nothing where there is none."""
+    mine = [error for error in begun if error.had_a_part(collision)]
+    if not mine:
+        return ", a human had erred" * collision.human_error_involved
+    last = max(mine, key=lambda error: error.time)
+    return f"; {collision.time - last.time:.1f} s before: {last.who} {last.what}"
 
 
 def near_miss_lines(result: EpisodeResult) -> list[str]:

@@ -16,7 +16,7 @@ from cosim.simulation.backend import sumo
 from cosim.simulation.convert import PERSON, Body, may_change
 from cosim.simulation.drivers import Drivers
 from cosim.simulation.mobil import LEFT, RIGHT, route_allows
-from cosim.types import Bools, Collision, HumanError, Kind
+from cosim.types import REMEMBERED, Bools, Collision, HumanError, Kind
 
 # SUMO's speed mode (Change_Vehicle_State): what an erring driver no longer heeds.
 SAFE_SPEED, MAX_ACCEL, MAX_DECEL, RIGHT_OF_WAY, RED_LIGHT = 1, 2, 4, 8, 16
@@ -35,7 +35,6 @@ PASSES = 10.0  # s at most for driving through a junction
 HOLDS = 4.0  # s that a forced lane change may take
 NEAR = 60.0  # m: within that of an AV errors may be tilted
 MEET_ANYBODY = ("red_light", "step_out")  # kinds of which nobody knows before whom they meet
-REMEMBERED = 5.0  # s after its end in which an error still has a part in a collision
 
 # Kinds drawn every second for every driver; the others belong to a manoeuvre.
 EVERY_SECOND = ("inattention", "hard_braking", "cut_in", "aborted_cut_in", "stalled_car")

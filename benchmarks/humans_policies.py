@@ -31,7 +31,7 @@ from cosim.workers.tasks import OK
 CAR = "car-alone=benchmarks/humans.py:Accelerate"  # it always asks for more speed: the rest is the car's own
 POLICIES = (
     *(CAR, "keep-lane", "idm", "idm-1.5", "idm-2.2", "altruist-rule", "vfn-p", "vfn", "vfn-p-demonstrated"),
-    *("vfn-demonstrated", "vfn-p-egoistic", "safe-dqn", "conv3d-dqn", "conv3d-a2c", "conv2d-dqn"),
+    *("vfn-p-egoistic", "safe-dqn", "conv3d-dqn", "conv3d-a2c", "conv2d-dqn", "vfn-demonstrated"),
 )
 DEMANDS = ("dense", "contested")
 NEAR = {

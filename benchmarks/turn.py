@@ -236,7 +236,7 @@ def main() -> None:
     parser.add_argument("--errors", default=NONE, help="of human drivers: none, field, stress or a file")
     parser.add_argument("--rows", type=Path, help="default docs/results/data/turn.csv")
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--out", type=Path, help="default docs/results/turn.md, with errors turn_ERRORS.md")
+    parser.add_argument("--out", type=Path, help="default docs/results/turn.md, or turn_stress.md")
     args = parser.parse_args()
     name = "turn" if args.errors == NONE else f"turn_{Path(args.errors).stem}"
     out, kept = args.out or RESULTS / f"{name}.md", args.rows or RESULTS / "data" / f"{name}.csv"

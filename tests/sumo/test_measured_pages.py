@@ -30,11 +30,14 @@ def test_every_measured_page_is_rebuilt_and_not_measured_twice(
         measured.make(page, place)
 
 
+AMONG_HUMANS = ("humans.md", "turn_stress.md")  # by commands of their own: docs/reproduction.md
+
+
 def test_every_page_figure_and_picture_of_the_results_is_made_by_make_results() -> None:
     driven = [job.name for job in JOBS] + [learning.NAME]
-    pages = {f"{name}.md" for name in driven} | {"README.md", "humans.md"}  # its table is filled in place
+    pages = {f"{name}.md" for name in driven} | {"README.md", *AMONG_HUMANS}
     pages |= {file for page in measured.PAGES for file in page.files if file.endswith(".md")}
-    tables = {f"data/{name}.csv" for name in driven}
+    tables = {f"data/{name}.csv" for name in (*driven, "avoidable", "turn_stress")}
     tables |= {file for page in measured.PAGES for file in page.files if file.endswith(".csv")}
     shown = {
         str((page.parent / picture).relative_to(RESULTS))

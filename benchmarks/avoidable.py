@@ -32,10 +32,11 @@ from cosim.control import COMFORT, MAX_DECEL
 from cosim.episode import Episode, Hook, Step
 from cosim.files import write_csv
 from cosim.learning.prediction_data import spread
+from cosim.report.result import error_of
 from cosim.report.statistics import share
 from cosim.scenario.episode_id import EpisodeId
 from cosim.seeding import FIRST_TEST_SEED
-from cosim.types import Collision, Command, EpisodeResult, HumanError, Snapshot
+from cosim.types import Command, EpisodeResult, Snapshot
 from cosim.workers.engines import LocalEngine
 from cosim.workers.tasks import Progress, Task
 
@@ -68,12 +69,6 @@ class Outcome:
     warned: float = 0.0  # s from its beginning to the collision
     answer: str = ""  # of ANSWERS, that would have avoided it; "": none
     left: float = 0.0  # s before the collision, at which that answer was the first that avoided it
-
-
-def error_of(collision: Collision, begun: Sequence[HumanError]) -> HumanError | None:
-    """The last error with a part in it: of one of both, or of somebody before one of them."""
-    mine = [e for e in begun if e.had_a_part(collision)]
-    return max(mine, key=lambda e: e.time, default=None)
 
 
 class Forks(Hook):

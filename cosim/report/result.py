@@ -76,12 +76,16 @@ def table(result: EpisodeResult, *, first: bool = True) -> str:
     return "\n".join(lines)
 
 
+def error_of(collision: Collision, begun: Sequence[HumanError]) -> HumanError | None:
+    """The last error with a part in it: of one of both, or of somebody before one of them."""
+    return max((e for e in begun if e.had_a_part(collision)), key=lambda e: e.time, default=None)
+
+
 def _error(collision: Collision, begun: Sequence[HumanError]) -> str:
     """The last human error with a part in a collision, in words; nothing where there is none."""
-    mine = [error for error in begun if error.had_a_part(collision)]
-    if not mine:
+    last = error_of(collision, begun)
+    if last is None:
         return ", a human had erred" * collision.human_error_involved
-    last = max(mine, key=lambda error: error.time)
     return f"; {collision.time - last.time:.1f} s before: {last.who} {last.what}"
 
 

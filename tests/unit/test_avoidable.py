@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from benchmarks.avoidable import Outcome, error_of, line
+from benchmarks.avoidable import Outcome, line
+from cosim.report.result import error_of
 from cosim.types import Collision, HumanError
 
 

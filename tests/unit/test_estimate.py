@@ -91,6 +91,7 @@ def test_a_tilt_is_written_as_it_is_read() -> None:
     assert found.rate("cut_in", 0.1) == 0.5  # no trial becomes certain
     assert found.rate("cut_in", 0.7) == 0.7
     assert found.rate("red_light", 0.1) == 0.1
+    assert tilt.log_ratio(0.1, 0.1, True) == 0.0
 
 
 def test_a_second_error_has_a_factor_of_its_own_or_that_of_the_first_times_during() -> None:
@@ -101,7 +102,6 @@ def test_a_second_error_has_a_factor_of_its_own_or_that_of_the_first_times_durin
     assert tilt.read("all.second=50").rate("stalled_car", 1e-4, False, True) == pytest.approx(5e-3)
     assert tilt.read("all.second=50").raises("stalled_car")
     assert tilt.case("cut_in", True, True) == tilt.case("cut_in", False, True) == "cut_in.second"
-    assert tilt.log_ratio(0.1, 0.1, True) == 0.0
 
 
 @pytest.mark.parametrize("text", ["cut_in", "cut_in=many", "cut_in=0.5", "untilted=0", "cut_in=nan"])

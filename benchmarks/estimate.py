@@ -1,6 +1,6 @@
 """The tilts of `cosim estimate`, and what its intervals are worth: a toy of known truth, brute force, speed.
 
-    python -m benchmarks.estimate tune --world merge --runs runs/tilts [--episodes 400] [--rounds 4]
+    python -m benchmarks.estimate tune --world merge --runs runs/tilts [--episodes 400 400 3000 3000]
     python -m benchmarks.estimate measure --runs runs/estimate [--worlds merge] [--episodes 4000]
     python -m benchmarks.estimate page --runs runs/estimate [--out PAGE] [--intervals 400]
 
@@ -38,12 +38,14 @@ FIRST = 0.4  # errors a tilted episode that the first tilts aim at: few, so that
 MEET = 0.75  # share of them that meets an AV first
 FOLLOW = 0.3  # second errors, if none ended the trials, where a first one has begun
 FOLLOWING = ("inattention", "hard_braking")  # what meets another error within seconds: a lapse, or before one
+ROUNDS = (400, 400, 3000, 3000)  # episodes: crashes are few, and the first rounds need none
 BALANCED = 2  # rounds in which all kinds are made equally frequent, before crashes are looked at
 DURING = 10.0  # at first the second error has a tenth of the time and of the drivers of the first
 PAGE = Path("docs/results/estimate.md")
 INTERVALS = 400
 REAL = ("exit", "contested", "stress")  # world, demand, errors: AVs crash so often that brute force sees it
 REAL_TILT = Tilt({ALL: 3.0, ALL + OTHER: 2.0}, 2.0, 0.1)
+FRESH = FIRST_TEST_SEED + 10_000  # of the level `field`: what was driven on seeds before was looked at
 BRUTE, REPETITIONS, EACH = 400, 10, 40  # episodes; estimates, and episodes of each
 TEMPER = 0.5  # power of the weights of crashed episodes: fewer of them decide everything
 KEPT = 0.2  # of the tilt before, in units of one crashed episode
@@ -115,11 +117,13 @@ def crossed(rows: Sequence[Row], before: Tilt) -> Tilt:
     return replace(before, factors=factors)
 
 
-def tune(world: str, demand: str, errors: str, runs: Path, episodes: int, rounds: int, workers: int) -> Tilt:
-    """The tilt after the last round; every round has seeds of its own."""
+def tune(world: str, demand: str, errors: str, runs: Path, episodes: Sequence[int], workers: int) -> Tilt:
+    """The tilt after the last round; every round has so many episodes, on seeds of its own."""
     tilt = Tilt({ALL: 2.0, ALL + OTHER: 2.0}, DURING)
-    for k in range(rounds):
-        seeds = range(TUNING_SEEDS.start + k * episodes, TUNING_SEEDS.start + (k + 1) * episodes)
+    first = TUNING_SEEDS.start
+    for k, count in enumerate(episodes):
+        seeds = range(first, first + count)
+        first = seeds.stop
         rows = drive(runs / f"{world}-{k}", world, demand, errors, tilt, seeds, workers)
         crashes = np.array(weights(rows))[[row["av_involved_collisions"] > 0 for row in rows]]
         print(f"round {k}: {len(crashes)} crashes, effective {effective(crashes):.1f}, {len(rows)} episodes")
@@ -138,7 +142,7 @@ def measure(runs: Path, worlds: Sequence[str], episodes: int, workers: int) -> N
         tilt = shipped(world)
         if tilt is None:
             raise SystemExit(f"{world} has no tilt: sumo_scenarios/tilts.yaml")
-        seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + episodes)
+        seeds = range(FRESH, FRESH + episodes)
         drive(runs / f"field-{world}", world, "dense", "field", tilt, seeds, workers)
 
 
@@ -264,8 +268,7 @@ def main() -> None:
     tuning.add_argument("--demand", default="dense")
     tuning.add_argument("--errors", default="field")
     tuning.add_argument("--runs", type=Path, required=True)
-    tuning.add_argument("--episodes", type=int, default=400)
-    tuning.add_argument("--rounds", type=int, default=5)
+    tuning.add_argument("--episodes", type=int, nargs="+", default=ROUNDS, help="of every round")
     tuning.add_argument("--workers", type=int, default=2)
     tuning.set_defaults(work=tune)
     measuring = commands.add_parser("measure")

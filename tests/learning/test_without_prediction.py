@@ -1,0 +1,25 @@
+"""A network that is shown the present in place of predictions, and the same without predicted frames."""
+
+import torch
+
+from benchmarks.without_prediction import shown_the_present, without_predicted_frames
+from policy.networks.vfn import VFN, VfnConfig
+
+CONFIG = VfnConfig(frames=14, extractor="frames", others=False, parts=2)
+
+
+def test_the_predicted_frames_are_folded_into_the_present() -> None:
+    """Same values, whatever is predicted; and of another past other values."""
+    torch.manual_seed(0)
+    network = VFN(CONFIG).eval()
+    torch.nn.init.normal_(network.value.weight)
+    maps = torch.randn(3, 14, CONFIG.latent)
+    rest = torch.zeros(3, 14, 16, 9), torch.randn(3, 64), torch.randn(3, 2)
+    foreseeing = network(maps, *rest)
+    own, config = without_predicted_frames(network, past=10)
+    assert config.frames == 10
+    shown_the_present(network, past=10)
+    torch.testing.assert_close(network(maps, *rest), own(maps[:, :10], *rest))
+    assert not torch.allclose(network(maps, *rest), foreseeing)
+    other = torch.cat([maps[:, :9], torch.randn(3, 5, CONFIG.latent)], 1)
+    assert not torch.allclose(network(other, *rest), own(maps[:, :10], *rest))

@@ -4,11 +4,10 @@
     python -m benchmarks.estimate measure --runs runs/estimate [--worlds merge] [--episodes 4000]
     python -m benchmarks.estimate page --runs runs/estimate [--out PAGE] [--intervals 400]
 
-`tune` drives tilted episodes of `idm` AVs on tuning seeds, and lets the tilt become that under which errors
-are as frequent as in those episodes in which an AV crashed (cross-entropy; docs/estimate.md); it prints the
-tilt for sumo_scenarios/tilts.yaml. `measure` drives what `page` shows, on test seeds: a case that brute force
-reaches, with and without a tilt, and `dense` at the level `field`. Both go on where they stopped. `page` adds
-the toy and writes docs/results/estimate.md.
+`tune` drives tilted episodes of `idm` AVs on tuning seeds, and raises errors the more, the more the crashes
+after them weigh (docs/estimate.md); it prints the tilt for sumo_scenarios/tilts.yaml. `measure` drives what
+`page` shows, on test seeds: a case that brute force reaches, with and without a tilt, and `dense` at the
+level `field`. Both go on where they stopped. `page` adds the toy and writes docs/results/estimate.md.
 """
 
 from __future__ import annotations
@@ -47,9 +46,8 @@ REAL = ("exit", "contested", "stress")  # world, demand, errors: AVs crash so of
 REAL_TILT = Tilt({ALL: 3.0, ALL + OTHER: 2.0}, 2.0, 0.1)
 FRESH = FIRST_TEST_SEED + 10_000  # of the level `field`: what was driven on seeds before was looked at
 BRUTE, REPETITIONS, EACH = 400, 10, 40  # episodes; estimates, and episodes of each
-TEMPER = 0.5  # power of the weights of crashed episodes: fewer of them decide everything
-KEPT = 0.2  # of the tilt before, in units of one crashed episode
-HUMANS = 0.2  # share of the score that crashes among humans have
+UNSEEN = 0.5  # crashes that every case is given beside those seen
+FIRST_WITH, FOLLOW_WITH = 1.0, 0.7  # as FIRST and FOLLOW, once crashes say which errors tell most
 
 
 def drive(
@@ -84,7 +82,7 @@ def balanced(rows: Sequence[Row], before: Tilt) -> Tilt:
     second ones of the kinds `FOLLOWING`."""
     factors: dict[str, float] = {}
     found = trials(rows)
-    begun = np.sum([b for n, (b, _) in found.items() if not n.endswith(SECOND)], 0) > 0
+    begun = begun_first(rows)
     for ending, aim in (("", FIRST * MEET), (OTHER, FIRST * (1.0 - MEET)), (SECOND, FOLLOW)):
         of = begun if ending == SECOND else np.ones(len(rows), bool)  # episodes that could show them
         names = [n for n in found if ending == ending_of(n)]
@@ -100,21 +98,37 @@ def ending_of(name: str) -> str:
     return "".join(name.partition(".")[1:])
 
 
-def crossed(rows: Sequence[Row], before: Tilt) -> Tilt:
-    """Every case as frequent as in the crashed episodes, by their weights; shrunk towards the tilt before."""
-    weight = np.array(weights(rows)) ** TEMPER
-    score = np.zeros(len(rows))
-    for share, column in ((1.0 - HUMANS, "av_involved_collisions"), (HUMANS, "hv_hv_collisions")):
-        hit = weight * np.array([row[column] > 0 for row in rows])
-        score += share * hit / hit.sum() if hit.any() else 0.0
+def allotted(rows: Sequence[Row], before: Tilt) -> Tilt:
+    """As many errors as tell most, and every case as often as it is worth.
+
+    A case of factor f begins in n of the episodes, n in proportion to f; the variance is the sum S of the
+    squared weights of the crashes after it, in proportion to 1 / f. Of all cases whose begun errors add up
+    to as many, sqrt(S / n) is then the best change of f (Neyman allocation). To S comes half a crash that
+    weighs as those seen do: none seen does not mean none. Without any crash the tilt stays.
+    """
+    squares = np.array(weights(rows)) ** 2
+    crashed = np.array([row["av_involved_collisions"] > 0 for row in rows])
+    if not crashed.any():
+        return before
+    unseen = UNSEEN * squares[crashed].mean()
     factors = dict(before.factors)
-    for name, (begun, expected) in trials(rows).items():
-        usual, was = expected.mean(), before.factors.get(name, 1.0)
-        if not usual > 0.0:
-            continue
-        new = (score @ begun + KEPT * was * usual) / (score @ expected + KEPT * usual)
-        factors[name] = max(float(new), 1.0)
+    for aim, second in ((FIRST_WITH, False), (FOLLOW_WITH, True)):
+        begun = {n: b > 0 for n, (b, _) in trials(rows).items() if n.endswith(SECOND) == second}
+        begun = {n: b for n, b in begun.items() if b.any()}
+        change = {n: math.sqrt((squares[b & crashed].sum() + unseen) / b.sum()) for n, b in begun.items()}
+        changed = sum(begun[n].sum() * change[n] for n in begun)  # errors, by the change as it is
+        wanted = aim * (sum(begun_first(rows)) if second else len(rows))
+        for name, by in change.items():
+            kind = name.removesuffix(SECOND)
+            was = before.factors.get(name, before.factors.get(kind, 1.0) * before.during)
+            factors[name] = max(float(was * by * wanted / changed), 1.0)
     return replace(before, factors=factors)
+
+
+def begun_first(rows: Sequence[Row]) -> npt.NDArray[np.bool_]:
+    """Of each episode, whether a first error near an AV began in it."""
+    of_first = [begun for name, (begun, _) in trials(rows).items() if not name.endswith(SECOND)]
+    return np.array(np.sum(of_first, 0) > 0)
 
 
 def tune(world: str, demand: str, errors: str, runs: Path, episodes: Sequence[int], workers: int) -> Tilt:
@@ -127,7 +141,7 @@ def tune(world: str, demand: str, errors: str, runs: Path, episodes: Sequence[in
         rows = drive(runs / f"{world}-{k}", world, demand, errors, tilt, seeds, workers)
         crashes = np.array(weights(rows))[[row["av_involved_collisions"] > 0 for row in rows]]
         print(f"round {k}: {len(crashes)} crashes, effective {effective(crashes):.1f}, {len(rows)} episodes")
-        tilt = balanced(rows, tilt) if k < BALANCED else crossed(rows, tilt)
+        tilt = balanced(rows, tilt) if k < BALANCED else allotted(rows, tilt)
         tilt = replace(tilt, factors={name: float(f"{f:.2g}") for name, f in tilt.factors.items()})
         print(tilt.text())
     return tilt

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import math
 
 import numpy as np
 import pytest
 
+from benchmarks import estimate
 from benchmarks.toy_crashes import KINDS, Toy
 from cosim.errors import BadInput
 from cosim.report.statistics import effective, paired_rate, paired_rate_change, pooled_rate, rate
@@ -114,3 +116,30 @@ def test_the_share_of_untilted_episodes_is_drawn_by_the_seed() -> None:
     drawn = [Tilt(untilted=0.25).drawn(seed) for seed in range(4000)]
     assert np.mean(drawn) == pytest.approx(0.75, abs=0.03)
     assert drawn == [Tilt(untilted=0.25).drawn(seed) for seed in range(4000)]
+
+
+def test_the_errors_that_tell_most_are_raised_most() -> None:
+    """Two kinds begin as often; crashes after one weigh ten times as much as after the other."""
+    before = Tilt({"cut_in": 10.0, "hard_braking": 10.0, "stalled_car": 10.0})
+
+    def row(kind: str, weight: float, crashes: int) -> dict[str, object]:
+        return {
+            "tilt_trials": json.dumps({kind: (1, 0.01)}),
+            "weight": weight,
+            "av_involved_collisions": crashes,
+        }
+
+    rows = [
+        *[row("cut_in", 0.1, k < 5) for k in range(50)],
+        *[row("hard_braking", 0.01, k < 5) for k in range(50)],
+        *[row("stalled_car", 0.1, 0) for _ in range(50)],
+    ]
+    found = estimate.allotted(rows, before)
+    factors = found.factors
+    assert factors["cut_in"] / factors["hard_braking"] == pytest.approx(
+        math.sqrt((5 * 0.01 + 0.5 * 0.00505) / (5 * 0.0001 + 0.5 * 0.00505))
+    )
+    assert 1.0 < factors["stalled_car"] < factors["cut_in"]  # none seen is not none
+    begin = sum(factors[kind] / before.factors[kind] * 50 for kind in before.factors)
+    assert begin == pytest.approx(estimate.FIRST_WITH * len(rows))
+    assert estimate.allotted(rows[100:], before) is before

@@ -1,6 +1,6 @@
 """The tilts of `cosim estimate`, and what its intervals are worth: a toy of known truth, brute force, speed.
 
-    python -m benchmarks.estimate tune --world merge --runs runs/tilts [--episodes 400 400 3000 3000]
+    python -m benchmarks.estimate tune --world merge --runs runs/tilts [--episodes 400 400 2000 2000]
     python -m benchmarks.estimate measure --runs runs/estimate [--worlds merge] [--episodes 4000]
     python -m benchmarks.estimate page --runs runs/estimate [--out PAGE] [--intervals 400]
 
@@ -37,7 +37,7 @@ FIRST = 0.4  # errors a tilted episode that the first tilts aim at: few, so that
 MEET = 0.75  # share of them that meets an AV first
 FOLLOW = 0.3  # second errors, if none ended the trials, where a first one has begun
 FOLLOWING = ("inattention", "hard_braking")  # what meets another error within seconds: a lapse, or before one
-ROUNDS = (400, 400, 3000, 3000)  # episodes: crashes are few, and the first rounds need none
+ROUNDS = (400, 400, 2000, 2000)  # episodes: crashes are few, and the first rounds need none
 BALANCED = 2  # rounds in which all kinds are made equally frequent, before crashes are looked at
 DURING = 10.0  # at first the second error has a tenth of the time and of the drivers of the first
 PAGE = Path("docs/results/estimate.md")

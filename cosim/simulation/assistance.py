@@ -27,6 +27,7 @@ CORRECTED = 1.0  # m/s2 more braking than asked for: from there on the car drive
 STALLED = 0.2, 1.5  # m/s2, or so little acceleration where so much was asked for
 RESPITE = 2.0  # s without a correction: the next one is a new one
 HARD = 3.5  # m/s2: harder braking is an emergency's
+TURNED = 15.0  # degrees from its lane's direction: it begins no lane change
 KEEPS_MOVING = 3.0  # m/s: no slower wish is followed inside a junction, nor for longer than `PATIENCE`
 CROSSES = 5.0  # s behind a junction in which it had to give way: inside and so long it takes its gap swiftly
 NOTICE = 150.0  # m: signals and stop lines further ahead are no reason yet
@@ -163,6 +164,8 @@ class Assistance(Commander):
 
     def _forbidden(self, name: str, lane: str, offset: int) -> str | None:
         why = super()._forbidden(name, lane, offset)
+        if why is None and _turning(name, lane):
+            why = "still turning off a junction"
         if why is None:
             why = _leaves_route(name, lane, offset)
             if why is not None:
@@ -292,6 +295,18 @@ def _lawful(own: str, base: str) -> str:
     if name not in sumo.vehicletype.getIDList():
         sumo.vehicletype.copy(base, name)
     return name
+
+
+def _turning(name: str, lane: str) -> bool:
+    """Whether a vehicle on `lane` comes off a junction and still stands across it with its rear there.
+
+    SUMO draws whoever changes lanes along the lane, and so turns it at once: a bus into those beside it.
+    """
+    place = sumo.vehicle.getLanePosition(name)
+    if place >= sumo.vehicle.getLength(name):
+        return False
+    turn = sumo.vehicle.getAngle(name) - sumo.lane.getAngle(lane, place)
+    return abs((turn + 180.0) % 360.0 - 180.0) > TURNED
 
 
 def _leaves_route(name: str, lane: str, offset: int) -> str | None:

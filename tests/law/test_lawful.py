@@ -138,6 +138,13 @@ def test_from_a_stop_sign_it_enters_no_gap_that_a_human_has_to_brake_for(law_wor
     assert result.value("right_of_way_violations") == 0
 
 
+def test_a_bus_changes_no_lanes_before_it_has_turned_off_a_junction(law_worlds: dict[str, Path]) -> None:
+    """SUMO would turn it at once, its rear into the bus beside it."""
+    result = drive(law_worlds["mixed_types"], "random", seed=101_010, duration=110.0)
+
+    assert result.value("av_involved_collisions") == 0
+
+
 def test_it_comes_to_a_stop_comfortably_and_does_not_creep_there(start: Start) -> None:
     standing = vehicle("standing", "hv", 150.0, speed=0.0, more='speedFactor="0.001"')
     worker = start([standing, vehicle("av", "av", 60.0, speed=10.0)], preset=Preset.LAWFUL)

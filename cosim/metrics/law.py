@@ -139,16 +139,16 @@ class Ways:
 
     def excused(self, link: int, now: Snapshot, row: int, av: int) -> bool:
         """Whether a vehicle on the way of `link` has another reason to brake than the one in row `av`."""
-        lane, inside = int(now.lane[row]), self._inside(link)
+        lane, inside, target = int(now.lane[row]), self._inside(link), self._road.links[link].target
         if lane in inside:
-            ahead = inside[inside.index(lane) :]
-        elif lane < 0 or self._road.lanes[lane].edge == self._road.lanes[self._road.links[link].target].edge:
+            ahead = (*inside[inside.index(lane) :], target)
+        elif lane < 0 or self._road.lanes[lane].edge == self._road.lanes[target].edge:
             return True  # off every lane, or past the junction
         else:
             signal = self._road.links[link].signal
             if 0 <= signal < len(now.signals) and int(now.signals[signal]) not in GOES:
                 return True
-            ahead = (lane, *inside) if lane == self._road.links[link].origin else (lane,)
+            ahead = (lane, *inside, target) if lane == self._road.links[link].origin else (lane,)
         near, more = LEADER
         near = max(near, float(now.speed[row]) ** 2 / (2.0 * COMFORTABLE) + more)
         start = -float(now.lane_position[row])  # m from its front bumper to the start of the lane

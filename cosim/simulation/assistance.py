@@ -306,7 +306,7 @@ def _turning(name: str, lane: str) -> bool:
     if place >= sumo.vehicle.getLength(name):
         return False
     turn = sumo.vehicle.getAngle(name) - sumo.lane.getAngle(lane, place)
-    return abs((turn + 180.0) % 360.0 - 180.0) > TURNED
+    return bool(abs((turn + 180.0) % 360.0 - 180.0) > TURNED)
 
 
 def _leaves_route(name: str, lane: str, offset: int) -> str | None:

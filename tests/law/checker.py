@@ -406,18 +406,19 @@ class Checker:
 
     def _excused(self, foe: Track, k: int, link: Link, av: str) -> bool:
         """Whether a foe on the way of `link` has another reason to brake: its signal, somebody else near
-        ahead on its lane or link or turning off its lane, or that it is past the junction."""
+        ahead on its lane or link or the lane behind it or turning off its lane, or that it is past the
+        junction."""
         row = foe.row(k)
         lane, gone = foe.lane[row], -foe.pos[row]
         reach = max(LEADER_REACH, foe.speed[row] ** 2 / (2.0 * COMFORTABLE) + STOP_ROOM)
         if _edge(lane) == _edge(link.target):
             return True
         if lane in link.via:
-            lanes = link.via[link.via.index(lane) :]
+            lanes = (*link.via[link.via.index(lane) :], link.target)
         else:
             if self.net.state(link, self.times[k]) not in GREEN | {""}:
                 return True
-            lanes = (lane, *link.via) if lane == link.origin else (lane,)
+            lanes = (lane, *link.via, link.target) if lane == link.origin else (lane,)
         if not lane.startswith(":"):  # who turns off its lane, and has not left it wholly
             rest = self.net.lanes[lane].length + gone
             for other in self.net.of_lane[lane]:

@@ -200,6 +200,12 @@ def test_a_leader_inside_the_junction_excuses_the_braking_but_not_the_av_itself(
     assert met(HARD, others={"beside": At(INSIDE_MINOR, 2.0)}, start=60.0) == 1
 
 
+@pytest.mark.parametrize(("position", "count"), [(4.0, 0), (20.0, 1)])
+def test_a_leader_just_behind_the_junction_excuses_the_braking(position: float, count: int) -> None:
+    """The foe is near 84 m then, 26 m before the end of the junction: bumpers are 25 and 41 m apart."""
+    assert met(HARD, others={"leader": At(MAJOR_OUT, position)}, start=75.0) == count
+
+
 def test_who_turns_off_the_foes_lane_and_is_still_on_it_excuses_the_braking() -> None:
     """A way of two meters that leaves the foe's lane: of 5 m of car 3 m or nothing are on the lane."""
     road = crossing()

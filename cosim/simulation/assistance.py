@@ -197,8 +197,9 @@ class Assistance(Commander):
         # an IDM nears a line with speed = distance / headway: so it stops, and does not creep there
         tau = min(headway, max(STOPS, speed / COMFORT))
         if late != state.late:
-            state.late, state.impatience = late, IMPATIENCE[0][0]
+            state.late = late
             set_type(name, _lawful(get.getTypeID(name), LATE_TYPE if late else LAWFUL_TYPE))
+            sumo.vehicletype.setImpatience(get.getTypeID(name), state.impatience)  # not the new type's
         elif tau == state.tau:
             return
         state.tau = tau

@@ -138,6 +138,16 @@ def test_from_a_stop_sign_it_enters_no_gap_that_a_human_has_to_brake_for(law_wor
     assert result.value("right_of_way_violations") == 0
 
 
+@pytest.mark.parametrize("seed", [102_007, 102_010])
+def test_who_comes_from_behind_makes_it_take_no_smaller_gap(law_worlds: dict[str, Path], seed: int) -> None:
+    """A human closes in on an AV that waits on the minor road while somebody comes on the major one."""
+    result = drive(
+        law_worlds["priority"], Always(MetaAction.ACCELERATE), share=0.2, seed=seed, duration=100.0
+    )
+
+    assert result.value("right_of_way_violations") == 0
+
+
 def test_a_bus_changes_no_lanes_before_it_has_turned_off_a_junction(law_worlds: dict[str, Path]) -> None:
     """SUMO would turn it at once, its rear into the bus beside it."""
     result = drive(law_worlds["mixed_types"], "random", seed=101_010, duration=110.0)

@@ -1,6 +1,6 @@
 """The tilts of `cosim estimate`, and what its intervals are worth: a toy of known truth, brute force, speed.
 
-    python -m benchmarks.estimate tune --world merge --runs runs/tilts [--episodes 400 400 2000 2000]
+    python -m benchmarks.estimate tune --world merge --runs runs/tilts [--episodes 400 400 3000 2000]
     python -m benchmarks.estimate measure --runs runs/estimate [--worlds merge] [--episodes 4000]
     python -m benchmarks.estimate page --runs runs/estimate [--out PAGE] [--intervals 400]
 
@@ -37,7 +37,7 @@ FIRST = 0.4  # errors a tilted episode that the first tilts aim at: few, so that
 MEET = 0.75  # share of them that meets an AV first
 FOLLOW = 0.3  # second errors, if none ended the trials, where a first one has begun
 FOLLOWING = ("inattention", "hard_braking")  # what meets another error within seconds: a lapse, or before one
-ROUNDS = (400, 400, 2000, 2000)  # episodes: crashes are few, and the first rounds need none
+ROUNDS = (400, 400, 3000, 2000)  # episodes: crashes are few, and the first rounds need none
 BALANCED = 2  # rounds in which all kinds are made equally frequent, before crashes are looked at
 DURING = 10.0  # at first the second error has a tenth of the time and of the drivers of the first
 PAGE = Path("docs/results/estimate.md")
@@ -104,16 +104,17 @@ def allotted(rows: Sequence[Row], before: Tilt) -> Tilt:
     A case of factor f begins in n of the episodes, n in proportion to f; the variance is the sum S of the
     squared weights of the crashes after it, in proportion to 1 / f. Of all cases whose begun errors add up
     to as many, sqrt(S / n) is then the best change of f (Neyman allocation). To S comes half a crash that
-    weighs as those seen do: none seen does not mean none. Without any crash the tilt stays.
+    weighs as those seen do: none seen does not mean none. A factor that most trials do not follow (q is at
+    its most, or they ended before) does not rise. Without any crash the tilt stays.
     """
     squares = np.array(weights(rows)) ** 2
     crashed = np.array([row["av_involved_collisions"] > 0 for row in rows])
     if not crashed.any():
         return before
     unseen = UNSEEN * squares[crashed].mean()
-    factors = dict(before.factors)
+    factors, found = dict(before.factors), trials(rows)
     for aim, second in ((FIRST_WITH, False), (FOLLOW_WITH, True)):
-        begun = {n: b > 0 for n, (b, _) in trials(rows).items() if n.endswith(SECOND) == second}
+        begun = {n: b > 0 for n, (b, _) in found.items() if n.endswith(SECOND) == second}
         begun = {n: b for n, b in begun.items() if b.any()}
         change = {n: math.sqrt((squares[b & crashed].sum() + unseen) / b.sum()) for n, b in begun.items()}
         changed = sum(begun[n].sum() * change[n] for n in begun)  # errors, by the change as it is
@@ -121,7 +122,9 @@ def allotted(rows: Sequence[Row], before: Tilt) -> Tilt:
         for name, by in change.items():
             kind = name.removesuffix(SECOND)
             was = before.factors.get(name, before.factors.get(kind, 1.0) * before.during)
-            factors[name] = max(float(was * by * wanted / changed), 1.0)
+            new = max(float(was * by * wanted / changed), 1.0)
+            follows = found[name][0].sum() > 0.5 * was * found[name][1].sum()
+            factors[name] = new if follows else min(new, was)
     return replace(before, factors=factors)
 
 

@@ -13,7 +13,7 @@ from cosim.files import yaml_input
 from cosim.scenario.human_errors import KINDS
 from cosim.seeding import uniform
 
-MOST = 0.1  # of a tilted probability: who waits ten trials may still not err (such episodes weigh much)
+MOST = 0.5  # of a tilted probability: both outcomes of a trial stay likely
 UNTILTED = 0.1  # share of episodes that are drawn as errors happen: no episode weighs more than 1 / UNTILTED
 ALL = "all"  # kinds that are not named
 OTHER = ".other"  # errors that do not meet an AV first

@@ -143,3 +143,5 @@ def test_the_errors_that_tell_most_are_raised_most() -> None:
     begin = sum(factors[kind] / before.factors[kind] * 50 for kind in before.factors)
     assert begin == pytest.approx(estimate.FIRST_WITH * len(rows))
     assert estimate.allotted(rows[100:], before) is before
+    rare = [{**one, "tilt_trials": json.dumps({"cut_in": (1, 0.5)})} for one in rows[:50]]  # a fifth begins
+    assert estimate.allotted([*rare, *rows[50:]], before).factors["cut_in"] == before.factors["cut_in"]

@@ -131,7 +131,7 @@ def allotted(rows: Sequence[Row], before: Tilt) -> Tilt:
 def begun_first(rows: Sequence[Row]) -> npt.NDArray[np.bool_]:
     """Of each episode, whether a first error near an AV began in it."""
     of_first = [begun for name, (begun, _) in trials(rows).items() if not name.endswith(SECOND)]
-    return np.array(np.sum(of_first, 0) > 0)
+    return np.array(np.sum([np.zeros(len(rows)), *of_first], 0) > 0)
 
 
 def tune(world: str, demand: str, errors: str, runs: Path, episodes: Sequence[int], workers: int) -> Tilt:

@@ -250,8 +250,9 @@ def _weights(tally: Array) -> Array:
 
 
 def _many(before: Array, after: Array) -> bool:
+    """Whether the events of several pairs are effectively `MANY`: those of one episode come together."""
     y, w = (np.concatenate(both) for both in ((before[0], after[0]), (_weights(before), _weights(after))))
-    return bool(y.any()) and float((w * y).sum()) ** 2 >= MANY * float((w**2 * y).sum())
+    return before.shape[1] > 1 and effective(w * y) >= MANY
 
 
 def _contributions(tally: Array, rate: Figure) -> Array:

@@ -73,6 +73,16 @@ def test_episodes_with_several_events_widen_the_interval() -> None:
     assert other.high - other.low > 2.0 * (one.high - one.low)
 
 
+def test_many_events_of_one_pair_do_not_make_a_normal_difference() -> None:
+    """Forty events of one episode on either side come together: nothing says how they scatter."""
+    one = np.array([[40.0], [1.0]])
+    found = paired_rate(one, np.array([[45.0], [1.0]]))
+    assert found.value == 5.0
+    assert found.low < -5.0 < 15.0 < found.high
+    two = np.array([[40.0, 0.0], [1.0, 1.0]])
+    assert paired_rate(two, two).low < 0.0
+
+
 def test_effective_samples_count_equal_weights() -> None:
     assert effective([2.0] * 7) == pytest.approx(7.0)
     assert effective([1.0, 0.0, 0.0]) == pytest.approx(1.0)

@@ -37,6 +37,7 @@ GAP = 2.0, 1.0  # m and s: the gap given to who changes lanes
 YIELDING = 2.0, 1.0  # m/s2 and m/s: how hard, and down to what, an AV slows for who asked
 PATIENCE = 10.0  # s
 DECIDES = 30.0  # m before a line at which it gives way: from there on it looks who comes
+COMES = 100.0  # m from which they come, however many edges that are
 AT_LINE = 5.0  # m: who is further away stands in a queue
 WAITS = 15.0, 40.0, 55.0  # s of waiting at a line, and how impatient an AV is by then
 IMPATIENCE = (0.8, 1.0, 1.0), (0.0, 0.4, 1.0)  # where AVs alone come, and where humans do
@@ -65,7 +66,7 @@ class Assisted(Controlled):
     gap_for: str = ""  # who asked for a gap
     gives_way: bool = False  # at the next junction, or in this one
     waited: float = 0.0  # s, to give way
-    impatience: float = IMPATIENCE[0][0]
+    impatience: float = 0.0
     crosses: float = 0.0  # s left of `CROSSES`
     headway: float = HEADWAY[0]  # s
     tau: float = HEADWAY[0]  # s, its driver's, shorter at low speed
@@ -89,6 +90,7 @@ class Assistance(Commander):
         self._looked = -math.inf  # s
         self._begun: list[Intervention] = []
         self._standing_gaps: dict[str, float] = {}  # human -> m
+        self._ways: dict[str, tuple[frozenset[str], frozenset[str]]] = {}  # edge -> `_ways_beside`
 
     def drive(self) -> None:
         """Before every simulation step: the agent's wish where it is the slower one, else SUMO's driver."""
@@ -154,13 +156,13 @@ class Assistance(Commander):
 
     def _take_over(self, name: str) -> Assisted:
         get = sumo.vehicle
-        set_type(name, _lawful(get.getTypeID(name), LAWFUL_TYPE))
+        _drive_as(name, LAWFUL_TYPE)
         get.setSpeedFactor(name, min(get.getSpeedFactor(name), 1.0))
         return Assisted(0.0, speed=get.getSpeed(name), lateral=get.getLateralLanePosition(name))
 
     def _hand_back(self, name: str) -> None:
         """It keeps its comfortable driver."""
-        set_type(name, _lawful(sumo.vehicle.getTypeID(name), LAWFUL_TYPE))
+        _drive_as(name, LAWFUL_TYPE)
 
     def _forbidden(self, name: str, lane: str, offset: int) -> str | None:
         why = super()._forbidden(name, lane, offset)
@@ -198,8 +200,7 @@ class Assistance(Commander):
         tau = min(headway, max(STOPS, speed / COMFORT))
         if late != state.late:
             state.late = late
-            set_type(name, _lawful(get.getTypeID(name), LATE_TYPE if late else LAWFUL_TYPE))
-            sumo.vehicletype.setImpatience(get.getTypeID(name), state.impatience)  # not the new type's
+            _drive_as(name, LATE_TYPE if late else LAWFUL_TYPE, state.impatience)
         elif tau == state.tau:
             return
         state.tau = tau
@@ -228,10 +229,15 @@ class Assistance(Commander):
         for state in self.controlled.values():
             state.gap_for = ""
         for name, state in self.controlled.items():
-            if not get.getRoadID(name).startswith(":"):
+            lane = get.getLaneID(name)
+            if not lane:  # it is parked, or SUMO carries it elsewhere
+                continue
+            red = False
+            if not lane.startswith(":"):
                 links = get.getNextLinks(name)
                 state.gives_way = bool(links) and not links[0][1]
-                self._wait(name, state)
+                red = bool(links) and links[0][5] in RED + YELLOW
+            self._wait(name, lane, state, red)
             for side in (1, -1):
                 wanted = get.getLaneChangeState(name, side)[0]
                 if wanted & STRATEGIC and wanted & BLOCKED:
@@ -239,35 +245,38 @@ class Assistance(Commander):
                     followers = get.getNeighbors(name, 0 if side > 0 else 1)
                     self._give([other for other, _ in followers], name)
 
-    def _wait(self, name: str, state: Assisted) -> None:
-        """Before humans it waits for a gap that nobody brakes for; AVs see it, and brake comfortably."""
+    def _wait(self, name: str, lane: str, state: Assisted, red: bool) -> None:
+        """Before humans it waits for a gap that nobody brakes for; AVs see it, and brake comfortably.
+
+        Inside a junction too: there those wait who turn across others. At a red light nobody waits for a gap.
+        """
         get = sumo.vehicle
-        away = sumo.lane.getLength(get.getLaneID(name)) - get.getLanePosition(name)
-        waits = state.gives_way and away < AT_LINE and get.getSpeed(name) < KEEPS_MOVING
+        away = sumo.lane.getLength(lane) - get.getLanePosition(name)
+        waits = state.gives_way and not red and away < AT_LINE and get.getSpeed(name) < KEEPS_MOVING
         state.waited = state.waited + LOOKS if waits else 0.0
-        grows = IMPATIENCE[state.gives_way and self._meets_humans(name)]
-        impatience = float(np.interp(state.waited, WAITS, grows))
+        humans = state.gives_way and away <= DECIDES and self._meets_humans(name)
+        impatience = float(np.interp(state.waited, WAITS, IMPATIENCE[humans]))
         if impatience != state.impatience:
             state.impatience = impatience
             # its type is its own since `set_type`
             sumo.vehicletype.setImpatience(get.getTypeID(name), impatience)
 
     def _meets_humans(self, name: str) -> bool:
-        """Whether anybody but AVs comes to the junction that is at most `DECIDES` ahead, from elsewhere.
+        """Whether anybody but AVs comes to the junction that it is at, from elsewhere.
 
         `getJunctionFoes` leaves out some who have priority.
         """
         get = sumo.vehicle
-        if sumo.lane.getLength(get.getLaneID(name)) - get.getLanePosition(name) > DECIDES:
-            return False
-        own = get.getRoadID(name)
-        others = sumo.junction.getIncomingEdges(sumo.edge.getToJunction(own))
-        return any(
-            other not in self.controlled
-            for edge in others
-            if edge != own
-            for other in sumo.edge.getLastStepVehicleIDs(edge)
-        )
+        own = get.getRoute(name)[max(get.getRouteIndex(name), 0)]
+        if own not in self._ways:
+            self._ways[own] = _ways_beside(own)
+        near, further = self._ways[own]
+        for edges, comes in ((near, True), (further, False)):
+            for edge in edges:
+                for other in sumo.edge.getLastStepVehicleIDs(edge):
+                    if other not in self.controlled and (comes or near & set(_route_ahead(other))):
+                        return True
+        return False
 
     def _give(self, asked: list[str], name: str) -> None:
         for other in asked:
@@ -296,6 +305,36 @@ def _lawful(own: str, base: str) -> str:
     if name not in sumo.vehicletype.getIDList():
         sumo.vehicletype.copy(base, name)
     return name
+
+
+def _drive_as(name: str, kind: str, impatience: float = 0.0) -> None:
+    """Give an AV another driver; how impatient it is no type decides."""
+    set_type(name, _lawful(sumo.vehicle.getTypeID(name), kind))
+    sumo.vehicletype.setImpatience(sumo.vehicle.getTypeID(name), impatience)
+
+
+def _ways_beside(own: str) -> tuple[frozenset[str], frozenset[str]]:
+    """The edges that lead to the junction at the end of `own`, its inner ones too, but for `own`; and those
+    before them from which it is at most `COMES`."""
+    junction = sumo.edge.getToJunction(own)
+    near = frozenset(sumo.junction.getIncomingEdges(junction)) - {own}
+    further: set[str] = set()
+    waiting = [(edge, 0.0) for edge in near if not edge.startswith(":")]
+    while waiting:
+        edge, away = waiting.pop()
+        away += float(sumo.lane.getLength(f"{edge}_0"))
+        before = sumo.edge.getFromJunction(edge)
+        if away >= COMES or before == junction:
+            continue
+        new = set(sumo.junction.getIncomingEdges(before)) - near - further - {own}
+        further |= new
+        waiting += [(edge, away) for edge in new if not edge.startswith(":")]
+    return near, frozenset(further)
+
+
+def _route_ahead(name: str) -> tuple[str, ...]:
+    """The edges that a vehicle still comes to."""
+    return tuple(sumo.vehicle.getRoute(name))[max(sumo.vehicle.getRouteIndex(name), 0) + 1 :]
 
 
 def _turning(name: str, lane: str) -> bool:

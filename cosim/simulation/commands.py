@@ -185,6 +185,8 @@ def force(name: str, accel: float, step: float) -> None:
 
 def _forbidden(name: str, lane: str, offset: int) -> str | None:
     """Why the road does not let vehicle `name` on `lane` change by `offset` lanes; None if it does."""
+    if not lane:
+        return "not on a lane"
     if lane.startswith(":"):
         return "inside a junction"
     edge, _, index = lane.rpartition("_")

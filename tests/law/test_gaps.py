@@ -1,0 +1,123 @@
+"""Preset `lawful`: from where one has to give way, an AV takes no gap that a human has to brake for."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+from collections.abc import Mapping
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+import sumo
+from conftest import Start, vehicle
+
+from cosim.host import Host
+from cosim.scenario import chosen_fleet, load
+from cosim.types import Command, Decision, EpisodeResult, History, MetaAction, Preset
+from cosim.workers.worker import Worker
+from tests.law.test_lawful import Always
+
+NODES = """<nodes><node id="w" x="-300" y="0"/><node id="m" x="-32" y="0"/>
+<node id="j" x="0" y="0" type="priority"/><node id="e" x="300" y="0"/>
+<node id="s" x="0" y="-150"/><node id="n" x="0" y="150"/></nodes>"""
+EDGE = '<edge id="{}" from="{}" to="{}" priority="{}" numLanes="1" speed="13.89"/>'
+MINOR = ("sj", "s", "j", 1), ("jn", "j", "n", 1)
+ROADS = {  # the major road; its edges from the west to the east
+    "whole": (("wj", "w", "j", 3), ("je", "j", "e", 3)),
+    "in two pieces": (("wm", "w", "m", 3), ("mj", "m", "j", 3), ("je", "j", "e", 3)),
+}
+CAR = '<vType id="car" carFollowModel="IDM" sigma="0" speedDev="0" accel="2" decel="4.5" tau="1.2"/>'
+TRAFFIC = f"""<routes>{CAR}
+<route id="minor" edges="sj jn"/><route id="major" edges="{{major}}"/>
+<vehicle id="hv" type="car" route="major" depart="{{human}}" departPos="60" departSpeed="13.8"/>
+<vehicle id="av" type="car" route="minor" depart="10" departPos="60" departSpeed="8"/></routes>"""
+TURN = f"""<routes>{CAR}
+<route id="left" edges="B1A1 A1A0"/><route id="on" edges="left1A1 A1B1"/>
+<vehicle id="av" type="car" route="left" depart="0" departPos="143" departSpeed="0"/>
+<flow id="hv" type="car" route="on" begin="{{human}}" number="9" period="3" departPos="20" departSpeed="13"/>
+</routes>"""
+CONFIG = """<configuration><net-file value="{net}"/><route-files value="{routes}"/>{more}<begin value="0"/>
+<end value="{end}"/><step-length value="0.1"/></configuration>"""
+HUMAN = 4.0  # s, when the human departs: it is at the junction some seconds after the AV
+
+
+class LetsGo(Always):
+    """It commands for two seconds and hands the car back."""
+
+    def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
+        began = getattr(self, "began", None)
+        if histories and began is None:
+            self.began = next(iter(histories.values())).time
+        found = super().decide(histories)
+        return {n: d for n, d in found.items() if histories[n].time < self.began + 2.0}
+
+
+def crossing(folder: Path, road: str, human: float) -> Path:
+    """The .sumocfg of a minor road that crosses a major one, with one AV and one human."""
+    edges = [EDGE.format(*edge) for edge in (*ROADS[road], *MINOR)]
+    parts = {"nod": NODES, "edg": "<edges>" + "".join(edges) + "</edges>"}
+    for kind, text in parts.items():
+        (folder / f"x.{kind}.xml").write_text(text)
+    netconvert = Path(sumo.SUMO_HOME) / "bin" / "netconvert"
+    files = ("-n", "x.nod.xml", "-e", "x.edg.xml", "-o", "x.net.xml")
+    subprocess.run([netconvert, *files], cwd=folder, check=True, capture_output=True)
+    major = " ".join(edge[0] for edge in ROADS[road])
+    (folder / "x.rou.xml").write_text(TRAFFIC.format(major=major, human=human))
+    config = folder / "x.sumocfg"
+    config.write_text(CONFIG.format(net="x.net.xml", routes="x.rou.xml", more="", end=45))
+    return config
+
+
+def turn_after_red(folder: Path, human: float) -> Path:
+    """The .sumocfg of a signalised junction whose red lasts for 70 s; the human comes from opposite."""
+    net = load("practice/lights").net
+    program = next(t for t in ElementTree.parse(net).getroot().iter("tlLogic") if t.get("id") == "A1")
+    program.set("programID", "long")
+    program[0].set("duration", "70")
+    (folder / "long.add.xml").write_bytes(b"<additional>" + ElementTree.tostring(program) + b"</additional>")
+    (folder / "t.rou.xml").write_text(TURN.format(human=human))
+    config = folder / "t.sumocfg"
+    config.write_text(
+        CONFIG.format(net=net, routes="t.rou.xml", more='<additional-files value="long.add.xml"/>', end=100)
+    )
+    return config
+
+
+def drive(config: Path, policy: Always) -> EpisodeResult:
+    fleet = chosen_fleet(None, "av", None)
+    with Worker(Host, load(str(config), preset=Preset.LAWFUL, fleet=fleet), policy, math.pi / 4) as worker:
+        result: EpisodeResult = worker.call("run", 0)
+    return result
+
+
+@pytest.mark.parametrize(
+    ("road", "policy"), [("whole", Always), ("in two pieces", Always), ("whole", LetsGo)]
+)
+def test_it_waits_for_who_comes_also_from_beyond_a_short_edge_and_when_handed_back(
+    tmp_path: Path, road: str, policy: type[Always]
+) -> None:
+    result = drive(crossing(tmp_path, road, HUMAN), policy(MetaAction.ACCELERATE))
+
+    assert result.value("right_of_way_violations") == 0
+    assert result.value("hard_brakings") == 0
+    assert result.value("av_trips_completed") == 1
+
+
+@pytest.mark.parametrize("human", [67.6, 68.4])
+def test_who_stood_at_a_red_light_takes_no_smaller_gap(tmp_path: Path, human: float) -> None:
+    """A left turn on green that must give way, after more than a minute of red."""
+    result = drive(turn_after_red(tmp_path, human), Always(MetaAction.ACCELERATE))
+
+    assert (result.value("right_of_way_violations"), result.value("hard_brakings")) == (0, 0)
+
+
+def test_a_parked_av_takes_commands_that_do_nothing(start: Start) -> None:
+    stop = '<stop lane="main_in_0" endPos="160" duration="8" parking="true"/>'
+    parked = vehicle("av", "av", 100.0, speed=10.0).replace("/>", f">{stop}</vehicle>")
+    worker = start([parked], preset=Preset.LAWFUL)
+    reasons = set()
+    for _ in range(60):
+        receipts, _ = worker.call("advance", [Command("av", 20.0, 1, 0.4)])
+        reasons |= {receipt.blocked for receipt in receipts}
+    assert "not on a lane" in reasons

@@ -23,7 +23,10 @@ AV_LANE_CHANGE = {
     "laneChangeModel.lcKeepRight": "0",
 }
 # What a vehicle keeps when its type changes: getters and setters of sumo.vehicle, in this order.
-KEPT = ("Length", "Width", "MaxSpeed", "SpeedFactor", "VehicleClass")
+KEPT = (
+    *("Length", "Width", "Height", "MaxSpeed", "SpeedFactor", "VehicleClass"),
+    *("ShapeClass", "EmissionClass", "Mass"),
+)
 
 
 class Fleet:

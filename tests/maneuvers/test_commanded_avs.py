@@ -12,6 +12,7 @@ import cosim
 from cosim.errors import BadInput
 from cosim.geometry import boxes, overlapping_pairs
 from cosim.scenario import Scenario, load
+from cosim.simulation.backend import sumo
 from cosim.simulation.sumo import SumoSimulator
 from cosim.types import Collision, Command, Receipt, Snapshot
 from cosim.workers.worker import Worker
@@ -66,6 +67,29 @@ def test_a_lane_change_takes_two_seconds_and_turns_the_car_meanwhile(start: Star
     assert y[-1] == pytest.approx(y[-2], abs=0.05), "and then straight on"
     assert of(early + late, "a", "heading").max() > 0.05
     assert of(late, "a", "lane")[-1] != of(early, "a", "lane")[0]
+
+
+BUS = (
+    '<vType id="av@bus" vClass="bus" emissionClass="HBEFA3/Bus" height="3.2" mass="12000" length="12"/>'
+    '<vehicle id="a" type="av@bus" route="main" depart="0" departPos="100" departSpeed="10"/>'
+)
+
+
+class Bodies(SumoSimulator):
+    """It tells what SUMO takes a vehicle for."""
+
+    def body(self, name: str) -> tuple[object, ...]:
+        fields = "Length", "Height", "ShapeClass", "EmissionClass", "Mass", "VehicleClass"
+        return tuple(getattr(sumo.vehicle, f"get{field}")(name) for field in fields)
+
+
+def test_a_commanded_bus_stays_a_bus(start: Start) -> None:
+    """Its emissions and its picture too: only the driver is another one."""
+    worker = start([BUS], simulator=Bodies, preset="lawful")
+    before = worker.call("body", "a")
+    drive(worker, [Command("a", 12.0, 0, HOLD)], 3)
+    assert before == (12.0, 3.2, "bus", "HBEFA3/Bus", 12000.0, "bus")
+    assert worker.call("body", "a") == before
 
 
 def test_a_second_lane_change_meanwhile_and_one_off_the_road_are_refused_with_a_reason(start: Start) -> None:

@@ -18,7 +18,8 @@ CONFIDENCE = 0.95
 Z = float(stats.norm.ppf(0.5 + CONFIDENCE / 2.0))
 RESAMPLES = 2000  # the bounds of a mean then wander by some 2 % of the interval's width from seed to seed
 FEW = 3.0  # effective events, from which on their weights tell what another one may weigh
-MANY = 20.0  # effective events of a pair, from which on the difference of their rates is about normal
+# effective events of two rates, and effective samples that have any: their difference is about normal
+MANY = 20.0, 10.0
 BATCH = 2_000_000  # resampled values held at once: 16 MB
 
 Array = npt.NDArray[np.float64]
@@ -250,9 +251,10 @@ def _weights(tally: Array) -> Array:
 
 
 def _many(before: Array, after: Array) -> bool:
-    """Whether the events of several pairs are effectively `MANY`: those of one episode come together."""
+    """Whether there are `MANY` of both: the events of one sample come together."""
     y, w = (np.concatenate(both) for both in ((before[0], after[0]), (_weights(before), _weights(after))))
-    return before.shape[1] > 1 and effective(w * y) >= MANY
+    events, samples = MANY
+    return effective(w * y) >= samples and float((w * y).sum()) ** 2 >= events * float((w**2 * y).sum())
 
 
 def _contributions(tally: Array, rate: Figure) -> Array:

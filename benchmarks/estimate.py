@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -82,7 +82,7 @@ def balanced(rows: Sequence[Row], before: Tilt) -> Tilt:
     second ones of the kinds `FOLLOWING`."""
     factors: dict[str, float] = {}
     found = trials(rows)
-    begun = begun_first(rows)
+    begun = begun_first(found, len(rows))
     for ending, aim in (("", FIRST * MEET), (OTHER, FIRST * (1.0 - MEET)), (SECOND, FOLLOW)):
         of = begun if ending == SECOND else np.ones(len(rows), bool)  # episodes that could show them
         names = [n for n in found if ending == ending_of(n)]
@@ -113,12 +113,13 @@ def allotted(rows: Sequence[Row], before: Tilt) -> Tilt:
         return before
     unseen = UNSEEN * squares[crashed].mean()
     factors, found = dict(before.factors), trials(rows)
+    first = int(begun_first(found, len(rows)).sum())
     for aim, second in ((FIRST_WITH, False), (FOLLOW_WITH, True)):
         begun = {n: b > 0 for n, (b, _) in found.items() if n.endswith(SECOND) == second}
         begun = {n: b for n, b in begun.items() if b.any()}
         change = {n: math.sqrt((squares[b & crashed].sum() + unseen) / b.sum()) for n, b in begun.items()}
         changed = sum(begun[n].sum() * change[n] for n in begun)  # errors, by the change as it is
-        wanted = aim * (sum(begun_first(rows)) if second else len(rows))
+        wanted = aim * (first if second else len(rows))
         for name, by in change.items():
             kind = name.removesuffix(SECOND)
             was = before.factors.get(name, before.factors.get(kind, 1.0) * before.during)
@@ -128,10 +129,10 @@ def allotted(rows: Sequence[Row], before: Tilt) -> Tilt:
     return replace(before, factors=factors)
 
 
-def begun_first(rows: Sequence[Row]) -> npt.NDArray[np.bool_]:
-    """Of each episode, whether a first error near an AV began in it."""
-    of_first = [begun for name, (begun, _) in trials(rows).items() if not name.endswith(SECOND)]
-    return np.array(np.sum([np.zeros(len(rows)), *of_first], 0) > 0)
+def begun_first(found: Mapping[str, Array], episodes: int) -> npt.NDArray[np.bool_]:
+    """Of each of so many episodes with these `trials`, whether a first error near an AV began in it."""
+    of_first = [begun for name, (begun, _) in found.items() if not name.endswith(SECOND)]
+    return np.array(np.sum([np.zeros(episodes), *of_first], 0) > 0)
 
 
 def tune(world: str, demand: str, errors: str, runs: Path, episodes: Sequence[int], workers: int) -> Tilt:

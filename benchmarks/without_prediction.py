@@ -25,6 +25,7 @@ from policy.training import experience
 from policy.training.config import agent_config
 from policy.training.curriculum import VfnTraining
 from policy.training.ddqn import DdqnLearner
+from policy.training.ensemble import RESULT as TAUGHT
 from policy.training.ensemble import Ensemble
 from policy.training.networks import use_threads
 from policy.training.replay_buffer import ReplayBuffer
@@ -85,7 +86,7 @@ def learn(run: Path, out: Path) -> Path:
     """The file of the `vfn`. Raises BadInput as `Ensemble.run` does."""
     file = configuration(str(run / "config.yaml")).file
     agent, own = agent_config("vfn-p", file), agent_config("vfn", file)
-    card = checkpoint.read_card(run / "ensemble" / "distilled.safetensors")
+    card = checkpoint.read_card(run / "ensemble" / TAUGHT)
     training = replace(file.training, seed=card["data"]["training"]["seed"])
     about = {**card["data"], "policy": "vfn", "learned_from": "drives of vfn-p"}
     out.mkdir(parents=True, exist_ok=True)
@@ -109,6 +110,10 @@ def main() -> None:
     parser.add_argument("run", type=Path, help="folder of a training of vfn-p")
     parser.add_argument("--out", type=Path, help="default: RUN/without_prediction")
     args = parser.parse_args()
+    if not (args.run / "ensemble" / TAUGHT).is_file():
+        parser.error(
+            f"argument run: {args.run} holds no training with a finished ensemble (ensemble/{TAUGHT})"
+        )
     use_threads(1)
     print(learn(args.run, args.out or args.run / "without_prediction"))
 

@@ -114,9 +114,7 @@ def places() -> list[tuple[str, str]]:
     return [(w, d) for w in sumo_scenarios.names() for d in DEMANDS if d in (load(w).demands or {})]
 
 
-def driven(
-    world: str, demand: str, errors: Errors | None, episodes: int, fleet: Fleet | None = None
-) -> Tally:
+def driven(world: str, demand: str, errors: Errors, episodes: int, fleet: Fleet | None = None) -> Tally:
     """Episodes on tuning seeds, whose AVs SUMO drives."""
     scenario = vetted(replace(load(world, demand=[demand], fleet=fleet), errors=errors))
     host, tally = Host(scenario, "idm", math.radians(45.0)), Tally()
@@ -139,7 +137,8 @@ def rates() -> list[str]:
     ]
     for kind in KINDS:
         of = [getattr(level.kinds, kind) for level in shipped.values()]
-        lines.append(markdown_row([f"`{kind}`", *map(_magnitudes, of), of[0].source]))
+        cells = [_in_worlds(_magnitudes(one), name, kind) for one, name in zip(of, shipped, strict=True)]
+        lines.append(markdown_row([f"`{kind}`", *cells, of[0].source]))
     return lines
 
 
@@ -149,7 +148,7 @@ def stress(episodes: int) -> list[str]:
     heads += ", errors an episode"
     lines = [markdown_row(heads.split(", ")), markdown_row(["---"] * 7)]
     for world, demand in places():
-        t = driven(world, demand, levels()["stress"], episodes)
+        t = driven(world, demand, levels(world)["stress"], episodes)
         hit = share(t.av, t.episodes)
         begun = ", ".join(f"{n / t.episodes:.1f} {kind}" for kind, n in t.errors.most_common())
         interval = f"{100 * hit.value:.0f} % ({100 * hit.low:.0f} to {100 * hit.high:.0f})"
@@ -231,6 +230,12 @@ def _magnitudes(kind: Any) -> str:
     more = {k: v for k, v in asdict(kind).items() if k not in ("rate", "source")}
     words = [f"{k} {v[0]:g} to {v[1]:g}" if isinstance(v, tuple) else f"{k} {v:g}" for k, v in more.items()]
     return "; ".join([f"{kind.rate:.2g}", *words])
+
+
+def _in_worlds(everywhere: str, level: str, kind: str) -> str:
+    """With what it is in worlds that have it otherwise."""
+    of = {world: _magnitudes(getattr(levels(world)[level].kinds, kind)) for world in sumo_scenarios.names()}
+    return "; ".join([everywhere, *(f"{w}: {said}" for w, said in of.items() if said != everywhere)])
 
 
 def fill(page: Path, name: str, lines: Sequence[str]) -> None:

@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +25,6 @@ from cosim.host import Host
 from cosim.report import run_folder, statistics
 from cosim.report.figures import Row
 from cosim.scenario import load
-from cosim.scenario.human_errors import levels
 from cosim.scenario.vet import vetted
 from cosim.seeding import FIRST_TEST_SEED, TUNING_SEEDS
 from cosim.types import Decision, EpisodeResult, History, MetaAction, ObservationConfig, PolicyContext, Preset
@@ -90,8 +88,7 @@ def taken_away(episodes: int) -> list[str]:
     for part in PARTS:
         hits = []
         for world, demand in DEMAND.items():
-            scenario = load(world, demand=[demand], preset=Preset.LAWFUL)
-            scenario = vetted(replace(scenario, errors=levels()[LEVEL]))
+            scenario = vetted(load(world, demand=[demand], preset=Preset.LAWFUL, errors=LEVEL))
             with Worker(Without, scenario, Accelerate(), math.radians(45.0)) as worker:
                 worker.call("take_away", part)
                 found: list[EpisodeResult] = [worker.call("run", s) for s in TUNING_SEEDS[:episodes]]

@@ -203,7 +203,7 @@ def load(
         preset=one_of(scenario.preset if preset is None else preset, Preset.ALL, "--preset"),
         on_collision=one_of(on_collision or scenario.on_collision, OnCollision.ALL, "--on-collision"),
         fleet=scenario.fleet if fleet is None else checked_fleet(fleet),
-        errors=human_errors.read(errors),
+        errors=human_errors.read(errors, world=scenario.name if scenario.ships else ""),
     )
 
 

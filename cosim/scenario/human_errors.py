@@ -127,14 +127,15 @@ class Errors:
     file: Path
 
 
-def read(what: str | None, field: str = "--errors", file: object = None) -> Errors | None:
+def read(what: str | None, field: str = "--errors", file: object = None, *, world: str = "") -> Errors | None:
     """The errors of a level that ships or of a user's YAML file (a table of kinds); None: nobody errs.
 
-    `field` and `file` are where `what` is asked for. Raises BadInput naming file, field and value.
+    `field` and `file` are where `what` is asked for; `world`: as of `levels`. Raises BadInput naming file,
+    field and value.
     """
     if what is None or what == NONE:
         return None
-    shipped = levels()
+    shipped = levels(world)
     if what in shipped:
         return shipped[what]
     path = Path(what)
@@ -156,11 +157,18 @@ def asked(what: str | None, folder: Path = Path()) -> str | None:
 
 
 @lru_cache
-def levels() -> dict[str, Errors]:
-    """The levels that ship by name. Raises BadInput."""
+def levels(world: str = "") -> dict[str, Errors]:
+    """The levels that ship by name, as they are in a world that ships.
+
+    A table `LEVEL.WORLD` of the file replaces kinds of `LEVEL` there. Raises BadInput.
+    """
     file = sumo_scenarios.ERRORS
     tables = yaml_input.document(file)
-    found = {name: yaml_input.dataclass_from(Kinds, table, file, name) for name, table in tables.items()}
+    found = {
+        name: yaml_input.dataclass_from(Kinds, table | tables.get(f"{name}.{world}", {}), file, name)
+        for name, table in tables.items()
+        if "." not in name
+    }
     return {name: Errors(name, _digest(kinds), kinds, file) for name, kinds in found.items()}
 
 

@@ -12,6 +12,7 @@ import pytest
 
 import sumo_scenarios
 from cosim.errors import BadInput
+from cosim.files import yaml_input
 from cosim.report.pairing import Group
 from cosim.scenario import load
 from cosim.scenario.episode_id import EpisodeId
@@ -39,6 +40,18 @@ def test_levels_have_every_kind_and_say_where_their_rates_are_from(name: str) ->
         assert rates is not None
         assert rates.rate > 0.0
         assert len(rates.source) > 20
+
+
+def test_a_level_differs_in_one_of_our_worlds_and_nowhere_else() -> None:
+    everywhere, there = (levels(world)["stress"].kinds for world in ("merge", "highway"))
+    assert there.inattention != everywhere.inattention
+    assert there.hard_braking == everywhere.hard_braking
+    driven = load("highway", errors="stress").errors
+    assert driven == levels("highway")["stress"]
+    assert driven != levels("merge")["stress"] == levels()["stress"]
+    named = [name.split(".") for name in yaml_input.document(sumo_scenarios.ERRORS) if "." in name]
+    assert named
+    assert all(level in levels() and world in sumo_scenarios.names() for level, world in named)
 
 
 def test_stress_has_higher_rates_than_field() -> None:

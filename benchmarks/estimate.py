@@ -237,7 +237,7 @@ def _real(runs: Path) -> list[str]:
 
 
 def _field(runs: Path) -> list[str]:
-    """What the level `field` costs."""
+    """What the level `field` costs, and the tilts that it was driven with."""
     folders = sorted(runs.glob("field-*"))
     if not folders:
         return []
@@ -251,6 +251,7 @@ def _field(runs: Path) -> list[str]:
         ),
         "|" + "---|" * 11,
     ]  # fmt: skip
+    tilts: list[str] = []
     for folder in folders:
         rows = _ok(folder)
         found = crash_rate.estimate(rows)
@@ -258,17 +259,19 @@ def _field(runs: Path) -> list[str]:
         intervals = [
             wording.interval(INCIDENCES[n].figure(rows), INCIDENCES[n]) for n in INCIDENCES if CRASHES in n
         ]
-        share = found["largest_crash_share"]
+        share, world = found["largest_crash_share"], folder.name.removeprefix("field-")
+        (cell,) = run_folder.read(folder).manifest["cells"].values()
+        tilts.append(f"Tilt of {world}: `{cell['manifest']['tilt']}`.")
         many = crash_rate.needed(rows)
         lines.append(
             markdown_row(
-                (folder.name.removeprefix("field-"), f"{len(rows)}", *intervals,
+                (world, f"{len(rows)}", *intervals,
                  f"{found['crashed_episodes']}, {found['effective_crashes']:.1f}",
                  f"{found['effective_samples']:.0f}", "-" if share is None else f"{100 * share:.0f} %",
                  f"{many:.0f}", f"{seconds:.2f}", f"{many * seconds / 7200:.1f}")
             )
         )  # fmt: skip
-    return [*lines, ""]
+    return [*lines, "", *tilts, ""]
 
 
 def _ok(folder: Path) -> list[Row]:

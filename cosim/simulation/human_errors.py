@@ -1,7 +1,7 @@
 """Lets human drivers and persons err: one trial per driver and second or per manoeuvre, drawn from hashes."""
 
 import math
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -38,6 +38,7 @@ MEET_ANYBODY = ("red_light", "step_out")  # kinds of which nobody knows before w
 
 # Kinds drawn every second for every driver; the others belong to a manoeuvre.
 EVERY_SECOND = ("inattention", "hard_braking", "cut_in", "aborted_cut_in", "stalled_car")
+# what a person who steps out has, and what holds where its type does not say
 IGNORE = {
     "jmDriveAfterRedTime": ("1000", "-1"),
     "jmIgnoreFoeProb": ("1", "0"),
@@ -69,6 +70,7 @@ class Erring:
     deceleration: float | None = None  # m/s2, of a driver who holds (0) or lowers its speed
     swerves: tuple[float, int] | None = None  # s, when it changes back, and to which side
     leaves: str = ""  # it ends when the vehicle has left this edge and the junction behind it
+    heeds: dict[str, str] | None = None  # what `IGNORE` names, of a person, before
 
 
 class HumanErrors:
@@ -436,7 +438,7 @@ class HumanErrors:
         length = self._drawn(self._kinds["step_out"].duration, "step_out", who, now, "duration")
         erring = self._begins("step_out", who, now, length, "walks onto the crossing without waiting", "")
         sumo.person.setMinGap(person, sumo.person.getMinGap(person))  # a type of its own
-        _ignores(person, True)
+        erring.heeds = _crosses_by(person, {name: on for name, (on, _) in IGNORE.items()})
         return erring
 
     def _begins(self, kind: str, who: str, now: float, length: float, what: str, near: str) -> Erring:
@@ -480,10 +482,10 @@ class HumanErrors:
         """Give back what was taken."""
         erring = self._erring.pop(name)
         self._ended[name] = sumo.simulation.getTime()
-        if erring.error.kind == "step_out":
+        if erring.heeds is not None:
             person = name.removeprefix(PERSON)
             if person in sumo.person.getIDList():
-                _ignores(person, False)
+                _crosses_by(person, erring.heeds)
             return
         if erring.deceleration is not None:
             sumo.vehicle.setSpeed(name, -1.0)
@@ -587,8 +589,11 @@ def _leader(name: str) -> tuple[str, float] | None:
     return found if found and found[0] else None
 
 
-def _ignores(person: str, ignores: bool) -> None:
-    """Signals and vehicles at crossings, by parameters of the type that is this person's alone."""
-    kind = sumo.person.getTypeID(person)
-    for name, (on, off) in IGNORE.items():
-        sumo.vehicletype.setParameter(kind, f"junctionModel.{name}", on if ignores else off)
+def _crosses_by(person: str, values: Mapping[str, str]) -> dict[str, str]:
+    """Set what a person heeds at crossings, parameters of its own type; returns them as they were."""
+    kind, before = sumo.person.getTypeID(person), {}
+    for name, value in values.items():
+        full = f"junctionModel.{name}"
+        before[name] = sumo.vehicletype.getParameter(kind, full) or IGNORE[name][1]
+        sumo.vehicletype.setParameter(kind, full, value)
+    return before

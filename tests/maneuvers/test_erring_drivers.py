@@ -57,6 +57,11 @@ class Seen:
         scenario = load(what, demand=[demand] if demand else (), fleet=fleet, warmup=0.0 if share else None)
         scenario = vetted(replace(scenario, errors=Errors("test", "", kinds, Path("test"))))
         self._host = Host(scenario, policy, 0.8)
+        self._modes: list[tuple[float, dict[str, tuple[int, int]]]] = []
+
+    def modes(self) -> list[tuple[float, dict[str, tuple[int, int]]]]:
+        """After every decision of `frames`: s, and what every vehicle's driver heeds."""
+        return self._modes
 
     def frames(self, seed: int, decisions: int) -> list[Snapshot]:
         episode = self._host.episode
@@ -66,6 +71,9 @@ class Seen:
         for _ in range(decisions):
             episode.advance(self._host.policy.decide(episode.histories))
             found += episode.frames
+            get = libsumo.vehicle
+            modes = {name: (get.getSpeedMode(name), get.getLaneChangeMode(name)) for name in get.getIDList()}
+            self._modes.append((found[-1].time, modes))
             if episode.over:
                 break
         return found
@@ -122,7 +130,30 @@ def given_back(frames: list[Snapshot], modes: list[Any]) -> bool:
     """Whether the driver is SUMO's own at every time at which no error is under way."""
     spans = [(e.time, e.until) for e in errors(frames)]
     free = [mode for t, mode in modes if all(not a - 1e-6 <= t <= b + 0.11 for a, b in spans)]
-    return bool(free) and {mode[:2] for mode in free} == {UNTOUCHED[:2]}
+    return bool(free) and set(free) == {UNTOUCHED}
+
+
+def through(frames: list[Snapshot], road: Any, error: HumanError) -> float:
+    """s at which who errs has left the junction that it was before; `until` where it has not."""
+    edges = [
+        (f.time, road.lanes[int(f.lane[f.row[error.who]])].edge)
+        for f in frames
+        if f.time >= error.time - 1e-6 and error.who in f.row and f.lane[f.row[error.who]] >= 0
+    ]
+    own = edges[0][1]
+    return next((t for t, edge in edges if edge != own and edge[0] != ":"), error.until)
+
+
+def given_back_behind(frames: list[Snapshot], road: Any, modes: list[Any]) -> bool:
+    """Whether all who erred at a junction drive as SUMO's own drivers as soon as they have left it."""
+    spans = [(e.who, e.time, min(through(frames, road, e), e.until)) for e in errors(frames)]
+    found = [
+        here[who]
+        for who, _, end in spans
+        for t, here in modes
+        if t > end + 0.11 and who in here and all(w != who or not a <= t <= b + 0.11 for w, a, b in spans)
+    ]
+    return bool(found) and set(found) == {UNTOUCHED[:2]}
 
 
 def test_an_inattentive_driver_keeps_its_speed_while_its_leader_brakes(start: Start) -> None:
@@ -208,25 +239,54 @@ def test_an_aborted_cut_in_ends_in_its_own_lane(start: Start) -> None:
     assert given_back(frames, modes)
 
 
-@pytest.mark.parametrize(("patience", "lag"), [(3.0, 0.0), (6.0, 0.0), (3.0, 100.0)])
-def test_who_forces_its_way_in_has_lost_its_patience_and_refuses_too_short_a_gap(
-    patience: float, lag: float
-) -> None:
-    kind = ForcedEntry(rate=1.0, patience=patience, lag=lag)
-    worker = Worker(Seen, "merge", Kinds(forced_entry=kind), None, "contested")
+def contested(
+    world: str, seed: int, decisions: int, **kinds: object
+) -> tuple[list[Snapshot], Any, list[Any]]:
+    """Frames, road and `Seen.modes` of a contested episode."""
+    worker = Worker(Seen, world, Kinds(**kinds), None, "contested")  # type: ignore[arg-type]
     try:
-        frames: list[Snapshot] = worker.call("frames", 100000, 60)
+        return worker.call("frames", seed, decisions), worker.call("road"), worker.call("modes")
     finally:
         worker.close()
-    found = [e for e in errors(frames) if e.who == "mission.0"]
-    if lag:
-        assert all("nobody comes" in e.what for e in found)
-        return
-    waited = re.search(r"after (\d+) s", found[0].what)
+
+
+@pytest.mark.parametrize("patience", [3.0, 6.0])
+def test_who_forces_its_way_in_has_lost_its_patience(patience: float) -> None:
+    kind = ForcedEntry(rate=1.0, patience=patience, lag=0.0)
+    frames, _, modes = contested("merge", 100000, 80, forced_entry=kind)
+    first = next(e for e in errors(frames) if e.who == "mission.0")
+    waited = re.search(r"after (\d+) s", first.what)
     assert waited is not None
     assert patience + 1 <= int(waited[1]) <= patience + 3
-    lanes = of(frames, "mission.0", "lane", found[0].time, found[0].time + 3.0)
+    lanes = of(frames, "mission.0", "lane", first.time, first.time + 3.0)
     assert lanes[0] != lanes[-1]
+    assert given_back(frames, [(t, (*here["mission.0"], -1.0)) for t, here in modes if "mission.0" in here])
+
+
+def test_who_refuses_every_gap_in_which_somebody_comes_stays_in_its_lane() -> None:
+    begun = []
+    for lag in (0.0, 100.0):
+        kind = ForcedEntry(rate=1.0, patience=3.0, lag=lag)
+        frames, _, _ = contested("merge", 100000, 60, forced_entry=kind)
+        begun.append([e for e in errors(frames) if e.who == "mission.0"])
+    assert begun[0]
+    assert "must brake" in begun[0][0].what
+    assert all("nobody comes" in e.what for e in begun[1])
+    lanes = of(frames, "mission.0", "lane", begun[0][0].time, begun[0][0].time + 3.0)
+    assert np.ptp(lanes) == 0, "it waits where the other one forces its way in"
+
+
+def test_who_forces_its_way_in_at_a_line_enters_and_goes_through() -> None:
+    kind = ForcedEntry(rate=1.0, patience=3.0, lag=0.0)
+    frames, road, modes = contested("intersection", 100000, 100, forced_entry=kind)
+    first = next(e for e in errors(frames) if e.who == "mission.0")
+    before = of(frames, first.who, "speed", first.time - 2.0, first.time)
+    assert before.max() < 3.0, "it has waited"
+    through_at = through(frames, road, first)
+    assert first.time < through_at < first.until
+    after = of(frames, first.who, "speed", first.time, through_at)
+    assert np.diff(after).min() > -0.5, "it does not stop again"
+    assert given_back_behind(frames, road, modes)
 
 
 def test_the_longer_one_has_waited_the_likelier_it_forces_its_way_in() -> None:
@@ -237,12 +297,8 @@ def test_the_longer_one_has_waited_the_likelier_it_forces_its_way_in() -> None:
 
 
 def test_a_driver_who_does_not_yield_enters_without_slowing_down() -> None:
-    worker = Worker(Seen, "intersection", Kinds(failure_to_yield=FailureToYield(rate=1.0)), None, "contested")
-    try:
-        frames: list[Snapshot] = worker.call("frames", 100000, 100)
-        road = worker.call("road")
-    finally:
-        worker.close()
+    kind = FailureToYield(rate=1.0)
+    frames, road, modes = contested("intersection", 100001, 100, failure_to_yield=kind)
     first = next(e for e in errors(frames) if e.who == "mission.0")
     assert first.near
     inside = next(
@@ -250,6 +306,7 @@ def test_a_driver_who_does_not_yield_enters_without_slowing_down() -> None:
     )
     assert inside.time - first.time < 4.0
     assert of(frames, first.who, "speed", first.time, inside.time).min() > 5.0
+    assert given_back_behind(frames, road, modes)
 
 
 def test_who_runs_a_red_light_passes_within_the_seconds_that_its_kind_allows(
@@ -261,7 +318,7 @@ def test_who_runs_a_red_light_passes_within_the_seconds_that_its_kind_allows(
     )
     try:
         frames: list[Snapshot] = worker.call("frames", 3, 300)
-        road = worker.call("road")
+        road, modes = worker.call("road"), worker.call("modes")
     finally:
         worker.close()
     found = errors(frames)
@@ -277,11 +334,19 @@ def test_who_runs_a_red_light_passes_within_the_seconds_that_its_kind_allows(
         red = [t for t, state in states if state == "r"]
         assert red, "on red"
         assert passed.time - red[0] <= late + 0.5
+    assert given_back_behind(frames, road, modes)
 
 
-def test_a_person_steps_out_and_looks_again_afterwards(law_worlds: dict[str, Path]) -> None:
+def test_a_person_steps_out_and_looks_again_afterwards(law_worlds: dict[str, Path], tmp_path: Path) -> None:
+    """As its own type says, where that says something."""
+    config = law_worlds["crossing_signals"]
+    demand = (config.parent / "demand.rou.xml").read_text()
+    own = '<vType id="careless" vClass="pedestrian" jmIgnoreFoeProb="0.25"/>'
+    demand = demand.replace("<routes>", f"<routes>{own}")
+    demand = demand.replace('<personFlow id="p_we"', '<personFlow id="p_we" type="careless"')
+    (tmp_path / "walks.rou.xml").write_text(demand)
     kind = StepOut(rate=1.0, duration=(4.0, 4.0))
-    worker = Worker(Seen, str(law_worlds["crossing_signals"]), Kinds(step_out=kind), 0.1)
+    worker = Worker(Seen, str(config), Kinds(step_out=kind), 0.1, str(tmp_path / "walks.rou.xml"))
     try:
         frames: list[Snapshot] = worker.call("frames", 3, 200)
         found = errors(frames)
@@ -289,10 +354,12 @@ def test_a_person_steps_out_and_looks_again_afterwards(law_worlds: dict[str, Pat
         walks = [of(frames, e.who, "speed", e.time + 0.4, e.time + 3.0).max() > 0.5 for e in found]
         assert np.mean(walks) > 0.7
         last = frames[-1]
-        over = [e.who for e in found if e.until < last.time - 0.2 and e.who in last.row]
-        again = {e.who for e in found if e.until >= last.time - 0.2}
-        for who in set(over) - again:
-            assert worker.call("restored", who.removeprefix("person:")) == ("-1", "0", "0")
+        over = {e.who for e in found if e.until < last.time - 0.2 and e.who in last.row}
+        over -= {e.who for e in found if e.until >= last.time - 0.2}
+        assert {"p_we" in who for who in over} == {False, True}
+        for who in over:
+            own = "0.25" if "p_we" in who else "0"
+            assert worker.call("restored", who.removeprefix("person:")) == ("-1", own, "0")
     finally:
         worker.close()
 
@@ -323,6 +390,17 @@ def test_two_humans_who_crash_become_wrecks_and_the_episode_goes_on(start: Start
     assert not crash.crash
     gone = [name for f in frames for name in f.events.wrecks_removed]
     assert sorted(gone) == ["h", "s"]
+
+
+@pytest.mark.parametrize("errs", [False, True])
+def test_whoever_errs_ahead_of_a_collision_has_a_part_in_it(start: Start, errs: bool) -> None:
+    kind = HardBraking(rate=1.0 if errs else 1e-12, deceleration=(5.0, 5.0), duration=(2.0, 2.0))
+    cars = [ALONE, vehicle("v", "av", 70.0, speed=20.0), vehicle("a", "av", 45.0, speed=20.0)]
+    worker = start(cars, Watched, errors=level(hard_braking=kind))
+    frames, _ = drive(worker, 20, [Command("v", 14.0, 0, HOLD), Command("a", 28.0, 0, HOLD)])
+    crash = collisions(frames)[0]
+    assert {crash.collider, crash.victim} == {"a", "v"}
+    assert crash.human_error_involved == errs
 
 
 def test_another_policy_meets_the_same_errors() -> None:

@@ -71,6 +71,19 @@ def test_killed_and_resumed_it_holds_every_episode_once(tmp_path: Path) -> None:
     assert any(h.velocity_map.any() for found in seen for h in found.values())
 
 
+def test_a_recording_holds_the_errors_that_were_asked_for(tmp_path: Path) -> None:
+    flags = ["record", "--scenario", "merge", "--demand", "contested", "--policy", "idm", "--duration", "8"]
+    for errors in ("none", "stress"):
+        out = tmp_path / errors
+        assert main([*flags, "--errors", errors, "--seeds", "3:4", "--out", str(out)]) == 0
+        (key,) = Folder(out).episodes()
+        events = read(Folder(out).episode_file(key)).events
+        begun = [error for happened in events.values() for error in happened.errors]
+        assert bool(begun) == (errors == "stress")
+        (cell,) = Folder(out).manifest()["cells"].values()
+        assert cell["manifest"].get("errors", {}).get("name", "none") == errors
+
+
 def test_it_never_writes_over_recordings_by_accident(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

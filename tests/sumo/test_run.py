@@ -70,6 +70,15 @@ def test_the_same_seed_in_fresh_processes_is_the_same_run_and_another_seed_is_no
     assert timeless[0] == timeless[1]
 
 
+def test_drivers_err_where_errors_are_asked_for() -> None:
+    asked = ["merge", "--demand", "contested", "--policy", "idm", "--duration", "12", "--seed", "200003"]
+    plain, erring = (document(*asked, *more) for more in ((), ("--errors", "stress")))
+    assert plain["human_errors"] == 0
+    assert erring["human_errors"] > 5
+    assert erring["errors"] == "stress"
+    assert erring["trace_hash"] != plain["trace_hash"]
+
+
 def test_the_whole_agent_commands_every_av_and_says_what_is_untrained() -> None:
     found = document("merge", "--policy", "vfn-p", "--duration", "4", "--seed", "200001")
     assert found["policy_label"] == make("vfn-p").label

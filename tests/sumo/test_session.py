@@ -23,6 +23,7 @@ import cosim.envs
 from cosim.envs.parallel import parallel_env
 from cosim.envs.session import Session
 from cosim.episode import Episode
+from cosim.host import Host
 from cosim.scenario import Scenario, load
 from cosim.simulation.sumo import SumoSimulator
 from cosim.types import COMPACT, SMOKE, Decision, Kind, MetaAction
@@ -71,6 +72,28 @@ def test_an_episode_through_gymnasium_is_the_one_that_the_loop_drives() -> None:
     with Worker(Loop, scenario) as worker:
         assert worker.call("drive", SEED, plan) == info["trace_hash"]
         assert worker.call("drive", SEED + 1, plan[:0]) != info["trace_hash"]
+
+
+def test_drivers_err_alike_through_every_interface() -> None:
+    """Draws are equal whoever drives: here nobody commands an AV."""
+    asked: dict[str, Any] = {"demand": "contested", "duration": DURATION, "errors": "stress"}
+    with cosim.open("merge", **asked) as session:
+        session.reset(SEED)
+        while not session.act({}).info["over"]:
+            pass
+        begun = [session.result().errors_begun]
+    env = parallel_env("merge", **asked)
+    env.reset(seed=SEED)
+    while env.agents:
+        env.step({})
+    begun.append(env.session.result().errors_begun)
+    env.close()
+    with Worker(
+        Host, load("merge", demand=("contested",), duration=DURATION, errors="stress"), "idm", 0.0
+    ) as worker:
+        begun.append(worker.call("run", SEED).errors_begun)
+    assert len(begun[0]) > 3
+    assert begun[0] == begun[1] == begun[2]
 
 
 def test_both_checkers_accept_an_environment_on_sumo() -> None:

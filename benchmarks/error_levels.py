@@ -22,12 +22,14 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 import sumo_scenarios
 from benchmarks.tables import markdown_row
 from cosim.episode import Episode, Hook, Step
 from cosim.files import whole
 from cosim.host import Host
-from cosim.report.statistics import paired_change, share
+from cosim.report.statistics import paired_change, pooled_rate, rate, share
 from cosim.scenario import Fleet, load
 from cosim.scenario.human_errors import KINDS, Errors, Kinds, levels
 from cosim.scenario.vet import vetted
@@ -158,25 +160,53 @@ def stress(episodes: int) -> list[str]:
 
 
 def alone(episodes: int) -> list[str]:
-    """Humans alone at raised rates of `field`, and what that means at its own rates."""
+    """Humans alone at raised rates of `field`, and what that means at its own rates.
+
+    Near-misses happen without any error too: what errors add is the difference to the first line.
+    """
     base = levels()["field"]
-    heads = "raised, by, km, collisions, near-misses, collisions per million km at the rates of `field`"
-    lines = [markdown_row(heads.split(", ")), markdown_row(["---"] * 6)]
-    raw: dict[str, float] = {}  # per million km
-    total = 0.0
-    for name, factors, factor, parts in ALONE:
+    heads = "raised, by, km, collisions, near-misses, per million km at the rates of `field`: collisions"
+    heads += ", near-misses that errors add"
+    lines = [markdown_row(heads.split(", ")), markdown_row(["---"] * 7)]
+    raw: dict[str, float] = {}  # collisions per million km
+    added: dict[str, tuple[float, float]] = {}  # near-misses per million km, and their variance
+    each: list[tuple[int, float]] = []  # collisions, and what one of them is worth
+    most, more, scatter = 0.0, 0.0, 0.0
+    for name, factors, factor, parts in (Raised("nothing", {}, 1.0), *ALONE):
         kinds = Kinds(**{kind: _raised(getattr(base.kinds, kind), by) for kind, by in factors.items()})
         errors = Errors(name, "", kinds, base.file)
         tallies = [
             driven(w, d, errors, episodes, Fleet(penetration=0.0)) for w, d in places() if d == "dense"
         ]
         km, pairs, near = (sum(getattr(t, n) for t in tallies) for n in ("driven", "pairs", "near"))
-        raw[name] = pairs / km * MILLION
-        per = max(raw[name] - sum(raw[part] for part in parts), 0.0) / factor
-        total += per
         by = " and ".join(f"{by:g}" for by in dict.fromkeys(factors.values()))
-        lines.append(markdown_row([name, by, f"{km:,.0f}", str(pairs), str(near or "-"), f"{per:.2g}"]))
-    return [*lines, markdown_row(["together", "", "", "", "", f"{total:.2g}"])]
+        cells = [name, by, f"{km:,.0f}", str(pairs), str(near)]
+        found = near / km * MILLION, near / km**2 * MILLION**2
+        if not factors:
+            without = found
+            lines.append(markdown_row([*cells, "", f"({_signed(*found)} come without)"]))
+            continue
+        raw[name] = pairs / km * MILLION
+        added[name] = found[0] - without[0], found[1] + without[1]
+        per = max(raw[name] - sum(raw[part] for part in parts), 0.0) / factor
+        of = rate(pairs, km * factor / MILLION)
+        bounds = f"at most {of.high:.2g}" if parts or not pairs else f"{of.low:.2g} to {of.high:.2g}"
+        here = (added[name][0] - sum(added[part][0] for part in parts)) / factor
+        spread = (added[name][1] + sum(added[part][1] for part in parts)) / factor**2
+        lines.append(markdown_row([*cells, f"{per:.2g} ({bounds})", _signed(here, spread)]))
+        most, more, scatter = most + per, more + here, scatter + spread
+        each.append((pairs, MILLION / (km * factor)))
+    counts, worth = (np.array(values, float) for values in zip(*each, strict=True))
+    pooled = pooled_rate(counts, 1.0 / (len(worth) * worth), worth)
+    together = f"{most:.2g} ({pooled.low:.2g} to {pooled.high:.2g})"
+    return [*lines, markdown_row(["together", "", "", "", "", together, _signed(more, scatter)])]
+
+
+def _signed(value: float, variance: float) -> str:
+    """With its normal 95 % interval, to two digits of that."""
+    half = 1.96 * math.sqrt(variance)
+    digits = max(1 - math.floor(math.log10(half)), 0) if half else 0
+    return f"{value:,.{digits}f} ({value - half:,.{digits}f} to {value + half:,.{digits}f})"
 
 
 def cost(episodes: int) -> list[str]:

@@ -24,7 +24,9 @@ from cosim.cli.main import main as cosim
 from cosim.host import Host
 from cosim.report import run_folder, statistics
 from cosim.report.figures import Row
+from cosim.report.pairing import errors_begun
 from cosim.scenario import load
+from cosim.scenario.policy_name import read as read_name
 from cosim.scenario.vet import vetted
 from cosim.seeding import FIRST_TEST_SEED, TUNING_SEEDS
 from cosim.types import Decision, EpisodeResult, History, MetaAction, ObservationConfig, PolicyContext, Preset
@@ -32,7 +34,7 @@ from cosim.workers.tasks import OK
 from cosim.workers.worker import Worker
 
 PAGE = Path("docs/results/humans.md")
-# In `contested` most happens; there the AVs of a motorway that nobody disturbs are hardly ever hit.
+# In `contested` most happens; there the AVs of a motorway that nobody disturbs are hit less often.
 DEMAND = {
     "merge": "contested",
     "exit": "contested",
@@ -41,10 +43,12 @@ DEMAND = {
     "highway": "dense",
 }
 LEVEL, IDM = "stress", "idm"
+CAR = "car-alone=benchmarks/humans.py:Accelerate"  # it always asks for more speed: the rest is the car's own
 BLOCK = 20  # seeds that are driven together
 COLUMNS = (
     *("world", "demand", "pairs", "policy", "an AV in a collision", "idm", "difference, pp", "p"),
     *("an AV caused one", "distance of all, m", "more than idm, m", "hard brakings of AVs", "idm"),
+    "errors that began in both",
 )
 # What is taken away -> the constants of cosim.simulation.assistance without it.
 PARTS: dict[str, dict[str, object]] = {
@@ -99,13 +103,18 @@ def taken_away(episodes: int) -> list[str]:
     return lines
 
 
+def label(policy: str) -> str:
+    """What tables and folders call it."""
+    return read_name(policy).label
+
+
 def rows_of(runs: Path, policy: str) -> dict[tuple[str, int], Row]:
     """(World, seed) -> row, of the demands of `DEMAND`, from all run folders below `runs`."""
     return {
         (str(row["scenario"]), int(row["seed"])): row
         for store in sorted(runs.glob("*/store.sqlite"))
         for row in run_folder.read(store.parent).rows
-        if (row["policy"], row["errors"], row["status"]) == (policy, LEVEL, OK)
+        if (row["policy"], row["errors"], row["status"]) == (label(policy), LEVEL, OK)
         and row["demand"] == DEMAND[str(row["scenario"])]
     }
 
@@ -124,14 +133,16 @@ def line(
     caused = sum(value > 0 for value in column(now, "av_caused_collisions"))
     way = [column(rows, "dt_mean_m") for rows in (now, then)]
     hard = [float(np.mean(column(rows, "hard_brakings_av"))) for rows in (now, then)]
+    *begun, both = errors_begun(zip(now, then, strict=True))
     return [
-        *(world or "together", DEMAND.get(world, ""), str(len(keys)), policy),
+        *(world or "together", DEMAND.get(world, ""), str(len(keys)), label(policy)),
         *(_counted(int(hit.sum()), len(keys)), _counted(int(before.sum()), len(keys))),
         statistics.paired_share(before, hit).text(1, 100.0),
         f"{statistics.mcnemar(*statistics.discordant(before, hit)):.2g}",
         _counted(caused, len(keys)),
         *(f"{np.mean(way[0]):.0f}", statistics.paired_mean(way[1], way[0]).text(0)),
         *(f"{hard[0]:.1f}", f"{hard[1]:.1f}"),
+        f"{100 * both / max(sum(begun) - both, 1):.0f} %",
     ]
 
 
@@ -143,7 +154,7 @@ def drive(policy: str, demand: str, seeds: range, runs: Path, workers: str) -> N
     """These episodes in all worlds of this demand; a run folder of their own, which is gone on with."""
     worlds = [word for name, d in DEMAND.items() if d == demand for word in ("--scenario", name)]
     which = ["--demand", demand, "--policy", policy, "--preset", Preset.LAWFUL, "--errors", LEVEL]
-    folder = runs / f"{demand}-{policy}-{seeds.start}"
+    folder = runs / f"{demand}-{label(policy)}-{seeds.start}"
     running = ["--seeds", f"{seeds.start}:{seeds.stop}", "--no-report", "--workers", workers]
     code = cosim(["evaluate", *worlds, *which, *running, "--resume", "--out", str(folder)])
     if code:
@@ -174,7 +185,7 @@ def main() -> None:
     )
     parser.add_argument("--taken-away", action="store_true")
     parser.add_argument("--episodes", type=int, help="a world; default 400, of --taken-away 30")
-    parser.add_argument("--policy", nargs="+", default=["vfn-p"])
+    parser.add_argument("--policy", nargs="+", default=["vfn-p", CAR])
     parser.add_argument("--runs", type=Path, default=Path("runs/humans"), help="where episodes are kept")
     parser.add_argument("--workers", default="2")
     parser.add_argument("--page", type=Path, default=PAGE)

@@ -17,18 +17,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from benchmarks.error_levels import fill
-from benchmarks.humans import BLOCK, IDM, LEVEL, PAGE
+from benchmarks.humans import BLOCK, CAR, IDM, LEVEL, PAGE, label
 from benchmarks.tables import markdown_row, picture
 from benchmarks.worlds import WITH_MISSION, WORLDS
 from cosim.cli.main import main as cosim
 from cosim.report import run_folder, statistics, wording
 from cosim.report.figures import INCIDENCES, Row
-from cosim.scenario.policy_name import read as read_name
 from cosim.seeding import FIRST_TEST_SEED
 from cosim.types import Preset
 from cosim.workers.tasks import OK
 
-CAR = "car-alone=benchmarks/humans.py:Accelerate"  # it always asks for more speed: the rest is the car's own
 POLICIES = (
     *(CAR, "keep-lane", "idm", "idm-1.5", "idm-2.2", "altruist-rule", "vfn-p", "vfn", "vfn-p-demonstrated"),
     *("vfn-p-egoistic", "safe-dqn", "conv3d-dqn", "conv3d-a2c", "conv2d-dqn", "vfn-demonstrated"),
@@ -55,11 +53,6 @@ ROLES = {
     "ahead": "one of both is behind an erring human",
     "nobody": "nobody erred",
 }
-
-
-def label(policy: str) -> str:
-    """What tables and folders call it."""
-    return read_name(policy).label
 
 
 Key = tuple[str, str, int]  # demand, world, seed

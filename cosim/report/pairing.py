@@ -60,18 +60,23 @@ class Group:
 
     @property
     def errors_begun(self) -> tuple[int, int, int]:
-        """Human errors that began in A's episodes, in B's, and of both the same: kind, who and second."""
-        begun = [[Counter(map(tuple, _errors(row))) for row in pair] for pair in self.pairs]
-        return (
-            sum(a.total() for a, _ in begun),
-            sum(b.total() for _, b in begun),
-            sum((a & b).total() for a, b in begun),
-        )
+        """See the function of that name."""
+        return errors_begun(self.pairs)
 
     @property
     def identical(self) -> int:
         """Pairs in which both drove exactly alike."""
         return sum(a.get("trace_hash") == b.get("trace_hash") for a, b in self.pairs)
+
+
+def errors_begun(pairs: Iterable[tuple[Row, Row]]) -> tuple[int, int, int]:
+    """Human errors that began in A's episodes, in B's, and of both the same: kind, who and second."""
+    begun = [[Counter(map(tuple, _errors(row))) for row in pair] for pair in pairs]
+    return (
+        sum(a.total() for a, _ in begun),
+        sum(b.total() for _, b in begun),
+        sum((a & b).total() for a, b in begun),
+    )
 
 
 def side(text: str) -> Side:

@@ -18,11 +18,12 @@ from pathlib import Path
 
 from benchmarks.error_levels import fill
 from benchmarks.humans import BLOCK, CAR, IDM, LEVEL, PAGE, label
-from benchmarks.tables import markdown_row, picture
+from benchmarks.tables import markdown_row, picture, stacked_bars
 from benchmarks.worlds import WITH_MISSION, WORLDS
 from cosim.cli.main import main as cosim
 from cosim.report import run_folder, statistics, wording
 from cosim.report.figures import INCIDENCES, Row
+from cosim.scenario.human_errors import KINDS
 from cosim.seeding import FIRST_TEST_SEED
 from cosim.types import Preset
 from cosim.workers.tasks import OK
@@ -200,6 +201,21 @@ def draw(found: Mapping[str, Mapping[Key, Row]], path: Path) -> str:
     return f"![who is in collisions]({path.name})"
 
 
+def draw_errors(found: Mapping[str, Mapping[Key, Row]], path: Path) -> str:
+    """Who erred in an AV's first collision, and how, by policy (Markdown), without `keep-lane`."""
+    panels: dict[str, dict[str, dict[str, int]]] = {"who erred": {}, "how": {}}
+    for policy, rows in found.items():
+        if policy == "keep-lane":
+            continue
+        erred = [who_erred(row) for row in rows.values() if hit(row)]
+        by_role = Counter(role for role, _ in erred)
+        panels["who erred"][policy] = {said: by_role[role] for role, said in ROLES.items()}
+        by_kind = Counter(kind for _, kind in erred if kind)
+        panels["how"][policy] = {kind: by_kind[kind] for kind in KINDS if by_kind[kind]}
+    stacked_bars(path, panels, "first collisions of an AV")
+    return f"![who erred in front of whom]({path.name})"
+
+
 def main() -> None:
     """Drive what is missing, then fill the page."""
     parser = argparse.ArgumentParser(
@@ -218,8 +234,11 @@ def main() -> None:
             drive(policy, range(first, min(first + BLOCK, seeds.stop)), args.runs, args.workers)
     found = read(args.runs, policies, seeds)
     found = {name: found[name] for name in map(label, (*POLICIES, *policies)) if name in found}
-    shown = draw(found, args.page.with_name("humans_policies.png"))
-    fill(args.page, "policies", ["", shown, "", *tables(found)])
+    pictures = [
+        draw(found, args.page.with_name("humans_policies.png")),
+        draw_errors(found, args.page.with_name("humans_errors.png")),
+    ]
+    fill(args.page, "policies", ["", *pictures, "", *tables(found)])
     print("\n".join(tables(found)))
 
 

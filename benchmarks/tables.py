@@ -191,6 +191,24 @@ def picture(
     drawn.savefig(path, dpi=DPI)
 
 
+def stacked_bars(path: Path, panels: Mapping[str, Mapping[str, Mapping[str, int]]], label: str) -> None:
+    """Panels side by side: title -> bar -> part -> count, from the top down; `label`: of the counts."""
+    bars = list(dict.fromkeys(bar for found in panels.values() for bar in found))
+    drawn = Picture(figsize=(5.0 * len(panels) + 1.5, 1.6 + 0.26 * len(bars)), layout="constrained")
+    every = drawn.subplots(1, len(panels), squeeze=False, sharey=True)[0]
+    for axes, (title, found) in zip(every, panels.items(), strict=True):
+        ends = np.zeros(len(bars))
+        for part in dict.fromkeys(part for counts in found.values() for part in counts):
+            wide = np.array([found.get(bar, {}).get(part, 0) for bar in bars], float)
+            axes.barh(bars, wide, left=ends, label=part)
+            ends += wide
+        axes.set(title=title, xlabel=label)
+        axes.grid(axis="x", alpha=0.3)
+        axes.legend(fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2)
+    every[0].invert_yaxis()
+    drawn.savefig(path, dpi=DPI)
+
+
 def write_page(path: Path | None, lines: Sequence[str]) -> None:
     """The Markdown page, whole or not at all; printed where there is no path."""
     if path is None:

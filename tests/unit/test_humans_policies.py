@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from benchmarks.humans_policies import ROLES, headline, line, roles, who_erred
+from benchmarks.humans_policies import ROLES, draw_errors, headline, line, roles, who_erred
 from benchmarks.worlds import WORLDS
 
 
@@ -86,3 +87,11 @@ def test_altruists_stand_beside_egoists_on_equal_seeds() -> None:
     assert cells[4].startswith("0, 6: -75 (")
     assert cells[5].startswith("8, 2: 75 (")
     assert cells[6].startswith("75 (")
+
+
+def test_a_picture_tells_who_erred(tmp_path: Path) -> None:
+    erred = row(True, [["inattention", "hv.1", 18.0]])
+    found = {"idm": {("dense", "merge", 1): erred, ("dense", "merge", 2): row()}, "vfn": {}}
+    shown = draw_errors(found, tmp_path / "errors.png")
+    assert shown == "![who erred in front of whom](errors.png)"
+    assert (tmp_path / "errors.png").stat().st_size > 5000

@@ -1,0 +1,103 @@
+"""One impatient human, nobody else errs: does whoever lets in crash less and get further (T's headline)?
+
+    python -m benchmarks.forced_entry [--episodes 200] [--lag 0.5] [--runs runs/forced_entry] [--page PAGE]
+
+`idm` and `altruist-rule` in the contested worlds with a mission vehicle, on equal test seeds, preset
+`lawful`. The error is `forced_entry` of `stress`; `lag` (s) is the shortest gap that it takes. Goes on where
+it stopped, and writes the table of docs/human_errors.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from benchmarks.error_levels import PAGE, fill
+from benchmarks.tables import markdown_row
+from benchmarks.worlds import WITH_MISSION
+from cosim.cli.main import main as cosim
+from cosim.report import run_folder, statistics
+from cosim.report.figures import Row
+from cosim.report.pairing import errors_begun
+from cosim.scenario.human_errors import levels
+from cosim.seeding import FIRST_TEST_SEED
+from cosim.workers.tasks import OK
+
+ARMS = ("idm", "altruist-rule")
+COLUMNS = (
+    *("world", "pairs", "a collision of the mission vehicle or an AV", "difference, pp", "p"),
+    *("of an AV", "let in", "difference, pp", "distance of all, more m", "of the mission vehicle", "of AVs"),
+    "forced entries",
+)
+
+
+def drive(lag: float, episodes: int, runs: Path, workers: str) -> dict[str, list[Row]]:
+    """Policy -> rows of all worlds, by world and seed."""
+    kind = levels()["stress"].kinds.forced_entry
+    assert kind is not None
+    runs.mkdir(parents=True, exist_ok=True)
+    file = runs / f"forced_{lag:g}.yaml"
+    file.write_text(yaml.safe_dump({"forced_entry": asdict(replace(kind, lag=lag))}))
+    words = [word for world in WITH_MISSION for word in ("--scenario", world)]
+    words += [word for policy in ARMS for word in ("--policy", policy)]
+    words += ["--demand", "contested", "--errors", str(file), "--no-report", "--workers", workers]
+    out = runs / f"lag_{lag:g}_{episodes}"
+    words += ["--seeds", f"{FIRST_TEST_SEED}:{FIRST_TEST_SEED + episodes}", "--resume", "--out", str(out)]
+    if code := cosim(["evaluate", *words]):
+        raise SystemExit(code)
+    rows = [row for row in run_folder.read(out).rows if row["status"] == OK]
+    rows.sort(key=lambda row: (str(row["scenario"]), int(row["seed"])))
+    return {policy: [row for row in rows if row["policy"] == policy] for policy in ARMS}
+
+
+def line(world: str, egoists: Sequence[Row], altruists: Sequence[Row]) -> list[str]:
+    """One world's cells, of rows paired in their order."""
+    both = egoists, altruists
+
+    def shares(name: str) -> list[str]:
+        before, after = (np.array([bool(row[name]) for row in rows]) for rows in both)
+        counts = [f"{100 * side.mean():.1f} %" for side in (before, after)]
+        p = statistics.mcnemar(*statistics.discordant(before, after))
+        return [", ".join(counts), statistics.paired_share(before, after).text(1, 100.0), f"{p:.2g}"]
+
+    def further(name: str) -> str:
+        before, after = ([float(row[name] or 0.0) for row in rows] for rows in both)
+        return statistics.paired_mean(before, after).text(0)
+
+    crashed, served = shares("crashed"), shares("mission_success")
+    hit = (sum(bool(row["av_involved_collisions"]) for row in rows) for rows in both)
+    *begun, _ = errors_begun(zip(*both, strict=True))
+    return [
+        *(world, str(len(egoists)), *crashed, ", ".join(map(str, hit)), *served[:2]),
+        *(further(name) for name in ("dt_mean_m", "dt_mission_m", "dt_av_m")),
+        ", ".join(map(str, begun)),
+    ]
+
+
+def main() -> None:
+    """Drive what is missing, then fill the page."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--episodes", type=int, default=200, help="a world")
+    parser.add_argument("--lag", type=float, default=0.5, metavar="S")
+    parser.add_argument("--runs", type=Path, default=Path("runs/forced_entry"))
+    parser.add_argument("--workers", default="2")
+    parser.add_argument("--page", type=Path, default=PAGE)
+    args = parser.parse_args()
+    rows = drive(args.lag, args.episodes, args.runs, args.workers)
+    lines = [markdown_row(COLUMNS), markdown_row(["---"] * len(COLUMNS))]
+    for world in WITH_MISSION:
+        egoists, altruists = ([row for row in rows[arm] if row["scenario"] == world] for arm in ARMS)
+        lines += [markdown_row(line(world, egoists, altruists))]
+    fill(args.page, "forced", lines)
+    print("\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()

@@ -6,15 +6,17 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.optimize import bisect
 
 from cosim.report import wording
 from cosim.report.figures import CRASHES, INCIDENCES, Row, measures, weights
-from cosim.report.statistics import Figure, Z, effective
+from cosim.report.statistics import Figure, effective, pooled_rate
 from cosim.report.summary import incidence_document, status_counts
 from cosim.workers.tasks import OK
 
 FEW = 10.0  # effective crashes, below which an interval was seen to hold the truth less often than it says
 HALF = 0.5  # relative half width of an interval that is called useful
+POWERS = -6.0, 6.0  # of ten: how many times as many episodes are thought of
 HEAVY = 0.25  # of all crashes' weight in one episode: another one like it would move the estimate
 
 
@@ -43,13 +45,16 @@ def estimate(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def needed(rows: Sequence[Row]) -> float:
-    """About how many episodes an interval of +- `HALF` of the crash rate takes; inf without a crash."""
-    y, k, w = INCIDENCES[CRASHES].tally(rows)
-    events = float((w * y).sum())
-    if not events:
-        return math.inf
-    scatter = float((w**2 * (y - events / (w * k).sum() * k) ** 2).sum()) / events**2
-    return (Z / HALF) ** 2 * scatter * len(rows)
+    """About how many episodes like these it takes until the interval of the crash rate is +- `HALF` of it
+    (half of its width); inf without a crash."""
+    tally = INCIDENCES[CRASHES].tally(rows)
+    y, k, w = tally[:, ~np.isnan(tally).any(0)]
+
+    def wider(power: float) -> float:
+        found = pooled_rate(y, k, w, 10.0**power)
+        return (found.high - found.low) / 2.0 / found.value - HALF
+
+    return 10.0 ** float(bisect(wider, *POWERS)) * len(rows) if y.any() else math.inf
 
 
 def text(found: Mapping[str, Any]) -> str:

@@ -86,6 +86,7 @@ def pooled_rate(
     counts: Sequence[float] | Array,
     exposures: Sequence[float] | Array,
     weights: Sequence[float] | Array | None = None,
+    times: float = 1.0,
 ) -> Figure:
     """Events per unit of exposure of n samples: R = sum(w y) / sum(w k), with a gamma interval.
 
@@ -100,20 +101,21 @@ def pooled_rate(
         counts: [n] y, events of each sample.
         exposures: [n] k, what they are divided by.
         weights: [n] w, positive likelihood ratios; None: all alike.
+        times: the interval that so many times as many samples would have, if they were like these.
     """
     y, k = np.asarray(counts, np.float64), np.asarray(exposures, np.float64)
     w = np.ones(len(y)) if weights is None else np.asarray(weights, np.float64)
-    exposure, events = float((w * k).sum()), float((w * y).sum())
+    exposure, events = times * float((w * k).sum()), times * float((w * y).sum())
     if not exposure > 0.0:
         return NA
     tail = (1.0 - CONFIDENCE) / 2.0
     if events == 0.0:
         return Figure(0.0, 0.0, float(w.max() * stats.chi2.ppf(1.0 - tail, 2) / 2.0) / exposure)
-    scatter = float((w**2 * (y - events / exposure * k) ** 2).sum()) * len(y) / max(len(y) - 1, 1)
-    poisson = float((w**2 * y).sum())
+    scatter = times * float((w**2 * (y - events / exposure * k) ** 2).sum()) * len(y) / max(len(y) - 1, 1)
+    poisson = times * float((w**2 * y).sum())
     variance = max(scatter, poisson)
     seen = w[y > 0.0]
-    largest = float(seen.max() if effective(seen) >= FEW else w.max()) * variance / poisson
+    largest = float(seen.max() if times * effective(seen) >= FEW else w.max()) * variance / poisson
 
     def bound(p: float, mean: float, spread: float) -> float:
         """The p-quantile of the gamma distribution of this mean and variance."""

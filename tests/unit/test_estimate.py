@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ import pytest
 from benchmarks import estimate
 from benchmarks.toy_crashes import KINDS, Toy
 from cosim.errors import BadInput
+from cosim.report import crash_rate
+from cosim.report.figures import CRASHES, INCIDENCES
 from cosim.report.statistics import effective, paired_rate, paired_rate_change, pooled_rate, rate
 from cosim.scenario import tilt
 from cosim.scenario.tilt import Tilt
@@ -155,3 +158,20 @@ def test_the_errors_that_tell_most_are_raised_most() -> None:
     assert estimate.allotted(rows[100:], before) is before
     rare = [{**one, "tilt_trials": json.dumps({"cut_in": (1, 0.5)})} for one in rows[:50]]  # a fifth begins
     assert estimate.allotted([*rare, *rows[50:]], before).factors["cut_in"] == before.factors["cut_in"]
+
+
+@pytest.mark.parametrize("spread", [1.0, 4.0])
+def test_as_many_episodes_as_are_said_to_be_needed_make_the_interval_as_wide(spread: float) -> None:
+    """Weights alike, or half of them `spread` times the others."""
+
+    def drawn(count: int) -> list[dict[str, Any]]:
+        each = [{"av_involved_collisions": float(k % 25 < 2), "av_km": 5.0} for k in range(count)]
+        return [row | {"weight": spread if k % 2 else 1.0} for k, row in enumerate(each)]
+
+    few, crash = drawn(100), INCIDENCES[CRASHES]
+    many = round(crash_rate.needed(few) / 50.0) * 50
+    found = crash.figure(drawn(many))
+    assert many > 150
+    assert (found.high - found.low) / 2.0 == pytest.approx(crash_rate.HALF * found.value, rel=0.08)
+    assert crash_rate.needed(drawn(many)) == pytest.approx(many, rel=0.2)
+    assert math.isinf(crash_rate.needed([row | {"av_involved_collisions": 0.0} for row in few]))

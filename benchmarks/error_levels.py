@@ -170,7 +170,7 @@ def alone(episodes: int) -> list[str]:
     lines = [markdown_row(heads.split(", ")), markdown_row(["---"] * 7)]
     raw: dict[str, float] = {}  # collisions per million km
     added: dict[str, tuple[float, float]] = {}  # near-misses per million km, and their variance
-    each: list[tuple[int, float]] = []  # collisions, and what one of them is worth
+    each: list[tuple[bool, float]] = []  # collisions, or none, and what one of them is worth
     most, more, scatter = 0.0, 0.0, 0.0
     for name, factors, factor, parts in (Raised("nothing", {}, 1.0), *ALONE):
         kinds = Kinds(**{kind: _raised(getattr(base.kinds, kind), by) for kind, by in factors.items()})
@@ -195,7 +195,7 @@ def alone(episodes: int) -> list[str]:
         spread = (added[name][1] + sum(added[part][1] for part in parts)) / factor**2
         lines.append(markdown_row([*cells, f"{per:.2g} ({bounds})", _signed(here, spread)]))
         most, more, scatter = most + per, more + here, scatter + spread
-        each.append((pairs, MILLION / (km * factor)))
+        each += [(pairs > 0, MILLION / (km * factor))] * max(pairs, 1)
     counts, worth = (np.array(values, float) for values in zip(*each, strict=True))
     pooled = pooled_rate(counts, 1.0 / (len(worth) * worth), worth)
     together = f"{most:.2g} ({pooled.low:.2g} to {pooled.high:.2g})"

@@ -45,7 +45,7 @@ INTERVALS = 400
 REAL = ("exit", "contested", "stress")  # world, demand, errors: AVs crash so often that brute force sees it
 REAL_TILT = Tilt({ALL: 3.0, ALL + OTHER: 2.0}, 2.0, 0.1)
 FRESH = FIRST_TEST_SEED + 10_000  # of the level `field`: what was driven on seeds before was looked at
-BRUTE, REPETITIONS, EACH = 400, 10, 40  # episodes; estimates, and episodes of each
+BRUTE, REPETITIONS, EACH = 1600, 40, 40  # episodes; estimates, and episodes of each
 UNSEEN = 0.5  # crashes that every case is given beside those seen
 FIRST_WITH, FOLLOW_WITH = 1.0, 0.7  # as FIRST and FOLLOW, once crashes say which errors tell most
 

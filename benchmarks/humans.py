@@ -46,8 +46,18 @@ LEVEL, IDM = "stress", "idm"
 CAR = "car-alone=benchmarks/humans.py:Accelerate"  # it always asks for more speed: the rest is the car's own
 BLOCK = 20  # seeds that are driven together
 COLUMNS = (
-    *("world", "demand", "pairs", "policy", "an AV in a collision", "idm", "difference, pp", "p"),
-    *("an AV caused one", "distance of all, m", "more than idm, m", "hard brakings of AVs", "idm"),
+    *(
+        "world",
+        "demand",
+        "pairs",
+        "policy",
+        "beside",
+        "an AV in a collision",
+        "beside",
+        "difference, pp",
+        "p",
+    ),
+    *("an AV caused one", "distance of all, m", "more than beside, m", "hard brakings of AVs", "beside"),
     "errors that began in both",
 )
 # What is taken away -> the constants of cosim.simulation.assistance without it.
@@ -120,11 +130,11 @@ def rows_of(runs: Path, policy: str) -> dict[tuple[str, int], Row]:
 
 
 def line(
-    world: str, policy: str, own: Mapping[tuple[str, int], Row], idm: Mapping[tuple[str, int], Row]
+    world: str, policy: str, beside: str, rows: Mapping[str, Mapping[tuple[str, int], Row]]
 ) -> list[str]:
-    """One world's cells, or of all together (""), paired by seed."""
-    keys = sorted(key for key in own.keys() & idm.keys() if world in ("", key[0]))
-    now, then = [own[key] for key in keys], [idm[key] for key in keys]
+    """One world's cells, or of all together (""), of two policies' rows paired by seed."""
+    keys = sorted(key for key in rows[policy].keys() & rows[beside].keys() if world in ("", key[0]))
+    now, then = ([rows[name][key] for key in keys] for name in (policy, beside))
 
     def column(rows: list[Row], name: str) -> list[float]:
         return [float(row[name] or 0.0) for row in rows]
@@ -135,7 +145,7 @@ def line(
     hard = [float(np.mean(column(rows, "hard_brakings_av"))) for rows in (now, then)]
     *begun, both = errors_begun(zip(now, then, strict=True))
     return [
-        *(world or "together", DEMAND.get(world, ""), str(len(keys)), label(policy)),
+        *(world or "together", DEMAND.get(world, ""), str(len(keys)), label(policy), label(beside)),
         *(_counted(int(hit.sum()), len(keys)), _counted(int(before.sum()), len(keys))),
         statistics.paired_share(before, hit).text(1, 100.0),
         f"{statistics.mcnemar(*statistics.discordant(before, hit)):.2g}",
@@ -173,9 +183,9 @@ def paired(policies: Sequence[str], episodes: int, runs: Path, workers: str) -> 
                     drive(policy, demand, seeds, runs, workers)
     rows = {name: rows_of(runs, name) for name in (IDM, *policies)}
     lines = [markdown_row(COLUMNS), markdown_row(["---"] * len(COLUMNS))]
-    for policy in policies:
-        lines += [markdown_row(line(w, policy, rows[policy], rows[IDM])) for w in (*DEMAND, "")]
-    return lines
+    beside = [(policy, IDM) for policy in policies]
+    beside += [(policy, CAR) for policy in policies if CAR in policies and policy != CAR]
+    return [*lines, *(markdown_row(line(w, *pair, rows)) for pair in beside for w in (*DEMAND, ""))]
 
 
 def main() -> None:

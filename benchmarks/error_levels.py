@@ -29,7 +29,7 @@ from benchmarks.tables import markdown_row
 from cosim.episode import Episode, Hook, Step
 from cosim.files import whole
 from cosim.host import Host
-from cosim.report.statistics import paired_change, pooled_rate, rate, share
+from cosim.report.statistics import Z, paired_change, pooled_rate, rate, share
 from cosim.scenario import Fleet, load
 from cosim.scenario.human_errors import KINDS, Errors, Kinds, levels
 from cosim.scenario.vet import vetted
@@ -204,7 +204,7 @@ def alone(episodes: int) -> list[str]:
 
 def _signed(value: float, variance: float) -> str:
     """With its normal 95 % interval, to two digits of that."""
-    half = 1.96 * math.sqrt(variance)
+    half = Z * math.sqrt(variance)
     digits = max(1 - math.floor(math.log10(half)), 0) if half else 0
     return f"{value:,.{digits}f} ({value - half:,.{digits}f} to {value + half:,.{digits}f})"
 

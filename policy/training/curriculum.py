@@ -47,6 +47,9 @@ class EnsembleConfig:
     (`policy.training.ensemble`)."""
 
     networks: int = 0  # that learn from the replay buffer
+    by_copies: int = 0  # further ones, which learn with `DdqnConfig.by_copies`
+    copies: float = 8.0  # weight of the copies there, in place of `DdqnConfig.forked`
+    shrink: float = 1.0  # there, in place of `DdqnConfig.shrink`
     updates: int = 5_000  # of each, from the weights that the training began with
     teachers: tuple[str, ...] = ()  # files of weights that count in the mean besides; one twice: twice
     distillation: int = 5_000  # updates of the one that is taught
@@ -57,11 +60,15 @@ class EnsembleConfig:
 
     def __post_init__(self) -> None:
         """Raises BadInput for a number out of range."""
-        in_range(self, positive="updates distillation n_step", not_negative="networks refused")
+        in_range(
+            self,
+            positive="updates distillation n_step",
+            not_negative="networks by_copies copies shrink refused",
+        )
 
     def __bool__(self) -> bool:
         """Whether there is anything to learn from."""
-        return bool(self.networks or self.teachers)
+        return bool(self.networks or self.by_copies or self.teachers)
 
 
 @dataclass(frozen=True, slots=True)

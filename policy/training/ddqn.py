@@ -27,6 +27,8 @@ class DdqnConfig:
     refused: float = 1.0  # weight of the refused actions' loss
     clip: float = 10.0  # largest gradient norm
     forked: float = 1.0  # weight of what copies of the simulation say of two actions, where there are any
+    by_copies: bool = False  # only they say what an action is worth more than another
+    shrink: float = 0.0  # weight of how much actions are said to differ for others: without evidence not
     imitation: float = 1.0  # weight of the demonstrations: their action is worth more than any other,
     margin: float = 0.3  # by this much, scaled (large-margin loss of deep Q-learning from demonstrations)
 
@@ -35,7 +37,7 @@ class DdqnConfig:
         in_range(
             self,
             positive="learning_rate target_every scale clip",
-            not_negative="weight_decay refused imitation margin",
+            not_negative="weight_decay refused imitation margin shrink",
         )
         if self.last_rate is not None:
             in_range(self, positive="last_rate")
@@ -54,11 +56,12 @@ class DdqnLearner(Learner):
     def update(self, batch: Batch, compared: Compared | None = None) -> Metrics:
         """One step of double Q-learning with masked targets (P, equations 2 and 3; algorithm 4); each part of
         the values learns from its own part of the return. The difference between the values of two actions
-        learns from copies of the simulation too, where there are any.
+        learns from copies of the simulation too, where there are any; with `by_copies` from them alone, since
+        what everybody else does meanwhile moves a return far more than one action does.
 
         Returns `td` (Huber loss of the n-step error), `unsafe` (loss of the refused actions), `imitation`
-        (of the demonstrated ones), `forked` (of the differences) and `q` (mean value of the actions carried
-        out).
+        (of the demonstrated ones), `forked` (of the differences), `shrink` (their mean size, the
+        others' part) and `q` (mean value of the actions carried out).
         """
         c = self.config
         with torch.no_grad():
@@ -67,7 +70,9 @@ class DdqnLearner(Learner):
             gained = batch.reward[:, None] if self.online.config.parts == 1 else batch.parts
             goal = gained * c.scale + batch.discount[:, None] * later
         apart = self.online.apart(*batch.now, batch.keep)
-        chosen = _taken(apart, batch.action)
+        chosen, level = _taken(apart, batch.action), apart.mean(2)
+        if c.by_copies:
+            chosen = (chosen - level).detach() + level
         td = functional.smooth_l1_loss(chosen, goal)
         q = self.online.weighed(apart, batch.now.phi)
         unsafe = self.refused(q, batch.possible) if c.r_unsafe is None else self._crashes(q, batch)
@@ -75,7 +80,8 @@ class DdqnLearner(Learner):
         forked = q.new_zeros(())
         if compared is not None:
             forked = c.forked * functional.smooth_l1_loss(*differences(self.online, compared, c.scale))
-        self.step(td + unsafe + imitation + forked, self.rate)
+        shrink = c.shrink * (apart - level[..., None])[:, -1].abs().mean()
+        self.step(td + unsafe + imitation + forked + shrink, self.rate)
         self.updates += 1
         if self.updates % c.target_every == 0:
             self.update_target()
@@ -84,6 +90,7 @@ class DdqnLearner(Learner):
             "unsafe": unsafe,
             "imitation": imitation,
             "forked": forked,
+            "shrink": shrink,
             "q": q.gather(1, batch.action[:, None]).mean(),
         }
         return {name: float(value.detach()) for name, value in losses.items()}

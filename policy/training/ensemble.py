@@ -30,17 +30,21 @@ class Teachers(NamedTuple):
     """Whose values are taught."""
 
     everywhere: list[VFN]  # their mean
-    specialists: dict[str, VFN]  # by SCENARIO/DEMAND: there this one's alone
+    specialists: dict[str, VFN]  # by SCENARIO/DEMAND: there this one alone says what an action is worth more
 
     @torch.no_grad()
     def values(self, batch: Advised) -> torch.Tensor:
-        """[B,parts,A] for these states."""
+        """[B,parts,A] for these states; a state's own value is always the mean of `everywhere`, so that
+        specialists may have learned from rewards of another size."""
         worlds = [label.rpartition("/")[0] for label in batch.episodes]
         values = torch.stack([network.apart(*batch.now) for network in self.everywhere]).mean(0)
+        level = values.mean(2, keepdim=True)
         for world, network in self.specialists.items():
             here = torch.tensor([name == world for name in worlds], device=values.device)
             if here.any():
-                values = torch.where(here[:, None, None], network.apart(*batch.now), values)
+                theirs = network.apart(*batch.now)
+                theirs += level - theirs.mean(2, keepdim=True)
+                values = torch.where(here[:, None, None], theirs, values)
         return values
 
 
@@ -71,7 +75,10 @@ class Ensemble:
         driven = list(replay.trajectories)
         more = [one for name in c.drives for one in driven if one.episode.rpartition("/")[0] == name]
         self.replay.add([*driven, *more])
-        self._learning = replace(config, ddqn=replace(config.ddqn, refused=c.refused))
+        ddqn = replace(config.ddqn, refused=c.refused)
+        alone = replace(ddqn, by_copies=True, forked=c.copies, shrink=c.shrink)
+        kinds = [ddqn] * c.networks + [alone] * c.by_copies  # of the networks, in order; then the pupil's
+        self._learning = [replace(config, ddqn=kind) for kind in (*kinds, ddqn)]
         self._about, self._device = {**about, "training": asdict(config)}, device
 
     def run(self, progress: Callable[[float, float], None] | None = None) -> Path:
@@ -81,20 +88,21 @@ class Ensemble:
         teacher of another layout.
         """
         c, path = self.config.ensemble, self.folder / RESULT
-        total = c.networks * c.updates + c.distillation
+        networks = c.networks + c.by_copies
+        total = networks * c.updates + c.distillation
 
         def shown(done: int) -> None:
             if progress is not None:
                 progress(done, total)
 
         teachers = [self._read(Path(file)) for file in c.teachers]
-        teachers += [self._network(k, shown) for k in range(c.networks)]
+        teachers += [self._network(k, shown) for k in range(networks)]
         if not self._finished(path):
-            pupil = self._learner("pupil")
+            pupil = self._learner("pupil", networks)
             special = (one.partition("=") for one in c.specialists)
             specialists = {world: self._read(Path(file)) for world, _, file in special}
             taught = Teachers(teachers, specialists)
-            measured = self._taught(pupil, taught, lambda k: shown(c.networks * c.updates + k))
+            measured = self._taught(pupil, taught, lambda k: shown(networks * c.updates + k))
             checkpoint.save(path, {"vfn": pupil.online}, {"vfn": self.vfn}, measured, self._about)
         shown(total)
         return path
@@ -104,7 +112,7 @@ class Ensemble:
         c, path = self.config.ensemble, self.folder / f"network-{k}.safetensors"
         if self._finished(path):
             return self._read(path)
-        learner = self._learner(str(k))
+        learner = self._learner(str(k), k)
         learner.update_target()
         rng, losses = generator(self.config.seed, "ensemble", str(k)), []
         for update in range(c.updates):
@@ -132,10 +140,10 @@ class Ensemble:
             shown(update)
         return mean_metrics(known[-max(c.distillation // 10, 1) :])
 
-    def _learner(self, name: str) -> DdqnLearner:
-        """As the training began, but for the seed of what is drawn."""
+    def _learner(self, name: str, k: int) -> DdqnLearner:
+        """As the training began, but for the seed of what is drawn; learns as the `k`-th network does."""
         seed = subseed(self.config.seed, f"ensemble/{name}") % 2**31
-        learner = make_trainer(replace(self._learning, seed=seed), self.vfn, self._device).learner
+        learner = make_trainer(replace(self._learning[k], seed=seed), self.vfn, self._device).learner
         assert isinstance(learner, DdqnLearner)
         return learner
 

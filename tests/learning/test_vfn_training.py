@@ -211,6 +211,66 @@ def test_with_weight_decay_what_chance_pays_differs_less() -> None:
     assert spread[1] < 0.75 * spread[0]
 
 
+def by_chance_and_by_copies() -> list[experience.Trajectory]:
+    """Returns pay Decelerate 10, by chance, oneself and others; in copies Accelerate alone brings anything."""
+    drives = []
+    for action in MetaAction:
+        paid = 10.0 * (action == MetaAction.DECELERATE)
+        one = trajectory([int(action)], [(paid, paid, 0.0)], situation=[0, 0], ending="crashed")
+        pair = int(action), int(MetaAction.ACCELERATE)
+        gain = 2.0 * (np.array(pair) == MetaAction.ACCELERATE)
+        drives.append(
+            replace(
+                one,
+                tried=np.full(1, pair[1], np.int8) if pair[0] != pair[1] else None,
+                gain=np.array([[gain[1] - gain[0], 0.0]], np.float32),
+                phi=np.radians(45.0),
+            )
+        )
+    return drives
+
+
+def test_by_copies_alone_no_return_says_what_an_action_is_worth_more() -> None:
+    drives = by_chance_and_by_copies()
+    replay = ReplayBuffer(ReplayConfig(batch=16, forked=16, n_step=1, relabel=0.0))
+    replay.add(drives)
+    found = []
+    for by_copies in (False, True):
+        config = DdqnConfig(learning_rate=3e-3, by_copies=by_copies)
+        learner, draws = DdqnLearner(replace(TINY, parts=2), config, seed=0), np.random.default_rng(0)
+        for _ in range(400):
+            losses = learner.update(replay.sample(draws), replay.compared(draws))
+        now = comparisons(places_tried(drives)[:1]).now
+        with torch.no_grad():
+            found.append(learner.online.apart(*now)[0].numpy())
+    slow, fast = int(MetaAction.DECELERATE), int(MetaAction.ACCELERATE)
+    rest = [a for a in MetaAction if a not in (slow, fast)]
+    assert found[0][1, slow] > found[0][1, rest].max() + 0.2  # what chance paid
+    own, others = found[1]
+    assert losses["forked"] < 1e-3
+    assert (own[fast] - np.delete(own, fast)).tolist() == pytest.approx([0.2] * 4, abs=0.03)
+    assert others == pytest.approx(others.mean(), abs=0.03)
+    assert found[1].mean(1) == pytest.approx([0.17, 0.17], abs=0.05)  # of what the drives earned, x 0.1
+
+
+def test_without_evidence_an_action_is_said_to_bring_the_others_nothing() -> None:
+    one = trajectory([1], [(1.0, 1.0, 0.0)], ending="crashed")
+    _, batch = only(ReplayConfig(batch=8, n_step=1, relabel=0.0), one)
+    spread = []
+    for shrink in (0.0, 1.0):
+        config = DdqnConfig(learning_rate=1e-3, by_copies=True, shrink=shrink)
+        learner = DdqnLearner(replace(TINY, parts=2), config, seed=0)
+        torch.manual_seed(0)
+        torch.nn.init.normal_(learner.online.value.weight, std=0.3)
+        for _ in range(300):
+            losses = learner.update(batch)
+        with torch.no_grad():
+            spread.append(learner.online.apart(*batch.now)[0].std(1).tolist())
+    assert losses["shrink"] < 0.02
+    assert spread[1][1] < 0.1 * spread[0][1]
+    assert spread[1][0] > 0.3 * spread[0][0]  # one's own part is not asked
+
+
 def test_a_refused_action_is_worth_a_crash() -> None:
     one = trajectory([1], [(0.0, 0.0, 0.0)], vetoed=[3])
     learner = DdqnLearner(TINY, DdqnConfig(learning_rate=1e-2), seed=1)
@@ -680,6 +740,38 @@ def test_a_specialist_alone_teaches_what_was_driven_in_its_world(tmp_path: Path)
     wanted = {"merge/contested/7": MetaAction.DECELERATE, "exit/contested/7": MetaAction.ACCELERATE}
     assert best.tolist() == [wanted[label] for label in batch.episodes]
     assert len(set(best.tolist())) == 2
+
+
+def test_of_a_specialist_only_differences_are_taught() -> None:
+    """It may have learned from rewards of another size: the state's own value is that of all others."""
+    replay = ReplayBuffer(ReplayConfig(batch=8))
+    replay.add([trajectory([0, 1], [(1.0, 0.0, 0.0)] * 2)])
+    usual, special = VFN(TINY), VFN(TINY)
+    assert usual.state is not None
+    assert special.state is not None
+    usual.state.bias.data[:], special.state.bias.data[:] = 3.0, 90.0
+    special.value.bias.data[MetaAction.IDLE] = 1.0
+    batch = replay.advised(generator(0, "drawn"), True)
+    world = batch.episodes[0].rpartition("/")[0]
+    values = Teachers([usual], {world: special}).values(batch)
+    assert values.mean().item() == pytest.approx(3.0, abs=1e-4)
+    assert (values[:, 0, MetaAction.IDLE] - values[:, 0, 0]).tolist() == pytest.approx([1.0] * len(values))
+
+
+def test_a_network_by_copies_learns_beside_the_others(tmp_path: Path) -> None:
+    ensemble = EnsembleConfig(networks=1, by_copies=1, updates=200, distillation=20)
+    config = replace(SHORT, ensemble=ensemble, replay=replace(SHORT.replay, forked=16))
+    run = TrainingRun(config, replace(TINY, parts=2), Pretend(), tmp_path)
+    run.trainer.replay.add(by_chance_and_by_copies())
+    run.distill()
+    replay, choices = run.trainer.replay, []
+    for k in range(2):
+        network = VFN(replace(TINY, parts=2))
+        file = tmp_path / "ensemble" / f"network-{k}.safetensors"
+        checkpoint.load(file, {"vfn": network}, {"vfn": network.config})
+        choices.append(network.apart(*replay.sample(generator(0, "states")).now).detach())
+    spread = [c[:, 1].std(1).mean().item() for c in choices]
+    assert spread[1] < 0.3 * spread[0]  # returns say that the others gain, copies say nothing of the kind
 
 
 def test_a_killed_ensemble_goes_on_with_the_networks_that_it_has(tmp_path: Path) -> None:

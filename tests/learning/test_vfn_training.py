@@ -212,7 +212,7 @@ def test_with_weight_decay_what_chance_pays_differs_less() -> None:
 
 
 def by_chance_and_by_copies() -> list[experience.Trajectory]:
-    """Returns pay Decelerate 10, by chance, oneself and others; in copies Accelerate alone brings anything."""
+    """Returns pay Decelerate 10, by chance, oneself and others; in copies Accelerate brings oneself 2."""
     drives = []
     for action in MetaAction:
         paid = 10.0 * (action == MetaAction.DECELERATE)

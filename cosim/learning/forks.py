@@ -18,11 +18,13 @@ from cosim.episode import Episode, Hook, Step, go_on
 from cosim.seeding import generator
 from cosim.simulation.fork import forked
 from cosim.types import Decision, Floats, Floats32, MetaAction
+from policy.inputs.meeting import meet, missions
 from policy.training.curriculum import Drive
 from policy.training.experience import Trajectory
 from policy.training.explorer import Explorer
 
 SIDEWAYS = (MetaAction.LANE_LEFT, MetaAction.LANE_RIGHT)
+NEAREST = 4  # AVs whose way meets the mission vehicle's: who arrives next before or behind it lets it in
 RARELY = 0.2  # a lane change is tried so often where an action that keeps the lane is tried once
 
 Tried = tuple[str, int, MetaAction, Floats32]  # AV, its decision, action, [H,3] reward terms from there on
@@ -53,6 +55,8 @@ class Forks(Hook):
         known = sorted(self._agent.learning.keys() & episode.histories.keys())
         if known:
             rng, together = self._rng, self._drive.forks.together
+            if self._drive.forks.meeting and rng.random() < self._drive.forks.meeting:
+                known = _nearest(episode, known) or known
             avs, seed = [known.pop(rng.integers(len(known)))], int(rng.integers(2**32))
             if together > 1:
                 avs += rng.permutation(known)[: rng.integers(together)].tolist()
@@ -93,6 +97,15 @@ class Forks(Hook):
         go_on(episode, agent, changed, forks.horizon)
         mine = {one.av: one for one in agent.finish()}
         return [(av, t, action, mine[av].terms[t : t + forks.horizon]) for av, t in tried.items()]
+
+
+def _nearest(episode: Episode, avs: Sequence[str]) -> list[str]:
+    """Up to `NEAREST` of `avs`, by name, that come nearest a mission vehicle where their ways meet."""
+    histories, road = episode.histories, episode.simulator.road
+    seen = missions(histories.values()).values()
+    behind = {av: [m.behind for at in seen if (m := meet(road, histories[av], at))] for av in avs}
+    distance = {av: min(map(abs, each)) for av, each in behind.items() if each}
+    return sorted(sorted(distance, key=distance.__getitem__)[:NEAREST])
 
 
 def _chances(decision: Decision) -> Floats:

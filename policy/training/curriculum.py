@@ -35,10 +35,15 @@ class ForkConfig:
     held: int = 6  # decisions for which the other action is held
     horizon: int = 40  # decisions over which the difference that it makes is summed up
     together: int = 1  # AVs that do so in one copy: as many as drawn, from 1 to this
+    meeting: float = (
+        0.0  # share of the copies whose AVs are of those that come nearest a mission vehicle's way
+    )
 
     def __post_init__(self) -> None:
         """Raises BadInput for a number out of range."""
         in_range(self, positive="held horizon together", not_negative="count")
+        if not 0.0 <= self.meeting <= 1.0:
+            raise BadInput("must be a share from 0 to 1", field="meeting", value=self.meeting)
 
 
 @dataclass(frozen=True, slots=True)

@@ -464,6 +464,24 @@ def test_in_some_copies_two_do_the_same_at_once() -> None:
     assert np.array_equal(a.tried[both], b.tried[both])
 
 
+@pytest.mark.parametrize("meeting", [0.0, 1.0])
+def test_copies_can_be_of_those_who_come_nearest_the_mission_vehicle(meeting: float) -> None:
+    """It drives on the right lane, all but one of the AVs on the left one; the nearest four let it in or not."""
+    near = {f"near{k}": 100.0 + 8.0 * k for k in range(4)}
+    far = {f"far{k}": 300.0 + 8.0 * k for k in range(3)}
+    episode = fake_episode(
+        FakeVehicle("m", 110.0, 0, 20.0, mission=True),
+        FakeVehicle("behind", 70.0, 0, 20.0, is_av=True),
+        *(FakeVehicle(name, x, 1, 20.0, is_av=True) for name, x in (near | far).items()),
+    )
+    forks = ForkConfig(count=12, held=2, horizon=4, together=2, meeting=meeting)
+    drive = Drive(Lesson("fake"), 5, 0.7, 0.0, "", "", True, gamma=0.97, forks=forks)
+    drove = drive_episode(episode, agent(learners=8), drive, RewardConfig(perception_range=50.0))
+    tried = {one.av for one in drove.trajectories if one.tried is not None and (one.tried >= 0).any()}
+    assert tried
+    assert bool(tried - near.keys()) == (meeting == 0.0)
+
+
 def test_a_learner_learns_from_copies_which_action_pays_oneself_and_which_the_others() -> None:
     """The returns of the drives say nothing: every decision pays alike."""
     tried, fast, slow = np.full(1, -1, np.int8), int(MetaAction.ACCELERATE), int(MetaAction.DECELERATE)

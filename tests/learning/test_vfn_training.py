@@ -466,7 +466,7 @@ def test_in_some_copies_two_do_the_same_at_once() -> None:
 
 @pytest.mark.parametrize("meeting", [0.0, 1.0])
 def test_copies_can_be_of_those_who_come_nearest_the_mission_vehicle(meeting: float) -> None:
-    """It drives on the right lane, all but one of the AVs on the left one; the nearest four let it in or not."""
+    """It drives on the right lane, all but one of the AVs on the left one; the four nearest are tried."""
     near = {f"near{k}": 100.0 + 8.0 * k for k in range(4)}
     far = {f"far{k}": 300.0 + 8.0 * k for k in range(3)}
     episode = fake_episode(

@@ -6,6 +6,7 @@ a network that begins as they did is taught the mean (distillation of an ensembl
 """
 
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -30,21 +31,17 @@ class Teachers(NamedTuple):
     """Whose values are taught."""
 
     everywhere: list[VFN]  # their mean
-    specialists: dict[str, VFN]  # by SCENARIO/DEMAND: there this one alone says what an action is worth more
+    specialists: dict[str, VFN]  # by SCENARIO/DEMAND: there this one's alone
 
     @torch.no_grad()
     def values(self, batch: Advised) -> torch.Tensor:
-        """[B,parts,A] for these states; a state's own value is always the mean of `everywhere`, so that
-        specialists may have learned from rewards of another size."""
+        """[B,parts,A] for these states."""
         worlds = [label.rpartition("/")[0] for label in batch.episodes]
         values = torch.stack([network.apart(*batch.now) for network in self.everywhere]).mean(0)
-        level = values.mean(2, keepdim=True)
         for world, network in self.specialists.items():
             here = torch.tensor([name == world for name in worlds], device=values.device)
             if here.any():
-                theirs = network.apart(*batch.now)
-                theirs += level - theirs.mean(2, keepdim=True)
-                values = torch.where(here[:, None, None], theirs, values)
+                values = torch.where(here[:, None, None], network.apart(*batch.now), values)
         return values
 
 
@@ -125,15 +122,20 @@ class Ensemble:
         return learner.online
 
     def _taught(self, pupil: DdqnLearner, teachers: Teachers, shown: Callable[[int], None]) -> Metrics:
-        """Teach it the mean; how well it knows it, over the last tenth of the updates (`lesson`)."""
-        c = self.config.ensemble
+        """Teach it what their mean says of actions; how well it knows that, over the last tenth of updates.
+
+        What a state is worth stays what the pupil's first weights say: rewards that teachers learned from may
+        have been of other sizes, and nothing is driven by it.
+        """
+        c, first = self.config.ensemble, deepcopy(pupil.online)
         rng, known = generator(self.config.seed, "distillation"), []
         for update in range(c.distillation):
             batch = self.replay.advised(rng, True, self._device)
-            mean = teachers.values(batch)
+            with torch.no_grad():
+                mean = levelled(teachers.values(batch), first.apart(*batch.now), batch.possible)
             mine = pupil.online.apart(*batch.now)
             q = pupil.online.weighed(mine, batch.now[3])
-            refused = pupil.refused(q, batch.possible)
+            refused = pupil.refused(q - q.mean(1, keepdim=True), batch.possible)
             pupil.step(lesson(mine, mean, batch.possible) + refused, self._rate(update, c.distillation))
             wanted = pupil.online.weighed(mean, batch.now[3])
             known.append({"refused": float(refused.detach()), **knows(q.detach(), wanted, batch.possible)})
@@ -161,6 +163,12 @@ class Ensemble:
         if checkpoint.read_card(path)["data"]["training"] != checkpoint.plain(self.config):
             raise BadInput("holds an ensemble of another configuration", file=path)
         return True
+
+
+def levelled(values: torch.Tensor, level: torch.Tensor, possible: torch.Tensor) -> torch.Tensor:
+    """[B,parts,A] `values` with the mean of `level` over the actions that are `possible` [B,A]."""
+    counted = _allowed(possible)[:, None].float()  # [B,1,A]
+    return values + ((level - values) * counted).sum(2, keepdim=True) / counted.sum(2, keepdim=True)
 
 
 def lesson(mine: torch.Tensor, mean: torch.Tensor, possible: torch.Tensor) -> torch.Tensor:

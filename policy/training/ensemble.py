@@ -74,8 +74,9 @@ class Ensemble:
         self.replay.add([*driven, *more])
         ddqn = replace(config.ddqn, refused=c.refused)
         alone = replace(ddqn, by_copies=True, forked=c.copies, shrink=c.shrink)
-        kinds = [ddqn] * c.networks + [alone] * c.by_copies  # of the networks, in order; then the pupil's
-        self._learning = [replace(config, ddqn=kind) for kind in (*kinds, ddqn)]
+        pupil = replace(ddqn, weight_decay=0.0)  # what it is taught is no noise
+        kinds = [ddqn] * c.networks + [alone] * c.by_copies + [pupil]  # of the networks, in order
+        self._learning = [replace(config, ddqn=kind) for kind in kinds]
         self._about, self._device = {**about, "training": asdict(config)}, device
 
     def run(self, progress: Callable[[float, float], None] | None = None) -> Path:

@@ -46,17 +46,8 @@ LEVEL, IDM = "stress", "idm"
 CAR = "car-alone=benchmarks/humans.py:Accelerate"  # it always asks for more speed: the rest is the car's own
 BLOCK = 20  # seeds that are driven together
 COLUMNS = (
-    *(
-        "world",
-        "demand",
-        "pairs",
-        "policy",
-        "beside",
-        "an AV in a collision",
-        "beside",
-        "difference, pp",
-        "p",
-    ),
+    *("world", "demand", "pairs", "policy", "beside"),
+    *("an AV in a collision", "beside", "difference, pp", "p"),
     *("an AV caused one", "distance of all, m", "more than beside, m", "hard brakings of AVs", "beside"),
     "errors that began in both",
 )

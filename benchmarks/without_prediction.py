@@ -39,8 +39,8 @@ class Unforeseen(Ensemble):
     def _network(self, k: int, shown: Callable[[int], None]) -> VFN:
         return shown_the_present(super()._network(k, shown), self._past)
 
-    def _learner(self, name: str, k: int) -> DdqnLearner:
-        learner = super()._learner(name, k)
+    def _learner(self, name: str) -> DdqnLearner:
+        learner = super()._learner(name)
         for network in (learner.online, learner.target):
             shown_the_present(network, self._past)
         return learner

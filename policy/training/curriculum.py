@@ -35,9 +35,7 @@ class ForkConfig:
     held: int = 6  # decisions for which the other action is held
     horizon: int = 40  # decisions over which the difference that it makes is summed up
     together: int = 1  # AVs that do so in one copy: as many as drawn, from 1 to this
-    meeting: float = (
-        0.0  # share of the copies whose AVs are of those that come nearest a mission vehicle's way
-    )
+    meeting: float = 0.0  # share of the copies whose AVs come nearest a mission vehicle where their ways meet
 
     def __post_init__(self) -> None:
         """Raises BadInput for a number out of range."""
@@ -117,7 +115,10 @@ class VfnTraining:
     a2c: A2cConfig = field(default_factory=A2cConfig)
 
     def __post_init__(self) -> None:
-        """Raises BadInput for worlds of the ensemble that no lesson drives."""
+        """Raises BadInput: no lesson drives a world of the ensemble, or there are no copies to learn from."""
+        if not self.replay.forked and (self.ddqn.by_copies or self.ensemble.by_copies):
+            problem = "nothing is learned by copies without any in a batch"
+            raise BadInput(problem, field="training.replay.forked", value=0)
         driven = {f"{lesson.scenario}/{lesson.demand}" for lesson in self.lessons}
         named = [("drives", name, name) for name in self.ensemble.drives]
         named += [("specialists", one, one.partition("=")[0]) for one in self.ensemble.specialists]

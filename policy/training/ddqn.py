@@ -27,8 +27,8 @@ class DdqnConfig:
     refused: float = 1.0  # weight of the refused actions' loss
     clip: float = 10.0  # largest gradient norm
     forked: float = 1.0  # weight of what copies of the simulation say of two actions, where there are any
-    by_copies: bool = False  # only they say what an action is worth more than another
-    shrink: float = 0.0  # weight of how much actions are said to differ for others: without evidence not
+    by_copies: bool = False  # differences between actions are learned from them alone
+    shrink: float = 0.0  # weight of the mean size by which actions differ for the others
     imitation: float = 1.0  # weight of the demonstrations: their action is worth more than any other,
     margin: float = 0.3  # by this much, scaled (large-margin loss of deep Q-learning from demonstrations)
 

@@ -24,6 +24,7 @@ from policy.training.replay_buffer import Advised, ReplayBuffer
 from policy.training.trainers import make_trainer, rate
 
 RESULT = "distilled.safetensors"
+PUPIL = "pupil"
 DIFFERENCES = 10.0  # what an error in the difference of two actions counts more than one in the state's value
 
 
@@ -75,8 +76,8 @@ class Ensemble:
         ddqn = replace(config.ddqn, refused=c.refused)
         alone = replace(ddqn, by_copies=True, forked=c.copies, shrink=c.shrink)
         pupil = replace(ddqn, weight_decay=0.0)  # what it is taught is no noise
-        kinds = [ddqn] * c.networks + [alone] * c.by_copies + [pupil]  # of the networks, in order
-        self._learning = [replace(config, ddqn=kind) for kind in kinds]
+        kinds = {str(k): ddqn if k < c.networks else alone for k in range(c.networks + c.by_copies)}
+        self._learning = {name: replace(config, ddqn=kind) for name, kind in {**kinds, PUPIL: pupil}.items()}
         self._about, self._device = {**about, "training": asdict(config)}, device
 
     def run(self, progress: Callable[[float, float], None] | None = None) -> Path:
@@ -96,7 +97,7 @@ class Ensemble:
         teachers = [self._read(Path(file)) for file in c.teachers]
         teachers += [self._network(k, shown) for k in range(networks)]
         if not self._finished(path):
-            pupil = self._learner("pupil", networks)
+            pupil = self._learner(PUPIL)
             special = (one.partition("=") for one in c.specialists)
             specialists = {world: self._read(Path(file)) for world, _, file in special}
             taught = Teachers(teachers, specialists)
@@ -110,7 +111,7 @@ class Ensemble:
         c, path = self.config.ensemble, self.folder / f"network-{k}.safetensors"
         if self._finished(path):
             return self._read(path)
-        learner = self._learner(str(k), k)
+        learner = self._learner(str(k))
         learner.update_target()
         rng, losses = generator(self.config.seed, "ensemble", str(k)), []
         for update in range(c.updates):
@@ -126,7 +127,7 @@ class Ensemble:
         """Teach it what their mean says of actions; how well it knows that, over the last tenth of updates.
 
         What a state is worth stays what the pupil's first weights say: rewards that teachers learned from may
-        have been of other sizes, and nothing is driven by it.
+        have been of other sizes, and no choice depends on it.
         """
         c, first = self.config.ensemble, deepcopy(pupil.online)
         rng, known = generator(self.config.seed, "distillation"), []
@@ -143,10 +144,10 @@ class Ensemble:
             shown(update)
         return mean_metrics(known[-max(c.distillation // 10, 1) :])
 
-    def _learner(self, name: str, k: int) -> DdqnLearner:
-        """As the training began, but for the seed of what is drawn; learns as the `k`-th network does."""
+    def _learner(self, name: str) -> DdqnLearner:
+        """As the training began, but for the seed of what is drawn; `name`: its number, or `PUPIL`."""
         seed = subseed(self.config.seed, f"ensemble/{name}") % 2**31
-        learner = make_trainer(replace(self._learning[k], seed=seed), self.vfn, self._device).learner
+        learner = make_trainer(replace(self._learning[name], seed=seed), self.vfn, self._device).learner
         assert isinstance(learner, DdqnLearner)
         return learner
 
@@ -166,10 +167,9 @@ class Ensemble:
         return True
 
 
-def levelled(values: torch.Tensor, level: torch.Tensor, possible: torch.Tensor) -> torch.Tensor:
-    """[B,parts,A] `values` with the mean of `level` over the actions that are `possible` [B,A]."""
-    counted = _allowed(possible)[:, None].float()  # [B,1,A]
-    return values + ((level - values) * counted).sum(2, keepdim=True) / counted.sum(2, keepdim=True)
+def levelled(values: torch.Tensor, like: torch.Tensor, possible: torch.Tensor) -> torch.Tensor:
+    """[B,parts,A] `values`, moved to the level of `like` [B,parts,A]; `possible` [B,A] as in `lesson`."""
+    return values + _level(like - values, possible)
 
 
 def lesson(mine: torch.Tensor, mean: torch.Tensor, possible: torch.Tensor) -> torch.Tensor:
@@ -184,10 +184,8 @@ def lesson(mine: torch.Tensor, mean: torch.Tensor, possible: torch.Tensor) -> to
         The mean squared error of the state values plus `DIFFERENCES` times that of what one action is worth
         more than another, which is what is driven by and much smaller.
     """
-    counted = _allowed(possible)[:, None].float()  # [B,1,A]
-    error = (mine - mean) * counted
-    level = error.sum(2, keepdim=True) / counted.sum(2, keepdim=True)
-    apart = (error - level) * counted
+    error, level = mine - mean, _level(mine - mean, possible)
+    apart = (error - level) * _allowed(possible)[:, None]
     return level.square().mean() + DIFFERENCES * apart.square().mean()
 
 
@@ -201,6 +199,12 @@ def knows(q: torch.Tensor, wanted: torch.Tensor, possible: torch.Tensor) -> Metr
     found = wanted.gather(1, choice.indices[:, None])[:, 0]
     agrees = (choice.indices == best.indices).float().mean()
     return {"agrees": float(agrees), "lost": float((best.values - found).mean())}
+
+
+def _level(values: torch.Tensor, possible: torch.Tensor) -> torch.Tensor:
+    """[B,parts,1] mean of `values` [B,parts,A] over what is `possible` [B,A]."""
+    counted = _allowed(possible)[:, None].float()  # [B,1,A]
+    return (values * counted).sum(2, keepdim=True) / counted.sum(2, keepdim=True)
 
 
 def _allowed(possible: torch.Tensor) -> torch.Tensor:

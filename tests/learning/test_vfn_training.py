@@ -782,6 +782,14 @@ def test_what_a_state_is_worth_stays_what_the_first_weights_say(tmp_path: Path) 
     assert (q[:, MetaAction.IDLE] - q[:, MetaAction.ACCELERATE]).numpy() == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.parametrize(
+    "asked", [{"ddqn": DdqnConfig(by_copies=True)}, {"ensemble": EnsembleConfig(by_copies=1)}]
+)
+def test_by_copies_without_any_is_refused(asked: dict[str, object]) -> None:
+    with pytest.raises(BadInput, match=r"training\.replay\.forked=0"):
+        replace(SHORT, **asked)  # type: ignore[arg-type]
+
+
 def test_a_network_by_copies_learns_beside_the_others(tmp_path: Path) -> None:
     ensemble = EnsembleConfig(networks=1, by_copies=1, updates=200, distillation=20)
     config = replace(SHORT, ensemble=ensemble, replay=replace(SHORT.replay, forked=16))

@@ -76,8 +76,8 @@ class Ensemble:
         ddqn = replace(config.ddqn, refused=c.refused)
         alone = replace(ddqn, by_copies=True, forked=c.copies, shrink=c.shrink)
         pupil = replace(ddqn, weight_decay=0.0)  # what it is taught is no noise
-        kinds = {str(k): ddqn if k < c.networks else alone for k in range(c.networks + c.by_copies)}
-        self._learning = {name: replace(config, ddqn=kind) for name, kind in {**kinds, PUPIL: pupil}.items()}
+        learners = [ddqn] * c.networks + [alone] * c.by_copies
+        self._ddqn = {PUPIL: pupil, **{str(k): kind for k, kind in enumerate(learners)}}
         self._about, self._device = {**about, "training": asdict(config)}, device
 
     def run(self, progress: Callable[[float, float], None] | None = None) -> Path:
@@ -147,7 +147,8 @@ class Ensemble:
     def _learner(self, name: str) -> DdqnLearner:
         """As the training began, but for the seed of what is drawn; `name`: its number, or `PUPIL`."""
         seed = subseed(self.config.seed, f"ensemble/{name}") % 2**31
-        learner = make_trainer(replace(self._learning[name], seed=seed), self.vfn, self._device).learner
+        config = replace(self.config, ddqn=self._ddqn[name], seed=seed)
+        learner = make_trainer(config, self.vfn, self._device).learner
         assert isinstance(learner, DdqnLearner)
         return learner
 

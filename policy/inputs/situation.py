@@ -20,7 +20,8 @@ NEAR = 100.0  # m: neighbours further away are
 FAST = 30.0  # m/s
 OWN = 7  # numbers of the command, before the lanes
 PER_LANE = 3 + 2 * len(LOOK_AHEAD) + 4
-SITUATION_INPUTS = OWN + 3 * PER_LANE + 6
+MEETS = OWN + 3 * PER_LANE  # where the six of the mission vehicle begin: is there one
+SITUATION_INPUTS = MEETS + 6
 
 
 def situation(histories: Sequence[History], road: RoadMap, shared: bool) -> Floats32:

@@ -5,15 +5,19 @@ and what the ego knows besides join after FC 512 through MLPs. The baselines of 
 network with parts left out.
 """
 
-from dataclasses import dataclass
+from copy import deepcopy
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import nn
 from torch.nn import functional
 
+from cosim.errors import BadInput
 from cosim.types import IS_MISSION, MetaAction
-from policy.inputs.situation import OWN, SITUATION_INPUTS
+from policy import checkpoint
+from policy.inputs.situation import MEETS, OWN, SITUATION_INPUTS
 from policy.inputs.tensors import APART, KINEMATIC_INPUTS, apart, unit
 from policy.networks.extractors import Conv2dMaps, Conv3dMaps, EncodedMaps, FrameMemory, Strides
 from policy.networks.frame_encoder import EncoderConfig
@@ -36,11 +40,17 @@ class VfnConfig:
     kinematic: int = 64  # features of a vehicle; 0: maps and phi are all the network sees, read by `apart`
     situation: int = 64  # width of the branch of what the ego knows besides; goes with `kinematic`
     others: bool = True  # False: they are seen in maps alone, beside the ego's own speed and command
+    meets: bool = False  # behind the maps, layers of their own for AVs whose way meets a mission vehicle's
     extractor: Literal["conv3d", "conv2d", "frames"] = "conv3d"  # frames: each by a trained `FrameEncoder`
     latent: int = 128  # numbers a frame becomes (extractor `frames`)
     dueling: bool = True  # q = state value + advantage: how good the moment is drowns what an action changes
     parts: int = 1  # 2: what an action brings oneself and what it brings the others are valued apart
     critic: bool = False  # True: action preferences and a state value (A2C), not action values
+
+    def __post_init__(self) -> None:
+        """Raises BadInput: a critic values all AVs by the same layers."""
+        if self.meets and self.critic:
+            raise BadInput("is for networks that value actions", field="vfn.meets", value=True)
 
 
 TABLE_1 = VfnConfig(features=(32, 64, 64), hidden=512, strides="literal", dueling=False)
@@ -110,6 +120,10 @@ class VFN(nn.Module):
         for head in (self.value, self.state) if self.state is not None else (self.value,):
             for parameter in head.parameters():
                 nn.init.zeros_(parameter)
+        self.met: VFN | None = None
+        if c.meets:
+            self.met = VFN(replace(c, meets=False))
+            self.met.maps = None  # it takes what these maps show
 
     @property
     def layout(self) -> torch.memory_format:
@@ -129,10 +143,26 @@ class VFN(nn.Module):
         keep: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """The joined representation [B,joined]; arguments as in `forward`."""
+        return self._features(self._seen(maps), kinematics, situation, phi, keep)
+
+    def _seen(self, maps: torch.Tensor | Frames | None) -> torch.Tensor | None:
+        """[B,flat] what the maps show."""
         if maps is None:
+            return None
+        seen = self.maps.stacked(maps.features) if isinstance(maps, Frames) else self.maps(maps)
+        return torch.as_tensor(seen)
+
+    def _features(
+        self,
+        seen: torch.Tensor | None,
+        kinematics: torch.Tensor,
+        situation: torch.Tensor,
+        phi: torch.Tensor,
+        keep: torch.Tensor | None = None,
+    ) -> torch.Tensor:
+        if seen is None:
             parts = [phi.new_zeros(len(phi), self.config.hidden)]
         else:
-            seen = self.maps.stacked(maps.features) if isinstance(maps, Frames) else self.maps(maps)
             parts = [functional.relu(self.hidden(seen))]
         if self.kinematics is not None:
             parts += [self.kinematics(kinematics), self.situation(situation)]
@@ -167,10 +197,25 @@ class VFN(nn.Module):
         """
         return self.weighed(self.apart(maps, kinematics, situation, phi, keep), phi)
 
-    def apart(self, *inputs: Any) -> torch.Tensor:
+    def apart(
+        self,
+        maps: torch.Tensor | Frames | None,
+        kinematics: torch.Tensor,
+        situation: torch.Tensor,
+        phi: torch.Tensor,
+        keep: torch.Tensor | None = None,
+    ) -> torch.Tensor:
         """Values [B,parts,5] of what the reward weighs with cos and sin of phi (P, equation 6; with one part:
         of all of it), for who drives by that phi. Arguments as in `forward`."""
-        z = self.features(*inputs)
+        seen = self._seen(maps)
+        q = self._apart(seen, kinematics, situation, phi, keep)
+        if self.met is None:
+            return q
+        theirs = self.met._apart(seen, kinematics, situation, phi, keep)
+        return torch.where(situation[:, MEETS, None, None] > 0.5, theirs, q)
+
+    def _apart(self, *inputs: Any) -> torch.Tensor:
+        z = self._features(*inputs)
         q: torch.Tensor = self.value(z).view(len(z), self.config.parts, len(MetaAction))
         if self.config.dueling and self.state is not None:
             q = q - q.mean(2, keepdim=True) + self.state(z)[..., None]
@@ -179,6 +224,23 @@ class VFN(nn.Module):
     def weighed(self, apart: torch.Tensor, phi: torch.Tensor) -> torch.Tensor:
         """Action values [B,5] of their parts [B,parts,5]; phi [B,2]."""
         return apart[:, 0] if self.config.parts == 1 else (apart * phi[..., None]).sum(1)
+
+    def like(self, path: Path) -> "VFN":
+        """The network of the file `path`, in this one's layout.
+
+        It may have been trained without `VfnConfig.meets`: then the layers of AVs that meet a mission vehicle
+        are those of all. Raises BadInput, WeightsMismatch.
+        """
+        made = deepcopy(self)
+        stated = checkpoint.read_card(path)["configs"].get("vfn") or {}
+        if made.met is None or stated.get("meets"):
+            checkpoint.load(path, {"vfn": made}, {"vfn": self.config})
+            return made
+        one = VFN(replace(self.config, meets=False))
+        checkpoint.load(path, {"vfn": one}, {"vfn": one.config})
+        for part in (made, made.met):
+            part.load_state_dict(one.state_dict(), strict=False)
+        return made
 
     def actor_critic(
         self,

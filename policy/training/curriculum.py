@@ -44,6 +44,9 @@ class ForkConfig:
             raise BadInput("must be a share from 0 to 1", field="meeting", value=self.meeting)
 
 
+TAUGHT = ("seen", "met")  # which AVs a specialist may be kept to (`policy.training.ensemble.AVS`)
+
+
 @dataclass(frozen=True, slots=True)
 class EnsembleConfig:
     """Several networks that learn from all that was driven, and one that is taught their mean
@@ -58,7 +61,9 @@ class EnsembleConfig:
     distillation: int = 5_000  # updates of the one that is taught
     refused: float = 1.0  # weight of the refused actions' loss, in place of `DdqnConfig.refused`
     n_step: int = 8  # in place of `ReplayConfig.n_step`
-    specialists: tuple[str, ...] = ()  # SCENARIO/DEMAND=FILE: this file alone teaches what was driven there
+    # SCENARIO/DEMAND=FILE: this file alone teaches what was driven there; SCENARIO/DEMAND@seen=FILE: only AVs
+    # that have a mission vehicle on their map; @met: only AVs whose way meets a mission vehicle's
+    specialists: tuple[str, ...] = ()
     drives: tuple[str, ...] = ()  # SCENARIO/DEMAND whose drives count once more; named twice: twice more
 
     def __post_init__(self) -> None:
@@ -121,7 +126,12 @@ class VfnTraining:
             raise BadInput(problem, field="training.replay.forked", value=0)
         driven = {f"{lesson.scenario}/{lesson.demand}" for lesson in self.lessons}
         named = [("drives", name, name) for name in self.ensemble.drives]
-        named += [("specialists", one, one.partition("=")[0]) for one in self.ensemble.specialists]
+        for one in self.ensemble.specialists:
+            world, at, which = one.partition("=")[0].partition("@")
+            if at and which not in TAUGHT:
+                problem = f"teaches no such AVs; choose from @{', @'.join(TAUGHT)}"
+                raise BadInput(problem, field="training.ensemble.specialists", value=one)
+            named.append(("specialists", one, world))
         for part, value, name in named:
             if name not in driven:
                 problem = f"no lesson drives it; lessons: {', '.join(sorted(driven))}"

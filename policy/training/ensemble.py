@@ -11,16 +11,20 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 
 from cosim.errors import BadInput
 from cosim.seeding import generator, subseed
 from policy import checkpoint
+from policy.inputs.situation import MEETS
+from policy.inputs.tensors import to_numpy
 from policy.networks.vfn import VFN, VfnConfig
 from policy.training.curriculum import VfnTraining
 from policy.training.ddqn import DdqnLearner
 from policy.training.learner import Metrics, mean_metrics
 from policy.training.replay_buffer import Advised, ReplayBuffer
+from policy.training.sight import MISSION, READINGS, bands
 from policy.training.trainers import make_trainer, rate
 
 RESULT = "distilled.safetensors"
@@ -28,19 +32,41 @@ PUPIL = "pupil"
 DIFFERENCES = 10.0  # what an error in the difference of two actions counts more than one in the state's value
 
 
+def sees_mission(batch: Advised) -> torch.Tensor:
+    """[B] bool: a mission vehicle is on the AV's newest perceived map."""
+    newest = to_numpy(batch.now[1][:, batch.past - 1]).astype(np.float64)
+    present = bands(newest)[:, READINGS.index(MISSION[0])] > 0.5
+    return torch.from_numpy(present).to(batch.possible.device)
+
+
+def meets_mission(batch: Advised) -> torch.Tensor:
+    """[B] bool: the AV's way meets a mission vehicle's (`policy.inputs.situation`)."""
+    return batch.now[2][:, MEETS] > 0.5
+
+
+# which AVs a specialist teaches in its world
+AVS: dict[str, Callable[[Advised], torch.Tensor]] = {
+    "": lambda batch: torch.ones_like(batch.possible[:, 0]),
+    "seen": sees_mission,
+    "met": meets_mission,
+}
+
+
 class Teachers(NamedTuple):
     """Whose values are taught."""
 
     everywhere: list[VFN]  # their mean
-    specialists: dict[str, VFN]  # by SCENARIO/DEMAND: there this one's alone
+    specialists: dict[str, VFN]  # by SCENARIO/DEMAND[@seen|@met]: there, of such AVs, this one's alone
 
     @torch.no_grad()
     def values(self, batch: Advised) -> torch.Tensor:
         """[B,parts,A] for these states."""
         worlds = [label.rpartition("/")[0] for label in batch.episodes]
         values = torch.stack([network.apart(*batch.now) for network in self.everywhere]).mean(0)
-        for world, network in self.specialists.items():
+        for where, network in self.specialists.items():
+            world, _, which = where.partition("@")
             here = torch.tensor([name == world for name in worlds], device=values.device)
+            here &= AVS[which](batch)
             if here.any():
                 values = torch.where(here[:, None, None], network.apart(*batch.now), values)
         return values
@@ -153,9 +179,7 @@ class Ensemble:
         return learner
 
     def _read(self, path: Path) -> VFN:
-        network = VFN(self.vfn)
-        checkpoint.load(path, {"vfn": network}, {"vfn": self.vfn})
-        return network.to(self._device)
+        return VFN(self.vfn).like(path).to(self._device)
 
     def _rate(self, update: int, updates: int) -> float:
         return rate(replace(self.config, iterations=updates), update)

@@ -69,6 +69,7 @@ class Advised(NamedTuple):
     possible: torch.Tensor  # [B,A] bool, actions that were safe
     wrong: torch.Tensor  # [B,A] bool, those of them that the demonstrator would not have taken
     episodes: list[str]  # B labels, SCENARIO/DEMAND/SEED: where each comes from
+    past: int  # N, the perceived frames of each; the rest are predicted
 
 
 class Compared(NamedTuple):
@@ -150,7 +151,7 @@ class ReplayBuffer:
             torch.from_numpy(np.stack(rows)).to(device)
             for rows in ([~tr.unsafe[t] for tr, t in now], [tr.wrong[t] for tr, t in now])
         )
-        return Advised(inputs, possible, wrong, [tr.episode for tr, _ in now])
+        return Advised(inputs, possible, wrong, [tr.episode for tr, _ in now], now[0][0].past)
 
     def compared(self, rng: np.random.Generator, device: str = "cpu") -> Compared | None:
         """States with an action tried in a copy; None while there is none."""

@@ -10,7 +10,6 @@ import numpy as np
 
 from cosim.errors import BadInput
 from cosim.seeding import generator, subseed
-from policy import checkpoint
 from policy.networks.extractors import EncodedMaps
 from policy.networks.vfn import VfnConfig
 from policy.training.a2c import A2cLearner
@@ -158,7 +157,7 @@ def make_trainer(config: VfnTraining, vfn: VfnConfig, device: str) -> Trainer:
             raise BadInput("an encoder that was taught to see is needed", field="training.encoder", value="")
         online.maps.encoder.load_state_dict(encoder(config.encoder, online.maps.encoder.config))
     if config.first:
-        checkpoint.load(Path(config.first), {"vfn": online}, {"vfn": vfn})
+        online.load_state_dict(online.like(Path(config.first)).state_dict())
     return trainer
 
 

@@ -20,11 +20,11 @@ from cosim.rewards import RewardConfig
 from cosim.scenario import Mission, Scenario
 from cosim.seeding import generator
 from cosim.simulation.fake import FakeSimulator, FakeVehicle
-from cosim.types import SMOKE, MetaAction
+from cosim.types import IS_MISSION, SMOKE, MetaAction, X
 from policy import checkpoint
 from policy.agents.approaches import AgentConfig
-from policy.inputs.situation import SITUATION_INPUTS
-from policy.inputs.tensors import KINEMATIC_INPUTS
+from policy.inputs.situation import MEETS, SITUATION_INPUTS
+from policy.inputs.tensors import KINEMATIC_INPUTS, KINEMATIC_SCALE
 from policy.networks.vfn import VFN, VfnConfig
 from policy.prediction.chain import ChainConfig
 from policy.safety import SafetyConfig
@@ -35,7 +35,7 @@ from policy.training.ddqn import DdqnConfig, DdqnLearner
 from policy.training.ensemble import Ensemble, Teachers
 from policy.training.experience import Trajectory
 from policy.training.explorer import ExploreConfig, Explorer
-from policy.training.replay_buffer import ReplayBuffer, ReplayConfig, comparisons, places_tried
+from policy.training.replay_buffer import Advised, ReplayBuffer, ReplayConfig, comparisons, places_tried
 from policy.training.trainers import rate
 from policy.training.vfn import TrainingRun
 
@@ -759,6 +759,32 @@ def test_a_specialist_alone_teaches_what_was_driven_in_its_world(tmp_path: Path)
     wanted = {"merge/contested/7": MetaAction.DECELERATE, "exit/contested/7": MetaAction.ACCELERATE}
     assert best.tolist() == [wanted[label] for label in batch.episodes]
     assert len(set(best.tolist())) == 2
+
+
+@pytest.mark.parametrize(("which", "taught"), [("", [0, 1, 2]), ("@seen", [1]), ("@met", [2])])
+def test_a_specialist_may_be_kept_to_the_avs_that_a_mission_vehicle_concerns(
+    which: str, taught: list[int]
+) -> None:
+    """Of three AVs one sees a mission vehicle 20 m ahead, one meets one that its map does not show."""
+    kinematics = torch.zeros(3, 3, 2, KINEMATIC_INPUTS)
+    kinematics[..., -1] = 1.0
+    kinematics[:, :, 1, X] = float(200.0 / KINEMATIC_SCALE[X])
+    kinematics[1, :, 1, X] = float(20.0 / KINEMATIC_SCALE[X])
+    kinematics[1:, :, 1, IS_MISSION] = 1.0
+    situation = torch.zeros(3, SITUATION_INPUTS)
+    situation[2, MEETS] = 1.0
+    now = (torch.zeros(3, 3, 4, 8, 16, dtype=torch.uint8), kinematics, situation, torch.zeros(3, 2))
+    possible = torch.ones(3, 5, dtype=torch.bool)
+    networks = [VFN(TINY), VFN(TINY)]
+    networks[1].value.bias.data[MetaAction.ACCELERATE] = 9.0
+    batch = Advised(now, possible, ~possible, ["exit/contested/7"] * 3, 3)
+    values = Teachers(networks[:1], {f"exit/contested{which}": networks[1]}).values(batch)
+    assert values[:, 0, MetaAction.ACCELERATE].nonzero().flatten().tolist() == taught
+
+
+def test_a_specialist_is_kept_to_avs_that_exist() -> None:
+    with pytest.raises(BadInput, match=r"specialists='merge/contested@near=a': .*@seen, @met"):
+        replace(SHORT, ensemble=EnsembleConfig(networks=1, specialists=("merge/contested@near=a",)))
 
 
 def test_what_a_state_is_worth_stays_what_the_first_weights_say(tmp_path: Path) -> None:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 from policy_scenes import Car, histories, straight_road
 
+from cosim.errors import WeightsMismatch
 from cosim.types import KINEMATIC_FEATURES
-from policy.inputs.situation import FAR, PER_LANE, SITUATION_INPUTS, situation
+from policy import checkpoint
+from policy.inputs.situation import FAR, MEETS, PER_LANE, SITUATION_INPUTS, situation
 from policy.inputs.tensors import KINEMATIC_INPUTS, apart, kinematic_tensor, svo_tensor, to_batch
 from policy.inputs.vehicle_inputs import NEIGHBOUR_INPUTS, NEIGHBOURS, own_inputs
 from policy.networks.hpn import HPN, HpnConfig
@@ -102,6 +106,30 @@ def test_the_vfn_hears_the_social_value_orientation_and_sees_the_maps() -> None:
         blind = network.value(features)
     assert features.shape == (2, 256)
     assert not torch.equal(blind, egoist)
+
+
+def test_weights_that_never_heard_of_a_meeting_drive_as_before_until_they_learn_of_it(
+    tmp_path: Path,
+) -> None:
+    torch.manual_seed(0)
+    maps = torch.randint(0, 256, (2, 14, 4, 32, 128), dtype=torch.uint8)
+    states = maps, torch.zeros(0), torch.rand(2, SITUATION_INPUTS), torch.ones(2, 2)
+    states[2][:, MEETS] = torch.tensor([0.0, 1.0])
+    before = VFN(VfnConfig(others=False))
+    torch.nn.init.normal_(before.value.weight)
+    checkpoint.save(tmp_path / "before.safetensors", {"vfn": before}, {"vfn": before.config})
+    blank = VFN(VfnConfig(others=False, meets=True))
+    network = blank.like(tmp_path / "before.safetensors")
+    assert torch.equal(network(*states), before(*states))
+    assert not blank(*states).any(), "the network that was asked stays as it was"
+    assert network.met is not None
+    torch.nn.init.normal_(network.met.value.weight)
+    changed = (network(*states) != before(*states)).any(1)
+    assert changed.tolist() == [False, True]
+    checkpoint.save(tmp_path / "after.safetensors", {"vfn": network}, {"vfn": network.config})
+    assert torch.equal(blank.like(tmp_path / "after.safetensors")(*states), network(*states))
+    with pytest.raises(WeightsMismatch, match="meets"):
+        before.like(tmp_path / "after.safetensors")
 
 
 def test_gradients_reach_every_layer_of_both_networks() -> None:

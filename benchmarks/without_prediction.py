@@ -66,11 +66,13 @@ def without_predicted_frames(network: VFN, past: int) -> tuple[VFN, VfnConfig]:
     """The network of `past` frames that values every state as `network` does when it is shown the present."""
     config = replace(network.config, frames=past)
     tensors = network.state_dict()
-    weight = tensors["hidden.weight"].unflatten(1, (network.config.frames, config.latent))
-    kept = weight[:, :past].clone()
-    kept[:, -1] += weight[:, past:].sum(1)
+    for name in (name for name in tensors if name.endswith("hidden.weight")):
+        weight = tensors[name].unflatten(1, (network.config.frames, config.latent))
+        kept = weight[:, :past].clone()
+        kept[:, -1] += weight[:, past:].sum(1)
+        tensors[name] = kept.flatten(1)
     own = VFN(config)
-    own.load_state_dict({**tensors, "hidden.weight": kept.flatten(1)})
+    own.load_state_dict(tensors)
     return own, config
 
 

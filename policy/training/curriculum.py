@@ -47,6 +47,13 @@ class ForkConfig:
 TAUGHT = ("seen", "met")  # which AVs a specialist may be kept to (`policy.training.ensemble.AVS`)
 
 
+def specialist(text: str) -> tuple[str, str, str]:
+    """SCENARIO/DEMAND, which AVs of it ("": all) and FILE of one of `EnsembleConfig.specialists`."""
+    where, _, file = text.partition("=")
+    world, _, which = where.rpartition("@")
+    return (world, which, file) if which in TAUGHT else (where, "", file)
+
+
 @dataclass(frozen=True, slots=True)
 class EnsembleConfig:
     """Several networks that learn from all that was driven, and one that is taught their mean
@@ -126,12 +133,7 @@ class VfnTraining:
             raise BadInput(problem, field="training.replay.forked", value=0)
         driven = {f"{lesson.scenario}/{lesson.demand}" for lesson in self.lessons}
         named = [("drives", name, name) for name in self.ensemble.drives]
-        for one in self.ensemble.specialists:
-            world, at, which = one.partition("=")[0].partition("@")
-            if at and which not in TAUGHT:
-                problem = f"teaches no such AVs; choose from @{', @'.join(TAUGHT)}"
-                raise BadInput(problem, field="training.ensemble.specialists", value=one)
-            named.append(("specialists", one, world))
+        named += [("specialists", one, specialist(one)[0]) for one in self.ensemble.specialists]
         for part, value, name in named:
             if name not in driven:
                 problem = f"no lesson drives it; lessons: {', '.join(sorted(driven))}"

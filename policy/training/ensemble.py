@@ -20,7 +20,7 @@ from policy import checkpoint
 from policy.inputs.situation import MEETS
 from policy.inputs.tensors import to_numpy
 from policy.networks.vfn import VFN, VfnConfig
-from policy.training.curriculum import VfnTraining
+from policy.training.curriculum import VfnTraining, specialist
 from policy.training.ddqn import DdqnLearner
 from policy.training.learner import Metrics, mean_metrics
 from policy.training.replay_buffer import Advised, ReplayBuffer
@@ -52,19 +52,26 @@ AVS: dict[str, Callable[[Advised], torch.Tensor]] = {
 }
 
 
+class Specialist(NamedTuple):
+    """Teaches alone what was driven in its world."""
+
+    world: str  # SCENARIO/DEMAND
+    which: str  # of `AVS`
+    network: VFN
+
+
 class Teachers(NamedTuple):
     """Whose values are taught."""
 
     everywhere: list[VFN]  # their mean
-    specialists: dict[str, VFN]  # by SCENARIO/DEMAND[@seen|@met]: there, of such AVs, this one's alone
+    specialists: list[Specialist]
 
     @torch.no_grad()
     def values(self, batch: Advised) -> torch.Tensor:
         """[B,parts,A] for these states."""
         worlds = [label.rpartition("/")[0] for label in batch.episodes]
         values = torch.stack([network.apart(*batch.now) for network in self.everywhere]).mean(0)
-        for where, network in self.specialists.items():
-            world, _, which = where.partition("@")
+        for world, which, network in self.specialists:
             here = torch.tensor([name == world for name in worlds], device=values.device)
             here &= AVS[which](batch)
             if here.any():
@@ -124,8 +131,8 @@ class Ensemble:
         teachers += [self._network(k, shown) for k in range(networks)]
         if not self._finished(path):
             pupil = self._learner(PUPIL)
-            special = (one.partition("=") for one in c.specialists)
-            specialists = {world: self._read(Path(file)) for world, _, file in special}
+            special = map(specialist, c.specialists)
+            specialists = [Specialist(world, which, self._read(Path(file))) for world, which, file in special]
             taught = Teachers(teachers, specialists)
             measured = self._taught(pupil, taught, lambda k: shown(networks * c.updates + k))
             checkpoint.save(path, {"vfn": pupil.online}, {"vfn": self.vfn}, measured, self._about)

@@ -30,9 +30,17 @@ from policy.prediction.chain import ChainConfig
 from policy.safety import SafetyConfig
 from policy.training import experience
 from policy.training.a2c import A2cConfig, A2cLearner
-from policy.training.curriculum import Drive, Drove, EnsembleConfig, ForkConfig, Lesson, VfnTraining
+from policy.training.curriculum import (
+    Drive,
+    Drove,
+    EnsembleConfig,
+    ForkConfig,
+    Lesson,
+    VfnTraining,
+    specialist,
+)
 from policy.training.ddqn import DdqnConfig, DdqnLearner
-from policy.training.ensemble import Ensemble, Teachers
+from policy.training.ensemble import Ensemble, Specialist, Teachers
 from policy.training.experience import Trajectory
 from policy.training.explorer import ExploreConfig, Explorer
 from policy.training.replay_buffer import Advised, ReplayBuffer, ReplayConfig, comparisons, places_tried
@@ -755,13 +763,15 @@ def test_a_specialist_alone_teaches_what_was_driven_in_its_world(tmp_path: Path)
     for network, file in zip(networks, files, strict=True):
         checkpoint.load(Path(file), {"vfn": network}, {"vfn": TINY})
     batch = replay.advised(generator(0, "drawn"), True)
-    best = Teachers(networks[:1], {"exit/contested": networks[1]}).values(batch).sum(1).argmax(1)
+    best = (
+        Teachers(networks[:1], [Specialist("exit/contested", "", networks[1])]).values(batch).sum(1).argmax(1)
+    )
     wanted = {"merge/contested/7": MetaAction.DECELERATE, "exit/contested/7": MetaAction.ACCELERATE}
     assert best.tolist() == [wanted[label] for label in batch.episodes]
     assert len(set(best.tolist())) == 2
 
 
-@pytest.mark.parametrize(("which", "taught"), [("", [0, 1, 2]), ("@seen", [1]), ("@met", [2])])
+@pytest.mark.parametrize(("which", "taught"), [("", [0, 1, 2]), ("seen", [1]), ("met", [2])])
 def test_a_specialist_may_be_kept_to_the_avs_that_a_mission_vehicle_concerns(
     which: str, taught: list[int]
 ) -> None:
@@ -778,13 +788,13 @@ def test_a_specialist_may_be_kept_to_the_avs_that_a_mission_vehicle_concerns(
     networks = [VFN(TINY), VFN(TINY)]
     networks[1].value.bias.data[MetaAction.ACCELERATE] = 9.0
     batch = Advised(now, possible, ~possible, ["exit/contested/7"] * 3, 3)
-    values = Teachers(networks[:1], {f"exit/contested{which}": networks[1]}).values(batch)
+    values = Teachers(networks[:1], [Specialist("exit/contested", which, networks[1])]).values(batch)
     assert values[:, 0, MetaAction.ACCELERATE].nonzero().flatten().tolist() == taught
 
 
-def test_a_specialist_is_kept_to_avs_that_exist() -> None:
-    with pytest.raises(BadInput, match=r"specialists='merge/contested@near=a': .*@seen, @met"):
-        replace(SHORT, ensemble=EnsembleConfig(networks=1, specialists=("merge/contested@near=a",)))
+def test_a_specialist_names_its_world_its_avs_and_its_file() -> None:
+    assert specialist("exit/dense@met=runs/a.b") == ("exit/dense", "met", "runs/a.b")
+    assert specialist("my@city/dense=a.b") == ("my@city/dense", "", "a.b")
 
 
 def test_what_a_state_is_worth_stays_what_the_first_weights_say(tmp_path: Path) -> None:

@@ -1,5 +1,8 @@
 """A network that is shown the present in place of predictions, and the same without predicted frames."""
 
+from dataclasses import replace
+
+import pytest
 import torch
 
 from benchmarks.without_prediction import shown_the_present, without_predicted_frames
@@ -8,13 +11,15 @@ from policy.networks.vfn import VFN, VfnConfig
 CONFIG = VfnConfig(frames=14, extractor="frames", others=False, parts=2)
 
 
-def test_the_predicted_frames_are_folded_into_the_present() -> None:
+@pytest.mark.parametrize("meets", [False, True])
+def test_the_predicted_frames_are_folded_into_the_present(meets: bool) -> None:
     """Same values, whatever is predicted; and of another past other values."""
     torch.manual_seed(0)
-    network = VFN(CONFIG).eval()
-    torch.nn.init.normal_(network.value.weight)
+    network = VFN(replace(CONFIG, meets=meets)).eval()
+    for part in [network, *([] if network.met is None else [network.met])]:
+        torch.nn.init.normal_(part.value.weight)
     maps = torch.randn(3, 14, CONFIG.latent)
-    rest = torch.zeros(3, 14, 16, 9), torch.randn(3, 64), torch.randn(3, 2)
+    rest = torch.zeros(3, 14, 16, 9), torch.randn(3, 64).round(), torch.randn(3, 2)
     foreseeing = network(maps, *rest)
     own, config = without_predicted_frames(network, past=10)
     assert config.frames == 10

@@ -79,8 +79,7 @@ def without_predicted_frames(network: VFN, past: int) -> tuple[VFN, VfnConfig]:
 def driven(run: Path, training: VfnTraining) -> ReplayBuffer:
     """What the training drove, and holds."""
     replay = ReplayBuffer(training.replay)
-    for file in sorted((run / "replay").glob("*.npz")):
-        replay.add(experience.load(file))
+    replay.add(experience.drives(run))
     return replay
 
 

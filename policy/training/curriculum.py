@@ -71,6 +71,7 @@ class EnsembleConfig:
     # SCENARIO/DEMAND=FILE: this file alone teaches what was driven there; SCENARIO/DEMAND@seen=FILE: only AVs
     # that have a mission vehicle on their map; @met: only AVs whose way meets a mission vehicle's
     specialists: tuple[str, ...] = ()
+    runs: tuple[str, ...] = ()  # folders of other trainings whose drives are learned from besides
     drives: tuple[str, ...] = ()  # SCENARIO/DEMAND whose drives count once more; named twice: twice more
 
     def __post_init__(self) -> None:

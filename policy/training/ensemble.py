@@ -20,6 +20,7 @@ from policy import checkpoint
 from policy.inputs.situation import MEETS
 from policy.inputs.tensors import to_numpy
 from policy.networks.vfn import VFN, VfnConfig
+from policy.training import experience
 from policy.training.curriculum import VfnTraining, specialist
 from policy.training.ddqn import DdqnLearner
 from policy.training.learner import Metrics, mean_metrics
@@ -82,6 +83,8 @@ class Teachers(NamedTuple):
 class Ensemble:
     """Learns in `folder`, one network after the other; those that are finished are read again.
 
+    Raises BadInput for drives of other trainings (`EnsembleConfig.runs`) that are missing or of other inputs.
+
     Args:
         config: the schedule of the training; its part `ensemble` is what is done here.
         vfn: layout of the networks.
@@ -103,7 +106,10 @@ class Ensemble:
         c = config.ensemble
         self.config, self.vfn, self.folder = config, vfn, folder
         self.replay = ReplayBuffer(replace(config.replay, n_step=c.n_step))
-        driven = list(replay.trajectories)
+        driven = [one for run in c.runs for one in experience.drives(Path(run))] + list(replay.trajectories)
+        if len(shapes := {one.shapes for one in driven}) > 1:
+            problem = f"was driven with other inputs: {' and '.join(map(str, shapes))}"
+            raise BadInput(problem, field="training.ensemble.runs", value=", ".join(c.runs))
         more = [one for name in c.drives for one in driven if one.episode.rpartition("/")[0] == name]
         self.replay.add([*driven, *more])
         ddqn = replace(config.ddqn, refused=c.refused)

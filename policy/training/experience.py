@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from cosim.errors import BadInput
 from cosim.files import whole
 from cosim.types import Bools, Bytes, Floats32
 from policy.inputs.tensors import States
@@ -54,6 +55,12 @@ class Trajectory:
     def past(self) -> int:
         """N, the past frames of a state."""
         return int(self.frames.shape[0] - len(self) * self.stride)
+
+    @property
+    def shapes(self) -> tuple[tuple[int, ...], ...]:
+        """What a network sees of one state: the maps past and predicted, kinematics, situation."""
+        each = self.frames.shape[1:], self.kinematics.shape[1:], self.situation.shape[1:]
+        return ((self.past, self.ahead.shape[1]), *each)
 
     def maps(self, t: int) -> list[Bytes | Halves]:
         """The map groups of state `t`: past [N,...] and predicted [M,...] frames."""
@@ -122,3 +129,14 @@ def load(path: Path) -> list[Trajectory]:
             )
             for k in range(int(file["count"]))
         ]
+
+
+def drives(run: Path) -> list[Trajectory]:
+    """What the training in the folder `run` holds in its replay buffer, oldest first.
+
+    Raises BadInput when that is nothing.
+    """
+    found = [one for file in sorted((run / "replay").glob("*.npz")) for one in load(file)]
+    if not found:
+        raise BadInput("holds no drives of a training", file=run / "replay")
+    return found

@@ -743,6 +743,24 @@ def test_drives_that_are_named_count_more(tmp_path: Path) -> None:
     assert counts == {"merge/contested/7": 3, "merge/sparse/7": 1}
 
 
+def test_drives_of_other_trainings_join_in_front(tmp_path: Path) -> None:
+    (tmp_path / "other" / "replay").mkdir(parents=True)
+    theirs, own = (trajectory([0, 1], [(1.0, 0.0, 0.0)] * 2) for _ in range(2))
+    experience.save(tmp_path / "other" / "replay" / "0.npz", [replace(theirs, episode="exit/dense/1")])
+    replay = ReplayBuffer(SHORT.replay)
+    replay.add([own])
+    config = replace(SHORT, ensemble=EnsembleConfig(networks=1, runs=(str(tmp_path / "other"),)))
+    ensemble = Ensemble(config, TINY, replay, tmp_path, {})
+    assert [one.episode for one in ensemble.replay.trajectories] == ["exit/dense/1", "hand"]
+    wide = replace(own, situation=np.zeros((3, 1), np.float32))
+    experience.save(tmp_path / "other" / "replay" / "1.npz", [wide])
+    with pytest.raises(BadInput, match=r"training\.ensemble\.runs='.*other': was driven with other inputs"):
+        Ensemble(config, TINY, replay, tmp_path, {})
+    nobody = replace(config, ensemble=EnsembleConfig(networks=1, runs=(str(tmp_path / "none"),)))
+    with pytest.raises(BadInput, match="none/replay: holds no drives"):
+        Ensemble(nobody, TINY, replay, tmp_path, {})
+
+
 @pytest.mark.parametrize(("part", "value"), [("drives", "exit/dense"), ("specialists", "exit/dense=a.b")])
 def test_worlds_that_no_lesson_drives_are_named_in_one_error(part: str, value: str) -> None:
     with pytest.raises(BadInput, match=rf"training.ensemble.{part}='{value}': .*merge/contested"):

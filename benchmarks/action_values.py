@@ -28,6 +28,7 @@ from benchmarks.tables import markdown_row, write_page
 from benchmarks.turn import resampled
 from benchmarks.worlds import WITH_MISSION
 from cosim.cli.arguments import seeds as seeds_of
+from cosim.errors import BadInput
 from cosim.learning.rollouts import Rollouts
 from cosim.policies import make
 from cosim.report.statistics import NA
@@ -35,9 +36,10 @@ from cosim.rewards.svo import RewardP
 from cosim.scenario.policy_name import label, read
 from cosim.types import Preset
 from policy.agents.prediction_aware import PredictionAware
+from policy.training import experience
 from policy.training.curriculum import Drive, ForkConfig, Lesson
 from policy.training.ddqn import DdqnConfig, differences
-from policy.training.experience import Trajectory, load
+from policy.training.experience import Trajectory
 from policy.training.explorer import ExploreConfig
 from policy.training.replay_buffer import comparisons, places_tried
 
@@ -105,24 +107,23 @@ def _both(true: np.ndarray, found: np.ndarray) -> str:
     return f"{sizes}, {np.corrcoef(true, found)[0, 1]:.2f}" if true.std() and found.std() else sizes
 
 
-def of_run(agents: Mapping[str, PredictionAware], files: Sequence[Path]) -> dict[str, list[str]]:
+def of_run(agents: Mapping[str, PredictionAware], driven: Sequence[Trajectory]) -> dict[str, list[str]]:
     """The lines of every world and demand, practice roads together, of copies that a training drove.
 
     Args:
         agents: label -> the agent whose network is judged.
-        files: of the training's replay.
+        driven: what the training holds in its replay buffer.
     """
     episodes: dict[str, list[Trajectory]] = {}
-    for file in files:
-        for one in load(file):
-            episodes.setdefault(one.episode, []).append(one)
+    for one in driven:
+        episodes.setdefault(one.episode, []).append(one)
     places: dict[str, list[list[Trajectory]]] = {}
     for name, trajectories in sorted(episodes.items()):
         place = "practice" if name.startswith("practice/") else name.rpartition("/")[0]
         places.setdefault(place, []).append(trajectories)
     return {
-        place: [row(name, [judged(agent, t).by_values() for t in driven]) for name, agent in agents.items()]
-        for place, driven in places.items()
+        place: [row(name, [judged(agent, t).by_values() for t in there]) for name, agent in agents.items()]
+        for place, there in places.items()
     }
 
 
@@ -155,10 +156,11 @@ def main() -> None:
             parser.error(f"{text} has no value network")
         agents[label(text)] = agent
     if args.run:
-        files = sorted((args.run / "replay").glob("*.npz"))
-        if not files:
-            parser.error(f"argument --run: {args.run} holds no drives of a training (replay/*.npz)")
-        print("\n".join([f"Copies of the training in `{args.run}`.", "", *page(of_run(agents, files))]))
+        try:
+            held = experience.drives(args.run)
+        except BadInput as error:
+            parser.error(f"argument --run: {error}")
+        print("\n".join([f"Copies of the training in `{args.run}`.", "", *page(of_run(agents, held))]))
         return
     tables: dict[str, list[str]] = {world: [] for world in args.worlds}
     for name, agent in agents.items():

@@ -5,7 +5,6 @@ and what the ego knows besides join after FC 512 through MLPs. The baselines of 
 network with parts left out.
 """
 
-from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -84,6 +83,12 @@ class Frames(NamedTuple):
     features: torch.Tensor  # [B,T,F,h,w]
 
 
+class Shown(NamedTuple):
+    """In place of maps: what all convolutions, or the encoder, made of them."""
+
+    flat: torch.Tensor  # [B,maps.flat]
+
+
 class VFN(nn.Module):
     """Q(s, .; w) for the five meta-actions (with `critic`: log-preferences and V(s; w)).
 
@@ -136,34 +141,18 @@ class VFN(nn.Module):
 
     def features(
         self,
-        maps: torch.Tensor | Frames | None,
+        maps: torch.Tensor | Frames | Shown | None,
         kinematics: torch.Tensor,
         situation: torch.Tensor,
         phi: torch.Tensor,
         keep: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """The joined representation [B,joined]; arguments as in `forward`."""
-        return self._features(self._seen(maps), kinematics, situation, phi, keep)
-
-    def _seen(self, maps: torch.Tensor | Frames | None) -> torch.Tensor | None:
-        """[B,flat] what the maps show."""
-        if maps is None:
-            return None
-        seen = self.maps.stacked(maps.features) if isinstance(maps, Frames) else self.maps(maps)
-        return torch.as_tensor(seen)
-
-    def _features(
-        self,
-        seen: torch.Tensor | None,
-        kinematics: torch.Tensor,
-        situation: torch.Tensor,
-        phi: torch.Tensor,
-        keep: torch.Tensor | None = None,
-    ) -> torch.Tensor:
-        if seen is None:
+        shown = self._shown(maps)
+        if shown is None:
             parts = [phi.new_zeros(len(phi), self.config.hidden)]
         else:
-            parts = [functional.relu(self.hidden(seen))]
+            parts = [functional.relu(self.hidden(shown.flat))]
         if self.kinematics is not None:
             parts += [self.kinematics(kinematics), self.situation(situation)]
         elif self.config.kinematic:
@@ -199,27 +188,28 @@ class VFN(nn.Module):
 
     def apart(
         self,
-        maps: torch.Tensor | Frames | None,
+        maps: torch.Tensor | Frames | Shown | None,
         kinematics: torch.Tensor,
         situation: torch.Tensor,
-        phi: torch.Tensor,
-        keep: torch.Tensor | None = None,
+        *more: Any,
     ) -> torch.Tensor:
         """Values [B,parts,5] of what the reward weighs with cos and sin of phi (P, equation 6; with one part:
         of all of it), for who drives by that phi. Arguments as in `forward`."""
-        seen = self._seen(maps)
-        q = self._apart(seen, kinematics, situation, phi, keep)
-        if self.met is None:
-            return q
-        theirs = self.met._apart(seen, kinematics, situation, phi, keep)
-        return torch.where(situation[:, MEETS, None, None] > 0.5, theirs, q)
-
-    def _apart(self, *inputs: Any) -> torch.Tensor:
-        z = self._features(*inputs)
+        shown = self._shown(maps)
+        z = self.features(shown, kinematics, situation, *more)
         q: torch.Tensor = self.value(z).view(len(z), self.config.parts, len(MetaAction))
         if self.config.dueling and self.state is not None:
             q = q - q.mean(2, keepdim=True) + self.state(z)[..., None]
-        return q
+        if self.met is None:
+            return q
+        met = situation[:, MEETS, None, None] > 0.5
+        return torch.where(met, self.met.apart(shown, kinematics, situation, *more), q)
+
+    def _shown(self, maps: torch.Tensor | Frames | Shown | None) -> Shown | None:
+        """What the maps show, read once for both sets of layers."""
+        if maps is None or isinstance(maps, Shown):
+            return maps
+        return Shown(self.maps.stacked(maps.features) if isinstance(maps, Frames) else self.maps(maps))
 
     def weighed(self, apart: torch.Tensor, phi: torch.Tensor) -> torch.Tensor:
         """Action values [B,5] of their parts [B,parts,5]; phi [B,2]."""
@@ -231,15 +221,16 @@ class VFN(nn.Module):
         It may have been trained without `VfnConfig.meets`: then the layers of AVs that meet a mission vehicle
         are those of all. Raises BadInput, WeightsMismatch.
         """
-        made = deepcopy(self)
         stated = checkpoint.read_card(path)["configs"].get("vfn") or {}
-        if made.met is None or stated.get("meets"):
-            checkpoint.load(path, {"vfn": made}, {"vfn": self.config})
-            return made
-        one = VFN(replace(self.config, meets=False))
+        meets = self.config.meets and bool(stated.get("meets"))
+        one = VFN(replace(self.config, meets=meets))
         checkpoint.load(path, {"vfn": one}, {"vfn": one.config})
+        if one.config == self.config:
+            return one
+        made = VFN(self.config)
         for part in (made, made.met):
-            part.load_state_dict(one.state_dict(), strict=False)
+            assert part is not None
+            part.load_state_dict(one.state_dict(), strict=False)  # one has no `met`, and `met` no maps
         return made
 
     def actor_critic(

@@ -781,9 +781,8 @@ def test_a_specialist_alone_teaches_what_was_driven_in_its_world(tmp_path: Path)
     for network, file in zip(networks, files, strict=True):
         checkpoint.load(Path(file), {"vfn": network}, {"vfn": TINY})
     batch = replay.advised(generator(0, "drawn"), True)
-    best = (
-        Teachers(networks[:1], [Specialist("exit/contested", "", networks[1])]).values(batch).sum(1).argmax(1)
-    )
+    teachers = Teachers(networks[:1], [Specialist("exit/contested", "", networks[1])])
+    best = teachers.values(batch).sum(1).argmax(1)
     wanted = {"merge/contested/7": MetaAction.DECELERATE, "exit/contested/7": MetaAction.ACCELERATE}
     assert best.tolist() == [wanted[label] for label in batch.episodes]
     assert len(set(best.tolist())) == 2

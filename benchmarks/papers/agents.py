@@ -25,7 +25,7 @@ PERCEPTION = 125.0  # m, what an AV's own sensors reach (definitions.md)
 NEWER = {
     "observation": ("road_version", "signal_timing"),
     "safety": ("assisted",),
-    "vfn": ("latent", "others", "parts"),
+    "vfn": ("latent", "others", "parts", "meets"),
 }
 
 

@@ -110,6 +110,12 @@ def check(settings: Settings, sample: int, seed: int = 0, jobs: Sequence[Job] = 
     return Checked(len(picked), differing, len(rows), len(rows) - len(mine))
 
 
+def unknown(settings: Settings, jobs: Sequence[Job] = JOBS) -> int:
+    """How many shipped episodes are of other agents, weights, files or versions; none is driven."""
+    cells = {cell.name for cell in _planned(jobs, settings).cells}
+    return sum(row["cell"] not in cells for row in shipped.episodes(settings.shipped).rows)
+
+
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.papers.episodes", description=__doc__)

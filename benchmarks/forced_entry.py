@@ -1,10 +1,13 @@
 """One impatient human, nobody else errs: does whoever lets in crash less and get further (T's headline)?
 
     python -m benchmarks.forced_entry [--episodes 200] [--lag 0.5] [--runs runs/forced_entry] [--page PAGE]
+    python -m benchmarks.forced_entry --arms vfn-p@0 vfn-p@45 --section learned
+    python -m benchmarks.forced_entry --arms vfn-p@0 vfn-p@45 --section learned-stress --errors stress
 
-`idm` and `altruist-rule` in the contested worlds with a mission vehicle, on equal test seeds, preset
-`lawful`. The error is `forced_entry` of `stress`; `lag` (s) is the shortest gap that it takes. Goes on where
-it stopped, and writes the table of docs/human_errors.md.
+An egoist and an altruist (a policy, at a phi in degrees) in the contested worlds with a mission vehicle, on
+equal test seeds, preset `lawful`. The error is `forced_entry` of `stress`; `lag` (s) is the shortest gap that
+it takes; with `--errors` it is another level's. Goes on where it stopped, and writes the table into the
+section of docs/human_errors.md.
 """
 
 from __future__ import annotations
@@ -36,23 +39,26 @@ COLUMNS = (
 )
 
 
-def drive(lag: float, episodes: int, runs: Path, workers: str) -> dict[str, list[Row]]:
-    """Policy -> rows of all worlds, by world and seed."""
+def forced(lag: float, runs: Path) -> str:
+    """The file of a level that has no other error."""
     kind = levels()["stress"].kinds.forced_entry
     assert kind is not None
     runs.mkdir(parents=True, exist_ok=True)
     file = runs / f"forced_{lag:g}.yaml"
     file.write_text(yaml.safe_dump({"forced_entry": asdict(replace(kind, lag=lag))}))
+    return str(file)
+
+
+def drive(arm: str, errors: str, seeds: range, out: Path, workers: str) -> list[Row]:
+    """What an arm, POLICY or POLICY@PHI, drove: rows of all worlds, by world and seed."""
+    policy, _, phi = arm.partition("@")
     words = [word for world in WITH_MISSION for word in ("--scenario", world)]
-    words += [word for policy in ARMS for word in ("--policy", policy)]
-    words += ["--demand", "contested", "--errors", str(file), "--no-report", "--workers", workers]
-    out = runs / f"lag_{lag:g}_{episodes}"
-    words += ["--seeds", f"{FIRST_TEST_SEED}:{FIRST_TEST_SEED + episodes}", "--resume", "--out", str(out)]
-    if code := cosim(["evaluate", *words]):
+    words += ["--demand", "contested", "--errors", errors, "--policy", policy, "--svo", phi or "45"]
+    words += ["--seeds", f"{seeds.start}:{seeds.stop}", "--no-report", "--workers", workers]
+    if code := cosim(["evaluate", *words, "--resume", "--out", str(out)]):
         raise SystemExit(code)
     rows = [row for row in run_folder.read(out).rows if row["status"] == OK]
-    rows.sort(key=lambda row: (str(row["scenario"]), int(row["seed"])))
-    return {policy: [row for row in rows if row["policy"] == policy] for policy in ARMS}
+    return sorted(rows, key=lambda row: (str(row["scenario"]), int(row["seed"])))
 
 
 def line(world: str, egoists: Sequence[Row], altruists: Sequence[Row]) -> list[str]:
@@ -86,16 +92,25 @@ def main() -> None:
     )
     parser.add_argument("--episodes", type=int, default=200, help="a world")
     parser.add_argument("--lag", type=float, default=0.5, metavar="S")
+    parser.add_argument("--arms", nargs=2, default=ARMS, metavar=("EGOIST", "ALTRUIST"))
+    parser.add_argument("--errors", help="of this level, not a forced entry alone")
+    parser.add_argument("--section", default="forced", help="of the page")
     parser.add_argument("--runs", type=Path, default=Path("runs/forced_entry"))
     parser.add_argument("--workers", default="2")
     parser.add_argument("--page", type=Path, default=PAGE)
     args = parser.parse_args()
-    rows = drive(args.lag, args.episodes, args.runs, args.workers)
+    errors = args.errors or forced(args.lag, args.runs)
+    seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + args.episodes)
+    name = args.errors or f"lag_{args.lag:g}"
+    rows = [
+        drive(arm, errors, seeds, args.runs / f"{name}_{args.episodes}-{arm.replace('/', '_')}", args.workers)
+        for arm in args.arms
+    ]
     lines = [markdown_row(COLUMNS), markdown_row(["---"] * len(COLUMNS))]
     for world in WITH_MISSION:
-        egoists, altruists = ([row for row in rows[arm] if row["scenario"] == world] for arm in ARMS)
+        egoists, altruists = ([row for row in of if row["scenario"] == world] for of in rows)
         lines += [markdown_row(line(world, egoists, altruists))]
-    fill(args.page, "forced", lines)
+    fill(args.page, args.section, lines)
     print("\n".join(lines))
 
 

@@ -14,7 +14,7 @@ from cosim.errors import BadInput
 from cosim.types import Policy, PolicyContext
 from policy import checkpoint
 from policy.agents import APPROACHES, make
-from policy.agents.approaches import AgentConfig, compact, shipped
+from policy.agents.approaches import AgentConfig, compact, shipped, vfn_of
 from policy.agents.prediction_aware import PredictionAware
 from policy.checkpoint import sha256
 from policy.networks.vfn import VFN, VfnConfig
@@ -72,6 +72,8 @@ def config(agent: Agent, untrained: bool = False) -> AgentConfig:
     if agent.weights:
         path = Path(agent.weights)
         c = replace(c, vfn_weights=path if path.is_file() else None)
+        if path.is_file():
+            c = replace(c, vfn=vfn_of(checkpoint.read_card(path), path))  # it may differ from what ships
     if untrained:
         c = replace(c, vfn_weights=None)
     if agent.mask == "none":

@@ -3,8 +3,8 @@
     python -m benchmarks.alone [--episodes 20] [--demand dense] [--worlds merge ...] [--seeds-from 200000]
         [--weights FILE] [--runs runs/alone] [--workers 2] [--out docs/results/alone.md]
 
-Preset `unguarded`, no mask: the best valued action is carried out. FILE is a network that is shown what `vfn-p` is
-and drives too. The same command goes on where it stopped.
+Preset `unguarded`, no mask: the best valued action is carried out. FILE is a network that is
+shown what `vfn-p` is, and drives too. The same command goes on where it stopped.
 """
 
 import argparse

@@ -87,9 +87,11 @@ def driving(name: str, card: Card) -> Iterator[str]:
     mask = "no safety prioritizer" if approach.mask == "none" else f"prioritizer on `{approach.mask}`"
     yield f"- Chooses an AV's meta-action from {sees}{predicted}; {layout['extractor']}, {mask}."
     phis = ", ".join(f"{phi:g}" for phi in training["svo"])
+    other = ", ".join(f"`{run}`" for run in (training.get("ensemble") or {}).get("runs", ()))
     yield (
         f"- Data: {len(log) * training['episodes']} episodes of {', '.join(data['scenarios'])} up to the "
         f"shipped iteration, seeds below 100,000, drives with phi {phis} degrees"
+        + (f", and the drives of {other}" if other else "")
         + (
             f"; predicted maps of `hpn` (SHA-256 `{data['hpn_sha256'][:12]}`)."
             if "hpn_sha256" in data
@@ -105,11 +107,14 @@ def driving(name: str, card: Card) -> Iterator[str]:
     if training.get("first"):
         yield f"- Began with: `{training['first']}`."
     hours = sum(row["iteration_s"] for row in log) / 3600
-    made = f"after {last['updates']:,} updates and {hours:.1f} h by its log"
+    learned = f"{last['updates']:,} updates and " if last["updates"] else ""
+    learned += f"{hours:.1f} h" + ("" if last["updates"] else " of drives")
+    made = f"after {learned} by its log"
     if shipped is None:
         yield (
-            f"- Shipped: what the ensemble taught (`training.ensemble`, docs/training.md), {made}; it "
-            f"chooses as its teachers do in {card['measured']['agrees']:.0%} of the states."
+            "- Shipped: what the ensemble taught (`training.ensemble`, docs/training.md) in "
+            f"{training['ensemble']['distillation']:,} updates, {made}; it chooses as its teachers do in "
+            f"{card['measured']['agrees']:.0%} of the states."
         )
     elif "validation" in card["measured"]:
         yield (

@@ -1,7 +1,7 @@
 """One impatient human, nobody else errs: does whoever lets in crash less and get further (T's headline)?
 
     python -m benchmarks.forced_entry [--episodes 200] [--lag 0.5] [--runs runs/forced_entry] [--page PAGE]
-    python -m benchmarks.forced_entry --arms vfn-p@0 vfn-p@45 --section learned
+    python -m benchmarks.forced_entry --arms vfn-p@0 vfn-p@45 --section learned [--worlds merge exit]
     python -m benchmarks.forced_entry --arms vfn-p@0 vfn-p@45 --section learned-stress --errors stress
 
 An egoist and an altruist (a policy, at a phi in degrees) in the contested worlds with a mission vehicle, on
@@ -49,10 +49,10 @@ def forced(lag: float, runs: Path) -> str:
     return str(file)
 
 
-def drive(arm: str, errors: str, seeds: range, out: Path, workers: str) -> list[Row]:
+def drive(arm: str, worlds: Sequence[str], errors: str, seeds: range, out: Path, workers: str) -> list[Row]:
     """What an arm, POLICY or POLICY@PHI, drove: rows of all worlds, by world and seed."""
     policy, _, phi = arm.partition("@")
-    words = [word for world in WITH_MISSION for word in ("--scenario", world)]
+    words = [word for world in worlds for word in ("--scenario", world)]
     words += ["--demand", "contested", "--errors", errors, "--policy", policy, "--svo", phi or "45"]
     words += ["--seeds", f"{seeds.start}:{seeds.stop}", "--no-report", "--workers", workers]
     if code := cosim(["evaluate", *words, "--resume", "--out", str(out)]):
@@ -93,6 +93,7 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=200, help="a world")
     parser.add_argument("--lag", type=float, default=0.5, metavar="S")
     parser.add_argument("--arms", nargs=2, default=ARMS, metavar=("EGOIST", "ALTRUIST"))
+    parser.add_argument("--worlds", nargs="+", choices=WITH_MISSION, default=WITH_MISSION)
     parser.add_argument("--errors", help="of this level, not a forced entry alone")
     parser.add_argument("--section", default="forced", help="of the page")
     parser.add_argument("--runs", type=Path, default=Path("runs/forced_entry"))
@@ -102,12 +103,12 @@ def main() -> None:
     errors = args.errors or forced(args.lag, args.runs)
     seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + args.episodes)
     name = args.errors or f"lag_{args.lag:g}"
-    rows = [
-        drive(arm, errors, seeds, args.runs / f"{name}_{args.episodes}-{arm.replace('/', '_')}", args.workers)
-        for arm in args.arms
-    ]
+    rows = []
+    for arm in args.arms:
+        out = args.runs / "-".join((name, str(args.episodes), *args.worlds, arm.replace("/", "_")))
+        rows.append(drive(arm, args.worlds, errors, seeds, out, args.workers))
     lines = [markdown_row(COLUMNS), markdown_row(["---"] * len(COLUMNS))]
-    for world in WITH_MISSION:
+    for world in args.worlds:
         egoists, altruists = ([row for row in of if row["scenario"] == world] for of in rows)
         lines += [markdown_row(line(world, egoists, altruists))]
     fill(args.page, args.section, lines)

@@ -44,14 +44,14 @@ class ForkConfig:
             raise BadInput("must be a share from 0 to 1", field="meeting", value=self.meeting)
 
 
-TAUGHT = ("seen", "met")  # which AVs a specialist may be kept to (`policy.training.ensemble.AVS`)
+MET = "@met"  # keeps a specialist to AVs whose way meets a mission vehicle's
 
 
-def specialist(text: str) -> tuple[str, str, str]:
-    """SCENARIO/DEMAND, which AVs of it ("": all) and FILE of one of `EnsembleConfig.specialists`."""
-    where, _, file = text.partition("=")
-    world, _, which = where.rpartition("@")
-    return (world, which, file) if which in TAUGHT else (where, "", file)
+def specialist(text: str) -> tuple[str, bool, str]:
+    """SCENARIO/DEMAND, whether it is kept to AVs that meet a mission vehicle, and FILE of one of
+    `EnsembleConfig.specialists`."""
+    world, _, file = text.partition("=")
+    return world.removesuffix(MET), world.endswith(MET), file
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,8 +68,8 @@ class EnsembleConfig:
     distillation: int = 5_000  # updates of the one that is taught
     refused: float = 1.0  # weight of the refused actions' loss, in place of `DdqnConfig.refused`
     n_step: int = 8  # in place of `ReplayConfig.n_step`
-    # SCENARIO/DEMAND=FILE: this file alone teaches what was driven there; SCENARIO/DEMAND@seen=FILE: only AVs
-    # that have a mission vehicle on their map; @met: only AVs whose way meets a mission vehicle's
+    # SCENARIO/DEMAND=FILE: this file alone teaches what was driven there; SCENARIO/DEMAND@met=FILE: only AVs
+    # whose way meets a mission vehicle's
     specialists: tuple[str, ...] = ()
     runs: tuple[str, ...] = ()  # folders of other trainings whose drives are learned from besides
     drives: tuple[str, ...] = ()  # SCENARIO/DEMAND whose drives count once more; named twice: twice more

@@ -11,21 +11,18 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 
 from cosim.errors import BadInput
 from cosim.seeding import generator, subseed
 from policy import checkpoint
 from policy.inputs.situation import MEETS
-from policy.inputs.tensors import to_numpy
 from policy.networks.vfn import VFN, VfnConfig
 from policy.training import experience
 from policy.training.curriculum import VfnTraining, specialist
 from policy.training.ddqn import DdqnLearner
 from policy.training.learner import Metrics, mean_metrics
 from policy.training.replay_buffer import Advised, ReplayBuffer
-from policy.training.sight import MISSION, READINGS, bands
 from policy.training.trainers import make_trainer, rate
 
 RESULT = "distilled.safetensors"
@@ -33,31 +30,16 @@ PUPIL = "pupil"
 DIFFERENCES = 10.0  # what an error in the difference of two actions counts more than one in the state's value
 
 
-def sees_mission(batch: Advised) -> torch.Tensor:
-    """[B] bool: a mission vehicle is on the AV's newest perceived map."""
-    newest = to_numpy(batch.now[1][:, batch.past - 1]).astype(np.float64)
-    present = bands(newest)[:, READINGS.index(MISSION[0])] > 0.5
-    return torch.from_numpy(present).to(batch.possible.device)
-
-
 def meets_mission(batch: Advised) -> torch.Tensor:
     """[B] bool: the AV's way meets a mission vehicle's (`policy.inputs.situation`)."""
     return batch.now[2][:, MEETS] > 0.5
-
-
-# which AVs a specialist teaches in its world
-AVS: dict[str, Callable[[Advised], torch.Tensor]] = {
-    "": lambda batch: torch.ones_like(batch.possible[:, 0]),
-    "seen": sees_mission,
-    "met": meets_mission,
-}
 
 
 class Specialist(NamedTuple):
     """Teaches alone what was driven in its world."""
 
     world: str  # SCENARIO/DEMAND
-    which: str  # of `AVS`
+    met: bool  # only AVs whose way meets a mission vehicle's
     network: VFN
 
 
@@ -72,9 +54,10 @@ class Teachers(NamedTuple):
         """[B,parts,A] for these states."""
         worlds = [label.rpartition("/")[0] for label in batch.episodes]
         values = torch.stack([network.apart(*batch.now) for network in self.everywhere]).mean(0)
-        for world, which, network in self.specialists:
+        for world, met, network in self.specialists:
             here = torch.tensor([name == world for name in worlds], device=values.device)
-            here &= AVS[which](batch)
+            if met:
+                here &= meets_mission(batch)
             if here.any():
                 values = torch.where(here[:, None, None], network.apart(*batch.now), values)
         return values
@@ -138,7 +121,7 @@ class Ensemble:
         if not self._finished(path):
             pupil = self._learner(PUPIL)
             special = map(specialist, c.specialists)
-            specialists = [Specialist(world, which, self._read(Path(file))) for world, which, file in special]
+            specialists = [Specialist(world, met, self._read(Path(file))) for world, met, file in special]
             taught = Teachers(teachers, specialists)
             measured = self._taught(pupil, taught, lambda k: shown(networks * c.updates + k))
             checkpoint.save(path, {"vfn": pupil.online}, {"vfn": self.vfn}, measured, self._about)

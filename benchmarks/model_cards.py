@@ -46,7 +46,10 @@ LIMITS = {  # by the configuration of the training
     "rewards": (LAWLESS,),
 }
 LAWFUL_ONLY = "It learned from rewards alone, in preset `lawful`: what it does in `unguarded` it never tried."
-TRAINED = {"vfn-p": "meeting-2"}  # the folder of its training's log, where that is not NAME-0
+TRAINED = {
+    "vfn-p": "meeting-2",
+    "vfn": "meeting-2",
+}  # the folder of its training's log, where that is not NAME-0
 PREDICTING_LIMITS = (
     "It learned from the five worlds alone, with drivers who follow IDM and LC2013 or MOBIL and never err; "
     "nothing is known of its error on recorded traffic or on other roads.",
@@ -99,10 +102,14 @@ def driving(name: str, card: Card) -> Iterator[str]:
         )
     )
     what = "a2c" if approach.learning == "a2c" else "vfn"
+    base, then = name, ""
+    if "learned_from" in data:  # it learned from what another network drove, without a drive of its own
+        base = "vfn-p"
+        then = f", then `python -m benchmarks.without_prediction runs/{base}`"
     yield (
-        f"- Training: `cosim train {what} --policy {name}{'' if rewards else ' --scenario all'} "
+        f"- Training: `cosim train {what} --policy {base}{'' if rewards else ' --scenario all'} "
         f"--seed {training['seed']} --iterations {training['iterations']} "
-        f"--config {folder.as_posix()}/config.yaml --out runs/{name}`"
+        f"--config {folder.as_posix()}/config.yaml --out runs/{base}`{then}"
     )
     if training.get("first"):
         yield f"- Began with: `{training['first']}`."

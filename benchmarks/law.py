@@ -38,7 +38,7 @@ from tests.worlds.build import NAMES, build
 
 TRYING, PAGE = 100_000, 200_000  # first seeds
 IDM = "idm"
-ARMS = ("vfn-p", "vfn-p-demonstrated", "random")
+ARMS = ("vfn-p", "random")
 FREE = ("random",)  # arms of which neither distance nor trips nor brakings are asked
 SHARES = (0.2, 1.0)  # of AVs
 FIGURES = (  # of the rows, beside what the checker counts

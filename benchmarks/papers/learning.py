@@ -30,7 +30,8 @@ def write(settings: Settings) -> None:
     learning_curves.write_csv(data / f"{NAME}.csv", runs)
     text = learning_curves.page(runs, f"python -m benchmarks.papers.{NAME}", f"{NAME}.png")
     if any(run.label == "vfn-p" for run in runs) and not settings.trainings:
-        text += ["", "`vfn-p` and `vfn`: from their own first weights. What ships went on from there:", FURTHER]
+        began = "`vfn-p` and `vfn`: from their own first weights. What ships went on from there:"
+        text += ["", began, FURTHER]
     write_page(settings.out / f"{NAME}.md", text)
     print(settings.out / f"{NAME}.md")
 

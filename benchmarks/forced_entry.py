@@ -35,7 +35,6 @@ ARMS = ("idm", "altruist-rule")
 COLUMNS = (
     *("world", "pairs", "a collision of the mission vehicle or an AV", "difference, pp", "p"),
     *("of an AV", "let in", "difference, pp", "distance of all, more m", "of the mission vehicle", "of AVs"),
-    "forced entries",
 )
 
 
@@ -107,7 +106,8 @@ def main() -> None:
     for arm in args.arms:
         out = args.runs / "-".join((name, str(args.episodes), *args.worlds, arm.replace("/", "_")))
         rows.append(drive(arm, args.worlds, errors, seeds, out, args.workers))
-    lines = [markdown_row(COLUMNS), markdown_row(["---"] * len(COLUMNS))]
+    head = [*COLUMNS, "errors that began" if args.errors else "forced entries"]
+    lines = [markdown_row(head), markdown_row(["---"] * len(head))]
     for world in args.worlds:
         egoists, altruists = ([row for row in of if row["scenario"] == world] for of in rows)
         lines += [markdown_row(line(world, egoists, altruists))]

@@ -101,7 +101,7 @@ def main() -> None:
     args = parser.parse_args()
     errors = args.errors or forced(args.lag, args.runs)
     seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + args.episodes)
-    name = args.errors or f"lag_{args.lag:g}"
+    name = Path(args.errors).stem if args.errors else f"lag_{args.lag:g}"
     rows = []
     for arm in args.arms:
         out = args.runs / "-".join((name, str(args.episodes), *args.worlds, arm.replace("/", "_")))

@@ -46,10 +46,8 @@ LIMITS = {  # by the configuration of the training
     "rewards": (LAWLESS,),
 }
 LAWFUL_ONLY = "It learned from rewards alone, in preset `lawful`: what it does in `unguarded` it never tried."
-TRAINED = {
-    "vfn-p": "meeting-2",
-    "vfn": "meeting-2",
-}  # the folder of its training's log, where that is not NAME-0
+# the folder of its training's log, where that is not NAME-0
+TRAINED = {"vfn-p": "meeting-2", "vfn": "meeting-2"}
 PREDICTING_LIMITS = (
     "It learned from the five worlds alone, with drivers who follow IDM and LC2013 or MOBIL and never err; "
     "nothing is known of its error on recorded traffic or on other roads.",
@@ -114,9 +112,8 @@ def driving(name: str, card: Card) -> Iterator[str]:
     if training.get("first"):
         yield f"- Began with: `{training['first']}`."
     hours = sum(row["iteration_s"] for row in log) / 3600
-    learned = f"{last['updates']:,} updates and " if last["updates"] else ""
-    learned += f"{hours:.1f} h" + ("" if last["updates"] else " of drives")
-    made = f"after {learned} by its log"
+    own = last["updates"]  # none: its drives are all that the pupil learned from
+    made = f"after {own:,} updates and {hours:.1f} h by its log" if own else f"after {hours:.1f} h of drives"
     if shipped is None:
         yield (
             "- Shipped: what the ensemble taught (`training.ensemble`, docs/training.md) in "

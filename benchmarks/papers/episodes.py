@@ -97,8 +97,7 @@ def check(settings: Settings, sample: int, seed: int = 0, jobs: Sequence[Job] = 
     if not rows:
         raise BadInput("holds no shipped episodes", value=str(settings.shipped))
     work = _planned(jobs, settings)
-    cells = {cell.name: cell for cell in work.cells}
-    mine = [row for row in rows if row["cell"] in cells]
+    mine = _known(rows, work)
     if not mine:
         other = shipped.other_versions(work.cells[0].manifest["versions"], settings.shipped)
         why = f"versions ({other})" if other else "weights or files"
@@ -112,8 +111,8 @@ def check(settings: Settings, sample: int, seed: int = 0, jobs: Sequence[Job] = 
 
 def unknown(settings: Settings, jobs: Sequence[Job] = JOBS) -> int:
     """How many shipped episodes are of other agents, weights, files or versions; none is driven."""
-    cells = {cell.name for cell in _planned(jobs, settings).cells}
-    return sum(row["cell"] not in cells for row in shipped.episodes(settings.shipped).rows)
+    rows = shipped.episodes(settings.shipped).rows
+    return len(rows) - len(_known(rows, _planned(jobs, settings)))
 
 
 def main() -> None:
@@ -167,6 +166,12 @@ def _planned(jobs: Sequence[Job], settings: Settings) -> Planned:
     """Every cell that the jobs order and whose agent can drive."""
     orders = [o for job in jobs for o in job.orders() if settings.untrained or missing(o.agent) is None]
     return planned(list(dict.fromkeys(orders)), settings)
+
+
+def _known(rows: Sequence[Row], work: Planned) -> list[Row]:
+    """Those of the cells that are planned here."""
+    cells = {cell.name for cell in work.cells}
+    return [row for row in rows if row["cell"] in cells]
 
 
 def _case(cell: Cell, agents: Mapping[str, Agent]) -> dict[str, Any]:

@@ -1,0 +1,34 @@
+"""Nothing lies in docs/results that no command makes, and every picture that is shown is there."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from benchmarks import measured
+from benchmarks.papers import learning
+from benchmarks.papers.jobs import JOBS
+
+RESULTS = Path(__file__).parents[2] / measured.RESULTS
+
+# by commands of their own: docs/reproduction.md
+AMONG_HUMANS = ("humans.md", "turn_stress.md", "uses_stress/attribution.md")
+
+
+def test_every_page_figure_and_picture_of_the_results_is_made_by_make_results() -> None:
+    driven = [job.name for job in JOBS] + [learning.NAME]
+    pages = {f"{name}.md" for name in driven} | {"README.md", *AMONG_HUMANS}
+    pages |= {file for page in measured.PAGES for file in page.files if file.endswith(".md")}
+    tables = {f"data/{name}.csv" for name in (*driven, "avoidable", "turn_stress")}
+    tables |= {file for page in measured.PAGES for file in page.files if file.endswith(".csv")}
+    tables |= {f"uses_stress/{name}.csv" for name in ("attribution", "closed_loop")}
+    shown = {
+        str((page.parent / picture).relative_to(RESULTS))
+        for page in (*RESULTS.glob("*.md"), *RESULTS.glob("uses*/*.md"))
+        for picture in re.findall(r"\]\(([^)]+\.(?:png|svg))\)", page.read_text())
+    }
+    files = {str(path.relative_to(RESULTS)) for path in RESULTS.rglob("*") if path.is_file()}
+    files = {file for file in files if not file.startswith(("trainings/", "episodes/", "data/real_nets/"))}
+    assert files - tables - shown == pages
+    assert tables <= files
+    assert shown <= files

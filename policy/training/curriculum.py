@@ -44,14 +44,22 @@ class ForkConfig:
             raise BadInput("must be a share from 0 to 1", field="meeting", value=self.meeting)
 
 
-MET = "@met"  # keeps a specialist to AVs whose way meets a mission vehicle's
+@dataclass(frozen=True, slots=True)
+class Specialist:
+    """Weights that alone teach what was driven in one world."""
 
+    world: str  # SCENARIO/DEMAND
+    file: str
+    met: bool = False  # only AVs whose way meets a mission vehicle's
+    # deg: at which phi its pupil is to turn to yielding, and at which phi who drives by the file turns
+    # (`benchmarks.turn`)
+    turn: tuple[float, float] = (45.0, 45.0)
 
-def specialist(text: str) -> tuple[str, bool, str]:
-    """SCENARIO/DEMAND, whether it is kept to AVs that meet a mission vehicle, and FILE of one of
-    `EnsembleConfig.specialists`."""
-    world, _, file = text.partition("=")
-    return world.removesuffix(MET), world.endswith(MET), file
+    def __post_init__(self) -> None:
+        """Raises BadInput for an angle that is none between 0 and 90 degrees."""
+        if not all(0.0 < angle < 90.0 for angle in self.turn):
+            problem = "two angles between 0 and 90 degrees are needed"
+            raise BadInput(problem, field="turn", value=list(self.turn))
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,9 +76,7 @@ class EnsembleConfig:
     distillation: int = 5_000  # updates of the one that is taught
     refused: float = 1.0  # weight of the refused actions' loss, in place of `DdqnConfig.refused`
     n_step: int = 8  # in place of `ReplayConfig.n_step`
-    # SCENARIO/DEMAND=FILE: this file alone teaches what was driven there; SCENARIO/DEMAND@met=FILE: only AVs
-    # whose way meets a mission vehicle's
-    specialists: tuple[str, ...] = ()
+    specialists: tuple[Specialist, ...] = ()
     runs: tuple[str, ...] = ()  # folders of other trainings whose drives are learned from besides
     drives: tuple[str, ...] = ()  # SCENARIO/DEMAND whose drives count once more; named twice: twice more
 
@@ -133,12 +139,12 @@ class VfnTraining:
             problem = "nothing is learned by copies without any in a batch"
             raise BadInput(problem, field="training.replay.forked", value=0)
         driven = {f"{lesson.scenario}/{lesson.demand}" for lesson in self.lessons}
-        named = [("drives", name, name) for name in self.ensemble.drives]
-        named += [("specialists", one, specialist(one)[0]) for one in self.ensemble.specialists]
-        for part, value, name in named:
+        named = [("drives", name) for name in self.ensemble.drives]
+        named += [("specialists", one.world) for one in self.ensemble.specialists]
+        for part, name in named:
             if name not in driven:
                 problem = f"no lesson drives it; lessons: {', '.join(sorted(driven))}"
-                raise BadInput(problem, field=f"training.ensemble.{part}", value=value)
+                raise BadInput(problem, field=f"training.ensemble.{part}", value=name)
 
 
 class Drive(NamedTuple):

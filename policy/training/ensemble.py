@@ -5,6 +5,7 @@ their values drives better than each (docs/training.md). Deciding with all of th
 a network that begins as they did is taught the mean (distillation of an ensemble).
 """
 
+import math
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import asdict, replace
@@ -19,7 +20,7 @@ from policy import checkpoint
 from policy.inputs.situation import MEETS
 from policy.networks.vfn import VFN, VfnConfig
 from policy.training import experience
-from policy.training.curriculum import VfnTraining, specialist
+from policy.training.curriculum import Specialist, VfnTraining
 from policy.training.ddqn import DdqnLearner
 from policy.training.learner import Metrics, mean_metrics
 from policy.training.replay_buffer import Advised, ReplayBuffer
@@ -27,6 +28,7 @@ from policy.training.trainers import make_trainer, rate
 
 RESULT = "distilled.safetensors"
 PUPIL = "pupil"
+LEAST = 1e-3  # of a cosine or sine that is divided by
 DIFFERENCES = 10.0  # what an error in the difference of two actions counts more than one in the state's value
 
 
@@ -35,32 +37,41 @@ def meets_mission(batch: Advised) -> torch.Tensor:
     return batch.now[2][:, MEETS] > 0.5
 
 
-class Specialist(NamedTuple):
-    """Teaches alone what was driven in its world."""
-
-    world: str  # SCENARIO/DEMAND
-    met: bool  # only AVs whose way meets a mission vehicle's
-    network: VFN
-
-
 class Teachers(NamedTuple):
     """Whose values are taught."""
 
     everywhere: list[VFN]  # their mean
-    specialists: list[Specialist]
+    specialists: list[tuple[Specialist, VFN]]
 
     @torch.no_grad()
     def values(self, batch: Advised) -> torch.Tensor:
         """[B,parts,A] for these states."""
         worlds = [label.rpartition("/")[0] for label in batch.episodes]
         values = torch.stack([network.apart(*batch.now) for network in self.everywhere]).mean(0)
-        for world, met, network in self.specialists:
-            here = torch.tensor([name == world for name in worlds], device=values.device)
-            if met:
+        for one, network in self.specialists:
+            here = torch.tensor([name == one.world for name in worlds], device=values.device)
+            if one.met:
                 here &= meets_mission(batch)
             if here.any():
-                values = torch.where(here[:, None, None], network.apart(*batch.now), values)
+                maps, kinematics, situation, phi = batch.now
+                asked = turned(phi, one.turn)
+                parts = network.apart(maps, kinematics, situation, asked)
+                if parts.shape[1] > 1:  # so that they weigh by phi what the file's weigh by the other angle
+                    parts = parts * (asked.clamp(min=LEAST) / phi.clamp(min=LEAST))[..., None]
+                values = torch.where(here[:, None, None], parts, values)
         return values
+
+
+def turned(phi: torch.Tensor, turn: tuple[float, float]) -> torch.Tensor:
+    """[B,2] cosine and sine of the angle that a specialist is asked with where its pupil drives by `phi`
+    [B,2]: 0 for 0, `Specialist.turn`'s second for its first, 90 degrees for 90, linear between."""
+    if turn[0] == turn[1]:
+        return phi
+    wanted, turns = (math.radians(angle) for angle in turn)
+    angle, right = torch.atan2(phi[:, 1], phi[:, 0]), 0.5 * math.pi
+    beyond = turns + (angle - wanted) * (right - turns) / (right - wanted)
+    found = torch.where(angle < wanted, angle * turns / wanted, beyond)
+    return torch.stack([found.cos(), found.sin()], 1)
 
 
 class Ensemble:
@@ -120,8 +131,7 @@ class Ensemble:
         teachers += [self._network(k, shown) for k in range(networks)]
         if not self._finished(path):
             pupil = self._learner(PUPIL)
-            special = map(specialist, c.specialists)
-            specialists = [Specialist(world, met, self._read(Path(file))) for world, met, file in special]
+            specialists = [(one, self._read(Path(one.file))) for one in c.specialists]
             taught = Teachers(teachers, specialists)
             measured = self._taught(pupil, taught, lambda k: shown(networks * c.updates + k))
             checkpoint.save(path, {"vfn": pupil.online}, {"vfn": self.vfn}, measured, self._about)

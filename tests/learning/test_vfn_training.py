@@ -4,6 +4,7 @@ the same seed twice gives the same losses, and a killed run goes on exactly."""
 from __future__ import annotations
 
 import json
+import math
 from collections import Counter
 from concurrent.futures import Future
 from dataclasses import replace
@@ -36,11 +37,11 @@ from policy.training.curriculum import (
     EnsembleConfig,
     ForkConfig,
     Lesson,
+    Specialist,
     VfnTraining,
-    specialist,
 )
 from policy.training.ddqn import DdqnConfig, DdqnLearner
-from policy.training.ensemble import Ensemble, Specialist, Teachers
+from policy.training.ensemble import Ensemble, Teachers
 from policy.training.experience import Trajectory
 from policy.training.explorer import ExploreConfig, Explorer
 from policy.training.replay_buffer import Advised, ReplayBuffer, ReplayConfig, comparisons, places_tried
@@ -761,9 +762,11 @@ def test_drives_of_other_trainings_join_in_front(tmp_path: Path) -> None:
         Ensemble(nobody, TINY, replay, tmp_path, {})
 
 
-@pytest.mark.parametrize(("part", "value"), [("drives", "exit/dense"), ("specialists", "exit/dense=a.b")])
-def test_worlds_that_no_lesson_drives_are_named_in_one_error(part: str, value: str) -> None:
-    with pytest.raises(BadInput, match=rf"training.ensemble.{part}='{value}': .*merge/contested"):
+@pytest.mark.parametrize(
+    ("part", "value"), [("drives", "exit/dense"), ("specialists", Specialist("exit/dense", "a.b"))]
+)
+def test_worlds_that_no_lesson_drives_are_named_in_one_error(part: str, value: object) -> None:
+    with pytest.raises(BadInput, match=rf"training.ensemble.{part}='exit/dense': .*merge/contested"):
         replace(SHORT, ensemble=replace(EnsembleConfig(networks=1), **{part: (value,)}))
 
 
@@ -781,7 +784,7 @@ def test_a_specialist_alone_teaches_what_was_driven_in_its_world(tmp_path: Path)
     for network, file in zip(networks, files, strict=True):
         checkpoint.load(Path(file), {"vfn": network}, {"vfn": TINY})
     batch = replay.advised(generator(0, "drawn"), True)
-    teachers = Teachers(networks[:1], [Specialist("exit/contested", False, networks[1])])
+    teachers = Teachers(networks[:1], [(Specialist("exit/contested", files[1]), networks[1])])
     best = teachers.values(batch).sum(1).argmax(1)
     wanted = {"merge/contested/7": MetaAction.DECELERATE, "exit/contested/7": MetaAction.ACCELERATE}
     assert best.tolist() == [wanted[label] for label in batch.episodes]
@@ -800,13 +803,41 @@ def test_a_specialist_may_be_kept_to_the_avs_that_meet_a_mission_vehicle(
     networks = [VFN(TINY), VFN(TINY)]
     networks[1].value.bias.data[MetaAction.ACCELERATE] = 9.0
     batch = Advised(now, possible, ~possible, ["exit/contested/7"] * 3, 3)
-    values = Teachers(networks[:1], [Specialist("exit/contested", met, networks[1])]).values(batch)
+    one = Specialist("exit/contested", "a.b", met)
+    values = Teachers(networks[:1], [(one, networks[1])]).values(batch)
     assert values[:, 0, MetaAction.ACCELERATE].nonzero().flatten().tolist() == taught
 
 
-def test_a_specialist_names_its_world_its_avs_and_its_file() -> None:
-    assert specialist("exit/dense@met=runs/a.b") == ("exit/dense", True, "runs/a.b")
-    assert specialist("my@city/dense=a.b") == ("my@city/dense", False, "a.b")
+def test_a_specialist_teaches_its_pupil_to_turn_at_another_phi() -> None:
+    """What it chooses at 52 degrees its pupil is taught to choose at 26, and at 0 and 90 as it does there."""
+
+    def action_values(phi: float, turn: tuple[float, float]) -> torch.Tensor:
+        angle = torch.tensor([math.radians(phi)])
+        weights = torch.stack([angle.cos(), angle.sin()], 1)
+        now = (
+            *(torch.zeros(1, 3, 4, 8, 16, dtype=torch.uint8), torch.zeros(1, 3, 2, KINEMATIC_INPUTS)),
+            *(torch.zeros(1, SITUATION_INPUTS), weights),
+        )
+        batch = Advised(now, torch.ones(1, 5) > 0, torch.ones(1, 5) > 1, ["exit/contested/7"], 3)
+        one = Specialist("exit/contested", "a.b", turn=turn)
+        return network.weighed(Teachers([network], [(one, network)]).values(batch), weights)
+
+    torch.manual_seed(0)
+    network = VFN(replace(TINY, parts=2))
+    torch.nn.init.normal_(network.value.weight)
+    as_it_is = (45.0, 45.0)
+    for pupil, teacher in ((26.0, 52.0), (13.0, 26.0), (58.0, 71.0)):
+        mine, theirs = action_values(pupil, (26.0, 52.0)), action_values(teacher, as_it_is)
+        torch.testing.assert_close(mine, theirs)
+        assert not torch.allclose(mine, action_values(pupil, as_it_is))
+    for phi in (0.0, 90.0):
+        mine, theirs = action_values(phi, (26.0, 52.0)), action_values(phi, as_it_is)
+        torch.testing.assert_close(mine, theirs, atol=1e-2, rtol=1e-2)
+
+
+def test_an_angle_that_none_can_turn_at_is_bad_input() -> None:
+    with pytest.raises(BadInput, match=r"turn=\[0, 52\]: two angles between 0 and 90 degrees"):
+        Specialist("exit/contested", "a.b", turn=(0, 52))
 
 
 def test_what_a_state_is_worth_stays_what_the_first_weights_say(tmp_path: Path) -> None:

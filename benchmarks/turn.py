@@ -5,9 +5,10 @@
 One network drives every contested world with a mission vehicle on equal test seeds at phi 0, 15, ... 90
 degrees, preset `lawful`, without human errors or (with a page and rows of its own) with them. The turn is the
 angle at which the share of mission vehicles that are let in crosses half of what it changes from 0 to 90
-degrees. The reward is cos(phi) own + sin(phi) others' (P, equation 6), so that of two ways of driving the
-kinder one earns more from the angle on at which tan(phi) = own reward lost / others' reward gained: the
-break-even of the drives at 0 and at 90 degrees.
+degrees, interpolated between the two driven angles that it lies between. The reward is cos(phi) own +
+sin(phi) others' (P, equation 6), so that of two ways of driving the kinder one earns more from the angle on
+at which tan(phi) = own reward lost / others' reward gained: the break-even of the drives at 0 and at 90
+degrees.
 Rows are kept in --rows, and not driven twice; those of other weights under the policy's name are driven anew.
 """
 
@@ -123,15 +124,31 @@ def break_even(own: Floats, others: Floats) -> float:
     return math.degrees(math.atan2(lost, gained)) if lost >= 0.0 and gained > 0.0 else math.nan
 
 
-def turn(served: Floats) -> float:
-    """Degrees at which the share [PHIS] first crosses the middle between its ends; nan: it does not rise."""
+def first_worth(own: Floats, others: Floats) -> tuple[float, float]:
+    """Degrees from which on any driven way earns more than driving as at 0, and at which phi that is driven.
+
+    Arguments as of `break_even`; nan, nan: none ever does.
+    """
+    found = [(break_even(own[[0, k]], others[[0, k]]), PHIS[k]) for k in range(1, len(PHIS))]
+    return min((one for one in found if not math.isnan(one[0])), default=(math.nan, math.nan))
+
+
+def crossing(served: Floats) -> tuple[float, float, float]:
+    """Where the share [PHIS] first crosses the middle between its ends: the driven angles before and after,
+    and the angle between them by interpolation, degrees; nan: it does not rise."""
     middle = 0.5 * (served[0] + served[-1])
-    if not served[-1] > served[0]:
-        return math.nan
-    for (low, high), (before, after) in zip(pairwise(PHIS), pairwise(served), strict=True):
-        if before <= middle < after:
-            return low + (high - low) * float((middle - before) / (after - before))
-    return math.nan
+    if served[-1] > served[0]:
+        for (low, high), (before, after) in zip(pairwise(PHIS), pairwise(served), strict=True):
+            if before <= middle < after:
+                return low, high, low + (high - low) * float((middle - before) / (after - before))
+    return math.nan, math.nan, math.nan
+
+
+def turn(served: Floats) -> Figure:
+    """Degrees at which the share [episodes, PHIS] crosses; from the driven angle before the interval's lower
+    end to the one after its upper end, by the bootstrap over episodes."""
+    before, after, between = (resampled(lambda share, k=k: crossing(share)[k], served) for k in range(3))
+    return Figure(between.value, before.low, after.high)
 
 
 def resampled(statistic: Callable[..., float], *figures: Floats) -> Figure:
@@ -171,7 +188,8 @@ def table(drives: Sequence[Drive]) -> list[str]:
 def verdict(drives: Sequence[Drive]) -> str:
     """Turn and break-even in a sentence."""
     served, own, others = (columns(drives, n) for n in ("served", "own", "others"))
-    turns, even = resampled(turn, served), resampled(break_even, own, others)
+    turns, even = turn(served), resampled(break_even, own, others)
+    least, driven = first_worth(own.mean(0), others.mean(0))
     crashed = sum(drive.crashed for drive in drives)
     said = (
         "the turn's interval holds it" if turns.low <= even.value <= turns.high else "the interval misses it"
@@ -179,8 +197,9 @@ def verdict(drives: Sequence[Drive]) -> str:
     if math.isnan(turns.low):
         said = "too few seeds for an interval of the turn"
     return (
-        f"Turn {turns.text(0)} degrees, break-even of the reward {even.text(0)} degrees: {said}. Episodes"
-        f" with a crash: {crashed} of {len(drives)}."
+        f"Turn {turns.text(0)} degrees, break-even of the reward {even.text(0)} degrees: {said}. Driving as"
+        f" at {driven:g} degrees earns more than as at 0 from {least:.0f} degrees on. Episodes with a crash:"
+        f" {crashed} of {len(drives)}."
     )
 
 
@@ -271,8 +290,9 @@ def main() -> None:
         "not let in counts with the episode's whole duration. Rewards are those of `rewards.yaml`, per AV",
         "and decision, before they are weighed. p: the step from the phi before, mean difference and",
         "Wilcoxon's signed ranks, over the six steps by Holm's method. Turn: where the share let in crosses",
-        "the middle between 0 and 90 degrees; break-even: where driving as at 90 degrees begins to earn more",
-        "than as at 0; both with bootstrap intervals over seeds.",
+        "the middle between 0 and 90 degrees, interpolated between the driven angles; its interval goes from",
+        "one driven angle to another, since nothing was driven between them. Break-even: where driving as at",
+        "90 degrees begins to earn more than as at 0. Both with bootstrap intervals over seeds.",
         *("", picture(drives, out.with_suffix(".svg")), ""),
     ]
     for world, mine in drives.items():

@@ -79,6 +79,9 @@ class EnsembleConfig:
     specialists: tuple[Specialist, ...] = ()
     runs: tuple[str, ...] = ()  # folders of other trainings whose drives are learned from besides
     drives: tuple[str, ...] = ()  # SCENARIO/DEMAND whose drives count once more; named twice: twice more
+    # the one that is taught learns from AVs whose way meets a mission vehicle's, and in the layers that drive
+    # them (`VfnConfig.meets`); whoever meets none drives by the first weights, to the bit
+    met_alone: bool = False
 
     def __post_init__(self) -> None:
         """Raises BadInput for a number out of range."""

@@ -22,6 +22,7 @@ from policy.networks.vfn import VFN, VfnConfig
 from policy.training import experience
 from policy.training.curriculum import Specialist, VfnTraining
 from policy.training.ddqn import DdqnLearner
+from policy.training.experience import Trajectory
 from policy.training.learner import Metrics, mean_metrics
 from policy.training.replay_buffer import Advised, ReplayBuffer
 from policy.training.trainers import make_trainer, rate
@@ -30,6 +31,11 @@ RESULT = "distilled.safetensors"
 PUPIL = "pupil"
 LEAST = 1e-3  # of a cosine or sine that is divided by
 DIFFERENCES = 10.0  # what an error in the difference of two actions counts more than one in the state's value
+
+
+def meets(drive: Trajectory) -> bool:
+    """Whether the AV's way meets a mission vehicle's at some time."""
+    return bool((drive.situation[:, MEETS] > 0.5).any())
 
 
 def meets_mission(batch: Advised) -> torch.Tensor:
@@ -105,6 +111,11 @@ class Ensemble:
             problem = f"was driven with other inputs: {' and '.join(map(str, shapes))}"
             raise BadInput(problem, field="training.ensemble.runs", value=", ".join(c.runs))
         more = [one for name in c.drives for one in driven if one.episode.rpartition("/")[0] == name]
+        if c.met_alone:
+            if not vfn.meets:
+                problem = "needs layers for AVs that meet a mission vehicle (vfn.meets)"
+                raise BadInput(problem, field="training.ensemble.met_alone", value=True)
+            driven, more = ([one for one in some if meets(one)] for some in (driven, more))
         self.replay.add([*driven, *more])
         ddqn = replace(config.ddqn, refused=c.refused)
         alone = replace(ddqn, by_copies=True, forked=c.copies, shrink=c.shrink)
@@ -182,6 +193,9 @@ class Ensemble:
         config = replace(self.config, ddqn=self._ddqn[name], seed=seed)
         learner = make_trainer(config, self.vfn, self._device).learner
         assert isinstance(learner, DdqnLearner)
+        if name == PUPIL and self.config.ensemble.met_alone:
+            for part, parameter in learner.online.named_parameters():
+                parameter.requires_grad_(parameter.requires_grad and part.startswith("met."))
         return learner
 
     def _read(self, path: Path) -> VFN:

@@ -840,6 +840,49 @@ def test_an_angle_that_none_can_turn_at_is_bad_input() -> None:
         Specialist("exit/contested", "a.b", turn=(0, 52))
 
 
+def test_only_who_meets_a_mission_vehicle_may_be_taught(tmp_path: Path) -> None:
+    """Whoever meets none drives by the first weights, to the bit."""
+    layout = replace(TINY, meets=True)
+    torch.manual_seed(3)
+    first, teacher = VFN(layout), VFN(TINY)
+    teacher.value.bias.data[MetaAction.ACCELERATE] = 3.0
+    files = [str(tmp_path / f"{name}.safetensors") for name in ("first", "teacher")]
+    for file, network in zip(files, (first, teacher), strict=True):
+        checkpoint.save(Path(file), {"vfn": network}, {"vfn": network.config})
+    nobody = trajectory([0, 1, 2, 4] * 3, [(1.0, 0.0, 0.0)] * 12)
+    situation = nobody.situation.copy()
+    situation[4:, MEETS] = 1.0
+    config = replace(
+        SHORT,
+        first=files[0],
+        lessons=(Lesson("merge"), Lesson("exit")),
+        ensemble=EnsembleConfig(
+            teachers=(files[1],),
+            specialists=(Specialist("exit/contested", files[1], met=True),),
+            distillation=60,
+            met_alone=True,
+        ),
+    )
+    replay = ReplayBuffer(config.replay)
+    replay.add([replace(nobody, episode="merge/contested/1")])
+    replay.add([replace(nobody, episode="exit/contested/1", situation=situation)])
+    ensemble = Ensemble(config, layout, replay, tmp_path, {})
+    assert [one.episode for one in ensemble.replay.trajectories] == ["exit/contested/1"]
+    taught = VFN(layout)
+    checkpoint.load(ensemble.run(), {"vfn": taught}, {"vfn": layout})
+    now = ensemble.replay.advised(generator(0, "drawn"), True).now
+    met = now[2][:, MEETS] > 0.5
+    assert met.any()
+    assert not met.all()
+    with torch.no_grad():
+        before, after = first.apart(*now), taught.apart(*now)
+    assert torch.equal(before[~met], after[~met])
+    assert not torch.allclose(before[met], after[met])
+    assert set(after[met].sum(1).argmax(1).tolist()) == {MetaAction.ACCELERATE}
+    with pytest.raises(BadInput, match=r"met_alone=True: needs layers .*vfn.meets"):
+        Ensemble(config, TINY, replay, tmp_path, {})
+
+
 def test_what_a_state_is_worth_stays_what_the_first_weights_say(tmp_path: Path) -> None:
     """Teachers may have learned from rewards of another size."""
     first, teacher = VFN(TINY), VFN(TINY)

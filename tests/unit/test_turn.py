@@ -14,8 +14,9 @@ from benchmarks.turn import (
     Drive,
     break_even,
     columns,
+    crossing,
+    first_worth,
     read,
-    resampled,
     table,
     turn,
     verdict,
@@ -42,15 +43,32 @@ def test_the_reward_breaks_even_where_what_is_lost_weighs_as_much_as_what_is_gai
 
 def test_the_turn_is_where_half_of_the_change_is_reached() -> None:
     served = np.array([0.0, 0.0, 0.5, 1.0, 1.0, 1.0, 1.0])
-    assert turn(served) == pytest.approx(30.0)
-    assert turn(0.2 + 0.5 * served) == pytest.approx(30.0)
-    assert math.isnan(turn(served[::-1]))
+    assert crossing(served) == pytest.approx((30.0, 45.0, 30.0))
+    assert crossing(0.25 + 0.5 * served) == pytest.approx((30.0, 45.0, 30.0))
+    assert math.isnan(crossing(served[::-1])[2])
+
+
+def test_the_interval_of_the_turn_ends_at_driven_angles() -> None:
+    """All seeds alike: it lies between 30 and 45 degrees, and nothing says where."""
+    served = np.tile(np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0]), (5, 1))
+    found = turn(served)
+    assert (found.low, found.value, found.high) == (30.0, 37.5, 45.0)
+
+
+def test_the_way_that_is_worth_it_first_is_named() -> None:
+    """At 45 degrees much is gained for little; at 90 more is lost."""
+    own = np.array([1.0, 1.0, 1.0, 0.9, 0.9, 0.9, 0.1])
+    others = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.9])
+    least, driven = first_worth(own, others)
+    assert least == pytest.approx(math.degrees(math.atan(0.1)))
+    assert driven == 45.0
+    assert all(math.isnan(x) for x in first_worth(own, 0.0 * others))
 
 
 def test_a_page_compares_episodes_of_equal_seeds() -> None:
     alone = drive(0.0, 99, False)
     assert columns([*DRIVES, alone], "served").shape == (12, len(PHIS)), "driven at one phi alone"
-    found = resampled(turn, columns(DRIVES, "served"))
+    found = turn(columns(DRIVES, "served"))
     assert found.value == pytest.approx(30.0)
     assert found.low < 30.0 < found.high
     lines = table(DRIVES)

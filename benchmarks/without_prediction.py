@@ -6,8 +6,8 @@ RUN is the folder of `cosim train vfn --policy vfn-p` whose configuration has an
 the one that is taught learn once more from the same drives, with the same seeds; wherever they are shown
 predicted maps, they are shown the present instead. What teaches them sees the predictions, so that all that a
 present tells of them can be learned. A first layer whose predicted frames all show the present is one without
-predicted frames and another weight for the present: so it is written, with the layout of `vfn`. It begins with the
-weights that RUN began with, or with FILE, a `vfn`.
+predicted frames and another weight for the present: so it is written, with the layout of `vfn`. It begins
+with the weights that RUN began with, or with FILE, a `vfn`.
 """
 
 import argparse

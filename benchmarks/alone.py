@@ -3,32 +3,39 @@
     python -m benchmarks.alone [--episodes 20] [--demand dense] [--worlds merge ...] [--seeds-from 200000]
         [--weights FILE] [--runs runs/alone] [--workers 2] [--out docs/results/alone.md]
 
-Preset `unguarded`, no mask: the best valued action is carried out. FILE is a network that is
-shown what `vfn-p` is, and drives too. The same command goes on where it stopped.
+Preset `unguarded`, no mask: the best valued action is carried out. `vfn-p-present` is `vfn-p` shown the
+present in place of every predicted map. `conv3d-dqn` and `conv3d-a2c`, of a demonstrator, see maps alone; so
+do `vfn-p` and `vfn`, beside their own speed, lanes and command. FILE is a network that is shown what `vfn-p`
+is, and drives too. The same command goes on where it stopped.
 """
 
 import argparse
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 
 from benchmarks.learned import asked, drivers, options, share
 from benchmarks.papers.agents import Agent, build
 from benchmarks.tables import markdown_row, write_page
 from cosim.cli.main import main as cosim
+from cosim.learning.attribution import questioned
 from cosim.report import run_folder, statistics
 from cosim.report.figures import Row
 from cosim.types import Policy
 from cosim.workers.tasks import OK
+from policy.attribution import PRESENT, Replaced
 from sumo_scenarios import names
 
 SVO = 60
 EVERY = "all worlds"
 CRASHED = "av_involved_collisions"
 WEIGHTS = "COSIM_ALONE_WEIGHTS"  # the environment variable that names the file to the workers
-ARMS = ("given", "vfn_p", "vfn", "vfn_p_demonstrated")  # functions of this module
+ARMS = (  # functions of this module
+    *("given", "vfn_p", "vfn_p_present", "vfn", "conv3d_dqn", "conv3d_a2c", "vfn_p_demonstrated"),
+)
 COLUMNS = (
-    "world", "network", "episodes", "with an AV in a collision", "AV-caused", "distance of all, m",
-    "less vfn-p-demonstrated, points",
+    "world", "network", "episodes", "with an AV in a collision", "AV-caused", "mission fulfilled",
+    "distance of all, m", "less vfn-p-demonstrated, points",
 )  # fmt: skip
 
 
@@ -40,6 +47,22 @@ def given() -> Policy:
 def vfn_p() -> Policy:
     """`vfn-p` without the mask."""
     return build(Agent("vfn-p alone", "vfn-p", mask="none"))
+
+
+def vfn_p_present() -> Policy:
+    """`vfn-p` without the mask, whose predicted maps show the present."""
+    agent = questioned("vfn-p")
+    return Replaced(agent.name, replace(agent.config, mask=False), ("predicted maps", PRESENT))
+
+
+def conv3d_dqn() -> Policy:
+    """`conv3d-dqn`: it never has a mask."""
+    return build(Agent("conv3d-dqn alone", "conv3d-dqn"))
+
+
+def conv3d_a2c() -> Policy:
+    """`conv3d-a2c`: it never has a mask."""
+    return build(Agent("conv3d-a2c alone", "conv3d-a2c"))
 
 
 def vfn() -> Policy:
@@ -81,6 +104,7 @@ def table(rows: Sequence[Row]) -> list[str]:
                         str(len(mine)),
                         share(mine, CRASHED),
                         share(mine, "av_caused_collisions"),
+                        share(mine, "mission_success"),
                         statistics.mean(distance).text(0),
                         statistics.paired_share(theirs, crashed).text(0, 100.0) if arm != ARMS[-1] else "",
                     ]

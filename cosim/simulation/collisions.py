@@ -245,8 +245,8 @@ def the_nets(snapshot: Snapshot, road: RoadMap, i: int, j: int) -> bool:
     """Whether two vehicles overlap though each follows its own lane, on lanes whose drivers need not heed one
     another (`heed_each_other`): the lanes lie too close together, and no driver can help it; or past one that
     waits where the net lets it wait inside a junction, or past a person on a walking area; or one behind the
-    other on a lane that is drawn shorter than it is, with a gap between them by its length."""
-    ways, drawn_shorter, waits = [], False, False
+    other where a lane is drawn shorter than it is, with a gap between them by its length."""
+    ways, waits = [], False
     for row in (i, j):
         lane = int(snapshot.lane[row])
         if walks_beside(road, int(snapshot.place[row])):
@@ -261,12 +261,23 @@ def the_nets(snapshot: Snapshot, road: RoadMap, i: int, j: int) -> bool:
         behind = snapshot.length[row] - snapshot.lane_position[row] * path.scale
         ways.append(foot(road, lane, behind, _end(snapshot, row, -0.5)))
         waits |= snapshot.speed[row] < HALTING and road.waits_inside(lane)
-        if snapshot.lane[i] == snapshot.lane[j] and path.scale < DRAWN_WHOLE:
-            last, first = sorted((i, j), key=lambda k: float(snapshot.lane_position[k]))
-            rear = snapshot.lane_position[first] - snapshot.length[first]
-            drawn_shorter = bool(rear > snapshot.lane_position[last])
+    if len(ways) == 1 or drawn_shorter(snapshot, road, i, j) or drawn_shorter(snapshot, road, j, i):
+        return True
     heeds = along_one_another if waits else heed_each_other
-    return drawn_shorter or len(ways) == 1 or not any(heeds(road, a, b) for a in ways[0] for b in ways[1])
+    return not any(heeds(road, a, b) for a in ways[0] for b in ways[1])
+
+
+def drawn_shorter(snapshot: Snapshot, road: RoadMap, last: int, first: int) -> bool:
+    """Whether `last` is behind `first` by the length of their lane, or of its lane and the next, and one of
+    these is drawn shorter than it is long."""
+    behind, ahead = (int(snapshot.lane[row]) for row in (last, first))
+    along = snapshot.lane_position[first] - snapshot.lane_position[last]  # m
+    if behind != ahead:
+        if ahead not in road.lanes[behind].successors:
+            return False
+        along += road.lanes[behind].length
+    shorter = min(road.path(lane).scale for lane in (behind, ahead)) < DRAWN_WHOLE
+    return bool(shorter and along > snapshot.length[first])
 
 
 def _end(snapshot: Snapshot, row: int, share: float) -> Floats:

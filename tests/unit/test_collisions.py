@@ -230,6 +230,23 @@ def test_one_behind_the_other_on_a_lane_drawn_shorter_than_it_is_has_not_collide
     assert len(CollisionDetector().from_boxes(touching, RoadMap((whole,)), known, {})) == 1
 
 
+def test_one_behind_the_other_on_the_lane_before_one_that_is_drawn_shorter_has_not_collided() -> None:
+    """As at a junction of an imported net whose lane of 5.4 m is drawn 3.5 m long."""
+    road = RoadMap(
+        (
+            lane("a_0", [(0.0, 0.0), (50.0, 0.0)], (1,)),
+            replace(lane(":J_0", [(50.0, 0.0), (53.5, 0.0)]), length=5.4),
+        )
+    )
+    queue: dict[str, Pose] = {"av": (45.5, 0.0, 0.0, 0.0), "hv": (50.4, 0.0, 0.0, 0.0)}
+    known, on = bodies("av", "hv"), {"av": 0, "hv": 1}
+    here = replace(scene(1.0, queue, on), lane_position=np.array([48.0, 5.4 / 3.5 * 2.9]))
+    assert CollisionDetector().from_boxes(here, road, known, {}) == []
+    whole = replace(road, lanes=(road.lanes[0], replace(road.lanes[1], length=3.5)))
+    touching = replace(here, lane_position=np.array([48.0, 2.9]))
+    assert len(CollisionDetector().from_boxes(touching, whole, known, {})) == 1
+
+
 def test_two_on_lanes_that_join_or_cross_or_follow_one_another_have_collided() -> None:
     known = bodies("av", "hv")
     apart = two_lanes(1.9, 1.9)

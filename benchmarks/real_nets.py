@@ -45,7 +45,7 @@ from cosim.workers.worker import Worker
 DECISION = Timing().decision  # s
 FIRST_SEED = 200000
 PENETRATION = 0.2
-SEEDS = {"idm": 10, "vfn-p-demonstrated": 2}  # of A10KW; the other nets are driven by idm on one seed
+SEEDS = {"idm": 10, "vfn-p": 2}  # of A10KW; the other nets are driven by idm on one seed
 LONGEST = 10_000.0  # s: of demonstrations that go on for days
 SETTLED = 60.0  # s: the memory is read from then on
 EVERY = 300.0  # s between the memory's readings that are kept

@@ -16,7 +16,7 @@ from benchmarks.tables import write_page
 from policy.agents import APPROACHES
 
 NAME = "learning"
-FURTHER = "[trainings/meeting-2](trainings/meeting-2/README.md)."
+FURTHER = "[trainings/turn-0](trainings/turn-0/README.md)."
 
 
 def write(settings: Settings) -> None:

@@ -4,8 +4,8 @@
 
 One network drives every contested world with a mission vehicle on equal test seeds at phi 0, 15, ... 90
 degrees, preset `lawful`, without human errors or (with a page and rows of its own) with them. The turn is the
-angle at which the share of mission vehicles that are let in crosses half of what it changes from 0 to 90
-degrees, interpolated between the two driven angles that it lies between. The reward is cos(phi) own +
+angle at which the share of mission vehicles that are let in crosses the middle between 0 degrees and its
+largest, interpolated between the two driven angles that it lies between. The reward is cos(phi) own +
 sin(phi) others' (P, equation 6), so that of two ways of driving the kinder one earns more from the angle on
 at which tan(phi) = own reward lost / others' reward gained: the break-even of the drives at 0 and at 90
 degrees.
@@ -134,10 +134,10 @@ def first_worth(own: Floats, others: Floats) -> tuple[float, float]:
 
 
 def crossing(served: Floats) -> tuple[float, float, float]:
-    """Where the share [PHIS] first crosses the middle between its ends: the driven angles before and after,
-    and the angle between them by interpolation, degrees; nan: it does not rise."""
-    middle = 0.5 * (served[0] + served[-1])
-    if served[-1] > served[0]:
+    """Where the share [PHIS] first crosses the middle between that at 0 degrees and the largest: the driven
+    angles before and after, and the angle between them by interpolation, degrees; nan: it does not rise."""
+    middle = 0.5 * (served[0] + served.max())
+    if served.max() > served[0]:
         for (low, high), (before, after) in zip(pairwise(PHIS), pairwise(served), strict=True):
             if before <= middle < after:
                 return low, high, low + (high - low) * float((middle - before) / (after - before))
@@ -191,9 +191,11 @@ def verdict(drives: Sequence[Drive]) -> str:
     turns, even = turn(served), resampled(break_even, own, others)
     least, driven = first_worth(own.mean(0), others.mean(0))
     crashed = sum(drive.crashed for drive in drives)
-    said = (
-        "the turn's interval holds it" if turns.low <= even.value <= turns.high else "the interval misses it"
-    )
+    said = "the interval of the turn misses it"
+    if turns.low <= even.value <= turns.high:
+        said = "the interval of the turn holds it"
+    elif turns.low <= even.high and even.low <= turns.high:
+        said = "the interval of the turn misses it, both intervals overlap"
     if math.isnan(turns.low):
         said = "too few seeds for an interval of the turn"
     return (
@@ -290,9 +292,9 @@ def main() -> None:
         "not let in counts with the episode's whole duration. Rewards are those of `rewards.yaml`, per AV",
         "and decision, before they are weighed. p: the step from the phi before, mean difference and",
         "Wilcoxon's signed ranks, over the six steps by Holm's method. Turn: where the share let in crosses",
-        "the middle between 0 and 90 degrees, interpolated between the driven angles; its interval goes from",
-        "one driven angle to another, since nothing was driven between them. Break-even: where driving as at",
-        "90 degrees begins to earn more than as at 0. Both with bootstrap intervals over seeds.",
+        "the middle between 0 degrees and its largest, interpolated between the driven angles; its interval",
+        "goes from one driven angle to another: nothing was driven between them. Break-even: where",
+        "driving as at 90 degrees begins to earn more than as at 0. Bootstrap intervals over seeds.",
         *("", picture(drives, out.with_suffix(".svg")), ""),
     ]
     for world, mine in drives.items():

@@ -103,7 +103,9 @@ def driving(name: str, card: Card) -> Iterator[str]:
     base, then = name, ""
     if "learned_from" in data:  # it learned from what another network drove, without a drive of its own
         base = "vfn-p"
-        then = f", then `python -m benchmarks.without_prediction runs/{base}`"
+        then = f", then `python -m benchmarks.without_prediction runs/{base}"
+        first = read_card(SHIPPED / f"{base}.safetensors")["data"]["training"].get("first")
+        then += "`" if training.get("first") == first else f" --first {training['first']}`"
     yield (
         f"- Training: `cosim train {what} --policy {base}{'' if rewards else ' --scenario all'} "
         f"--seed {training['seed']} --iterations {training['iterations']} "
@@ -112,8 +114,9 @@ def driving(name: str, card: Card) -> Iterator[str]:
     if training.get("first"):
         yield f"- Began with: `{training['first']}`."
     hours = sum(row["iteration_s"] for row in log) / 3600
+    took = f"{hours:.1f} h" if hours >= 0.1 else f"{60 * hours:.0f} min"
     own = last["updates"]  # none: its drives are all that the pupil learned from
-    made = f"after {own:,} updates and {hours:.1f} h by its log" if own else f"after {hours:.1f} h of drives"
+    made = f"after {own:,} updates and {took} by its log" if own else f"after {took} of drives"
     if shipped is None:
         yield (
             "- Shipped: what the ensemble taught (`training.ensemble`, docs/training.md) in "

@@ -111,6 +111,7 @@ def learn(run: Path, out: Path, first: Path | None = None) -> Path:
     ensemble = Unforeseen(training, agent.vfn, replay, out, about)
     if first is not None:
         ensemble.first = with_predicted_frames(VFN(own.vfn).like(first), agent.vfn)
+        about["training"] = {**about["training"], "first": str(first)}
     with Progress("vfn", "updates") as progress:
         taught = ensemble.run(progress)
     pupil = VFN(agent.vfn)

@@ -25,6 +25,7 @@ class A2cConfig:
     entropy: float = 0.01  # keeps the policy from closing up early
     critic: float = 0.5  # weight of the value loss
     scale: float = 0.1  # of all rewards, as the DDQN's
+    normalize: bool = False  # advantages to mean 0 and deviation 1 over a batch
     clip: float = 0.5  # largest gradient norm
     imitation: float = 0.0  # weight of the demonstrations: the chance of a demonstrated action is to be 1
 
@@ -94,6 +95,8 @@ class A2cLearner(Learner):
         preference, value = self.online.actor_critic(*states(places, phi, device))
         logs = preference.log_softmax(1)
         advantage = (goal - value).detach()
+        if c.normalize and len(advantage) > 1:
+            advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-6)
         losses = {
             "policy": -(advantage * logs.gather(1, action[:, None])[:, 0]).mean(),
             "value": (goal - value).square().mean(),

@@ -653,9 +653,11 @@ def test_a2c_is_demonstrated_first_and_drives_alone_afterwards(tmp_path: Path) -
     assert imitation[0] < 0.2, "it was imitated before the first drive of its own"
 
 
-def test_actor_and_critic_learn_which_action_pays() -> None:
-    """One place, one decision: accelerating pays 10, everything else nothing. Drives follow the policy."""
-    learner = A2cLearner(replace(TINY, critic=True), A2cConfig(learning_rate=3e-3, n_step=1), seed=0)
+@pytest.mark.parametrize(("normalize", "reward"), [(False, 10.0), (True, 0.01)])
+def test_actor_and_critic_learn_which_action_pays(normalize: bool, reward: float) -> None:
+    """One place, one decision: accelerating pays, everything else nothing. Drives follow the policy."""
+    config = A2cConfig(learning_rate=3e-3, n_step=1, normalize=normalize)
+    learner = A2cLearner(replace(TINY, critic=True), config, seed=0)
     rng = np.random.default_rng(0)
     for _ in range(40):
         with torch.no_grad():
@@ -665,7 +667,7 @@ def test_actor_and_critic_learn_which_action_pays() -> None:
             )
         chances = preference.softmax(1)[0].double().numpy()
         actions = rng.choice(5, size=32, p=chances / chances.sum())
-        pay = [(10.0 if a == MetaAction.ACCELERATE else 0.0, 0.0, 0.0) for a in actions]
+        pay = [(reward if a == MetaAction.ACCELERATE else 0.0, 0.0, 0.0) for a in actions]
         drives = [trajectory([int(a)], [p], ending="crashed") for a, p in zip(actions, pay, strict=True)]
         learner.learn(drives, rng)
     assert chances[MetaAction.ACCELERATE] > 0.9

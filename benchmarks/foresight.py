@@ -102,8 +102,12 @@ def tested(worlds: Mapping[str, Arms], first: str, other: str) -> list[list[str]
     return lines
 
 
-def gained(arms: Arms, name: str) -> Figure:
-    """The share of the oracle's gain that prediction has, with a bootstrap interval over pairs."""
+def gained(arms: Arms, name: str) -> Figure | None:
+    """The share of the oracle's gain that prediction has, with a bootstrap interval over pairs; None where
+    the interval of that gain holds 0."""
+    gain = statistics.paired_mean(of(arms[WITHOUT], name), of(arms[ORACLE], name))
+    if not (gain.low > 0.0 or gain.high < 0.0):
+        return None
     values: Floats = np.array([of(arms[arm], name) for arm in ARMS])  # [arms, episodes]
     rng = np.random.default_rng(0)
     draws = rng.integers(0, values.shape[1], (statistics.RESAMPLES, values.shape[1]))
@@ -127,8 +131,13 @@ def page(rows: Sequence[Row], about: Sequence[str]) -> list[str]:
     lines += [markdown_row(cells) for pair in PAIRS for cells in tested(worlds, *pair)]
     lines += [""]
     for name, what in ((NEAR, "near-misses of AVs"), ("dt_mean_m", "distance of all")):
-        shares = "; ".join(f"{w} {gained(arms, name).text(0, 100.0)} %" for w, arms in worlds.items())
-        lines.append(f"- Share of the oracle's gain in {what} that `vfn-p` has: {shares}.")
+        shares = {world: gained(arms, name) for world, arms in worlds.items()}
+        known = "; ".join(f"{w} {one.text(0, 100.0)} %" for w, one in shares.items() if one is not None)
+        nothing = ", ".join(world for world, one in shares.items() if one is None)
+        lines.append(
+            f"- Share of the oracle's gain in {what} that `vfn-p` has: {known or 'there is no gain'}."
+        )
+        lines.append(f"  The oracle gains nothing that these pairs show: {nothing or 'nowhere'}.")
     return lines
 
 

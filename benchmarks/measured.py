@@ -174,6 +174,13 @@ def alone(place: Place) -> list[list[str]]:
     return [["benchmarks.alone", *flags, "--out", str(place.out / "alone.md")]]
 
 
+def foresight(place: Place) -> list[list[str]]:
+    """What prediction is worth where humans err."""
+    flags = ["--worlds", "merge", "--episodes", "1"] if place.small else []
+    kept = ["--runs", str(place.work / "foresight_runs"), "--out", str(place.out / "foresight.md")]
+    return [["benchmarks.foresight", *flags, *kept]]
+
+
 def behaviors(place: Place) -> list[list[str]]:
     """How faithfully LC2013 drives Table II."""
     flags = ["--report", "--scale", "0.002" if place.small else "1"]
@@ -239,6 +246,7 @@ PAGES = (
     Page("seeing", seeing, ("seeing.md",)),
     Page("learned", learned, ("learned.md",)),
     Page("alone", alone, ("alone.md",)),
+    Page("foresight", foresight, ("foresight.md",)),
     Page("real_nets", real_nets, ("real_nets.md",)),
     Page("behaviors", behaviors, ("behaviors.md",)),
     Page(

@@ -31,7 +31,9 @@ def test_seeds_that_an_arm_lacks_are_left_out() -> None:
 
 def test_prediction_has_half_of_what_the_oracle_gains() -> None:
     worlds = foresight.paired(ROWS)
+    assert foresight.gained(worlds["merge"], "dt_av_m") is None
     share = foresight.gained(worlds["merge"], foresight.NEAR)
+    assert share is not None
     assert share.value == pytest.approx(0.5)
     assert share.low == pytest.approx(0.5)
     page = "\n".join(foresight.page(ROWS, ["about"]))

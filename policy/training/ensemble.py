@@ -83,7 +83,8 @@ def turned(phi: torch.Tensor, turn: tuple[float, float]) -> torch.Tensor:
 class Ensemble:
     """Learns in `folder`, one network after the other; those that are finished are read again.
 
-    Raises BadInput for drives of other trainings (`EnsembleConfig.runs`) that are missing or of other inputs.
+    Raises BadInput for drives of other trainings (`EnsembleConfig.runs`) that are missing or of other inputs,
+    and where `EnsembleConfig.met_alone` finds no layers or no drives to learn in and from.
 
     Args:
         config: the schedule of the training; its part `ensemble` is what is done here.
@@ -116,6 +117,9 @@ class Ensemble:
                 problem = "needs layers for AVs that meet a mission vehicle (vfn.meets)"
                 raise BadInput(problem, field="training.ensemble.met_alone", value=True)
             driven, more = ([one for one in some if meets(one)] for some in (driven, more))
+            if not driven:
+                problem = "in no drive does an AV meet a mission vehicle"
+                raise BadInput(problem, field="training.ensemble.met_alone", value=True)
         self.replay.add([*driven, *more])
         ddqn = replace(config.ddqn, refused=c.refused)
         alone = replace(ddqn, by_copies=True, forked=c.copies, shrink=c.shrink)

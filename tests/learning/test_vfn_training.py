@@ -883,6 +883,10 @@ def test_only_who_meets_a_mission_vehicle_may_be_taught(tmp_path: Path) -> None:
     assert set(after[met].sum(1).argmax(1).tolist()) == {MetaAction.ACCELERATE}
     with pytest.raises(BadInput, match=r"met_alone=True: needs layers .*vfn.meets"):
         Ensemble(config, TINY, replay, tmp_path, {})
+    without = ReplayBuffer(config.replay)
+    without.add([nobody])
+    with pytest.raises(BadInput, match="met_alone=True: in no drive does an AV meet"):
+        Ensemble(config, layout, without, tmp_path, {})
 
 
 def test_what_a_state_is_worth_stays_what_the_first_weights_say(tmp_path: Path) -> None:

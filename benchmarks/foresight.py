@@ -13,18 +13,19 @@ looking; then collisions and distances. The share of the oracle's gain is what `
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from benchmarks.learned import asked, drivers, of, options
+from benchmarks.learned import asked, drivers, of, options, share
 from benchmarks.tables import markdown_row, write_page
+from benchmarks.turn import resampled
 from benchmarks.worlds import WITH_MISSION
 from cosim.cli.main import main as cosim
 from cosim.report import run_folder, statistics
 from cosim.report.figures import Row
 from cosim.report.statistics import Figure
-from cosim.types import Floats
 from cosim.workers.tasks import OK
 
 SVO = 60
@@ -65,13 +66,9 @@ def paired(rows: Sequence[Row]) -> dict[str, Arms]:
 
 def means(world: str, arm: str, rows: Sequence[Row]) -> list[str]:
     """The cells of one arm in one world."""
-    collided, served = (
-        statistics.share(int(hits(rows, name).sum()), len(rows)).text(0, 100.0) + " %"
-        for name in (HIT, "mission_success")
-    )
     near = statistics.mean(of(rows, NEAR)).text(2)
     return [
-        *(world, arm, str(len(rows)), near, collided, served),
+        *(world, arm, str(len(rows)), near, share(rows, HIT), share(rows, "mission_success")),
         *(statistics.mean(of(rows, name)).text(0) for name in DISTANCES),
     ]
 
@@ -108,17 +105,11 @@ def gained(arms: Arms, name: str) -> Figure | None:
     gain = statistics.paired_mean(of(arms[WITHOUT], name), of(arms[ORACLE], name))
     if not (gain.low > 0.0 or gain.high < 0.0):
         return None
-    values: Floats = np.array([of(arms[arm], name) for arm in ARMS])  # [arms, episodes]
-    rng = np.random.default_rng(0)
-    draws = rng.integers(0, values.shape[1], (statistics.RESAMPLES, values.shape[1]))
 
-    def ratio(means: Floats) -> float:
-        return float((means[1] - means[0]) / (means[2] - means[0])) if means[2] != means[0] else np.nan
+    def ratio(without: float, mine: float, oracle: float) -> float:
+        return (mine - without) / (oracle - without) if oracle != without else math.nan
 
-    found = np.array([ratio(values[:, rows].mean(1)) for rows in draws])
-    tail = 50.0 * (1.0 - statistics.CONFIDENCE)
-    low, high = np.nanpercentile(found, [tail, 100.0 - tail])
-    return Figure(ratio(values.mean(1)), float(low), float(high))
+    return resampled(ratio, *(np.array(of(arms[arm], name)) for arm in ARMS))
 
 
 def page(rows: Sequence[Row], about: Sequence[str]) -> list[str]:

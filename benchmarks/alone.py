@@ -14,6 +14,8 @@ import os
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from benchmarks.learned import asked, drivers, options, share
 from benchmarks.papers.agents import Agent, build
 from benchmarks.tables import markdown_row, write_page
@@ -113,6 +115,23 @@ def table(rows: Sequence[Row]) -> list[str]:
     return lines
 
 
+def beside(rows: Sequence[Row]) -> list[str]:
+    """Pairs of `vfn-p` and each other network: episodes with an AV in a collision, a line a network."""
+    lines = []
+    mine = {(row["scenario"], row["seed"]): row for row in rows if row["policy"] == _label("vfn_p")}
+    for arm in (arm for arm in ARMS if arm != "vfn_p"):
+        theirs = {(row["scenario"], row["seed"]): row for row in rows if row["policy"] == _label(arm)}
+        told = []
+        for world in (EVERY, *dict.fromkeys(str(world) for world, _ in mine)):
+            pairs = [key for key in mine if key in theirs and world in (key[0], EVERY)]
+            after, before = (np.array([bool(part[key][CRASHED]) for key in pairs]) for part in (mine, theirs))
+            p = statistics.mcnemar(*statistics.discordant(before, after))
+            told.append(f"{world} {after.sum()} and {before.sum()} of {len(pairs)}, p {p:.2g}")
+        if theirs:
+            lines.append(f"- `{_label('vfn_p')}` and `{_label(arm)}`: {'; '.join(told)}.")
+    return lines
+
+
 def _label(arm: str) -> str:
     return f"{arm.replace('_', '-')}-alone"
 
@@ -146,7 +165,8 @@ def main() -> None:
         "Tango's 95 % intervals.",
         "",
     ]
-    write_page(args.out, [*about, *table(rows)])
+    pairs = "Pairs with an AV in a collision, p by McNemar, not corrected for how many there are:"
+    write_page(args.out, [*about, *table(rows), "", pairs, "", *beside(rows)])
     print(args.out.read_text())
 
 

@@ -1,13 +1,16 @@
 """What prediction is worth where humans err: without it, with it, and with the future that really comes.
 
     python -m benchmarks.foresight [--episodes 60] [--demand contested] [--worlds merge ...]
-        [--seeds-from 200000] [--runs runs/foresight] [--workers 2] [--out docs/results/foresight.md]
+        [--halves exit ...] [--seeds-from 200000] [--runs runs/foresight] [--workers 2]
+        [--out docs/results/foresight.md]
 
 `vfn` (sees no predicted map, and its prioritizer expects constant speeds), `vfn-p` and `vfn-p-oracle` (the
 simulation, driven on in a copy, predicts: fair, for errors that have not begun do not begin) at 60 degrees,
 mixed drivers, errors `stress`, preset `lawful`, on equal seeds. Near-misses of AVs come first, named before
 looking; then collisions and distances. The share of the oracle's gain is what `vfn-p` has of what
-`vfn-p-oracle` has less than `vfn`. The same command goes on where it stopped.
+`vfn-p-oracle` has less than `vfn`. In the worlds of `--halves` two more drive, which say where that gain
+comes from: what comes is told to the networks alone, or to the mask alone. The same command goes on where it
+stopped.
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -27,11 +31,14 @@ from cosim.report import run_folder, statistics
 from cosim.report.figures import Row
 from cosim.report.statistics import Figure
 from cosim.workers.tasks import OK
+from policy.agents.approaches import compact
+from policy.agents.oracle import Oracle
 
 SVO = 60
 BEHAVIOR, LEVEL = "mixed", "stress"
 WITHOUT, WITH, ORACLE = ARMS = ("vfn", "vfn-p", "vfn-p-oracle")
 PAIRS = ((WITH, WITHOUT), (ORACLE, WITHOUT), (ORACLE, WITH))
+HALVES = {"networks-told": "networks_told", "mask-told": "mask_told"}  # functions of this module
 TOGETHER = "all worlds"
 NEAR, HIT = "av_near_misses_ttc", "av_involved_collisions"
 DISTANCES = ("dt_mission_m", "dt_av_m", "dt_mean_m")
@@ -43,22 +50,32 @@ DIFFERENCES = ("world", "arms", "pairs", "near-misses of AVs", "p by Holm", "wit
 Arms = Mapping[str, Sequence[Row]]  # rows in the same order of worlds and seeds
 
 
+def networks_told() -> Oracle:
+    """`vfn-p` whose networks know what comes; its mask has predictions."""
+    return Oracle("vfn-p", compact("vfn-p"), "networks")
+
+
+def mask_told() -> Oracle:
+    """`vfn-p` whose mask knows what comes; its networks have predictions."""
+    return Oracle("vfn-p", compact("vfn-p"), "mask")
+
+
 def hits(rows: Sequence[Row], name: str) -> np.ndarray:
     """[episodes] bool."""
     return np.array([bool(row.get(name)) for row in rows])
 
 
-def paired(rows: Sequence[Row]) -> dict[str, Arms]:
-    """World (and `TOGETHER`) -> arm -> rows, of the seeds that all arms have driven."""
+def paired(rows: Sequence[Row], wanted: Sequence[str] = ARMS) -> dict[str, Arms]:
+    """World (and `TOGETHER`) -> arm -> rows, of the seeds that all `wanted` arms have driven."""
     found: dict[tuple[str, int], dict[str, Row]] = {}
     for row in rows:
         found.setdefault((str(row["scenario"]), int(row["seed"])), {})[str(row["policy"])] = row
-    whole = {key: arms for key, arms in sorted(found.items()) if arms.keys() >= set(ARMS)}
+    whole = {key: arms for key, arms in sorted(found.items()) if arms.keys() >= set(wanted)}
     worlds = dict.fromkeys(world for world, _ in whole)
     return {
         world: {
             arm: [arms[arm] for (where, _), arms in whole.items() if world in (where, TOGETHER)]
-            for arm in ARMS
+            for arm in wanted
         }
         for world in (*worlds, TOGETHER)
     }
@@ -129,7 +146,27 @@ def page(rows: Sequence[Row], about: Sequence[str]) -> list[str]:
             f"- Share of the oracle's gain in {what} that `vfn-p` has: {known or 'there is no gain'}."
         )
         lines.append(f"  The oracle gains nothing that these pairs show: {nothing or 'nowhere'}.")
+    halves = paired(rows, (*ARMS, *HALVES))
+    if len(halves) > 1:
+        lines += ["", "## Who has to be told", ""]
+        lines += ["What comes is told to the networks alone, or to the mask alone; the other has the agent's"]
+        lines += ["own predictions.", "", markdown_row(MEANS), markdown_row(["---"] * len(MEANS))]
+        lines += [markdown_row(means(w, arm, arms[arm])) for w, arms in halves.items() for arm in HALVES]
+        lines += ["", markdown_row(DIFFERENCES), markdown_row(["---"] * len(DIFFERENCES))]
+        pairs = [(half, other) for other in (WITH, ORACLE) for half in HALVES]
+        lines += [markdown_row(cells) for pair in pairs for cells in tested(halves, *pair)]
     return lines
+
+
+def drive(arms: Sequence[str], worlds: Sequence[str], out: Path, args: argparse.Namespace) -> list[Row]:
+    """The rows of these arms in these worlds; what is in `out` is not driven again."""
+    words = [word for world in worlds for word in ("--scenario", world)]
+    words += [word for arm in arms for word in ("--policy", arm)]
+    words += ["--demand", args.demand, "--behavior", BEHAVIOR, "--errors", LEVEL, "--svo", str(SVO)]
+    words += ["--seeds", f"{args.seeds_from}:{args.seeds_from + args.episodes}", "--no-report"]
+    if code := cosim(["evaluate", *words, "--workers", args.workers, "--resume", "--out", str(out)]):
+        raise SystemExit(code)
+    return [row for row in run_folder.read(out).rows if row["status"] == OK]
 
 
 def main() -> None:
@@ -139,15 +176,13 @@ def main() -> None:
     )
     options(parser, "foresight", "contested", WITH_MISSION)
     parser.set_defaults(episodes=60)
+    parser.add_argument("--halves", nargs="+", choices=WITH_MISSION, default=[], help="default: no world")
     args = parser.parse_args()
     seeds = f"{args.seeds_from}:{args.seeds_from + args.episodes}"
-    words = [word for world in args.worlds for word in ("--scenario", world)]
-    words += [word for arm in ARMS for word in ("--policy", arm)]
-    words += ["--demand", args.demand, "--behavior", BEHAVIOR, "--errors", LEVEL, "--svo", str(SVO)]
-    words += ["--seeds", seeds, "--no-report", "--workers", args.workers, "--resume", "--out", str(args.runs)]
-    if code := cosim(["evaluate", *words]):
-        raise SystemExit(code)
-    rows = [row for row in run_folder.read(args.runs).rows if row["status"] == OK]
+    rows = drive(ARMS, args.worlds, args.runs / "whole", args)
+    if args.halves:
+        told = [f"{name}=benchmarks.foresight:{made}" for name, made in HALVES.items()]
+        rows += drive(told, args.halves, args.runs / "halves", args)
     about = [
         f"`{args.demand}`, {drivers(rows)}, errors `{LEVEL}`, seeds {seeds}, preset `lawful`, phi {SVO}",
         "degrees. Means with bootstrap, shares with Wilson's, differences of shares with Tango's 95 %",

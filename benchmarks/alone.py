@@ -1,7 +1,7 @@
 """What a value network drives into without the safety prioritizer and without the car's own braking.
 
     python -m benchmarks.alone [--episodes 20] [--demand dense] [--worlds merge ...] [--seeds-from 200000]
-        [--weights FILE] [--runs runs/alone] [--workers 2] [--out docs/results/alone.md]
+        [--arms vfn-p ...] [--weights FILE] [--runs runs/alone] [--workers 2] [--out docs/results/alone.md]
 
 Preset `unguarded`, no mask: the best valued action is carried out. `vfn-p-present` is `vfn-p` shown the
 present in place of every predicted map. `conv3d-dqn` and `conv3d-a2c`, of a demonstrator, see maps alone; so
@@ -142,12 +142,15 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     options(parser, "alone", "dense", names())
+    shipped = [arm.replace("_", "-") for arm in ARMS[1:]]
+    parser.add_argument("--arms", nargs="+", choices=shipped, default=shipped, help="default: all")
     parser.add_argument("--weights", metavar="FILE", help="a further network: `given-alone`")
     args = parser.parse_args()
     if args.weights:
         os.environ[WEIGHTS] = args.weights
     seeds = f"{args.seeds_from}:{args.seeds_from + args.episodes}"
-    arms = ARMS if args.weights else ARMS[1:]
+    arms = [arm.replace("-", "_") for arm in args.arms]
+    arms = [ARMS[0], *arms] if args.weights else arms
     words = [word for world in args.worlds for word in ("--scenario", world)]
     words += [word for arm in arms for word in ("--policy", f"{_label(arm)}=benchmarks.alone:{arm}")]
     words += ["--demand", args.demand, "--seeds", seeds, "--svo", str(SVO), "--preset", "unguarded"]

@@ -136,7 +136,7 @@ def options(parser: argparse.ArgumentParser, name: str, demand: str, worlds: Seq
     parser.add_argument("--out", type=Path, default=Path("docs/results", f"{name}.md"))
 
 
-ASKED = ("episodes", "demand", "errors", "worlds", "seeds_from", "others", "weights", "halves")
+ASKED = ("episodes", "demand", "errors", "worlds", "seeds_from", "others", "arms", "weights", "halves")
 
 
 def asked(parser: argparse.ArgumentParser, args: argparse.Namespace) -> str:

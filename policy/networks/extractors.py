@@ -112,6 +112,9 @@ class EncodedMaps(nn.Module):
         return frames.flatten(1)
 
 
+AT_ONCE = 256  # frames: all of a city's AVs would take a gigabyte
+
+
 class FrameMemory:
     """Convolves every frame of the AVs' maps once, to the bit as if all were convolved at every decision.
 
@@ -135,7 +138,9 @@ class FrameMemory:
             row = self._row.get(name)
             known[:old] = row is not None and np.array_equal(self._maps[row, n - old : n], mine[:old])
         new = ~kept
-        made = to_numpy(self._extractor.frames(torch.from_numpy(pictures[new])).permute(0, 2, 3, 1))
+        many = np.count_nonzero(new) // AT_ONCE + 1  # parts of like size: of a few frames alone bits differ
+        parts = torch.from_numpy(pictures[new]).tensor_split(many)
+        made = to_numpy(torch.cat([self._extractor.frames(part) for part in parts]).permute(0, 2, 3, 1))
         features: Floats32 = np.empty((count, frames, *made.shape[1:]), np.float32)
         features[new] = made
         before = [self._row[name] for name, known in zip(names, kept[:, 0], strict=True) if known]

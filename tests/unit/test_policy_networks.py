@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from policy import checkpoint
 from policy.inputs.situation import FAR, MEETS, PER_LANE, SITUATION_INPUTS, situation
 from policy.inputs.tensors import KINEMATIC_INPUTS, apart, kinematic_tensor, svo_tensor, to_batch
 from policy.inputs.vehicle_inputs import NEIGHBOUR_INPUTS, NEIGHBOURS, own_inputs
+from policy.networks import extractors
 from policy.networks.hpn import HPN, HpnConfig
 from policy.networks.kinematic_branch import KinematicBranch, KinematicConfig, correct, sureness
 from policy.networks.map_branch import MapBranch, MapBranchConfig
@@ -296,6 +298,25 @@ def test_frames_remembered_from_the_last_decision_give_the_same_values_to_the_bi
             convolved = calls[-1]
             assert torch.equal(remembered, network(maps, *rest))
         assert convolved == (14, 6 + 14, 6 + 6 + 14, 14 + 14)[number]
+
+
+@pytest.mark.parametrize("extractor", ["conv3d", "frames"])
+def test_a_citys_frames_are_read_in_parts_to_the_bit(
+    extractor: Literal["conv3d", "frames"], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    torch.manual_seed(0)
+    network = VFN(VfnConfig(extractor=extractor)).eval()
+    maps = torch.randint(0, 256, (5, 14, 4, 32, 128), dtype=torch.uint8)
+
+    def read() -> torch.Tensor:
+        memory = network.memory(10, 2)
+        assert memory is not None
+        with torch.inference_mode():
+            return memory.frames(list("abcde"), maps)
+
+    whole = read()
+    monkeypatch.setattr(extractors, "AT_ONCE", 16)
+    assert torch.equal(read(), whole)
 
 
 def test_maps_read_apart_say_who_is_where_and_how_fast() -> None:

@@ -138,7 +138,7 @@ class FrameMemory:
             row = self._row.get(name)
             known[:old] = row is not None and np.array_equal(self._maps[row, n - old : n], mine[:old])
         new = ~kept
-        many = np.count_nonzero(new) // AT_ONCE + 1  # parts of like size: of a few frames alone bits differ
+        many = int(new.sum()) // AT_ONCE + 1  # parts of like size: of a few frames alone bits differ
         parts = torch.from_numpy(pictures[new]).tensor_split(many)
         made = to_numpy(torch.cat([self._extractor.frames(part) for part in parts]).permute(0, 2, 3, 1))
         features: Floats32 = np.empty((count, frames, *made.shape[1:]), np.float32)

@@ -54,20 +54,24 @@ class A2cLearner(Learner):
         """One pass, in random order, over the transitions of trajectories driven with the present weights.
 
         Returns the means of `policy`, `value`, `entropy` (nat) and `imitation` (minus the log of the chance
-        of the demonstrated actions); nothing when there are no transitions.
+        of the demonstrated actions), and `explained_variance`, the share of the returns' variance that the
+        critic had foretold; nothing when there are no transitions.
         """
         places = [(t, k) for t in drives for k in range(len(t))]
         if not places:
             return {}
-        returns = np.concatenate([self._returns(t) for t in drives if len(t)])
+        known = [self._returns(t) for t in drives if len(t)]
+        returns, foretold = (np.concatenate(part) for part in zip(*known, strict=True))
         losses = [
             self._update([places[i] for i in rows], returns[rows])
             for rows in _batches(rng.permutation(len(places)), self.config.batch)
         ]
-        return mean_metrics(losses)
+        explained = 1.0 - float((returns - foretold).var()) / max(float(returns.var()), 1e-12)
+        return mean_metrics(losses) | {"explained_variance": explained}
 
-    def _returns(self, drive: Trajectory) -> Floats32:
-        """n-step returns [D], bootstrapped by the critic unless the drive ended in a crash before."""
+    def _returns(self, drive: Trajectory) -> tuple[Floats32, Floats32]:
+        """n-step returns [D], bootstrapped by the critic unless the drive ended in a crash before; what the
+        critic foretold [D]."""
         c, d = self.config, len(drive)
         phi = np.full(d + 1, drive.phi, np.float32)
         values = np.empty(d + 1, np.float32)
@@ -85,7 +89,7 @@ class A2cLearner(Learner):
         for t in range(d):
             end = min(t + c.n_step, d)
             out[t] = c.gamma ** np.arange(end - t) @ reward[t:end] + c.gamma ** (end - t) * values[end]
-        return out
+        return out, values[:d]
 
     def _update(self, places: list[tuple[Trajectory, int]], returns: Floats32) -> Metrics:
         c, device = self.config, self.device

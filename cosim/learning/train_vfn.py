@@ -63,7 +63,7 @@ def train(args: argparse.Namespace) -> int:
         about["reward"] = training.reward
     if agent.predicted_maps and agent.chain.source == "hpn" and agent.hpn_weights is not None:
         about["hpn_sha256"] = sha256(agent.hpn_weights)
-    explore = replace(file.explore, sample=learning == "a2c")
+    explore = replace(file.explore, sample=training.a2c.keep if learning == "a2c" else 0)
     keep_freed_memory()
     use_threads(args.threads)  # more threads than cores stall each other (docs/training.md)
     writer = tensorboard(folder)

@@ -19,6 +19,7 @@ class A2cConfig:
 
     learning_rate: float = 3e-4
     weight_decay: float = 0.0  # of AdamW: what every weight loses of itself in an update, times the rate
+    keep: int = 1  # decisions that what is drawn is kept: nobody opens a gap within one of 0.4 s
     n_step: int = 8  # as the DDQN's (docs/training.md); 1 is the papers'
     gamma: float = 0.97  # a decision of 0.4 s
     batch: int = 64
@@ -33,7 +34,7 @@ class A2cConfig:
         """Raises BadInput for a number out of range."""
         in_range(
             self,
-            positive="learning_rate n_step gamma batch scale clip",
+            positive="learning_rate keep n_step gamma batch scale clip",
             not_negative="weight_decay imitation",
         )
 
@@ -53,11 +54,13 @@ class A2cLearner(Learner):
     def learn(self, drives: Sequence[Trajectory], rng: np.random.Generator) -> Metrics:
         """One pass, in random order, over the transitions of trajectories driven with the present weights.
 
+        Of `config.keep` decisions with the same drawn action the first is learned from.
+
         Returns the means of `policy`, `value`, `entropy` (nat) and `imitation` (minus the log of the chance
         of the demonstrated actions), and `explained_variance`, the share of the returns' variance that the
         critic had foretold; nothing when there are no transitions.
         """
-        places = [(t, k) for t in drives for k in range(len(t))]
+        places = [(t, k) for t in drives for k in range(0, len(t), self.config.keep)]
         if not places:
             return {}
         known = [self._returns(t) for t in drives if len(t)]
@@ -70,26 +73,27 @@ class A2cLearner(Learner):
         return mean_metrics(losses) | {"explained_variance": explained}
 
     def _returns(self, drive: Trajectory) -> tuple[Floats32, Floats32]:
-        """n-step returns [D], bootstrapped by the critic unless the drive ended in a crash before; what the
-        critic foretold [D]."""
+        """Of every `keep`-th decision: n-step returns, bootstrapped by the critic unless the drive ended in a
+        crash before; and what the critic foretold."""
         c, d = self.config, len(drive)
-        phi = np.full(d + 1, drive.phi, np.float32)
-        values = np.empty(d + 1, np.float32)
+        begins = np.arange(0, d, c.keep)
+        ends = np.minimum(begins + c.n_step, d)
+        asked = np.union1d(begins, ends)
+        phi = np.full(len(asked), drive.phi, np.float32)
+        values = np.zeros(d + 1, np.float32)
         with torch.no_grad():
-            for rows in _batches(np.arange(d + 1), c.batch):
-                _, v = self.online.actor_critic(
-                    *states([(drive, int(t)) for t in rows], phi[rows], self.device)
-                )
-                values[rows] = v.to("cpu").numpy()
+            for rows in _batches(np.arange(len(asked)), c.batch):
+                places = [(drive, int(t)) for t in asked[rows]]
+                _, v = self.online.actor_critic(*states(places, phi[rows], self.device))
+                values[asked[rows]] = v.to("cpu").numpy()
         if drive.ending == "crashed":
             values[d] = 0.0
         weights = np.array([np.cos(drive.phi), np.sin(drive.phi), np.sin(drive.phi)], np.float32)
         reward = c.scale * (drive.terms @ weights)  # [D]
-        out = np.empty(d, np.float32)
-        for t in range(d):
-            end = min(t + c.n_step, d)
-            out[t] = c.gamma ** np.arange(end - t) @ reward[t:end] + c.gamma ** (end - t) * values[end]
-        return out, values[:d]
+        out = np.empty(len(begins), np.float32)
+        for i, (t, end) in enumerate(zip(begins, ends, strict=True)):
+            out[i] = c.gamma ** np.arange(end - t) @ reward[t:end] + c.gamma ** (end - t) * values[end]
+        return out, values[begins]
 
     def _update(self, places: list[tuple[Trajectory, int]], returns: Floats32) -> Metrics:
         c, device = self.config, self.device

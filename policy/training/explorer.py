@@ -26,7 +26,7 @@ class ExploreConfig:
 
     learners: int = 4  # AVs that explore and are recorded; the others act with frozen weights (P, Alg. 4)
     repeat: float = 2.0  # decisions a random action is kept on average: a gap does not open in 0.4 s
-    sample: bool = False  # actions drawn from the network's preferences (A2C), not epsilon-greedy
+    sample: int = 0  # decisions that one drawn from the preferences is kept (A2C); 0: epsilon-greedy
     advised: bool = True  # whether the demonstrator is asked in every state; one that is imitated is
     near: float = 60.0  # m to the mission vehicle within which a decision counts as interaction
 
@@ -146,16 +146,16 @@ class Explorer(PredictionAware):
             mine = [b for b, av in enumerate(inputs.scene.agents) if av in self.learning]
             if self._epsilon > 0.0:
                 q[mine] += self._rng.gumbel(size=(len(mine), q.shape[1])).astype(np.float32)
+                for b in mine:
+                    av = inputs.scene.agents[b]
+                    if not self._holds(av, q[b]) and self.explore.sample > 1:
+                        self.hold(av, MetaAction(int(q[b].argmax())), self.explore.sample - 1)
             return q
         for b, av in enumerate(inputs.scene.agents):
             if av not in self.learning:
                 continue
             draws = self._rng.random(2)
-            action, more = self._held.pop(av, (None, 0))
-            if action is not None:
-                q[b, action] = q[b].max() + 1.0
-                if more > 1:
-                    self._held[av] = action, more - 1
+            if self._holds(av, q[b]):
                 continue
             if av in self._repeated and draws[0] < 1.0 / self.explore.repeat:
                 del self._repeated[av]
@@ -167,6 +167,16 @@ class Explorer(PredictionAware):
                 q[b] = self._rng.random(len(MetaAction)).astype(np.float32)
                 q[b, self._repeated[av]] = 2.0
         return q
+
+    def _holds(self, av: str, q: Floats32) -> bool:
+        """Whether an action is set for this decision; then q [A] prefers it."""
+        action, more = self._held.pop(av, (None, 0))
+        if action is None:
+            return False
+        q[action] = q.max() + 1.0
+        if more > 1:
+            self._held[av] = action, more - 1
+        return True
 
     def _record(self, av: str, b: int, inputs: Inputs, decision: Decision, advice: Floats32) -> None:
         """One decision of the learning AV `av`, row `b` of the inputs; advice [A] of the demonstrator."""

@@ -428,6 +428,22 @@ def test_what_is_stored_is_what_was_seen() -> None:
         assert (t.terms[:, 0] > 0).all()  # it drove
 
 
+def test_what_is_drawn_is_kept_and_learned_from_once() -> None:
+    one = agent()
+    one.explore = ExploreConfig(sample=4, advised=False)
+    episode = fake_episode(FakeVehicle("a", 100.0, 0, 20.0, is_av=True))
+    (drove,) = drive_episode(
+        episode, one, Drive(Lesson("fake"), 5, 0.7, 0.5, "", "", True), RewardConfig()
+    ).trajectories
+    preferred = [int(a if v < 0 else v) for a, v in zip(drove.action, drove.vetoed, strict=True)]
+    blocks = np.reshape(preferred, (5, 4))  # 20 decisions
+    assert (blocks == blocks[:, :1]).all()
+    assert len(set(blocks[:, 0])) > 1
+    learner = A2cLearner(replace(TINY, critic=True), A2cConfig(keep=4, n_step=8, batch=1, scale=1.0), seed=0)
+    learner.learn([trajectory([1] * 10, [(1.0, 0.0, 0.0)] * 10, ending="crashed")], np.random.default_rng(0))
+    assert learner.updates == 3, "decisions 0, 4 and 8"
+
+
 def test_copies_of_the_simulation_tell_what_another_action_brings_and_change_nothing() -> None:
     """Alone on the road whoever brakes for 2.4 s loses own distance; nobody else gains or loses by it."""
     one = agent()

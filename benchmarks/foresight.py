@@ -187,6 +187,9 @@ def main() -> None:
         f"`{args.demand}`, {drivers(rows)}, errors `{LEVEL}`, seeds {seeds}, preset `lawful`, phi {SVO}",
         "degrees. Means with bootstrap, shares with Wilson's, differences of shares with Tango's 95 %",
         "intervals; p by Wilcoxon's signed ranks and McNemar's test, over the worlds by Holm's method.",
+        "`vfn` sees no predicted map, and its mask expects constant speeds; the oracle tells networks and",
+        "mask where everybody is in 4 s if AVs do as commanded and no human error begins",
+        "(docs/definitions.md).",
         "",
         f"Made by `python -m benchmarks.foresight{asked(parser, args)}`.",
     ]

@@ -103,7 +103,7 @@ def startup(place: Place) -> list[list[str]]:
 
 def reward_balance(place: Place) -> list[list[str]]:
     """Whether yielding pays."""
-    flags = ["--seeds", "150100:150101" if place.small else "150100:150106"]
+    flags = ["--seeds", "150100:150101" if place.small else "150100:150120"]
     flags += ["--scenario", "merge"] if place.small else []
     return [["benchmarks.reward_balance", *flags, "--out", str(place.out / "reward_balance.md")]]
 
@@ -148,7 +148,7 @@ def action_values(place: Place) -> list[list[str]]:
 
 def turn(place: Place) -> list[list[str]]:
     """At which phi it begins to yield."""
-    flags = ["--worlds", "merge", "--episodes", "1"] if place.small else []
+    flags = ["--worlds", "merge", "--episodes", "1"] if place.small else ["--episodes", "20"]
     flags += ["--rows", str(place.out / "data" / "turn.csv"), "--workers", "2"]
     return [["benchmarks.turn", *flags, "--out", str(place.out / "turn.md")]]
 
@@ -162,8 +162,8 @@ def seeing(place: Place) -> list[list[str]]:
 
 def learned(place: Place) -> list[list[str]]:
     """What the network that learned from rewards alone does."""
-    flags = ["--errors", "none", "--worlds", "merge"] if place.small else []
-    flags += ["--episodes", "1" if place.small else "10", "--runs", str(place.work / "learned_runs")]
+    flags = ["--errors", "none", *(["--worlds", "merge", "--episodes", "1"] if place.small else [])]
+    flags += ["--runs", str(place.work / "learned_runs")]
     return [["benchmarks.learned", LEARNED, *flags, "--out", str(place.out / "learned.md")]]
 
 
@@ -176,7 +176,7 @@ def alone(place: Place) -> list[list[str]]:
 
 def foresight(place: Place) -> list[list[str]]:
     """What prediction is worth where humans err."""
-    flags = ["--worlds", "merge", "--episodes", "1"] if place.small else []
+    flags = ["--worlds", "merge", "--episodes", "1"] if place.small else ["--halves", "exit", "intersection"]
     kept = ["--runs", str(place.work / "foresight_runs"), "--out", str(place.out / "foresight.md")]
     return [["benchmarks.foresight", *flags, *kept]]
 

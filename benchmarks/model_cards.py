@@ -26,9 +26,13 @@ RESULTS = Path("docs/results")
 HEAD = 2  # lines of a table before its rows
 FIGURES = ("collision_rate", "mission_success_rate", "dt_mean_m")
 MAPS_UNUSED = (
-    "It does not use its maps, past or predicted: with every map zeroed 0.1 % of the choices of "
-    "`vfn-p-demonstrated` change (1,172 decisions, contested merge). A difference between that and "
-    "`vfn-demonstrated` says nothing about prediction."
+    "It does not use its maps, past or predicted: what a map shows changes none of its choices in the "
+    "contested merge, or hardly one (docs/results/attribution.md). A difference between `vfn-p-demonstrated` "
+    "and `vfn-demonstrated` says nothing about prediction."
+)
+DESCENT = (
+    "It descends from trainings of which one step, before docs/results/trainings/reflex-0, cannot be made "
+    "again (docs/training.md, Where `vfn-p` comes from)."
 )
 MAPS_ONLY = "It sees nothing but maps, brakes for whatever is near, and has been trained for minutes only."
 LAWLESS = (
@@ -43,7 +47,7 @@ DEMONSTRATED = (
 LIMITS = {  # by the configuration of the training
     "compact": (MAPS_UNUSED, *DEMONSTRATED),
     "maps": (MAPS_ONLY, *DEMONSTRATED),
-    "rewards": (LAWLESS,),
+    "rewards": (DESCENT, LAWLESS),
 }
 LAWFUL_ONLY = "It learned from rewards alone, in preset `lawful`: what it does in `unguarded` it never tried."
 # the folder of its training's log, where that is not NAME-0
@@ -134,9 +138,10 @@ def driving(name: str, card: Card) -> Iterator[str]:
     if len(table) > HEAD:
         yield from ("- Measured (test seeds, preset `unguarded`):", "", *table, "")
     else:
-        driven = f"| {name} at " in (RESULTS / "learned.md").read_text(encoding="utf-8")
-        where = "on test seeds, preset `lawful`: docs/results/learned.md" if driven else "in no table yet"
-        yield f"- Measured {where}."
+        told = {"learned.md": f"| {name} at ", "alone.md": f"| {name}-alone |", "foresight.md": f"| {name} |"}
+        there = [page for page, arm in told.items() if arm in (RESULTS / page).read_text(encoding="utf-8")]
+        where = "on test seeds: " + ", ".join(f"docs/results/{page}" for page in there)
+        yield f"- Measured {where if there else 'in no table yet'}."
     if rewards and not any(lesson.get("preset") for lesson in training["lessons"]):
         yield f"- Limit: {LAWFUL_ONLY}"
     yield from (f"- Limit: {text}" for text in LIMITS[approach.config])
@@ -184,7 +189,8 @@ def predicting(name: str, card: Card) -> Iterator[str]:
         yield "- Predicts each vehicle's trajectory for 4 s (docs/prediction.md)."
         page, unit = "docs/results/prediction.md", "m"
     count = len(recorded)
-    yield f"- Data: {train['episodes']} episodes, recorded by {count} commands such as `{recorded[0]}`."
+    then = " (`vfn` was the network of a demonstrator then)" if "--policy vfn" in recorded[0] else ""
+    yield f"- Data: {train['episodes']} episodes, recorded by {count} commands such as `{recorded[0]}`{then}."
     yield f"- Training: {training}, {steps} updates." + (
         f" {data['note'].capitalize()}." if "note" in data else ""
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -209,12 +210,24 @@ def stacked_bars(path: Path, panels: Mapping[str, Mapping[str, Mapping[str, int]
     drawn.savefig(path, dpi=DPI)
 
 
+READ = "<!-- read -->", "<!-- end of read -->"  # between them stands what a person read in the figures
+
+
 def write_page(path: Path | None, lines: Sequence[str]) -> None:
-    """The Markdown page, whole or not at all; printed where there is no path."""
+    """The Markdown page, whole or not at all; printed where there is no path.
+
+    What the page that was there has between `READ` stays, before the first section; stderr asks to read it.
+    """
     if path is None:
         print("\n".join(lines))
         return
     path.parent.mkdir(parents=True, exist_ok=True)
+    begin, end = READ
+    if path.is_file() and begin in (old := path.read_text(encoding="utf-8")):
+        first = next((k for k, line in enumerate(lines) if line.startswith("## ")), len(lines))
+        note = begin + old.partition(begin)[2].partition(end)[0] + end
+        lines = [*lines[:first], note, "", *lines[first:]]
+        print(f"{path}: does what stands between {begin} and {end} still hold?", file=sys.stderr)
     with whole(path) as draft:
         draft.write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
 

@@ -35,10 +35,10 @@ SAID_FIRST = (
     "predicted: what a map shows changes none of their choices, or hardly one",
     "(`docs/results/attribution.md`, by `cosim bench attribution --policy vfn-p-demonstrated --scenario",
     "merge --demand contested --seeds 150000:150006 --out DIR`). So the first against the second does not",
-    "measure what predicted maps are worth. `vfn-p` and `vfn`, which learned from rewards alone and see",
-    "other vehicles in their maps alone, are not in the tables yet; what a network learns from rewards",
-    "alone stands in `docs/results/learned.md`. On real networks with signals the preset `unguarded`",
-    "drives unlawfully, through red lights and faster than lanes allow.",
+    "measure what predicted maps are worth. What `vfn-p` and `vfn`, which learned from rewards alone and",
+    "see other vehicles in their maps alone, were asked and show stands in `docs/agent.md`. On real",
+    "networks with signals the preset `unguarded` drives unlawfully, through red lights and faster than",
+    "lanes allow.",
 )
 STYLE: Any = {"svg.fonttype": "none", "svg.hashsalt": "cosim", "font.size": 9.0}  # equal figures, equal file
 

@@ -102,7 +102,8 @@ def write(settings: Settings) -> None:
         there = (out / claim.page).is_file()
         link = f"[{claim.page}]({claim.page})" if there else claim.page
         page.append(f"| {claim.source} | {claim.claim} | {claim.found(out)} | {link} |")
-    others = sorted(p.name for p in out.glob("*.md") if p.name != "README.md")
+    pages = [*out.glob("*.md"), *out.glob("uses*/*.md")]
+    others = sorted(str(p.relative_to(out)) for p in pages if p.name != "README.md")
     page += ["", "All pages: " + ", ".join(f"[{name.removesuffix('.md')}]({name})" for name in others) + "."]
     write_page(out / "README.md", page)
     print(out / "README.md")

@@ -41,15 +41,15 @@ def save(
     }
     with whole(path) as draft:
         save_file(tensors, draft, metadata={"format": FORMAT})
-    card = {
-        "format": FORMAT,
-        "sha256": sha256(path),
-        "configs": {name: asdict(c) if is_dataclass(c) else c for name, c in configs.items()},  # type: ignore[arg-type]
-        "measured": dict(measured or {}),
-        "data": dict(data or {}),
-    }
-    with whole(path.with_suffix(".json")) as draft:
-        draft.write_text(json.dumps(card, indent=2, sort_keys=True) + "\n")
+        card = {
+            "format": FORMAT,
+            "sha256": sha256(draft),
+            "configs": {name: asdict(c) if is_dataclass(c) else c for name, c in configs.items()},  # type: ignore[arg-type]
+            "measured": dict(measured or {}),
+            "data": dict(data or {}),
+        }
+        with whole(path.with_suffix(".json")) as text:  # first: weights that are there have their card
+            text.write_text(json.dumps(card, indent=2, sort_keys=True) + "\n")
 
 
 def read_card(path: Path) -> dict[str, Any]:

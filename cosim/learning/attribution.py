@@ -215,7 +215,9 @@ def table(driven: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         driven: what `Asking.run` returned for the episodes of one policy.
     """
     rows = []
-    for key in driven[0]["answers"]:
+    keys = list(dict.fromkeys(key for episode in driven for key in episode["answers"]))
+    inputs = list(dict.fromkeys(name for name, _ in keys))  # an input's replacements stand together
+    for key in sorted(keys, key=lambda key: inputs.index(key[0])):
         found = np.sum([e["answers"][key] for e in driven if key in e["answers"]], 0)
         sums = dict(zip(SUMS, found.tolist(), strict=True))
         n = int(sums["decisions"])

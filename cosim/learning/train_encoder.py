@@ -30,7 +30,7 @@ from policy.training.networks import use_threads
 from policy.training.sight import Seen, SightTask, SightTraining
 from sumo_scenarios import names
 
-HELD = 3.0  # decisions for which a random action is held on average
+HELD = 6.0  # decisions for which a random action is held on average
 
 
 class Watcher(PredictionAware):
@@ -71,7 +71,7 @@ class Watcher(PredictionAware):
         agents, actions = inputs.scene.agents, len(MetaAction)
         decided = self.choose(self._rng.random((len(agents), actions)).astype(np.float32), inputs)
         for av in agents:
-            if av not in self._held or self._rng.random() < self._training.every / HELD / 2.0:
+            if av not in self._held or self._rng.random() < self._training.every / HELD:
                 self._held[av] = decided[av].action
         rows = self._rng.permutation(len(agents))[: self._training.avs]
         past, states = self.observation.frames, inputs.states
@@ -112,7 +112,7 @@ def gather(
         for demand in load(world).demands or {}
         for errors in dict.fromkeys(("", training.errors))
         for seed in seeds
-        if (seed % 2 == 1) == bool(errors)
+        if not training.errors or (seed % 2 == 1) == bool(errors)
     ]
     each = spread(LocalEngine(Watching, (agent, training), workers=workers), tasks, title)
     return sight.joined([part for parts in each for part in parts])

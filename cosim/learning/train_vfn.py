@@ -53,7 +53,8 @@ def train(args: argparse.Namespace) -> int:
     folder = prepare_folder(args.out)
     if not args.resume and (folder / "state.json").exists():
         raise BadInput("holds a training run already: --resume goes on", field="--out", value=args.out)
-    (folder / "config.yaml").write_text(yaml.safe_dump(values, sort_keys=False), encoding="utf-8")
+    explore = replace(file.explore, sample=training.a2c.keep if learning == "a2c" else 0)
+    file = replace(file, explore=explore)
     about = {
         "policy": name,
         "scenarios": sorted({lesson.scenario for lesson in training.lessons}),
@@ -63,7 +64,6 @@ def train(args: argparse.Namespace) -> int:
         about["reward"] = training.reward
     if agent.predicted_maps and agent.chain.source == "hpn" and agent.hpn_weights is not None:
         about["hpn_sha256"] = sha256(agent.hpn_weights)
-    explore = replace(file.explore, sample=training.a2c.keep if learning == "a2c" else 0)
     keep_freed_memory()
     use_threads(args.threads)  # more threads than cores stall each other (docs/training.md)
     writer = tensorboard(folder)
@@ -72,6 +72,8 @@ def train(args: argparse.Namespace) -> int:
         run = TrainingRun(training, agent.vfn, actors, folder, device=args.device, log=writer, about=about)
         if args.resume and not run.resume():
             print("nothing to resume: starting anew", file=sys.stderr)
+        run.check_ensemble()
+        (folder / "config.yaml").write_text(yaml.safe_dump(values, sort_keys=False), encoding="utf-8")
         run.run(progress)
         if training.ensemble:
             with Progress(f"distill {name}", "updates") as progress:

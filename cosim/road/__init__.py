@@ -13,6 +13,7 @@ from cosim.road.link import Crossing as Crossing
 from cosim.road.link import Link as Link
 from cosim.road.link import Rule as Rule
 
+REMEMBERED = 20_000  # routes ahead: a city's vehicles have a new one on every edge
 PATH_HORIZON = 400.0  # m: further than any AV drives within the 4 s horizon, and than arms are long
 
 
@@ -89,7 +90,7 @@ class LaneGraph(NamedTuple):
 
 @dataclass(frozen=True)
 class RoadMap:
-    """Every lane of a net. Paths are cached, so asking again is free."""
+    """Every lane of a net. Paths are cached: asking again is free, and equal ways share one."""
 
     lanes: tuple[Lane, ...]
     zones: tuple[ConflictZone, ...] = ()
@@ -101,6 +102,7 @@ class RoadMap:
     crossings: tuple[Crossing, ...] = ()
     closed: tuple[Lane, ...] = ()  # a lane of every edge that is closed to motor vehicles: where others are
     _paths: dict[tuple[int, tuple[str, ...] | None], LanePath] = field(default_factory=dict, repr=False)
+    _ways: dict[tuple[tuple[int, ...], bool, bool], LanePath] = field(default_factory=dict, repr=False)
     index: dict[str, int] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
@@ -116,7 +118,12 @@ class RoadMap:
         key = (lane, route)
         found = self._paths.get(key)
         if found is None:
-            found = self._paths[key] = self._follow(lane, route)
+            if len(self._paths) >= REMEMBERED:
+                self._paths.clear()
+            way = self._follow(lane, route)
+            if way not in self._ways:
+                self._ways[way] = self._join(*way)
+            found = self._paths[key] = self._ways[way]
         return found
 
     @cached_property
@@ -192,7 +199,8 @@ class RoadMap:
         last = [lane.shape[-1] - lane.shape[-2] for lane in self.lanes]
         return [float(np.arctan2(d[1], d[0])) for d in last]
 
-    def _follow(self, first: int, route: tuple[str, ...] | None) -> LanePath:
+    def _follow(self, first: int, route: tuple[str, ...] | None) -> tuple[tuple[int, ...], bool, bool]:
+        """The lanes of a path, whether it ends in a dead end, and whether because the route is finished."""
         lanes = [first]
         total = self._lengths[first]
         place = 0  # where on the route we are
@@ -213,7 +221,7 @@ class RoadMap:
                 break
             lanes.append(following)
             total += self._lengths[following]
-        return self._join(tuple(lanes), dead_end, leaves)
+        return tuple(lanes), dead_end, leaves
 
     def _successor(self, index: int, route: tuple[str, ...] | None, place: int) -> tuple[int, int] | None:
         lane = self.lanes[index]

@@ -82,12 +82,12 @@ def coming(scene: Scene, frames: Sequence[Snapshot], dt: float) -> Floats:
     for k, frame in enumerate(frames):
         rows = np.array([frame.row.get(name, -1) for name in scene.vehicles])
         there = rows >= 0
-        turn = frame.heading[rows] - now[:, HEADING]
-        heading = now[:, HEADING] + (turn + np.pi) % (2 * np.pi) - np.pi
-        seen = np.stack([frame.x[rows], frame.y[rows], frame.speed[rows], heading], 1)
         way = (now[:, SPEED] * dt)[:, None] * np.stack([np.cos(now[:, HEADING]), np.sin(now[:, HEADING])], 1)
         gone = np.concatenate([now[:, :2] + way, now[:, 2:]], 1)
-        now = np.where(there[:, None], seen, gone)
+        rows, left = rows[there], now[there, HEADING]
+        heading = left + (frame.heading[rows] - left + np.pi) % (2 * np.pi) - np.pi
+        now = gone
+        now[there] = np.stack([frame.x[rows], frame.y[rows], frame.speed[rows], heading], 1)
         out[:, k] = now
     return out
 

@@ -80,6 +80,11 @@ class PredictionAware:
         """A new episode. Raises BadInput when the observation is not the one the networks were built for."""
         if context.observation != self.observation:
             raise BadInput("the observation is not the one this agent needs", field="observation")
+        for part, dt in (("safety", self.config.safety.dt), ("traffic", self.config.traffic.dt)):
+            if dt != context.timing.frame:
+                raise BadInput(
+                    f"is not the frame of {context.timing.frame:g} s", field=f"{part}.dt", value=dt
+                )
         if self._road is not context.road:
             self._road = context.road
             version, predicted = self.observation.road_version, self.config.predicted_maps

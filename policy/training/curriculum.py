@@ -15,6 +15,8 @@ from policy.training.ddqn import DdqnConfig
 from policy.training.experience import Trajectory
 from policy.training.replay_buffer import ReplayConfig
 
+WAITS = 0.9  # of the replay buffer: whole drives leave it, so that it is never quite full
+
 
 @dataclass(frozen=True, slots=True)
 class Lesson:
@@ -137,7 +139,20 @@ class VfnTraining:
     a2c: A2cConfig = field(default_factory=A2cConfig)
 
     def __post_init__(self) -> None:
-        """Raises BadInput: no lesson drives a world of the ensemble, or there are no copies to learn from."""
+        """Raises BadInput: a number is out of range, no lesson drives a world of the ensemble, there are no
+        copies to learn from, or the replay buffer never holds what is waited for."""
+        in_range(
+            self,
+            positive="iterations episodes updates epsilon_iterations disseminate validate_every save_every",
+            not_negative="prefill warm_up warm_up_after validation",
+        )
+        if self.ensemble and not self.validation:
+            raise BadInput("an ensemble is judged by validation", field="training.validation", value=0)
+        imitates = (self.a2c if self.learning == "a2c" else self.ddqn).imitation > 0.0
+        waits = max(self.prefill, self.warm_up_after) if imitates else self.prefill
+        if waits > WAITS * self.replay.capacity and not self.ensemble:
+            problem = f"nothing is learned before {waits} decisions are kept"
+            raise BadInput(problem, field="training.replay.capacity", value=self.replay.capacity)
         if not self.replay.forked and (self.ddqn.by_copies or self.ensemble.by_copies):
             problem = "nothing is learned by copies without any in a batch"
             raise BadInput(problem, field="training.replay.forked", value=0)

@@ -106,7 +106,6 @@ class Ensemble:
     ) -> None:
         c = config.ensemble
         self.config, self.vfn, self.folder = config, vfn, folder
-        self.replay = ReplayBuffer(replace(config.replay, n_step=c.n_step))
         driven = [one for run in c.runs for one in experience.drives(Path(run))] + list(replay.trajectories)
         if len(shapes := {one.shapes for one in driven}) > 1:
             problem = f"was driven with other inputs: {' and '.join(map(str, shapes))}"
@@ -120,7 +119,10 @@ class Ensemble:
             if not driven:
                 problem = "in no drive does an AV meet a mission vehicle"
                 raise BadInput(problem, field="training.ensemble.met_alone", value=True)
-        self.replay.add([*driven, *more])
+        kept = [*driven, *more]
+        capacity = max(config.replay.capacity, sum(map(len, kept)))  # nothing that was asked for is dropped
+        self.replay = ReplayBuffer(replace(config.replay, n_step=c.n_step, capacity=capacity))
+        self.replay.add(kept)
         ddqn = replace(config.ddqn, refused=c.refused)
         alone = replace(ddqn, by_copies=True, forked=c.copies, shrink=c.shrink)
         pupil = replace(ddqn, weight_decay=0.0)  # what it is taught is no noise
@@ -209,11 +211,16 @@ class Ensemble:
         return rate(replace(self.config, iterations=updates), update)
 
     def _finished(self, path: Path) -> bool:
-        if not path.is_file():
-            return False
-        if checkpoint.read_card(path)["data"]["training"] != checkpoint.plain(self.config):
-            raise BadInput("holds an ensemble of another configuration", file=path)
-        return True
+        return finished(path, self.config)
+
+
+def finished(path: Path, config: VfnTraining) -> bool:
+    """Whether these weights of an ensemble are there. Raises BadInput for those of another configuration."""
+    if not path.is_file():
+        return False
+    if checkpoint.read_card(path)["data"]["training"] != checkpoint.plain(config):
+        raise BadInput("holds an ensemble of another configuration", file=path)
+    return True
 
 
 def levelled(values: torch.Tensor, like: torch.Tensor, possible: torch.Tensor) -> torch.Tensor:

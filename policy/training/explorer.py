@@ -126,7 +126,8 @@ class Explorer(PredictionAware):
 
     def hold(self, av: str, action: MetaAction, count: int) -> None:
         """The learning AV `av` prefers `action` for its next `count` decisions."""
-        self._held[av] = action, count
+        if count:
+            self._held[av] = action, count
 
     # ---- inside ----
 
@@ -148,7 +149,7 @@ class Explorer(PredictionAware):
                 q[mine] += self._rng.gumbel(size=(len(mine), q.shape[1])).astype(np.float32)
                 for b in mine:
                     av = inputs.scene.agents[b]
-                    if not self._holds(av, q[b]) and self.explore.sample > 1:
+                    if not self._holds(av, q[b]):
                         self.hold(av, MetaAction(int(q[b].argmax())), self.explore.sample - 1)
             return q
         for b, av in enumerate(inputs.scene.agents):

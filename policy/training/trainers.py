@@ -125,6 +125,10 @@ class OnPolicyTrainer(Trainer):
 
     learner: A2cLearner
 
+    def epsilon(self, k: int) -> float:
+        """All of its actions are drawn from the network's preferences."""
+        return 1.0
+
     def guided(self, k: int) -> float:
         """Share of the episodes that the demonstrator drives."""
         return float(self.keeps)

@@ -25,7 +25,7 @@ from policy import checkpoint
 from policy.networks.vfn import VFN, VfnConfig
 from policy.training import curriculum, experience
 from policy.training.curriculum import Drive, Drove, VfnTraining
-from policy.training.ensemble import Ensemble
+from policy.training.ensemble import Ensemble, finished
 from policy.training.trainers import make_trainer
 
 LATER = ("iterations", "ensemble")  # what a run that goes on may be given otherwise
@@ -74,8 +74,12 @@ class TrainingRun:
     # ---- the loop ----
 
     def run(self, progress: Callable[[float, float], None] | None = None) -> None:
-        """Train to the last iteration, from wherever `resume` left off."""
+        """Train to the last iteration, from wherever `resume` left off; else anew, whatever lies there."""
         c, trainer = self.config, self.trainer
+        if not self.iteration:  # a run that was killed before its first checkpoint leaves some
+            for path in (*self.folder.glob("weights/*"), *self.folder.glob("replay/*")):
+                path.unlink()
+            (self.folder / "log.jsonl").unlink(missing_ok=True)
         while self.iteration < c.iterations:
             began = time.perf_counter()
             k = self.iteration
@@ -109,6 +113,12 @@ class TrainingRun:
                 self.save()
             if progress is not None:
                 progress(self.iteration, c.iterations)
+
+    def check_ensemble(self) -> None:
+        """Raises BadInput where the folder holds an ensemble of another configuration, before any drive."""
+        if self.config.ensemble:
+            for path in (self.folder / "ensemble").glob("*.safetensors"):
+                finished(path, self.config)
 
     def distill(self, progress: Callable[[float, float], None] | None = None) -> dict[str, Any]:
         """Teach one network the mean of an ensemble (`VfnTraining.ensemble`); it is judged as the others are.
@@ -173,6 +183,8 @@ class TrainingRun:
             "files": self._files,
             "gone": self._gone,
             "config": asdict(self.config),
+            "vfn": asdict(self.vfn),
+            "about": self._about,
             "tensors": name,
         }
         with whole(self.folder / name) as draft:
@@ -200,6 +212,8 @@ class TrainingRun:
         mine = json.loads(json.dumps(asdict(self.config)))
         theirs = checkpoint.filled(state["config"], json.loads(json.dumps(asdict(VfnTraining()))))
         differs = [name for name in mine if mine[name] != theirs[name] and name not in LATER]
+        for part, own in (("vfn", asdict(self.vfn)), ("about", self._about)):  # older states do not say
+            differs += _differing(state.get(part, {}), json.loads(json.dumps(own)))
         if differs:
             raise BadInput("was trained with another configuration", file=file, field=", ".join(differs))
         self.iteration, self._gone = state["iteration"], state["gone"]
@@ -211,6 +225,9 @@ class TrainingRun:
         for number, (name, _) in enumerate(self._files):
             trajectories = experience.load(self.folder / "replay" / name)
             self.trainer.replay.add(trajectories[self._gone if number == 0 else 0 :])
+        for path in (self.folder / "weights").glob("*"):  # they will be learned again
+            if int(path.stem) > self.iteration:
+                path.unlink()
         log = self.folder / "log.jsonl"
         if log.is_file():  # lines after the checkpoint will be written again
             lines = [x for x in log.read_text().splitlines() if json.loads(x)["iteration"] < self.iteration]
@@ -224,6 +241,17 @@ class TrainingRun:
             for name, value in record.items():
                 if isinstance(value, int | float) and math.isfinite(value):
                     self._log.add_scalar(name, value, record["iteration"])
+
+
+def _differing(theirs: Mapping[str, Any], mine: Mapping[str, Any], where: str = "") -> list[str]:
+    """The fields that both have, with other values: `safety.dt`."""
+    found = []
+    for name in theirs.keys() & mine.keys():
+        if isinstance(theirs[name], dict) and isinstance(mine[name], dict):
+            found += _differing(theirs[name], mine[name], f"{where}{name}.")
+        elif theirs[name] != mine[name]:
+            found.append(f"{where}{name}")
+    return sorted(found)
 
 
 def _means(prefix: str, figures: Sequence[Mapping[str, float | None]]) -> dict[str, float]:

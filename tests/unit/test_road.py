@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import cosim.road
 from cosim.road import ConflictZone, Lane, RoadMap
 from cosim.simulation.fake import straight_road
 
@@ -36,6 +37,17 @@ def test_a_route_makes_a_lane_that_does_not_follow_it_a_dead_end() -> None:
     assert keep.leaves
     assert not keep.dead_end
     assert keep.length == pytest.approx(400.0)
+
+
+def test_routes_that_lead_the_same_way_share_a_path_and_not_all_are_remembered(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(cosim.road, "REMEMBERED", 5)
+    road = merge_road()
+    paths = {id(road.path(0, ("in", "out", f"far{k}"))) for k in range(20)}
+    assert len(paths) == 1
+    assert len(road._paths) <= 5
+    assert road.path(1, ("in", "out")) is not road.path(1, ("in", "out", "far")), "it does not arrive there"
 
 
 def test_route_knowledge_measures_from_the_vehicle() -> None:

@@ -771,6 +771,8 @@ def test_drives_of_other_trainings_join_in_front(tmp_path: Path) -> None:
     config = replace(SHORT, ensemble=EnsembleConfig(networks=1, runs=(str(tmp_path / "other"),)))
     ensemble = Ensemble(config, TINY, replay, tmp_path, {})
     assert [one.episode for one in ensemble.replay.trajectories] == ["exit/dense/1", "hand"]
+    small = replace(config, replay=replace(SHORT.replay, capacity=3))  # of four decisions: none is dropped
+    assert len(Ensemble(small, TINY, replay, tmp_path, {}).replay.trajectories) == 2
     wide = replace(own, situation=np.zeros((3, 1), np.float32))
     experience.save(tmp_path / "other" / "replay" / "1.npz", [wide])
     with pytest.raises(BadInput, match=r"training\.ensemble\.runs='.*other': was driven with other inputs"):

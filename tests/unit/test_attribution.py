@@ -187,6 +187,19 @@ def test_shares_are_those_of_the_decisions_of_all_episodes_and_the_page_says_wha
     assert "`x`: inputs that change no choice, whatever replaces them: maps." in page
     assert "phi 30 %" in page
     assert "2 episodes a policy" in page
+    answers[0].pop(("maps", "another AV's"))  # it comes in the last episode only, after another input
+    late = np.array([8.0, 8.0, 8.0, 1.0, 4.0])
+    episodes[1]["answers"] = {keys[0]: np.array(sums[0]), keys[2]: np.array(sums[2]), keys[1]: late}
+    rows = table(episodes)
+    assert [(row["input"], row["decisions"]) for row in rows] == [("maps", 20), ("maps", 8), ("phi", 20)]
+    assert "whatever replaces them: none." in markdown(episodes, {"x": rows}, "cosim bench attribution ...")
+
+
+def test_a_mask_of_another_clock_is_refused() -> None:
+    agent = Questioned("vfn-p")
+    slow = PolicyContext(ROAD, Timing(frame=0.1), agent.observation, 0.0, np.random.default_rng(0))
+    with pytest.raises(BadInput, match=r"safety\.dt"):
+        agent.reset(slow)
 
 
 def test_what_an_encoder_makes_of_maps_is_replaced_as_the_maps_are() -> None:

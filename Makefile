@@ -52,6 +52,7 @@ pages: $(VENV)/.installed-dev
 # Some of the shipped episodes driven anew: are they the same in every figure and the trace hash?
 audit: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.papers.episodes check --sample $(SAMPLE) --workers $(WORKERS)
+	$(BIN)/python -m benchmarks.rows check --sample $(SAMPLE)
 
 # The same in small: one world, two episodes each, two seconds long, untrained networks. Shows that all works.
 results-small: $(VENV)/.installed-dev

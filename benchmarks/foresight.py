@@ -8,9 +8,10 @@
 simulation, driven on in a copy, predicts: fair, for errors that have not begun do not begin) at 60 degrees,
 mixed drivers, errors `stress`, preset `lawful`, on equal seeds. Near-misses of AVs come first, named before
 looking; then collisions and distances. The share of the oracle's gain is what `vfn-p` has of what
-`vfn-p-oracle` has less than `vfn`. In the worlds of `--halves` two more drive, which say where that gain
-comes from: what comes is told to the networks alone, or to the mask alone. The same command goes on where it
-stopped.
+`vfn-p-oracle` has less than `vfn`. In the worlds of `--halves` three more drive, which say where that gain
+comes from: what comes is told to the networks alone, or to the mask alone, or nothing is, but the agent's own
+predictions are drawn as the oracle's are, without the shading that stands for doubt. The same command goes on
+where it stopped.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -33,12 +35,14 @@ from cosim.report.statistics import Figure
 from cosim.workers.tasks import OK
 from policy.agents.approaches import compact
 from policy.agents.oracle import Oracle
+from policy.agents.prediction_aware import PredictionAware
 
 SVO = 60
 BEHAVIOR, LEVEL = "mixed", "stress"
 WITHOUT, WITH, ORACLE = ARMS = ("vfn", "vfn-p", "vfn-p-oracle")
 PAIRS = ((WITH, WITHOUT), (ORACLE, WITHOUT), (ORACLE, WITH))
-HALVES = {"networks-told": "networks_told", "mask-told": "mask_told"}  # functions of this module
+# functions of this module
+HALVES = {"networks-told": "networks_told", "mask-told": "mask_told", "unshaded": "unshaded"}
 TOGETHER = "all worlds"
 NEAR, HIT = "av_near_misses_ttc", "av_involved_collisions"
 DISTANCES = ("dt_mission_m", "dt_av_m", "dt_mean_m")
@@ -58,6 +62,12 @@ def networks_told() -> Oracle:
 def mask_told() -> Oracle:
     """`vfn-p` whose mask knows what comes; its networks have predictions."""
     return Oracle("vfn-p", compact("vfn-p"), "mask")
+
+
+def unshaded() -> PredictionAware:
+    """`vfn-p` whose own predictions are drawn without shading."""
+    config = compact("vfn-p")
+    return PredictionAware("vfn-p", replace(config, chain=replace(config.chain, shade=False)))
 
 
 def hits(rows: Sequence[Row], name: str) -> np.ndarray:
@@ -150,7 +160,9 @@ def page(rows: Sequence[Row], about: Sequence[str]) -> list[str]:
     if len(halves) > 1:
         lines += ["", "## Who has to be told", ""]
         lines += ["What comes is told to the networks alone, or to the mask alone; the other has the agent's"]
-        lines += ["own predictions.", "", markdown_row(MEANS), markdown_row(["---"] * len(MEANS))]
+        lines += ["own predictions. `unshaded`: nobody is told; the agent's own predictions are drawn as the"]
+        lines += ["oracle's are, without the shading that stands for doubt.", ""]
+        lines += [markdown_row(MEANS), markdown_row(["---"] * len(MEANS))]
         lines += [markdown_row(means(w, arm, arms[arm])) for w, arms in halves.items() for arm in HALVES]
         lines += ["", markdown_row(DIFFERENCES), markdown_row(["---"] * len(DIFFERENCES))]
         pairs = [(half, other) for other in (WITH, ORACLE) for half in HALVES]

@@ -23,6 +23,7 @@ from policy.safety import SafetyConfig
 PERCEPTION = 125.0  # m, what an AV's own sensors reach (definitions.md)
 # options that shipped episodes do not name: their defaults are what was done without them
 NEWER = {
+    "chain": ("shade",),
     "observation": ("road_version", "signal_timing"),
     "safety": ("assisted",),
     "vfn": ("latent", "others", "parts", "meets"),

@@ -26,6 +26,7 @@ class ChainConfig:
     horizon: int = 20  # frames of 0.2 s: 4 s (P, Table I)
     every: int = 5  # the VFN takes every fifth frame, M = 4; paper: 1, M = 20
     source: Literal["hpn", "gp_raster"] = "hpn"  # gp_raster: maps rendered from the forecast as it is
+    shade: bool = True  # vehicles are drawn the darker the less sure their places are (`shade`)
 
     def __post_init__(self) -> None:
         """Raises BadInput for a number out of range."""
@@ -116,6 +117,8 @@ def predict(
             raise ValueError("the kinematic branch needs the traffic along the lanes")
         corrected = apply(hpn.kinematic, vehicle_inputs(scene, forecast, traffic), forecast)
         forecast = corrected.forecast
+    if not config.shade:
+        corrected = None  # what is left of it shades
     m, every = config.horizon, config.every
     states = (forecast.x[:, :m], forecast.y[:, :m], forecast.speed[:, :m], forecast.heading[:, :m])
     rows, valid = rows_ahead(scene, *states)

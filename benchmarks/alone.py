@@ -4,9 +4,10 @@
         [--arms vfn-p ...] [--weights FILE] [--runs runs/alone] [--workers 2] [--out docs/results/alone.md]
 
 Preset `unguarded`, no mask: the best valued action is carried out. `vfn-p-present` is `vfn-p` shown the
-present in place of every predicted map. `conv3d-dqn` and `conv3d-a2c`, of a demonstrator, see maps alone; so
-do `vfn-p` and `vfn`, beside their own speed, lanes and command. FILE is a network that is shown what `vfn-p`
-is, and drives too. The same command goes on where it stopped.
+present in place of every predicted map; `vfn-p-unshaded`, which drives where it is asked for, has its own
+predictions drawn without the shading that stands for doubt. `conv3d-dqn` and `conv3d-a2c`, of a demonstrator,
+see maps alone; so do `vfn-p` and `vfn`, beside their own speed, lanes and command. FILE is a network that is
+shown what `vfn-p` is, and drives too. The same command goes on where it stopped.
 """
 
 import argparse
@@ -25,6 +26,8 @@ from cosim.report import run_folder, statistics
 from cosim.report.figures import Row
 from cosim.types import Policy
 from cosim.workers.tasks import OK
+from policy.agents.approaches import compact
+from policy.agents.prediction_aware import PredictionAware
 from policy.attribution import PRESENT, Replaced
 from sumo_scenarios import names
 
@@ -33,7 +36,8 @@ EVERY = "all worlds"
 CRASHED = "av_involved_collisions"
 WEIGHTS = "COSIM_ALONE_WEIGHTS"  # the environment variable that names the file to the workers
 ARMS = (  # functions of this module
-    *("given", "vfn_p", "vfn_p_present", "vfn", "conv3d_dqn", "conv3d_a2c", "vfn_p_demonstrated"),
+    *("given", "vfn_p", "vfn_p_present", "vfn_p_unshaded", "vfn", "conv3d_dqn", "conv3d_a2c"),
+    "vfn_p_demonstrated",
 )
 COLUMNS = (
     "world", "network", "episodes", "with an AV in a collision", "AV-caused", "mission fulfilled",
@@ -55,6 +59,12 @@ def vfn_p_present() -> Policy:
     """`vfn-p` without the mask, whose predicted maps show the present."""
     agent = questioned("vfn-p")
     return Replaced(agent.name, replace(agent.config, mask=False), ("predicted maps", PRESENT))
+
+
+def vfn_p_unshaded() -> Policy:
+    """`vfn-p` without the mask, whose predicted maps are drawn without the shading that stands for doubt."""
+    config = compact("vfn-p")
+    return PredictionAware("vfn-p", replace(config, mask=False, chain=replace(config.chain, shade=False)))
 
 
 def conv3d_dqn() -> Policy:
@@ -143,7 +153,10 @@ def main() -> None:
     )
     options(parser, "alone", "dense", names())
     shipped = [arm.replace("_", "-") for arm in ARMS[1:]]
-    parser.add_argument("--arms", nargs="+", choices=shipped, default=shipped, help="default: all")
+    usual = [arm for arm in shipped if arm != "vfn-p-unshaded"]
+    parser.add_argument(
+        "--arms", nargs="+", choices=shipped, default=usual, help=f"default: {' '.join(usual)}"
+    )
     parser.add_argument("--weights", metavar="FILE", help="a further network: `given-alone`")
     args = parser.parse_args()
     if args.weights:

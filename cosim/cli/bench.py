@@ -101,6 +101,12 @@ def _add_attribution(kinds: arguments.SubCommands) -> None:
         "--closed-loop", action="store_true", help="also drive whole episodes with each input replaced"
     )
     command.add_argument(
+        "--replace",
+        action="append",
+        metavar="INPUT",
+        help="with --closed-loop this input alone, as 'all maps'; repeatable (default: every one)",
+    )
+    command.add_argument(
         "--by", default="dt_mission_m", metavar="FIGURE", help="of closed_loop.csv: which one is tested"
     )
     arguments.add(command, "--workers", default=1)
@@ -118,6 +124,7 @@ def work_attribution(args: argparse.Namespace) -> int:
     out = prepare_folder(args.out)
     what = (args.policy, args.scenario, args.demand, args.seeds, args.svo, args.duration)
     how = {"errors": args.errors, "closed_loop": args.closed_loop, "by": args.by, "workers": args.workers}
+    how["replaced"] = args.replace or ()
     attribution(out, *what, **how, command="cosim " + shlex.join(sys.argv[1:]))
     print((out / PAGE).read_text(encoding="utf-8"))
     return 0

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from cosim.batch.episode_runner import EpisodeRunner
 from cosim.batch.matrix import Plan
 from cosim.batch.record import planned
-from cosim.errors import BadInput
+from cosim.errors import BadInput, one_of
 from cosim.files import write_csv
 from cosim.learning.prediction_data import spread
 from cosim.policies import make
@@ -95,21 +95,25 @@ def attribution(
     errors: str | None = None,
     closed_loop: bool = False,
     by: str = BY,
+    replaced: Sequence[str] = (),
     workers: int = 1,
     command: str = "",
 ) -> None:
     """Drive and ask; writes TABLE, PICTURE and PAGE into `out`.
 
     `closed_loop`: also drives every episode with each of `policy.attribution.replacements`: DRIVEN, and a
-    part of PAGE, where the worlds are tested by the figure `by`. `errors`: of the human drivers.
+    part of PAGE, where the worlds are tested by the figure `by`. `replaced`: these inputs alone, not all.
+    `errors`: of the human drivers.
 
-    Raises BadInput as `cosim.batch.record.planned`, for a policy without a value network, and for a figure
-    that is none of FIGURES.
+    Raises BadInput as `cosim.batch.record.planned`, for a policy without a value network, for a figure that
+    is none of FIGURES, and for an input that a policy does not have.
     """
     if by not in FIGURES:
         raise BadInput(f"is none of {', '.join(FIGURES)}", field="--by", value=by)
     for policy in policies:
-        questioned(policy)
+        ways = {what[0] for what in _ways(questioned(policy))}
+        for name in replaced:
+            one_of(name, sorted(ways), "--replace")
     plan = planned(scenarios, [demand], [], policies, seeds, svo_deg, duration, errors=errors)
     tasks = [cell.task(case) for cell, case in plan.cases()]
     driven = spread(LocalEngine(Asking, workers=workers), tasks, "attribution")
@@ -120,19 +124,26 @@ def attribution(
     page = markdown(driven, tables, command)
     if closed_loop:
         rows: list[dict[str, Any]] = []
-        for part in closed(plan, workers):
+        for part in closed(plan, workers, replaced):
             rows += part
             write_csv(out / DRIVEN, rows)
         page += "\n" + closed_markdown(rows, by)
     (out / PAGE).write_text(page, encoding="utf-8")
 
 
-def closed(plan: Plan, workers: int = 1) -> Iterator[list[dict[str, Any]]]:
-    """Per policy, world and replacement (none first): a row per episode, SHARED and FIGURES."""
+def _ways(agent: PredictionAware) -> list[tuple[str, str]]:
+    """The (input, replacement) with which an agent can drive."""
+    return [*replacements(agent.vfn, agent.observation.frames), ORACLE]
+
+
+def closed(plan: Plan, workers: int = 1, replaced: Sequence[str] = ()) -> Iterator[list[dict[str, Any]]]:
+    """Per policy, world and replacement (none first; of `replaced` inputs alone, where some are named): a row
+    per episode, SHARED and FIGURES."""
     for cell in plan.cells:
         agent = questioned(cell.case.policy)
         tasks = [one.task(case) for one, case in plan.cases() if one is cell]
-        for what in (NOTHING, *replacements(agent.vfn, agent.observation.frames), ORACLE):
+        asked = [what for what in _ways(agent) if not replaced or what[0] in replaced]
+        for what in (NOTHING, *asked):
             engine = LocalEngine(Replacing, (None if what is NOTHING else what,), workers=workers)
             driven = spread(engine, tasks, f"{cell.case.what}: {' '.join(what).strip()}")
             keys = ("policy", "scenario", "seed", *SHARED, *FIGURES)

@@ -81,6 +81,18 @@ def test_driving_with_an_input_replaced_is_compared_with_driving_by_all_of_them(
     assert "| map branch | its last layer zero |" in text
 
 
+def test_one_input_alone_is_replaced_where_it_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--policy", "vfn-p", "--scenario", "merge", "--demand", "contested", "--closed-loop"]
+    words += ["--seeds", "150000:150001", "--duration", "1.2", "--out", str(tmp_path)]
+    assert main(["bench", "attribution", *words, "--replace", "all maps"]) == 0
+    with (tmp_path / "closed_loop.csv").open(newline="") as file:
+        assert [row["input"] for row in csv.DictReader(file)] == ["nothing", "all maps"]
+    assert main(["bench", "attribution", *words, "--replace", "all map"]) == 2
+    assert "did you mean 'all maps'" in capsys.readouterr().err
+
+
 def test_a_policy_that_has_no_network_is_bad_input(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

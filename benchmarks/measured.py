@@ -134,7 +134,8 @@ def uses(place: Place) -> list[list[str]]:
     worlds = ("merge",) if place.small else ("merge", "exit", "roundabout", "intersection")
     flags = ["--policy", LEARNED, "--demand", "contested", "--svo", "60", "--workers", "2", "--closed-loop"]
     flags += [word for world in worlds for word in ("--scenario", world)]
-    flags += ["--seeds", "200000:200001", "--duration", "2"] if place.small else ["--seeds", "200000:200010"]
+    flags += ["--replace", "all maps", "--replace", "map branch"]
+    flags += ["--seeds", "200000:200001", "--duration", "2"] if place.small else ["--seeds", "200000:200020"]
     return [["cosim.cli.main", "bench", "attribution", *flags, "--out", str(place.out / "uses")]]
 
 

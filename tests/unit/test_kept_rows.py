@@ -18,6 +18,7 @@ PAGES = {
     "foresight": 240,
     "forced_entry": 200,
     "humans": 2000,
+    "lawful_worlds": 1000,
     "learned": 80,
 }  # episodes an arm
 

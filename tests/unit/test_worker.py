@@ -7,6 +7,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
+from multiprocessing import resource_tracker
 from pathlib import Path
 
 import pytest
@@ -168,6 +169,7 @@ def test_a_factory_that_refuses_leaves_no_process() -> None:
 
 
 def test_closing_closes_the_object_the_process_and_the_files(tmp_path: Path) -> None:
+    resource_tracker.ensure_running()  # the first worker of a process starts it, and it stays
     files = len(os.listdir("/proc/self/fd"))
     worker = Worker(Served, str(tmp_path / "bequest"))
     pid = worker.pid

@@ -39,7 +39,7 @@ from cosim.seeding import TUNING_SEEDS
 from cosim.workers.memory import keep_freed_memory
 from cosim.workers.worker import Worker
 
-POLICY = "vfn-p-demonstrated"
+POLICY = "vfn-p"
 TARGET_MS = 4.0  # a decision, per AV
 AVS = (25, 50, 100)
 SHARE = 5  # one vehicle in so many is an AV

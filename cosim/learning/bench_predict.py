@@ -13,7 +13,7 @@ from cosim.files import write_csv
 from cosim.learning import map_bench, map_figures
 from cosim.learning.prediction_scores import LEVEL, Predicted, Scores
 from cosim.recording.file import Recording, read
-from cosim.recording.folder import Folder
+from cosim.recording.folder import Folder, fits
 from cosim.recording.views import Windows, windows
 from cosim.report import statistics
 from cosim.road import RoadMap
@@ -50,11 +50,11 @@ def bench_predict(
     called = [LED, *(predictor.name for predictor in made)]
     if twice := next((name for name in called if called.count(name) > 1), None):
         raise BadInput("two predictors are called so", field="predictor", value=twice)
-    keys = [key for key in folder.episodes() if seeds is None or int(key.rsplit("-", 1)[1]) in seeds]
+    keys = folder.episodes(seeds)
     scores = Scores(HORIZON, DT)
     for key in shown(keys, len(keys), "bench predict", "episodes"):
         recording = read(folder.episode_file(key))
-        if _wanted(recording, scenarios, behaviors):
+        if fits(recording.case, scenarios, behaviors):
             measure(scores, recording, made, folder.road(recording))
     if not scores.cases:
         raise BadInput("holds no recording of these scenarios, behaviours and seeds", file=folder.path)
@@ -247,13 +247,6 @@ def plot(file: Path, scores: Scores) -> None:
     figure.tight_layout()
     figure.savefig(file, dpi=110)
     plt.close(figure)
-
-
-def _wanted(recording: Recording, scenarios: Sequence[str], behaviors: Sequence[str]) -> bool:
-    case = recording.case
-    return (not scenarios or case["scenario"] in scenarios) and (
-        not behaviors or case["behavior"] in behaviors
-    )
 
 
 def _figure(row: Mapping[str, Any]) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 from cosim.errors import BadInput
 from cosim.learning.prediction_data import EpisodeReader, followed, spread
 from cosim.recording.file import read
-from cosim.recording.folder import Folder
+from cosim.recording.folder import Folder, fits
 from cosim.report import statistics
 from cosim.types import COMPACT, Floats
 from cosim.workers.engines import LocalEngine
@@ -100,9 +100,8 @@ def measure(
     source = Folder(folder)
     keys = [
         key
-        for key in source.episodes()
-        if (seeds is None or int(key.rsplit("-", 1)[1]) in seeds)
-        and _wanted(read(source.episode_file(key)).case, scenarios, behaviors)
+        for key in source.episodes(seeds)
+        if fits(read(source.episode_file(key)).case, scenarios, behaviors)
     ]
     chosen = hpn_weights() if weights is None else weights
     engine = LocalEngine(MapMeter, ({k: str(p) for k, p in chosen.items()}, stride), workers=workers)
@@ -111,12 +110,6 @@ def measure(
     if not measured:
         raise BadInput("no recorded episode is long enough to measure maps on", file=folder)
     return measured
-
-
-def _wanted(case: Mapping[str, Any], scenarios: Sequence[str], behaviors: Sequence[str]) -> bool:
-    return (not scenarios or case["scenario"] in scenarios) and (
-        not behaviors or case["behavior"] in behaviors
-    )
 
 
 def rows(episodes: Sequence[EpisodeErrors]) -> list[dict[str, Any]]:

@@ -13,7 +13,7 @@ from cosim.errors import BadInput
 from cosim.files import prepare_folder
 from cosim.learning.configuration import configuration
 from cosim.learning.prediction_data import MAPLESS, EpisodeReader, episodes, followed, recorded_by, spread
-from cosim.recording.folder import Folder
+from cosim.recording.folder import Folder, seed_of
 from cosim.seeding import TRAINING_SEEDS, TUNING_SEEDS
 from cosim.types import COMPACT
 from cosim.workers.engines import LocalEngine
@@ -126,7 +126,7 @@ def _checked(paths: Sequence[str], seeds: range, field: str) -> list[tuple[Path,
     found = episodes([Path(p) for p in paths])
     if not found:
         raise BadInput("holds no episodes", field=field, value=", ".join(paths))
-    wrong = sorted({s for _, key in found if (s := int(key.rsplit("-", 1)[1])) not in seeds})
+    wrong = sorted({s for _, key in found if (s := seed_of(key)) not in seeds})
     if wrong:
         raise BadInput(
             f"seeds {seeds.start} to {seeds.stop - 1} are for this, not {wrong[0]} (cosim record --seeds)",
@@ -139,7 +139,7 @@ def _checked(paths: Sequence[str], seeds: range, field: str) -> list[tuple[Path,
 def _manifest(keys: Sequence[tuple[Path, str]]) -> dict[str, Any]:
     """What data it was, short enough for a card: how it was recorded, how much of it, and a hash."""
     names = sorted(key for _, key in keys)
-    seeds = [int(name.rsplit("-", 1)[1]) for name in names]
+    seeds = [seed_of(name) for name in names]
     folders = [Folder(path).manifest() for path in sorted({path for path, _ in keys})]
     return {
         "episodes": len(names),

@@ -13,6 +13,18 @@ from cosim.recording.file import FORMAT, Recording, read
 from cosim.road import RoadMap
 
 
+def seed_of(key: str) -> int:
+    """The seed of a recorded episode, by its key."""
+    return int(key.rsplit("-", 1)[1])
+
+
+def fits(case: Mapping[str, Any], scenarios: Sequence[str], behaviors: Sequence[str]) -> bool:
+    """Whether a recording is of one of these scenarios and behaviours; none named: of any."""
+    return (not scenarios or case["scenario"] in scenarios) and (
+        not behaviors or case["behavior"] in behaviors
+    )
+
+
 class Folder:
     """`DIR/manifest.json`, `DIR/episodes/KEY.parquet`, `DIR/roads/HASH.json`.
 
@@ -40,9 +52,10 @@ class Folder:
     def has(self, key: str) -> bool:
         return self.episode_file(key).is_file()
 
-    def episodes(self) -> list[str]:
-        """Keys of the episodes that are there, sorted."""
-        return sorted(file.stem for file in (self.path / "episodes").glob("*.parquet"))
+    def episodes(self, seeds: range | None = None) -> list[str]:
+        """Keys of the episodes that are there, sorted; with `seeds` of these alone."""
+        keys = sorted(file.stem for file in (self.path / "episodes").glob("*.parquet"))
+        return [key for key in keys if seeds is None or seed_of(key) in seeds]
 
     def manifest(self) -> dict[str, Any]:
         """Raises BadInput when this is not a folder of recordings."""

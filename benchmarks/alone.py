@@ -14,19 +14,21 @@ import argparse
 import os
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
+from benchmarks.foresight import unshaded
 from benchmarks.learned import asked, drivers, options, share
 from benchmarks.papers.agents import Agent, build
 from benchmarks.tables import markdown_row, write_page
 from cosim.cli.main import main as cosim
 from cosim.learning.attribution import questioned
+from cosim.policies.trained import config
 from cosim.report import run_folder, statistics
 from cosim.report.figures import Row
 from cosim.types import Policy
 from cosim.workers.tasks import OK
-from policy.agents.approaches import compact
 from policy.agents.prediction_aware import PredictionAware
 from policy.attribution import PRESENT, Replaced
 from sumo_scenarios import names
@@ -47,7 +49,7 @@ COLUMNS = (
 
 def given() -> Policy:
     """The network of `--weights` without the mask."""
-    return build(Agent("given alone", "vfn-p", weights=os.environ[WEIGHTS], mask="none"))
+    return PredictionAware("given alone", replace(config(Path(os.environ[WEIGHTS])), mask=False))
 
 
 def vfn_p() -> Policy:
@@ -63,8 +65,7 @@ def vfn_p_present() -> Policy:
 
 def vfn_p_unshaded() -> Policy:
     """`vfn-p` without the mask, whose predicted maps are drawn without the shading that stands for doubt."""
-    config = compact("vfn-p")
-    return PredictionAware("vfn-p", replace(config, mask=False, chain=replace(config.chain, shade=False)))
+    return unshaded(mask=False)
 
 
 def conv3d_dqn() -> Policy:

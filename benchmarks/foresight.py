@@ -64,10 +64,10 @@ def mask_told() -> Oracle:
     return Oracle("vfn-p", compact("vfn-p"), "mask")
 
 
-def unshaded() -> PredictionAware:
+def unshaded(*, mask: bool = True) -> PredictionAware:
     """`vfn-p` whose own predictions are drawn without shading."""
     config = compact("vfn-p")
-    return PredictionAware("vfn-p", replace(config, chain=replace(config.chain, shade=False)))
+    return PredictionAware("vfn-p", replace(config, mask=mask, chain=replace(config.chain, shade=False)))
 
 
 def hits(rows: Sequence[Row], name: str) -> np.ndarray:

@@ -146,7 +146,7 @@ class Ensemble:
 
         teachers = [self._read(Path(file)) for file in c.teachers]
         teachers += [self._network(k, shown) for k in range(networks)]
-        if not self._finished(path):
+        if not finished(path, self.config):
             pupil = self._learner(PUPIL)
             specialists = [(one, self._read(Path(one.file))) for one in c.specialists]
             taught = Teachers(teachers, specialists)
@@ -158,7 +158,7 @@ class Ensemble:
     def _network(self, k: int, shown: Callable[[int], None]) -> VFN:
         """The `k`-th network, learned from the replay buffer or read."""
         c, path = self.config.ensemble, self.folder / f"network-{k}.safetensors"
-        if self._finished(path):
+        if finished(path, self.config):
             return self._read(path)
         learner = self._learner(str(k))
         learner.update_target()
@@ -209,9 +209,6 @@ class Ensemble:
 
     def _rate(self, update: int, updates: int) -> float:
         return rate(replace(self.config, iterations=updates), update)
-
-    def _finished(self, path: Path) -> bool:
-        return finished(path, self.config)
 
 
 def finished(path: Path, config: VfnTraining) -> bool:

@@ -145,12 +145,11 @@ class Explorer(PredictionAware):
         q = q.copy()
         if self.explore.sample:  # the largest of preferences + Gumbel noise is a draw from their softmax
             mine = [b for b, av in enumerate(inputs.scene.agents) if av in self.learning]
-            if self._epsilon > 0.0:
-                q[mine] += self._rng.gumbel(size=(len(mine), q.shape[1])).astype(np.float32)
-                for b in mine:
-                    av = inputs.scene.agents[b]
-                    if not self._holds(av, q[b]):
-                        self.hold(av, MetaAction(int(q[b].argmax())), self.explore.sample - 1)
+            q[mine] += self._rng.gumbel(size=(len(mine), q.shape[1])).astype(np.float32)
+            for b in mine:
+                av = inputs.scene.agents[b]
+                if not self._holds(av, q[b]):
+                    self.hold(av, MetaAction(int(q[b].argmax())), self.explore.sample - 1)
             return q
         for b, av in enumerate(inputs.scene.agents):
             if av not in self.learning:

@@ -6,7 +6,8 @@ is slower, SUMO drives by itself, so that it brakes as hard as it must. Between 
 given (V2V), because SUMO's cooperation ends where a speed is commanded.
 
 A human close behind may not be looking: the car then keeps a longer headway, and as soon as the one behind
-closes in without braking it uses that room up, later and harder on its own brakes, until he brakes.
+closes in without braking it uses that room up, later and harder on its own brakes, until he brakes. AVs
+ahead of it are told (V2V), and make room before the end of their queue has used its own up.
 """
 
 import math
@@ -46,6 +47,7 @@ HEADWAY = 0.8, 1.8  # s to the leader; with a human that close behind
 CLOSES = 3.0, 2.0, 0.5  # s to contact, m/s2 that would avoid it, and the share of it of who heeds
 ROOM = (1.5, 0.2), (3.0, 0.5)  # s to contact, s to the leader that it makes do with; between them linear
 FLEES = 1.0  # s that this lasts at least
+TOLD = 8.0, 30.0  # s to contact of the AVs ahead that are told, m between one vehicle and the next up to them
 STOPS = 0.3  # s to the leader at walking pace and below
 RETURNS = 0.1, 0.2  # s of headway won back per s, below and above `HEADWAY`
 
@@ -91,11 +93,15 @@ class Assistance(Commander):
         self._begun: list[Intervention] = []
         self._standing_gaps: dict[str, float] = {}  # human -> m
         self._ways: dict[str, tuple[frozenset[str], frozenset[str]]] = {}  # edge -> `_ways_beside`
+        # AV -> s until somebody further behind, who does not brake, would be there
+        self._told: dict[str, float] = {}
+        self._heard = self._told  # in the step before
 
     def drive(self) -> None:
         """Before every simulation step: the agent's wish where it is the slower one, else SUMO's driver."""
         get = sumo.vehicle
         now = sumo.simulation.getTime()
+        self._heard, self._told = self._told, {}
         for name, state in self.controlled.items():
             speed = get.getSpeed(name)
             self._mind_follower(name, speed, state, now)
@@ -182,7 +188,10 @@ class Assistance(Commander):
         if human:
             gap += self._standing_gap(follower)
         contact = self._contact(name, speed, follower, max(gap, 0.1)) if human else math.inf
-        if contact < CLOSES[0]:
+        if contact < math.inf:
+            self._tell(name, follower, gap)
+        contact = min(contact, self._heard.get(name, math.inf))
+        if contact < math.inf:
             if now >= state.flees:
                 self._begun.append(Intervention(now, name, "emergency: vehicle behind"))
             state.flees = now + FLEES
@@ -215,6 +224,21 @@ class Assistance(Commander):
         _, least, heeds = CLOSES
         asked = closing**2 / (2.0 * gap) + max(-get.getAcceleration(name), 0.0)
         return math.inf if asked < least or -get.getAcceleration(follower) > heeds * asked else gap / closing
+
+    def _tell(self, name: str, follower: str, gap: float) -> None:
+        """The AVs ahead hear of a follower `gap` m behind `name`, whoever drives between."""
+        get, (soon, apart) = sumo.vehicle, TOLD
+        fast, away = get.getSpeed(follower), gap  # m/s, m
+        while ahead := get.getLeader(name, apart):
+            leader, free = ahead
+            if not leader or free > apart:
+                return
+            away += get.getLength(name) + max(free, 0.0)
+            closing = fast - get.getSpeed(leader)
+            if away > soon * closing:
+                return
+            self._told[leader] = min(away / closing, self._told.get(leader, math.inf))
+            name = leader
 
     def _standing_gap(self, name: str) -> float:
         """m, which SUMO takes off a follower's gap."""

@@ -78,6 +78,9 @@ class EnsembleConfig:
     distillation: int = 5_000  # updates of the one that is taught
     refused: float = 1.0  # weight of the refused actions' loss, in place of `DdqnConfig.refused`
     n_step: int = 8  # in place of `ReplayConfig.n_step`
+    most: float = (
+        90.0  # deg: the largest phi that a teacher is asked with; a larger one is taught as this one
+    )
     specialists: tuple[Specialist, ...] = ()
     runs: tuple[str, ...] = ()  # folders of other trainings whose drives are learned from besides
     drives: tuple[str, ...] = ()  # SCENARIO/DEMAND whose drives count once more; named twice: twice more
@@ -92,6 +95,8 @@ class EnsembleConfig:
             positive="updates distillation n_step",
             not_negative="networks by_copies copies shrink refused",
         )
+        if not 45.0 <= self.most <= 90.0:
+            raise BadInput("must be an angle from 45 to 90 degrees", field="most", value=self.most)
 
     def __bool__(self) -> bool:
         """Whether there is anything to learn from."""

@@ -48,12 +48,20 @@ class Teachers(NamedTuple):
 
     everywhere: list[VFN]  # their mean
     specialists: list[tuple[Specialist, VFN]]
+    most: float = 90.0  # deg (`EnsembleConfig.most`)
 
     @torch.no_grad()
     def values(self, batch: Advised) -> torch.Tensor:
         """[B,parts,A] for these states."""
         worlds = [label.rpartition("/")[0] for label in batch.episodes]
-        values = torch.stack([network.apart(*batch.now) for network in self.everywhere]).mean(0)
+        phi = batch.now[3]
+        asked = at_most(phi, self.most)
+        values = torch.stack([network.apart(*batch.now[:3], asked) for network in self.everywhere]).mean(0)
+        if values.shape[1] > 1:  # so that they weigh by phi what they are worth by the angle asked with
+            own, others = values[:, :1], (values * asked[..., None]).sum(1, keepdim=True)
+            same = (asked == phi).all(1)[:, None, None]
+            rest = (others - own * phi[:, :1, None]) / phi[:, 1:, None].clamp(min=LEAST)
+            values = torch.where(same, values, torch.cat([own, rest], 1))
         for one, network in self.specialists:
             here = torch.tensor([name == one.world for name in worlds], device=values.device)
             if one.met:
@@ -66,6 +74,12 @@ class Teachers(NamedTuple):
                     parts = parts * (asked.clamp(min=LEAST) / phi.clamp(min=LEAST))[..., None]
                 values = torch.where(here[:, None, None], parts, values)
         return values
+
+
+def at_most(phi: torch.Tensor, most: float) -> torch.Tensor:
+    """[B,2] cosine and sine of the angles of `phi` [B,2], or of `most` deg where they are larger."""
+    limit = phi.new_tensor([math.cos(math.radians(most)), math.sin(math.radians(most))])
+    return torch.where((phi[:, :1] < limit[0]) & (most < 90.0), limit, phi)
 
 
 def turned(phi: torch.Tensor, turn: tuple[float, float]) -> torch.Tensor:
@@ -149,7 +163,7 @@ class Ensemble:
         if not finished(path, self.config):
             pupil = self._learner(PUPIL)
             specialists = [(one, self._read(Path(one.file))) for one in c.specialists]
-            taught = Teachers(teachers, specialists)
+            taught = Teachers(teachers, specialists, c.most)
             measured = self._taught(pupil, taught, lambda k: shown(networks * c.updates + k))
             checkpoint.save(path, {"vfn": pupil.online}, {"vfn": self.vfn}, measured, self._about)
         shown(total)

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import libsumo
 import numpy as np
 import pytest
 from conftest import Start, vehicle
@@ -18,6 +19,7 @@ from cosim.scenario import chosen_fleet, load
 from cosim.scenario.human_errors import levels
 from cosim.scenario.vet import vetted
 from cosim.simulation import assistance
+from cosim.simulation.sumo import SumoSimulator
 from cosim.types import (
     Command,
     Decision,
@@ -115,6 +117,29 @@ def test_the_car_makes_room_for_who_closes_in_and_does_not_brake() -> None:
     seeds = (100_103, 100_111, 100_115, 100_124)
     assert hit_from_behind(Unheeding, seeds) == [True] * 4
     assert hit_from_behind(Host, seeds) == [False] * 4
+
+
+class Unseeing(SumoSimulator):
+    """One human keeps his speed whoever is ahead; `told`: whether AVs hear of it from one behind."""
+
+    def look_away(self, name: str, told: bool) -> None:
+        assistance.TOLD = assistance.TOLD if told else (0.0, 0.0)
+        libsumo.vehicle.setSpeedMode(name, 0)
+        libsumo.vehicle.setSpeed(name, 13.0)
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_avs_ahead_make_room_for_a_queue_that_somebody_drives_into(start: Start, told: bool) -> None:
+    queue = [vehicle("first", "av", 160.0, speed=4.0), vehicle("last", "av", 151.0, speed=4.0)]
+    human = vehicle("human", "hv", 105.0, speed=13.0)
+    worker = start([*queue, human], simulator=Unseeing, preset=Preset.LAWFUL)
+    worker.call("look_away", "human", told)
+    hit = False
+    for _ in range(14):
+        lets_in = [Command("first", 4.0, 0, 0.4), Command("last", 30.0, 0, 0.4)]
+        frames = worker.call("advance", lets_in)[1]
+        hit = hit or any(c.victim_is_av for frame in frames for c in frame.events.collisions)
+    assert hit is not told
 
 
 def test_the_headway_is_longer_with_a_human_close_behind(start: Start) -> None:

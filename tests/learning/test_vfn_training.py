@@ -828,31 +828,45 @@ def test_a_specialist_may_be_kept_to_the_avs_that_meet_a_mission_vehicle(
     assert values[:, 0, MetaAction.ACCELERATE].nonzero().flatten().tolist() == taught
 
 
-def test_a_specialist_teaches_its_pupil_to_turn_at_another_phi() -> None:
-    """What it chooses at 52 degrees its pupil is taught to choose at 26, and at 0 and 90 as it does there."""
+def taught(
+    network: VFN, phi: float, turn: tuple[float, float] = (45.0, 45.0), most: float = 90.0
+) -> torch.Tensor:
+    """[1,A] action values that a pupil is taught for `phi` degrees by `network`, the only one that is asked."""
+    angle = torch.tensor([math.radians(phi)])
+    weights = torch.stack([angle.cos(), angle.sin()], 1)
+    now = (
+        *(torch.zeros(1, 3, 4, 8, 16, dtype=torch.uint8), torch.zeros(1, 3, 2, KINEMATIC_INPUTS)),
+        *(torch.zeros(1, SITUATION_INPUTS), weights),
+    )
+    batch = Advised(now, torch.ones(1, 5) > 0, torch.ones(1, 5) > 1, ["exit/contested/7"], 3)
+    turns = [] if turn[0] == turn[1] else [(Specialist("exit/contested", "a.b", turn=turn), network)]
+    return network.weighed(Teachers([network], turns, most).values(batch), weights)
 
-    def action_values(phi: float, turn: tuple[float, float]) -> torch.Tensor:
-        angle = torch.tensor([math.radians(phi)])
-        weights = torch.stack([angle.cos(), angle.sin()], 1)
-        now = (
-            *(torch.zeros(1, 3, 4, 8, 16, dtype=torch.uint8), torch.zeros(1, 3, 2, KINEMATIC_INPUTS)),
-            *(torch.zeros(1, SITUATION_INPUTS), weights),
-        )
-        batch = Advised(now, torch.ones(1, 5) > 0, torch.ones(1, 5) > 1, ["exit/contested/7"], 3)
-        one = Specialist("exit/contested", "a.b", turn=turn)
-        return network.weighed(Teachers([network], [(one, network)]).values(batch), weights)
 
+@pytest.fixture
+def two_parts() -> VFN:
     torch.manual_seed(0)
     network = VFN(replace(TINY, parts=2))
     torch.nn.init.normal_(network.value.weight)
-    as_it_is = (45.0, 45.0)
+    return network
+
+
+def test_no_teacher_is_asked_with_more_than_the_largest_phi(two_parts: VFN) -> None:
+    """What is worth most to it at 75 degrees its pupil is taught at 90, and at 60 what is at 60."""
+    for pupil, teacher in ((90.0, 75.0), (80.0, 75.0), (60.0, 60.0)):
+        torch.testing.assert_close(taught(two_parts, pupil, most=75.0), taught(two_parts, teacher))
+    assert not torch.allclose(taught(two_parts, 90.0), taught(two_parts, 75.0))
+
+
+def test_a_specialist_teaches_its_pupil_to_turn_at_another_phi(two_parts: VFN) -> None:
+    """What it chooses at 52 degrees its pupil is taught to choose at 26, and at 0 and 90 as it does there."""
+    turn = 26.0, 52.0
     for pupil, teacher in ((26.0, 52.0), (13.0, 26.0), (58.0, 71.0)):
-        mine, theirs = action_values(pupil, (26.0, 52.0)), action_values(teacher, as_it_is)
-        torch.testing.assert_close(mine, theirs)
-        assert not torch.allclose(mine, action_values(pupil, as_it_is))
+        mine = taught(two_parts, pupil, turn)
+        torch.testing.assert_close(mine, taught(two_parts, teacher))
+        assert not torch.allclose(mine, taught(two_parts, pupil))
     for phi in (0.0, 90.0):
-        mine, theirs = action_values(phi, (26.0, 52.0)), action_values(phi, as_it_is)
-        torch.testing.assert_close(mine, theirs, atol=1e-2, rtol=1e-2)
+        torch.testing.assert_close(taught(two_parts, phi, turn), taught(two_parts, phi), atol=1e-2, rtol=1e-2)
 
 
 def test_an_angle_that_none_can_turn_at_is_bad_input() -> None:

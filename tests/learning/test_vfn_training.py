@@ -831,7 +831,7 @@ def test_a_specialist_may_be_kept_to_the_avs_that_meet_a_mission_vehicle(
 def taught(
     network: VFN, phi: float, turn: tuple[float, float] = (45.0, 45.0), most: float = 90.0
 ) -> torch.Tensor:
-    """[1,A] action values that a pupil is taught for `phi` degrees by `network`, the only one that is asked."""
+    """[1,A] action values that a pupil is taught for `phi` degrees by `network`, its only teacher."""
     angle = torch.tensor([math.radians(phi)])
     weights = torch.stack([angle.cos(), angle.sin()], 1)
     now = (

@@ -57,6 +57,7 @@ PARTS: dict[str, dict[str, object]] = {
     "the longer headway": {"HEADWAY": (0.8, 0.8)},
     "the use of the room ahead": {"CLOSES": (0.0, 0.0, 0.0)},
     "both": {"CLOSE": 0.0},
+    "telling AVs ahead": {"TOLD": (0.0, 0.0)},
 }
 
 

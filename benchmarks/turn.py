@@ -44,6 +44,7 @@ from cosim.report.statistics import CONFIDENCE, RESAMPLES, Figure, holm, mean, p
 from cosim.scenario.episode_id import EpisodeId
 from cosim.scenario.human_errors import NONE
 from cosim.scenario.manifest import digests
+from cosim.scenario.policy_name import read as read_name
 from cosim.seeding import FIRST_TEST_SEED
 from cosim.types import Floats, Ints
 from cosim.workers.engines import LocalEngine
@@ -264,10 +265,10 @@ def main() -> None:
     seeds = args.seeds or range(FIRST_TEST_SEED, FIRST_TEST_SEED + args.episodes)
     asked = f"--seeds {seeds.start}:{seeds.stop}" if args.seeds else f"--episodes {args.episodes}"
     asked += "" if args.errors == NONE else f" --errors {args.errors}"
-    weights = weights_of(args.policy)
-    done = {k: d for k, d in read(kept).items() if d.policy != args.policy or d.weights == weights}
+    policy, weights = read_name(args.policy).text, weights_of(args.policy)
+    done = {k: d for k, d in read(kept).items() if d.policy != policy or d.weights == weights}
     for world in args.worlds:
-        plan = partial(planned, [world], [DEMAND], [], [args.policy], seeds, errors=args.errors)
+        plan = partial(planned, [world], [DEMAND], [], [policy], seeds, errors=args.errors)
         cases = [
             case
             for phi in PHIS
@@ -280,7 +281,7 @@ def main() -> None:
             done[key] = replace(drive, weights=weights)
         write_csv(kept, [asdict(done[key]) for key in sorted(done)])
     drives = {
-        world: [d for d in done.values() if d.world == world and d.policy == args.policy and d.seed in seeds]
+        world: [d for d in done.values() if d.world == world and d.policy == policy and d.seed in seeds]
         for world in args.worlds
     }
     lines = [

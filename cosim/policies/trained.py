@@ -8,11 +8,10 @@ from cosim.errors import BadInput
 from cosim.files.yaml_input import dataclass_from
 from cosim.scenario.policy_name import PolicyName
 from cosim.types import COMPACT, PAPER, ObservationConfig
-from policy.agents.approaches import APPROACHES, AgentConfig, configure, shipped, vfn_of
+from policy.agents.approaches import APPROACHES, AgentConfig, chain_of, configure, shipped, vfn_of
 from policy.agents.prediction_aware import PredictionAware
 from policy.checkpoint import read_card, sha256
 from policy.networks.hpn import HpnConfig
-from policy.prediction.chain import ChainConfig
 from policy.prediction.traffic import TrafficConfig
 from policy.safety import SafetyConfig
 
@@ -47,7 +46,7 @@ def config(weights: Path) -> AgentConfig:
     hpn = shipped("hpn")
     other = hpn is not None and about.get("hpn_sha256", sha256(hpn)) != sha256(hpn)
     return replace(
-        configure(approach, seen, section(ChainConfig, "chain"), section(HpnConfig, "hpn"), vfn),
+        configure(approach, seen, chain_of(card, file), section(HpnConfig, "hpn"), vfn),
         safety=section(SafetyConfig, "safety"),
         traffic=section(TrafficConfig, "traffic"),
         vfn_weights=weights,

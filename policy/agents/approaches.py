@@ -40,10 +40,12 @@ class AgentConfig:
 
 def compact(name: str) -> AgentConfig:
     """The compact configuration of an approach, with the weights that are shipped for it and, as their card
-    says it, the layout of its network."""
-    weights = shipped(name)
-    layout = VfnConfig() if weights is None else vfn_of(read_card(weights), weights.with_suffix(".json"))
-    config = configure(name, COMPACT, ChainConfig(), HpnConfig(), layout)
+    says it, the layout of its network and how its predicted maps are drawn."""
+    weights, layout, chain = shipped(name), VfnConfig(), ChainConfig()
+    if weights is not None:
+        card, file = read_card(weights), weights.with_suffix(".json")
+        layout, chain = vfn_of(card, file), chain_of(card, file)
+    config = configure(name, COMPACT, chain, HpnConfig(), layout)
     return replace(config, vfn_weights=weights, hpn_weights=shipped("hpn"))
 
 
@@ -94,6 +96,11 @@ def configure(
 def vfn_of(card: Mapping[str, Any], file: Path) -> VfnConfig:
     """The layout of the value network that the card `file` is of. Raises BadInput naming it and the field."""
     return dataclass_from(VfnConfig, card["configs"].get("vfn", {}), file, "configs.vfn")
+
+
+def chain_of(card: Mapping[str, Any], file: Path) -> ChainConfig:
+    """How the maps were predicted that the network learned from. Raises BadInput as `vfn_of`."""
+    return dataclass_from(ChainConfig, card["data"].get("chain", {}), file, "data.chain")
 
 
 def shipped(name: str) -> Path | None:

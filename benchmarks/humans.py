@@ -54,10 +54,11 @@ COLUMNS = (
 # What is taken away -> the constants of cosim.simulation.assistance without it.
 PARTS: dict[str, dict[str, object]] = {
     "nothing": {},
-    "the longer headway": {"HEADWAY": (0.8, 0.8)},
-    "the use of the room ahead": {"CLOSES": (0.0, 0.0, 0.0)},
+    "the longer headway": {"HEADWAY": (0.8, 0.8), "STANDS": (2.0, 2.0)},
+    "of it what it stands off": {"STANDS": (2.0, 2.0)},
+    "the use of the room ahead": {"CLOSES": (0.0, 0.0)},
+    "of it what AVs ahead are told": {"TOLD": (0.0, 0.0)},
     "both": {"CLOSE": 0.0},
-    "telling AVs ahead": {"TOLD": (0.0, 0.0)},
 }
 
 

@@ -44,7 +44,9 @@ WAITS = 15.0, 40.0, 55.0  # s of waiting at a line, and how impatient an AV is b
 IMPATIENCE = (0.8, 1.0, 1.0), (0.0, 0.4, 1.0)  # where AVs alone come, and where humans do
 CLOSE = 60.0  # m behind
 HEADWAY = 0.8, 1.8  # s to the leader; with a human that close behind
-CLOSES = 3.0, 2.0, 0.5  # s to contact, m/s2 that would avoid it, and the share of it of who heeds
+STANDS = 2.0, 5.0  # m to a standing leader; with the longer headway
+CLOSES = 3.0, 0.5  # s to contact, and the share of the braking that would avoid it of who heeds
+ASKED = 2.0, 0.5  # m/s2 that would avoid it: from there on the car makes room; goes on doing so
 ROOM = (1.5, 0.2), (3.0, 0.5)  # s to contact, s to the leader that it makes do with; between them linear
 FLEES = 1.0  # s that this lasts at least
 TOLD = 8.0, 30.0  # s to contact of the AVs ahead that are told, m between one vehicle and the next up to them
@@ -72,6 +74,7 @@ class Assisted(Controlled):
     crosses: float = 0.0  # s left of `CROSSES`
     headway: float = HEADWAY[0]  # s
     tau: float = HEADWAY[0]  # s, its driver's, shorter at low speed
+    stands: float = STANDS[0]  # m, its driver's
     late: bool = False  # whether it brakes late
     flees: float = -math.inf  # s, until when it makes room for who does not brake behind it
     idled: float = 0.0  # s, for which the agent has asked for less than `KEEPS_MOVING`
@@ -187,7 +190,8 @@ class Assistance(Commander):
         human = bool(follower) and follower not in self.controlled
         if human:
             gap += self._standing_gap(follower)
-        contact = self._contact(name, speed, follower, max(gap, 0.1)) if human else math.inf
+        least = ASKED[now < state.flees]
+        contact = self._contact(name, speed, follower, max(gap, 0.1), least) if human else math.inf
         if contact < math.inf:
             self._tell(name, follower, gap)
         contact = min(contact, self._heard.get(name, math.inf))
@@ -195,9 +199,9 @@ class Assistance(Commander):
             if now >= state.flees:
                 self._begun.append(Intervention(now, name, "emergency: vehicle behind"))
             state.flees = now + FLEES
-            (soon, least), (later, most) = ROOM
+            (soon, shortest), (later, most) = ROOM
             left = min(max((contact - soon) / (later - soon), 0.0), 1.0)
-            headway = min(least + left * (most - least), state.headway)
+            headway = min(shortest + left * (most - shortest), state.headway)
         elif now < state.flees:
             return
         else:
@@ -207,23 +211,26 @@ class Assistance(Commander):
         state.headway, late = headway, headway < HEADWAY[0]
         # an IDM nears a line with speed = distance / headway: so it stops, and does not creep there
         tau = min(headway, max(STOPS, speed / COMFORT))
+        stands = STANDS[headway > HEADWAY[0]]
         if late != state.late:
-            state.late = late
+            state.late, state.stands = late, STANDS[0]
             _drive_as(name, LATE_TYPE if late else LAWFUL_TYPE, state.impatience)
-        elif tau == state.tau:
+        elif tau == state.tau and stands == state.stands:
             return
         state.tau = tau
         get.setTau(name, tau)
+        if stands != state.stands and not late:
+            state.stands = stands
+            get.setMinGap(name, stands)
 
-    def _contact(self, name: str, speed: float, follower: str, gap: float) -> float:
-        """s until a follower `gap` m behind is here; inf where he brakes, or need not yet."""
+    def _contact(self, name: str, speed: float, follower: str, gap: float, least: float) -> float:
+        """s until a follower `gap` m behind is here; inf where he brakes, or need not by `least` m/s2."""
         get = sumo.vehicle
         closing = get.getSpeed(follower) - speed
         if closing <= 0.0 or gap >= CLOSES[0] * closing:
             return math.inf
-        _, least, heeds = CLOSES
         asked = closing**2 / (2.0 * gap) + max(-get.getAcceleration(name), 0.0)
-        return math.inf if asked < least or -get.getAcceleration(follower) > heeds * asked else gap / closing
+        return math.inf if asked < least or -get.getAcceleration(follower) > CLOSES[1] * asked else gap / closing
 
     def _tell(self, name: str, follower: str, gap: float) -> None:
         """The AVs ahead hear of a follower `gap` m behind `name`, whoever drives between."""
@@ -233,7 +240,7 @@ class Assistance(Commander):
             leader, free = ahead
             if not leader or free > apart:
                 return
-            away += get.getLength(name) + max(free, 0.0)
+            away += get.getLength(name) + get.getMinGap(name) + free  # SUMO takes it off
             closing = fast - get.getSpeed(leader)
             if away > soon * closing:
                 return

@@ -67,7 +67,7 @@ _TYPES = (tc.POSITION_2D, *[tc.TYPE_DOUBLE] * 4, tc.TYPE_STRING)
 _HEADS = tuple(bytes((variable, 0, kind)) for variable, kind in zip(VEHICLES.values(), _TYPES, strict=True))
 Row = tuple[tuple[float, float], float, float, float, float, str]  # the values, in their order
 # Commands that change nothing of the above before the next step; after any other one SUMO is asked anew.
-LATER = {"setSpeed", "setTau", "setSpeedMode", "setLaneChangeMode", "changeLaneRelative"}
+LATER = {"setSpeed", "setTau", "setMinGap", "setSpeedMode", "setLaneChangeMode", "changeLaneRelative"}
 
 
 class Client:

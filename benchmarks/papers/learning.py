@@ -16,7 +16,7 @@ from benchmarks.tables import write_page
 from policy.agents import APPROACHES
 
 NAME = "learning"
-FURTHER = "[trainings/turn-0](trainings/turn-0/README.md)."
+FURTHER = "[trainings/sharp-1](trainings/sharp-1/README.md)."
 
 
 def write(settings: Settings) -> None:

@@ -22,9 +22,8 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from benchmarks.error_levels import fill
 from benchmarks.humans import DEMAND, LEVEL, PAGE
-from benchmarks.tables import markdown_row
+from benchmarks.tables import fill, markdown_row
 from cosim.batch.episode_runner import EpisodeRunner
 from cosim.batch.record import planned
 from cosim.cli.arguments import seeds as seeds_of

@@ -25,9 +25,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import sumo_scenarios
-from benchmarks.tables import markdown_row
+from benchmarks.tables import fill, markdown_row
 from cosim.episode import Episode, Hook, Step
-from cosim.files import whole
 from cosim.host import Host
 from cosim.report.statistics import Z, paired_change, pooled_rate, rate, share
 from cosim.scenario import Fleet, load
@@ -266,18 +265,6 @@ def _in_worlds(everywhere: str, level: str, kind: str) -> str:
     """With what it is in worlds that have it otherwise."""
     of = {world: _magnitudes(getattr(levels(world)[level].kinds, kind)) for world in sumo_scenarios.names()}
     return "; ".join([everywhere, *(f"{w}: {said}" for w, said in of.items() if said != everywhere)])
-
-
-def fill(page: Path, name: str, lines: Sequence[str]) -> None:
-    """Put the lines between the page's markers of this name."""
-    begin, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
-    text = page.read_text(encoding="utf-8")
-    before, _, rest = text.partition(begin)
-    _, marked, after = rest.partition(end)
-    if not marked:
-        raise SystemExit(f"{page}: no markers {begin} and {end}")
-    with whole(page) as draft:
-        draft.write_text("\n".join([before + begin, *lines, end + after]), encoding="utf-8")
 
 
 TABLES = {"stress": stress, "alone": alone, "cost": cost}

@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from benchmarks.error_levels import PAGE, fill
-from benchmarks.tables import markdown_row
+from benchmarks.error_levels import PAGE
+from benchmarks.tables import fill, markdown_row
 from benchmarks.worlds import WITH_MISSION
 from cosim.cli.main import main as cosim
 from cosim.report import run_folder, statistics

@@ -18,8 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.error_levels import fill
-from benchmarks.tables import markdown_row
+from benchmarks.tables import fill, markdown_row
 from cosim.cli.main import main as cosim
 from cosim.host import Host
 from cosim.report import run_folder, statistics

@@ -16,9 +16,8 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from benchmarks.error_levels import fill
 from benchmarks.humans import BLOCK, CAR, IDM, LEVEL, PAGE, label
-from benchmarks.tables import markdown_row, picture, stacked_bars
+from benchmarks.tables import fill, markdown_row, picture, stacked_bars
 from benchmarks.worlds import WITH_MISSION, WORLDS
 from cosim.cli.main import main as cosim
 from cosim.report import run_folder, statistics, wording

@@ -210,23 +210,46 @@ def stacked_bars(path: Path, panels: Mapping[str, Mapping[str, Mapping[str, int]
     drawn.savefig(path, dpi=DPI)
 
 
-READ = "<!-- read -->", "<!-- end of read -->"  # between them stands what a person read in the figures
+READ = "read"  # between these marks stands what a person read in the figures
+
+
+def marks(name: str) -> tuple[str, str]:
+    """What stands before and behind a part of a page that is kept, or made anew, by itself."""
+    return f"<!-- {name} -->", f"<!-- end of {name} -->"
+
+
+def marked(text: str, name: str) -> tuple[str, str, str] | None:
+    """What stands before the marks of this name, between and behind them; None where they are not there."""
+    begin, end = marks(name)
+    before, _, rest = text.partition(begin)
+    between, found, after = rest.partition(end)
+    return (before, between, after) if found else None
+
+
+def fill(page: Path, name: str, lines: Sequence[str]) -> None:
+    """Put the lines between the page's marks of this name. Raises SystemExit where it has none."""
+    begin, end = marks(name)
+    parts = marked(page.read_text(encoding="utf-8"), name)
+    if parts is None:
+        raise SystemExit(f"{page}: no markers {begin} and {end}")
+    with whole(page) as draft:
+        draft.write_text("\n".join([parts[0] + begin, *lines, end + parts[2]]), encoding="utf-8")
 
 
 def write_page(path: Path | None, lines: Sequence[str]) -> None:
     """The Markdown page, whole or not at all; printed where there is no path.
 
-    What the page that was there has between `READ` stays, before the first section; stderr asks to read it.
+    What the page that was there has between the marks of `READ` stays, before the first section; stderr asks
+    to read it.
     """
     if path is None:
         print("\n".join(lines))
         return
     path.parent.mkdir(parents=True, exist_ok=True)
-    begin, end = READ
-    if path.is_file() and begin in (old := path.read_text(encoding="utf-8")):
+    begin, end = marks(READ)
+    if path.is_file() and (parts := marked(path.read_text(encoding="utf-8"), READ)):
         first = next((k for k, line in enumerate(lines) if line.startswith("## ")), len(lines))
-        note = begin + old.partition(begin)[2].partition(end)[0] + end
-        lines = [*lines[:first], note, "", *lines[first:]]
+        lines = [*lines[:first], begin + parts[1] + end, "", *lines[first:]]
         print(f"{path}: does what stands between {begin} and {end} still hold?", file=sys.stderr)
     with whole(path) as draft:
         draft.write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")

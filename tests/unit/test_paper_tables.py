@@ -13,7 +13,7 @@ from benchmarks.papers.claims import APPROACHES, VFN, VFN_P
 from benchmarks.papers.driving import Settings
 from benchmarks.papers.guide import NONE, OTHER, OVERTAKES, SLOWS, YIELDS, guided
 from benchmarks.papers.pages import SAID_FIRST
-from benchmarks.tables import READ, Line, write_csv, write_page
+from benchmarks.tables import READ, Line, marks, write_csv, write_page
 from cosim.recording.replay_data import ReplayData, Track
 from cosim.report.run_folder import Run
 from cosim.road import Lane, RoadMap
@@ -204,7 +204,7 @@ def test_what_a_person_read_in_a_page_survives_the_page_made_anew(
 ) -> None:
     page = tmp_path / "page.md"
     write_page(page, ["# A page", "", "1 of 2.", "", "## More", "", "old"])
-    begin, end = READ
+    begin, end = marks(READ)
     page.write_text(page.read_text().replace("## More", f"{begin}\nIt is the car.\n{end}\n\n## More"))
     write_page(page, ["# A page", "", "2 of 2.", "", "## More", "", "new"])
     assert page.read_text() == (f"# A page\n\n2 of 2.\n\n{begin}\nIt is the car.\n{end}\n\n## More\n\nnew\n")

@@ -4,8 +4,8 @@
         [--arms vfn-p ...] [--weights FILE] [--runs runs/alone] [--workers 2] [--out docs/results/alone.md]
 
 Preset `unguarded`, no mask: the best valued action is carried out. `vfn-p-present` is `vfn-p` shown the
-present in place of every predicted map; `vfn-p-unshaded`, which drives where it is asked for, has its own
-predictions drawn without the shading that stands for doubt. `conv3d-dqn` and `conv3d-a2c`, of a demonstrator,
+present in place of every predicted map; `vfn-p-shaded`, which drives where it is asked for, has its own
+predictions drawn with the shading that stands for doubt. `conv3d-dqn` and `conv3d-a2c`, of a demonstrator,
 see maps alone; so do `vfn-p` and `vfn`, beside their own speed, lanes and command. FILE is a network that is
 shown what `vfn-p` is, and drives too. The same command goes on where it stopped.
 """
@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.foresight import unshaded
+from benchmarks.foresight import shaded
 from benchmarks.learned import asked, drivers, options, share
 from benchmarks.papers.agents import Agent, build
 from benchmarks.tables import markdown_row, write_page
@@ -38,7 +38,7 @@ EVERY = "all worlds"
 CRASHED = "av_involved_collisions"
 WEIGHTS = "COSIM_ALONE_WEIGHTS"  # the environment variable that names the file to the workers
 ARMS = (  # functions of this module
-    *("given", "vfn_p", "vfn_p_present", "vfn_p_unshaded", "vfn", "conv3d_dqn", "conv3d_a2c"),
+    *("given", "vfn_p", "vfn_p_present", "vfn_p_shaded", "vfn", "conv3d_dqn", "conv3d_a2c"),
     "vfn_p_demonstrated",
 )
 COLUMNS = (
@@ -63,9 +63,9 @@ def vfn_p_present() -> Policy:
     return Replaced(agent.name, replace(agent.config, mask=False), ("predicted maps", PRESENT))
 
 
-def vfn_p_unshaded() -> Policy:
-    """`vfn-p` without the mask, whose predicted maps are drawn without the shading that stands for doubt."""
-    return unshaded(mask=False)
+def vfn_p_shaded() -> Policy:
+    """`vfn-p` without the mask, whose predicted maps are drawn with the shading that stands for doubt."""
+    return shaded(mask=False)
 
 
 def conv3d_dqn() -> Policy:
@@ -154,7 +154,7 @@ def main() -> None:
     )
     options(parser, "alone", "dense", names())
     shipped = [arm.replace("_", "-") for arm in ARMS[1:]]
-    usual = [arm for arm in shipped if arm != "vfn-p-unshaded"]
+    usual = [arm for arm in shipped if arm != "vfn-p-shaded"]
     parser.add_argument(
         "--arms", nargs="+", choices=shipped, default=usual, help=f"default: {' '.join(usual)}"
     )

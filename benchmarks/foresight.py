@@ -9,9 +9,9 @@ simulation, driven on in a copy, predicts: fair, for errors that have not begun 
 mixed drivers, errors `stress`, preset `lawful`, on equal seeds. Near-misses of AVs come first, named before
 looking; then collisions and distances. The share of the oracle's gain is what `vfn-p` has of what
 `vfn-p-oracle` has less than `vfn`. In the worlds of `--halves` three more drive, which say where that gain
-comes from: what comes is told to the networks alone, or to the mask alone, or nothing is, but the agent's own
-predictions are drawn as the oracle's are, without the shading that stands for doubt. The same command goes on
-where it stopped.
+comes from: what comes is told to the networks alone, or to the mask alone, or nothing is, and the agent's own
+predictions, otherwise drawn as the oracle's are, have the shading that stands for doubt. The same command
+goes on where it stopped.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ BEHAVIOR, LEVEL = "mixed", "stress"
 WITHOUT, WITH, ORACLE = ARMS = ("vfn", "vfn-p", "vfn-p-oracle")
 PAIRS = ((WITH, WITHOUT), (ORACLE, WITHOUT), (ORACLE, WITH))
 # functions of this module
-HALVES = {"networks-told": "networks_told", "mask-told": "mask_told", "unshaded": "unshaded"}
+HALVES = {"networks-told": "networks_told", "mask-told": "mask_told", "shaded": "shaded"}
 TOGETHER = "all worlds"
 NEAR, HIT = "av_near_misses_ttc", "av_involved_collisions"
 DISTANCES = ("dt_mission_m", "dt_av_m", "dt_mean_m")
@@ -64,10 +64,10 @@ def mask_told() -> Oracle:
     return Oracle("vfn-p", compact("vfn-p"), "mask")
 
 
-def unshaded(*, mask: bool = True) -> PredictionAware:
-    """`vfn-p` whose own predictions are drawn without shading."""
+def shaded(*, mask: bool = True) -> PredictionAware:
+    """`vfn-p` whose own predictions are drawn with the shading that stands for doubt."""
     config = compact("vfn-p")
-    return PredictionAware("vfn-p", replace(config, mask=mask, chain=replace(config.chain, shade=False)))
+    return PredictionAware("vfn-p", replace(config, mask=mask, chain=replace(config.chain, shade=True)))
 
 
 def hits(rows: Sequence[Row], name: str) -> np.ndarray:
@@ -160,8 +160,8 @@ def page(rows: Sequence[Row], about: Sequence[str]) -> list[str]:
     if len(halves) > 1:
         lines += ["", "## Who has to be told", ""]
         lines += ["What comes is told to the networks alone, or to the mask alone; the other has the agent's"]
-        lines += ["own predictions. `unshaded`: nobody is told; the agent's own predictions are drawn as the"]
-        lines += ["oracle's are, without the shading that stands for doubt.", ""]
+        lines += ["own predictions, which are drawn as the oracle's are. `shaded`: nobody is told, and they are"]
+        lines += ["drawn with the shading that stands for doubt.", ""]
         lines += [markdown_row(MEANS), markdown_row(["---"] * len(MEANS))]
         lines += [markdown_row(means(w, arm, arms[arm])) for w, arms in halves.items() for arm in HALVES]
         lines += ["", markdown_row(DIFFERENCES), markdown_row(["---"] * len(DIFFERENCES))]

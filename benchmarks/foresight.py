@@ -160,8 +160,8 @@ def page(rows: Sequence[Row], about: Sequence[str]) -> list[str]:
     if len(halves) > 1:
         lines += ["", "## Who has to be told", ""]
         lines += ["What comes is told to the networks alone, or to the mask alone; the other has the agent's"]
-        lines += ["own predictions, which are drawn as the oracle's are. `shaded`: nobody is told, and they are"]
-        lines += ["drawn with the shading that stands for doubt.", ""]
+        lines += ["own predictions, which are drawn as the oracle's are. `shaded`: nobody is told, and they"]
+        lines += ["are drawn with the shading that stands for doubt.", ""]
         lines += [markdown_row(MEANS), markdown_row(["---"] * len(MEANS))]
         lines += [markdown_row(means(w, arm, arms[arm])) for w, arms in halves.items() for arm in HALVES]
         lines += ["", markdown_row(DIFFERENCES), markdown_row(["---"] * len(DIFFERENCES))]

@@ -230,7 +230,8 @@ class Assistance(Commander):
         if closing <= 0.0 or gap >= CLOSES[0] * closing:
             return math.inf
         asked = closing**2 / (2.0 * gap) + max(-get.getAcceleration(name), 0.0)
-        return math.inf if asked < least or -get.getAcceleration(follower) > CLOSES[1] * asked else gap / closing
+        heeds = -get.getAcceleration(follower) > CLOSES[1] * asked
+        return math.inf if asked < least or heeds else gap / closing
 
     def _tell(self, name: str, follower: str, gap: float) -> None:
         """The AVs ahead hear of a follower `gap` m behind `name`, whoever drives between."""

@@ -13,12 +13,7 @@ from policy.agents import POLICIES
 
 ROOT = Path(__file__).parents[2]
 PAGES = {
-    "alone": 100,
-    "alone_pair": 300,
-    "foresight": 240,
-    "forced_entry": 200,
     "humans": 2000,
-    "lawful_worlds": 1000,
     "learned": 80,
 }  # episodes an arm
 

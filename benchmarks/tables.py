@@ -219,11 +219,16 @@ def marks(name: str) -> tuple[str, str]:
 
 
 def marked(text: str, name: str) -> tuple[str, str, str] | None:
-    """What stands before the marks of this name, between and behind them; None where they are not there."""
+    """What stands before the marks of this name, between and behind them; None where they are not there.
+
+    Raises SystemExit where only the first is: what a person wrote behind it is not to be lost.
+    """
     begin, end = marks(name)
-    before, _, rest = text.partition(begin)
-    between, found, after = rest.partition(end)
-    return (before, between, after) if found else None
+    before, begun, rest = text.partition(begin)
+    between, ended, after = rest.partition(end)
+    if begun and not ended:
+        raise SystemExit(f"{begin} stands without {end}")
+    return (before, between, after) if begun else None
 
 
 def fill(page: Path, name: str, lines: Sequence[str]) -> None:

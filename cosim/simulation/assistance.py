@@ -241,7 +241,8 @@ class Assistance(Commander):
             leader, free = ahead
             if not leader or free > apart:
                 return
-            away += get.getLength(name) + get.getMinGap(name) + free  # SUMO takes it off
+            # SUMO's gap to a leader is less by the follower's minGap
+            away += get.getLength(name) + get.getMinGap(name) + free
             closing = fast - get.getSpeed(leader)
             if away > soon * closing:
                 return

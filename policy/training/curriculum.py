@@ -78,9 +78,8 @@ class EnsembleConfig:
     distillation: int = 5_000  # updates of the one that is taught
     refused: float = 1.0  # weight of the refused actions' loss, in place of `DdqnConfig.refused`
     n_step: int = 8  # in place of `ReplayConfig.n_step`
-    most: float = (
-        90.0  # deg: the largest phi that a teacher is asked with; a larger one is taught as this one
-    )
+    # deg: the largest phi that a teacher is asked with; a larger one is taught as this one
+    most: float = 90.0
     specialists: tuple[Specialist, ...] = ()
     runs: tuple[str, ...] = ()  # folders of other trainings whose drives are learned from besides
     drives: tuple[str, ...] = ()  # SCENARIO/DEMAND whose drives count once more; named twice: twice more

@@ -16,10 +16,12 @@ from torch.nn import functional
 from cosim.errors import BadInput
 from cosim.types import IS_MISSION, MetaAction
 from policy import checkpoint
-from policy.inputs.situation import MEETS, OWN, SITUATION_INPUTS
+from policy.inputs.situation import ASSISTED, MEETS, OWN
 from policy.inputs.tensors import APART, KINEMATIC_INPUTS, apart, unit
 from policy.networks.extractors import Conv2dMaps, Conv3dMaps, EncodedMaps, FrameMemory, Strides
 from policy.networks.frame_encoder import EncoderConfig
+
+SETS = {"met": "meets", "assisted": "assisted"}  # layers of their own, by part of `VFN`: the option
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +42,7 @@ class VfnConfig:
     situation: int = 64  # width of the branch of what the ego knows besides; goes with `kinematic`
     others: bool = True  # False: they are seen in maps alone, beside the ego's own speed and command
     meets: bool = False  # behind the maps, layers of their own for AVs whose way meets a mission vehicle's
+    assisted: bool = False  # and for those whose car keeps the law and its distance itself (`lawful`)
     extractor: Literal["conv3d", "conv2d", "frames"] = "conv3d"  # frames: each by a trained `FrameEncoder`
     latent: int = 128  # numbers a frame becomes (extractor `frames`)
     dueling: bool = True  # q = state value + advantage: how good the moment is drowns what an action changes
@@ -48,8 +51,9 @@ class VfnConfig:
 
     def __post_init__(self) -> None:
         """Raises BadInput: a critic values all AVs by the same layers."""
-        if self.meets and self.critic:
-            raise BadInput("is for networks that value actions", field="vfn.meets", value=True)
+        for field in SETS.values():
+            if getattr(self, field) and self.critic:
+                raise BadInput("is for networks that value actions", field=f"vfn.{field}", value=True)
 
 
 TABLE_1 = VfnConfig(features=(32, 64, 64), hidden=512, strides="literal", dueling=False)
@@ -114,7 +118,7 @@ class VFN(nn.Module):
         if own:
             # a branch of its own: what few numbers say about the ego's way and command must not drown
             self.situation = nn.Sequential(
-                nn.Linear(SITUATION_INPUTS if rows else OWN, c.situation),
+                nn.Linear(ASSISTED if rows else OWN, c.situation),
                 nn.ReLU(),
                 nn.Linear(c.situation, c.situation),
                 nn.ReLU(),
@@ -125,10 +129,14 @@ class VFN(nn.Module):
         for head in (self.value, self.state) if self.state is not None else (self.value,):
             for parameter in head.parameters():
                 nn.init.zeros_(parameter)
-        self.met: VFN | None = None
-        if c.meets:
-            self.met = VFN(replace(c, meets=False))
-            self.met.maps = None  # it takes what these maps show
+        # sets of layers for some AVs, which take what these maps show
+        self.met = VFN(replace(c, meets=False, assisted=False)).without_maps() if c.meets else None
+        self.assisted = VFN(replace(c, assisted=False)).without_maps() if c.assisted else None
+
+    def without_maps(self) -> "VFN":
+        """This one, for what other maps show."""
+        self.maps = None
+        return self
 
     @property
     def layout(self) -> torch.memory_format:
@@ -154,7 +162,7 @@ class VFN(nn.Module):
         else:
             parts = [functional.relu(self.hidden(shown.flat))]
         if self.kinematics is not None:
-            parts += [self.kinematics(kinematics), self.situation(situation)]
+            parts += [self.kinematics(kinematics), self.situation(situation[:, :ASSISTED])]
         elif self.config.kinematic:
             parts.append(self.situation(situation[:, :OWN]))
         if keep is not None:
@@ -196,14 +204,19 @@ class VFN(nn.Module):
         """Values [B,parts,5] of what the reward weighs with cos and sin of phi (P, equation 6; with one part:
         of all of it), for who drives by that phi. Arguments as in `forward`."""
         shown = self._shown(maps)
+        assisted = situation[:, ASSISTED, None, None] > 0.5
+        if self.assisted is not None and assisted.all():
+            return self.assisted.apart(shown, kinematics, situation, *more)
         z = self.features(shown, kinematics, situation, *more)
         q: torch.Tensor = self.value(z).view(len(z), self.config.parts, len(MetaAction))
         if self.config.dueling and self.state is not None:
             q = q - q.mean(2, keepdim=True) + self.state(z)[..., None]
-        if self.met is None:
-            return q
-        met = situation[:, MEETS, None, None] > 0.5
-        return torch.where(met, self.met.apart(shown, kinematics, situation, *more), q)
+        if self.met is not None:
+            met = situation[:, MEETS, None, None] > 0.5
+            q = torch.where(met, self.met.apart(shown, kinematics, situation, *more), q)
+        if self.assisted is not None and assisted.any():
+            q = torch.where(assisted, self.assisted.apart(shown, kinematics, situation, *more), q)
+        return q
 
     def _shown(self, maps: torch.Tensor | Frames | Shown | None) -> Shown | None:
         """What the maps show, read once for both sets of layers."""
@@ -218,20 +231,27 @@ class VFN(nn.Module):
     def like(self, path: Path) -> "VFN":
         """The network of the file `path`, in this one's layout.
 
-        It may have been trained without `VfnConfig.meets`: then the layers of AVs that meet a mission vehicle
-        are those of all. Raises BadInput, WeightsMismatch.
+        It may have been trained without `VfnConfig.meets` or `.assisted`: then the layers of the AVs that
+        these name are those of all. Raises BadInput, WeightsMismatch.
         """
         stated = checkpoint.read_card(path)["configs"].get("vfn") or {}
-        meets = self.config.meets and bool(stated.get("meets"))
-        one = VFN(replace(self.config, meets=meets))
+        meets, assisted = (getattr(self.config, field) and bool(stated.get(field)) for field in SETS.values())
+        config = replace(self.config, meets=meets, assisted=assisted)
+        one = VFN(config)
         checkpoint.load(path, {"vfn": one}, {"vfn": one.config})
-        if one.config == self.config:
+        if config == self.config:
             return one
         made = VFN(self.config)
-        for part in (made, made.met):
-            assert part is not None
-            part.load_state_dict(one.state_dict(), strict=False)  # one has no `met`, and `met` no maps
+        made._take(one)
         return made
+
+    def _take(self, one: "VFN") -> None:
+        """The weights of `one`; in sets of layers that it lacks, those of all."""
+        self.load_state_dict(one.state_dict(), strict=False)  # who lacks sets, or maps
+        for part in SETS:
+            mine, its = getattr(self, part), getattr(one, part)
+            if mine is not None:
+                mine._take(one if its is None else its)
 
     def actor_critic(
         self,

@@ -53,6 +53,7 @@ class Specialist:
     world: str  # SCENARIO/DEMAND
     file: str
     met: bool = False  # only AVs whose way meets a mission vehicle's
+    others: bool = False  # only what an action brings the others; what it brings oneself the teachers of all
     # deg: at which phi its pupil is to turn to yielding, and at which phi who drives by the file turns
     # (`benchmarks.turn`)
     turn: tuple[float, float] = (45.0, 45.0)
@@ -83,9 +84,9 @@ class EnsembleConfig:
     specialists: tuple[Specialist, ...] = ()
     runs: tuple[str, ...] = ()  # folders of other trainings whose drives are learned from besides
     drives: tuple[str, ...] = ()  # SCENARIO/DEMAND whose drives count once more; named twice: twice more
-    # the one that is taught learns from AVs whose way meets a mission vehicle's, and in the layers that drive
-    # them (`VfnConfig.meets`); whoever meets none drives by the first weights, to the bit
-    met_alone: bool = False
+    # the one that is taught learns in these layers alone (`VfnConfig.meets`, `.assisted`), from the AVs that
+    # they drive; all others are driven by the first weights, to the bit
+    alone: Literal["", "met", "assisted"] = ""
 
     def __post_init__(self) -> None:
         """Raises BadInput for a number out of range."""

@@ -17,8 +17,8 @@ import torch
 from cosim.errors import BadInput
 from cosim.seeding import generator, subseed
 from policy import checkpoint
-from policy.inputs.situation import MEETS
-from policy.networks.vfn import VFN, VfnConfig
+from policy.inputs.situation import ASSISTED, MEETS
+from policy.networks.vfn import SETS, VFN, VfnConfig
 from policy.training import experience
 from policy.training.curriculum import Specialist, VfnTraining
 from policy.training.ddqn import DdqnLearner
@@ -29,13 +29,14 @@ from policy.training.trainers import make_trainer, rate
 
 RESULT = "distilled.safetensors"
 PUPIL = "pupil"
+BY = {"met": MEETS, "assisted": ASSISTED}  # what of the situation picks the layers
 LEAST = 1e-3  # of a cosine or sine that is divided by
 DIFFERENCES = 10.0  # what an error in the difference of two actions counts more than one in the state's value
 
 
-def meets(drive: Trajectory) -> bool:
-    """Whether the AV's way meets a mission vehicle's at some time."""
-    return bool((drive.situation[:, MEETS] > 0.5).any())
+def drives(part: str, trajectory: Trajectory) -> bool:
+    """Whether the layers `part` of a network (`SETS`) drive this AV at some time."""
+    return bool((trajectory.situation[:, BY[part]] > 0.5).any())
 
 
 def meets_mission(batch: Advised) -> torch.Tensor:
@@ -72,6 +73,8 @@ class Teachers(NamedTuple):
                 parts = network.apart(maps, kinematics, situation, asked)
                 if parts.shape[1] > 1:  # so that they weigh by phi what the file's weigh by the other angle
                     parts = parts * (asked.clamp(min=LEAST) / phi.clamp(min=LEAST))[..., None]
+                if one.others:
+                    parts = torch.cat([values[:, :1], parts[:, 1:]], 1)
                 values = torch.where(here[:, None, None], parts, values)
         return values
 
@@ -98,7 +101,7 @@ class Ensemble:
     """Learns in `folder`, one network after the other; those that are finished are read again.
 
     Raises BadInput for drives of other trainings (`EnsembleConfig.runs`) that are missing or of other inputs,
-    and where `EnsembleConfig.met_alone` finds no layers or no drives to learn in and from.
+    and where `EnsembleConfig.alone` finds no layers or no drives to learn in and from.
 
     Args:
         config: the schedule of the training; its part `ensemble` is what is done here.
@@ -125,14 +128,14 @@ class Ensemble:
             problem = f"was driven with other inputs: {' and '.join(map(str, shapes))}"
             raise BadInput(problem, field="training.ensemble.runs", value=", ".join(c.runs))
         more = [one for name in c.drives for one in driven if one.episode.rpartition("/")[0] == name]
-        if c.met_alone:
-            if not vfn.meets:
-                problem = "needs layers for AVs that meet a mission vehicle (vfn.meets)"
-                raise BadInput(problem, field="training.ensemble.met_alone", value=True)
-            driven, more = ([one for one in some if meets(one)] for some in (driven, more))
+        if c.alone:
+            if not getattr(vfn, SETS[c.alone]):
+                problem = f"needs layers of their own for these AVs (vfn.{SETS[c.alone]})"
+                raise BadInput(problem, field="training.ensemble.alone", value=c.alone)
+            driven, more = ([one for one in some if drives(c.alone, one)] for some in (driven, more))
             if not driven:
-                problem = "in no drive does an AV meet a mission vehicle"
-                raise BadInput(problem, field="training.ensemble.met_alone", value=True)
+                problem = "in no drive is there an AV that these layers drive"
+                raise BadInput(problem, field="training.ensemble.alone", value=c.alone)
         kept = [*driven, *more]
         capacity = max(config.replay.capacity, sum(map(len, kept)))  # nothing that was asked for is dropped
         self.replay = ReplayBuffer(replace(config.replay, n_step=c.n_step, capacity=capacity))
@@ -213,9 +216,10 @@ class Ensemble:
         config = replace(self.config, ddqn=self._ddqn[name], seed=seed)
         learner = make_trainer(config, self.vfn, self._device).learner
         assert isinstance(learner, DdqnLearner)
-        if name == PUPIL and self.config.ensemble.met_alone:
+        alone = self.config.ensemble.alone
+        if name == PUPIL and alone:
             for part, parameter in learner.online.named_parameters():
-                parameter.requires_grad_(parameter.requires_grad and part.startswith("met."))
+                parameter.requires_grad_(parameter.requires_grad and f"{alone}." in part)
         return learner
 
     def _read(self, path: Path) -> VFN:

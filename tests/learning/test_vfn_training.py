@@ -894,7 +894,7 @@ def test_only_who_meets_a_mission_vehicle_may_be_taught(tmp_path: Path) -> None:
             teachers=(files[1],),
             specialists=(Specialist("exit/contested", files[1], met=True),),
             distillation=60,
-            met_alone=True,
+            alone="met",
         ),
     )
     replay = ReplayBuffer(config.replay)
@@ -913,11 +913,11 @@ def test_only_who_meets_a_mission_vehicle_may_be_taught(tmp_path: Path) -> None:
     assert torch.equal(before[~met], after[~met])
     assert not torch.allclose(before[met], after[met])
     assert set(after[met].sum(1).argmax(1).tolist()) == {MetaAction.ACCELERATE}
-    with pytest.raises(BadInput, match=r"met_alone=True: needs layers .*vfn.meets"):
+    with pytest.raises(BadInput, match=r"alone='met': needs layers .*vfn.meets"):
         Ensemble(config, TINY, replay, tmp_path, {})
     without = ReplayBuffer(config.replay)
     without.add([nobody])
-    with pytest.raises(BadInput, match="met_alone=True: in no drive does an AV meet"):
+    with pytest.raises(BadInput, match="alone='met': in no drive is there an AV"):
         Ensemble(config, layout, without, tmp_path, {})
 
 

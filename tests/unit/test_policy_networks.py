@@ -264,13 +264,13 @@ def test_the_avs_know_in_which_order_they_reach_the_mission_vehicle() -> None:
     ]
     seen = histories(road, cars)
     order = ("ahead", "guide", "later")
-    known = situation([seen[name] for name in order], road, shared=True)[:, -6:]
+    known = situation([seen[name] for name in order], road, shared=True)[:, MEETS:]
     assert known[:, 0].tolist() == [1.0] * 3, "their lanes lie side by side"
     assert np.diff(known[:, 1]) * FAR == pytest.approx([40.0, 30.0])
     assert known[:, 2] == pytest.approx([-1.0, known[0, 1], known[1, 1]]), "who arrives next before it"
     assert known[:, 3:5].tolist() == [[0.0, 1.0]] * 3, "beside, from the right"
     assert known[:, 5] == pytest.approx([0.6] * 3)
-    alone = situation([seen[name] for name in order], road, shared=False)[:, -6:]
+    alone = situation([seen[name] for name in order], road, shared=False)[:, MEETS:]
     assert alone[:, 2].tolist() == [-1.0] * 3, "without V2V nobody knows of the others"
 
 

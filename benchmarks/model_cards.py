@@ -86,8 +86,10 @@ def driving(name: str, card: Card) -> Iterator[str]:
     layout, rewards = card["configs"]["vfn"], approach.config == "rewards"
     sees = "kinematics, situation and maps" if approach.kinematics else "maps"
     sees = sees if layout.get("others", True) else "its own speed and command, and maps"
-    met = layout.get("meets", False)
-    sees = f"whether its way meets a mission vehicle's (layers of their own), {sees}" if met else sees
+    if layout.get("meets", False):
+        sees = f"whether its way meets a mission vehicle's (layers of their own), {sees}"
+    if layout.get("assisted", False):
+        sees = f"whether its car keeps the law and its distance itself (`lawful`; layers of their own), {sees}"
     predicted = ", predicted maps among them" if approach.predicted_maps else ""
     mask = "no safety prioritizer" if approach.mask == "none" else f"prioritizer on `{approach.mask}`"
     yield f"- Chooses an AV's meta-action from {sees}{predicted}; {layout['extractor']}, {mask}."

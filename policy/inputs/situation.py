@@ -25,9 +25,7 @@ ASSISTED = MEETS + 6  # behind them: whether the car itself keeps the law and it
 SITUATION_INPUTS = ASSISTED + 1
 
 
-def situation(
-    histories: Sequence[History], road: RoadMap, shared: bool, assisted: bool = False
-) -> Floats32:
+def situation(histories: Sequence[History], road: RoadMap, shared: bool, assisted: bool = False) -> Floats32:
     """[B,SITUATION_INPUTS], scaled to about [-1, 1], of AVs that decide together.
 
     Command (7): target speed, speed limit, distance to the conflict zone, lane change under way, own

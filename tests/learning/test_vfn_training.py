@@ -828,6 +828,22 @@ def test_a_specialist_may_be_kept_to_the_avs_that_meet_a_mission_vehicle(
     assert values[:, 0, MetaAction.ACCELERATE].nonzero().flatten().tolist() == taught
 
 
+def test_a_specialist_may_teach_what_an_action_brings_the_others_alone() -> None:
+    layout = replace(TINY, parts=2)
+    networks = [VFN(layout), VFN(layout)]
+    for network, value in zip(networks, (1.0, 2.0), strict=True):
+        network.value.bias.data[[MetaAction.ACCELERATE, 5 + MetaAction.DECELERATE]] = value
+    now = (
+        *(torch.zeros(1, 3, 4, 8, 16, dtype=torch.uint8), torch.zeros(1, 3, 2, KINEMATIC_INPUTS)),
+        *(torch.zeros(1, SITUATION_INPUTS), torch.tensor([[0.6, 0.8]])),
+    )
+    batch = Advised(now, torch.ones(1, 5) > 0, torch.ones(1, 5) > 1, ["exit/contested/7"], 3)
+    one = Specialist("exit/contested", "a.b", others=True)
+    values = Teachers(networks[:1], [(one, networks[1])]).values(batch)
+    own, others = (network.apart(*now) for network in networks)
+    torch.testing.assert_close(values, torch.cat([own[:, :1], others[:, 1:]], 1))
+
+
 def taught(
     network: VFN, phi: float, turn: tuple[float, float] = (45.0, 45.0), most: float = 90.0
 ) -> torch.Tensor:

@@ -89,7 +89,8 @@ def driving(name: str, card: Card) -> Iterator[str]:
     if layout.get("meets", False):
         sees = f"whether its way meets a mission vehicle's (layers of their own), {sees}"
     if layout.get("assisted", False):
-        sees = f"whether its car keeps the law and its distance itself (`lawful`; layers of their own), {sees}"
+        own = "whether its car keeps the law and its distance itself (`lawful`; layers of their own)"
+        sees = f"{own}, {sees}"
     predicted = ", predicted maps among them" if approach.predicted_maps else ""
     mask = "no safety prioritizer" if approach.mask == "none" else f"prioritizer on `{approach.mask}`"
     yield f"- Chooses an AV's meta-action from {sees}{predicted}; {layout['extractor']}, {mask}."

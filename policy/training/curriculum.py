@@ -54,12 +54,14 @@ class Specialist:
     file: str
     met: bool = False  # only AVs whose way meets a mission vehicle's
     others: bool = False  # only what an action brings the others; what it brings oneself the teachers of all
+    weight: float = 1.0  # of what an action brings the others
     # deg: at which phi its pupil is to turn to yielding, and at which phi who drives by the file turns
     # (`benchmarks.turn`)
     turn: tuple[float, float] = (45.0, 45.0)
 
     def __post_init__(self) -> None:
-        """Raises BadInput for an angle that is none between 0 and 90 degrees."""
+        """Raises BadInput for a number out of range, and an angle that is none between 0 and 90 degrees."""
+        in_range(self, positive="weight")
         if not all(0.0 < angle < 90.0 for angle in self.turn):
             problem = "two angles between 0 and 90 degrees are needed"
             raise BadInput(problem, field="turn", value=list(self.turn))

@@ -73,8 +73,8 @@ class Teachers(NamedTuple):
                 parts = network.apart(maps, kinematics, situation, asked)
                 if parts.shape[1] > 1:  # so that they weigh by phi what the file's weigh by the other angle
                     parts = parts * (asked.clamp(min=LEAST) / phi.clamp(min=LEAST))[..., None]
-                if one.others:
-                    parts = torch.cat([values[:, :1], parts[:, 1:]], 1)
+                own = values if one.others else parts
+                parts = torch.cat([own[:, :1], one.weight * parts[:, 1:]], 1)
                 values = torch.where(here[:, None, None], parts, values)
         return values
 

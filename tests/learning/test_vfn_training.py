@@ -838,10 +838,10 @@ def test_a_specialist_may_teach_what_an_action_brings_the_others_alone() -> None
         *(torch.zeros(1, SITUATION_INPUTS), torch.tensor([[0.6, 0.8]])),
     )
     batch = Advised(now, torch.ones(1, 5) > 0, torch.ones(1, 5) > 1, ["exit/contested/7"], 3)
-    one = Specialist("exit/contested", "a.b", others=True)
+    one = Specialist("exit/contested", "a.b", others=True, weight=3.0)
     values = Teachers(networks[:1], [(one, networks[1])]).values(batch)
     own, others = (network.apart(*now) for network in networks)
-    torch.testing.assert_close(values, torch.cat([own[:, :1], others[:, 1:]], 1))
+    torch.testing.assert_close(values, torch.cat([own[:, :1], 3.0 * others[:, 1:]], 1))
 
 
 def taught(

@@ -68,14 +68,13 @@ class Teachers(NamedTuple):
             if one.met:
                 here &= meets_mission(batch)
             if here.any():
-                maps, kinematics, situation, phi = batch.now
+                maps, kinematics, situation, phi = (seen[here] for seen in batch.now)
                 asked = turned(phi, one.turn)
                 parts = network.apart(maps, kinematics, situation, asked)
                 if parts.shape[1] > 1:  # so that they weigh by phi what the file's weigh by the other angle
                     parts = parts * (asked.clamp(min=LEAST) / phi.clamp(min=LEAST))[..., None]
-                own = values if one.others else parts
-                parts = torch.cat([own[:, :1], one.weight * parts[:, 1:]], 1)
-                values = torch.where(here[:, None, None], parts, values)
+                own = values[here] if one.others else parts
+                values[here] = torch.cat([own[:, :1], one.weight * parts[:, 1:]], 1)
         return values
 
 

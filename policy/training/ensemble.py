@@ -68,9 +68,10 @@ class Teachers(NamedTuple):
             if one.met:
                 here &= meets_mission(batch)
             if here.any():
-                maps, kinematics, situation, phi = (seen[here] for seen in batch.now)
+                maps, kinematics, situation, phi = batch.now
+                maps, phi = None if maps is None else maps[here], phi[here]
                 asked = turned(phi, one.turn)
-                parts = network.apart(maps, kinematics, situation, asked)
+                parts = network.apart(maps, kinematics[here], situation[here], asked)
                 if parts.shape[1] > 1:  # so that they weigh by phi what the file's weigh by the other angle
                     parts = parts * (asked.clamp(min=LEAST) / phi.clamp(min=LEAST))[..., None]
                 own = values[here] if one.others else parts

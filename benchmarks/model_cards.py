@@ -51,7 +51,7 @@ LIMITS = {  # by the configuration of the training
 }
 LAWFUL_ONLY = "It learned from rewards alone, in preset `lawful`: what it does in `unguarded` it never tried."
 # the folder of its training's log, where that is not NAME-0
-TRAINED = {"vfn-p": "sharp-1", "vfn": "sharp-1"}
+TRAINED = {"vfn-p": "assisted-0", "vfn": "assisted-0"}
 PREDICTING_LIMITS = (
     "It learned from the five worlds alone, with drivers who follow IDM and LC2013 or MOBIL and never err; "
     "nothing is known of its error on recorded traffic or on other roads.",

@@ -16,7 +16,7 @@ from benchmarks.tables import write_page
 from policy.agents import APPROACHES
 
 NAME = "learning"
-FURTHER = "[trainings/sharp-1](trainings/sharp-1/README.md)."
+FURTHER = "[trainings/assisted-0](trainings/assisted-0/README.md)."
 
 
 def write(settings: Settings) -> None:

@@ -13,6 +13,7 @@ import torch
 from cosim.errors import BadInput
 from cosim.files import whole
 from cosim.types import Bools, Bytes, Floats32
+from policy.inputs.situation import SITUATION_INPUTS
 from policy.inputs.tensors import States
 
 Ending = Literal["crashed", "left", "cut"]  # cut: the episode ended before the AV's drive did
@@ -117,8 +118,12 @@ def save(path: Path, trajectories: list[Trajectory]) -> None:
 
 
 def load(path: Path) -> list[Trajectory]:
-    """What `save` wrote."""
+    """What `save` wrote. Raises BadInput for what a version wrote in which AVs were told something else."""
     with np.load(path, allow_pickle=False) as file:
+        told = file["0.situation"].shape[1] if int(file["count"]) else SITUATION_INPUTS
+        if told != SITUATION_INPUTS:
+            problem = f"another version of cosim drove it: a situation has {SITUATION_INPUTS} numbers"
+            raise BadInput(problem, file=path, field="situation", value=told)
         return [
             Trajectory(
                 **{

@@ -762,6 +762,13 @@ def test_drives_that_are_named_count_more(tmp_path: Path) -> None:
     assert counts == {"merge/contested/7": 3, "merge/sparse/7": 1}
 
 
+def test_drives_of_a_version_that_told_avs_something_else_are_bad_input(tmp_path: Path) -> None:
+    one = trajectory([0, 1, 2, 4], [(1.0, 0.0, 0.0)] * 4)
+    experience.save(tmp_path / "a.npz", [replace(one, situation=one.situation[:, :-1])])
+    with pytest.raises(BadInput, match=rf"a.npz: situation={SITUATION_INPUTS - 1}: another version of cosim"):
+        experience.load(tmp_path / "a.npz")
+
+
 def test_drives_of_other_trainings_join_in_front(tmp_path: Path) -> None:
     (tmp_path / "other" / "replay").mkdir(parents=True)
     theirs, own = (trajectory([0, 1], [(1.0, 0.0, 0.0)] * 2) for _ in range(2))
@@ -773,7 +780,7 @@ def test_drives_of_other_trainings_join_in_front(tmp_path: Path) -> None:
     assert [one.episode for one in ensemble.replay.trajectories] == ["exit/dense/1", "hand"]
     small = replace(config, replay=replace(SHORT.replay, capacity=3))  # of four decisions: none is dropped
     assert len(Ensemble(small, TINY, replay, tmp_path, {}).replay.trajectories) == 2
-    wide = replace(own, situation=np.zeros((3, 1), np.float32))
+    wide = replace(own, kinematics=own.kinematics[..., :-1])
     experience.save(tmp_path / "other" / "replay" / "1.npz", [wide])
     with pytest.raises(BadInput, match=r"training\.ensemble\.runs='.*other': was driven with other inputs"):
         Ensemble(config, TINY, replay, tmp_path, {})

@@ -26,7 +26,7 @@ NEWER = {
     "chain": ("shade",),
     "observation": ("road_version", "signal_timing"),
     "safety": ("assisted",),
-    "vfn": ("latent", "others", "parts", "meets", "assisted"),
+    "vfn": ("latent", "others", "parts", "most", "meets", "assisted"),
 }
 
 

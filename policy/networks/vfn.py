@@ -5,6 +5,7 @@ and what the ego knows besides join after FC 512 through MLPs. The baselines of 
 network with parts left out.
 """
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -47,6 +48,7 @@ class VfnConfig:
     latent: int = 128  # numbers a frame becomes (extractor `frames`)
     dueling: bool = True  # q = state value + advantage: how good the moment is drowns what an action changes
     parts: int = 1  # 2: what an action brings oneself and what it brings the others are valued apart
+    most: float = 90.0  # deg: who drives by a larger phi is driven by this one
     critic: bool = False  # True: action preferences and a state value (A2C), not action values
 
     def __post_init__(self) -> None:
@@ -54,6 +56,8 @@ class VfnConfig:
         for field in SETS.values():
             if getattr(self, field) and self.critic:
                 raise BadInput("is for networks that value actions", field=f"vfn.{field}", value=True)
+        if not 45.0 <= self.most <= 90.0:
+            raise BadInput("must be an angle from 45 to 90 degrees", field="vfn.most", value=self.most)
 
 
 TABLE_1 = VfnConfig(features=(32, 64, 64), hidden=512, strides="literal", dueling=False)
@@ -192,6 +196,7 @@ class VFN(nn.Module):
         Returns:
             q: [B,5] value of each `MetaAction`.
         """
+        phi = at_most(phi, self.config.most)
         return self.weighed(self.apart(maps, kinematics, situation, phi, keep), phi)
 
     def apart(
@@ -236,7 +241,7 @@ class VFN(nn.Module):
         """
         stated = checkpoint.read_card(path)["configs"].get("vfn") or {}
         meets, assisted = (getattr(self.config, field) and bool(stated.get(field)) for field in SETS.values())
-        config = replace(self.config, meets=meets, assisted=assisted)
+        config = replace(self.config, meets=meets, assisted=assisted, most=stated.get("most", 90.0))
         one = VFN(config)
         checkpoint.load(path, {"vfn": one}, {"vfn": one.config})
         if config == self.config:
@@ -268,3 +273,9 @@ class VFN(nn.Module):
             raise ValueError("this network has no critic")
         z = self.features(maps, kinematics, situation, phi)
         return self.value(z), self.state(z)[:, 0]
+
+
+def at_most(phi: torch.Tensor, most: float) -> torch.Tensor:
+    """[B,2] cosine and sine of the angles of `phi` [B,2], or of `most` deg where they are larger."""
+    limit = phi.new_tensor([math.cos(math.radians(most)), math.sin(math.radians(most))])
+    return torch.where((phi[:, :1] < limit[0]) & (most < 90.0), limit, phi)

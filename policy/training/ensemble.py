@@ -18,7 +18,7 @@ from cosim.errors import BadInput
 from cosim.seeding import generator, subseed
 from policy import checkpoint
 from policy.inputs.situation import ASSISTED, MEETS
-from policy.networks.vfn import SETS, VFN, VfnConfig
+from policy.networks.vfn import SETS, VFN, VfnConfig, at_most
 from policy.training import experience
 from policy.training.curriculum import Specialist, VfnTraining
 from policy.training.ddqn import DdqnLearner
@@ -77,12 +77,6 @@ class Teachers(NamedTuple):
                 own = values[here] if one.others else parts
                 values[here] = torch.cat([own[:, :1], one.weight * parts[:, 1:]], 1)
         return values
-
-
-def at_most(phi: torch.Tensor, most: float) -> torch.Tensor:
-    """[B,2] cosine and sine of the angles of `phi` [B,2], or of `most` deg where they are larger."""
-    limit = phi.new_tensor([math.cos(math.radians(most)), math.sin(math.radians(most))])
-    return torch.where((phi[:, :1] < limit[0]) & (most < 90.0), limit, phi)
 
 
 def turned(phi: torch.Tensor, turn: tuple[float, float]) -> torch.Tensor:

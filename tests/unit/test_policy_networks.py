@@ -10,7 +10,7 @@ import pytest
 import torch
 from policy_scenes import Car, histories, straight_road
 
-from cosim.errors import WeightsMismatch
+from cosim.errors import BadInput, WeightsMismatch
 from cosim.types import KINEMATIC_FEATURES
 from policy import checkpoint
 from policy.inputs.situation import ASSISTED, FAR, MEETS, PER_LANE, SITUATION_INPUTS, situation
@@ -157,6 +157,19 @@ def test_who_meets_a_mission_vehicle_keeps_layers_of_its_own_where_the_car_assis
     states[2][:, ASSISTED] = torch.tensor([0.0, 0.0, 1.0, 1.0])
     changed = ((network(*states) - before(*states)).abs() > 1e-3).any(1)
     assert changed.tolist() == [False, False, False, True]
+
+
+def test_who_drives_by_a_larger_phi_is_driven_by_the_largest() -> None:
+    torch.manual_seed(0)
+    network = VFN(VfnConfig(parts=2, most=75.0))
+    torch.nn.init.normal_(network.value.weight)
+    seen = torch.rand(1, 14, 4, 32, 128), torch.rand(1, 14, 16, 9), torch.rand(1, SITUATION_INPUTS)
+    values = {deg: network(*seen, svo_tensor(np.radians(deg), 1)) for deg in (60.0, 75.0, 80.0, 90.0)}
+    assert torch.equal(values[90.0], values[80.0])
+    torch.testing.assert_close(values[90.0], values[75.0])
+    assert not torch.allclose(values[75.0], values[60.0])
+    with pytest.raises(BadInput, match=r"vfn.most=30"):
+        VfnConfig(most=30.0)
 
 
 def test_gradients_reach_every_layer_of_both_networks() -> None:

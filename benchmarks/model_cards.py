@@ -50,6 +50,7 @@ LIMITS = {  # by the configuration of the training
     "rewards": (DESCENT, LAWLESS),
 }
 LAWFUL_ONLY = "It learned from rewards alone, in preset `lawful`: what it does in `unguarded` it never tried."
+ASSISTED = "What keeps its distance in `unguarded` are layers that this training left as they were (docs/training.md)."
 # the folder of its training's log, where that is not NAME-0
 TRAINED = {"vfn-p": "assisted-0", "vfn": "assisted-0"}
 PREDICTING_LIMITS = (
@@ -146,7 +147,7 @@ def driving(name: str, card: Card) -> Iterator[str]:
         where = "on test seeds: " + ", ".join(f"docs/results/{page}" for page in there)
         yield f"- Measured {where if there else 'in no table yet'}."
     if rewards and not any(lesson.get("preset") for lesson in training["lessons"]):
-        yield f"- Limit: {LAWFUL_ONLY}"
+        yield f"- Limit: {ASSISTED if layout.get('assisted') else LAWFUL_ONLY}"
     yield from (f"- Limit: {text}" for text in LIMITS[approach.config])
 
 

@@ -50,7 +50,9 @@ LIMITS = {  # by the configuration of the training
     "rewards": (DESCENT, LAWLESS),
 }
 LAWFUL_ONLY = "It learned from rewards alone, in preset `lawful`: what it does in `unguarded` it never tried."
-ASSISTED = "What keeps its distance in `unguarded` are layers that this training left as they were (docs/training.md)."
+ASSISTED = (
+    "What keeps its distance in `unguarded` are layers that this training left alone (docs/training.md)."
+)
 # the folder of its training's log, where that is not NAME-0
 TRAINED = {"vfn-p": "assisted-0", "vfn": "assisted-0"}
 PREDICTING_LIMITS = (

@@ -145,7 +145,9 @@ def driving(name: str, card: Card) -> Iterator[str]:
         yield from ("- Measured (test seeds, preset `unguarded`):", "", *table, "")
     else:
         told = {"learned.md": f"| {name} at ", "alone.md": f"| {name}-alone |", "foresight.md": f"| {name} |"}
-        there = [page for page, arm in told.items() if arm in (RESULTS / page).read_text(encoding="utf-8")]
+        told |= {"turn.md": f"--policy {name} ", "humans.md": f"| {name} | idm |", "law.md": f"% | {name} |"}
+        texts = {page: (RESULTS / page).read_text(encoding="utf-8") for page in told}
+        there = [page for page, arm in told.items() if arm in texts[page] and EARLIER not in texts[page]]
         where = "on test seeds: " + ", ".join(f"docs/results/{page}" for page in there)
         yield f"- Measured {where if there else 'in no table yet'}."
     if rewards and not any(lesson.get("preset") for lesson in training["lessons"]):

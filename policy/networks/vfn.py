@@ -52,10 +52,11 @@ class VfnConfig:
     critic: bool = False  # True: action preferences and a state value (A2C), not action values
 
     def __post_init__(self) -> None:
-        """Raises BadInput: a critic values all AVs by the same layers."""
-        for field in SETS.values():
-            if getattr(self, field) and self.critic:
-                raise BadInput("is for networks that value actions", field=f"vfn.{field}", value=True)
+        """Raises BadInput for an angle out of range, and what a critic has not: it values all AVs alike."""
+        for field, none in (*((field, False) for field in SETS.values()), ("most", 90.0)):
+            if self.critic and getattr(self, field) != none:
+                value = getattr(self, field)
+                raise BadInput("is for networks that value actions", field=f"vfn.{field}", value=value)
         if not 45.0 <= self.most <= 90.0:
             raise BadInput("must be an angle from 45 to 90 degrees", field="vfn.most", value=self.most)
 
@@ -224,7 +225,7 @@ class VFN(nn.Module):
         return q
 
     def _shown(self, maps: torch.Tensor | Frames | Shown | None) -> Shown | None:
-        """What the maps show, read once for both sets of layers."""
+        """What the maps show, read once for all sets of layers."""
         if maps is None or isinstance(maps, Shown):
             return maps
         return Shown(self.maps.stacked(maps.features) if isinstance(maps, Frames) else self.maps(maps))
@@ -237,7 +238,7 @@ class VFN(nn.Module):
         """The network of the file `path`, in this one's layout.
 
         It may have been trained without `VfnConfig.meets` or `.assisted`: then the layers of the AVs that
-        these name are those of all. Raises BadInput, WeightsMismatch.
+        these name are those of all. `VfnConfig.most` is this one's. Raises BadInput, WeightsMismatch.
         """
         stated = checkpoint.read_card(path)["configs"].get("vfn") or {}
         meets, assisted = (getattr(self.config, field) and bool(stated.get(field)) for field in SETS.values())

@@ -53,7 +53,7 @@ class Specialist:
     world: str  # SCENARIO/DEMAND
     file: str
     met: bool = False  # only AVs whose way meets a mission vehicle's
-    others: bool = False  # only what an action brings the others; what it brings oneself the teachers of all
+    others: bool = False  # only what an action brings the others: what it brings oneself stays as taught
     weight: float = 1.0  # of what an action brings the others
     # deg: at which phi its pupil is to turn to yielding, and at which phi who drives by the file turns
     # (`benchmarks.turn`)

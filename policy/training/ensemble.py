@@ -130,6 +130,10 @@ class Ensemble:
             if not driven:
                 problem = "in no drive is there an AV that these layers drive"
                 raise BadInput(problem, field="training.ensemble.alone", value=c.alone)
+        for one in c.specialists:
+            if vfn.parts == 1 and (one.others or one.weight != 1.0):
+                problem = "teaches the others' part, which a network of one part has not (vfn.parts)"
+                raise BadInput(problem, field="training.ensemble.specialists", value=one.world)
         kept = [*driven, *more]
         capacity = max(config.replay.capacity, sum(map(len, kept)))  # nothing that was asked for is dropped
         self.replay = ReplayBuffer(replace(config.replay, n_step=c.n_step, capacity=capacity))

@@ -944,6 +944,13 @@ def test_only_who_meets_a_mission_vehicle_may_be_taught(tmp_path: Path) -> None:
         Ensemble(config, layout, without, tmp_path, {})
 
 
+def test_a_network_of_one_part_cannot_be_taught_the_others_part(tmp_path: Path) -> None:
+    specialist = Specialist("merge/contested", "a.safetensors", weight=2.0)
+    config = replace(SHORT, ensemble=EnsembleConfig(teachers=("a.safetensors",), specialists=(specialist,)))
+    with pytest.raises(BadInput, match=r"specialists='merge/contested': teaches the others' part"):
+        Ensemble(config, TINY, ReplayBuffer(config.replay), tmp_path, {})
+
+
 def test_what_a_state_is_worth_stays_what_the_first_weights_say(tmp_path: Path) -> None:
     """Teachers may have learned from rewards of another size."""
     first, teacher = VFN(TINY), VFN(TINY)

@@ -53,6 +53,7 @@ LAWFUL_ONLY = "It learned from rewards alone, in preset `lawful`: what it does i
 ASSISTED = (
     "What keeps its distance in `unguarded` are layers that this training left alone (docs/training.md)."
 )
+EARLIER = "**Of an earlier agent**"  # on pages that are not driven anew
 # the folder of its training's log, where that is not NAME-0
 TRAINED = {"vfn-p": "assisted-0", "vfn": "assisted-0"}
 PREDICTING_LIMITS = (

@@ -25,7 +25,7 @@ def test_runs_on_ray_are_those_of_this_machine(server: Server, tmp_path: Path) -
     assert server.wait(uploaded)["status"] == "finished"
 
     cluster = Server(tmp_path / "data", *FLAGS)
-    endless = cluster.submit(scenario="merge", duration=3000)
+    endless = cluster.submit(scenario="merge", duration=30_000)
     runs = {seed: cluster.submit(**SHORT, seeds=f"{seed}:{seed + 1}") for seed in undisturbed}
     cluster.wait(endless, "running")
     time.sleep(5.0)  # it is driven, or its actors start

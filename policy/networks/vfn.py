@@ -22,7 +22,9 @@ from policy.inputs.tensors import APART, KINEMATIC_INPUTS, apart, unit
 from policy.networks.extractors import Conv2dMaps, Conv3dMaps, EncodedMaps, FrameMemory, Strides
 from policy.networks.frame_encoder import EncoderConfig
 
-SETS = {"met": "meets", "assisted": "assisted"}  # layers of their own, by part of `VFN`: the option
+# layers of their own, by part of `VFN`: the option, and which number of the situation picks them
+SETS = {"met": "meets", "assisted": "assisted"}
+PICKED_BY = {"met": MEETS, "assisted": ASSISTED}
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,9 +55,9 @@ class VfnConfig:
 
     def __post_init__(self) -> None:
         """Raises BadInput for an angle out of range, and what a critic has not: it values all AVs alike."""
-        for field, none in (*((field, False) for field in SETS.values()), ("most", 90.0)):
-            if self.critic and getattr(self, field) != none:
-                value = getattr(self, field)
+        for field, without in (("meets", False), ("assisted", False), ("most", 90.0)):
+            value = getattr(self, field)
+            if self.critic and value != without:
                 raise BadInput("is for networks that value actions", field=f"vfn.{field}", value=value)
         if not 45.0 <= self.most <= 90.0:
             raise BadInput("must be an angle from 45 to 90 degrees", field="vfn.most", value=self.most)
@@ -210,18 +212,16 @@ class VFN(nn.Module):
         """Values [B,parts,5] of what the reward weighs with cos and sin of phi (P, equation 6; with one part:
         of all of it), for who drives by that phi. Arguments as in `forward`."""
         shown = self._shown(maps)
-        assisted = situation[:, ASSISTED, None, None] > 0.5
-        if self.assisted is not None and assisted.all():
+        if self.assisted is not None and (situation[:, ASSISTED] > 0.5).all():
             return self.assisted.apart(shown, kinematics, situation, *more)
         z = self.features(shown, kinematics, situation, *more)
         q: torch.Tensor = self.value(z).view(len(z), self.config.parts, len(MetaAction))
         if self.config.dueling and self.state is not None:
             q = q - q.mean(2, keepdim=True) + self.state(z)[..., None]
-        if self.met is not None:
-            met = situation[:, MEETS, None, None] > 0.5
-            q = torch.where(met, self.met.apart(shown, kinematics, situation, *more), q)
-        if self.assisted is not None and assisted.any():
-            q = torch.where(assisted, self.assisted.apart(shown, kinematics, situation, *more), q)
+        for part, column in PICKED_BY.items():
+            network, here = getattr(self, part), situation[:, column, None, None] > 0.5
+            if network is not None and here.any():
+                q = torch.where(here, network.apart(shown, kinematics, situation, *more), q)
         return q
 
     def _shown(self, maps: torch.Tensor | Frames | Shown | None) -> Shown | None:

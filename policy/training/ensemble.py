@@ -17,8 +17,8 @@ import torch
 from cosim.errors import BadInput
 from cosim.seeding import generator, subseed
 from policy import checkpoint
-from policy.inputs.situation import ASSISTED, MEETS
-from policy.networks.vfn import SETS, VFN, VfnConfig, at_most
+from policy.inputs.situation import MEETS
+from policy.networks.vfn import PICKED_BY, SETS, VFN, VfnConfig, at_most
 from policy.training import experience
 from policy.training.curriculum import Specialist, VfnTraining
 from policy.training.ddqn import DdqnLearner
@@ -29,14 +29,13 @@ from policy.training.trainers import make_trainer, rate
 
 RESULT = "distilled.safetensors"
 PUPIL = "pupil"
-BY = {"met": MEETS, "assisted": ASSISTED}  # what of the situation picks the layers
 LEAST = 1e-3  # of a cosine or sine that is divided by
 DIFFERENCES = 10.0  # what an error in the difference of two actions counts more than one in the state's value
 
 
 def drives(part: str, trajectory: Trajectory) -> bool:
     """Whether the layers `part` of a network (`SETS`) drive this AV at some time."""
-    return bool((trajectory.situation[:, BY[part]] > 0.5).any())
+    return bool((trajectory.situation[:, PICKED_BY[part]] > 0.5).any())
 
 
 def meets_mission(batch: Advised) -> torch.Tensor:

@@ -15,11 +15,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cosim.control import COMFORT, COMFORT_TIME, wished_accel
+from cosim.control import COMFORT, COMFORT_TIME, MAX_DECEL, wished_accel
+from cosim.road import RoadMap
 from cosim.road.rules import RED, YELLOW
 from cosim.simulation.backend import sumo
 from cosim.simulation.commands import Commander, Controlled
 from cosim.simulation.fleet import set_type
+from cosim.simulation.inside import Inside
 from cosim.types import Intervention, Preset
 
 # sumo_scenarios/types.add.xml: an IDM that brakes comfortably, and one that brakes late
@@ -29,6 +31,10 @@ STALLED = 0.2, 1.5  # m/s2, or so little acceleration where so much was asked fo
 RESPITE = 2.0  # s without a correction: the next one is a new one
 HARD = 3.5  # m/s2: harder braking is an emergency's
 TURNED = 15.0  # degrees from its lane's direction: it begins no lane change
+STARTS, SHORT_OF = (
+    1.0,
+    0.3,
+)  # m/s: so slow it stays where it is for who stands in its way; m it stops before him
 KEEPS_MOVING = 3.0  # m/s: no slower wish is followed inside a junction, nor for longer than `PATIENCE`
 CROSSES = 5.0  # s behind a junction in which it had to give way: inside and so long it takes its gap swiftly
 NOTICE = 150.0  # m: signals and stop lines further ahead are no reason yet
@@ -53,6 +59,7 @@ TOLD = 8.0, 30.0  # s to contact of the AVs ahead that are told, m between one v
 STOPS = 0.3  # s to the leader at walking pace and below
 RETURNS = 0.1, 0.2  # s of headway won back per s, below and above `HEADWAY`
 
+IGNORES = "junctionModel.ignoreIDs"  # whom SUMO's driver does not heed at junctions
 STRATEGIC, BLOCKED = 8, 512 + 1024 + 2048 + 4096 + 8192  # bits of SUMO's lane-change state
 
 
@@ -78,6 +85,9 @@ class Assisted(Controlled):
     late: bool = False  # whether it brakes late
     flees: float = -math.inf  # s, until when it makes room for who does not brake behind it
     idled: float = 0.0  # s, for which the agent has asked for less than `KEEPS_MOVING`
+    stops: bool = False  # for somebody who stands in its way inside a junction
+    held: float = 0.0  # s, for which it has done so in this one
+    first: str = ""  # the AV that goes first there
 
     @property
     def asked(self) -> float:
@@ -90,8 +100,9 @@ class Assistance(Commander):
 
     controlled: dict[str, Assisted]  # type: ignore[assignment]  # `_take_over` makes all of them
 
-    def __init__(self, step: float) -> None:
+    def __init__(self, step: float, road: RoadMap) -> None:
         super().__init__(Preset.LAWFUL, step)
+        self._junctions = Inside(road)
         self._looked = -math.inf  # s
         self._begun: list[Intervention] = []
         self._standing_gaps: dict[str, float] = {}  # human -> m
@@ -116,7 +127,8 @@ class Assistance(Commander):
                 state.accel = (speed - state.speed) / self._step
             target = min(state.goal(speed, COMFORT_TIME), state.limit)
             state.idled = state.idled + self._step if state.target < KEEPS_MOVING else 0.0
-            inside = get.getRoadID(name).startswith(":")
+            lane = get.getLaneID(name)
+            inside = lane.startswith(":")
             swift = inside and state.gives_way  # as SUMO's driver, whose acceleration its gap was judged by
             state.crosses = CROSSES if swift else state.crosses - self._step
             if flees:
@@ -129,8 +141,9 @@ class Assistance(Commander):
             state.raw, state.accel = wished_accel(speed, target, state.accel, self._step)
             if state.gap_for and not flees:
                 state.accel = min(state.accel, self._yielding(name, speed, state))
+            self._mind_inside(name, lane, speed, state)
             state.wish, state.speed = max(speed + state.accel * self._step, 0.0), speed
-            ours = not (slower or flees or swift)
+            ours = state.stops or not (slower or flees or swift)
             if ours:
                 get.setSpeed(name, state.wish)
             elif state.ours:
@@ -146,7 +159,7 @@ class Assistance(Commander):
             accel = (speed - state.speed) / self._step
             if accel < min(state.raw, 0.0) - CORRECTED or (state.raw > STALLED[1] and accel < STALLED[0]):
                 if now - state.corrected > RESPITE:
-                    begun.append(Intervention(now, name, _reason(name, accel)))
+                    begun.append(Intervention(now, name, _reason(name, accel, state.stops)))
                 state.corrected = now
             lateral = get.getLateralLanePosition(name)
             drift, state.lateral = lateral - state.lateral, lateral
@@ -311,6 +324,28 @@ class Assistance(Commander):
                         return True
         return False
 
+    def _mind_inside(self, name: str, lane: str, speed: float, state: Assisted) -> None:
+        """Inside a junction, stop for who stands in the way; but not for ever.
+
+        If that is an AV, it no longer heeds this one (V2V): it would wait for it.
+        """
+        room, whom = math.inf, ""
+        if not lane.startswith(":"):
+            state.held = 0.0
+        elif state.held < PATIENCE:
+            room, whom = self._junctions.room(name, lane)
+        needed = speed**2 / (2.0 * max(room - SHORT_OF, 0.1))
+        state.stops = room < math.inf and (speed < STARTS or needed > COMFORT)
+        first = whom if state.stops and whom in self.controlled else ""
+        if first != state.first:
+            for other, ignored in ((state.first, ""), (first, name)):
+                if other in self.controlled:
+                    sumo.vehicle.setParameter(other, IGNORES, ignored)
+            state.first = first
+        if state.stops:
+            state.held += self._step
+            state.accel = min(state.accel, -min(max(needed, COMFORT), MAX_DECEL))
+
     def _give(self, asked: list[str], name: str) -> None:
         for other in asked:
             if other in self.controlled and not self.controlled[name].gap_for:
@@ -397,10 +432,13 @@ def _leaves_route(name: str, lane: str, offset: int) -> str | None:
     return "the lane leaves the route"
 
 
-def _reason(name: str, accel: float) -> str:
-    """Why the car drives slower than the agent wishes, or brakes harder (`accel` m/s2)."""
+def _reason(name: str, accel: float, stops: bool) -> str:
+    """Why the car drives slower than the agent wishes, or brakes harder (`accel` m/s2); `stops`: inside a
+    junction, for who stands in its way."""
     get = sumo.vehicle
     words = "emergency: " if accel < -HARD else ""
+    if stops:
+        return f"{words}vehicle in the way"
     speed = get.getSpeed(name)
     reach = min(0.5 * speed * speed + 2.0 * speed + 10.0, NOTICE)  # m, from where an IDM begins to brake
     leader = get.getLeader(name, reach)

@@ -109,7 +109,7 @@ class SumoSimulator:
         self._drivers = Drivers(self._scenario.behavior, self._scenario.driver_model, seed)
         self._fleet = self._FLEET(self._scenario, self._drivers, self._av_parameters)
         preset, step = self._scenario.preset, self._scenario.timing.step
-        self._commander = Assistance(step) if preset == Preset.LAWFUL else Commander(preset, step)
+        self._commander = Assistance(step, self.road) if preset == Preset.LAWFUL else Commander(preset, step)
         self._commander.shared = self._SHARED
         self._bodies: dict[str, Body] = {}
         self._routes: dict[str, tuple[str, ...]] = {}

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cosim.control import COMFORT, COMFORT_TIME, MAX_DECEL, wished_accel
+from cosim.control import COMFORT, COMFORT_TIME, wished_accel
 from cosim.road import RoadMap
 from cosim.road.rules import RED, YELLOW
 from cosim.simulation.backend import sumo
@@ -85,7 +85,7 @@ class Assisted(Controlled):
     late: bool = False  # whether it brakes late
     flees: float = -math.inf  # s, until when it makes room for who does not brake behind it
     idled: float = 0.0  # s, for which the agent has asked for less than `KEEPS_MOVING`
-    stops: bool = False  # for somebody who stands in its way inside a junction
+    stays: bool = False  # inside a junction, for somebody in its way
     held: float = 0.0  # s, for which it has done so in this one
     first: str = ""  # the AV that goes first there
 
@@ -143,7 +143,7 @@ class Assistance(Commander):
                 state.accel = min(state.accel, self._yielding(name, speed, state))
             self._mind_inside(name, lane, speed, state)
             state.wish, state.speed = max(speed + state.accel * self._step, 0.0), speed
-            ours = state.stops or not (slower or flees or swift)
+            ours = state.stays or not (slower or flees or swift)
             if ours:
                 get.setSpeed(name, state.wish)
             elif state.ours:
@@ -159,7 +159,7 @@ class Assistance(Commander):
             accel = (speed - state.speed) / self._step
             if accel < min(state.raw, 0.0) - CORRECTED or (state.raw > STALLED[1] and accel < STALLED[0]):
                 if now - state.corrected > RESPITE:
-                    begun.append(Intervention(now, name, _reason(name, accel, state.stops)))
+                    begun.append(Intervention(now, name, _reason(name, accel, state.stays)))
                 state.corrected = now
             lateral = get.getLateralLanePosition(name)
             drift, state.lateral = lateral - state.lateral, lateral
@@ -325,26 +325,23 @@ class Assistance(Commander):
         return False
 
     def _mind_inside(self, name: str, lane: str, speed: float, state: Assisted) -> None:
-        """Inside a junction, stop for who stands in the way; but not for ever.
+        """Whoever stands inside a junction stays there while somebody is in its way; but not for ever.
 
         If that is an AV, it no longer heeds this one (V2V): it would wait for it.
         """
-        room, whom = math.inf, ""
-        if not lane.startswith(":"):
-            state.held = 0.0
-        elif state.held < PATIENCE:
-            room, whom = self._junctions.room(name, lane)
-        needed = speed**2 / (2.0 * max(room - SHORT_OF, 0.1))
-        state.stops = room < math.inf and (speed < STARTS or needed > COMFORT)
-        first = whom if state.stops and whom in self.controlled else ""
+        inside, whom = lane.startswith(":"), ""
+        if inside and speed < STARTS and state.held < PATIENCE:
+            whom = self._junctions.in_the_way(name, lane)
+        state.stays = bool(whom)
+        state.held = state.held + state.stays * self._step if inside else 0.0
+        first = whom if whom in self.controlled else ""
         if first != state.first:
             for other, ignored in ((state.first, ""), (first, name)):
                 if other in self.controlled:
                     sumo.vehicle.setParameter(other, IGNORES, ignored)
             state.first = first
-        if state.stops:
-            state.held += self._step
-            state.accel = min(state.accel, -min(max(needed, COMFORT), MAX_DECEL))
+        if state.stays:
+            state.accel = -COMFORT
 
     def _give(self, asked: list[str], name: str) -> None:
         for other in asked:
@@ -432,12 +429,12 @@ def _leaves_route(name: str, lane: str, offset: int) -> str | None:
     return "the lane leaves the route"
 
 
-def _reason(name: str, accel: float, stops: bool) -> str:
-    """Why the car drives slower than the agent wishes, or brakes harder (`accel` m/s2); `stops`: inside a
-    junction, for who stands in its way."""
+def _reason(name: str, accel: float, stays: bool) -> str:
+    """Why the car drives slower than the agent wishes, or brakes harder (`accel` m/s2); `stays`: inside a
+    junction, for somebody in its way."""
     get = sumo.vehicle
     words = "emergency: " if accel < -HARD else ""
-    if stops:
+    if stays:
         return f"{words}vehicle in the way"
     speed = get.getSpeed(name)
     reach = min(0.5 * speed * speed + 2.0 * speed + 10.0, NOTICE)  # m, from where an IDM begins to brake

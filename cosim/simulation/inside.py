@@ -33,16 +33,15 @@ class Inside:
     def __init__(self, road: RoadMap) -> None:
         self._road = road
 
-    def room(self, name: str, lane: str) -> tuple[float, str]:
-        """m that the AV `name`, on the internal lane `lane`, can drive on in the junction before it touches
-        somebody who stands there, is coming to a stand, or will wait there, and who that is; inf and "" where
-        nobody is in its way."""
+    def in_the_way(self, name: str, lane: str) -> str:
+        """Who the AV `name`, which stands on the internal lane `lane`, would touch on its way out of the
+        junction, if everybody else who is slow came to a stand and who may wait there did; "" for nobody."""
         get, road = sumo.vehicle, self._road
         own = road.index.get(lane, -1)
         came, leaves = self._way(own) if own >= 0 else ([], [])
         others = list(self._others({*came, *leaves}))
         if not others:
-            return math.inf, ""
+            return ""
         length, at = get.getLength(name), get.getLanePosition(name)
         path = road.path(own)
         left = sum(road.lanes[k].length for k in leaves) - at
@@ -54,14 +53,13 @@ class Inside:
         places = Boxes(x, y, heading[:, None], length, get.getWidth(name) + 2.0 * BESIDE)
         touched = overlap(places, Boxes(*np.array([box for _, box in others]).T))  # [places, others]
         touched[:, touched[0]] = False  # who is touched where it is now is beside it: to stand would not help
-        where = int(touched.any(axis=1).argmax())
-        return (float(ahead[where - 1]), others[int(touched[where].argmax())][0]) if where else (math.inf, "")
+        first = touched[touched.any(axis=1).argmax()]
+        return others[int(first.argmax())][0] if first.any() else ""
 
     # ---- inside ----
 
     def _others(self, way: set[int]) -> Iterator[tuple[str, Box]]:
-        """Names and boxes of those who stand in the junction of `way`, not on it: where they come to a stand,
-        or will wait."""
+        """Names and boxes of those who stand in the junction of `way`, not on it: where they will."""
         get, lanes = sumo.vehicle, self._road.lanes
         junction = next((lanes[lane].start for lane in way), "")
         for lane in self._lanes.get(junction, ()):

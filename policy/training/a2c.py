@@ -28,6 +28,7 @@ class A2cConfig:
     scale: float = 0.1  # of all rewards, as the DDQN's
     normalize: bool = False  # advantages to mean 0 and deviation 1 over a batch
     clip: float = 0.5  # largest gradient norm
+    far: float = 1.0  # what the actor learns from a decision with no mission vehicle near (`explore.near`)
     imitation: float = 0.0  # weight of the demonstrations: the chance of a demonstrated action is to be 1
 
     def __post_init__(self) -> None:
@@ -35,7 +36,7 @@ class A2cConfig:
         in_range(
             self,
             positive="learning_rate keep n_step gamma batch scale clip",
-            not_negative="weight_decay imitation",
+            not_negative="weight_decay imitation far",
         )
 
 
@@ -103,10 +104,14 @@ class A2cLearner(Learner):
         preference, value = self.online.actor_critic(*states(places, phi, device))
         logs = preference.log_softmax(1)
         advantage = (goal - value).detach()
+        weight = torch.tensor([1.0 if t.interacting[k] else c.far for t, k in places], device=device)
+        weight = weight / weight.sum().clamp(min=1.0)
         if c.normalize and len(advantage) > 1:
-            advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-6)
+            mean = (weight * advantage).sum()
+            deviation = (weight * (advantage - mean).square()).sum().sqrt()
+            advantage = (advantage - mean) / (deviation + 1e-6)
         losses = {
-            "policy": -(advantage * logs.gather(1, action[:, None])[:, 0]).mean(),
+            "policy": -(weight * advantage * logs.gather(1, action[:, None])[:, 0]).sum(),
             "value": (goal - value).square().mean(),
             "entropy": -(logs.exp() * logs).sum(1).mean(),
             "imitation": _misfit(

@@ -180,6 +180,13 @@ def test_a_bus_changes_no_lanes_before_it_has_turned_off_a_junction(law_worlds: 
     assert result.value("av_involved_collisions") == 0
 
 
+def test_nobody_starts_inside_a_junction_into_one_that_stands_in_its_way(law_worlds: dict[str, Path]) -> None:
+    """SUMO's driver starts, and so hit one there in docs/results/law.md."""
+    result = drive(law_worlds["crossing_signals"], "random", seed=200_004, duration=100.0)
+
+    assert result.value("av_involved_collisions") == 0
+
+
 def test_it_comes_to_a_stop_comfortably_and_does_not_creep_there(start: Start) -> None:
     standing = vehicle("standing", "hv", 150.0, speed=0.0, more='speedFactor="0.001"')
     worker = start([standing, vehicle("av", "av", 60.0, speed=10.0)], preset=Preset.LAWFUL)

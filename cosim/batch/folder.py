@@ -1,14 +1,13 @@
 """The folder of a run: made, locked, checked for disk space before anything is run, removed if that fails."""
 
 import contextlib
-import fcntl
 import os
 from contextlib import AbstractContextManager
 from pathlib import Path
 
 from cosim.batch.store import FILE
 from cosim.errors import BadInput
-from cosim.files import cannot
+from cosim.files import cannot, lock
 
 EPISODE_BYTES = 32_000  # 6 kB in the store, 2 kB exported, and the store's log beside it
 LEAST_BYTES = 4_000_000  # bytes
@@ -29,7 +28,7 @@ class RunFolder(contextlib.AbstractContextManager["RunFolder"]):
         self._lock: int | None = None
         self._made = self._make()
         try:
-            self._take_lock()
+            self._lock = lock(self.path, "--out", path)
             held = [name for name in RESULTS if (self.path / name).exists()]
             if held and not resume:
                 raise self._wrong(f"holds {held[0]} already: go on with --resume, or name another folder")
@@ -72,15 +71,6 @@ class RunFolder(contextlib.AbstractContextManager["RunFolder"]):
         for folder in self._made:
             with contextlib.suppress(OSError):  # another process put a file there in the meantime
                 folder.rmdir()
-
-    def _take_lock(self) -> None:
-        """flock on the folder itself: gone with the process, however that ends."""
-        with self._cannot("lock this folder"):
-            self._lock = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY)
-            try:
-                fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise self._wrong("another process is working in it") from None
 
     def _check_space(self, size: int) -> None:
         """Write and remove a file of the size that the results may reach."""

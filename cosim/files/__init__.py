@@ -2,6 +2,7 @@
 
 import contextlib
 import csv
+import fcntl
 import json
 import math
 import os
@@ -91,6 +92,32 @@ def new_folder(path: str | None) -> Iterator[Path | None]:
         if new and folder is not None:
             shutil.rmtree(folder, ignore_errors=True)
         raise
+
+
+def lock(folder: Path, field: str, shown: str, who: str = "process") -> int:
+    """Lock a folder until what is returned is closed (`os.close`), or the process ends, however it does.
+
+    Raises BadInput: another `who` is working in it.
+    """
+    with cannot("lock this folder", field=field, value=shown):
+        held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(held)
+            raise BadInput(f"another {who} is working in it", field=field, value=shown) from None
+    return held
+
+
+@contextlib.contextmanager
+def working_in(path: str) -> Iterator[Path]:
+    """The folder that --out names, made and locked for the block. Raises BadInput."""
+    folder = prepare_folder(path)
+    held = lock(folder, "--out", path)
+    try:
+        yield folder
+    finally:
+        os.close(held)
 
 
 def prepare_folder(path: str, field: str = "--out") -> Path:

@@ -10,7 +10,7 @@ import numpy as np
 
 from cosim.episode import run_episode
 from cosim.errors import BadInput
-from cosim.files import prepare_folder
+from cosim.files import working_in
 from cosim.host import Host, Hosts
 from cosim.learning.configuration import configuration
 from cosim.learning.prediction_data import spread
@@ -126,29 +126,31 @@ def train(args: argparse.Namespace) -> int:
     file = configuration(args.config).file
     training, agent = file.sight, agent_config("vfn-p", file)
     worlds = [place(w) for w in args.scenario if w != "all"] or list(names())
-    folder = prepare_folder(args.out)
-    keep_freed_memory()
-    use_threads(args.threads)
-    seen = gather(agent, training, worlds, TRAINING_SEEDS[: training.drives], args.workers, "learns from")
-    checked = gather(agent, training, worlds, TUNING_SEEDS[: training.validation], args.workers, "checks on")
-    task = SightTask(file.encoder, training, seen, checked, args.device)
-    about = {
-        "scenarios": worlds,
-        "frames": {"training": len(seen.maps), "validation": len(checked.maps)},
-        "sight": asdict(training),
-    }
-    layout = {"encoder": asdict(file.encoder), **about}
-    with Progress("train encoder", "updates") as progress:
-        log = supervised.train(
-            task, training.loop, folder, layout=layout, resume=args.resume, progress=progress
+    with working_in(args.out) as folder:
+        keep_freed_memory()
+        use_threads(args.threads)
+        seen = gather(agent, training, worlds, TRAINING_SEEDS[: training.drives], args.workers, "learns from")
+        checked = gather(
+            agent, training, worlds, TUNING_SEEDS[: training.validation], args.workers, "checks on"
         )
-    weights = folder / "encoder.safetensors"
-    explained = sight.explained(checked.readings, sight.read_all(task.network, checked.maps, args.device))
-    measured = {"R2 on tuning seeds": {name: round(value, 3) for name, value in explained.items()}}
-    sight.save(weights, task.network, measured, about)
-    supervised.write_log(weights.with_suffix(".csv"), log)
-    for name, value in explained.items():
-        print(f"  {value:6.2f}  {name}")
-    print(f"encoder: {training.loop.updates} updates on {len(seen.maps):,} frames")
-    print(f"  {weights}")
-    return 0
+        task = SightTask(file.encoder, training, seen, checked, args.device)
+        about = {
+            "scenarios": worlds,
+            "frames": {"training": len(seen.maps), "validation": len(checked.maps)},
+            "sight": asdict(training),
+        }
+        layout = {"encoder": asdict(file.encoder), **about}
+        with Progress("train encoder", "updates") as progress:
+            log = supervised.train(
+                task, training.loop, folder, layout=layout, resume=args.resume, progress=progress
+            )
+        weights = folder / "encoder.safetensors"
+        explained = sight.explained(checked.readings, sight.read_all(task.network, checked.maps, args.device))
+        measured = {"R2 on tuning seeds": {name: round(value, 3) for name, value in explained.items()}}
+        sight.save(weights, task.network, measured, about)
+        supervised.write_log(weights.with_suffix(".csv"), log)
+        for name, value in explained.items():
+            print(f"  {value:6.2f}  {name}")
+        print(f"encoder: {training.loop.updates} updates on {len(seen.maps):,} frames")
+        print(f"  {weights}")
+        return 0

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from cosim.errors import BadInput
-from cosim.files import prepare_folder
+from cosim.files import working_in
 from cosim.learning.configuration import configuration
 from cosim.learning.prediction_data import MAPLESS, EpisodeReader, episodes, followed, recorded_by, spread
 from cosim.recording.folder import Folder, seed_of
@@ -44,28 +44,30 @@ def train(args: argparse.Namespace) -> int:
         "train": _checked(args.recordings, TRAINING_SEEDS, "--recordings"),
         "validation": _checked(args.validation, TUNING_SEEDS, "--validation"),
     }
-    folder = prepare_folder(args.out)
-    keep_freed_memory()
-    use_threads(args.threads)
-    data = {part: _manifest(keys) for part, keys in found.items()}
-    examples = {part: _gather(keys, name, training, args.workers, part) for part, keys in found.items()}
-    task: KinematicTask | MapTask
-    variant, loop = hpn.VARIANTS[name], training.loop
-    sets = examples["train"], examples["validation"]
-    if variant.maps == "plain":
-        loop = training.map_loop
-        task = MapTask(variant.map_branch, training.maps, loop.updates, *sets, args.device)
-    else:
-        task = KinematicTask(variant.kinematic, training.kinematics, loop.updates, *sets, args.device)
-    layout = {"hpn": asdict(variant), "training": asdict(training), "data": data}
-    with Progress(f"train {name}", "updates") as progress:
-        log = supervised.train(task, loop, folder, layout=layout, resume=args.resume, progress=progress)
-    file_name = folder / f"{name}.safetensors"
-    supervised.write_log(file_name.with_suffix(".csv"), log)
-    hpn.save(file_name, name, hpn.assemble(name, task), log[-1], {**data, "commands": _commands(args, found)})
-    print(f"{name}: {loop.updates} updates, validation loss {log[-1]['validation_loss']:.4f}")
-    print(f"  {file_name}")
-    return 0
+    with working_in(args.out) as folder:
+        keep_freed_memory()
+        use_threads(args.threads)
+        data = {part: _manifest(keys) for part, keys in found.items()}
+        examples = {part: _gather(keys, name, training, args.workers, part) for part, keys in found.items()}
+        task: KinematicTask | MapTask
+        variant, loop = hpn.VARIANTS[name], training.loop
+        sets = examples["train"], examples["validation"]
+        if variant.maps == "plain":
+            loop = training.map_loop
+            task = MapTask(variant.map_branch, training.maps, loop.updates, *sets, args.device)
+        else:
+            task = KinematicTask(variant.kinematic, training.kinematics, loop.updates, *sets, args.device)
+        layout = {"hpn": asdict(variant), "training": asdict(training), "data": data}
+        with Progress(f"train {name}", "updates") as progress:
+            log = supervised.train(task, loop, folder, layout=layout, resume=args.resume, progress=progress)
+        file_name = folder / f"{name}.safetensors"
+        supervised.write_log(file_name.with_suffix(".csv"), log)
+        hpn.save(
+            file_name, name, hpn.assemble(name, task), log[-1], {**data, "commands": _commands(args, found)}
+        )
+        print(f"{name}: {loop.updates} updates, validation loss {log[-1]['validation_loss']:.4f}")
+        print(f"  {file_name}")
+        return 0
 
 
 def _commands(args: argparse.Namespace, found: Mapping[str, Sequence[tuple[Path, str]]]) -> dict[str, Any]:

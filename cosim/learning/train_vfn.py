@@ -10,7 +10,7 @@ from dataclasses import asdict, replace
 import yaml
 
 from cosim.errors import BadInput
-from cosim.files import code, prepare_folder
+from cosim.files import code, working_in
 from cosim.learning.configuration import configuration
 from cosim.learning.rollouts import Rollouts
 from cosim.metrics import read as read_metric
@@ -50,42 +50,46 @@ def train(args: argparse.Namespace) -> int:
         raise BadInput("is for networks that keep a replay buffer", field="training.ensemble")
     for lesson in training.lessons:
         load(lesson.scenario, demand=[lesson.demand], behavior=lesson.behavior)
-    folder = prepare_folder(args.out)
-    if not args.resume and (folder / "state.json").exists():
-        raise BadInput("holds a training run already: --resume goes on", field="--out", value=args.out)
-    explore = replace(file.explore, sample=training.a2c.keep if learning == "a2c" else 0)
-    file = replace(file, explore=explore)
-    about = {
-        "policy": name,
-        "scenarios": sorted({lesson.scenario for lesson in training.lessons}),
-        **{part: asdict(getattr(file, part)) for part in ABOUT},
-    }
-    if training.reward:
-        about["reward"] = training.reward
-    if agent.predicted_maps and agent.chain.source == "hpn" and agent.hpn_weights is not None:
-        about["hpn_sha256"] = sha256(agent.hpn_weights)
-    keep_freed_memory()
-    use_threads(args.threads)  # more threads than cores stall each other (docs/training.md)
-    writer = tensorboard(folder)
-    rollouts = Rollouts(args.workers, name, agent, explore, training.reward or file.reward, training.metrics)
-    with closing(writer), Progress(f"train {name}", "iterations") as progress, rollouts as actors:
-        run = TrainingRun(training, agent.vfn, actors, folder, device=args.device, log=writer, about=about)
-        if args.resume and not run.resume():
-            print("nothing to resume: starting anew", file=sys.stderr)
-        run.check_ensemble()
-        (folder / "config.yaml").write_text(yaml.safe_dump(values, sort_keys=False), encoding="utf-8")
-        run.run(progress)
+    with working_in(args.out) as folder:
+        if not args.resume and (folder / "state.json").exists():
+            raise BadInput("holds a training run already: --resume goes on", field="--out", value=args.out)
+        explore = replace(file.explore, sample=training.a2c.keep if learning == "a2c" else 0)
+        file = replace(file, explore=explore)
+        about = {
+            "policy": name,
+            "scenarios": sorted({lesson.scenario for lesson in training.lessons}),
+            **{part: asdict(getattr(file, part)) for part in ABOUT},
+        }
+        if training.reward:
+            about["reward"] = training.reward
+        if agent.predicted_maps and agent.chain.source == "hpn" and agent.hpn_weights is not None:
+            about["hpn_sha256"] = sha256(agent.hpn_weights)
+        keep_freed_memory()
+        use_threads(args.threads)  # more threads than cores stall each other (docs/training.md)
+        writer = tensorboard(folder)
+        rollouts = Rollouts(
+            args.workers, name, agent, explore, training.reward or file.reward, training.metrics
+        )
+        with closing(writer), Progress(f"train {name}", "iterations") as progress, rollouts as actors:
+            run = TrainingRun(
+                training, agent.vfn, actors, folder, device=args.device, log=writer, about=about
+            )
+            if args.resume and not run.resume():
+                print("nothing to resume: starting anew", file=sys.stderr)
+            run.check_ensemble()
+            (folder / "config.yaml").write_text(yaml.safe_dump(values, sort_keys=False), encoding="utf-8")
+            run.run(progress)
+            if training.ensemble:
+                with Progress(f"distill {name}", "updates") as progress:
+                    taught = run.distill(progress)
         if training.ensemble:
-            with Progress(f"distill {name}", "updates") as progress:
-                taught = run.distill(progress)
-    if training.ensemble:
-        print(f"  {run.folder / 'ensemble' / RESULT}, validation reward {taught['valid/reward']:.3f}")
-    # as `--policy` wants the folder: a bare word would be a policy that ships
-    typed = shlex.quote(args.out if "/" in args.out else f"./{args.out}")
-    best = f", best validation reward {run.best:.3f}" if math.isfinite(run.best) else ""
-    print(f"{name}: {run.iteration} iterations, {run.trainer.learner.updates} updates{best}")
-    print(f"  {folder / BEST}" + (f" (cosim run merge --policy {typed})" if best else ""))
-    return 0
+            print(f"  {run.folder / 'ensemble' / RESULT}, validation reward {taught['valid/reward']:.3f}")
+        # as `--policy` wants the folder: a bare word would be a policy that ships
+        typed = shlex.quote(args.out if "/" in args.out else f"./{args.out}")
+        best = f", best validation reward {run.best:.3f}" if math.isfinite(run.best) else ""
+        print(f"{name}: {run.iteration} iterations, {run.trainer.learner.updates} updates{best}")
+        print(f"  {folder / BEST}" + (f" (cosim run merge --policy {typed})" if best else ""))
+        return 0
 
 
 def _scheduled(training: VfnTraining, args: argparse.Namespace, name: str) -> VfnTraining:

@@ -1,7 +1,6 @@
 """What a server is started with, and where it keeps things."""
 
 import contextlib
-import fcntl
 import ipaddress
 import os
 import secrets
@@ -9,8 +8,7 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
-from cosim.errors import BadInput
-from cosim.files import prepare_folder, whole
+from cosim.files import lock, prepare_folder, whole
 
 TOKEN = "COSIM_TOKEN"  # the variable that names the bearer token
 MB = 1 << 20
@@ -86,12 +84,7 @@ class DataFolder(contextlib.AbstractContextManager["DataFolder"]):
 
     def __init__(self, path: str) -> None:
         self.path = prepare_folder(path, "--data").absolute()
-        self._lock = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY)
-        try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            os.close(self._lock)
-            raise BadInput("another server is working in it", field="--data", value=path) from None
+        self._lock = lock(self.path, "--data", path, "server")
         shutil.rmtree(self.path / "scratch", ignore_errors=True)  # of a server that was killed
         for name in ("runs", "uploads", "scratch"):
             (self.path / name).mkdir(exist_ok=True)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from cosim.errors import BadInput
-from cosim.files import cannot, prepare_folder, read_json
+from cosim.files import cannot, prepare_folder, read_json, working_in
 
 
 def test_an_error_of_the_system_names_what_was_being_done_and_where(tmp_path: Path) -> None:
@@ -56,3 +56,15 @@ def test_a_folder_in_the_place_of_a_document_cannot_be_read(tmp_path: Path) -> N
 def test_what_is_absent_is_said_in_the_callers_words(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="a run of cosim is needed"):
         read_json(tmp_path / "a.json", "a run of cosim is needed")
+
+
+def test_one_process_at_a_time_works_in_a_folder(tmp_path: Path) -> None:
+    run = str(tmp_path / "run")
+    with (
+        working_in(run),
+        pytest.raises(BadInput, match="another process is working in it"),
+        working_in(run),
+    ):
+        raise AssertionError("two at a time")
+    with working_in(run):
+        pass

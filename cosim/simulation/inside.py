@@ -9,6 +9,7 @@ import math
 from collections import defaultdict
 from collections.abc import Iterator
 from functools import cached_property
+from itertools import takewhile
 
 import numpy as np
 
@@ -16,15 +17,13 @@ from cosim.geometry import Boxes, overlap
 from cosim.road import RoadMap
 from cosim.road.rules import RED, YELLOW
 from cosim.simulation.backend import sumo
-from cosim.simulation.conventions import centres
+from cosim.types import Floats
 
 STOPS = 4.5  # m/s2, with which who is slow comes to a stand
 SLOW = 3.0  # m/s: who is faster passes
 SPACING = 0.25  # m between the places that are looked at
 BESIDE = 0.1  # m that an AV wants to have free on either side
 SOON = 3.0, 10.0  # s, or m, from a green line: who is so near will be inside
-
-Box = tuple[float, float, float, float, float]  # centre (m), heading (rad), length and width (m)
 
 
 class Inside:
@@ -35,44 +34,35 @@ class Inside:
 
     def in_the_way(self, name: str, lane: str) -> str:
         """Who the AV `name`, which stands on the internal lane `lane`, would touch on its way out of the
-        junction, if everybody else who is slow came to a stand and who may wait there did; "" for nobody."""
-        get, road = sumo.vehicle, self._road
-        own = road.index.get(lane, -1)
-        came, leaves = self._way(own) if own >= 0 else ([], [])
-        others = list(self._others({*came, *leaves}))
-        if not others:
+        junction: somebody who stands there or drives through, or may soon wait there; "" for nobody."""
+        get, own = sumo.vehicle, self._road.index.get(lane, -1)
+        if own < 0:
             return ""
-        length, at = get.getLength(name), get.getLanePosition(name)
-        path = road.path(own)
-        left = sum(road.lanes[k].length for k in leaves) - at
-        ahead = np.arange(0.0, left + length, SPACING)
-        front = np.stack(path.pose((at + ahead) * path.scale)[:2])
-        rear = np.stack(path.pose((at + ahead - length) * path.scale)[:2])
-        heading = np.arctan2(*(front - rear)[::-1])
-        x, y = 0.5 * (front + rear)[..., None]
-        places = Boxes(x, y, heading[:, None], length, get.getWidth(name) + 2.0 * BESIDE)
-        touched = overlap(places, Boxes(*np.array([box for _, box in others]).T))  # [places, others]
-        touched[:, touched[0]] = False  # who is touched where it is now is beside it: to stand would not help
-        first = touched[touched.any(axis=1).argmax()]
-        return others[int(first.argmax())][0] if first.any() else ""
+        mine = None
+        for other, theirs in self._others(own):
+            if mine is None:
+                mine = self._through(name, own, get.getLanePosition(name), BESIDE)
+            touched = overlap(Boxes(*mine[:, :, None]), Boxes(*theirs))  # [places, places]
+            if touched.any() and not touched[0].any():  # else it is beside: to stay would not help
+                return other
+        return ""
 
     # ---- inside ----
 
-    def _others(self, way: set[int]) -> Iterator[tuple[str, Box]]:
-        """Names and boxes of those who stand in the junction of `way`, not on it: where they will."""
+    def _others(self, own: int) -> Iterator[tuple[str, Floats]]:
+        """Names, and places as `_through`'s, of those who are on other ways through the junction of the lane
+        `own`, or soon will be: where they stand, will wait, or drive through."""
         get, lanes = sumo.vehicle, self._road.lanes
-        junction = next((lanes[lane].start for lane in way), "")
-        for lane in self._lanes.get(junction, ()):
-            if lane in way:  # SUMO's driver heeds them
+        for lane in self._lanes[lanes[own].start]:
+            if lane in self._way(own):  # SUMO's driver heeds them
                 continue
-            waits = self._road.waits_inside(lane)
+            waits, end = self._road.waits_inside(lane), lanes[lane].length
             for other in sumo.lane.getLastStepVehicleIDs(lanes[lane].id):
-                speed = get.getSpeed(other)
-                if waits:
-                    yield other, self._at_end(other, lane)
-                elif speed < SLOW:
-                    x, y = get.getPosition(other)
-                    yield other, _at(other, x, y, get.getAngle(other), speed**2 / (2.0 * STOPS))
+                at, speed = get.getLanePosition(other), get.getSpeed(other)
+                through = self._through(other, lane, at)
+                stands = min(at + speed**2 / (2.0 * STOPS), end) - at
+                last = end - at if waits else stands if speed < SLOW else math.inf
+                yield other, through[:, : int(min(last / SPACING, through.shape[1])) + 1]
             for origin in self._origins[lane] if waits else ():
                 for other in sumo.lane.getLastStepVehicleIDs(lanes[origin].id):
                     seconds, metres = SOON
@@ -81,23 +71,32 @@ class Inside:
                         continue
                     links = get.getNextLinks(other)
                     if links and links[0][4] == lanes[lane].id and links[0][5] not in RED + YELLOW:
-                        yield other, self._at_end(other, lane)
+                        yield other, self._through(other, lane, end)[:, :1]
 
-    def _at_end(self, name: str, lane: int) -> Box:
-        """Where it waits at the end of a lane inside the junction."""
-        path = self._road.path(lane)
-        x, y, heading = path.pose(np.array([self._road.lanes[lane].length * path.scale]))
-        return _at(name, float(x[0]), float(y[0]), 90.0 - math.degrees(float(heading[0])))
+    def _through(self, name: str, lane: int, at: float, beside: float = 0.0) -> Floats:
+        """[5,k] x, y (m), heading (rad), length and width (m) of a vehicle every `SPACING` m on its way from
+        `at` (m) on a lane inside a junction until it has left it; `beside`: m more on either side."""
+        road, length = self._road, sumo.vehicle.getLength(name)
+        path = road.path(lane)
+        leaves = takewhile(lambda k: road.lanes[k].internal, path.lanes)
+        left = sum(road.lanes[k].length for k in leaves) - at + length
+        along = at + np.arange(0.0, left, SPACING)
+        front = np.stack(path.pose(along * path.scale)[:2])
+        rear = np.stack(path.pose((along - length) * path.scale)[:2])
+        heading = np.arctan2(*(front - rear)[::-1])
+        sizes = np.array([[length], [sumo.vehicle.getWidth(name) + 2.0 * beside]])
+        return np.concatenate([0.5 * (front + rear), [heading], sizes.repeat(len(along), 1)])
 
-    def _way(self, lane: int) -> tuple[list[int], list[int]]:
-        """A lane inside a junction and those before it, back to the line, and it and those after it."""
+    def _way(self, lane: int) -> set[int]:
+        """The lanes inside a junction that lead to one of them and on from it, and itself."""
         lanes, before = self._road.lanes, self._road.before
-        came, leaves = [lane], [lane]
-        while following := [k for k in lanes[leaves[-1]].successors if lanes[k].internal]:
-            leaves.append(following[0])
-        while earlier := [k for k in before[came[-1]] if lanes[k].internal]:
-            came.append(earlier[0])
-        return came, leaves
+        found, ends = {lane}, [lane]
+        while ends:
+            near = ends.pop()
+            new = {k for k in (*lanes[near].successors, *before[near]) if lanes[k].internal} - found
+            found |= new
+            ends += new
+        return found
 
     @cached_property
     def _lanes(self) -> dict[str, list[int]]:
@@ -115,11 +114,3 @@ class Inside:
         for link in self._road.links:
             found[link.via].append(link.origin)
         return found
-
-
-def _at(name: str, x: float, y: float, angle: float, further: float = 0.0) -> Box:
-    """A vehicle with its front at x and y (m), by SUMO's angle (degrees), `further` m on."""
-    length = sumo.vehicle.getLength(name)
-    half = np.array([0.5 * length - further])
-    cx, cy, heading = centres(np.array([x]), np.array([y]), np.array([angle]), half)
-    return float(cx[0]), float(cy[0]), float(heading[0]), length, sumo.vehicle.getWidth(name)

@@ -31,10 +31,7 @@ STALLED = 0.2, 1.5  # m/s2, or so little acceleration where so much was asked fo
 RESPITE = 2.0  # s without a correction: the next one is a new one
 HARD = 3.5  # m/s2: harder braking is an emergency's
 TURNED = 15.0  # degrees from its lane's direction: it begins no lane change
-STARTS, SHORT_OF = (
-    1.0,
-    0.3,
-)  # m/s: so slow it stays where it is for who stands in its way; m it stops before him
+STARTS = 0.1  # m/s: who is slower inside a junction stands, and looks whether somebody is in its way
 KEEPS_MOVING = 3.0  # m/s: no slower wish is followed inside a junction, nor for longer than `PATIENCE`
 CROSSES = 5.0  # s behind a junction in which it had to give way: inside and so long it takes its gap swiftly
 NOTICE = 150.0  # m: signals and stop lines further ahead are no reason yet

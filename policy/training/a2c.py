@@ -113,7 +113,7 @@ class A2cLearner(Learner):
         losses = {
             "policy": -(weight * advantage * logs.gather(1, action[:, None])[:, 0]).sum(),
             "value": (goal - value).square().mean(),
-            "entropy": -(logs.exp() * logs).sum(1).mean(),
+            "entropy": -(weight * (logs.exp() * logs).sum(1)).sum(),
             "imitation": _misfit(
                 logs, torch.from_numpy(np.stack([t.wrong[k] for t, k in places])).to(device)
             ),

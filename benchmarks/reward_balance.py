@@ -73,7 +73,7 @@ class Demonstrated(Explorer):
     def reset(self, context: PolicyContext) -> None:
         """A new episode."""
         super().reset(context)
-        self.episode("balance", 0.0, context.rng, guided=True)
+        self.episode("balance", 0.0, context.rng, context.rng, guided=True)
 
 
 class Crawl(Unled):

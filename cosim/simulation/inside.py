@@ -52,9 +52,9 @@ class Inside:
     def _others(self, own: int) -> Iterator[tuple[str, Floats]]:
         """Names, and places as `_through`'s, of those who are on other ways through the junction of the lane
         `own`, or soon will be: where they stand, will wait, or drive through."""
-        get, lanes = sumo.vehicle, self._road.lanes
+        get, lanes, way = sumo.vehicle, self._road.lanes, self._way(own)
         for lane in self._lanes[lanes[own].start]:
-            if lane in self._way(own):  # SUMO's driver heeds them
+            if lane in way:  # SUMO's driver heeds them
                 continue
             waits, end = self._road.waits_inside(lane), lanes[lane].length
             for other in sumo.lane.getLastStepVehicleIDs(lanes[lane].id):
@@ -88,7 +88,7 @@ class Inside:
         return np.concatenate([0.5 * (front + rear), [heading], sizes.repeat(len(along), 1)])
 
     def _way(self, lane: int) -> set[int]:
-        """The lanes inside a junction that lead to one of them and on from it, and itself."""
+        """A lane inside a junction, with those in it that lead there, and that it leads to."""
         lanes, before = self._road.lanes, self._road.before
         found, ends = {lane}, [lane]
         while ends:

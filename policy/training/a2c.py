@@ -1,5 +1,6 @@
 """Multi-agent advantage actor-critic after T: shared weights, n-step returns, one pass over fresh drives."""
 
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -19,6 +20,7 @@ class A2cConfig:
 
     learning_rate: float = 3e-4
     weight_decay: float = 0.0  # of AdamW: what every weight loses of itself in an update, times the rate
+    attempts: int = 1  # drives with the same traffic and learners: if several, their mean is the baseline
     keep: int = 1  # decisions that what is drawn is kept: nobody opens a gap within one of 0.4 s
     n_step: int = 8  # as the DDQN's (docs/training.md); 1 is the papers'
     gamma: float = 0.97  # a decision of 0.4 s
@@ -35,7 +37,7 @@ class A2cConfig:
         """Raises BadInput for a number out of range."""
         in_range(
             self,
-            positive="learning_rate keep n_step gamma batch scale clip",
+            positive="learning_rate attempts keep n_step gamma batch scale clip",
             not_negative="weight_decay imitation far",
         )
 
@@ -59,15 +61,21 @@ class A2cLearner(Learner):
 
         Returns the means of `policy`, `value`, `entropy` (nat) and `imitation` (minus the log of the chance
         of the demonstrated actions), and `explained_variance`, the share of the returns' variance that the
-        critic had foretold; nothing when there are no transitions.
+        critic, or the mean of several attempts, had foretold; nothing when there are no transitions.
         """
         places = [(t, k) for t in drives for k in range(0, len(t), self.config.keep)]
         if not places:
             return {}
         known = [self._returns(t) for t in drives if len(t)]
         returns, foretold = (np.concatenate(part) for part in zip(*known, strict=True))
+        if self.config.attempts > 1:
+            alike = defaultdict(list)  # the same AV at the same time in the same traffic
+            for i, (t, k) in enumerate(places):
+                alike[t.episode, t.av, k].append(i)
+            for rows in alike.values():
+                foretold[rows] = returns[rows].mean() if len(rows) > 1 else foretold[rows]
         losses = [
-            self._update([places[i] for i in rows], returns[rows])
+            self._update([places[i] for i in rows], returns[rows], foretold[rows])
             for rows in _batches(rng.permutation(len(places)), self.config.batch)
         ]
         explained = 1.0 - float((returns - foretold).var()) / max(float(returns.var()), 1e-12)
@@ -96,14 +104,14 @@ class A2cLearner(Learner):
             out[i] = c.gamma ** np.arange(end - t) @ reward[t:end] + c.gamma ** (end - t) * values[end]
         return out, values[begins]
 
-    def _update(self, places: list[tuple[Trajectory, int]], returns: Floats32) -> Metrics:
+    def _update(self, places: list[tuple[Trajectory, int]], returns: Floats32, foretold: Floats32) -> Metrics:
         c, device = self.config, self.device
         phi = np.array([t.phi for t, _ in places], np.float32)
         action = torch.tensor([int(t.action[k]) for t, k in places], device=device)
         goal = torch.from_numpy(returns).to(device)
         preference, value = self.online.actor_critic(*states(places, phi, device))
         logs = preference.log_softmax(1)
-        advantage = (goal - value).detach()
+        advantage = goal - (torch.from_numpy(foretold).to(device) if c.attempts > 1 else value.detach())
         weight = torch.tensor([1.0 if t.interacting[k] else c.far for t, k in places], device=device)
         weight = weight / weight.sum().clamp(min=1.0)
         if c.normalize and len(advantage) > 1:

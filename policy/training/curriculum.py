@@ -1,5 +1,6 @@
 """The schedule of drives: lessons, seeds, exploration and who drives, all drawn from one seed."""
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -187,6 +188,7 @@ class Drive(NamedTuple):
     preset: str = Preset.UNGUARDED
     forks: ForkConfig = ForkConfig()
     gamma: float = 1.0  # that what forks change is discounted with
+    attempt: int = 0  # of those with the same traffic and learners (`A2cConfig.attempts`)
 
 
 class Drove(NamedTuple):
@@ -199,7 +201,8 @@ class Drove(NamedTuple):
 def drives(c: VfnTraining, k: int, weights: str, frozen: str, epsilon: float, guided: float) -> list[Drive]:
     """The episodes of iteration `k`; `guided`: the share of them that the demonstrator drives."""
     drawn = []
-    for j in range(c.episodes):
+    attempts = c.a2c.attempts if c.learning == "a2c" else 1
+    for j, attempt in itertools.product(range(c.episodes), range(attempts)):
         draws = [uniform(c.seed, name, str(k), str(j)) for name in ("lesson", "svo", "guided")]
         lesson = _drawn(c.lessons, draws[0])
         drawn.append(
@@ -216,6 +219,7 @@ def drives(c: VfnTraining, k: int, weights: str, frozen: str, epsilon: float, gu
                 preset=lesson.preset or c.preset,
                 forks=c.forks,
                 gamma=c.replay.gamma,
+                attempt=attempt,
             )
         )
     return drawn

@@ -47,18 +47,25 @@ class Explorer(PredictionAware):
         self._demonstrator = Demonstrator(knows_command=config.vfn.kinematic > 0)
 
     def episode(
-        self, label: str, epsilon: float, rng: np.random.Generator, guided: bool = False, record: bool = True
+        self,
+        label: str,
+        epsilon: float,
+        rng: np.random.Generator,
+        who: np.random.Generator,
+        guided: bool = False,
+        record: bool = True,
     ) -> None:
         """A new episode.
 
         Args:
             label: scenario, demand and seed, to find the trajectories again.
             epsilon: how much exploration, 0 to 1.
-            rng: every random draw comes from it.
+            rng: what is tried is drawn from it.
+            who: those who learn are; it may be `rng`.
             guided: the demonstrator drives every AV.
             record: False: no AV learns, all drive greedily by the frozen network.
         """
-        self._label, self._epsilon, self._rng = label, epsilon, rng
+        self._label, self._epsilon, self._rng, self._who = label, epsilon, rng, who
         self._guided, self._learners = guided, self.explore.learners if record else 0
         self._advised = guided or (record and self.explore.advised)
         self._demonstrator.reset(self._context)
@@ -135,7 +142,7 @@ class Explorer(PredictionAware):
         """Those who see a mission vehicle first, then any."""
         scene = inputs.scene
         sees = [bool((h.kinematics[-1, :, IS_MISSION] * h.valid[-1] > 0.5).any()) for h in scene.histories]
-        draws = self._rng.random(len(scene.agents))
+        draws = self._who.random(len(scene.agents))
         order = sorted(range(len(scene.agents)), key=lambda b: (not sees[b], draws[b]))
         self.learning = {scene.agents[b]: defaultdict(list) for b in sorted(order[: self._learners])}
         self._learners = 0

@@ -39,6 +39,7 @@ from policy.training.curriculum import (
     Lesson,
     Specialist,
     VfnTraining,
+    drives,
 )
 from policy.training.ddqn import DdqnConfig, DdqnLearner
 from policy.training.ensemble import Ensemble, Teachers
@@ -687,6 +688,53 @@ def test_actor_and_critic_learn_which_action_pays(normalize: bool, reward: float
         drives = [trajectory([int(a)], [p], ending="crashed") for a, p in zip(actions, pay, strict=True)]
         learner.learn(drives, rng)
     assert chances[MetaAction.ACCELERATE] > 0.9
+
+
+@pytest.mark.parametrize(("attempts", "learns"), [(8, True), (1, False)])
+def test_attempts_in_the_same_traffic_tell_chance_from_what_one_did(attempts: int, learns: bool) -> None:
+    """Accelerating pays 1, what the traffic brings varies by 50."""
+    config = A2cConfig(learning_rate=3e-3, n_step=1, normalize=True, attempts=attempts)
+    learner = A2cLearner(replace(TINY, critic=True), config, seed=0)
+    rng = np.random.default_rng(0)
+    for k in range(40):
+        with torch.no_grad():
+            states = experience.states([(trajectory([0], [(0.0, 0.0, 0.0)]), 0)], np.zeros(1, np.float32))
+            chances = learner.online.actor_critic(*states)[0].softmax(1)[0].double().numpy()
+        drives = []
+        for luck in 50.0 * rng.standard_normal(4):
+            for action in rng.choice(5, size=8, p=chances / chances.sum()):
+                pay = luck + float(action == MetaAction.ACCELERATE)
+                one = trajectory([int(action)], [(pay, 0.0, 0.0)], ending="crashed")
+                drives.append(replace(one, episode=f"{k} {luck}"))
+        learner.learn(drives, rng)
+    assert (chances[MetaAction.ACCELERATE] > 0.9) == learns
+
+
+def test_the_actor_learns_nothing_far_from_the_mission_vehicle_if_that_weighs_nothing() -> None:
+    learner = A2cLearner(replace(TINY, critic=True), A2cConfig(n_step=1, far=0.0), seed=0)
+    policy = {}
+    for near in (False, True):
+        one = trajectory([int(MetaAction.ACCELERATE)], [(1.0, 0.0, 0.0)], ending="crashed", near=near)
+        policy[near] = learner.learn([one], np.random.default_rng(0))["policy"]
+    assert policy[False] == 0.0
+    assert policy[True] > 0.0
+
+
+def test_attempts_have_the_same_traffic_and_differ_in_what_is_tried() -> None:
+    config = replace(SHORT, learning="a2c", episodes=2, a2c=A2cConfig(attempts=3))
+    planned = drives(config, 1, "", "", 0.5, 0.0)
+    assert [d.attempt for d in planned] == [0, 1, 2] * 2
+    assert len({(d.seed, d.lesson, d.svo, d.errors) for d in planned}) == 2
+    cars = [FakeVehicle(name, at, 0, 20.0, is_av=True) for name, at in (("a", 100.0), ("b", 200.0))]
+    tried = []
+    for attempt in (0, 1):
+        one = agent()
+        one.explore = ExploreConfig(learners=1, sample=4, advised=False)
+        drive = Drive(Lesson("fake"), 5, 0.7, 0.5, "", "", True, attempt=attempt)
+        (drove,) = drive_episode(fake_episode(*cars), one, drive, RewardConfig()).trajectories
+        tried.append((drove.episode, drove.av, drove.action.tolist()))
+    assert tried[0][:2] == tried[1][:2]
+    assert tried[0][2] != tried[1][2]
 
 
 def test_actor_and_critic_imitate_where_no_reward_speaks_for_it() -> None:

@@ -103,9 +103,11 @@ def lock(folder: Path, field: str, shown: str, who: str = "process") -> int:
         held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
         try:
             fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
+        except OSError as error:
             os.close(held)
-            raise BadInput(f"another {who} is working in it", field=field, value=shown) from None
+            if isinstance(error, BlockingIOError):
+                raise BadInput(f"another {who} is working in it", field=field, value=shown) from None
+            raise
     return held
 
 

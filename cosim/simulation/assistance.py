@@ -56,7 +56,6 @@ TOLD = 8.0, 30.0  # s to contact of the AVs ahead that are told, m between one v
 STOPS = 0.3  # s to the leader at walking pace and below
 RETURNS = 0.1, 0.2  # s of headway won back per s, below and above `HEADWAY`
 
-IGNORES = "junctionModel.ignoreIDs"  # whom SUMO's driver does not heed at junctions
 STRATEGIC, BLOCKED = 8, 512 + 1024 + 2048 + 4096 + 8192  # bits of SUMO's lane-change state
 
 
@@ -84,7 +83,6 @@ class Assisted(Controlled):
     idled: float = 0.0  # s, for which the agent has asked for less than `KEEPS_MOVING`
     stays: bool = False  # inside a junction, for somebody in its way
     held: float = 0.0  # s, for which it has done so in this one
-    first: str = ""  # the AV that goes first there
 
     @property
     def asked(self) -> float:
@@ -322,21 +320,10 @@ class Assistance(Commander):
         return False
 
     def _mind_inside(self, name: str, lane: str, speed: float, state: Assisted) -> None:
-        """Whoever stands inside a junction stays there while somebody is in its way; but not for ever.
-
-        If that is an AV, it no longer heeds this one (V2V): it would wait for it.
-        """
-        inside, whom = lane.startswith(":"), ""
-        if inside and speed < STARTS and state.held < PATIENCE:
-            whom = self._junctions.in_the_way(name, lane)
-        state.stays = bool(whom)
+        """Who stands inside a junction stays there while somebody is in its way, for `PATIENCE` at most."""
+        inside, looks = lane.startswith(":"), speed < STARTS and state.held < PATIENCE
+        state.stays = inside and looks and self._junctions.blocked(name, lane)
         state.held = state.held + state.stays * self._step if inside else 0.0
-        first = whom if whom in self.controlled else ""
-        if first != state.first:
-            for other, ignored in ((state.first, ""), (first, name)):
-                if other in self.controlled:
-                    sumo.vehicle.setParameter(other, IGNORES, ignored)
-            state.first = first
         if state.stays:
             state.accel = -COMFORT
 

@@ -1,8 +1,9 @@
-"""Who stands in an AV's way inside a junction.
+"""Who is in the way of an AV that stands inside a junction.
 
-There SUMO's driver heeds those who have the right of way, and drives past, or into, those who stand partly
-across its way: because the road behind is full, or where the net lets them wait inside the junction
-(https://sumo.dlr.de/docs/Simulation/Intersections.html, "Waiting within the intersection").
+There SUMO's driver heeds those who have the right of way. It starts into others who are passing, or who stand
+partly across its way where the net lets them wait inside the junction
+(https://sumo.dlr.de/docs/Simulation/Intersections.html, "Waiting within the intersection"). Here everybody is
+looked at whose front is inside the junction, or soon will be.
 """
 
 import math
@@ -14,7 +15,7 @@ from itertools import takewhile
 import numpy as np
 
 from cosim.geometry import Boxes, overlap
-from cosim.road import RoadMap
+from cosim.road import LanePath, RoadMap
 from cosim.road.rules import RED, YELLOW
 from cosim.simulation.backend import sumo
 from cosim.types import Floats
@@ -31,28 +32,29 @@ class Inside:
 
     def __init__(self, road: RoadMap) -> None:
         self._road = road
+        self._ways: dict[int, tuple[LanePath, tuple[int, ...]]] = {}
 
-    def in_the_way(self, name: str, lane: str) -> str:
-        """Who the AV `name`, which stands on the internal lane `lane`, would touch on its way out of the
-        junction: somebody who stands there or drives through, or may soon wait there; "" for nobody."""
-        get, own = sumo.vehicle, self._road.index.get(lane, -1)
+    def blocked(self, name: str, lane: str) -> bool:
+        """Whether the AV `name`, which stands on the internal lane `lane`, would touch somebody on its way
+        out of the junction: who stands there, drives through, or may soon wait there."""
+        own = self._road.index.get(lane, -1)
         if own < 0:
-            return ""
+            return False
         mine = None
-        for other, theirs in self._others(own):
+        for theirs in self._others(own):
             if mine is None:
-                mine = self._through(name, own, get.getLanePosition(name), BESIDE)
+                mine = self._through(name, own, sumo.vehicle.getLanePosition(name), BESIDE)
             touched = overlap(Boxes(*mine[:, :, None]), Boxes(*theirs))  # [places, places]
             if touched.any() and not touched[0].any():  # else it is beside: to stay would not help
-                return other
-        return ""
+                return True
+        return False
 
     # ---- inside ----
 
-    def _others(self, own: int) -> Iterator[tuple[str, Floats]]:
-        """Names, and places as `_through`'s, of those who are on other ways through the junction of the lane
+    def _others(self, own: int) -> Iterator[Floats]:
+        """The places, as `_through`'s, of those who are on other ways through the junction of the lane
         `own`, or soon will be: where they stand, will wait, or drive through."""
-        get, lanes, way = sumo.vehicle, self._road.lanes, self._way(own)
+        get, lanes, (_, way) = sumo.vehicle, self._road.lanes, self._way(own)
         for lane in self._lanes[lanes[own].start]:
             if lane in way:  # SUMO's driver heeds them
                 continue
@@ -62,7 +64,7 @@ class Inside:
                 through = self._through(other, lane, at)
                 stands = min(at + speed**2 / (2.0 * STOPS), end) - at
                 last = end - at if waits else stands if speed < SLOW else math.inf
-                yield other, through[:, : int(min(last / SPACING, through.shape[1])) + 1]
+                yield through[:, : int(min(last / SPACING, through.shape[1])) + 1]
             for origin in self._origins[lane] if waits else ():
                 for other in sumo.lane.getLastStepVehicleIDs(lanes[origin].id):
                     seconds, metres = SOON
@@ -71,32 +73,32 @@ class Inside:
                         continue
                     links = get.getNextLinks(other)
                     if links and links[0][4] == lanes[lane].id and links[0][5] not in RED + YELLOW:
-                        yield other, self._through(other, lane, end)[:, :1]
+                        yield self._through(other, lane, end)[:, :1]
 
     def _through(self, name: str, lane: int, at: float, beside: float = 0.0) -> Floats:
         """[5,k] x, y (m), heading (rad), length and width (m) of a vehicle every `SPACING` m on its way from
         `at` (m) on a lane inside a junction until it has left it; `beside`: m more on either side."""
-        road, length = self._road, sumo.vehicle.getLength(name)
-        path = road.path(lane)
-        leaves = takewhile(lambda k: road.lanes[k].internal, path.lanes)
-        left = sum(road.lanes[k].length for k in leaves) - at + length
-        along = at + np.arange(0.0, left, SPACING)
-        front = np.stack(path.pose(along * path.scale)[:2])
-        rear = np.stack(path.pose((along - length) * path.scale)[:2])
+        path, inside = self._way(lane)
+        ends, length = [*path.lane_start[1:], path.length], sumo.vehicle.getLength(name)
+        k = inside.index(lane)
+        scale = (ends[k] - path.lane_start[k]) / max(self._road.lanes[lane].length, SPACING)
+        arc = np.arange(path.lane_start[k] + at * scale, ends[len(inside) - 1] + length, SPACING)
+        front, rear = (np.stack(path.pose(a)[:2]) for a in (arc, arc - length))
         heading = np.arctan2(*(front - rear)[::-1])
         sizes = np.array([[length], [sumo.vehicle.getWidth(name) + 2.0 * beside]])
-        return np.concatenate([0.5 * (front + rear), [heading], sizes.repeat(len(along), 1)])
+        return np.concatenate([0.5 * (front + rear), [heading], sizes.repeat(len(arc), 1)])
 
-    def _way(self, lane: int) -> set[int]:
-        """A lane inside a junction, with those in it that lead there, and that it leads to."""
-        lanes, before = self._road.lanes, self._road.before
-        found, ends = {lane}, [lane]
-        while ends:
-            near = ends.pop()
-            new = {k for k in (*lanes[near].successors, *before[near]) if lanes[k].internal} - found
-            found |= new
-            ends += new
-        return found
+    def _way(self, lane: int) -> tuple[LanePath, tuple[int, ...]]:
+        """The path over a lane inside a junction from the line on, and its lanes up to the junction's end."""
+        if lane not in self._ways:
+            lanes, first = self._road.lanes, lane
+            while before := [k for k in self._road.before[first] if lanes[k].internal]:
+                first = before[0]
+            if lane not in self._road.path(first).lanes:  # it parts from that path
+                first = lane
+            path = self._road.path(first)
+            self._ways[lane] = path, tuple(takewhile(lambda k: lanes[k].internal, path.lanes))
+        return self._ways[lane]
 
     @cached_property
     def _lanes(self) -> dict[str, list[int]]:

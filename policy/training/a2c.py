@@ -20,7 +20,9 @@ class A2cConfig:
 
     learning_rate: float = 3e-4
     weight_decay: float = 0.0  # of AdamW: what every weight loses of itself in an update, times the rate
-    attempts: int = 1  # drives with the same traffic and learners: if several, their mean is the baseline
+    attempts: int = (
+        1  # drives with the same traffic and learners: of several the others' mean is the baseline
+    )
     keep: int = 1  # decisions that what is drawn is kept: nobody opens a gap within one of 0.4 s
     n_step: int = 8  # as the DDQN's (docs/training.md); 1 is the papers'
     gamma: float = 0.97  # a decision of 0.4 s
@@ -30,7 +32,7 @@ class A2cConfig:
     scale: float = 0.1  # of all rewards, as the DDQN's
     normalize: bool = False  # advantages to mean 0 and deviation 1 over a batch
     clip: float = 0.5  # largest gradient norm
-    far: float = 1.0  # what the actor learns from a decision with no mission vehicle near (`explore.near`)
+    far: float = 1.0  # weight, for the actor, of decisions that no mission vehicle is near (`explore.near`)
     imitation: float = 0.0  # weight of the demonstrations: the chance of a demonstrated action is to be 1
 
     def __post_init__(self) -> None:
@@ -61,7 +63,7 @@ class A2cLearner(Learner):
 
         Returns the means of `policy`, `value`, `entropy` (nat) and `imitation` (minus the log of the chance
         of the demonstrated actions), and `explained_variance`, the share of the returns' variance that the
-        critic, or the mean of several attempts, had foretold; nothing when there are no transitions.
+        critic, or the mean of the other attempts, had foretold; nothing when there are no transitions.
         """
         places = [(t, k) for t in drives for k in range(0, len(t), self.config.keep)]
         if not places:
@@ -73,7 +75,8 @@ class A2cLearner(Learner):
             for i, (t, k) in enumerate(places):
                 alike[t.episode, t.av, k].append(i)
             for rows in alike.values():
-                foretold[rows] = returns[rows].mean() if len(rows) > 1 else foretold[rows]
+                if len(rows) > 1:
+                    foretold[rows] = (returns[rows].sum() - returns[rows]) / (len(rows) - 1)
         losses = [
             self._update([places[i] for i in rows], returns[rows], foretold[rows])
             for rows in _batches(rng.permutation(len(places)), self.config.batch)
@@ -113,20 +116,21 @@ class A2cLearner(Learner):
         logs = preference.log_softmax(1)
         advantage = goal - (torch.from_numpy(foretold).to(device) if c.attempts > 1 else value.detach())
         weight = torch.tensor([1.0 if t.interacting[k] else c.far for t, k in places], device=device)
-        weight = weight / weight.sum().clamp(min=1.0)
         if c.normalize and len(advantage) > 1:
-            mean = (weight * advantage).sum()
-            deviation = (weight * (advantage - mean).square()).sum().sqrt()
-            advantage = (advantage - mean) / (deviation + 1e-6)
+            share = weight / weight.sum().clamp(min=1e-6)
+            mean = (share * advantage).sum()
+            variance = (share * (advantage - mean).square()).sum() * len(share) / (len(share) - 1)
+            advantage = (advantage - mean) / (variance.sqrt() + 1e-6)
+        entropy = -(logs.exp() * logs).sum(1)
         losses = {
-            "policy": -(weight * advantage * logs.gather(1, action[:, None])[:, 0]).sum(),
+            "policy": -(weight * advantage * logs.gather(1, action[:, None])[:, 0]).mean(),
             "value": (goal - value).square().mean(),
-            "entropy": -(weight * (logs.exp() * logs).sum(1)).sum(),
+            "entropy": entropy.mean(),
             "imitation": _misfit(
                 logs, torch.from_numpy(np.stack([t.wrong[k] for t, k in places])).to(device)
             ),
         }
-        actor = losses["policy"] + c.critic * losses["value"] - c.entropy * losses["entropy"]
+        actor = losses["policy"] + c.critic * losses["value"] - c.entropy * (weight * entropy).mean()
         self.step(actor + c.imitation * losses["imitation"])
         self.updates += 1
         return {name: float(loss.detach()) for name, loss in losses.items()}

@@ -1,6 +1,5 @@
 """The schedule of drives: lessons, seeds, exploration and who drives, all drawn from one seed."""
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -202,26 +201,25 @@ def drives(c: VfnTraining, k: int, weights: str, frozen: str, epsilon: float, gu
     """The episodes of iteration `k`; `guided`: the share of them that the demonstrator drives."""
     drawn = []
     attempts = c.a2c.attempts if c.learning == "a2c" else 1
-    for j, attempt in itertools.product(range(c.episodes), range(attempts)):
+    for j in range(c.episodes):
         draws = [uniform(c.seed, name, str(k), str(j)) for name in ("lesson", "svo", "guided")]
         lesson = _drawn(c.lessons, draws[0])
-        drawn.append(
-            Drive(
-                lesson,
-                (k * c.episodes + j + subseed(c.seed, "episodes")) % len(TRAINING_SEEDS),
-                math.radians(c.svo[int(draws[1] * len(c.svo))]),
-                epsilon,
-                weights,
-                frozen,
-                record=True,
-                guided=draws[2] < guided,
-                errors=c.errors if uniform(c.seed, "errors", str(k), str(j)) < c.erring else "",
-                preset=lesson.preset or c.preset,
-                forks=c.forks,
-                gamma=c.replay.gamma,
-                attempt=attempt,
-            )
+        drive = Drive(
+            lesson,
+            (k * c.episodes + j + subseed(c.seed, "episodes")) % len(TRAINING_SEEDS),
+            math.radians(c.svo[int(draws[1] * len(c.svo))]),
+            epsilon,
+            weights,
+            frozen,
+            record=True,
+            guided=draws[2] < guided,
+            errors=c.errors if uniform(c.seed, "errors", str(k), str(j)) < c.erring else "",
+            preset=lesson.preset or c.preset,
+            forks=c.forks,
+            gamma=c.replay.gamma,
         )
+        # the demonstrator tries nothing
+        drawn += [drive._replace(attempt=i) for i in range(1 if drive.guided else attempts)]
     return drawn
 
 

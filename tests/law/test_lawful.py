@@ -14,6 +14,7 @@ from conftest import Start, vehicle
 
 from cosim.control import COMFORT, JERK, lawful_speed, wished_accel
 from cosim.host import Host
+from cosim.road import RoadMap
 from cosim.road.rules import RulesAhead
 from cosim.scenario import chosen_fleet, load
 from cosim.scenario.human_errors import levels
@@ -181,10 +182,32 @@ def test_a_bus_changes_no_lanes_before_it_has_turned_off_a_junction(law_worlds: 
 
 
 def test_nobody_starts_inside_a_junction_into_one_that_stands_in_its_way(law_worlds: dict[str, Path]) -> None:
-    """SUMO's driver starts, and so hit one there in docs/results/law.md."""
+    """SUMO's driver starts, and hits one there."""
     result = drive(law_worlds["crossing_signals"], "random", seed=200_004, duration=100.0)
 
     assert result.value("av_involved_collisions") == 0
+
+
+def test_who_stands_inside_a_junction_stays_for_somebody_in_the_way_but_not_for_ever() -> None:
+    class Full:
+        def blocked(self, name: str, lane: str) -> bool:
+            return True
+
+    car = assistance.Assistance(STEP, RoadMap((), ()))
+    car._junctions = Full()  # type: ignore[assignment]
+    state = assistance.Assisted(0.0)
+
+    def stays(lane: str, speed: float, steps: int = 1) -> int:
+        found = 0
+        for _ in range(steps):
+            car._mind_inside("av", lane, speed, state)
+            found += state.stays
+        return found
+
+    assert stays(":j_0_0", 0.5) == 0, "it rolls"
+    assert stays(":j_0_0", 0.0, 200) == pytest.approx(assistance.PATIENCE / STEP, abs=1)
+    assert stays("e_0", 0.0) == 0, "it is out"
+    assert stays(":k_0_0", 0.0) == 1, "another junction"
 
 
 def test_it_comes_to_a_stop_comfortably_and_does_not_creep_there(start: Start) -> None:

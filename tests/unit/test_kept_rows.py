@@ -14,6 +14,7 @@ from policy.agents import POLICIES
 ROOT = Path(__file__).parents[2]
 PAGES = {
     "alone": 100,
+    "foresight": 240,
     "forced_entry": 200,
     "humans": 2000,
     "learned": 80,

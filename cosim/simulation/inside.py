@@ -55,6 +55,7 @@ class Inside:
         """The places, as `_through`'s, of those who are on other ways through the junction of the lane
         `own`, or soon will be: where they stand, will wait, or drive through."""
         get, lanes, (_, way) = sumo.vehicle, self._road.lanes, self._way(own)
+        seconds, metres = SOON
         for lane in self._lanes[lanes[own].start]:
             if lane in way:  # SUMO's driver heeds them
                 continue
@@ -67,7 +68,6 @@ class Inside:
                 yield through[:, : int(min(last / SPACING, through.shape[1])) + 1]
             for origin in self._origins[lane] if waits else ():
                 for other in sumo.lane.getLastStepVehicleIDs(lanes[origin].id):
-                    seconds, metres = SOON
                     away = lanes[origin].length - get.getLanePosition(other)
                     if away > max(seconds * get.getSpeed(other), metres):
                         continue

@@ -20,9 +20,7 @@ class A2cConfig:
 
     learning_rate: float = 3e-4
     weight_decay: float = 0.0  # of AdamW: what every weight loses of itself in an update, times the rate
-    attempts: int = (
-        1  # drives with the same traffic and learners: of several the others' mean is the baseline
-    )
+    attempts: int = 1  # drives of the same traffic by the same learners; the others' mean is the baseline
     keep: int = 1  # decisions that what is drawn is kept: nobody opens a gap within one of 0.4 s
     n_step: int = 8  # as the DDQN's (docs/training.md); 1 is the papers'
     gamma: float = 0.97  # a decision of 0.4 s

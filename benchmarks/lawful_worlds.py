@@ -27,7 +27,8 @@ SHIPPED = Path("docs/results/episodes")
 FEWER = 3.0  # how many times fewer hard brakings are asked for
 COLUMNS = (
     "world", "episodes", "crashed", "hard brakings of AVs", "of it in unguarded", "distance of all, m",
-    "less that in unguarded, m", "the same of AVs, m", "too fast in unguarded", "mission", "in unguarded", "interventions", "targets",
+    "less that in unguarded, m", "the same of AVs, m", "too fast in unguarded",
+    "mission", "in unguarded", "interventions", "targets",
 )  # fmt: skip
 
 
@@ -71,7 +72,12 @@ def line(world: str, lawful: Mapping[int, Row], before: Mapping[int, Row]) -> li
     ]
     return [
         *(world, str(len(seeds)), f"{crashed.text(1, 100.0)} %", f"{hard:.1f}", f"{hard_before:.1f}"),
-        *(f"{np.mean(column(now, 'dt_mean_m')):.1f}", way.text(1), of_avs.text(1), f"{100.0 * too_fast:.0f} %"),
+        *(
+            f"{np.mean(column(now, 'dt_mean_m')):.1f}",
+            way.text(1),
+            of_avs.text(1),
+            f"{100.0 * too_fast:.0f} %",
+        ),
         *(f"{m.text(0, 100.0)} %" if m.known else "-" for m in missions),
         *(
             f"{np.mean(column(now, 'interventions')):.1f}",

@@ -53,7 +53,10 @@ def train(args: argparse.Namespace) -> int:
     with working_in(args.out) as folder:
         if not args.resume and (folder / "state.json").exists():
             raise BadInput("holds a training run already: --resume goes on", field="--out", value=args.out)
-        explore = replace(file.explore, sample=training.a2c.keep if learning == "a2c" else 0)
+        if learning == "a2c":
+            explore = replace(file.explore, sample=training.a2c.keep, floor=training.a2c.floor)
+        else:
+            explore = file.explore
         file = replace(file, explore=explore)
         about = {
             "policy": name,

@@ -1,5 +1,6 @@
 """Multi-agent advantage actor-critic after T: shared weights, n-step returns, one pass over fresh drives."""
 
+import copy
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -9,6 +10,8 @@ import torch
 
 from cosim.errors import in_range
 from cosim.types import Floats32
+from policy.inputs.situation import comes_next
+from policy.inputs.tensors import States
 from policy.training.experience import Trajectory, states
 from policy.training.learner import Learner, Metrics, mean_metrics
 from policy.training.replay_buffer import Advised
@@ -21,10 +24,17 @@ class A2cConfig:
     learning_rate: float = 3e-4
     weight_decay: float = 0.0  # of AdamW: what every weight loses of itself in an update, times the rate
     attempts: int = 1  # drives of the same traffic by the same learners; the others' mean is the baseline
+    # share of the draws that are even over all actions, so that what is not preferred is tried too; it is
+    # learned from as if it had been preferred, but what is preferred less often than it is drawn evenly is not
+    # refused any further
+    floor: float = 0.0
+    # weight of the distance (KL) to what it began as, for AVs that do not come next to a mission vehicle
+    anchor: float = 0.0
     keep: int = 1  # decisions that what is drawn is kept: nobody opens a gap within one of 0.4 s
     n_step: int = 8  # as the DDQN's (docs/training.md); 1 is the papers'
     gamma: float = 0.97  # a decision of 0.4 s
     batch: int = 64
+    passes: int = 1  # over what an iteration drove; 1 is A2C
     entropy: float = 0.01  # keeps the policy from closing up early
     critic: float = 0.5  # weight of the value loss
     scale: float = 0.1  # of all rewards, as the DDQN's
@@ -37,8 +47,8 @@ class A2cConfig:
         """Raises BadInput for a number out of range."""
         in_range(
             self,
-            positive="learning_rate attempts keep n_step gamma batch scale clip",
-            not_negative="weight_decay imitation far",
+            positive="learning_rate attempts keep n_step gamma batch passes scale clip",
+            not_negative="weight_decay imitation far floor anchor",
         )
 
 
@@ -55,38 +65,63 @@ class A2cLearner(Learner):
         return float((-loss.detach()).exp())
 
     def learn(self, drives: Sequence[Trajectory], rng: np.random.Generator) -> Metrics:
-        """One pass, in random order, over the transitions of trajectories driven with the present weights.
+        """`config.passes`, each in random order, over trajectories driven with the present weights.
 
-        Of `config.keep` decisions with the same drawn action the first is learned from.
+        Of `config.keep` decisions with the same drawn action the first is learned from. With an anchor what
+        was drawn is what counts as interaction (`explore.next`), and as many other states are held to it.
 
-        Returns the means of `policy`, `value`, `entropy` (nat) and `imitation` (minus the log of the chance
-        of the demonstrated actions), and `explained_variance`, the share of the returns' variance that the
-        critic, or the mean of the other attempts, had foretold; nothing when there are no transitions.
+        Returns the means of `policy`, `value`, `entropy` (nat), `imitation` (minus the log of the chance of
+        the demonstrated actions) and `moved` (nat, what the anchor holds), and `explained_variance`, the
+        share of the returns' variance that the critic, or the mean of the other attempts, had foretold;
+        nothing when there are no transitions.
         """
-        places = [(t, k) for t in drives for k in range(0, len(t), self.config.keep)]
+        c = self.config
+        drawn = [(t, self._draws(t)) for t in drives]
+        places = [(t, int(k)) for t, begins in drawn for k in begins]
         if not places:
             return {}
-        known = [self._returns(t) for t in drives if len(t)]
+        known = [self._returns(t, begins) for t, begins in drawn if len(begins)]
         returns, foretold = (np.concatenate(part) for part in zip(*known, strict=True))
-        if self.config.attempts > 1:
-            alike = defaultdict(list)  # the same AV at the same time in the same traffic
-            for i, (t, k) in enumerate(places):
-                alike[t.episode, t.av, k].append(i)
+        if c.attempts > 1:
+            alike = defaultdict(
+                list
+            )  # of the same AV in the same traffic its first draws, its second ones, ...
+            which = ((t.episode, t.av, k) for t, begins in drawn for k in range(len(begins)))
+            for i, key in enumerate(which):
+                alike[key].append(i)
             for rows in alike.values():
                 if len(rows) > 1:
                     foretold[rows] = (returns[rows].sum() - returns[rows]) / (len(rows) - 1)
+        others: list[tuple[Trajectory, int]] = []
+        if c.anchor:
+            others = [(t, int(k)) for t in drives for k in np.flatnonzero(~comes_next(t.situation[:-1]))]
         losses = [
-            self._update([places[i] for i in rows], returns[rows], foretold[rows])
-            for rows in _batches(rng.permutation(len(places)), self.config.batch)
+            self._update(
+                [places[i] for i in rows],
+                returns[rows],
+                foretold[rows],
+                [others[i] for i in rng.integers(len(others), size=len(rows))] if others else [],
+            )
+            for _ in range(c.passes)
+            for rows in _batches(rng.permutation(len(places)), c.batch)
         ]
         explained = 1.0 - float((returns - foretold).var()) / max(float(returns.var()), 1e-12)
         return mean_metrics(losses) | {"explained_variance": explained}
 
-    def _returns(self, drive: Trajectory) -> tuple[Floats32, Floats32]:
-        """Of every `keep`-th decision: n-step returns, bootstrapped by the critic unless the drive ended in a
-        crash before; and what the critic foretold."""
+    def remember(self) -> None:
+        """What the network is now is what the anchor holds it to."""
+        self._began = copy.deepcopy(self.online).eval()
+
+    def _draws(self, drive: Trajectory) -> np.ndarray:
+        """The decisions [K] at which an action was drawn, not kept."""
+        if self.config.anchor:
+            return np.flatnonzero(drive.interacting)
+        return np.arange(0, len(drive), self.config.keep)
+
+    def _returns(self, drive: Trajectory, begins: np.ndarray) -> tuple[Floats32, Floats32]:
+        """Of the decisions `begins` [K]: n-step returns, bootstrapped by the critic unless the drive ended in
+        a crash before; and what the critic foretold."""
         c, d = self.config, len(drive)
-        begins = np.arange(0, d, c.keep)
         ends = np.minimum(begins + c.n_step, d)
         asked = np.union1d(begins, ends)
         phi = np.full(len(asked), drive.phi, np.float32)
@@ -105,12 +140,17 @@ class A2cLearner(Learner):
             out[i] = c.gamma ** np.arange(end - t) @ reward[t:end] + c.gamma ** (end - t) * values[end]
         return out, values[begins]
 
-    def _update(self, places: list[tuple[Trajectory, int]], returns: Floats32, foretold: Floats32) -> Metrics:
+    def _update(
+        self,
+        places: list[tuple[Trajectory, int]],
+        returns: Floats32,
+        foretold: Floats32,
+        others: list[tuple[Trajectory, int]],
+    ) -> Metrics:
         c, device = self.config, self.device
-        phi = np.array([t.phi for t, _ in places], np.float32)
         action = torch.tensor([int(t.action[k]) for t, k in places], device=device)
         goal = torch.from_numpy(returns).to(device)
-        preference, value = self.online.actor_critic(*states(places, phi, device))
+        preference, value = self.online.actor_critic(*self._states(places))
         logs = preference.log_softmax(1)
         advantage = goal - (torch.from_numpy(foretold).to(device) if c.attempts > 1 else value.detach())
         weight = torch.tensor([1.0 if t.interacting[k] else c.far for t, k in places], device=device)
@@ -119,19 +159,33 @@ class A2cLearner(Learner):
             mean = (share * advantage).sum()
             variance = (share * (advantage - mean).square()).sum() * len(share) / (len(share) - 1)
             advantage = (advantage - mean) / (variance.sqrt() + 1e-6)
+        chance = logs.gather(1, action[:, None])[:, 0]  # log
+        weight = weight * ~((advantage < 0.0) & (chance.exp() < c.floor / logs.shape[1]))
         entropy = -(logs.exp() * logs).sum(1)
+        wrong = torch.from_numpy(np.stack([t.wrong[k] for t, k in places])).to(device)
         losses = {
-            "policy": -(weight * advantage * logs.gather(1, action[:, None])[:, 0]).mean(),
+            "policy": -(weight * advantage * chance).mean(),
             "value": (goal - value).square().mean(),
             "entropy": entropy.mean(),
-            "imitation": _misfit(
-                logs, torch.from_numpy(np.stack([t.wrong[k] for t, k in places])).to(device)
-            ),
+            "imitation": _misfit(logs, wrong),
+            "moved": self._moved(others) if others else logs.new_zeros(()),
         }
         actor = losses["policy"] + c.critic * losses["value"] - c.entropy * (weight * entropy).mean()
-        self.step(actor + c.imitation * losses["imitation"])
+        self.step(actor + c.imitation * losses["imitation"] + c.anchor * losses["moved"])
         self.updates += 1
         return {name: float(loss.detach()) for name, loss in losses.items()}
+
+    def _moved(self, places: list[tuple[Trajectory, int]]) -> torch.Tensor:
+        """How far the preferences are from what they began as (KL, nat), mean."""
+        at = self._states(places)
+        with torch.no_grad():
+            began = self._began.actor_critic(*at)[0].log_softmax(1)
+        now = self.online.actor_critic(*at)[0].log_softmax(1)
+        return (began.exp() * (began - now)).sum(1).mean()
+
+    def _states(self, places: list[tuple[Trajectory, int]]) -> States:
+        phi = np.array([t.phi for t, _ in places], np.float32)
+        return states(places, phi, self.device)
 
 
 def _misfit(logs: torch.Tensor, wrong: torch.Tensor) -> torch.Tensor:

@@ -9,9 +9,10 @@ import numpy as np
 import torch
 
 from cosim.rewards import RewardTerms
-from cosim.types import IS_MISSION, Decision, Floats32, History, MetaAction
+from cosim.types import IS_MISSION, Bools, Decision, Floats32, History, MetaAction
 from policy.agents.approaches import AgentConfig
 from policy.agents.prediction_aware import Inputs, PredictionAware
+from policy.inputs.situation import comes_next
 from policy.inputs.tensors import States, to_numpy
 from policy.networks.vfn import VFN
 from policy.training.demonstrator import AS_GOOD, YIELD, Demonstrator
@@ -29,6 +30,10 @@ class ExploreConfig:
     sample: int = 0  # decisions that one drawn from the preferences is kept (A2C); 0: epsilon-greedy
     advised: bool = True  # whether the demonstrator is asked in every state; one that is imitated is
     near: float = 60.0  # m to the mission vehicle within which a decision counts as interaction
+    # with `sample`: all AVs are recorded; an AV explores only while it is the one that arrives next behind a
+    # mission vehicle, within `near` of it, and what it draws there is what counts as interaction
+    next: bool = False
+    floor: float = 0.0  # with `sample`: share of what is drawn that is drawn evenly
 
 
 class Explorer(PredictionAware):
@@ -67,6 +72,8 @@ class Explorer(PredictionAware):
         """
         self._label, self._epsilon, self._rng, self._who = label, epsilon, rng, who
         self._guided, self._learners = guided, self.explore.learners if record else 0
+        self._explorers: set[str] = set()  # who has explored in this episode, with `ExploreConfig.next`
+        self._drawn: set[str] = set()  # who draws at this decision
         self._advised = guided or (record and self.explore.advised)
         self._demonstrator.reset(self._context)
         self.learning: dict[str, dict[str, list[Any]]] = {}  # AV -> field of `Trajectory` -> values so far
@@ -144,19 +151,19 @@ class Explorer(PredictionAware):
         sees = [bool((h.kinematics[-1, :, IS_MISSION] * h.valid[-1] > 0.5).any()) for h in scene.histories]
         draws = self._who.random(len(scene.agents))
         order = sorted(range(len(scene.agents)), key=lambda b: (not sees[b], draws[b]))
-        self.learning = {scene.agents[b]: defaultdict(list) for b in sorted(order[: self._learners])}
+        count = len(order) if self.explore.next else self._learners
+        self.learning = {scene.agents[b]: defaultdict(list) for b in sorted(order[:count])}
         self._learners = 0
+
+    def _nears(self, inputs: Inputs) -> Bools:
+        """[B] whether an AV arrives next behind a mission vehicle, and is within `near` m of it."""
+        return comes_next(to_numpy(inputs.states.situation), self.explore.near)
 
     def _explored(self, q: Floats32, inputs: Inputs) -> Floats32:
         """Random preferences in place of some learning AVs' values; the prioritizer still guards them."""
         q = q.copy()
-        if self.explore.sample:  # the largest of preferences + Gumbel noise is a draw from their softmax
-            mine = [b for b, av in enumerate(inputs.scene.agents) if av in self.learning]
-            q[mine] += self._rng.gumbel(size=(len(mine), q.shape[1])).astype(np.float32)
-            for b in mine:
-                av = inputs.scene.agents[b]
-                if not self._holds(av, q[b]):
-                    self.hold(av, MetaAction(int(q[b].argmax())), self.explore.sample - 1)
+        if self.explore.sample:
+            self._draw(q, inputs)
             return q
         for b, av in enumerate(inputs.scene.agents):
             if av not in self.learning:
@@ -174,6 +181,30 @@ class Explorer(PredictionAware):
                 q[b] = self._rng.random(len(MetaAction)).astype(np.float32)
                 q[b, self._repeated[av]] = 2.0
         return q
+
+    def _draw(self, q: Floats32, inputs: Inputs) -> None:
+        """Learning AVs' preferences q [B,A], replaced by such that the drawn action is preferred."""
+        c, agents = self.explore, inputs.scene.agents
+        mine = [b for b, av in enumerate(agents) if av in self.learning]
+        # the largest of log-preferences + Gumbel noise is a draw from their softmax
+        noise = self._rng.gumbel(size=(len(mine), q.shape[1])).astype(np.float32)
+        nears = self._nears(inputs) if c.next else np.ones(len(agents), np.bool_)
+        self._drawn = set()
+        for b, noises in zip(mine, noise, strict=True):
+            av = agents[b]
+            if not self._holds(av, q[b]) and nears[b] and self._may(av):
+                self._drawn.add(av)
+                if c.floor:
+                    share = np.exp(q[b] - q[b].max())
+                    q[b] = np.log((1.0 - c.floor) * share / share.sum() + c.floor / len(share))
+                q[b] += noises
+                self.hold(av, MetaAction(int(q[b].argmax())), c.sample - 1)
+
+    def _may(self, av: str) -> bool:
+        """Whether `av` explores, if it comes next: so many may in an episode."""
+        if self.explore.next and len(self._explorers) < self.explore.learners:
+            self._explorers.add(av)
+        return not self.explore.next or av in self._explorers
 
     def _holds(self, av: str, q: Floats32) -> bool:
         """Whether an action is set for this decision; then q [A] prefers it."""
@@ -207,7 +238,9 @@ class Explorer(PredictionAware):
             "vetoed": np.int8(preferred if unsafe[preferred] else -1),
             "wrong": ~unsafe & (advice < best - AS_GOOD),
             "yielding": np.bool_(advice.max() == YIELD),
-            "interacting": np.bool_(close.any() or unsafe[preferred]),
+            "interacting": np.bool_(
+                av in self._drawn if self.explore.next else close.any() or unsafe[preferred]
+            ),
         }
         for name, value in now.items():
             recorded[name].append(value)

@@ -162,6 +162,8 @@ def make_trainer(config: VfnTraining, vfn: VfnConfig, device: str) -> Trainer:
         online.maps.encoder.load_state_dict(encoder(config.encoder, online.maps.encoder.config))
     if config.first:
         online.load_state_dict(online.like(Path(config.first)).state_dict())
+    if isinstance(trainer, OnPolicyTrainer):
+        trainer.learner.remember()
     return trainer
 
 

@@ -737,6 +737,80 @@ def test_attempts_have_the_same_traffic_and_differ_in_what_is_tried() -> None:
     assert tried[0][2] != tried[1][2]
 
 
+def test_who_comes_next_to_the_mission_vehicle_alone_explores() -> None:
+    """It drives on the right lane; all are recorded, and what is drawn is kept."""
+    one = agent(learners=1)
+    one.explore = ExploreConfig(learners=1, sample=5, near=60.0, next=True, advised=False)
+    episode = fake_episode(
+        FakeVehicle("m", 110.0, 0, 20.0, mission=True),
+        FakeVehicle("ahead", 150.0, 1, 20.0, is_av=True),
+        FakeVehicle("next", 70.0, 1, 20.0, is_av=True),
+        FakeVehicle("later", 60.0, 1, 20.0, is_av=True),
+    )
+    drive = Drive(Lesson("fake"), 5, 0.7, 1.0, "", "", True)
+    drove = drive_episode(episode, one, drive, RewardConfig()).trajectories
+    assert {t.av for t in drove} == {"ahead", "next", "later"}
+    (explored,) = (t for t in drove if t.interacting.any())
+    assert explored.av == "next"
+    begins = np.flatnonzero(explored.interacting)
+    assert begins[0] == 0
+    assert (np.diff(begins) >= 5).all()
+
+
+def test_a_floor_tries_what_is_not_preferred() -> None:
+    """Preferences are certain: without a floor the same is drawn for ever."""
+    drawn = {}
+    for floor in (0.0, 1.0):
+        one = agent()
+        one.explore = ExploreConfig(sample=1, floor=floor, advised=False)
+        with torch.no_grad():
+            one.vfn.value.bias[int(MetaAction.IDLE)] = 50.0
+        drive = Drive(Lesson("fake"), 5, 0.7, 1.0, "", "", True)
+        episode = fake_episode(FakeVehicle("a", 100.0, 0, 20.0, is_av=True))
+        (drove,) = drive_episode(episode, one, drive, RewardConfig()).trajectories
+        drawn[floor] = set(drove.action.tolist())
+    assert drawn[0.0] == {int(MetaAction.IDLE)}
+    assert len(drawn[1.0]) > 1
+
+
+@pytest.mark.parametrize("anchor", [0.01, 10.0])
+def test_an_anchor_holds_who_does_not_come_next_to_what_it_began_as(anchor: float) -> None:
+    """One that comes next is paid for accelerating; another one, which is not, sees nothing."""
+    config = A2cConfig(learning_rate=3e-3, n_step=1, floor=0.5, anchor=anchor, passes=2)
+    learner = A2cLearner(replace(TINY, critic=True), config, seed=0)
+    learner.remember()
+    rng = np.random.default_rng(0)
+    other = trajectory([0], [(0.0, 0.0, 0.0)], situation=[0, 0], near=False)
+
+    def chance(of: Trajectory) -> float:
+        with torch.no_grad():
+            seen = experience.states([(of, 0)], np.zeros(1, np.float32))
+            return float(learner.online.actor_critic(*seen)[0].softmax(1)[0, MetaAction.ACCELERATE])
+
+    for _ in range(40):
+        drives = [other]
+        for action in rng.integers(5, size=16):  # as a floor of 1 draws
+            pay = float(action == MetaAction.ACCELERATE)
+            nexts = trajectory(
+                [int(action)], [(10.0 * pay, 0.0, 0.0)], situation=[MEETS] * 2, ending="crashed"
+            )
+            nexts.situation[:, MEETS + 1 : MEETS + 3] = 0.1, -1.0
+            drives.append(nexts)
+        learner.learn(drives, rng)
+    assert chance(drives[1]) > 0.9
+    assert (abs(chance(other) - 0.2) < 0.05) == (anchor > 1.0)
+
+
+def test_what_is_hardly_preferred_is_not_refused_any_further() -> None:
+    learner = A2cLearner(replace(TINY, critic=True), A2cConfig(n_step=1, floor=1.0), seed=0)
+    with torch.no_grad():
+        learner.online.value.bias[int(MetaAction.IDLE)] = 5.0
+    fast, rng = [int(MetaAction.ACCELERATE)], np.random.default_rng(0)
+    bad, good = (trajectory(fast, [(pay, 0.0, 0.0)], ending="crashed") for pay in (-1.0, 1.0))
+    assert learner.learn([bad], rng)["policy"] == 0.0
+    assert learner.learn([good], rng)["policy"] > 0.0
+
+
 def test_actor_and_critic_imitate_where_no_reward_speaks_for_it() -> None:
     config = A2cConfig(learning_rate=1e-2, imitation=1.0)
     learner = A2cLearner(replace(TINY, critic=True), config, seed=0)

@@ -25,7 +25,7 @@ class A2cConfig:
     weight_decay: float = 0.0  # of AdamW: what every weight loses of itself in an update, times the rate
     attempts: int = 1  # drives of the same traffic by the same learners; the others' mean is the baseline
     # share of the draws that are even over all actions, so that what is not preferred is tried too; it is
-    # learned from as if it had been preferred, but what is preferred less often than it is drawn evenly is not
+    # learned from as if it had been preferred, but what is preferred less often than drawn evenly is not
     # refused any further
     floor: float = 0.0
     # weight of the distance (KL) to what it began as, for AVs that do not come next to a mission vehicle

@@ -56,7 +56,8 @@ def line(world: str, lawful: Mapping[int, Row], before: Mapping[int, Row]) -> li
     hard, hard_before = (float(np.mean(column(rows, "hard_brakings_av"))) for rows in (now, then))
     way = statistics.paired_mean(column(then, "dt_mean_m"), column(now, "dt_mean_m"))
     both = [pair for pair in zip(then, now, strict=True) if all(row["dt_av_m"] is not None for row in pair)]
-    of_avs = statistics.paired_mean(*(column(list(rows), "dt_av_m") for rows in zip(*both, strict=True)))
+    before_avs, now_avs = (column(list(rows), "dt_av_m") for rows in zip(*both, strict=True))
+    of_avs = statistics.paired_mean(before_avs, now_avs)
     too_fast = float(np.mean(column(then, "speeding_share")))
     missions = [
         statistics.share(int(sum(v)), len(v)) for v in (column(r, "mission_success") for r in (now, then))

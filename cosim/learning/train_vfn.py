@@ -48,15 +48,18 @@ def train(args: argparse.Namespace) -> int:
     training = _scheduled(file.training, args, name)
     if training.ensemble and learning == "a2c":
         raise BadInput("is for networks that keep a replay buffer", field="training.ensemble")
+    if file.explore.next != (learning == "a2c" and training.a2c.anchor > 0.0):
+        problem = "goes together with training.a2c.anchor, in cosim train a2c alone"
+        raise BadInput(problem, field="explore.next", value=file.explore.next)
+    if file.explore.next and not training.first:
+        raise BadInput("the weights that the anchor holds to are needed", field="training.first", value="")
     for lesson in training.lessons:
         load(lesson.scenario, demand=[lesson.demand], behavior=lesson.behavior)
     with working_in(args.out) as folder:
         if not args.resume and (folder / "state.json").exists():
             raise BadInput("holds a training run already: --resume goes on", field="--out", value=args.out)
-        if learning == "a2c":
-            explore = replace(file.explore, sample=training.a2c.keep, floor=training.a2c.floor)
-        else:
-            explore = file.explore
+        drawn = {"sample": training.a2c.keep, "floor": training.a2c.floor} if learning == "a2c" else {}
+        explore = replace(file.explore, **{"sample": 0, "floor": 0.0, **drawn})
         file = replace(file, explore=explore)
         about = {
             "policy": name,

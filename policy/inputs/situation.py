@@ -43,9 +43,14 @@ def situation(histories: Sequence[History], road: RoadMap, shared: bool, assiste
 
 
 def comes_next(situations: Floats32, within: float = FAR) -> Bools:
-    """[B] whether an AV arrives next behind the mission vehicle, less than `within` m; situations [B,.]."""
+    """[B] whether an AV arrives next behind the mission vehicle, within `within` m (200 at most).
+
+    Args:
+        situations: [B,SITUATION_INPUTS]. Without V2V nobody knows of others: all behind it come next.
+        within: m.
+    """
     there, behind, before = situations[:, MEETS : MEETS + 3].T
-    comes: Bools = (there > 0.5) & (behind > 0.0) & (behind < within / FAR) & (before <= 0.0)
+    comes: Bools = (there > 0.5) & (behind > 0.0) & (behind < min(within / FAR, 1.0)) & (before <= 0.0)
     return comes
 
 

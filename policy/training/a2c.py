@@ -1,4 +1,4 @@
-"""Multi-agent advantage actor-critic after T: shared weights, n-step returns, one pass over fresh drives."""
+"""Multi-agent advantage actor-critic after T: shared weights, n-step returns, passes over fresh drives."""
 
 import copy
 from collections import defaultdict
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from cosim.errors import in_range
+from cosim.errors import BadInput, in_range
 from cosim.types import Floats32
 from policy.inputs.situation import comes_next
 from policy.inputs.tensors import States
@@ -24,11 +24,12 @@ class A2cConfig:
     learning_rate: float = 3e-4
     weight_decay: float = 0.0  # of AdamW: what every weight loses of itself in an update, times the rate
     attempts: int = 1  # drives of the same traffic by the same learners; the others' mean is the baseline
-    # share of the draws that are even over all actions, so that what is not preferred is tried too; it is
-    # learned from as if it had been preferred, but what is preferred less often than drawn evenly is not
-    # refused any further
+    # share of the draws that are even over all actions, so that what is not preferred is tried too. They are
+    # learned from as if drawn by preference; from an advantage below 0 of an action whose chance is below a
+    # fifth of the floor nothing is
     floor: float = 0.0
-    # weight of the distance (KL) to what it began as, for AVs that do not come next to a mission vehicle
+    # weight of the distance (KL) to `training.first`, for AVs that do not come next to a mission vehicle, or
+    # are more than 200 m behind it (with `explore.next`)
     anchor: float = 0.0
     keep: int = 1  # decisions that what is drawn is kept: nobody opens a gap within one of 0.4 s
     n_step: int = 8  # as the DDQN's (docs/training.md); 1 is the papers'
@@ -40,7 +41,7 @@ class A2cConfig:
     scale: float = 0.1  # of all rewards, as the DDQN's
     normalize: bool = False  # advantages to mean 0 and deviation 1 over a batch
     clip: float = 0.5  # largest gradient norm
-    far: float = 1.0  # weight, for the actor, of decisions that no mission vehicle is near (`explore.near`)
+    far: float = 1.0  # weight, for the actor, of decisions that do not count as interaction (`explore.near`)
     imitation: float = 0.0  # weight of the demonstrations: the chance of a demonstrated action is to be 1
 
     def __post_init__(self) -> None:
@@ -50,6 +51,8 @@ class A2cConfig:
             positive="learning_rate attempts keep n_step gamma batch passes scale clip",
             not_negative="weight_decay imitation far floor anchor",
         )
+        if self.floor > 1.0:
+            raise BadInput("must be a share from 0 to 1", field="floor", value=self.floor)
 
 
 class A2cLearner(Learner):
@@ -83,9 +86,8 @@ class A2cLearner(Learner):
         known = [self._returns(t, begins) for t, begins in drawn if len(begins)]
         returns, foretold = (np.concatenate(part) for part in zip(*known, strict=True))
         if c.attempts > 1:
-            alike = defaultdict(
-                list
-            )  # of the same AV in the same traffic its first draws, its second ones, ...
+            # of the same AV in the same traffic its first draws, its second ones, ..., at whatever times
+            alike = defaultdict(list)
             which = ((t.episode, t.av, k) for t, begins in drawn for k in range(len(begins)))
             for i, key in enumerate(which):
                 alike[key].append(i)

@@ -41,7 +41,7 @@ class Trajectory:
     vetoed: npt.NDArray[np.int8]  # [D] the preferred action that was masked, or -1
     wrong: Bools  # [D,A] what the demonstrator would not have done, though safe; none: no demonstration
     terms: Floats32  # [D,3] reward terms: ego, AVs, HVs (equation 6)
-    interacting: Bools  # [D] near a mission vehicle, or vetoed: drawn more often
+    interacting: Bools  # [D] near a mission vehicle, or vetoed: drawn more often (`explore.next`: drawn)
     yielding: Bools  # [D] the demonstrator would have yielded to a mission vehicle here
     phi: float  # rad, the SVO it acted with
     ending: Ending

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from cosim.errors import BadInput, in_range
 from cosim.rewards import RewardTerms
 from cosim.types import IS_MISSION, Bools, Decision, Floats32, History, MetaAction
 from policy.agents.approaches import AgentConfig
@@ -27,21 +28,29 @@ class ExploreConfig:
 
     learners: int = 4  # AVs that explore and are recorded; the others act with frozen weights (P, Alg. 4)
     repeat: float = 2.0  # decisions a random action is kept on average: a gap does not open in 0.4 s
-    sample: int = 0  # decisions that one drawn from the preferences is kept (A2C); 0: epsilon-greedy
+    # decisions that one drawn from the preferences is kept; 0: epsilon-greedy. `training.a2c.keep` sets it
+    sample: int = 0
+    floor: float = 0.0  # with `sample`: share of the draws that are even. `training.a2c.floor` sets it
     advised: bool = True  # whether the demonstrator is asked in every state; one that is imitated is
     near: float = 60.0  # m to the mission vehicle within which a decision counts as interaction
-    # with `sample`: all AVs are recorded; an AV explores only while it is the one that arrives next behind a
-    # mission vehicle, within `near` of it, and what it draws there is what counts as interaction
+    # A2C: every AV of the first decision is recorded, and the first `learners` that arrive next behind a
+    # mission vehicle, within `near` of it, draw there; all others act greedily. A draw counts as interaction
     next: bool = False
-    floor: float = 0.0  # with `sample`: share of what is drawn that is drawn evenly
+
+    def __post_init__(self) -> None:
+        """Raises BadInput for a number out of range."""
+        in_range(self, positive="learners repeat near", not_negative="sample floor")
+        if self.floor > 1.0:
+            raise BadInput("must be a share from 0 to 1", field="floor", value=self.floor)
 
 
 class Explorer(PredictionAware):
     """`PredictionAware` whose first few AVs explore with the learner's weights.
 
     The others act greedily with `frozen` ones, so that one AV's transitions do not depend on what its
-    neighbours explore (semi-sequential training, P algorithm 4; T, section IV). `episode` must be called
-    after `reset`.
+    neighbours explore (semi-sequential training, P algorithm 4; T, section IV); with `ExploreConfig.next` all
+    AVs of the first decision act with the learner's, and few of them explore. `episode` must be called after
+    `reset`.
     """
 
     def __init__(self, name: str, config: AgentConfig, explore: ExploreConfig) -> None:

@@ -121,7 +121,7 @@ def rate(config: VfnTraining, k: int) -> float:
 
 
 class OnPolicyTrainer(Trainer):
-    """T's A2C: each trajectory is learned from once. Demonstrations are kept until they were learned from."""
+    """T's A2C: an iteration learns from its own trajectories. Demonstrations are kept until all are there."""
 
     learner: A2cLearner
 
@@ -139,7 +139,7 @@ class OnPolicyTrainer(Trainer):
         return self.learner.imitates and self._prefilling
 
     def learn_afterwards(self, k: int, drives: Sequence[Trajectory], kept: bool) -> Metrics:
-        """A pass over its own trajectories; after the last demonstration, the steps towards all of them."""
+        """Learn from its own trajectories; after the last demonstration, the steps towards all of them."""
         if not kept:
             return _named(self.learner.learn(drives, generator(self.config.seed, "order", str(k))))
         if not self.keeps:
@@ -162,7 +162,7 @@ def make_trainer(config: VfnTraining, vfn: VfnConfig, device: str) -> Trainer:
         online.maps.encoder.load_state_dict(encoder(config.encoder, online.maps.encoder.config))
     if config.first:
         online.load_state_dict(online.like(Path(config.first)).state_dict())
-    if isinstance(trainer, OnPolicyTrainer):
+    if isinstance(trainer, OnPolicyTrainer) and config.a2c.anchor:
         trainer.learner.remember()
     return trainer
 

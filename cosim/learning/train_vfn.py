@@ -58,8 +58,9 @@ def train(args: argparse.Namespace) -> int:
     with working_in(args.out) as folder:
         if not args.resume and (folder / "state.json").exists():
             raise BadInput("holds a training run already: --resume goes on", field="--out", value=args.out)
-        drawn = {"sample": training.a2c.keep, "floor": training.a2c.floor} if learning == "a2c" else {}
-        explore = replace(file.explore, **{"sample": 0, "floor": 0.0, **drawn})
+        explore = replace(file.explore, sample=0, floor=0.0)
+        if learning == "a2c":
+            explore = replace(explore, sample=training.a2c.keep, floor=training.a2c.floor)
         file = replace(file, explore=explore)
         about = {
             "policy": name,

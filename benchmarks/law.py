@@ -2,10 +2,12 @@
 
     python -m benchmarks.law [--worlds arterial ...] [--arms vfn-p ...] [--seeds 3] [--preset lawful] [--show]
     python -m benchmarks.law --page --seeds 20
+    python -m benchmarks.law --page --seeds 20 --errors stress --arms vfn-p --penetration 0.2
 
-The first prints, on seeds from 100,000; the second writes docs/results/law.md, on seeds from 200,000. `idm`
-is always driven beside the arms: what is asked of them is measured by it. The independent checker is
-tests/law/checker.py. With --runs DIR what was driven before is not driven again; the same command goes on.
+The first prints, on seeds from 100,000; the second writes docs/results/law.md, on seeds from 200,000, the
+third law_stress.md, where humans err. `idm` is always driven beside the arms: what is asked of them is
+measured by it. The independent checker is tests/law/checker.py. With --runs DIR what was driven before is
+not driven again; the same command goes on.
 """
 
 from __future__ import annotations
@@ -21,6 +23,8 @@ from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from benchmarks.tables import markdown_row, write_page
 from cosim.batch.episode_runner import EpisodeRunner
@@ -85,11 +89,16 @@ class Checked(EpisodeRunner):
 
 
 def cases(
-    worlds: Mapping[str, Path], arms: Sequence[str], shares: Sequence[float], seeds: range, preset: str
+    worlds: Mapping[str, Path],
+    arms: Sequence[str],
+    shares: Sequence[float],
+    seeds: range,
+    preset: str,
+    errors: str | None = None,
 ) -> list[Case]:
     """Every episode, `idm` first."""
     return [
-        Case(str(worlds[world]), arm, seed, penetration=share, preset=preset)
+        Case(str(worlds[world]), arm, seed, penetration=share, preset=preset, errors=errors)
         for world, share, arm, seed in itertools.product(worlds, shares, dict.fromkeys((IDM, *arms)), seeds)
     ]
 
@@ -248,15 +257,53 @@ def shown(rows: Sequence[Row]) -> list[str]:
     return lines
 
 
-def page(rows: Sequence[Row], preset: str, seeds: range, command: str) -> list[str]:
-    """docs/results/law.md"""
+def beside_idm(rows: Sequence[Row]) -> list[str]:
+    """Markdown: episodes with an AV in a collision, paired with `idm`'s, of every world and of all."""
+    head = ["world", "AVs", "arm", "pairs", "an AV in a collision", "of `idm`", "difference, pp", "p"]
+    head += ["an AV caused one", "of `idm`", "distance of all, more m"]
+    lines = [markdown_row(head), markdown_row(["---"] * len(head))]
+    at = {(row["world"], row["penetration"], row["arm"], row["seed"]): row["figures"] for row in rows}
+    worlds = list(dict.fromkeys(row["world"] for row in rows))
+    arms = dict.fromkeys((row["penetration"], row["arm"]) for row in rows if row["arm"] != IDM)
+    for (share, arm), among in itertools.product(arms, ([world] for world in worlds)):
+        lines.append(_paired(at, share, arm, among))
+    lines += [_paired(at, share, arm, worlds) for share, arm in arms if len(worlds) > 1]
+    return lines
+
+
+def _paired(at: Mapping[tuple[Any, ...], Row], share: float, arm: str, worlds: Sequence[str]) -> str:
+    keys = [key for key in at if key[0] in worlds and key[1:3] == (share, arm)]
+    now, then = [at[key] for key in keys], [at[*key[:2], IDM, key[3]] for key in keys]
+
+    def hits(rows: Sequence[Row], name: str) -> np.ndarray:
+        return np.array([bool(row[name]) for row in rows])
+
+    hit, before = (hits(rows, "av_involved_collisions") for rows in (now, then))
+    before_m, now_m = ([float(row["dt_mean_m"]) for row in rows] for rows in (then, now))
+    return markdown_row(
+        [
+            *(worlds[0] if len(worlds) == 1 else "together", f"{share:.0%}", arm, str(len(keys))),
+            *(f"{h.sum()}: {statistics.share(int(h.sum()), len(h)).text(1, 100.0)} %" for h in (hit, before)),
+            statistics.paired_share(before, hit).text(1, 100.0),
+            f"{statistics.mcnemar(*statistics.discordant(before, hit)):.2g}",
+            *(str(hits(rows, "av_caused_collisions").sum()) for rows in (now, then)),
+            statistics.paired_mean(before_m, now_m).text(1),
+        ]
+    )
+
+
+def page(
+    rows: Sequence[Row], preset: str, seeds: range, command: str, errors: str | None = None
+) -> list[str]:
+    """docs/results/law.md, or law_stress.md"""
     found = tables(rows)
     verdicts = [line.rpartition(" | ")[2].strip(" |") for line in found if line.startswith("| ")]
     asked = [verdict for verdict in verdicts if verdict == "met" or verdict.startswith("missed: ")]
     missed = Counter(name for v in asked for name in v.removeprefix("missed: ").split(", ") if v != "met")
     return [
-        "# The law of the road",
+        "# The law of the road" + (" among humans who err" if errors else ""),
         "",
+        *([f"Errors `{errors}` (docs/human_errors.md).", "", *beside_idm(rows), ""] if errors else []),
         f"Made by `{command}`: the worlds of tests/worlds, which netconvert and netgenerate build, preset",
         f"`{preset}`, {len(seeds)} seeds from {seeds.start:,}, the same for every arm. Counted from SUMO's",
         "outputs by tests/law/checker.py, which shares no code with what drives; collisions caused,",
@@ -294,29 +341,35 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add("--seeds", type=int, default=3, metavar="N", help="how many")
     add("--first", type=int, metavar="SEED", help=f"default {TRYING}; of the page {PAGE}")
     add("--preset", choices=Preset.ALL, default=Preset.LAWFUL)
+    add("--errors", metavar="LEVEL", help="of human drivers; none")
     add("--workers", type=int, default=2, metavar="N")
     add("--runs", type=Path, metavar="DIR", help="keep the rows there, and go on from them")
     add("--keep", type=Path, metavar="DIR", help="keep SUMO's outputs there")
     add("--show", action="store_true", help="list every violation")
     add("--page", action="store_true", help="write the page")
-    add("--out", type=Path, default=Path("docs/results/law.md"), metavar="FILE.md")
+    add("--out", type=Path, metavar="FILE.md", help="docs/results/law.md, or law_LEVEL.md")
     args = parser.parse_args(arguments)
     first = args.first or (PAGE if args.page else TRYING)
     seeds = range(first, first + args.seeds)
     place = args.runs or Path(tempfile.mkdtemp(prefix="cosim-law-"))
     began = time.perf_counter()
     worlds = build(place / "worlds", args.worlds)
-    todo = cases(worlds, args.arms, args.penetration, seeds, args.preset)
+    todo = cases(worlds, args.arms, args.penetration, seeds, args.preset, args.errors)
     rows = driven(todo, args.workers, args.runs and args.runs / "episodes.jsonl", args.keep)
     if args.show:
         print("\n".join(shown(rows)))
     if args.page:
         said = f"python -m benchmarks.law --page --seeds {args.seeds}"
         said += "" if args.preset == Preset.LAWFUL else f" --preset {args.preset}"
-        write_page(args.out, page(rows, args.preset, seeds, said))
-        print(args.out)
+        if args.errors:
+            shares = " ".join(f"{share:g}" for share in args.penetration)
+            said += f" --errors {args.errors} --arms {' '.join(args.arms)} --penetration {shares}"
+        name = f"law_{Path(args.errors).stem}.md" if args.errors else "law.md"
+        out = args.out or Path("docs/results") / name
+        write_page(out, page(rows, args.preset, seeds, said, args.errors))
+        print(out)
     else:
-        print("\n".join(tables(rows)))
+        print("\n".join([*tables(rows), *(beside_idm(rows) if args.errors else [])]))
         print(f"{len(rows)} episodes, {time.perf_counter() - began:.0f} s")
 
 

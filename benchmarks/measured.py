@@ -216,6 +216,14 @@ def law(place: Place) -> list[list[str]]:
     return [["benchmarks.law", "--page", *flags, "--out", str(place.out / "law.md")]]
 
 
+def law_stress(place: Place) -> list[list[str]]:
+    """The same among humans who err."""
+    flags = ["--errors", "stress", "--arms", "vfn-p", "--penetration", "0.2"]
+    flags += ["--worlds", "arterial", "--seeds", "1"] if place.small else ["--seeds", "20"]
+    flags += ["--runs", str(place.work / "law_stress_runs")]
+    return [["benchmarks.law", "--page", *flags, "--out", str(place.out / "law_stress.md")]]
+
+
 def lawful_worlds(place: Place) -> list[list[str]]:
     """Our worlds in preset lawful."""
     flags = ["--worlds", "merge", "--episodes", "1"] if place.small else []
@@ -225,6 +233,7 @@ def lawful_worlds(place: Place) -> list[list[str]]:
 
 PAGES = (
     Page("law", law, ("law.md",)),
+    Page("law_stress", law_stress, ("law_stress.md",)),
     Page("lawful_worlds", lawful_worlds, ("lawful_worlds.md",)),
     Page("agent", agent, ("agent.md",)),
     Page("prediction_speed", prediction_speed, ("prediction_speed.md",)),

@@ -347,7 +347,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add("--keep", type=Path, metavar="DIR", help="keep SUMO's outputs there")
     add("--show", action="store_true", help="list every violation")
     add("--page", action="store_true", help="write the page")
-    add("--out", type=Path, metavar="FILE.md", help="docs/results/law.md, or law_LEVEL.md")
+    add("--out", type=Path, metavar="FILE.md", help="docs/results/law.md, or, of stress, law_stress.md")
     args = parser.parse_args(arguments)
     first = args.first or (PAGE if args.page else TRYING)
     seeds = range(first, first + args.seeds)

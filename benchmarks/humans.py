@@ -131,20 +131,27 @@ def line(
     def column(rows: list[Row], name: str) -> list[float]:
         return [float(row[name] or 0.0) for row in rows]
 
-    hit, before = (np.array(column(rows, "av_involved_collisions")) > 0 for rows in (now, then))
     caused = sum(value > 0 for value in column(now, "av_caused_collisions"))
     way = [column(rows, "dt_mean_m") for rows in (now, then)]
     hard = [float(np.mean(column(rows, "hard_brakings_av"))) for rows in (now, then)]
     *begun, both = errors_begun(zip(now, then, strict=True))
     return [
         *(world or "together", DEMAND.get(world, ""), str(len(keys)), label(policy), label(beside)),
-        *(_counted(int(hit.sum()), len(keys)), _counted(int(before.sum()), len(keys))),
-        statistics.paired_share(before, hit).text(1, 100.0),
-        f"{statistics.mcnemar(*statistics.discordant(before, hit)):.2g}",
+        *in_collisions(now, then),
         _counted(caused, len(keys)),
         *(f"{np.mean(way[0]):.0f}", statistics.paired_mean(way[1], way[0]).text(0)),
         *(f"{hard[0]:.1f}", f"{hard[1]:.1f}"),
         f"{100 * both / max(sum(begun) - both, 1):.0f} %",
+    ]
+
+
+def in_collisions(now: Sequence[Row], then: Sequence[Row]) -> list[str]:
+    """Cells of paired rows: episodes with an AV in a collision, those of `then`, the difference, p."""
+    hit, before = (np.array([(row["av_involved_collisions"] or 0) > 0 for row in r]) for r in (now, then))
+    return [
+        *(_counted(int(side.sum()), len(side)) for side in (hit, before)),
+        statistics.paired_share(before, hit).text(1, 100.0),
+        f"{statistics.mcnemar(*statistics.discordant(before, hit)):.2g}",
     ]
 
 

@@ -24,8 +24,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from benchmarks.humans import in_collisions
 from benchmarks.tables import markdown_row, write_page
 from cosim.batch.episode_runner import EpisodeRunner
 from cosim.report import statistics
@@ -265,28 +264,19 @@ def beside_idm(rows: Sequence[Row]) -> list[str]:
     at = {(row["world"], row["penetration"], row["arm"], row["seed"]): row["figures"] for row in rows}
     worlds = list(dict.fromkeys(row["world"] for row in rows))
     arms = dict.fromkeys((row["penetration"], row["arm"]) for row in rows if row["arm"] != IDM)
-    for (share, arm), among in itertools.product(arms, ([world] for world in worlds)):
-        lines.append(_paired(at, share, arm, among))
-    lines += [_paired(at, share, arm, worlds) for share, arm in arms if len(worlds) > 1]
-    return lines
+    among = [[world] for world in worlds] + ([worlds] if len(worlds) > 1 else [])
+    return lines + [_paired(at, share, arm, some) for some in among for share, arm in arms]
 
 
 def _paired(at: Mapping[tuple[Any, ...], Row], share: float, arm: str, worlds: Sequence[str]) -> str:
     keys = [key for key in at if key[0] in worlds and key[1:3] == (share, arm)]
     now, then = [at[key] for key in keys], [at[*key[:2], IDM, key[3]] for key in keys]
-
-    def hits(rows: Sequence[Row], name: str) -> np.ndarray:
-        return np.array([bool(row[name]) for row in rows])
-
-    hit, before = (hits(rows, "av_involved_collisions") for rows in (now, then))
     before_m, now_m = ([float(row["dt_mean_m"]) for row in rows] for rows in (then, now))
     return markdown_row(
         [
             *(worlds[0] if len(worlds) == 1 else "together", f"{share:.0%}", arm, str(len(keys))),
-            *(f"{h.sum()}: {statistics.share(int(h.sum()), len(h)).text(1, 100.0)} %" for h in (hit, before)),
-            statistics.paired_share(before, hit).text(1, 100.0),
-            f"{statistics.mcnemar(*statistics.discordant(before, hit)):.2g}",
-            *(str(hits(rows, "av_caused_collisions").sum()) for rows in (now, then)),
+            *in_collisions(now, then),
+            *(str(sum(bool(row["av_caused_collisions"]) for row in rows)) for rows in (now, then)),
             statistics.paired_mean(before_m, now_m).text(1),
         ]
     )

@@ -130,8 +130,9 @@ class Range:
         return f"must be at most {self.high:g}" if number > self.high else None
 
 
-def in_range(config: object, *, positive: str = "", not_negative: str = "") -> None:
-    """Refuse a configuration whose fields of these names (with spaces between) are out of range.
+def in_range(config: object, *, positive: str = "", not_negative: str = "", share: str = "") -> None:
+    """Refuse a configuration whose fields of these names (with spaces between) are out of range; a share is
+    from 0 to 1.
 
     Raises BadInput naming the field and the value.
     """
@@ -140,6 +141,9 @@ def in_range(config: object, *, positive: str = "", not_negative: str = "") -> N
         if value < 0 or (value == 0 and not zero):
             problem = "must be 0 or more" if zero else "must be above 0"
             raise BadInput(problem, field=name, value=value)
+    for name in share.split():
+        if not 0.0 <= getattr(config, name) <= 1.0:
+            raise BadInput("must be a share from 0 to 1", field=name, value=getattr(config, name))
 
 
 def hint(name: str, known: Iterable[str]) -> str:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from cosim.errors import BadInput, in_range
+from cosim.errors import in_range
 from cosim.types import Floats32
 from policy.inputs.situation import comes_next
 from policy.inputs.tensors import States
@@ -49,10 +49,9 @@ class A2cConfig:
         in_range(
             self,
             positive="learning_rate attempts keep n_step gamma batch passes scale clip",
-            not_negative="weight_decay imitation far floor anchor",
+            not_negative="weight_decay imitation far anchor",
+            share="floor",
         )
-        if self.floor > 1.0:
-            raise BadInput("must be a share from 0 to 1", field="floor", value=self.floor)
 
 
 class A2cLearner(Learner):

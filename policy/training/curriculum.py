@@ -41,9 +41,7 @@ class ForkConfig:
 
     def __post_init__(self) -> None:
         """Raises BadInput for a number out of range."""
-        in_range(self, positive="held horizon together", not_negative="count")
-        if not 0.0 <= self.meeting <= 1.0:
-            raise BadInput("must be a share from 0 to 1", field="meeting", value=self.meeting)
+        in_range(self, positive="held horizon together", not_negative="count", share="meeting")
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from cosim.errors import BadInput, in_range
+from cosim.errors import in_range
 from cosim.rewards import RewardTerms
-from cosim.types import IS_MISSION, Bools, Decision, Floats32, History, MetaAction
+from cosim.types import IS_MISSION, Decision, Floats32, History, MetaAction
 from policy.agents.approaches import AgentConfig
 from policy.agents.prediction_aware import Inputs, PredictionAware
 from policy.inputs.situation import comes_next
@@ -39,9 +39,7 @@ class ExploreConfig:
 
     def __post_init__(self) -> None:
         """Raises BadInput for a number out of range."""
-        in_range(self, positive="learners repeat near", not_negative="sample floor")
-        if self.floor > 1.0:
-            raise BadInput("must be a share from 0 to 1", field="floor", value=self.floor)
+        in_range(self, positive="learners repeat near", not_negative="sample", share="floor")
 
 
 class Explorer(PredictionAware):
@@ -164,10 +162,6 @@ class Explorer(PredictionAware):
         self.learning = {scene.agents[b]: defaultdict(list) for b in sorted(order[:count])}
         self._learners = 0
 
-    def _nears(self, inputs: Inputs) -> Bools:
-        """[B] whether an AV arrives next behind a mission vehicle, and is within `near` m of it."""
-        return comes_next(to_numpy(inputs.states.situation), self.explore.near)
-
     def _explored(self, q: Floats32, inputs: Inputs) -> Floats32:
         """Random preferences in place of some learning AVs' values; the prioritizer still guards them."""
         q = q.copy()
@@ -197,7 +191,9 @@ class Explorer(PredictionAware):
         mine = [b for b, av in enumerate(agents) if av in self.learning]
         # the largest of log-preferences + Gumbel noise is a draw from their softmax
         noise = self._rng.gumbel(size=(len(mine), q.shape[1])).astype(np.float32)
-        nears = self._nears(inputs) if c.next else np.ones(len(agents), np.bool_)
+        nears = np.ones(len(agents), np.bool_)
+        if c.next:
+            nears = comes_next(to_numpy(inputs.states.situation), c.near)
         self._drawn = set()
         for b, noises in zip(mine, noise, strict=True):
             av = agents[b]

@@ -2,9 +2,11 @@
 
 from functools import cache
 
-from cosim.metrics.context import AV, MetricContext
+import numpy as np
+
+from cosim.metrics.context import AV, PERSON, MetricContext
 from cosim.road import Link, RoadMap, Rule
-from cosim.types import Entry, Metric, Offence, Snapshot
+from cosim.types import Entry, Floats, Metric, Offence, Snapshot
 
 COMFORTABLE = 3.0  # m/s2: who could stop at yellow with this must
 STOPPED = 0.5  # m/s, at most, within the last 10 m before a stop sign
@@ -13,6 +15,7 @@ LEADER = (
     30.0,
     10.0,
 )  # m: a vehicle that near ahead, or so near beyond where `COMFORTABLE` stops it, is braked for
+WALKERS = 10.0  # m from a crossing: persons that near are braked for
 SIGNS = (Rule.STOP, Rule.ALL_WAY_STOP)
 BY_TURNS = (Rule.EQUAL, Rule.ALL_WAY_STOP, Rule.ZIPPER)  # all wait for one another: only collisions count
 GOES = frozenset(map(ord, "GgoO"))  # states of a signal that lets go, or is off
@@ -122,6 +125,14 @@ def _braking(earlier: Snapshot, row: int, later: Snapshot, then: int) -> float:
     return float(earlier.speed[row] - later.speed[then]) / elapsed if elapsed > 0.0 else 0.0
 
 
+def _away(points: Floats, line: Floats) -> Floats:
+    """[p] m from points [p,2] to a line of pieces [k,2]."""
+    pieces = np.diff(line, axis=0)
+    reach = points[:, None] - line[:-1]  # [p,k-1,2]
+    along = np.clip((reach * pieces).sum(-1) / np.maximum((pieces**2).sum(-1), 1e-9), 0.0, 1.0)
+    return np.hypot(*np.moveaxis(reach - along[..., None] * pieces, -1, 0)).min(-1)
+
+
 class Ways:
     """Where vehicles are on the way of a link: before its line, on its internal lanes, beyond it."""
 
@@ -148,11 +159,15 @@ class Ways:
             signal = self._road.links[link].signal
             if 0 <= signal < len(now.signals) and int(now.signals[signal]) not in GOES:
                 return True
+            if signal < 0 and self._road.links[link].rule in SIGNS:
+                return True
             ahead = (lane, *inside, target) if lane == self._road.links[link].origin else (lane,)
         near, more = LEADER
         near = max(near, float(now.speed[row]) ** 2 / (2.0 * COMFORTABLE) + more)
         start = -float(now.lane_position[row])  # m from its front bumper to the start of the lane
         rest = start + self._road.lanes[lane].length
+        if (lane in inside or rest <= near) and self._walked(frozenset(ahead).intersection(inside), now):
+            return True
         stretches = []  # lane, m to its start, whether only who is not wholly on it is in the way
         for k in ahead:
             stretches.append((k, start, False))
@@ -168,6 +183,18 @@ class Ways:
                 if front > 0.0 and front - length <= near:
                     return True
         return False
+
+    def _walked(self, lanes: frozenset[int], now: Snapshot) -> bool:
+        """Whether persons are on, or within `WALKERS` m of, a crossing over one of these lanes."""
+        persons = np.flatnonzero(now.kind == PERSON)
+        if not len(persons):
+            return False
+        at = np.stack([now.x[persons], now.y[persons]], -1)  # [p,2] m
+        return any(
+            bool((_away(at, crossing.shape) <= WALKERS).any())
+            for crossing in self._road.crossings
+            if lanes.intersection(crossing.lanes)
+        )
 
     def _internal(self, link: int) -> tuple[int, ...]:
         """The internal lanes of a link, in driving order."""

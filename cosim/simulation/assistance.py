@@ -320,9 +320,10 @@ class Assistance(Commander):
         return False
 
     def _mind_inside(self, name: str, lane: str, speed: float, state: Assisted) -> None:
-        """Who stands inside a junction stays there while somebody is in its way, for `PATIENCE` at most."""
-        inside, looks = lane.startswith(":"), speed < STARTS and state.held < PATIENCE
-        state.stays = inside and looks and self._junctions.blocked(name, lane)
+        """Who stands inside a junction stays there while somebody is in its way, or may soon be; for longer
+        than `PATIENCE` only while somebody is."""
+        inside, long = lane.startswith(":"), state.held >= PATIENCE
+        state.stays = inside and speed < STARTS and self._junctions.blocked(name, lane, now=long)
         state.held = state.held + state.stays * self._step if inside else 0.0
         if state.stays:
             state.accel = -COMFORT

@@ -33,6 +33,7 @@ FOE_REACH = 100.0  # m before a junction
 LEADER_REACH = 30.0  # m, or
 STOP_ROOM = 10.0  # m more than it takes to stop comfortably
 STANDING = 0.1  # m/s, at most
+WALK_REACH = 10.0  # m from a crossing
 SLOWING = 0.1  # m/s2
 PATIENCE = 60.0  # s
 QUEUE_GAP = 10.0  # m
@@ -68,6 +69,7 @@ class Link:
     index: int = -1  # in the junction's table
     yields: frozenset[int] = frozenset()  # indices of the links that go first
     meets: frozenset[int] = frozenset()  # indices of the links that it crosses or merges with
+    crossings: list[list[tuple[float, ...]]] = field(default_factory=list)  # that it crosses
 
 
 @dataclass
@@ -130,6 +132,12 @@ class Net:
                     None if tl is None else (tl, int(c.attrib["linkIndex"])),
                 )
             )
+        self.crossings = {  # the corners of their centre lines
+            lane.attrib["id"]: [tuple(map(float, xy.split(",")[:2])) for xy in lane.attrib["shape"].split()]
+            for edge in root.iter("edge")
+            if edge.get("function") == "crossing"
+            for lane in edge.iter("lane")
+        }
         inside = {j.attrib["id"]: j for j in root.iter("junction")}
         for link in self.links:
             junction = inside[link.junction]
@@ -138,6 +146,11 @@ class Net:
                 link.index = places.index(link.via[-1])
                 table = next(r for r in junction.iter("request") if int(r.attrib["index"]) == link.index)
                 link.yields, link.meets = (_bits(table.attrib[name]) for name in ("response", "foes"))
+                link.crossings = [
+                    self.crossings[place]
+                    for index, place in enumerate(places)
+                    if index in link.meets and place in self.crossings
+                ]
         self.of_via = {lane: link for link in self.links for lane in link.via}
         self.of_lane: dict[str, list[Link]] = defaultdict(list)
         self.of_edges: dict[tuple[str, str], list[Link]] = defaultdict(list)
@@ -248,6 +261,7 @@ class Checker:
         self.times: list[float] = []
         self.tracks: dict[str, Track] = {}
         self.on_lane: list[dict[str, list[tuple[float, str]]]] = []  # per step: lane -> (pos, vehicle)
+        self.persons: list[list[tuple[float, float]]] = []  # per step, where they are
         self._read_fcd(folder / "fcd.xml", is_av)
         self._read_ways(folder / "vehroute.xml")
         self.touched: dict[frozenset[str], list[float]] = defaultdict(list)
@@ -405,9 +419,9 @@ class Checker:
         return []
 
     def _excused(self, foe: Track, k: int, link: Link, av: str) -> bool:
-        """Whether a foe on the way of `link` has another reason to brake: its signal, somebody else near
-        ahead on its lane or link or the lane behind it or turning off its lane, or that it is past the
-        junction."""
+        """Whether a foe on the way of `link` has another reason to brake: its signal or stop sign, persons at
+        a crossing, somebody else near ahead on its lane or link or the lane behind it or turning off its
+        lane, or that it is past the junction."""
         row = foe.row(k)
         lane, gone = foe.lane[row], -foe.pos[row]
         reach = max(LEADER_REACH, foe.speed[row] ** 2 / (2.0 * COMFORTABLE) + STOP_ROOM)
@@ -418,7 +432,13 @@ class Checker:
         else:
             if self.net.state(link, self.times[k]) not in GREEN | {""}:
                 return True
+            if link.signal is None and link.state in "sw":
+                return True
             lanes = (lane, *link.via, link.target) if lane == link.origin else (lane,)
+        if lane in link.via or (lane == link.origin and self.net.lanes[lane].length + gone <= reach):
+            for line in link.crossings:
+                if any(_apart(at, line) <= WALK_REACH for at in self.persons[k]):
+                    return True
         if not lane.startswith(":"):  # who turns off its lane, and has not left it wholly
             rest = self.net.lanes[lane].length + gone
             for other in self.net.of_lane[lane]:
@@ -520,6 +540,7 @@ class Checker:
                 track.speed.append(float(get["speed"]))
                 lanes[get["lane"]].append((float(get["pos"]), track.id))
             self.on_lane.append(lanes)
+            self.persons.append([(float(p.attrib["x"]), float(p.attrib["y"])) for p in element.iter("person")])
             element.clear()
         if len(self.times) > 1:
             step = round(self.times[1] - self.times[0], 6)
@@ -562,6 +583,15 @@ def _edge(lane: str) -> str:
 def _until_end(step: int) -> int:
     """Steps from `step` to the one with which its frame ends."""
     return -(step + 1) % FRAME
+
+
+def _apart(point: tuple[float, float], line: list[tuple[float, ...]]) -> float:
+    """m from a point to a line of pieces."""
+    p, found = complex(*point), float("inf")
+    for a, b in itertools.pairwise(complex(*corner[:2]) for corner in line):
+        part = ((p - a) * (b - a).conjugate()).real / max(abs(b - a) ** 2, 1e-9)
+        found = min(found, abs(p - a - min(max(part, 0.0), 1.0) * (b - a)))
+    return found
 
 
 def _bits(row: str) -> frozenset[int]:

@@ -26,9 +26,12 @@ NET = """<net version="1.20">
 <edge id="n" from="J" to="N"><lane id="n_0" index="0" speed="10" length="200"/></edge>
 <edge id="w" from="W" to="J"><lane id="w_0" index="0" speed="13" length="200"/></edge>
 <edge id="e" from="J" to="E"><lane id="e_0" index="0" speed="13" length="200"/></edge>
+<edge id=":J_c0" function="crossing" crossingEdges="w">
+<lane id=":J_c0_0" index="0" allow="pedestrian" speed="3" length="6" width="4" shape="200,-3 200,3"/></edge>
 {logic}
-<junction id="J" type="{kind}" incLanes="s_0 w_0" intLanes=":J_0_0 :J_1_0">
-<request index="0" response="10" foes="10" cont="0"/><request index="1" response="00" foes="01" cont="0"/>
+<junction id="J" type="{kind}" incLanes="s_0 w_0" intLanes=":J_0_0 :J_1_0 :J_c0_0">
+<request index="0" response="010" foes="010" cont="0"/><request index="1" response="100" foes="101" cont="0"/>
+<request index="2" response="000" foes="010" cont="0"/>
 </junction>
 <connection from="s" to="n" fromLane="0" toLane="0" via=":J_0_0" {s}/>
 <connection from="w" to="e" fromLane="0" toLane="0" via=":J_1_0" {w}/>
@@ -52,8 +55,10 @@ def drive(
     vehicles: dict[str, Vehicle],
     *,
     state: str = "m",
+    major: str = "M",
     program: str = "",
     collisions: Sequence[tuple[str, str, float]] = (),
+    person: tuple[float, float] | None = None,
 ) -> Law:
     """Write the outputs of an episode in which these vehicles drive like this, and have them checked."""
     signal = ('tl="T" linkIndex="0"', 'tl="T" linkIndex="1"') if program else ("", "")
@@ -63,7 +68,7 @@ def drive(
             logic=program,
             kind="traffic_light" if program else "priority",
             s=f'state="{state}" {signal[0]}',
-            w=f'state="{"w" if state == "w" else "M"}" {signal[1]}',
+            w=f'state="{"w" if state == "w" else major}" {signal[1]}',
         )
     )
     steps: list[list[str]] = [[] for _ in range(max(len(v[3]) for v in vehicles.values()))]
@@ -81,6 +86,9 @@ def drive(
             steps[k].append(f'<vehicle id="{name}" type="{kind}" {there}/>')
         trips.append(f'<tripinfo id="{name}" arrival="{arrived}"/>')
         ways.append(f'<vehicle id="{name}"><route edges="{way} {"n" if way == "s" else "e"}"/></vehicle>')
+    if person:
+        for found in steps:
+            found.append(f'<person id="p" x="{person[0]}" y="{person[1]}"/>')
     rows = [f'<timestep time="{0.1 * k:.2f}">{"".join(found)}</timestep>' for k, found in enumerate(steps)]
     hits = [f'<collision time="{t}" collider="{a}" victim="{b}"/>' for a, b, t in collisions]
     files = {"fcd": rows, "tripinfo": trips, "vehroute": ways, "collision": hits}
@@ -192,6 +200,21 @@ def test_a_foe_that_brakes_for_its_leader_was_given_way(tmp_path: Path) -> None:
     assert kinds(drive(tmp_path, {"a": ENTERS, "b": foe, "c": far})) == ["right_of_way"]
     alone = drive(tmp_path, {"a": ENTERS, "b": foe, "c": leader})
     assert [v.what.split()[0] for v in alone.violations if v.kind == "right_of_way"] == ["c"]
+
+
+def test_a_foe_that_brakes_before_its_own_stop_sign_was_given_way(tmp_path: Path) -> None:
+    vehicles = {"a": ENTERS, "b": (HV, "w", 120.0, braking(12.0, 5.5, 5.0, 10.0))}
+
+    assert kinds(drive(tmp_path, vehicles, major="s")) == []
+
+
+@pytest.mark.parametrize(("x", "count"), [(200.0, 0), (209.9, 0), (210.1, 1)])
+def test_a_foe_that_brakes_for_persons_was_given_way(tmp_path: Path, x: float, count: int) -> None:
+    near = {"a": ENTERS, "b": (HV, "w", 120.0, braking(12.0, 5.5, 5.0, 10.0))}
+    far = {"a": ENTERS, "b": (HV, "w", 90.0, braking(12.0, 5.5, 5.0, 10.0))}
+
+    assert drive(tmp_path, near, person=(x, 0.0)).right_of_way_violations == count
+    assert drive(tmp_path, far, person=(x, 0.0)).right_of_way_violations == 1
 
 
 def test_a_foe_with_a_red_signal_has_no_right_of_way(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from cosim.cli.main import main
 from cosim.metrics import MetricContext, Metrics
 from cosim.report import html as report
 from cosim.report.run_folder import read
-from cosim.road import Lane, Link, RoadMap, Rule
+from cosim.road import Crossing, Lane, Link, RoadMap, Rule
 from cosim.types import Collision, Entry, Events, Intervention, Kind, Snapshot, Timing
 
 FRAME = 0.2  # s
@@ -239,6 +239,33 @@ def test_a_foe_past_the_junction_brakes_for_something_else() -> None:
 @pytest.mark.parametrize(("state", "count"), [("G", 1), ("g", 1), ("o", 1), ("y", 0), ("r", 0)])
 def test_a_foe_may_brake_for_its_own_signal(state: str, count: int) -> None:
     assert met(HARD, signals=f"g{state}") == count
+
+
+@pytest.mark.parametrize("rule", [Rule.STOP, Rule.ALL_WAY_STOP])
+def test_a_foe_may_brake_before_its_own_stop_sign_but_not_behind_it(rule: Rule) -> None:
+    road = crossing()
+    road = replace(road, links=(road.links[MINOR_LINK], replace(road.links[MAJOR_LINK], rule=rule)))
+    assert met(HARD, road=road) == 0
+    assert met(HARD, road=road, where=INSIDE_MAJOR, start=0.0) == 1
+
+
+@pytest.mark.parametrize(
+    ("place", "start", "count"),
+    [
+        ((5.0, 0.0), 60.0, 0),  # on the crossing
+        ((5.0, 12.9), 60.0, 0),  # within 10 m of its end at (5, 3)
+        ((5.0, 13.1), 60.0, 1),
+        ((5.0, 0.0), 50.0, 1),  # the foe is near 59 m then, 41 m before the line
+    ],
+)
+def test_persons_at_a_crossing_over_its_way_excuse_the_braking(
+    place: tuple[float, float], start: float, count: int
+) -> None:
+    zebra = Crossing("c", np.array([[5.0, -3.0], [5.0, 3.0]]), 4.0, (INSIDE_MAJOR,))
+    person = At(-1, 0.0, 1.0, kind=Kind.PERSON, x=place[0], y=place[1])
+    over, elsewhere = (replace(crossing(), crossings=(replace(zebra, lanes=k),)) for k in ((4,), (1,)))
+    assert met(HARD, others={"person:p": person}, start=start, road=over) == count
+    assert met(HARD, others={"person:p": person}, start=start, road=elsewhere) == 1
 
 
 def test_a_foe_that_is_touched_was_not_given_way_even_where_all_wait_for_one_another() -> None:

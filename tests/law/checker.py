@@ -540,7 +540,8 @@ class Checker:
                 track.speed.append(float(get["speed"]))
                 lanes[get["lane"]].append((float(get["pos"]), track.id))
             self.on_lane.append(lanes)
-            self.persons.append([(float(p.attrib["x"]), float(p.attrib["y"])) for p in element.iter("person")])
+            walking = element.iter("person")
+            self.persons.append([(float(p.attrib["x"]), float(p.attrib["y"])) for p in walking])
             element.clear()
         if len(self.times) > 1:
             step = round(self.times[1] - self.times[0], 6)

@@ -130,7 +130,8 @@ def _away(points: Floats, line: Floats) -> Floats:
     pieces = np.diff(line, axis=0)
     reach = points[:, None] - line[:-1]  # [p,k-1,2]
     along = np.clip((reach * pieces).sum(-1) / np.maximum((pieces**2).sum(-1), 1e-9), 0.0, 1.0)
-    return np.hypot(*np.moveaxis(reach - along[..., None] * pieces, -1, 0)).min(-1)
+    nearest: Floats = np.hypot(*np.moveaxis(reach - along[..., None] * pieces, -1, 0)).min(-1)
+    return nearest
 
 
 class Ways:

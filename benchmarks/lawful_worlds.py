@@ -24,11 +24,12 @@ from cosim.workers.tasks import OK
 
 PAGE = Path("docs/results/lawful_worlds.md")
 SHIPPED = Path("docs/results/episodes")
+IDM = "idm"
 FEWER = 3.0  # how many times fewer hard brakings are asked for
 COLUMNS = (
     "world", "episodes", "crashed", "hard brakings of AVs", "of it in unguarded", "distance of all, m",
     "less what it is in unguarded, m", "the same of AVs, m", "too fast in unguarded",
-    "mission", "in unguarded", "interventions", "targets",
+    "mission", "in unguarded", "interventions", "idm less unguarded, m", "targets",
 )  # fmt: skip
 
 
@@ -44,10 +45,13 @@ def by_seed(folder: Path, policy: str, preset: str) -> dict[str, dict[int, Row]]
     return found
 
 
-def line(world: str, lawful: Mapping[int, Row], before: Mapping[int, Row]) -> list[str]:
-    """One world's cells: paired by seed with `before`; crashes of both count."""
-    seeds = sorted(lawful.keys() & before.keys())
-    now, then = [lawful[s] for s in seeds], [before[s] for s in seeds]
+Rows = Mapping[int, Row]  # by seed
+
+
+def line(world: str, lawful: Rows, before: Rows, idm: Rows) -> list[str]:
+    """One world's cells: paired by seed with `before`, which `idm` is too; crashes of all count."""
+    seeds = sorted(lawful.keys() & before.keys() & idm.keys())
+    now, then, sumos = ([rows[s] for s in seeds] for rows in (lawful, before, idm))
 
     def column(rows: list[Row], name: str) -> list[float]:
         return [float(row[name]) for row in rows if row.get(name) is not None]
@@ -55,6 +59,7 @@ def line(world: str, lawful: Mapping[int, Row], before: Mapping[int, Row]) -> li
     crashed = statistics.share(sum(map(bool, column(now, "crashed"))), len(now))
     hard, hard_before = (float(np.mean(column(rows, "hard_brakings_av"))) for rows in (now, then))
     way = statistics.paired_mean(column(then, "dt_mean_m"), column(now, "dt_mean_m"))
+    of_idm = statistics.paired_mean(column(then, "dt_mean_m"), column(sumos, "dt_mean_m"))
     both = [pair for pair in zip(then, now, strict=True) if all(row["dt_av_m"] is not None for row in pair)]
     before_avs, now_avs = (column(list(rows), "dt_av_m") for rows in zip(*both, strict=True))
     of_avs = statistics.paired_mean(before_avs, now_avs)
@@ -82,6 +87,7 @@ def line(world: str, lawful: Mapping[int, Row], before: Mapping[int, Row]) -> li
         *(f"{m.text(0, 100.0)} %" if m.known else "-" for m in missions),
         *(
             f"{np.mean(column(now, 'interventions')):.1f}",
+            of_idm.text(1),
             "missed: " + ", ".join(missed) if missed else "met",
         ),
     ]
@@ -122,13 +128,14 @@ def main() -> None:
         "`lawful` up to the limit: where the road is free that alone is a shorter way. Too fast: share of",
         "the AVs' time that they are more than 0.5 m/s above the limit. Targets: no crash, a third of the",
         "hard brakings at most, the distance of all not below (interval). Rates with Wilson, differences",
-        "with bootstrap intervals (95 %).",
+        "with bootstrap intervals (95 %). `idm`: SUMO's own driver in every vehicle, up to the limit.",
         "",
         "Made by `python -m benchmarks.lawful_worlds`.",
     ]
+    idm = driven(IDM, Preset.LAWFUL, args)
     for policy in args.policies:
         lawful, before = (driven(policy, preset, args) for preset in (Preset.LAWFUL, Preset.UNGUARDED))
-        rows = [line(world, lawful[world], before[world]) for world in sorted(lawful)]
+        rows = [line(world, lawful[world], before[world], idm[world]) for world in sorted(lawful)]
         lines += ["", f"## {policy}", "", markdown_row(COLUMNS), markdown_row(["---"] * len(COLUMNS))]
         lines += map(markdown_row, rows)
     write_page(args.out, lines)

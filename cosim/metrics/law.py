@@ -5,8 +5,8 @@ from functools import cache
 import numpy as np
 
 from cosim.metrics.context import AV, PERSON, MetricContext
-from cosim.road import Link, RoadMap, Rule
-from cosim.types import Entry, Floats, Metric, Offence, Snapshot
+from cosim.road import Crossing, Link, RoadMap, Rule
+from cosim.types import Entry, Metric, Offence, Snapshot
 
 COMFORTABLE = 3.0  # m/s2: who could stop at yellow with this must
 STOPPED = 0.5  # m/s, at most, within the last 10 m before a stop sign
@@ -125,13 +125,17 @@ def _braking(earlier: Snapshot, row: int, later: Snapshot, then: int) -> float:
     return float(earlier.speed[row] - later.speed[then]) / elapsed if elapsed > 0.0 else 0.0
 
 
-def _away(points: Floats, line: Floats) -> Floats:
-    """[p] m from points [p,2] to a line of pieces [k,2]."""
-    pieces = np.diff(line, axis=0)
-    reach = points[:, None] - line[:-1]  # [p,k-1,2]
-    along = np.clip((reach * pieces).sum(-1) / np.maximum((pieces**2).sum(-1), 1e-9), 0.0, 1.0)
-    nearest: Floats = np.hypot(*np.moveaxis(reach - along[..., None] * pieces, -1, 0)).min(-1)
-    return nearest
+def persons_near(now: Snapshot, crossing: Crossing, reach: float) -> bool:
+    """Whether persons are at most `reach` m from the centre line of a crossing."""
+    persons = np.flatnonzero(now.kind == PERSON)
+    if not len(persons):
+        return False
+    line = crossing.shape
+    pieces = np.diff(line, axis=0)  # [k,2] m
+    beyond = np.stack([now.x[persons], now.y[persons]], -1)[:, None] - line[:-1]  # [p,k,2] m
+    along = np.clip((beyond * pieces).sum(-1) / np.maximum((pieces**2).sum(-1), 1e-9), 0.0, 1.0)
+    away = np.hypot(*np.moveaxis(beyond - along[..., None] * pieces, -1, 0))
+    return bool((away <= reach).any())
 
 
 class Ways:
@@ -139,19 +143,20 @@ class Ways:
 
     def __init__(self, road: RoadMap) -> None:
         self._road = road
-        self._inside = cache(self._internal)
+        self.inside = cache(self._internal)
+        self.crossings = cache(self._crossings)
 
     def left(self, link: int, now: Snapshot, row: int) -> bool:
         """Whether a vehicle that entered by the link is out of the junction, its rear bumper too."""
         lane, lanes = int(now.lane[row]), self._road.lanes
         if lane < 0 or lanes[lane].internal:
-            return lane not in self._inside(link)
+            return lane not in self.inside(link)
         beyond = lanes[lane].edge != lanes[self._road.links[link].target].edge
         return beyond or bool(now.lane_position[row] >= now.length[row])
 
     def excused(self, link: int, now: Snapshot, row: int, av: int) -> bool:
         """Whether a vehicle on the way of `link` has another reason to brake than the one in row `av`."""
-        lane, inside, target = int(now.lane[row]), self._inside(link), self._road.links[link].target
+        lane, inside, target = int(now.lane[row]), self.inside(link), self._road.links[link].target
         if lane in inside:
             ahead = (*inside[inside.index(lane) :], target)
         elif lane < 0 or self._road.lanes[lane].edge == self._road.lanes[target].edge:
@@ -167,7 +172,8 @@ class Ways:
         near = max(near, float(now.speed[row]) ** 2 / (2.0 * COMFORTABLE) + more)
         start = -float(now.lane_position[row])  # m from its front bumper to the start of the lane
         rest = start + self._road.lanes[lane].length
-        if (lane in inside or rest <= near) and self._walked(frozenset(ahead).intersection(inside), now):
+        walked = any(persons_near(now, crossing, WALKERS) for crossing in self.crossings(link))
+        if walked and (lane in inside or rest <= near):
             return True
         stretches = []  # lane, m to its start, whether only who is not wholly on it is in the way
         for k in ahead:
@@ -185,17 +191,10 @@ class Ways:
                     return True
         return False
 
-    def _walked(self, lanes: frozenset[int], now: Snapshot) -> bool:
-        """Whether persons are on, or within `WALKERS` m of, a crossing over one of these lanes."""
-        persons = np.flatnonzero(now.kind == PERSON)
-        if not len(persons):
-            return False
-        at = np.stack([now.x[persons], now.y[persons]], -1)  # [p,2] m
-        return any(
-            bool((_away(at, crossing.shape) <= WALKERS).any())
-            for crossing in self._road.crossings
-            if lanes.intersection(crossing.lanes)
-        )
+    def _crossings(self, link: int) -> tuple[Crossing, ...]:
+        """The pedestrian crossings over the internal lanes of a link."""
+        inside = self.inside(link)
+        return tuple(one for one in self._road.crossings if not set(inside).isdisjoint(one.lanes))
 
     def _internal(self, link: int) -> tuple[int, ...]:
         """The internal lanes of a link, in driving order."""

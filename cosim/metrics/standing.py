@@ -6,7 +6,8 @@ import numpy as np
 
 from cosim.geometry import gap_ahead
 from cosim.metrics.context import AV, MetricContext, slow
-from cosim.metrics.law import AvCounts
+from cosim.metrics.law import AvCounts, Ways, persons_near
+from cosim.road import Crossing
 from cosim.types import Metric, Offence, Snapshot
 
 STANDING = 0.1  # m/s, SUMO's own threshold of a halting vehicle
@@ -24,9 +25,14 @@ class Standing(AvCounts):
         super().reset(first, context)
         self._road = context.road
         self._signals: dict[int, tuple[int, ...]] = {}  # lane -> the signals of its links
-        for link in context.road.links:
+        self._crossings: dict[int, tuple[Crossing, ...]] = {}  # lane -> over its links, or over its own one
+        ways = Ways(context.road)
+        for number, link in enumerate(context.road.links):
             if link.signal >= 0:
                 self._signals[link.origin] = (*self._signals.get(link.origin, ()), link.signal)
+            if over := ways.crossings(number):
+                for lane in (link.origin, *ways.inside(number)):
+                    self._crossings[lane] = (*self._crossings.get(lane, ()), *over)
         self._waiting: dict[str, float] = {}  # AV -> s, since when it stands without a reason
         self._inside: dict[str, tuple[str, float]] = {}  # AV -> the junction in which it stands, since (s)
         self._stuck: set[str] = set()
@@ -79,14 +85,14 @@ class Standing(AvCounts):
             zip(queued.tolist(), leaders.tolist(), strict=True)
         )  # row -> row of the next, -1 for none
         planned, lanes = set(s.events.stopped), s.lane.tolist()
-        waits: dict[int, bool] = {}  # lane -> whether a signal at its end asks to wait
+        waits: dict[int, bool] = {}  # lane -> whether a signal at its end, or a person, asks to wait
         found: dict[int, bool] = {}
         for row in standing:
             queue = []
             while row in ahead and row not in found:
                 queue.append(row)
                 if (lane := lanes[row]) not in waits:
-                    waits[lane] = self._at_signal(s, lane)
+                    waits[lane] = self._at_signal(s, lane) or self._for_persons(s, lane)
                 alone = ahead[row] not in ahead and s.kind[row] != AV
                 found[row] = waits[lane] or s.ids[row] in planned or alone
                 if found[row]:
@@ -99,3 +105,7 @@ class Standing(AvCounts):
     def _at_signal(self, s: Snapshot, lane: int) -> bool:
         """Whether a signal at the end of the lane asks to wait."""
         return any(k < len(s.signals) and int(s.signals[k]) in WAIT for k in self._signals.get(lane, ()))
+
+    def _for_persons(self, s: Snapshot, lane: int) -> bool:
+        """Whether a person is on a crossing over the lane's ways through the junction."""
+        return any(persons_near(s, one, 0.5 * one.width) for one in self._crossings.get(lane, ()))

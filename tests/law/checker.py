@@ -56,6 +56,22 @@ class Lane:
     limit: float  # m/s
 
 
+@dataclass(frozen=True)
+class Zebra:
+    """A pedestrian crossing."""
+
+    line: list[complex]  # m, the corners of its centre line
+    width: float  # m
+
+    def apart(self, x: float, y: float) -> float:
+        """m from a place to its centre line."""
+        p, found = complex(x, y), float("inf")
+        for a, b in itertools.pairwise(self.line):
+            part = ((p - a) * (b - a).conjugate()).real / max(abs(b - a) ** 2, 1e-9)
+            found = min(found, abs(p - a - min(max(part, 0.0), 1.0) * (b - a)))
+        return found
+
+
 @dataclass
 class Link:
     """A way through a junction from one lane to another."""
@@ -69,7 +85,7 @@ class Link:
     index: int = -1  # in the junction's table
     yields: frozenset[int] = frozenset()  # indices of the links that go first
     meets: frozenset[int] = frozenset()  # indices of the links that it crosses or merges with
-    crossings: list[list[tuple[float, ...]]] = field(default_factory=list)  # that it crosses
+    crossings: list[Zebra] = field(default_factory=list)  # that it crosses
 
 
 @dataclass
@@ -132,8 +148,11 @@ class Net:
                     None if tl is None else (tl, int(c.attrib["linkIndex"])),
                 )
             )
-        self.crossings = {  # the corners of their centre lines
-            lane.attrib["id"]: [tuple(map(float, xy.split(",")[:2])) for xy in lane.attrib["shape"].split()]
+        self.crossings = {
+            lane.attrib["id"]: Zebra(
+                [complex(*map(float, xy.split(",")[:2])) for xy in lane.attrib["shape"].split()],
+                float(lane.attrib["width"]),
+            )
             for edge in root.iter("edge")
             if edge.get("function") == "crossing"
             for lane in edge.iter("lane")
@@ -435,10 +454,10 @@ class Checker:
             if link.signal is None and link.state in "sw":
                 return True
             lanes = (lane, *link.via, link.target) if lane == link.origin else (lane,)
-        if lane in link.via or (lane == link.origin and self.net.lanes[lane].length + gone <= reach):
-            for line in link.crossings:
-                if any(_apart(at, line) <= WALK_REACH for at in self.persons[k]):
-                    return True
+        walked = any(zebra.apart(*at) <= WALK_REACH for zebra in link.crossings for at in self.persons[k])
+        at_line = lane == link.origin and self.net.lanes[lane].length + gone <= reach
+        if walked and (at_line or lane in link.via):
+            return True
         if not lane.startswith(":"):  # who turns off its lane, and has not left it wholly
             rest = self.net.lanes[lane].length + gone
             for other in self.net.of_lane[lane]:
@@ -466,10 +485,15 @@ class Checker:
                 return
 
     def _waits(self, track: Track, k: int, seen: set[str]) -> bool:
-        """Whether a red or yellow signal, or a queue before one or behind a human, is ahead in its lane."""
+        """Whether a red or yellow signal, persons on a crossing, or a queue before one of these or behind a
+        human are ahead in its lane."""
         row, seen = track.row(k), seen | {track.id}
         lane = track.lane[row]
         if any(self.net.state(link, self.times[k]) in RED | YELLOW for link in self.net.of_lane[lane]):
+            return True
+        links = [self.net.of_via[lane]] if lane in self.net.of_via else self.net.of_lane[lane]
+        zebras = [zebra for link in links for zebra in link.crossings]
+        if any(zebra.apart(*at) <= 0.5 * zebra.width for zebra in zebras for at in self.persons[k]):
             return True
         free = True
         for pos, name in self.on_lane[k].get(lane, ()):
@@ -584,15 +608,6 @@ def _edge(lane: str) -> str:
 def _until_end(step: int) -> int:
     """Steps from `step` to the one with which its frame ends."""
     return -(step + 1) % FRAME
-
-
-def _apart(point: tuple[float, float], line: list[tuple[float, ...]]) -> float:
-    """m from a point to a line of pieces."""
-    p, found = complex(*point), float("inf")
-    for a, b in itertools.pairwise(complex(*corner[:2]) for corner in line):
-        part = ((p - a) * (b - a).conjugate()).real / max(abs(b - a) ** 2, 1e-9)
-        found = min(found, abs(p - a - min(max(part, 0.0), 1.0) * (b - a)))
-    return found
 
 
 def _bits(row: str) -> frozenset[int]:

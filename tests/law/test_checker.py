@@ -262,6 +262,14 @@ def test_who_waits_for_red_or_behind_who_waits_for_it_is_not_stuck(tmp_path: Pat
     assert drive(tmp_path, queue).avs_stuck == 2, "who stands behind somebody that stands without cause"
 
 
+@pytest.mark.parametrize(("y", "count"), [(4.9, 0), (5.1, 1)])
+def test_who_waits_for_persons_on_a_crossing_is_not_stuck(tmp_path: Path, y: float, count: int) -> None:
+    stands = (AV, "w", 199.0, [0.0] * 701)
+
+    assert drive(tmp_path, {"a": stands}, person=(200.0, y)).avs_stuck == count
+    assert drive(tmp_path, {"a": (AV, "s", 199.0, [0.0] * 701)}, person=(200.0, 0.0)).avs_stuck == 1
+
+
 def test_trips_brakings_and_distance_are_counted(tmp_path: Path) -> None:
     arrives = (AV, "s", 350.0, steady(10.0, 10.0))
     brakes = (AV, "w", 0.0, braking(10.0, 2.0, 4.0, 10.0))

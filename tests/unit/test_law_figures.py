@@ -320,6 +320,20 @@ def test_red_and_yellow_are_reasons_to_stand(signals: str, count: int) -> None:
     assert standing(MINOR, 70.0, crossing(signals=True), signals=signals)["avs_stuck"] == count
 
 
+@pytest.mark.parametrize(("place", "count"), [((5.0, 0.0), 0), ((5.0, 4.9), 0), ((5.0, 5.1), 1)])
+def test_a_person_on_a_crossing_over_its_way_is_a_reason_to_stand(
+    place: tuple[float, float], count: int
+) -> None:
+    person = {"person:p": At(-1, 0.0, 1.0, kind=Kind.PERSON, x=place[0], y=place[1])}
+    zebra = Crossing("c", np.array([[5.0, -3.0], [5.0, 3.0]]), 4.0, (INSIDE_MINOR,))
+    over, elsewhere = (
+        replace(crossing(), crossings=(replace(zebra, lanes=(k,)),)) for k in (INSIDE_MINOR, INSIDE_MAJOR)
+    )
+    assert standing(MINOR, 70.0, over, person)["avs_stuck"] == count
+    assert standing(INSIDE_MINOR, 70.0, over, person)["avs_stuck"] == count
+    assert standing(MINOR, 70.0, elsewhere, person)["avs_stuck"] == 1
+
+
 def test_a_queue_is_a_reason_to_stand_if_its_head_has_one() -> None:
     queue = {"b": At(MINOR, 60.0), "c": av(MINOR, 70.0)}
     road = crossing(signals=True)

@@ -145,6 +145,10 @@ class Ways:
         self._road = road
         self.inside = cache(self._internal)
         self.crossings = cache(self._crossings)
+        self._over: dict[int, list[Crossing]] = {}  # lane -> the crossings over it
+        for crossing in road.crossings:
+            for lane in crossing.lanes:
+                self._over.setdefault(lane, []).append(crossing)
 
     def left(self, link: int, now: Snapshot, row: int) -> bool:
         """Whether a vehicle that entered by the link is out of the junction, its rear bumper too."""
@@ -172,8 +176,8 @@ class Ways:
         near = max(near, float(now.speed[row]) ** 2 / (2.0 * COMFORTABLE) + more)
         start = -float(now.lane_position[row])  # m from its front bumper to the start of the lane
         rest = start + self._road.lanes[lane].length
-        walked = any(persons_near(now, crossing, WALKERS) for crossing in self.crossings(link))
-        if walked and (lane in inside or rest <= near):
+        comes = lane in inside or (lane == self._road.links[link].origin and rest <= near)
+        if comes and any(persons_near(now, crossing, WALKERS) for crossing in self.crossings(link)):
             return True
         stretches = []  # lane, m to its start, whether only who is not wholly on it is in the way
         for k in ahead:
@@ -193,8 +197,9 @@ class Ways:
 
     def _crossings(self, link: int) -> tuple[Crossing, ...]:
         """The pedestrian crossings over the internal lanes of a link."""
-        inside = self.inside(link)
-        return tuple(one for one in self._road.crossings if not set(inside).isdisjoint(one.lanes))
+        if not self._over:
+            return ()
+        return tuple({one.id: one for lane in self.inside(link) for one in self._over.get(lane, ())}.values())
 
     def _internal(self, link: int) -> tuple[int, ...]:
         """The internal lanes of a link, in driving order."""

@@ -1,6 +1,7 @@
 """The episodes behind the pages of `vfn-p`: kept with their trace hashes, some of them driven anew on demand.
 
     python -m benchmarks.rows keep PAGE RUN [RUN ...]     # run folders -> docs/results/data/rows/PAGE.csv.gz
+    python -m benchmarks.rows keep PAGE RUN [RUN ...] --add     # to the rows that are there
     python -m benchmarks.rows check [PAGE ...] [--sample 10]
 
 `check` drives episodes picked at random and compares every figure that is kept and the trace hash; it ends
@@ -48,13 +49,14 @@ COLUMNS = (*IDENTITY, *FIGURES)
 FORCED = "forced_"  # a level of `benchmarks.forced_entry`: its lag follows
 TRAININGS = "docs/results/trainings"
 TWIN = f"{TRAININGS}/twin-0/distilled.safetensors"
+A2C = ("a2c-egoist", "a2c-altruist", "conv3d-egoist", "conv3d-altruist")
 # label of a policy that does not ship -> what `--policy` drives it by
 POLICIES = {
     **{f"{arm.replace('_', '-')}-alone": f"benchmarks.alone:{arm}" for arm in alone.ARMS[1:]},
     **{label: f"benchmarks.foresight:{made}" for label, made in foresight.HALVES.items()},
     humans.CAR.partition("=")[0]: humans.CAR.partition("=")[2],
     "distilled": TWIN,
-    **{arm: f"{TRAININGS}/{arm}-0/{arm}.safetensors" for arm in ("a2c-egoist", "a2c-altruist")},
+    **{arm: f"{TRAININGS}/{arm}-0/{arm}.safetensors" for arm in A2C},
 }
 
 Kept = dict[str, str]  # column -> text
@@ -65,12 +67,16 @@ def kept(row: Mapping[str, Any]) -> Kept:
     return {name: "" if row.get(name) is None else str(row[name]) for name in COLUMNS}
 
 
-def keep(page: str, runs: Sequence[Path], out: Path = KEPT) -> int:
+def keep(page: str, runs: Sequence[Path], out: Path = KEPT, *, add: bool = False) -> int:
     """Write the rows of these run folders, sorted; the same rows give the same file. Returns how many.
 
-    Raises BadInput for a folder that is none.
+    `add`: beside the rows that are there; of one episode the newer row. Raises BadInput for a folder that is
+    none, or where there are no rows to add to.
     """
     rows = [kept(row) for run in runs for row in run_folder.read(run).rows if row["status"] == OK]
+    if add:
+        newest = {tuple(row[name] for name in IDENTITY): row for row in (*read(page, out), *rows)}
+        rows = list(newest.values())
     rows.sort(key=lambda row: (*(row[name] for name in IDENTITY[:-1]), int(row["seed"])))
     text = io.StringIO()
     writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
@@ -130,6 +136,7 @@ def main() -> None:
     keeping = commands.add_parser("keep")
     keeping.add_argument("page", metavar="PAGE")
     keeping.add_argument("runs", nargs="+", type=Path, metavar="RUN")
+    keeping.add_argument("--add", action="store_true", help="to the rows that are there")
     checking = commands.add_parser("check")
     checking.add_argument("pages", nargs="*", metavar="PAGE", help="default: all")
     checking.add_argument("--sample", type=int, default=10, metavar="N", help="episodes")
@@ -137,7 +144,7 @@ def main() -> None:
     args = parser.parse_args()
     try:
         if args.command == "keep":
-            print(f"{KEPT / args.page}.csv.gz: {keep(args.page, args.runs)} episodes")
+            print(f"{KEPT / args.page}.csv.gz: {keep(args.page, args.runs, add=args.add)} episodes")
             return
         pages = args.pages or sorted(path.name.removesuffix(".csv.gz") for path in KEPT.glob("*.csv.gz"))
         rows = [row for page in pages for row in read(page)]

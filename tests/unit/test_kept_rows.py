@@ -6,6 +6,7 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+from run_rows import cell, write
 
 from benchmarks import rows
 from cosim.errors import BadInput
@@ -48,3 +49,14 @@ def test_a_row_says_what_the_command_line_is_to_say(tmp_path: Path) -> None:
     assert (ROOT / rows.TWIN).is_file()
     with pytest.raises(BadInput, match="no rows are kept"):
         rows.read("nothing", tmp_path)
+
+
+def test_rows_are_added_to_those_that_are_there_and_newer_ones_replace_them(tmp_path: Path) -> None:
+    first = write(tmp_path / "first", cell("idm", 3))
+    second = write(tmp_path / "second", cell("idm", 2, first=200_002, columns={"dt_mean_m": [700.0, 701.0]}))
+    with pytest.raises(BadInput, match="no rows are kept"):
+        rows.keep("page", [second], tmp_path, add=True)
+    assert rows.keep("page", [first], tmp_path) == 3
+    assert rows.keep("page", [second], tmp_path, add=True) == 4
+    found = {int(row["seed"]): row["dt_mean_m"] for row in rows.read("page", tmp_path)}
+    assert found == {200_000: "810.0", 200_001: "810.0", 200_002: "700.0", 200_003: "701.0"}

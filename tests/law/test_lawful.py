@@ -181,20 +181,25 @@ def test_a_bus_changes_no_lanes_before_it_has_turned_off_a_junction(law_worlds: 
     assert result.value("av_involved_collisions") == 0
 
 
-def test_nobody_starts_inside_a_junction_into_one_that_stands_in_its_way(law_worlds: dict[str, Path]) -> None:
-    """SUMO's driver starts, and hits one there."""
-    result = drive(law_worlds["crossing_signals"], "random", seed=200_004, duration=100.0)
+@pytest.mark.parametrize("seed", [200_004, 200_015])
+def test_nobody_starts_inside_a_junction_into_one_that_stands_in_its_way(
+    law_worlds: dict[str, Path], seed: int
+) -> None:
+    """SUMO's driver starts, and hits one there: at once, or after ten seconds."""
+    result = drive(law_worlds["crossing_signals"], "random", seed=seed, duration=100.0)
 
     assert result.value("av_involved_collisions") == 0
 
 
-def test_who_stands_inside_a_junction_stays_for_somebody_in_the_way_but_not_for_ever() -> None:
+def test_who_stands_inside_a_junction_stays_for_who_may_come_but_not_for_ever_as_for_who_is_there() -> None:
     class Full:
-        def blocked(self, name: str, lane: str) -> bool:
-            return True
+        there = False
 
-    car = assistance.Assistance(STEP, RoadMap((), ()))
-    car._junctions = Full()  # type: ignore[assignment]
+        def blocked(self, name: str, lane: str, now: bool) -> bool:
+            return self.there or not now
+
+    car, full = assistance.Assistance(STEP, RoadMap((), ())), Full()
+    car._junctions = full  # type: ignore[assignment]
     state = assistance.Assisted(0.0)
 
     def stays(lane: str, speed: float, steps: int = 1) -> int:
@@ -208,6 +213,8 @@ def test_who_stands_inside_a_junction_stays_for_somebody_in_the_way_but_not_for_
     assert stays(":j_0_0", 0.0, 200) == pytest.approx(assistance.PATIENCE / STEP, abs=1)
     assert stays("e_0", 0.0) == 0, "it is out"
     assert stays(":k_0_0", 0.0) == 1, "another junction"
+    full.there = True
+    assert stays(":k_0_0", 0.0, 200) == 200, "somebody stands there"
 
 
 def test_it_comes_to_a_stop_comfortably_and_does_not_creep_there(start: Start) -> None:

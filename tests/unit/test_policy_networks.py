@@ -361,7 +361,7 @@ def test_a_citys_frames_are_read_in_parts_to_the_bit(
             return memory.frames(list("abcde"), maps)
 
     whole = read()
-    monkeypatch.setattr(extractors, "AT_ONCE", 40)  # two parts: below 16 frames some processors round otherwise
+    monkeypatch.setattr(extractors, "AT_ONCE", 40)  # two parts; below 16 frames some processors round
     assert torch.equal(read(), whole)
 
 

@@ -262,6 +262,11 @@ class Snapshot:
         return len(self.ids)
 
     @cached_property
+    def persons(self) -> npt.NDArray[np.intp]:
+        """[p] rows of the persons."""
+        return np.flatnonzero(self.kind == int(Kind.PERSON))
+
+    @cached_property
     def vehicles(self) -> Snapshot:
         """The same without persons."""
         kept = np.flatnonzero(self.kind != int(Kind.PERSON))

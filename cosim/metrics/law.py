@@ -2,9 +2,7 @@
 
 from functools import cache
 
-import numpy as np
-
-from cosim.metrics.context import AV, PERSON, MetricContext
+from cosim.metrics.context import AV, MetricContext
 from cosim.road import Crossing, Link, RoadMap, Rule
 from cosim.types import Entry, Metric, Offence, Snapshot
 
@@ -127,15 +125,8 @@ def _braking(earlier: Snapshot, row: int, later: Snapshot, then: int) -> float:
 
 def persons_near(now: Snapshot, crossing: Crossing, reach: float) -> bool:
     """Whether persons are at most `reach` m from the centre line of a crossing."""
-    persons = np.flatnonzero(now.kind == PERSON)
-    if not len(persons):
-        return False
-    line = crossing.shape
-    pieces = np.diff(line, axis=0)  # [k,2] m
-    beyond = np.stack([now.x[persons], now.y[persons]], -1)[:, None] - line[:-1]  # [p,k,2] m
-    along = np.clip((beyond * pieces).sum(-1) / np.maximum((pieces**2).sum(-1), 1e-9), 0.0, 1.0)
-    away = np.hypot(*np.moveaxis(beyond - along[..., None] * pieces, -1, 0))
-    return bool((away <= reach).any())
+    rows = now.persons
+    return len(rows) > 0 and bool((crossing.away(now.x[rows], now.y[rows]) <= reach).any())
 
 
 class Ways:

@@ -1,7 +1,11 @@
 """Ways through junctions: which lane leads to which, by which signal, and who has the right of way."""
 
+import math
 from dataclasses import dataclass
 from enum import IntEnum
+from itertools import pairwise
+
+import numpy as np
 
 from cosim.arrays import Floats
 
@@ -38,3 +42,13 @@ class Crossing:
     width: float  # m
     lanes: tuple[int, ...]  # the lanes that it crosses
     signal: int = -1  # index into `Snapshot.signals`
+
+    def away(self, x: Floats, y: Floats) -> Floats:
+        """[n] m from places x, y [n] m to its centre line."""
+        distance = np.full(len(x), np.inf)
+        for (ax, ay), (bx, by) in pairwise(self.shape.tolist()):
+            length = max(math.hypot(bx - ax, by - ay), 1e-6)
+            ux, uy = (bx - ax) / length, (by - ay) / length
+            t = np.clip((x - ax) * ux + (y - ay) * uy, 0.0, length)
+            distance = np.minimum(distance, np.hypot(x - ax - t * ux, y - ay - t * uy))
+        return distance

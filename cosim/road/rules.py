@@ -174,7 +174,7 @@ class _Zebra:
 
     def __init__(self, crossing: Crossing) -> None:
         ends = crossing.shape.tolist()
-        self.signal, self._half, self._shape = crossing.signal, 0.5 * crossing.width, crossing.shape
+        self.signal, self._half, self._crossing = crossing.signal, 0.5 * crossing.width, crossing
         self._pieces = []  # of its centre line: x m, y m, direction, length m, m to go on before and after it
         for k, ((ax, ay), (bx, by)) in enumerate(pairwise(ends)):
             length = max(math.hypot(bx - ax, by - ay), 1e-6)
@@ -207,9 +207,6 @@ class _Zebra:
         arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(lane, axis=0).T))])
         at = np.arange(0.0, arc[-1] + STEP, STEP)
         x, y = np.interp(at, arc, lane[:, 0]), np.interp(at, arc, lane[:, 1])
-        distance = np.full(len(at), np.inf)
-        for ax, ay, ux, uy, length, _, _ in self._pieces:
-            t = np.clip((x - ax) * ux + (y - ay) * uy, 0.0, length)
-            distance = np.minimum(distance, np.hypot(x - ax - t * ux, y - ay - t * uy))
+        distance = self._crossing.away(x, y)
         inside = np.flatnonzero(distance <= max(self._half, float(distance.min())))
         return float(at[inside[0]]), float(at[inside[-1]])

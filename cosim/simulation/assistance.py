@@ -323,7 +323,7 @@ class Assistance(Commander):
         """Who stands inside a junction stays there while somebody is in its way, or may soon be; for longer
         than `PATIENCE` only while somebody is."""
         inside, long = lane.startswith(":"), state.held >= PATIENCE
-        state.stays = inside and speed < STARTS and self._junctions.blocked(name, lane, now=long)
+        state.stays = inside and speed < STARTS and self._junctions.blocked(name, lane, present=long)
         state.held = state.held + state.stays * self._step if inside else 0.0
         if state.stays:
             state.accel = -COMFORT

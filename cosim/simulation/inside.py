@@ -34,14 +34,15 @@ class Inside:
         self._road = road
         self._ways: dict[int, tuple[LanePath, tuple[int, ...]]] = {}
 
-    def blocked(self, name: str, lane: str, now: bool = False) -> bool:
+    def blocked(self, name: str, lane: str, present: bool = False) -> bool:
         """Whether the AV `name`, which stands on the internal lane `lane`, would touch somebody on its way
-        out of the junction: who stands there, drives through, or may soon wait there; `now`: who is there."""
+        out of the junction: who stands there, drives through, or may soon wait there; `present`: who is
+        there."""
         own = self._road.index.get(lane, -1)
         if own < 0:
             return False
         mine = None
-        for theirs in self._others(own, now):
+        for theirs in self._others(own, present):
             if mine is None:
                 mine = self._through(name, own, sumo.vehicle.getLanePosition(name), BESIDE)
             touched = overlap(Boxes(*mine[:, :, None]), Boxes(*theirs))  # [places, places]
@@ -51,9 +52,9 @@ class Inside:
 
     # ---- inside ----
 
-    def _others(self, own: int, now: bool) -> Iterator[Floats]:
+    def _others(self, own: int, present: bool) -> Iterator[Floats]:
         """The places, as `_through`'s, of those who are on other ways through the junction of the lane
-        `own`, or soon will be: where they stand, will wait, or drive through; `now`: where they are."""
+        `own`, or soon will be: where they stand, will wait, or drive through; `present`: where they are."""
         get, lanes, (_, way) = sumo.vehicle, self._road.lanes, self._way(own)
         seconds, metres = SOON
         for lane in self._lanes[lanes[own].start]:
@@ -63,13 +64,13 @@ class Inside:
             for other in sumo.lane.getLastStepVehicleIDs(lanes[lane].id):
                 at, speed = get.getLanePosition(other), get.getSpeed(other)
                 through = self._through(other, lane, at)
-                if now:
+                if present:
                     yield through[:, :1]
                     continue
                 stands = min(at + speed**2 / (2.0 * STOPS), end) - at
                 last = end - at if waits else stands if speed < SLOW else math.inf
                 yield through[:, : int(min(last / SPACING, through.shape[1])) + 1]
-            for origin in self._origins[lane] if waits and not now else ():
+            for origin in self._origins[lane] if waits and not present else ():
                 for other in sumo.lane.getLastStepVehicleIDs(lanes[origin].id):
                     away = lanes[origin].length - get.getLanePosition(other)
                     if away > max(seconds * get.getSpeed(other), metres):

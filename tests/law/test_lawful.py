@@ -195,8 +195,8 @@ def test_who_stands_inside_a_junction_stays_for_who_may_come_but_not_for_ever_as
     class Full:
         there = False
 
-        def blocked(self, name: str, lane: str, now: bool) -> bool:
-            return self.there or not now
+        def blocked(self, name: str, lane: str, present: bool) -> bool:
+            return self.there or not present
 
     car, full = assistance.Assistance(STEP, RoadMap((), ())), Full()
     car._junctions = full  # type: ignore[assignment]

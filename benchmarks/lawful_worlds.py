@@ -4,7 +4,8 @@
         [--runs runs/lawful] [--workers 2] [--out PAGE]
 
 The policies drive `dense` from test seed 200,000 on; the same command goes on where it stopped. Episodes in
-`unguarded` that ship (docs/results/episodes) are not driven again. Writes docs/results/lawful_worlds.md.
+`unguarded` that ship (docs/results/episodes) are not driven again. Beside them the same networks drive in
+`unguarded` no faster than the limit (`WithinLimit`). Writes docs/results/lawful_worlds.md.
 """
 
 import argparse
@@ -16,21 +17,49 @@ import numpy as np
 import sumo_scenarios
 from benchmarks.tables import markdown_row, write_page
 from cosim.cli.main import main as cosim
+from cosim.control import next_target
 from cosim.report import run_folder, statistics
 from cosim.report.figures import Row
 from cosim.seeding import FIRST_TEST_SEED
-from cosim.types import Preset
+from cosim.types import Decision, History, PolicyContext, Preset
 from cosim.workers.tasks import OK
+from policy import agents
 
 PAGE = Path("docs/results/lawful_worlds.md")
 SHIPPED = Path("docs/results/episodes")
 IDM = "idm"
+WITHIN = "within-limit"  # `WithinLimit`, in `unguarded`
 FEWER = 3.0  # how many times fewer hard brakings are asked for
 COLUMNS = (
     "world", "episodes", "crashed", "hard brakings of AVs", "of it in unguarded", "distance of all, m",
     "less what it is in unguarded, m", "the same of AVs, m", "too fast in unguarded",
-    "mission", "in unguarded", "interventions", "idm less unguarded, m", "targets",
+    "mission", "in unguarded", "interventions", "idm less unguarded, m", "within the limit less unguarded, m",
+    "lawful less within the limit, m", "targets",
 )  # fmt: skip
+
+
+class WithinLimit:
+    """`cosim.types.Policy`: `vfn-p`, but no command leads above the limit of its lane."""
+
+    def __init__(self) -> None:
+        self._inner = agents.make("vfn-p")
+        self.observation = self._inner.observation
+        self.files = getattr(self._inner, "files", ())
+
+    def reset(self, context: PolicyContext) -> None:
+        """A new episode."""
+        self._inner.reset(context)
+        self._hold = context.timing.decision  # s
+
+    def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
+        """What `vfn-p` decides; where that leads above the limit, it reaches the limit and stays there."""
+        return {av: self._within(histories[av], d) for av, d in self._inner.decide(histories).items()}
+
+    def _within(self, seen: History, decision: Decision) -> Decision:
+        limit, speed = seen.route.speed_limit, seen.ego_speed
+        if next_target(seen.target_speed, speed, decision.action, limit) <= limit:
+            return decision
+        return decision._replace(accel=(limit - speed) / self._hold)
 
 
 def by_seed(folder: Path, policy: str, preset: str) -> dict[str, dict[int, Row]]:
@@ -48,18 +77,21 @@ def by_seed(folder: Path, policy: str, preset: str) -> dict[str, dict[int, Row]]
 Rows = Mapping[int, Row]  # by seed
 
 
-def line(world: str, lawful: Rows, before: Rows, idm: Rows) -> list[str]:
-    """One world's cells: paired by seed with `before`, which `idm` is too; crashes of all count."""
-    seeds = sorted(lawful.keys() & before.keys() & idm.keys())
-    now, then, sumos = ([rows[s] for s in seeds] for rows in (lawful, before, idm))
+def line(world: str, lawful: Rows, before: Rows, within: Rows, idm: Rows) -> list[str]:
+    """One world's cells, paired by seed; crashes of all count. `before`: in `unguarded`, `within` too."""
+    seeds = sorted(lawful.keys() & before.keys() & within.keys() & idm.keys())
+    now, then, slower, sumos = ([rows[s] for s in seeds] for rows in (lawful, before, within, idm))
 
     def column(rows: list[Row], name: str) -> list[float]:
         return [float(row[name]) for row in rows if row.get(name) is not None]
 
     crashed = statistics.share(sum(map(bool, column(now, "crashed"))), len(now))
     hard, hard_before = (float(np.mean(column(rows, "hard_brakings_av"))) for rows in (now, then))
-    way = statistics.paired_mean(column(then, "dt_mean_m"), column(now, "dt_mean_m"))
-    of_idm = statistics.paired_mean(column(then, "dt_mean_m"), column(sumos, "dt_mean_m"))
+
+    def further(rows: list[Row], others: list[Row]) -> statistics.Figure:
+        return statistics.paired_mean(column(others, "dt_mean_m"), column(rows, "dt_mean_m"))
+
+    way = further(now, then)
     both = [pair for pair in zip(then, now, strict=True) if all(row["dt_av_m"] is not None for row in pair)]
     before_avs, now_avs = (column(list(rows), "dt_av_m") for rows in zip(*both, strict=True))
     of_avs = statistics.paired_mean(before_avs, now_avs)
@@ -87,7 +119,9 @@ def line(world: str, lawful: Rows, before: Rows, idm: Rows) -> list[str]:
         *(f"{m.text(0, 100.0)} %" if m.known else "-" for m in missions),
         *(
             f"{np.mean(column(now, 'interventions')):.1f}",
-            of_idm.text(1),
+            further(sumos, then).text(1),
+            further(slower, then).text(1),
+            further(now, slower).text(1),
             "missed: " + ", ".join(missed) if missed else "met",
         ),
     ]
@@ -100,8 +134,9 @@ def driven(policy: str, preset: str, args: argparse.Namespace) -> dict[str, dict
     if all(shipped.get(world, {}).keys() >= set(seeds) for world in args.worlds):
         return {world: {seed: shipped[world][seed] for seed in seeds} for world in args.worlds}
     out = args.runs / f"{policy}-{preset}"
+    named = f"{WITHIN}=benchmarks.lawful_worlds:{WithinLimit.__name__}" if policy == WITHIN else policy
     words = [word for world in args.worlds for word in ("--scenario", world)]
-    words += ["--demand", "dense", "--policy", policy, "--preset", preset]
+    words += ["--demand", "dense", "--policy", named, "--preset", preset]
     words += ["--seeds", f"{seeds.start}:{seeds.stop}", "--resume", "--workers", args.workers]
     if code := cosim(["evaluate", *words, "--no-report", "--out", str(out)]):
         raise SystemExit(code)
@@ -128,14 +163,17 @@ def main() -> None:
         "`lawful` up to the limit: where the road is free that alone is a shorter way. Too fast: share of",
         "the AVs' time that they are more than 0.5 m/s above the limit. Targets: no crash, a third of the",
         "hard brakings at most, the distance of all not below (interval). Rates with Wilson, differences",
-        "with bootstrap intervals (95 %). `idm`: SUMO's own driver in every vehicle, up to the limit.",
+        "with bootstrap intervals (95 %). `idm`: SUMO's own driver in every vehicle, up to the limit. Within",
+        "the limit: the same networks in `unguarded`, but no command leads above the limit of the lane.",
         "",
         "Made by `python -m benchmarks.lawful_worlds`.",
     ]
-    idm = driven(IDM, Preset.LAWFUL, args)
+    idm, within = driven(IDM, Preset.LAWFUL, args), driven(WITHIN, Preset.UNGUARDED, args)
     for policy in args.policies:
         lawful, before = (driven(policy, preset, args) for preset in (Preset.LAWFUL, Preset.UNGUARDED))
-        rows = [line(world, lawful[world], before[world], idm[world]) for world in sorted(lawful)]
+        rows = [
+            line(world, lawful[world], before[world], within[world], idm[world]) for world in sorted(lawful)
+        ]
         lines += ["", f"## {policy}", "", markdown_row(COLUMNS), markdown_row(["---"] * len(COLUMNS))]
         lines += map(markdown_row, rows)
     write_page(args.out, lines)

@@ -13,8 +13,6 @@ ahead of it are told (V2V), and make room before the end of their queue has used
 import math
 from dataclasses import dataclass
 
-import numpy as np
-
 from cosim.control import COMFORT, COMFORT_TIME, wished_accel
 from cosim.road import RoadMap
 from cosim.road.rules import RED, YELLOW
@@ -43,8 +41,9 @@ PATIENCE = 10.0  # s
 DECIDES = 30.0  # m before a line at which it gives way: from there on it looks who comes
 COMES = 100.0  # m from which they come, however many edges that are
 AT_LINE = 5.0  # m: who is further away stands in a queue
-WAITS = 15.0, 40.0, 55.0  # s of waiting at a line, and how impatient an AV is by then
-IMPATIENCE = (0.8, 1.0, 1.0), (0.0, 0.4, 1.0)  # where AVs alone come, and where humans do
+WAITS = 15.0  # s of waiting at a line; from then on it takes its gap whatever the agent asks for
+# where AVs alone come, and where humans do: SUMO adds a share of 180 s stood, which makes humans brake hard
+IMPATIENCE = 0.8, -1.0
 CLOSE = 60.0  # m behind
 HEADWAY = 0.8, 1.8  # s to the leader; with a human that close behind
 STANDS = 2.0, 5.0  # m to a standing leader; with the longer headway
@@ -128,7 +127,7 @@ class Assistance(Commander):
             state.crosses = CROSSES if swift else state.crosses - self._step
             if flees:
                 target = math.inf
-            elif state.crosses > 0.0:
+            elif state.crosses > 0.0 or state.waited > WAITS:
                 target = state.limit
             elif inside or state.idled > PATIENCE:
                 target = max(target, min(KEEPS_MOVING, state.limit))
@@ -296,7 +295,7 @@ class Assistance(Commander):
         waits = state.gives_way and not red and away < AT_LINE and get.getSpeed(name) < KEEPS_MOVING
         state.waited = state.waited + LOOKS if waits else 0.0
         humans = state.gives_way and away <= DECIDES and self._meets_humans(name)
-        impatience = float(np.interp(state.waited, WAITS, IMPATIENCE[humans]))
+        impatience = IMPATIENCE[humans]
         if impatience != state.impatience:
             state.impatience = impatience
             # its type is its own since `set_type`

@@ -174,6 +174,22 @@ def test_who_comes_from_behind_makes_it_take_no_smaller_gap(law_worlds: dict[str
     assert result.value("right_of_way_violations") == 0
 
 
+@pytest.mark.parametrize(("world", "seed"), [("stop_signs", 150_006), ("priority", 150_034)])
+def test_who_has_waited_long_takes_no_gap_that_a_human_has_to_brake_for(
+    law_worlds: dict[str, Path], world: str, seed: int
+) -> None:
+    """SUMO's drivers become impatient while they stand."""
+    result = drive(law_worlds[world], "random", share=0.2, seed=seed, duration=120.0)
+
+    assert result.value("right_of_way_violations") == 0
+
+
+def test_who_has_waited_long_takes_its_gap_though_the_agent_brakes(law_worlds: dict[str, Path]) -> None:
+    result = drive(law_worlds["stop_signs"], "random", share=0.2, seed=150_008, duration=120.0)
+
+    assert result.value("avs_stuck") == 0
+
+
 def test_a_bus_changes_no_lanes_before_it_has_turned_off_a_junction(law_worlds: dict[str, Path]) -> None:
     """SUMO would turn it at once, its rear into the bus beside it."""
     result = drive(law_worlds["mixed_types"], "random", seed=101_010, duration=110.0)

@@ -39,6 +39,10 @@ TURN = f"""<routes>{CAR}
 </routes>"""
 CONFIG = """<configuration><net-file value="{net}"/><route-files value="{routes}"/>{more}<begin value="0"/>
 <end value="{end}"/><step-length value="0.1"/></configuration>"""
+MERGE = """<routes><vType id="ego" carFollowModel="IDM" sigma="0" speedDev="0" impatience="{impatience}"/>
+<vType id="foe" carFollowModel="IDM" sigma="0" speedDev="0" decel="2.8"/>
+<vehicle id="ego" type="ego" depart="0" departPos="100"><route edges="sj je"/></vehicle>
+<vehicle id="foe" type="foe" depart="4" departPos="5" departSpeed="13"><route edges="wj je"/></vehicle></routes>"""
 HUMAN = 4.0  # s, when the human departs: it is at the junction some seconds after the AV
 
 
@@ -53,8 +57,8 @@ class LetsGo(Always):
         return {n: d for n, d in found.items() if histories[n].time < self.began + 2.0}
 
 
-def crossing(folder: Path, road: str, human: float) -> Path:
-    """The .sumocfg of a minor road that crosses a major one, with one AV and one human."""
+def crossing_net(folder: Path, road: str) -> str:
+    """The name of the net of a minor road that crosses a major one."""
     edges = [EDGE.format(*edge) for edge in (*ROADS[road], *MINOR)]
     parts = {"nod": NODES, "edg": "<edges>" + "".join(edges) + "</edges>"}
     for kind, text in parts.items():
@@ -62,10 +66,16 @@ def crossing(folder: Path, road: str, human: float) -> Path:
     netconvert = Path(sumo.SUMO_HOME) / "bin" / "netconvert"
     files = ("-n", "x.nod.xml", "-e", "x.edg.xml", "-o", "x.net.xml")
     subprocess.run([netconvert, *files], cwd=folder, check=True, capture_output=True)
+    return "x.net.xml"
+
+
+def crossing(folder: Path, road: str, human: float) -> Path:
+    """The .sumocfg of that net with one AV and one human."""
+    net = crossing_net(folder, road)
     major = " ".join(edge[0] for edge in ROADS[road])
     (folder / "x.rou.xml").write_text(TRAFFIC.format(major=major, human=human))
     config = folder / "x.sumocfg"
-    config.write_text(CONFIG.format(net="x.net.xml", routes="x.rou.xml", more="", end=45))
+    config.write_text(CONFIG.format(net=net, routes="x.rou.xml", more="", end=45))
     return config
 
 
@@ -102,6 +112,23 @@ def test_it_waits_for_who_comes_also_from_beyond_a_short_edge_and_when_handed_ba
     assert result.value("right_of_way_violations") == 0
     assert result.value("hard_brakings") == 0
     assert result.value("av_trips_completed") == 1
+
+
+def test_a_little_impatience_makes_sumos_driver_wait_for_who_is_far_away(tmp_path: Path) -> None:
+    """docs/sumo.md: for who brakes comfortably and comes to the same lane, more than 200 m off."""
+    net = crossing_net(tmp_path, "whole")
+    took = {}
+    for impatience in (0.0, 0.1, 0.5):
+        (tmp_path / "m.rou.xml").write_text(MERGE.format(impatience=impatience))
+        words = ["-n", net, "-r", "m.rou.xml", "--step-length", "0.1", "--tripinfo-output", "trips.xml"]
+        sumo_ = Path(sumo.SUMO_HOME) / "bin" / "sumo"
+        subprocess.run([sumo_, *words], cwd=tmp_path, check=True, capture_output=True)
+        trips = ElementTree.parse(tmp_path / "trips.xml").getroot()
+        took[impatience] = next(float(t.get("waitingTime", 0)) for t in trips if t.get("id") == "ego")
+
+    assert took[0.0] < 1.0
+    assert took[0.5] < 1.0
+    assert took[0.1] > 10.0
 
 
 @pytest.mark.parametrize("human", [67.6, 68.4])

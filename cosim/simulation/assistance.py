@@ -28,8 +28,10 @@ CORRECTED = 1.0  # m/s2 more braking than asked for: from there on the car drive
 STALLED = 0.2, 1.5  # m/s2, or so little acceleration where so much was asked for
 RESPITE = 2.0  # s without a correction: the next one is a new one
 HARD = 3.5  # m/s2: harder braking is an emergency's
-TURNED = 15.0  # degrees from its lane's direction: it begins no lane change
 STARTS = 0.1  # m/s: who is slower inside a junction stands, and looks whether somebody is in its way
+STOPS_FOR = 2.5, 1.0  # m/s2, and m that are left, before who stands inside
+LOOKS_IN = 25.0  # m before a line: from there on it looks who stands behind it
+ENTERS = 1.0  # s before a line: so near to it no lane change is begun
 KEEPS_MOVING = 3.0  # m/s: no slower wish is followed inside a junction, nor for longer than `PATIENCE`
 CROSSES = 5.0  # s behind a junction in which it had to give way: inside and so long it takes its gap swiftly
 NOTICE = 150.0  # m: signals and stop lines further ahead are no reason yet
@@ -137,7 +139,7 @@ class Assistance(Commander):
                 state.accel = min(state.accel, self._yielding(name, speed, state))
             self._mind_inside(name, lane, speed, state)
             state.wish, state.speed = max(speed + state.accel * self._step, 0.0), speed
-            ours = state.stays or not (slower or flees or swift)
+            ours = not (slower or flees or swift) or (state.stays and not (slower and speed >= STARTS))
             if ours:
                 get.setSpeed(name, state.wish)
             elif state.ours:
@@ -182,8 +184,8 @@ class Assistance(Commander):
 
     def _forbidden(self, name: str, lane: str, offset: int) -> str | None:
         why = super()._forbidden(name, lane, offset)
-        if why is None and _turning(name, lane):
-            why = "still turning off a junction"
+        if why is None:
+            why = _at_junction(name, lane)
         if why is None:
             why = _leaves_route(name, lane, offset)
             if why is not None:
@@ -320,12 +322,33 @@ class Assistance(Commander):
 
     def _mind_inside(self, name: str, lane: str, speed: float, state: Assisted) -> None:
         """Who stands inside a junction stays there while somebody is in its way, or may soon be; for longer
-        than `PATIENCE` only while somebody is."""
+        than `PATIENCE` only while somebody is. Who drives stops before who stands there, for so long before
+        its line."""
         inside, long = lane.startswith(":"), state.held >= PATIENCE
-        state.stays = inside and speed < STARTS and self._junctions.blocked(name, lane, present=long)
-        state.held = state.held + state.stays * self._step if inside else 0.0
+        if inside and speed < STARTS:
+            state.stays = self._junctions.blocked(name, lane, present=long)
+        else:
+            brakes, left = STOPS_FOR
+            needs = speed * speed / (2.0 * brakes) + left  # m
+            room, line = self._room(name, lane, inside)
+            state.stays = room < needs or (
+                room < math.inf and line < needs and not long and line > needs - left
+            )
         if state.stays:
             state.accel = -COMFORT
+            state.held += self._step
+        elif not inside and speed >= KEEPS_MOVING:
+            state.held = 0.0
+
+    def _room(self, name: str, lane: str, inside: bool) -> tuple[float, float]:
+        """m to who stands in its way inside a junction, inf where nobody does; m to its line, or inf."""
+        if inside:
+            return self._junctions.room(name, lane), math.inf
+        away = sumo.lane.getLength(lane) - sumo.vehicle.getLanePosition(name) if lane else math.inf
+        links = sumo.vehicle.getNextLinks(name) if away < LOOKS_IN else ()
+        if not links or not links[0][4] or links[0][5] in RED + YELLOW:
+            return math.inf, away
+        return away + self._junctions.room(name, links[0][4], 0.0), away
 
     def _give(self, asked: list[str], name: str) -> None:
         for other in asked:
@@ -386,16 +409,18 @@ def _route_ahead(name: str) -> tuple[str, ...]:
     return tuple(sumo.vehicle.getRoute(name))[max(sumo.vehicle.getRouteIndex(name), 0) + 1 :]
 
 
-def _turning(name: str, lane: str) -> bool:
-    """Whether a vehicle on `lane` comes off a junction and still stands across it with its rear there.
+def _at_junction(name: str, lane: str) -> str | None:
+    """Why a vehicle on `lane` is too near to a junction to change lanes; None if it is not.
 
-    SUMO draws whoever changes lanes along the lane, and so turns it at once: a bus into those beside it.
+    SUMO draws whoever changes lanes along the lane, and so turns at once a rear that still stands in a
+    junction: a bus into those beside it. And a change that is asked for before a line may begin behind it.
     """
-    place = sumo.vehicle.getLanePosition(name)
-    if place >= sumo.vehicle.getLength(name):
-        return False
-    turn = sumo.vehicle.getAngle(name) - sumo.lane.getAngle(lane, place)
-    return bool(abs((turn + 180.0) % 360.0 - 180.0) > TURNED)
+    place, get = sumo.vehicle.getLanePosition(name), sumo.vehicle
+    if place < get.getLength(name):
+        return "still leaving a junction"
+    if sumo.lane.getLength(lane) - place < get.getSpeed(name) * ENTERS:
+        return "about to enter a junction"
+    return None
 
 
 def _leaves_route(name: str, lane: str, offset: int) -> str | None:

@@ -3,7 +3,7 @@
 There SUMO's driver heeds those who have the right of way. It starts into others who are passing, or who stand
 partly across its way where the net lets them wait inside the junction
 (https://sumo.dlr.de/docs/Simulation/Intersections.html, "Waiting within the intersection"). Here everybody is
-looked at whose front is inside the junction, or soon will be.
+looked at who is inside the junction with a part of his body, or soon will be, and persons who walk there.
 """
 
 import math
@@ -23,7 +23,9 @@ from cosim.types import Floats
 STOPS = 4.5  # m/s2, with which who is slow comes to a stand
 SLOW = 3.0  # m/s: who is faster passes
 SPACING = 0.25  # m between the places that are looked at
-BESIDE = 0.1  # m that an AV wants to have free on either side
+BESIDE = 0.1  # m that an AV that stands wants to have free on either side
+CREEPS = 0.5  # m/s: who is slower stands, for those who drive
+PERSON = 0.5  # m, across
 SOON = 3.0, 10.0  # s, or m, from a green line: who is so near will be inside
 
 
@@ -36,8 +38,8 @@ class Inside:
 
     def blocked(self, name: str, lane: str, present: bool = False) -> bool:
         """Whether the AV `name`, which stands on the internal lane `lane`, would touch somebody on its way
-        out of the junction: who stands there, drives through, or may soon wait there; `present`: who is
-        there."""
+        out of the junction: who stands there, drives or walks through, or may soon wait there; `present`: who
+        is there."""
         own = self._road.index.get(lane, -1)
         if own < 0:
             return False
@@ -50,13 +52,46 @@ class Inside:
                 return True
         return False
 
+    def room(self, name: str, lane: str, at: float | None = None) -> float:
+        """m that the AV `name` can drive over the internal lane `lane`, from where it is or from `at` (m),
+        until it touches somebody who stands in the junction; inf where nobody does but who is beside it."""
+        own = self._road.index.get(lane, -1)
+        standing = [] if own < 0 else [_body(who) for who in self._on_other_ways(own) if _creeps(who)]
+        if not standing:
+            return math.inf
+        mine = self._through(name, own, sumo.vehicle.getLanePosition(name) if at is None else at)
+        theirs = Boxes(*np.concatenate(standing, 1)[:, None, :])
+        touched = overlap(Boxes(*mine[:, :, None]), theirs)  # [places, who]
+        places = np.flatnonzero(touched[:, ~touched[0]].any(1))
+        return float(places[0]) * SPACING if len(places) else math.inf
+
     # ---- inside ----
 
+    def _on_other_ways(self, own: int) -> Iterator[str]:
+        """Who is in the junction of the lane `own`, with his tail at least; not on the way over that lane,
+        where SUMO's driver heeds them."""
+        lanes = self._road.lanes
+        for lane in self._lanes[lanes[own].start]:
+            if lane not in self._way(own)[1]:
+                yield from sumo.lane.getLastStepVehicleIDs(lanes[lane].id)
+        yield from self._tails(own)
+
+    def _tails(self, own: int) -> Iterator[str]:
+        """Who has left that junction but for his tail."""
+        lanes, get = self._road.lanes, sumo.vehicle
+        mine = {k for lane in self._way(own)[1] for k in lanes[lane].successors}
+        for lane in self._beyond[lanes[own].start] - mine:
+            for other in sumo.lane.getLastStepVehicleIDs(lanes[lane].id):
+                if get.getLanePosition(other) < get.getLength(other):
+                    yield other
+
     def _others(self, own: int, present: bool) -> Iterator[Floats]:
-        """The places, as `_through`'s, of those who are on other ways through the junction of the lane
-        `own`, or soon will be: where they stand, will wait, or drive through; `present`: where they are."""
+        """The places, as `_through`'s, of those who are on other ways through the junction of the lane `own`,
+        or soon will be: where they stand, will wait, drive or walk; `present`: where they are."""
         get, lanes, (_, way) = sumo.vehicle, self._road.lanes, self._way(own)
         seconds, metres = SOON
+        yield from self._walkers(lanes[own].start, 0.0 if present else seconds)
+        yield from map(_body, self._tails(own))
         for lane in self._lanes[lanes[own].start]:
             if lane in way:  # SUMO's driver heeds them
                 continue
@@ -78,6 +113,15 @@ class Inside:
                     links = get.getNextLinks(other)
                     if links and links[0][4] == lanes[lane].id and links[0][5] not in RED + YELLOW:
                         yield self._through(other, lane, end)[:, :1]
+
+    def _walkers(self, junction: str, seconds: float) -> Iterator[Floats]:
+        """The places of each person on the crossings and walking areas of a junction, for so many seconds."""
+        get = sumo.person
+        for who in (one for edge in self._walks[junction] for one in sumo.edge.getLastStepPersonIDs(edge)):
+            (x, y), heading = get.getPosition(who), math.radians(90.0 - get.getAngle(who))
+            way = np.arange(0.0, get.getSpeed(who) * seconds + 1e-9, SPACING)
+            places = x + way * math.cos(heading), y + way * math.sin(heading), np.full(len(way), heading)
+            yield np.stack([*places, *np.full((2, len(way)), PERSON)])
 
     def _through(self, name: str, lane: int, at: float, beside: float = 0.0) -> Floats:
         """[5,k] x, y (m), heading (rad), length and width (m) of a vehicle every `SPACING` m on its way from
@@ -114,9 +158,44 @@ class Inside:
         return found
 
     @cached_property
+    def _beyond(self) -> dict[str, set[int]]:
+        """Junction -> the lanes that lead out of it."""
+        lanes = self._road.lanes
+        return {
+            junction: {k for lane in inside for k in lanes[lane].successors if not lanes[k].internal}
+            for junction, inside in self._lanes.items()
+        }
+
+    @cached_property
+    def _walks(self) -> dict[str, list[str]]:
+        """Junction -> its crossings (`:j_c0`) and walking areas (`:j_w0`)."""
+        found: defaultdict[str, list[str]] = defaultdict(list)
+        for edge in sumo.edge.getIDList():
+            junction, _, kind = edge.rpartition("_")
+            if junction.startswith(":") and kind[:1] in ("c", "w") and kind[1:].isdigit():
+                found[junction[1:]].append(edge)
+        return found
+
+    @cached_property
     def _origins(self) -> dict[int, list[int]]:
         """Lane inside a junction -> the lanes that lead onto it over a stop line."""
         found: defaultdict[int, list[int]] = defaultdict(list)
         for link in self._road.links:
             found[link.via].append(link.origin)
         return found
+
+
+def _body(name: str) -> Floats:
+    """[5,1] x, y (m), heading (rad), length and width (m) of a vehicle where it is."""
+    get = sumo.vehicle
+    (x, y), heading, length = (
+        get.getPosition(name),
+        math.radians(90.0 - get.getAngle(name)),
+        get.getLength(name),
+    )
+    middle = x - 0.5 * length * math.cos(heading), y - 0.5 * length * math.sin(heading)
+    return np.array([*middle, heading, length, get.getWidth(name)])[:, None]
+
+
+def _creeps(name: str) -> bool:
+    return bool(sumo.vehicle.getSpeed(name) < CREEPS)

@@ -42,7 +42,8 @@ CONFIG = """<configuration><net-file value="{net}"/><route-files value="{routes}
 MERGE = """<routes><vType id="ego" carFollowModel="IDM" sigma="0" speedDev="0" impatience="{impatience}"/>
 <vType id="foe" carFollowModel="IDM" sigma="0" speedDev="0" decel="2.8"/>
 <vehicle id="ego" type="ego" depart="0" departPos="100"><route edges="sj je"/></vehicle>
-<vehicle id="foe" type="foe" depart="4" departPos="5" departSpeed="13"><route edges="wj je"/></vehicle></routes>"""
+<vehicle id="foe" type="foe" depart="4" departPos="5" departSpeed="13"><route edges="wj je"/></vehicle>
+</routes>"""
 HUMAN = 4.0  # s, when the human departs: it is at the junction some seconds after the AV
 
 

@@ -207,12 +207,27 @@ def test_nobody_starts_inside_a_junction_into_one_that_stands_in_its_way(
     assert result.value("av_involved_collisions") == 0
 
 
+@pytest.mark.parametrize(
+    ("world", "seed"), [("crossing_signals", 150_039), ("mixed_types", 150_004), ("mixed_types", 150_019)]
+)
+def test_nobody_drives_into_one_who_stands_inside_a_junction_with_his_tail_at_least(
+    law_worlds: dict[str, Path], world: str, seed: int
+) -> None:
+    """Who creeps to where persons begin to walk; a truck's tail; a change of lanes begun before the line."""
+    result = drive(law_worlds[world], "random", seed=seed, duration=120.0)
+
+    assert result.value("av_involved_collisions") == 0
+
+
 def test_who_stands_inside_a_junction_stays_for_who_may_come_but_not_for_ever_as_for_who_is_there() -> None:
     class Full:
         there = False
 
         def blocked(self, name: str, lane: str, present: bool) -> bool:
             return self.there or not present
+
+        def room(self, name: str, lane: str) -> float:
+            return 3.0 if self.there else math.inf
 
     car, full = assistance.Assistance(STEP, RoadMap((), ())), Full()
     car._junctions = full  # type: ignore[assignment]
@@ -227,10 +242,11 @@ def test_who_stands_inside_a_junction_stays_for_who_may_come_but_not_for_ever_as
 
     assert stays(":j_0_0", 0.5) == 0, "it rolls"
     assert stays(":j_0_0", 0.0, 200) == pytest.approx(assistance.PATIENCE / STEP, abs=1)
-    assert stays("e_0", 0.0) == 0, "it is out"
+    assert stays("", 5.0) == 0, "it is out"
     assert stays(":k_0_0", 0.0) == 1, "another junction"
     full.there = True
     assert stays(":k_0_0", 0.0, 200) == 200, "somebody stands there"
+    assert [stays(":k_0_0", speed) for speed in (2.0, 4.0)] == [0, 1], "it stops before him"
 
 
 def test_it_comes_to_a_stop_comfortably_and_does_not_creep_there(start: Start) -> None:

@@ -1,4 +1,4 @@
-"""Who is in the way of an AV that stands inside a junction.
+"""Who is in the way of an AV inside a junction, or before one.
 
 There SUMO's driver heeds those who have the right of way. It starts into others who are passing, or who stand
 partly across its way where the net lets them wait inside the junction

@@ -208,12 +208,18 @@ def test_nobody_starts_inside_a_junction_into_one_that_stands_in_its_way(
 
 
 @pytest.mark.parametrize(
-    ("world", "seed"), [("crossing_signals", 150_039), ("mixed_types", 150_004), ("mixed_types", 150_019)]
+    ("world", "seed"),
+    [
+        ("crossing_signals", 150_015),
+        ("crossing_signals", 150_039),
+        ("mixed_types", 150_013),
+        ("mixed_types", 150_019),
+    ],
 )
 def test_nobody_drives_into_one_who_stands_inside_a_junction_with_his_tail_at_least(
     law_worlds: dict[str, Path], world: str, seed: int
 ) -> None:
-    """Who creeps to where persons begin to walk; a truck's tail; a change of lanes begun before the line."""
+    """Who stands there; who begins to walk; a truck's tail; a change of lanes begun before the line."""
     result = drive(law_worlds[world], "random", seed=seed, duration=120.0)
 
     assert result.value("av_involved_collisions") == 0

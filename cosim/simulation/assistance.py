@@ -415,7 +415,8 @@ def _at_junction(name: str, lane: str) -> str | None:
     SUMO draws whoever changes lanes along the lane, and so turns at once a rear that still stands in a
     junction: a bus into those beside it. And a change that is asked for before a line may begin behind it.
     """
-    place, get = sumo.vehicle.getLanePosition(name), sumo.vehicle
+    get = sumo.vehicle
+    place = get.getLanePosition(name)
     if place < get.getLength(name):
         return "still leaving a junction"
     if sumo.lane.getLength(lane) - place < get.getSpeed(name) * ENTERS:

@@ -18,6 +18,7 @@ from cosim.geometry import Boxes, overlap
 from cosim.road import LanePath, RoadMap
 from cosim.road.rules import RED, YELLOW
 from cosim.simulation.backend import sumo
+from cosim.simulation.conventions import centres
 from cosim.types import Floats
 
 STOPS = 4.5  # m/s2, with which who is slow comes to a stand
@@ -56,10 +57,12 @@ class Inside:
         """m that the AV `name` can drive over the internal lane `lane`, from where it is or from `at` (m),
         until it touches somebody who stands in the junction; inf where nobody does but who is beside it."""
         own = self._road.index.get(lane, -1)
-        standing = [] if own < 0 else [_body(who) for who in self._on_other_ways(own) if _creeps(who)]
+        get = sumo.vehicle
+        others = () if own < 0 else self._on_other_ways(own)
+        standing = [_body(other) for other in others if get.getSpeed(other) < CREEPS]
         if not standing:
             return math.inf
-        mine = self._through(name, own, sumo.vehicle.getLanePosition(name) if at is None else at)
+        mine = self._through(name, own, get.getLanePosition(name) if at is None else at)
         theirs = Boxes(*np.concatenate(standing, 1)[:, None, :])
         touched = overlap(Boxes(*mine[:, :, None]), theirs)  # [places, who]
         places = np.flatnonzero(touched[:, ~touched[0]].any(1))
@@ -188,14 +191,6 @@ class Inside:
 def _body(name: str) -> Floats:
     """[5,1] x, y (m), heading (rad), length and width (m) of a vehicle where it is."""
     get = sumo.vehicle
-    (x, y), heading, length = (
-        get.getPosition(name),
-        math.radians(90.0 - get.getAngle(name)),
-        get.getLength(name),
-    )
-    middle = x - 0.5 * length * math.cos(heading), y - 0.5 * length * math.sin(heading)
-    return np.array([*middle, heading, length, get.getWidth(name)])[:, None]
-
-
-def _creeps(name: str) -> bool:
-    return bool(sumo.vehicle.getSpeed(name) < CREEPS)
+    length = get.getLength(name)
+    front = np.array([[*get.getPosition(name), get.getAngle(name), 0.5 * length]]).T
+    return np.stack([*centres(*front), [length], [get.getWidth(name)]])

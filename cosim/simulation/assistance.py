@@ -3,7 +3,8 @@
 In every step the car drives the slower of two speeds: what the agent wishes, comfortably, and what SUMO's
 driver (speed mode 31) allows for signals, right of way, limits, persons and whoever drives ahead. Where that
 is slower, SUMO drives by itself, so that it brakes as hard as it must. Between AVs gaps are asked for and
-given (V2V), because SUMO's cooperation ends where a speed is commanded.
+given (V2V), because SUMO's cooperation ends where a speed is commanded. Who has waited long at a line judges
+its gap itself (`gaps.py`).
 
 A human close behind may not be looking: the car then keeps a longer headway, and as soon as the one behind
 closes in without braking it uses that room up, later and harder on its own brakes, until he brakes. AVs
@@ -17,8 +18,9 @@ from cosim.control import COMFORT, COMFORT_TIME, wished_accel
 from cosim.road import RoadMap
 from cosim.road.rules import RED, YELLOW
 from cosim.simulation.backend import sumo
-from cosim.simulation.commands import Commander, Controlled
+from cosim.simulation.commands import SPEED_MODE, Commander, Controlled
 from cosim.simulation.fleet import set_type
+from cosim.simulation.gaps import Gaps
 from cosim.simulation.inside import Inside
 from cosim.types import Intervention, Preset
 
@@ -38,12 +40,15 @@ NOTICE = 150.0  # m: signals and stop lines further ahead are no reason yet
 SERVES = 60.0, 100.0  # m that a lane must serve the route at least, and more for every lane to change back
 LOOKS = 0.4  # s between looks at right of way and blocked lane changes
 GAP = 2.0, 1.0  # m and s: the gap given to who changes lanes
+STOPS_SHORT = 0.5  # m before its line
 YIELDING = 2.0, 1.0  # m/s2 and m/s: how hard, and down to what, an AV slows for who asked
 PATIENCE = 10.0  # s
 DECIDES = 30.0  # m before a line at which it gives way: from there on it looks who comes
 COMES = 100.0  # m from which they come, however many edges that are
 AT_LINE = 5.0  # m: who is further away stands in a queue
-WAITS = 15.0  # s of waiting at a line; from then on it takes its gap whatever the agent asks for
+WAITS = 15.0  # s of waiting at a line; from then on it judges and takes its gap, whatever the agent asks for
+GOES_FIRST = SPEED_MODE[Preset.LAWFUL] - 8  # heeds nobody outside the junction
+LETS = 1.0  # s for which an AV that is asked lets another one in
 # where AVs alone come, and where humans do: SUMO adds a share of 180 s stood, which makes humans brake hard
 IMPATIENCE = 0.8, -1.0
 CLOSE = 60.0  # m behind
@@ -84,6 +89,9 @@ class Assisted(Controlled):
     idled: float = 0.0  # s, for which the agent has asked for less than `KEEPS_MOVING`
     stays: bool = False  # inside a junction, for somebody in its way
     held: float = 0.0  # s, for which it has done so in this one
+    goes: bool = False  # takes its gap
+    lets: float = -math.inf  # s, until when it stops before its line for who takes one
+    has_let: float = 0.0  # s, for which it has done so at this one
 
     @property
     def asked(self) -> float:
@@ -99,6 +107,7 @@ class Assistance(Commander):
     def __init__(self, step: float, road: RoadMap) -> None:
         super().__init__(Preset.LAWFUL, step)
         self._junctions = Inside(road)
+        self._gaps = Gaps(road, self._junctions)
         self._looked = -math.inf  # s
         self._begun: list[Intervention] = []
         self._standing_gaps: dict[str, float] = {}  # human -> m
@@ -137,6 +146,12 @@ class Assistance(Commander):
             state.raw, state.accel = wished_accel(speed, target, state.accel, self._step)
             if state.gap_for and not flees:
                 state.accel = min(state.accel, self._yielding(name, speed, state))
+            if inside:
+                state.has_let = 0.0
+            elif lane and now < state.lets:
+                left = sumo.lane.getLength(lane) - get.getLanePosition(name) - STOPS_SHORT
+                state.accel = min(state.accel, -speed * speed / (2.0 * max(left, 0.1)))
+                state.has_let += self._step
             self._mind_inside(name, lane, speed, state)
             state.wish, state.speed = max(speed + state.accel * self._step, 0.0), speed
             ours = not (slower or flees or swift) or (state.stays and not (slower and speed >= STARTS))
@@ -155,7 +170,7 @@ class Assistance(Commander):
             accel = (speed - state.speed) / self._step
             if accel < min(state.raw, 0.0) - CORRECTED or (state.raw > STALLED[1] and accel < STALLED[0]):
                 if now - state.corrected > RESPITE:
-                    begun.append(Intervention(now, name, _reason(name, accel, state.stays)))
+                    begun.append(Intervention(now, name, _reason(name, accel, state, now)))
                 state.corrected = now
             lateral = get.getLateralLanePosition(name)
             drift, state.lateral = lateral - state.lateral, lateral
@@ -280,6 +295,7 @@ class Assistance(Commander):
                 state.gives_way = bool(links) and not links[0][1]
                 red = bool(links) and links[0][5] in RED + YELLOW
             self._wait(name, lane, state, red)
+            self._take_gap(name, lane, state)
             for side in (1, -1):
                 wanted = get.getLaneChangeState(name, side)[0]
                 if wanted & STRATEGIC and wanted & BLOCKED:
@@ -302,6 +318,32 @@ class Assistance(Commander):
             state.impatience = impatience
             # its type is its own since `set_type`
             sumo.vehicletype.setImpatience(get.getTypeID(name), impatience)
+
+    def _take_gap(self, name: str, lane: str, state: Assisted) -> None:
+        """Who has waited long at a line without a signal judges its gap itself; AVs let it in."""
+        if state.goes and lane.startswith(":"):  # until it has left the junction
+            return
+        goes = False
+        links = sumo.vehicle.getNextLinks(name) if state.waited > WAITS and not lane.startswith(":") else ()
+        if links and links[0][4] and links[0][5] in "ms":
+            goes, asked = self._gaps.take(name, lane, links[0][4], self._lets_in)
+            for other in asked:
+                self.controlled[other].lets = sumo.simulation.getTime() + LETS
+        if goes != state.goes:
+            state.goes = goes
+            sumo.vehicle.setSpeedMode(name, GOES_FIRST if goes else SPEED_MODE[Preset.LAWFUL])
+
+    def _lets_in(self, name: str, before: float) -> bool:
+        """Whether it is an AV that can stop comfortably so many m before its line, and has not for long."""
+        get, state = sumo.vehicle, self.controlled.get(name)
+        if (
+            state is None
+            or state.goes
+            or state.has_let >= PATIENCE
+            or state.flees > sumo.simulation.getTime()
+        ):
+            return False
+        return bool(get.getSpeed(name) ** 2 <= 2.0 * YIELDING[0] * max(before - 2.0 * STOPS_SHORT, 0.0))
 
     def _meets_humans(self, name: str) -> bool:
         """Whether anybody but AVs comes to the junction that it is at, from elsewhere.
@@ -439,20 +481,21 @@ def _leaves_route(name: str, lane: str, offset: int) -> str | None:
     return "the lane leaves the route"
 
 
-def _reason(name: str, accel: float, stays: bool) -> str:
-    """Why the car drives slower than the agent wishes, or brakes harder (`accel` m/s2); `stays`: inside a
-    junction, for somebody in its way."""
+def _reason(name: str, accel: float, state: Assisted, now: float) -> str:
+    """Why the car drives slower at `now` (s) than the agent wishes, or brakes harder (`accel` m/s2)."""
     get = sumo.vehicle
     words = "emergency: " if accel < -HARD else ""
-    if stays:
+    if state.stays:
         return f"{words}vehicle in the way"
+    if now < state.lets:
+        return f"{words}lets an AV in"
     speed = get.getSpeed(name)
     reach = min(0.5 * speed * speed + 2.0 * speed + 10.0, NOTICE)  # m, from where an IDM begins to brake
     leader = get.getLeader(name, reach)
     gap = leader[1] if leader and leader[0] else math.inf
-    for _, _, distance, state in get.getNextTLS(name)[:1]:
-        if distance < min(reach, gap) and state in RED + YELLOW:
-            return words + ("red light" if state in RED else "yellow light")
+    for _, _, distance, light in get.getNextTLS(name)[:1]:
+        if distance < min(reach, gap) and light in RED + YELLOW:
+            return words + ("red light" if light in RED else "yellow light")
     if gap < reach:
         return f"{words}vehicle ahead"
     links = get.getNextLinks(name)

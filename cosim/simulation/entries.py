@@ -11,11 +11,12 @@ from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property, partial
-from itertools import chain, pairwise
+from itertools import chain
 from typing import NamedTuple
 
 from cosim.road import RoadMap, Rule
 from cosim.simulation.backend import sumo
+from cosim.simulation.foes import Foes
 from cosim.types import Entry
 
 LAST = 10.0  # m before the line over which the least speed is taken (docs/definitions.md, The law)
@@ -62,6 +63,7 @@ class EntryWatcher:
 
     def __init__(self, road: RoadMap, step: float, shared: bool = False) -> None:
         self._road = road
+        self._foes = Foes(road, FOES_WITHIN)
         self._shared = shared
         self._step = step
         self._matters = [
@@ -154,7 +156,7 @@ class EntryWatcher:
         self, name: str, av: Watched, passed: Passed, position: float, speed: float, now: float
     ) -> Entry:
         if passed.inside:
-            foes = self._foes(passed.link, name)
+            foes = self._foes.of(passed.link, name)
             return Entry(now, name, passed.link, "", speed, speed, foes=foes, inside=True)
         link = self._road.links[passed.link]
         line = self._odometer_of(name) - passed.beyond - position  # the odometer at the line, m
@@ -167,7 +169,7 @@ class EntryWatcher:
                 since, marks = self._lights[light].yellow.get(index, (now - self._step, {}))
                 odometer, then = marks.get(name, (line, math.inf))
                 yellow = since, line - odometer, then
-        foes = () if state == "G" else self._foes(passed.link, name)
+        foes = () if state == "G" else self._foes.of(passed.link, name)
         return Entry(now, name, passed.link, state, speed, min(last, default=speed), *yellow, foes)
 
     def _switch(self, began: float) -> None:
@@ -197,50 +199,6 @@ class EntryWatcher:
             except sumo.TraCIException:
                 continue
         return found
-
-    def _foes(self, entered: int, name: str) -> tuple[tuple[str, int], ...]:
-        """Vehicles with the right of way over a link: on a link's internal lanes, or on the way to it."""
-        first = [foe for foe in self._road.links[entered].foes if not self._red(foe)]
-        if not first:
-            return ()
-        found: dict[str, int] = {}
-        edges = {self._road.lanes[self._road.links[foe].origin].edge for foe in first}
-        for foe in first:
-            for inner in self._inside(foe):
-                found.update((other, foe) for other in sumo.lane.getLastStepVehicleIDs(inner))
-        for lane, position in self._before(entered):
-            for other in sumo.lane.getLastStepVehicleIDs(self._road.lanes[lane].id):
-                if other not in found and self._position_of(other) >= position:
-                    taken = self._taken(other, lane, edges)
-                    found.update((other, foe) for foe in first if foe in taken)
-        found.pop(name, None)
-        return tuple(found.items())
-
-    def _red(self, number: int) -> bool:
-        link = self._road.links[number]
-        if link.signal < 0:
-            return False
-        light, index = self._road.signals[link.signal]
-        return sumo.trafficlight.getRedYellowGreenState(light)[index] in "ru"
-
-    def _taken(self, name: str, lane: int, edges: set[str]) -> Sequence[int]:
-        """The links that a vehicle on `lane` may take where its route next leaves one of `edges`.
-
-        They go on from the lanes that it can be on without a change; all of them, where there are none.
-        """
-        route = sumo.vehicle.getRoute(name)
-        place = sumo.vehicle.getRouteIndex(name)
-        at = {lane}
-        while self._road.lanes[lane].internal:  # the lane it comes out on
-            at = set(self._road.lanes[lane].successors)
-            lane = next(iter(at), lane)
-        for here, then in pairwise(route[place + (self._road.lanes[lane].edge != route[place]) :]):
-            options = self._between.get((here, then), ())
-            taken = [k for k in options if self._road.links[k].origin in at] or options
-            if here in edges:
-                return taken
-            at = {self._road.links[k].target for k in taken}
-        return ()
 
     # ---- tables of the road ----
 
@@ -292,26 +250,6 @@ class EntryWatcher:
         """The stop lines that matter on the way from one lane to another (asked again, it is free)."""
         return cache(self._lines_between)
 
-    @cached_property
-    def _inside(self) -> Callable[[int], tuple[str, ...]]:
-        """A link's internal lanes."""
-        return cache(self._internal)
-
-    @cached_property
-    def _before(self) -> Callable[[int], tuple[tuple[int, float], ...]]:
-        """The lanes before the lines of a link's foes; on each the position (m) from which on one is within
-        `FOES_WITHIN` of the line."""
-        return cache(self._lanes_before)
-
-    @cached_property
-    def _between(self) -> dict[tuple[str, str], list[int]]:
-        """(edge, edge) -> the links from one to the other."""
-        found: dict[tuple[str, str], list[int]] = {}
-        for k, link in enumerate(self._road.links):
-            edges = self._road.lanes[link.origin].edge, self._road.lanes[link.target].edge
-            found.setdefault(edges, []).append(k)
-        return found
-
     def _lines_between(self, first: int, last: int) -> tuple[Passed, ...]:
         lanes, came = self._road.lanes, {first: first}
         reached = [first]
@@ -339,31 +277,3 @@ class EntryWatcher:
                 beyond += lanes[before].length
             lane = before
         return tuple(reversed(found))
-
-    def _internal(self, number: int) -> tuple[str, ...]:
-        found: list[str] = []
-        lane, lanes = self._road.links[number].via, self._road.lanes
-        while lane >= 0 and lanes[lane].internal and len(found) < HOPS:
-            found.append(lanes[lane].id)
-            lane = next(iter(lanes[lane].successors), -1)
-        return tuple(found)
-
-    def _lanes_before(self, number: int) -> tuple[tuple[int, float], ...]:
-        lanes, links = self._road.lanes, self._road.links
-        left: dict[str, float] = {}  # edge -> m of it, from its end, that are within reach
-        waiting = [(lanes[links[foe].origin].edge, FOES_WITHIN) for foe in links[number].foes]
-        while waiting:
-            edge, reach = waiting.pop()
-            if reach <= left.get(edge, 0.0):
-                continue
-            left[edge] = reach
-            for lane in self._beside[edge]:
-                more = reach - lanes[lane].length
-                waiting += [(lanes[origin].edge, more) for origin in self._road.before[lane]]
-        inside = lanes[links[number].via].start if links[number].via >= 0 else ""
-        return tuple(
-            (lane, lanes[lane].length - reach)
-            for edge, reach in left.items()
-            for lane in self._beside[edge]
-            if not (lanes[lane].internal and lanes[lane].start == inside)
-        )

@@ -47,7 +47,7 @@ class Inside:
         mine = None
         for theirs in self._others(own, present):
             if mine is None:
-                mine = self._through(name, own, sumo.vehicle.getLanePosition(name), BESIDE)
+                mine = self.through(name, own, sumo.vehicle.getLanePosition(name), BESIDE)
             touched = overlap(Boxes(*mine[:, :, None]), Boxes(*theirs))  # [places, places]
             if touched.any() and not touched[0].any():  # else it is beside: to stay would not help
                 return True
@@ -62,11 +62,24 @@ class Inside:
         standing = [_body(other) for other in others if get.getSpeed(other) < CREEPS]
         if not standing:
             return math.inf
-        mine = self._through(name, own, get.getLanePosition(name) if at is None else at)
+        mine = self.through(name, own, get.getLanePosition(name) if at is None else at)
         theirs = Boxes(*np.concatenate(standing, 1)[:, None, :])
         touched = overlap(Boxes(*mine[:, :, None]), theirs)  # [places, who]
         places = np.flatnonzero(touched[:, ~touched[0]].any(1))
         return float(places[0]) * SPACING if len(places) else math.inf
+
+    def through(self, name: str, lane: int, at: float, beside: float = 0.0) -> Floats:
+        """[5,k] x, y (m), heading (rad), length and width (m) of a vehicle every `SPACING` m on its way from
+        `at` (m) on a lane inside a junction until it has left it; `beside`: m more on either side."""
+        path, inside = self._way(lane)
+        ends, length = [*path.lane_start[1:], path.length], sumo.vehicle.getLength(name)
+        k = inside.index(lane)
+        scale = (ends[k] - path.lane_start[k]) / max(self._road.lanes[lane].length, SPACING)
+        arc = np.arange(path.lane_start[k] + at * scale, ends[len(inside) - 1] + length, SPACING)
+        front, rear = (np.stack(path.pose(a)[:2]) for a in (arc, arc - length))
+        heading = np.arctan2(*(front - rear)[::-1])
+        sizes = np.array([[length], [sumo.vehicle.getWidth(name) + 2.0 * beside]])
+        return np.concatenate([0.5 * (front + rear), [heading], sizes.repeat(len(arc), 1)])
 
     # ---- inside ----
 
@@ -89,7 +102,7 @@ class Inside:
                     yield other
 
     def _others(self, own: int, present: bool) -> Iterator[Floats]:
-        """The places, as `_through`'s, of those who are on other ways through the junction of the lane `own`,
+        """The places, as `through`'s, of those who are on other ways through the junction of the lane `own`,
         or soon will be: where they stand, will wait, drive or walk; `present`: where they are."""
         get, lanes, (_, way) = sumo.vehicle, self._road.lanes, self._way(own)
         seconds, metres = SOON
@@ -101,7 +114,7 @@ class Inside:
             waits, end = self._road.waits_inside(lane), lanes[lane].length
             for other in sumo.lane.getLastStepVehicleIDs(lanes[lane].id):
                 at, speed = get.getLanePosition(other), get.getSpeed(other)
-                through = self._through(other, lane, at)
+                through = self.through(other, lane, at)
                 if present:
                     yield through[:, :1]
                     continue
@@ -115,7 +128,7 @@ class Inside:
                         continue
                     links = get.getNextLinks(other)
                     if links and links[0][4] == lanes[lane].id and links[0][5] not in RED + YELLOW:
-                        yield self._through(other, lane, end)[:, :1]
+                        yield self.through(other, lane, end)[:, :1]
 
     def _walkers(self, junction: str, seconds: float) -> Iterator[Floats]:
         """The places of each person on the crossings and walking areas of a junction, for so many seconds."""
@@ -125,19 +138,6 @@ class Inside:
             way = np.arange(0.0, get.getSpeed(who) * seconds + 1e-9, SPACING)
             places = x + way * math.cos(heading), y + way * math.sin(heading), np.full(len(way), heading)
             yield np.stack([*places, *np.full((2, len(way)), PERSON)])
-
-    def _through(self, name: str, lane: int, at: float, beside: float = 0.0) -> Floats:
-        """[5,k] x, y (m), heading (rad), length and width (m) of a vehicle every `SPACING` m on its way from
-        `at` (m) on a lane inside a junction until it has left it; `beside`: m more on either side."""
-        path, inside = self._way(lane)
-        ends, length = [*path.lane_start[1:], path.length], sumo.vehicle.getLength(name)
-        k = inside.index(lane)
-        scale = (ends[k] - path.lane_start[k]) / max(self._road.lanes[lane].length, SPACING)
-        arc = np.arange(path.lane_start[k] + at * scale, ends[len(inside) - 1] + length, SPACING)
-        front, rear = (np.stack(path.pose(a)[:2]) for a in (arc, arc - length))
-        heading = np.arctan2(*(front - rear)[::-1])
-        sizes = np.array([[length], [sumo.vehicle.getWidth(name) + 2.0 * beside]])
-        return np.concatenate([0.5 * (front + rear), [heading], sizes.repeat(len(arc), 1)])
 
     def _way(self, lane: int) -> tuple[LanePath, tuple[int, ...]]:
         """The path over a lane inside a junction from the line on, and its lanes up to the junction's end."""

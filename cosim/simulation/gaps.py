@@ -1,0 +1,150 @@
+"""The gap that an AV takes which has waited long before a line where it must give way.
+
+SUMO's driver lets everybody go first who has the right of way over it, he who stands too: he may set off at
+any time. Often he waits himself, until the gap is over. Here who stands has waived it, AVs agree to let one
+in (V2V), and all others must be so far that they need not brake for it.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from cosim.geometry import Boxes, overlap
+from cosim.road import Link, RoadMap, Rule
+from cosim.simulation.backend import sumo
+from cosim.simulation.foes import Foes
+from cosim.simulation.inside import SPACING, Inside
+
+WITHIN = 200.0  # m before their lines, in which others are looked at
+FASTEST = 20.0  # m/s, limit of their roads: where they drive faster that is too near
+SETS_OFF = 0.5, 2.0  # s until one moves, m/s2 with which it gains speed
+GAINS = 2.0  # m/s2, with which those who drive are taken to gain speed, up to the limit
+MARGIN = 1.5  # s between one and the next at a place that both pass
+MATCHES = 1.5  # m/s2, with which who then follows on its lane may slow down
+BRAKES = 25.0  # m before his line, where who gives way himself brakes
+WAIVES = 2.0  # s for which who stands has stood
+SLOWED = 1.2  # m/s2, with which who lets it in can still stop when it sets off
+HORIZON = 5.0  # s until it can, in which those who let it in are asked
+STOPS = (Rule.STOP, Rule.ALL_WAY_STOP)
+
+Met = tuple[float, float, float]  # m behind the lines: own way clear; from where and up to where he is on it
+
+
+class Gaps:
+    """The gaps at the lines of `road`; `inside` knows the ways through its junctions."""
+
+    def __init__(self, road: RoadMap, inside: Inside) -> None:
+        self._road = road
+        self._inside = inside
+        self._foes = Foes(road, WITHIN)
+
+    def take(
+        self, name: str, lane: str, via: str, lets: Callable[[str, float], bool]
+    ) -> tuple[bool, list[str]]:
+        """Whether `name`, which stands on `lane` before a line, can set off now over the lane `via` in the
+        junction; and the AVs that have to let it in, now or soon.
+
+        Args:
+            lets: whether a vehicle, so many m before its line, lets others in.
+        """
+        road = self._road
+        own, into = road.index[lane], road.index[via]
+        link = road.link_of[own, into]
+        if any(road.lanes[road.links[foe].origin].speed_limit > FASTEST for foe in road.links[link].foes):
+            return False, []
+        line = road.lanes[own].length - sumo.vehicle.getLanePosition(name)  # m
+        closed: list[tuple[float, float]] = []  # s from now: from when until when it cannot set off
+        agreed: list[tuple[float, str, bool]] = []  # s: from when on, for whom who lets it in; is he slow
+        first: dict[int, float] = {}  # lane -> m before its line, behind which nobody passes who stays there
+        for before, other, number in self._by_distance(link, name):
+            if before is None:
+                return False, []
+            origin, speed = road.links[number].origin, sumo.vehicle.getSpeed(other)
+            if before > first.get(origin, math.inf):
+                continue
+            agrees = before > 0.0 and lets(other, before)
+            if agrees or (before > 0.0 and sumo.vehicle.getWaitingTime(other) > WAIVES):
+                first[origin] = before
+            met = self._meet(name, into, other, number) if agrees or origin not in first else None
+            if met is None:
+                continue
+            begin, end = self._shut(road.links[link], line, number, met, before, speed)
+            if agrees:
+                agreed.append((begin, other, speed**2 <= 2.0 * SLOWED * max(before - 1.0, 0.0)))
+            elif end > 0.0:
+                closed.append((begin, end))
+        start = 0.0
+        for begin, end in sorted(closed):
+            if begin < start < end:
+                start = end
+        asked = [(other, slow) for begin, other, slow in agreed if begin < start]
+        if start > HORIZON:
+            return False, []
+        return start == 0.0 and all(slow for _, slow in asked), [other for other, _ in asked]
+
+    # ---- inside ----
+
+    def _by_distance(self, link: int, name: str) -> Iterator[tuple[float | None, str, int]]:
+        """Those with the right of way over a link: m before their line (below 0: beyond it; None: not
+        known), who, and by which link; the nearest first."""
+        found = [(self._before(other, number), other, number) for other, number in self._foes.of(link, name)]
+        yield from sorted(found, key=lambda foe: -math.inf if foe[0] is None else foe[0])
+
+    def _meet(self, name: str, into: int, other: str, number: int) -> Met | None:
+        """Where `name` and `other` meet in the junction; None where their ways do not."""
+        mine = self._inside.through(name, into, 0.0)
+        theirs = self._inside.through(other, self._road.links[number].via, 0.0)
+        met = overlap(Boxes(*mine[:, :, None]), Boxes(*theirs[:, None, :]))  # [places, places]
+        places, others = np.flatnonzero(met.any(1)), np.flatnonzero(met.any(0))
+        if not len(places):
+            return None
+        return float(places[-1] + 1) * SPACING, float(others[0]) * SPACING, float(others[-1]) * SPACING
+
+    def _shut(
+        self, mine: Link, line: float, number: int, met: Met, before: float, speed: float
+    ) -> tuple[float, float]:
+        """s from now, from when until when one who is `line` m before its line cannot set off for who drives
+        `speed` m/s `before` m before the line of the link `number`."""
+        lanes, theirs = self._road.lanes, self._road.links[number]
+        clear, reach, gone = met
+        (wait, gains), turns = SETS_OFF, lanes[mine.via].speed_limit
+        most = max(speed, lanes[theirs.origin].speed_limit)
+        if before > 0.0 and theirs.rule in STOPS:
+            there = before / max(speed, 0.1) + wait + _time(reach, 0.0, GAINS, most)
+        elif before > 0.0 and theirs.foes:
+            there = _time(before - BRAKES, speed, GAINS, most)
+        else:
+            there = _time(before + reach, speed, GAINS, most)
+        if theirs.target == mine.target:
+            slower = max(most - min(math.sqrt(2.0 * gains * (line + clear)), turns), 0.0)  # m/s
+            there -= slower**2 / (2.0 * MATCHES) / most
+        passes = wait + _time(line + clear, 0.0, gains, turns)
+        return there - passes - MARGIN, (before + gone) / max(speed, 1.0)
+
+    def _before(self, name: str, number: int) -> float | None:
+        """m that a vehicle is before the line of the link `number`; below 0: beyond it. None: not known."""
+        road, get = self._road, sumo.vehicle
+        lane, at = road.index.get(get.getLaneID(name), -1), get.getLanePosition(name)
+        if lane < 0:
+            return None
+        inside, beyond = road.links[number].via, 0.0
+        while inside >= 0 and road.lanes[inside].internal:
+            if inside == lane:
+                return -float(beyond + at)
+            beyond += road.lanes[inside].length
+            inside = next(iter(road.lanes[inside].successors), -1)
+        away = float(road.lanes[lane].length - at)
+        for following, _, _, _, via, *_, length in get.getNextLinks(name):
+            if via and road.index.get(via, -1) == road.links[number].via:
+                return away
+            away += float(length + sumo.lane.getLength(following))
+        return None
+
+
+def _time(way: float, speed: float, gains: float, most: float) -> float:
+    """s for `way` m from `speed` m/s on, gaining `gains` m/s2 up to `most` m/s; 0 for none."""
+    way, until = max(way, 0.0), (most**2 - speed**2) / (2.0 * gains)
+    if way <= until:
+        return (math.sqrt(speed**2 + 2.0 * gains * way) - speed) / gains
+    return (most - speed) / gains + (way - until) / most

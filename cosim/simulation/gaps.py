@@ -60,13 +60,14 @@ class Gaps:
         for before, other, number in self._by_distance(link, name):
             if before is None:
                 return False, []
-            origin, speed = road.links[number].origin, sumo.vehicle.getSpeed(other)
-            if before > first.get(origin, math.inf):
-                continue
+            theirs, speed = road.links[number], sumo.vehicle.getSpeed(other)
             agrees = before > 0.0 and lets(other, before)
-            if agrees or (before > 0.0 and sumo.vehicle.getWaitingTime(other) > WAIVES):
-                first[origin] = before
-            met = self._meet(name, into, other, number) if agrees or origin not in first else None
+            stands = before > 0.0 and sumo.vehicle.getWaitingTime(other) > WAIVES
+            if before > first.get(theirs.origin, math.inf) and not _slows(theirs, before):
+                continue
+            if agrees or stands:
+                first[theirs.origin] = min(before, first.get(theirs.origin, math.inf))
+            met = self._meet(name, into, other, number) if agrees or not stands else None
             if met is None:
                 continue
             begin, end = self._shut(road.links[link], line, number, met, before, speed)
@@ -112,7 +113,7 @@ class Gaps:
         most = max(speed, lanes[theirs.origin].speed_limit)
         if before > 0.0 and theirs.rule in STOPS:
             there = before / max(speed, 0.1) + wait + _time(reach, 0.0, GAINS, most)
-        elif before > 0.0 and theirs.foes:
+        elif _slows(theirs, before):
             there = _time(before - BRAKES, speed, GAINS, most)
         else:
             there = _time(before + reach, speed, GAINS, most)
@@ -140,6 +141,11 @@ class Gaps:
                 return away
             away += float(length + sumo.lane.getLength(following))
         return None
+
+
+def _slows(link: Link, before: float) -> bool:
+    """Whether who is so many m before the line of `link` brakes there, to give way, without stopping."""
+    return before > 0.0 and bool(link.foes) and link.rule not in STOPS
 
 
 def _time(way: float, speed: float, gains: float, most: float) -> float:

@@ -37,6 +37,13 @@ TURN = f"""<routes>{CAR}
 <vehicle id="av" type="car" route="left" depart="0" departPos="143" departSpeed="0"/>
 <flow id="hv" type="car" route="on" begin="{{human}}" number="9" period="3" departPos="20" departSpeed="13"/>
 </routes>"""
+STREAM = f"""<routes>{CAR}
+<route id="minor" edges="sj jn"/><route id="major" edges="wj je"/>
+<flow id="hv" type="car" route="major" begin="0" number="10" period="3.5" departPos="60" departSpeed="13"/>
+<vehicle id="av" type="car" route="minor" depart="10" departPos="60" departSpeed="8"/>
+<vehicle id="{{lets}}" type="car" route="major" depart="35" departPos="60" departSpeed="13"/>
+<flow id="h3" type="car" route="major" begin="38.5" number="15" period="3.5" departPos="60" departSpeed="13"/>
+</routes>"""
 CONFIG = """<configuration><net-file value="{net}"/><route-files value="{routes}"/>{more}<begin value="0"/>
 <end value="{end}"/><step-length value="0.1"/></configuration>"""
 MERGE = """<routes><vType id="ego" carFollowModel="IDM" sigma="0" speedDev="0" impatience="{impatience}"/>
@@ -80,6 +87,16 @@ def crossing(folder: Path, road: str, human: float) -> Path:
     return config
 
 
+def stream(folder: Path, lets: str) -> Path:
+    """The .sumocfg of that net with an AV on the minor road, whose line somebody passes every 3.5 s on the
+    major one for 90 s; one of them is called `lets`."""
+    net = crossing_net(folder, "whole")
+    (folder / "x.rou.xml").write_text(STREAM.format(lets=lets))
+    config = folder / "x.sumocfg"
+    config.write_text(CONFIG.format(net=net, routes="x.rou.xml", more="", end=75))
+    return config
+
+
 def turn_after_red(folder: Path, human: float) -> Path:
     """The .sumocfg of a signalised junction whose red lasts for 70 s; the human comes from opposite."""
     net = load("practice/lights").net
@@ -96,7 +113,7 @@ def turn_after_red(folder: Path, human: float) -> Path:
 
 
 def drive(config: Path, policy: Always) -> EpisodeResult:
-    fleet = chosen_fleet(None, "av", None)
+    fleet = chosen_fleet(None, "av2?", None)
     with Worker(Host, load(str(config), preset=Preset.LAWFUL, fleet=fleet), policy, math.pi / 4) as worker:
         result: EpisodeResult = worker.call("run", 0)
     return result
@@ -137,6 +154,17 @@ def test_who_stood_at_a_red_light_takes_no_smaller_gap(tmp_path: Path, human: fl
     """A left turn on green that must give way, after more than a minute of red."""
     result = drive(turn_after_red(tmp_path, human), Always(MetaAction.ACCELERATE))
 
+    assert (result.value("right_of_way_violations"), result.value("hard_brakings")) == (0, 0)
+
+
+@pytest.mark.parametrize(("lets", "crosses"), [("av2", True), ("hv2", False)])
+def test_an_av_lets_one_in_that_has_waited_long_and_nobody_brakes_hard(
+    tmp_path: Path, lets: str, crosses: bool
+) -> None:
+    """Where no AV is among those who have the right of way nobody lets it in."""
+    result = drive(stream(tmp_path, lets), Always(MetaAction.ACCELERATE))
+
+    assert ((result.value("av_trips_completed") or 0) > 0) is crosses
     assert (result.value("right_of_way_violations"), result.value("hard_brakings")) == (0, 0)
 
 

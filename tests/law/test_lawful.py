@@ -184,6 +184,16 @@ def test_who_has_waited_long_takes_no_gap_that_a_human_has_to_brake_for(
     assert result.value("right_of_way_violations") == 0
 
 
+@pytest.mark.parametrize("seed", [150_006, 150_043])
+def test_who_has_waited_long_goes_before_those_who_stand_opposite(
+    law_worlds: dict[str, Path], seed: int
+) -> None:
+    """SUMO's driver waits for them for more than a minute, while they wait for others."""
+    result = drive(law_worlds["stop_signs"], "vfn-p", share=0.2, seed=seed, duration=120.0)
+
+    assert (result.value("avs_stuck"), result.value("right_of_way_violations")) == (0, 0)
+
+
 def test_who_has_waited_long_takes_its_gap_though_the_agent_brakes(law_worlds: dict[str, Path]) -> None:
     result = drive(law_worlds["stop_signs"], "random", share=0.2, seed=150_008, duration=120.0)
 

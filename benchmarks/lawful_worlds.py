@@ -4,8 +4,10 @@
         [--runs runs/lawful] [--workers 2] [--out PAGE]
 
 The policies drive `dense` from test seed 200,000 on; the same command goes on where it stopped. Episodes in
-`unguarded` that ship (docs/results/episodes) are not driven again. Beside them the same networks drive in
-`unguarded` no faster than the limit (`WithinLimit`). Writes docs/results/lawful_worlds.md.
+`unguarded` that ship (docs/results/episodes) are not driven again. What the way that `lawful` is shorter
+comes from is taken away: the same networks in `unguarded` no faster than the limit (`WithinLimit`), and in
+`lawful` in cars that keep no longer headway before humans (`ShortHeadway`), and whose driver aims above the
+limit too, so that it does not slow down near it (`AimsHigher`). Writes docs/results/lawful_worlds.md.
 """
 
 import argparse
@@ -21,6 +23,8 @@ from cosim.control import next_target
 from cosim.report import run_folder, statistics
 from cosim.report.figures import Row
 from cosim.seeding import FIRST_TEST_SEED
+from cosim.simulation import assistance
+from cosim.simulation.backend import sumo
 from cosim.types import Decision, History, PolicyContext, Preset
 from cosim.workers.tasks import OK
 from policy import agents
@@ -29,17 +33,20 @@ PAGE = Path("docs/results/lawful_worlds.md")
 SHIPPED = Path("docs/results/episodes")
 IDM = "idm"
 WITHIN = "within-limit"  # `WithinLimit`, in `unguarded`
+SHORT, HIGHER = "short-headway", "aims-higher"  # `ShortHeadway`, `AimsHigher`, in `lawful`
+ABOVE = 1.3  # times the limit, that the driver of `AimsHigher` aims at; its commands stay within the limit
 FEWER = 3.0  # how many times fewer hard brakings are asked for
 COLUMNS = (
     "world", "episodes", "crashed", "hard brakings of AVs", "of it in unguarded", "distance of all, m",
     "less what it is in unguarded, m", "the same of AVs, m", "too fast in unguarded",
     "mission", "in unguarded", "interventions", "idm less unguarded, m", "within the limit less unguarded, m",
-    "lawful less within the limit, m", "targets",
+    "lawful less within the limit, m", "with the short headway less lawful, m",
+    "aiming higher too less lawful, m", "targets",
 )  # fmt: skip
 
 
-class WithinLimit:
-    """`cosim.types.Policy`: `vfn-p`, but no command leads above the limit of its lane."""
+class Changed:
+    """`cosim.types.Policy`: `vfn-p`, with something taken away."""
 
     def __init__(self) -> None:
         self._inner = agents.make("vfn-p")
@@ -52,14 +59,48 @@ class WithinLimit:
         self._hold = context.timing.decision  # s
 
     def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
-        """What `vfn-p` decides; where that leads above the limit, it reaches the limit and stays there."""
-        return {av: self._within(histories[av], d) for av, d in self._inner.decide(histories).items()}
+        """What `vfn-p` decides."""
+        return dict(self._inner.decide(histories))
+
+
+class WithinLimit(Changed):
+    """No command leads above the limit of its lane."""
+
+    def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
+        """Where a decision leads above the limit, it reaches the limit and stays there."""
+        return {av: self._within(histories[av], d) for av, d in super().decide(histories).items()}
 
     def _within(self, seen: History, decision: Decision) -> Decision:
         limit, speed = seen.route.speed_limit, seen.ego_speed
         if next_target(seen.target_speed, speed, decision.action, limit) <= limit:
             return decision
         return decision._replace(accel=(limit - speed) / self._hold)
+
+
+class ShortHeadway(Changed):
+    """The car keeps no longer headway before humans; it changes the car of its process."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        assistance.HEADWAY = assistance.HEADWAY[:1] * 2
+        assistance.STANDS = assistance.STANDS[:1] * 2
+
+
+class AimsHigher(ShortHeadway):
+    """Nor does its driver slow down as it nears the limit, which an IDM does, and the more the nearer its
+    leader is; an AV drives up to the limit as before, because the commands of the agent do not go further."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        take_over = assistance.Assistance._take_over
+
+        def aims_higher(self: assistance.Assistance, name: str) -> assistance.Assisted:
+            state = take_over(self, name)
+            get = sumo.vehicle
+            get.setSpeedFactor(name, ABOVE * get.getSpeedFactor(name))
+            return state
+
+        assistance.Assistance._take_over = aims_higher  # type: ignore[method-assign]
 
 
 def by_seed(folder: Path, policy: str, preset: str) -> dict[str, dict[int, Row]]:
@@ -77,10 +118,14 @@ def by_seed(folder: Path, policy: str, preset: str) -> dict[str, dict[int, Row]]
 Rows = Mapping[int, Row]  # by seed
 
 
-def line(world: str, lawful: Rows, before: Rows, within: Rows, idm: Rows) -> list[str]:
+def line(
+    world: str, lawful: Rows, before: Rows, within: Rows, idm: Rows, short: Rows, higher: Rows
+) -> list[str]:
     """One world's cells, paired by seed; crashes of all count. `before`: in `unguarded`, `within` too."""
     seeds = sorted(lawful.keys() & before.keys() & within.keys() & idm.keys())
     now, then, slower, sumos = ([rows[s] for s in seeds] for rows in (lawful, before, within, idm))
+    some = sorted(set(seeds) & short.keys() & higher.keys())
+    again, nearer, faster = ([rows[s] for s in some] for rows in (lawful, short, higher))
 
     def column(rows: list[Row], name: str) -> list[float]:
         return [float(row[name]) for row in rows if row.get(name) is not None]
@@ -122,6 +167,8 @@ def line(world: str, lawful: Rows, before: Rows, within: Rows, idm: Rows) -> lis
             further(sumos, then).text(1),
             further(slower, then).text(1),
             further(now, slower).text(1),
+            further(nearer, again).text(1),
+            further(faster, again).text(1),
             "missed: " + ", ".join(missed) if missed else "met",
         ),
     ]
@@ -129,12 +176,14 @@ def line(world: str, lawful: Rows, before: Rows, within: Rows, idm: Rows) -> lis
 
 def driven(policy: str, preset: str, args: argparse.Namespace) -> dict[str, dict[int, Row]]:
     """World -> seed -> row; what is missing is driven."""
-    seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + args.episodes)
+    episodes = min(args.episodes, args.changed) if policy in (SHORT, HIGHER) else args.episodes
+    seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + episodes)
     shipped = by_seed(SHIPPED, policy, preset)
     if all(shipped.get(world, {}).keys() >= set(seeds) for world in args.worlds):
         return {world: {seed: shipped[world][seed] for seed in seeds} for world in args.worlds}
     out = args.runs / f"{policy}-{preset}"
-    named = f"{WITHIN}=benchmarks.lawful_worlds:{WithinLimit.__name__}" if policy == WITHIN else policy
+    changed = {WITHIN: WithinLimit, SHORT: ShortHeadway, HIGHER: AimsHigher}.get(policy)
+    named = f"{policy}=benchmarks.lawful_worlds:{changed.__name__}" if changed else policy
     words = [word for world in args.worlds for word in ("--scenario", world)]
     words += ["--demand", "dense", "--policy", named, "--preset", preset]
     words += ["--seeds", f"{seeds.start}:{seeds.stop}", "--resume", "--workers", args.workers]
@@ -150,6 +199,7 @@ def main() -> None:
     )
     parser.add_argument("--policies", nargs="+", default=["vfn-p"])
     parser.add_argument("--episodes", type=int, default=100)
+    parser.add_argument("--changed", type=int, default=40, help="the same in the cars that are changed")
     parser.add_argument("--worlds", nargs="+", default=sumo_scenarios.names(), choices=sumo_scenarios.names())
     parser.add_argument("--runs", type=Path, default=Path("runs/lawful"), help="where episodes are kept")
     parser.add_argument("--out", type=Path, default=PAGE)
@@ -165,15 +215,18 @@ def main() -> None:
         "hard brakings at most, the distance of all not below (interval). Rates with Wilson, differences",
         "with bootstrap intervals (95 %). `idm`: SUMO's own driver in every vehicle, up to the limit. Within",
         "the limit: the same networks in `unguarded`, but no command leads above the limit of the lane.",
+        "Short headway: in `lawful`, but the car keeps no longer headway before humans; aiming higher: nor",
+        f"does its driver, an IDM that aims at {ABOVE:g} times the limit, slow down as it nears the limit (both",
+        f"on the first {min(args.episodes, args.changed)} seeds).",
         "",
         "Made by `python -m benchmarks.lawful_worlds`.",
     ]
-    idm, within = driven(IDM, Preset.LAWFUL, args), driven(WITHIN, Preset.UNGUARDED, args)
+    beside = [driven(WITHIN, Preset.UNGUARDED, args)]
+    beside += [driven(name, Preset.LAWFUL, args) for name in (IDM, SHORT, HIGHER)]
     for policy in args.policies:
         lawful, before = (driven(policy, preset, args) for preset in (Preset.LAWFUL, Preset.UNGUARDED))
-        rows = [
-            line(world, lawful[world], before[world], within[world], idm[world]) for world in sorted(lawful)
-        ]
+        arms = lawful, before, *beside
+        rows = [line(world, *(arm[world] for arm in arms)) for world in sorted(lawful)]
         lines += ["", f"## {policy}", "", markdown_row(COLUMNS), markdown_row(["---"] * len(COLUMNS))]
         lines += map(markdown_row, rows)
     write_page(args.out, lines)

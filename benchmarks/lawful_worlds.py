@@ -216,8 +216,8 @@ def main() -> None:
         "with bootstrap intervals (95 %). `idm`: SUMO's own driver in every vehicle, up to the limit. Within",
         "the limit: the same networks in `unguarded`, but no command leads above the limit of the lane.",
         "Short headway: in `lawful`, but the car keeps no longer headway before humans; aiming higher: nor",
-        f"does its driver, an IDM that aims at {ABOVE:g} times the limit, slow down as it nears the limit (both",
-        f"on the first {min(args.episodes, args.changed)} seeds).",
+        f"does its driver, an IDM that aims at {ABOVE:g} times the limit, slow down as it nears the limit",
+        f"(both on the first {min(args.episodes, args.changed)} seeds).",
         "",
         "Made by `python -m benchmarks.lawful_worlds`.",
     ]

@@ -49,9 +49,9 @@ class Gaps:
             lets: whether a vehicle, so many m before its line, lets others in.
         """
         road = self._road
-        own, into = road.index[lane], road.index[via]
-        link = road.link_of[own, into]
-        if any(road.lanes[road.links[foe].origin].speed_limit > FASTEST for foe in road.links[link].foes):
+        own, into = road.index.get(lane, -1), road.index.get(via, -1)
+        link = road.link_of.get((own, into), -1)
+        if link < 0 or self._left_to_sumo(link):
             return False, []
         line = road.lanes[own].length - sumo.vehicle.getLanePosition(name)  # m
         closed: list[tuple[float, float]] = []  # s from now: from when until when it cannot set off
@@ -85,6 +85,14 @@ class Gaps:
         return start == 0.0 and all(slow for _, slow in asked), [other for other, _ in asked]
 
     # ---- inside ----
+
+    def _left_to_sumo(self, link: int) -> bool:
+        """Whether others drive too fast there to be seen in time, or persons are at the junction, whom SUMO's
+        driver looks for on its own way and beside it."""
+        lanes, links = self._road.lanes, self._road.links
+        if any(lanes[links[foe].origin].speed_limit > FASTEST for foe in links[link].foes):
+            return True
+        return any(True for _ in self._inside.walkers(lanes[links[link].via].start, 0.0))
 
     def _by_distance(self, link: int, name: str) -> Iterator[tuple[float | None, str, int]]:
         """Those with the right of way over a link: m before their line (below 0: beyond it; None: not

@@ -81,6 +81,15 @@ class Inside:
         sizes = np.array([[length], [sumo.vehicle.getWidth(name) + 2.0 * beside]])
         return np.concatenate([0.5 * (front + rear), [heading], sizes.repeat(len(arc), 1)])
 
+    def walkers(self, junction: str, seconds: float) -> Iterator[Floats]:
+        """The places of each person on the crossings and walking areas of a junction, for so many seconds."""
+        get = sumo.person
+        for who in (one for edge in self._walks[junction] for one in sumo.edge.getLastStepPersonIDs(edge)):
+            (x, y), heading = get.getPosition(who), math.radians(90.0 - get.getAngle(who))
+            way = np.arange(0.0, get.getSpeed(who) * seconds + 1e-9, SPACING)
+            places = x + way * math.cos(heading), y + way * math.sin(heading), np.full(len(way), heading)
+            yield np.stack([*places, *np.full((2, len(way)), PERSON)])
+
     # ---- inside ----
 
     def _on_other_ways(self, own: int) -> Iterator[str]:
@@ -106,7 +115,7 @@ class Inside:
         or soon will be: where they stand, will wait, drive or walk; `present`: where they are."""
         get, lanes, (_, way) = sumo.vehicle, self._road.lanes, self._way(own)
         seconds, metres = SOON
-        yield from self._walkers(lanes[own].start, 0.0 if present else seconds)
+        yield from self.walkers(lanes[own].start, 0.0 if present else seconds)
         yield from map(_body, self._tails(own))
         for lane in self._lanes[lanes[own].start]:
             if lane in way:  # SUMO's driver heeds them
@@ -129,15 +138,6 @@ class Inside:
                     links = get.getNextLinks(other)
                     if links and links[0][4] == lanes[lane].id and links[0][5] not in RED + YELLOW:
                         yield self.through(other, lane, end)[:, :1]
-
-    def _walkers(self, junction: str, seconds: float) -> Iterator[Floats]:
-        """The places of each person on the crossings and walking areas of a junction, for so many seconds."""
-        get = sumo.person
-        for who in (one for edge in self._walks[junction] for one in sumo.edge.getLastStepPersonIDs(edge)):
-            (x, y), heading = get.getPosition(who), math.radians(90.0 - get.getAngle(who))
-            way = np.arange(0.0, get.getSpeed(who) * seconds + 1e-9, SPACING)
-            places = x + way * math.cos(heading), y + way * math.sin(heading), np.full(len(way), heading)
-            yield np.stack([*places, *np.full((2, len(way)), PERSON)])
 
     def _way(self, lane: int) -> tuple[LanePath, tuple[int, ...]]:
         """The path over a lane inside a junction from the line on, and its lanes up to the junction's end."""

@@ -65,9 +65,9 @@ class Gaps:
             stands = before > 0.0 and sumo.vehicle.getWaitingTime(other) > WAIVES
             if before > first.get(theirs.origin, math.inf) and not _slows(theirs, before):
                 continue
-            if agrees or stands:
-                first[theirs.origin] = min(before, first.get(theirs.origin, math.inf))
             met = self._meet(name, into, other, number) if agrees or not stands else None
+            if stands or (agrees and met is not None):
+                first[theirs.origin] = min(before, first.get(theirs.origin, math.inf))
             if met is None:
                 continue
             begin, end = self._shut(road.links[link], line, number, met, before, speed)

@@ -333,17 +333,16 @@ class Assistance(Commander):
             state.goes = goes
             sumo.vehicle.setSpeedMode(name, GOES_FIRST if goes else SPEED_MODE[Preset.LAWFUL])
 
-    def _lets_in(self, name: str, before: float) -> bool:
-        """Whether it is an AV that can stop comfortably so many m before its line, and has not for long."""
-        get, state = sumo.vehicle, self.controlled.get(name)
-        if (
-            state is None
-            or state.goes
-            or state.has_let >= PATIENCE
-            or state.flees > sumo.simulation.getTime()
-        ):
+    def _lets_in(self, name: str, before: float) -> bool | None:
+        """Whether it is an AV that can stop comfortably so many m before its line, and has not for long; None
+        for an AV that takes its own gap."""
+        state = self.controlled.get(name)
+        if state is not None and state.goes:
+            return None
+        if state is None or state.has_let >= PATIENCE or state.flees > sumo.simulation.getTime():
             return False
-        return bool(get.getSpeed(name) ** 2 <= 2.0 * YIELDING[0] * max(before - 2.0 * STOPS_SHORT, 0.0))
+        needs = sumo.vehicle.getSpeed(name) ** 2 / (2.0 * YIELDING[0])  # m
+        return bool(needs <= max(before - 2.0 * STOPS_SHORT, 0.0))
 
     def _meets_humans(self, name: str) -> bool:
         """Whether anybody but AVs comes to the junction that it is at, from elsewhere.

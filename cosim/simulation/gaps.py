@@ -40,13 +40,13 @@ class Gaps:
         self._foes = Foes(road, WITHIN)
 
     def take(
-        self, name: str, lane: str, via: str, lets: Callable[[str, float], bool]
+        self, name: str, lane: str, via: str, lets: Callable[[str, float], bool | None]
     ) -> tuple[bool, list[str]]:
         """Whether `name`, which stands on `lane` before a line, can set off now over the lane `via` in the
         junction; and the AVs that have to let it in, now or soon.
 
         Args:
-            lets: whether a vehicle, so many m before its line, lets others in.
+            lets: whether a vehicle, so many m before its line, lets others in; None: it sets off itself.
         """
         road = self._road
         own, into = road.index.get(lane, -1), road.index.get(via, -1)
@@ -61,8 +61,8 @@ class Gaps:
             if before is None:
                 return False, []
             theirs, speed = road.links[number], sumo.vehicle.getSpeed(other)
-            agrees = before > 0.0 and lets(other, before)
-            stands = before > 0.0 and sumo.vehicle.getWaitingTime(other) > WAIVES
+            agrees = lets(other, before) if before > 0.0 else None
+            stands = agrees is not None and sumo.vehicle.getWaitingTime(other) > WAIVES
             if before > first.get(theirs.origin, math.inf) and not _slows(theirs, before):
                 continue
             met = self._meet(name, into, other, number) if agrees or not stands else None

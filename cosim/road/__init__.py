@@ -161,6 +161,14 @@ class RoadMap:
         return tuple(map(tuple, found))
 
     @cached_property
+    def lanes_of(self) -> dict[str, tuple[int, ...]]:
+        """Edge -> its lanes."""
+        found: dict[str, tuple[int, ...]] = {}
+        for k, lane in enumerate(self.lanes):
+            found[lane.edge] = (*found.get(lane.edge, ()), k)
+        return found
+
+    @cached_property
     def links_through(self) -> dict[int, tuple[int, ...]]:
         """Lane inside a junction -> the links (indices) that lead over it."""
         found: dict[int, tuple[int, ...]] = {}

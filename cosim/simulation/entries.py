@@ -238,14 +238,6 @@ class EntryWatcher:
         return found
 
     @cached_property
-    def _beside(self) -> dict[str, list[int]]:
-        """Edge -> its lanes."""
-        found: dict[str, list[int]] = {}
-        for k, lane in enumerate(self._road.lanes):
-            found.setdefault(lane.edge, []).append(k)
-        return found
-
-    @cached_property
     def _passed(self) -> Callable[[int, int], tuple[Passed, ...]]:
         """The stop lines that matter on the way from one lane to another (asked again, it is free)."""
         return cache(self._lines_between)
@@ -256,7 +248,7 @@ class EntryWatcher:
         for _ in range(HOPS):
             following = []
             for lane in reached:
-                for successor in (*lanes[lane].successors, *self._beside[lanes[lane].edge]):
+                for successor in (*lanes[lane].successors, *self._road.lanes_of[lanes[lane].edge]):
                     if successor not in came:
                         came[successor] = lane
                         following.append(successor)

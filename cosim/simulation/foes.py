@@ -77,14 +77,6 @@ class Foes:
         return cache(self._lanes_before)
 
     @cached_property
-    def _beside(self) -> dict[str, list[int]]:
-        """Edge -> its lanes."""
-        found: dict[str, list[int]] = {}
-        for k, lane in enumerate(self._road.lanes):
-            found.setdefault(lane.edge, []).append(k)
-        return found
-
-    @cached_property
     def _between(self) -> dict[tuple[str, str], list[int]]:
         """(edge, edge) -> the links from one to the other."""
         found: dict[tuple[str, str], list[int]] = {}
@@ -110,13 +102,13 @@ class Foes:
             if reach <= left.get(edge, 0.0):
                 continue
             left[edge] = reach
-            for lane in self._beside[edge]:
+            for lane in self._road.lanes_of[edge]:
                 more = reach - lanes[lane].length
                 waiting += [(lanes[origin].edge, more) for origin in self._road.before[lane]]
         inside = lanes[links[number].via].start if links[number].via >= 0 else ""
         return tuple(
             (lane, lanes[lane].length - reach)
             for edge, reach in left.items()
-            for lane in self._beside[edge]
+            for lane in self._road.lanes_of[edge]
             if not (lanes[lane].internal and lanes[lane].start == inside)
         )

@@ -134,7 +134,6 @@ class Ways:
 
     def __init__(self, road: RoadMap) -> None:
         self._road = road
-        self.inside = cache(self._internal)
         self.crossings = cache(self._crossings)
         self._over: dict[int, list[Crossing]] = {}  # lane -> the crossings over it
         for crossing in road.crossings:
@@ -145,13 +144,13 @@ class Ways:
         """Whether a vehicle that entered by the link is out of the junction, its rear bumper too."""
         lane, lanes = int(now.lane[row]), self._road.lanes
         if lane < 0 or lanes[lane].internal:
-            return lane not in self.inside(link)
+            return lane not in self._road.inside[link]
         beyond = lanes[lane].edge != lanes[self._road.links[link].target].edge
         return beyond or bool(now.lane_position[row] >= now.length[row])
 
     def excused(self, link: int, now: Snapshot, row: int, av: int) -> bool:
         """Whether a vehicle on the way of `link` has another reason to brake than the one in row `av`."""
-        lane, inside, target = int(now.lane[row]), self.inside(link), self._road.links[link].target
+        lane, inside, target = int(now.lane[row]), self._road.inside[link], self._road.links[link].target
         if lane in inside:
             ahead = (*inside[inside.index(lane) :], target)
         elif lane < 0 or self._road.lanes[lane].edge == self._road.lanes[target].edge:
@@ -190,13 +189,6 @@ class Ways:
         """The pedestrian crossings over the internal lanes of a link."""
         if not self._over:
             return ()
-        return tuple({one.id: one for lane in self.inside(link) for one in self._over.get(lane, ())}.values())
-
-    def _internal(self, link: int) -> tuple[int, ...]:
-        """The internal lanes of a link, in driving order."""
-        found: list[int] = []
-        lane, lanes = self._road.links[link].via, self._road.lanes
-        while lane >= 0 and lanes[lane].internal and lane not in found:
-            found.append(lane)
-            lane = next(iter(lanes[lane].successors), -1)
-        return tuple(found)
+        return tuple(
+            {one.id: one for lane in self._road.inside[link] for one in self._over.get(lane, ())}.values()
+        )

@@ -31,7 +31,7 @@ class Standing(AvCounts):
             if link.signal >= 0:
                 self._signals[link.origin] = (*self._signals.get(link.origin, ()), link.signal)
             if over := ways.crossings(number):
-                for lane in (link.origin, *ways.inside(number)):
+                for lane in (link.origin, *context.road.inside[number]):
                     self._crossings[lane] = (*self._crossings.get(lane, ()), *over)
         self._waiting: dict[str, float] = {}  # AV -> s, since when it stands without a reason
         self._inside: dict[str, tuple[str, float]] = {}  # AV -> the junction in which it stands, since (s)

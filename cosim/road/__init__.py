@@ -172,12 +172,23 @@ class RoadMap:
     def links_through(self) -> dict[int, tuple[int, ...]]:
         """Lane inside a junction -> the links (indices) that lead over it."""
         found: dict[int, tuple[int, ...]] = {}
-        for number, link in enumerate(self.links):
-            lane = link.via
-            while lane >= 0 and self.lanes[lane].internal:
+        for number, lanes in enumerate(self.inside):
+            for lane in lanes:
                 found[lane] = (*found.get(lane, ()), number)
-                lane = next(iter(self.lanes[lane].successors), -1)
         return found
+
+    @cached_property
+    def inside(self) -> tuple[tuple[int, ...], ...]:
+        """The lanes inside the junction of each link, in driving order."""
+        found = []
+        for link in self.links:
+            ways: list[int] = []
+            lane = link.via
+            while lane >= 0 and self.lanes[lane].internal and lane not in ways:
+                ways.append(lane)
+                lane = next(iter(self.lanes[lane].successors), -1)
+            found.append(tuple(ways))
+        return tuple(found)
 
     @cached_property
     def straight_on(self) -> LaneGraph:

@@ -7,8 +7,6 @@ from itertools import pairwise
 from cosim.road import RoadMap
 from cosim.simulation.backend import sumo
 
-HOPS = 8  # lanes inside a junction
-
 
 class Foes:
     """The vehicles with the right of way over the links of `road`, at most `within` m before their line."""
@@ -27,8 +25,9 @@ class Foes:
         found: dict[str, int] = {}
         edges = {self._road.lanes[self._road.links[foe].origin].edge for foe in first}
         for foe in first:
-            for inner in self._inside(foe):
-                found.update((other, foe) for other in sumo.lane.getLastStepVehicleIDs(inner))
+            for inner in self._road.inside[foe]:
+                lane_id = self._road.lanes[inner].id
+                found.update((other, foe) for other in sumo.lane.getLastStepVehicleIDs(lane_id))
         for lane, position in self._before(entered):
             for other in sumo.lane.getLastStepVehicleIDs(self._road.lanes[lane].id):
                 if other not in found and self._position_of(other) >= position:
@@ -66,11 +65,6 @@ class Foes:
         return ()
 
     @cached_property
-    def _inside(self) -> Callable[[int], tuple[str, ...]]:
-        """A link's internal lanes."""
-        return cache(self._internal)
-
-    @cached_property
     def _before(self) -> Callable[[int], tuple[tuple[int, float], ...]]:
         """The lanes before the lines of a link's foes; on each the position (m) from which on one is within
         `within` of the line."""
@@ -84,14 +78,6 @@ class Foes:
             edges = self._road.lanes[link.origin].edge, self._road.lanes[link.target].edge
             found.setdefault(edges, []).append(k)
         return found
-
-    def _internal(self, number: int) -> tuple[str, ...]:
-        found: list[str] = []
-        lane, lanes = self._road.links[number].via, self._road.lanes
-        while lane >= 0 and lanes[lane].internal and len(found) < HOPS:
-            found.append(lanes[lane].id)
-            lane = next(iter(lanes[lane].successors), -1)
-        return tuple(found)
 
     def _lanes_before(self, number: int) -> tuple[tuple[int, float], ...]:
         lanes, links = self._road.lanes, self._road.links

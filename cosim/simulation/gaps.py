@@ -15,6 +15,7 @@ from cosim.road import Link, RoadMap, Rule
 from cosim.simulation.backend import sumo
 from cosim.simulation.foes import Foes
 from cosim.simulation.inside import SPACING, Inside
+from cosim.types import Floats
 
 WITHIN = 200.0  # m before their lines, in which others are looked at
 FASTEST = 20.0  # m/s, limit of their roads: where they drive faster that is too near
@@ -54,6 +55,7 @@ class Gaps:
         if link < 0 or self._left_to_sumo(link):
             return False, []
         line = road.lanes[own].length - sumo.vehicle.getLanePosition(name)  # m
+        mine = self._inside.through(name, into, 0.0)
         closed: list[tuple[float, float]] = []  # s from now: from when until when it cannot set off
         agreed: list[tuple[float, str, bool]] = []  # s: from when on, for whom who lets it in; is he slow
         first: dict[int, float] = {}  # lane -> m before its line, behind which nobody passes who stays there
@@ -65,7 +67,7 @@ class Gaps:
             stands = agrees is not None and sumo.vehicle.getWaitingTime(other) > WAIVES
             if before > first.get(theirs.origin, math.inf) and not _slows(theirs, before):
                 continue
-            met = self._meet(name, into, other, number) if agrees or not stands else None
+            met = self._meet(mine, other, number) if agrees or not stands else None
             if stands or (agrees and met is not None):
                 first[theirs.origin] = min(before, first.get(theirs.origin, math.inf))
             if met is None:
@@ -100,9 +102,8 @@ class Gaps:
         found = [(self._before(other, number), other, number) for other, number in self._foes.of(link, name)]
         yield from sorted(found, key=lambda foe: -math.inf if foe[0] is None else foe[0])
 
-    def _meet(self, name: str, into: int, other: str, number: int) -> Met | None:
-        """Where `name` and `other` meet in the junction; None where their ways do not."""
-        mine = self._inside.through(name, into, 0.0)
+    def _meet(self, mine: Floats, other: str, number: int) -> Met | None:
+        """Where who drives `mine` ([5,k], of `Inside.through`) and `other` meet; None where they do not."""
         theirs = self._inside.through(other, self._road.links[number].via, 0.0)
         met = overlap(Boxes(*mine[:, :, None]), Boxes(*theirs[:, None, :]))  # [places, places]
         places, others = np.flatnonzero(met.any(1)), np.flatnonzero(met.any(0))
@@ -137,12 +138,11 @@ class Gaps:
         lane, at = road.index.get(get.getLaneID(name), -1), get.getLanePosition(name)
         if lane < 0:
             return None
-        inside, beyond = road.links[number].via, 0.0
-        while inside >= 0 and road.lanes[inside].internal:
+        beyond = 0.0
+        for inside in road.inside[number]:
             if inside == lane:
                 return -float(beyond + at)
             beyond += road.lanes[inside].length
-            inside = next(iter(road.lanes[inside].successors), -1)
         away = float(road.lanes[lane].length - at)
         for following, _, _, _, via, *_, length in get.getNextLinks(name):
             if via and road.index.get(via, -1) == road.links[number].via:

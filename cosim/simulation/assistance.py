@@ -40,6 +40,7 @@ NOTICE = 150.0  # m: signals and stop lines further ahead are no reason yet
 SERVES = 60.0, 100.0  # m that a lane must serve the route at least, and more for every lane to change back
 LOOKS = 0.4  # s between looks at right of way and blocked lane changes
 GAP = 2.0, 1.0  # m and s: the gap given to who changes lanes
+BESIDE = 1.0  # m more for who has stood for `PATIENCE` and cannot change lanes
 STOPS_SHORT = 0.5  # m before its line
 YIELDING = 2.0, 1.0  # m/s2 and m/s: how hard, and down to what, an AV slows for who asked
 PATIENCE = 10.0  # s
@@ -48,6 +49,8 @@ COMES = 100.0  # m from which they come, however many edges that are
 AT_LINE = 5.0  # m: who is further away stands in a queue
 WAITS = 15.0  # s of waiting at a line; from then on it judges and takes its gap, whatever the agent asks for
 GOES_FIRST = SPEED_MODE[Preset.LAWFUL] - 8  # heeds nobody outside the junction
+GOES_ON = 32  # nor inside: of its own it looks who is in its way
+HOLDS = 10.0, 2.4  # m before a line, m/s2: from there on it goes before no AV that would brake harder
 LETS = 1.0  # s for which an AV that is asked lets another one in
 # where AVs alone come, and where humans do: SUMO adds a share of 180 s stood, which makes humans brake hard
 IMPATIENCE = 0.8, -1.0
@@ -89,9 +92,10 @@ class Assisted(Controlled):
     idled: float = 0.0  # s, for which the agent has asked for less than `KEEPS_MOVING`
     stays: bool = False  # inside a junction, for somebody in its way
     held: float = 0.0  # s, for which it has done so in this one
-    goes: bool = False  # takes its gap
+    goes: str = ""  # the lane from which it takes its gap
     lets: float = -math.inf  # s, until when it stops before its line for who takes one
     has_let: float = 0.0  # s, for which it has done so at this one
+    holds: bool = False  # for an AV that would have to brake hard
 
     @property
     def asked(self) -> float:
@@ -148,10 +152,10 @@ class Assistance(Commander):
                 state.accel = min(state.accel, self._yielding(name, speed, state))
             if inside:
                 state.has_let = 0.0
-            elif lane and now < state.lets:
+            elif lane and (now < state.lets or state.holds):
                 left = sumo.lane.getLength(lane) - get.getLanePosition(name) - STOPS_SHORT
                 state.accel = min(state.accel, -speed * speed / (2.0 * max(left, 0.1)))
-                state.has_let += self._step
+                state.has_let += self._step * (now < state.lets)
             self._mind_inside(name, lane, speed, state)
             state.wish, state.speed = max(speed + state.accel * self._step, 0.0), speed
             ours = not (slower or flees or swift) or (state.stays and not (slower and speed >= STARTS))
@@ -289,13 +293,15 @@ class Assistance(Commander):
             lane = get.getLaneID(name)
             if not lane:  # it is parked, or SUMO carries it elsewhere
                 continue
-            red = False
+            red, via = False, ""
             if not lane.startswith(":"):
                 links = get.getNextLinks(name)
                 state.gives_way = bool(links) and not links[0][1]
                 red = bool(links) and links[0][5] in RED + YELLOW
+                via = links[0][4] if links else ""
             self._wait(name, lane, state, red)
-            self._take_gap(name, lane, state)
+            self._take_gap(name, lane, via, state)
+            state.holds = state.gives_way and not (red or state.goes) and self._holds(name, lane, via)
             for side in (1, -1):
                 wanted = get.getLaneChangeState(name, side)[0]
                 if wanted & STRATEGIC and wanted & BLOCKED:
@@ -319,19 +325,34 @@ class Assistance(Commander):
             # its type is its own since `set_type`
             sumo.vehicletype.setImpatience(get.getTypeID(name), impatience)
 
-    def _take_gap(self, name: str, lane: str, state: Assisted) -> None:
-        """Who has waited long at a line without a signal judges its gap itself; AVs let it in."""
-        if state.goes and lane.startswith(":"):  # until it has left the junction
+    def _take_gap(self, name: str, lane: str, via: str, state: Assisted) -> None:
+        """Who has waited long at a line without a signal, or in the junction behind it, judges its gap
+        itself; AVs let it in."""
+        inside = lane.startswith(":")
+        if state.goes and inside and lane != state.goes:  # until it has left the junction
             return
         goes = False
-        links = sumo.vehicle.getNextLinks(name) if state.waited > WAITS and not lane.startswith(":") else ()
-        if links and links[0][4] and links[0][5] in "ms":
-            goes, asked = self._gaps.take(name, lane, links[0][4], self._lets_in)
+        if state.waited > WAITS:
+            goes, asked = self._gaps.take(name, lane, via, self._lets_in)
             for other in asked:
                 self.controlled[other].lets = sumo.simulation.getTime() + LETS
-        if goes != state.goes:
-            state.goes = goes
-            sumo.vehicle.setSpeedMode(name, GOES_FIRST if goes else SPEED_MODE[Preset.LAWFUL])
+        if goes != bool(state.goes):
+            state.goes = lane if goes else ""
+            mode = GOES_FIRST + inside * GOES_ON if goes else SPEED_MODE[Preset.LAWFUL]
+            sumo.vehicle.setSpeedMode(name, mode)
+
+    def _holds(self, name: str, lane: str, via: str) -> bool:
+        """Whether one that gives way there waits for AVs that would have to brake hard for it (V2V)."""
+        get, (near, hard) = sumo.vehicle, HOLDS
+        away, speed = sumo.lane.getLength(lane) - get.getLanePosition(name), get.getSpeed(name)
+        if away > near or speed * speed > 2.0 * COMFORT * max(away - STOPS_SHORT, 0.1):
+            return False
+        return self._gaps.brakes(name, lane, via, self._step, self._comes) > hard
+
+    def _comes(self, name: str) -> bool:
+        """Whether it is an AV that lets nobody in."""
+        state = self.controlled.get(name)
+        return state is not None and state.lets < sumo.simulation.getTime()
 
     def _lets_in(self, name: str, before: float) -> bool | None:
         """Whether it is an AV that can stop comfortably so many m before its line, and has not for long; None
@@ -367,7 +388,7 @@ class Assistance(Commander):
         its line."""
         inside, long = lane.startswith(":"), state.held >= PATIENCE
         if inside and speed < STARTS:
-            state.stays = self._junctions.blocked(name, lane, present=long)
+            state.stays = state.holds or self._junctions.blocked(name, lane, present=long)
         else:
             brakes, left = STOPS_FOR
             needs = speed * speed / (2.0 * brakes) + left  # m
@@ -406,7 +427,11 @@ class Assistance(Commander):
         except sumo.TraCIException:  # it has left
             return COMFORT
         room, headway = GAP
-        if gap < max(speed**2 - theirs**2, 0.0) / (2.0 * brakes):
+        near = max(speed**2 - theirs**2, 0.0) / (2.0 * brakes)  # m
+        if get.getWaitingTime(state.gap_for) > PATIENCE:  # the first that can stops for it
+            room, least = room + BESIDE, 0.0
+            near += room
+        if gap < near:
             return COMFORT  # it is beside, or too near: it goes first, whoever follows it gives way
         slower = max(theirs + 0.5 * (gap - room - headway * speed), least)  # m/s
         return float(max(slower - speed, -brakes))
@@ -484,10 +509,10 @@ def _reason(name: str, accel: float, state: Assisted, now: float) -> str:
     """Why the car drives slower at `now` (s) than the agent wishes, or brakes harder (`accel` m/s2)."""
     get = sumo.vehicle
     words = "emergency: " if accel < -HARD else ""
+    if state.holds or now < state.lets:
+        return f"{words}lets an AV in"
     if state.stays:
         return f"{words}vehicle in the way"
-    if now < state.lets:
-        return f"{words}lets an AV in"
     speed = get.getSpeed(name)
     reach = min(0.5 * speed * speed + 2.0 * speed + 10.0, NOTICE)  # m, from where an IDM begins to brake
     leader = get.getLeader(name, reach)

@@ -18,6 +18,8 @@ from cosim.simulation.inside import SPACING, Inside
 from cosim.types import Floats
 
 WITHIN = 200.0  # m before their lines, in which others are looked at
+GENTLY = 1.2  # m/s2: who can stop before his line with less is not asked
+SEEN = 0.5  # m behind its line, where others brake for it
 FASTEST = 20.0  # m/s, limit of their roads: where they drive faster that is too near
 SETS_OFF = 0.5, 2.0  # s until one moves, m/s2 with which it gains speed
 GAINS = 2.0  # m/s2, with which those who drive are taken to gain speed, up to the limit
@@ -47,11 +49,12 @@ class Gaps:
         junction; and the AVs that have to let it in, now or soon.
 
         Args:
+            lane: also one inside a junction, at whose end the net lets it wait; `via` does not matter then.
             lets: whether a vehicle, so many m before its line, lets others in; None: it sets off itself.
         """
         road = self._road
-        own, into = road.index.get(lane, -1), road.index.get(via, -1)
-        link = road.link_of.get((own, into), -1)
+        own = road.index.get(lane, -1)
+        link, into = self._ahead(own, road.index.get(via, -1))
         if link < 0 or self._left_to_sumo(link):
             return False, []
         line = road.lanes[own].length - sumo.vehicle.getLanePosition(name)  # m
@@ -86,12 +89,53 @@ class Gaps:
             return False, []
         return start == 0.0 and all(slow for _, slow in asked), [other for other, _ in asked]
 
+    def brakes(self, name: str, lane: str, via: str, step: float, comes: Callable[[str], bool]) -> float:
+        """m/s2 with which the drivers of those with the right of way would brake at most, if `name` went on
+        from `lane`, on which it nears its line or waits behind it, over the lane `via`.
+
+        Args:
+            lane: as of `take`.
+            step: s of a simulation step.
+            comes: whether a vehicle is one that can be asked.
+        """
+        road, get = self._road, sumo.vehicle
+        own = road.index.get(lane, -1)
+        link, into = self._ahead(own, road.index.get(via, -1))
+        if link < 0 or not road.links[link].foes:
+            return 0.0
+        mine, hardest = None, 0.0
+        away = road.lanes[own].length - get.getLanePosition(name)
+        there = _time(away + SEEN, get.getSpeed(name), GAINS, FASTEST)  # s
+        for other, number in self._foes.of(link, name):
+            before, speed = self._before(other, number), get.getSpeed(other)
+            if before is None or before <= 0.0 or speed**2 <= 2.0 * GENTLY * before or not comes(other):
+                continue
+            if mine is None:
+                mine = self._inside.through(name, into, 0.0)
+            met = self._meet(mine, other, number)
+            if met is not None:
+                gap = max(before + met[1] - there * speed, 0.1)
+                hardest = max(hardest, (speed - get.getStopSpeed(other, speed, gap)) / step)
+        return hardest
+
     # ---- inside ----
 
+    def _ahead(self, own: int, via: int) -> tuple[int, int]:
+        """The link over whose line, or from whose place to wait, one goes on from the lane `own`, and onto
+        which lane; below 0 where there is none."""
+        road = self._road
+        if not road.waits_inside(own):
+            return road.link_of.get((own, via), -1), via
+        link = road.links_through[own][0]
+        return link, road.lanes[own].successors[0]
+
     def _left_to_sumo(self, link: int) -> bool:
-        """Whether others drive too fast there to be seen in time, or persons are at the junction, whom SUMO's
-        driver looks for on its own way and beside it."""
+        """Whether there is a signal, or other rules than to give way; whether others drive too fast to be
+        seen in time, or persons are at the junction, whom SUMO's driver looks for on its own way and beside
+        it."""
         lanes, links = self._road.lanes, self._road.links
+        if links[link].signal >= 0 or links[link].rule not in (Rule.YIELD, Rule.STOP):
+            return True
         if any(lanes[links[foe].origin].speed_limit > FASTEST for foe in links[link].foes):
             return True
         return any(True for _ in self._inside.walkers(lanes[links[link].via].start, 0.0))

@@ -24,7 +24,7 @@ from cosim.types import Floats
 STOPS = 4.5  # m/s2, with which who is slow comes to a stand
 SLOW = 3.0  # m/s: who is faster passes
 SPACING = 0.25  # m between the places that are looked at
-BESIDE = 0.1  # m that an AV that stands wants to have free on either side
+BESIDE = np.array([[0.0], [0.0], [0.0], [0.0], [0.2]])  # m of width more, for who stands
 CREEPS = 0.5  # m/s: who is slower stands, for those who drive
 PERSON = 0.5  # m, across
 SOON = 3.0, 10.0  # s, or m, from a green line: who is so near will be inside
@@ -47,19 +47,18 @@ class Inside:
         mine = None
         for theirs in self._others(own, present):
             if mine is None:
-                mine = self.through(name, own, sumo.vehicle.getLanePosition(name), BESIDE)
-            touched = overlap(Boxes(*mine[:, :, None]), Boxes(*theirs))  # [places, places]
-            if touched.any() and not touched[0].any():  # else it is beside: to stay would not help
+                mine = self.through(name, own, sumo.vehicle.getLanePosition(name))
+            if _comes_to(mine + BESIDE, theirs) or _comes_to(mine, theirs):
                 return True
         return False
 
     def room(self, name: str, lane: str, at: float | None = None) -> float:
         """m that the AV `name` can drive over the internal lane `lane`, from where it is or from `at` (m),
-        until it touches somebody who stands in the junction; inf where nobody does but who is beside it."""
+        until it touches somebody who stands in the junction, or slowly comes to where he waits in it, or, if
+        it is inside itself, walks there; inf where nobody does but who is beside it."""
         own = self._road.index.get(lane, -1)
         get = sumo.vehicle
-        others = () if own < 0 else self._on_other_ways(own)
-        standing = [_body(other) for other in others if get.getSpeed(other) < CREEPS]
+        standing = [] if own < 0 else list(self._standing(own, inside=at is None))
         if not standing:
             return math.inf
         mine = self.through(name, own, get.getLanePosition(name) if at is None else at)
@@ -68,9 +67,9 @@ class Inside:
         places = np.flatnonzero(touched[:, ~touched[0]].any(1))
         return float(places[0]) * SPACING if len(places) else math.inf
 
-    def through(self, name: str, lane: int, at: float, beside: float = 0.0) -> Floats:
+    def through(self, name: str, lane: int, at: float) -> Floats:
         """[5,k] x, y (m), heading (rad), length and width (m) of a vehicle every `SPACING` m on its way from
-        `at` (m) on a lane inside a junction until it has left it; `beside`: m more on either side."""
+        `at` (m) on a lane inside a junction until it has left it."""
         path, inside = self._way(lane)
         ends, length = [*path.lane_start[1:], path.length], sumo.vehicle.getLength(name)
         k = inside.index(lane)
@@ -78,13 +77,15 @@ class Inside:
         arc = np.arange(path.lane_start[k] + at * scale, ends[len(inside) - 1] + length, SPACING)
         front, rear = (np.stack(path.pose(a)[:2]) for a in (arc, arc - length))
         heading = np.arctan2(*(front - rear)[::-1])
-        sizes = np.array([[length], [sumo.vehicle.getWidth(name) + 2.0 * beside]])
+        sizes = np.array([[length], [sumo.vehicle.getWidth(name)]])
         return np.concatenate([0.5 * (front + rear), [heading], sizes.repeat(len(arc), 1)])
 
-    def walkers(self, junction: str, seconds: float) -> Iterator[Floats]:
-        """The places of each person on the crossings and walking areas of a junction, for so many seconds."""
+    def walkers(self, junction: str, seconds: float, kinds: str = "cw") -> Iterator[Floats]:
+        """The places of each person on the crossings and walking areas of a junction, for so many seconds;
+        `kinds`: c for those on crossings alone."""
         get = sumo.person
-        for who in (one for edge in self._walks[junction] for one in sumo.edge.getLastStepPersonIDs(edge)):
+        edges = [edge for edge in self._walks[junction] if edge.rpartition("_")[2][0] in kinds]
+        for who in (one for edge in edges for one in sumo.edge.getLastStepPersonIDs(edge)):
             (x, y), heading = get.getPosition(who), math.radians(90.0 - get.getAngle(who))
             way = np.arange(0.0, get.getSpeed(who) * seconds + 1e-9, SPACING)
             places = x + way * math.cos(heading), y + way * math.sin(heading), np.full(len(way), heading)
@@ -92,14 +93,25 @@ class Inside:
 
     # ---- inside ----
 
-    def _on_other_ways(self, own: int) -> Iterator[str]:
-        """Who is in the junction of the lane `own`, with his tail at least; not on the way over that lane,
-        where SUMO's driver heeds them."""
-        lanes = self._road.lanes
+    def _standing(self, own: int, inside: bool) -> Iterator[Floats]:
+        """Who stands in the junction of the lane `own`, with his tail at least, or slowly comes to a place
+        where the net lets him wait in it; not on the way over that lane, where SUMO's driver heeds them.
+        `inside`: who walks over its crossings too."""
+        lanes, get = self._road.lanes, sumo.vehicle
         for lane in self._lanes[lanes[own].start]:
-            if lane not in self._way(own)[1]:
-                yield from sumo.lane.getLastStepVehicleIDs(lanes[lane].id)
-        yield from self._tails(own)
+            if lane in self._way(own)[1]:
+                continue
+            for other in sumo.lane.getLastStepVehicleIDs(lanes[lane].id):
+                speed = get.getSpeed(other)
+                if speed < CREEPS:
+                    yield _body(other)
+                if speed < SLOW and self._road.waits_inside(lane):
+                    yield self.through(other, lane, lanes[lane].length)[:, :1]
+        for other in self._tails(own):
+            if get.getSpeed(other) < CREEPS:
+                yield _body(other)
+        if inside:
+            yield from self.walkers(lanes[own].start, SOON[0], "c")
 
     def _tails(self, own: int) -> Iterator[str]:
         """Who has left that junction but for his tail."""
@@ -186,6 +198,12 @@ class Inside:
         for link in self._road.links:
             found[link.via].append(link.origin)
         return found
+
+
+def _comes_to(mine: Floats, theirs: Floats) -> bool:
+    """Whether one that drives `mine` touches `theirs` on its way and is not beside it: to stay is no help."""
+    touched = overlap(Boxes(*mine[:, :, None]), Boxes(*theirs))  # [places, places]
+    return bool(touched.any()) and not touched[0].any()
 
 
 def _body(name: str) -> Floats:

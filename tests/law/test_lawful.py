@@ -19,7 +19,7 @@ from cosim.road.rules import RulesAhead
 from cosim.scenario import chosen_fleet, load
 from cosim.scenario.human_errors import levels
 from cosim.scenario.vet import vetted
-from cosim.simulation import assistance
+from cosim.simulation import assistance, inside
 from cosim.simulation.sumo import SumoSimulator
 from cosim.types import (
     Command,
@@ -222,6 +222,7 @@ def test_nobody_starts_inside_a_junction_into_one_that_stands_in_its_way(
     [
         ("crossing_signals", 150_015),
         ("crossing_signals", 150_039),
+        ("crossing_signals", 160_026),
         ("mixed_types", 150_013),
         ("mixed_types", 150_019),
     ],
@@ -229,10 +230,52 @@ def test_nobody_starts_inside_a_junction_into_one_that_stands_in_its_way(
 def test_nobody_drives_into_one_who_stands_inside_a_junction_with_his_tail_at_least(
     law_worlds: dict[str, Path], world: str, seed: int
 ) -> None:
-    """Who stands there; who begins to walk; a truck's tail; a change of lanes begun before the line."""
+    """Who stands there; who begins to walk, or walks while one drives; a truck's tail; a change of lanes
+    begun before the line."""
     result = drive(law_worlds[world], "random", seed=seed, duration=120.0)
 
     assert result.value("av_involved_collisions") == 0
+
+
+@pytest.mark.parametrize(("world", "seed"), [("priority", 162_005), ("crossing_signals", 162_006)])
+def test_nobody_drives_into_one_who_slowly_comes_to_where_he_waits_inside_a_junction(
+    law_worlds: dict[str, Path], world: str, seed: int
+) -> None:
+    """SUMO's drivers pass each other there, and the net has no room for both."""
+    result = drive(law_worlds[world], "vfn-p", seed=seed, duration=120.0)
+
+    assert result.value("av_involved_collisions") == 0
+
+
+def test_who_stands_close_beside_another_stays_where_its_turn_would_touch_him() -> None:
+    """Of two trucks side by side one turns; that it wants more room than there is beside it is no reason to
+    start."""
+    beside = np.array([[0.0], [2.51], [0.0], [12.0], [2.5]])
+    straight = np.array([[0.0, 1.0, 2.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [12.0] * 3, [2.5] * 3])
+    turn = straight + np.array([[0.0] * 3, [0.0, 0.2, 0.6], [0.0, 0.1, 0.2], [0.0] * 3, [0.0] * 3])
+
+    def starts(way: np.ndarray) -> bool:
+        return not any(inside._comes_to(mine, beside) for mine in (way, way + inside.BESIDE))
+
+    assert starts(straight)
+    assert not starts(turn)
+
+
+def test_who_waits_inside_a_junction_goes_before_those_who_stand_for_somebody_else(
+    law_worlds: dict[str, Path],
+) -> None:
+    """One that has stopped just behind its line is in the way of who has the right of way, and waits for one
+    inside, who waits for him."""
+    result = drive(law_worlds["priority"], "random", seed=200_018, duration=120.0)
+
+    assert result.value("av_trips_completed") > 10, "so many had got away before"
+
+
+def test_it_goes_before_no_av_that_would_brake_hard_for_it(law_worlds: dict[str, Path]) -> None:
+    """SUMO's driver enters 40 m before one that drives 14 m/s, who then brakes with more than 3 m/s2."""
+    result = drive(law_worlds["priority"], "vfn-p", seed=163_012, duration=60.0)
+
+    assert result.value("right_of_way_violations") == 0
 
 
 def test_who_stands_inside_a_junction_stays_for_who_may_come_but_not_for_ever_as_for_who_is_there() -> None:

@@ -154,7 +154,8 @@ class Assistance(Commander):
                 state.has_let = 0.0
             elif lane and (now < state.lets or state.holds):
                 left = sumo.lane.getLength(lane) - get.getLanePosition(name) - STOPS_SHORT
-                state.accel = min(state.accel, -speed * speed / (2.0 * max(left, 0.1)))
+                stops = -speed * speed / (2.0 * max(left, 0.1))
+                state.accel = min(state.accel, max(stops, -COMFORT))
                 state.has_let += self._step * (now < state.lets)
             self._mind_inside(name, lane, speed, state)
             state.wish, state.speed = max(speed + state.accel * self._step, 0.0), speed
@@ -306,8 +307,10 @@ class Assistance(Commander):
                 wanted = get.getLaneChangeState(name, side)[0]
                 if wanted & STRATEGIC and wanted & BLOCKED:
                     # of two that block one another the one that asks first goes first
-                    followers = get.getNeighbors(name, 0 if side > 0 else 1)
-                    self._give([other for other, _ in followers], name)
+                    asked = [other for other, _ in get.getNeighbors(name, 0 if side > 0 else 1)]
+                    if get.getWaitingTime(name) > PATIENCE:  # the nearest may always be too near
+                        asked += [get.getFollower(other, CLOSE)[0] for other in asked]
+                    self._give(asked, name)
 
     def _wait(self, name: str, lane: str, state: Assisted, red: bool) -> None:
         """Before humans it waits for a gap that nobody brakes for; AVs see it, and brake comfortably.

@@ -107,8 +107,10 @@ class Gaps:
         away = road.lanes[own].length - get.getLanePosition(name)
         there = _time(away + SEEN, get.getSpeed(name), GAINS, FASTEST)  # s
         for other, number in self._foes.of(link, name):
+            if road.links[number].rule in STOPS or not comes(other):  # who stops brakes anyway
+                continue
             before, speed = self._before(other, number), get.getSpeed(other)
-            if before is None or before <= 0.0 or speed**2 <= 2.0 * GENTLY * before or not comes(other):
+            if before is None or before <= 0.0 or speed**2 <= 2.0 * GENTLY * before:
                 continue
             if mine is None:
                 mine = self._inside.through(name, into, 0.0)

@@ -190,6 +190,11 @@ class Gaps:
                 return -float(beyond + at)
             beyond += road.lanes[inside].length
         away = float(road.lanes[lane].length - at)
+        while road.lanes[lane].internal:  # `getNextLinks` begins at the end of the lane that it comes out on
+            lane = next(iter(road.lanes[lane].successors), -1)
+            if lane < 0:
+                return None
+            away += road.lanes[lane].length
         for following, _, _, _, via, *_, length in get.getNextLinks(name):
             if via and road.index.get(via, -1) == road.links[number].via:
                 return away

@@ -65,6 +65,47 @@ class LetsGo(Always):
         return {n: d for n, d in found.items() if histories[n].time < self.began + 2.0}
 
 
+class Nears:
+    """Drives a world, and says how far vehicles are from their next line, before them and afterwards."""
+
+    def __init__(self, configuration: Path) -> None:
+        import libsumo
+
+        quiet = ["--no-step-log", "true", "--no-warnings", "true"]
+        libsumo.start(["sumo", "-c", str(configuration), "--seed", "7", *quiet])
+        self._configuration = configuration
+
+    def measure(self, steps: int) -> dict[str, list[tuple[float, float]]]:
+        """[m that `Gaps` says, m that it was] of those who were inside a junction then, and of all others."""
+        import libsumo
+
+        from cosim.simulation.convert import read_road
+        from cosim.simulation.gaps import Gaps
+        from cosim.simulation.inside import Inside
+
+        get, road = libsumo.vehicle, read_road((), self._configuration)
+        gaps = Gaps(road, Inside(road))
+        said: dict[tuple[str, str], list[tuple[str, float, float]]] = {}
+        found: dict[str, list[tuple[float, float]]] = {"inside": [], "before": []}
+        for step in range(steps):
+            libsumo.simulationStep()
+            for name in get.getIDList():
+                lane, odometer = get.getLaneID(name), get.getDistance(name)
+                line = odometer - get.getLanePosition(name)
+                for where, metres, at in said.pop((name, lane), []):
+                    found[where].append((metres, line - at))
+                links = get.getNextLinks(name)
+                if step % 5 or not links or not links[0][4]:
+                    continue
+                via = links[0][4]
+                number = next(k for k, link in enumerate(road.links) if link.via == road.index[via])
+                metres = gaps._before(name, number)
+                assert metres is not None
+                where = "inside" if lane.startswith(":") else "before"
+                said.setdefault((name, via), []).append((where, metres, odometer))
+        return found
+
+
 def crossing_net(folder: Path, road: str) -> str:
     """The name of the net of a minor road that crosses a major one."""
     edges = [EDGE.format(*edge) for edge in (*ROADS[road], *MINOR)]
@@ -177,3 +218,14 @@ def test_a_parked_av_takes_commands_that_do_nothing(start: Start) -> None:
         receipts, _ = worker.call("advance", [Command("av", 20.0, 1, 0.4)])
         reasons |= {receipt.blocked for receipt in receipts}
     assert "not on a lane" in reasons
+
+
+def test_who_comes_is_as_far_from_its_line_as_it_then_drives_also_from_inside_the_junction_before(
+    law_worlds: dict[str, Path],
+) -> None:
+    with Worker(Nears, law_worlds["priority"]) as worker:
+        found = worker.call("measure", 600)
+
+    for where, least in (("inside", 5), ("before", 200)):
+        assert len(found[where]) > least
+        assert max(abs(said - was) for said, was in found[where]) < 1.0

@@ -40,7 +40,7 @@ NOTICE = 150.0  # m: signals and stop lines further ahead are no reason yet
 SERVES = 60.0, 100.0  # m that a lane must serve the route at least, and more for every lane to change back
 LOOKS = 0.4  # s between looks at right of way and blocked lane changes
 GAP = 2.0, 1.0  # m and s: the gap given to who changes lanes
-BESIDE = 1.0  # m more for who has stood for `PATIENCE` and cannot change lanes
+STOOD = 1.0  # m more of it for who has stood for `PATIENCE` and cannot change lanes
 STOPS_SHORT = 0.5  # m before its line
 YIELDING = 2.0, 1.0  # m/s2 and m/s: how hard, and down to what, an AV slows for who asked
 PATIENCE = 10.0  # s
@@ -49,7 +49,7 @@ COMES = 100.0  # m from which they come, however many edges that are
 AT_LINE = 5.0  # m: who is further away stands in a queue
 WAITS = 15.0  # s of waiting at a line; from then on it judges and takes its gap, whatever the agent asks for
 GOES_FIRST = SPEED_MODE[Preset.LAWFUL] - 8  # heeds nobody outside the junction
-GOES_ON = 32  # nor inside: of its own it looks who is in its way
+GOES_ON = 32  # with it, of those inside nobody either: `Inside` looks who is in its way
 HOLDS = 10.0, 2.4  # m before a line, m/s2: from there on it goes before no AV that would brake harder
 LETS = 1.0  # s for which an AV that is asked lets another one in
 # where AVs alone come, and where humans do: SUMO adds a share of 180 s stood, which makes humans brake hard
@@ -432,7 +432,7 @@ class Assistance(Commander):
         room, headway = GAP
         near = max(speed**2 - theirs**2, 0.0) / (2.0 * brakes)  # m
         if get.getWaitingTime(state.gap_for) > PATIENCE:  # the first that can stops for it
-            room, least = room + BESIDE, 0.0
+            room, least = room + STOOD, 0.0
             near += room
         if gap < near:
             return COMFORT  # it is beside, or too near: it goes first, whoever follows it gives way

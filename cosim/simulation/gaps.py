@@ -91,7 +91,8 @@ class Gaps:
 
     def brakes(self, name: str, lane: str, via: str, step: float, comes: Callable[[str], bool]) -> float:
         """m/s2 with which the drivers of those with the right of way would brake at most, if `name` went on
-        from `lane`, on which it nears its line or waits behind it, over the lane `via`.
+        from `lane`, on which it nears its line or waits behind it, over the lane `via`. They stop, so that
+        their gap to it stays what they want, where the lanes meet.
 
         Args:
             lane: as of `take`.
@@ -114,9 +115,10 @@ class Gaps:
                 continue
             if mine is None:
                 mine = self._inside.through(name, into, 0.0)
+                mine[4] += 2.0 * (road.lanes[into].width - mine[4])  # so much wider are lanes than cars
             met = self._meet(mine, other, number)
             if met is not None:
-                gap = max(before + met[1] - there * speed, 0.1)
+                gap = max(before + met[1] - get.getMinGap(other) - there * speed, 0.1)
                 hardest = max(hardest, (speed - get.getStopSpeed(other, speed, gap)) / step)
         return hardest
 

@@ -6,8 +6,9 @@
 The policies drive `dense` from test seed 200,000 on; the same command goes on where it stopped. Episodes in
 `unguarded` that ship (docs/results/episodes) are not driven again. What the way that `lawful` is shorter
 comes from is taken away: the same networks in `unguarded` no faster than the limit (`WithinLimit`), and in
-`lawful` in cars that keep no longer headway before humans (`ShortHeadway`), and whose driver aims above the
-limit too, so that it does not slow down near it (`AimsHigher`). Writes docs/results/lawful_worlds.md.
+`lawful` in cars that keep no longer headway before humans (`ShortHeadway`). How far anybody gets who keeps to
+the limit: `Hurries` and `HurriesCloser`, whom nothing but the limit and the leader holds back. Writes
+docs/results/lawful_worlds.md.
 """
 
 import argparse
@@ -25,23 +26,26 @@ from cosim.report.figures import Row
 from cosim.seeding import FIRST_TEST_SEED
 from cosim.simulation import assistance
 from cosim.simulation.backend import sumo
+from cosim.simulation.fleet import AV_LANE_CHANGE, set_type
 from cosim.types import Decision, History, PolicyContext, Preset
 from cosim.workers.tasks import OK
 from policy import agents
+from policy.agents.idm import ACCEL, Idm
 
 PAGE = Path("docs/results/lawful_worlds.md")
 SHIPPED = Path("docs/results/episodes")
 IDM = "idm"
 WITHIN = "within-limit"  # `WithinLimit`, in `unguarded`
-SHORT, HIGHER = "short-headway", "aims-higher"  # `ShortHeadway`, `AimsHigher`, in `lawful`
-ABOVE = 1.3  # times the limit, that the driver of `AimsHigher` aims at
+SHORT = "short-headway"  # `ShortHeadway`, in `lawful`
+HURRIES, CLOSER = "hurries", "hurries-closer"  # `Hurries`, `HurriesCloser`, in `lawful`
+EMERGENCY = 9.0  # m/s2
 FEWER = 3.0  # how many times fewer hard brakings are asked for
 COLUMNS = (
     "world", "episodes", "crashed", "hard brakings of AVs", "of it in unguarded", "distance of all, m",
     "less what it is in unguarded, m", "the same of AVs, m", "too fast in unguarded",
     "mission", "in unguarded", "interventions", "idm less unguarded, m", "within the limit less unguarded, m",
     "lawful less within the limit, m", "with the short headway less lawful, m",
-    "aiming higher too less lawful, m", "too fast then (worst)", "targets",
+    "in a hurry less unguarded, m", "in a hurry and closer less unguarded, m", "targets",
 )  # fmt: skip
 
 
@@ -86,22 +90,48 @@ class ShortHeadway(Changed):
         assistance.STANDS = assistance.STANDS[:1] * 2
 
 
-class AimsHigher(ShortHeadway):
-    """Nor does its driver slow down as it nears the limit, which an IDM does, and the more the nearer its
-    leader is. Commands lead up to the limit as before, but where SUMO's driver drives by itself the car gets
-    above it, for moments on a road and for longer in a roundabout: the page says by how much."""
+class Hurries(Idm):
+    """SUMO's Krauss driver without imperfections in every AV: as fast as the limit and its leader let it, as
+    close to him as `TIME_GAP` and `STANDSTILL` say, on nobody's behalf but its own."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        take_over = assistance.Assistance._take_over
+    name = "hurries"
+    TIME_GAP, STANDSTILL, DECEL = 0.5, 1.0, 4.5  # s, m, m/s2
 
-        def aims_higher(self: assistance.Assistance, name: str) -> assistance.Assisted:
-            state = take_over(self, name)
-            get = sumo.vehicle
-            get.setSpeedFactor(name, ABOVE * get.getSpeedFactor(name))
-            return state
+    def reset(self, context: PolicyContext) -> None:
+        """A new episode."""
+        super().reset(context)
+        self._changed: set[str] = set()
 
-        assistance.Assistance._take_over = aims_higher  # type: ignore[method-assign]
+    def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
+        """Nobody is commanded; whoever is new gets that driver."""
+        get = sumo.vehicle
+        for av in histories.keys() - self._changed:
+            krauss = f"{get.getTypeID(av).partition('@')[0]}.krauss"
+            if krauss not in sumo.vehicletype.getIDList():
+                sumo.vehicletype.copy("DEFAULT_VEHTYPE", krauss)
+            set_type(av, krauss)
+            get.setImperfection(av, 0.0)
+            get.setTau(av, self.TIME_GAP)
+            get.setMinGap(av, self.STANDSTILL)
+            get.setAccel(av, ACCEL)
+            get.setDecel(av, self.DECEL)
+            get.setEmergencyDecel(av, EMERGENCY)
+            for name, value in AV_LANE_CHANGE.items():
+                get.setParameter(av, name, value)
+        self._changed |= histories.keys()
+        return {}
+
+
+class HurriesCloser(Hurries):
+    """The same, so close that nobody could answer for it."""
+
+    name = "hurries-closer"
+    TIME_GAP, STANDSTILL, DECEL = 0.2, 0.5, 8.0
+
+
+OURS: Mapping[str, type[Changed | Idm]] = {
+    WITHIN: WithinLimit, SHORT: ShortHeadway, HURRIES: Hurries, CLOSER: HurriesCloser,
+}  # fmt: skip
 
 
 def by_seed(folder: Path, policy: str, preset: str) -> dict[str, dict[int, Row]]:
@@ -119,14 +149,10 @@ def by_seed(folder: Path, policy: str, preset: str) -> dict[str, dict[int, Row]]
 Rows = Mapping[int, Row]  # by seed
 
 
-def line(
-    world: str, lawful: Rows, before: Rows, within: Rows, idm: Rows, short: Rows, higher: Rows
-) -> list[str]:
-    """One world's cells, paired by seed; crashes of all count. `before`: in `unguarded`, `within` too."""
-    seeds = sorted(lawful.keys() & before.keys() & within.keys() & idm.keys())
-    now, then, slower, sumos = ([rows[s] for s in seeds] for rows in (lawful, before, within, idm))
-    some = sorted(set(seeds) & short.keys() & higher.keys())
-    again, nearer, faster = ([rows[s] for s in some] for rows in (lawful, short, higher))
+def line(world: str, lawful: Rows, before: Rows, beside: Mapping[str, Rows]) -> list[str]:
+    """One world's cells, paired by seed; crashes of all count. `before`: in `unguarded`."""
+    seeds = sorted(lawful.keys() & before.keys() & beside[WITHIN].keys() & beside[IDM].keys())
+    now, then = ([rows[s] for s in seeds] for rows in (lawful, before))
 
     def column(rows: list[Row], name: str) -> list[float]:
         return [float(row[name]) for row in rows if row.get(name) is not None]
@@ -134,10 +160,12 @@ def line(
     crashed = statistics.share(sum(map(bool, column(now, "crashed"))), len(now))
     hard, hard_before = (float(np.mean(column(rows, "hard_brakings_av"))) for rows in (now, then))
 
-    def further(rows: list[Row], others: list[Row]) -> statistics.Figure:
-        return statistics.paired_mean(column(others, "dt_mean_m"), column(rows, "dt_mean_m"))
+    def further(rows: Rows, others: Rows) -> statistics.Figure:
+        both = [seed for seed in seeds if seed in rows and seed in others]
+        before, after = (column([arm[seed] for seed in both], "dt_mean_m") for arm in (others, rows))
+        return statistics.paired_mean(before, after)
 
-    way = further(now, then)
+    way = further(lawful, before)
     both = [pair for pair in zip(then, now, strict=True) if all(row["dt_av_m"] is not None for row in pair)]
     before_avs, now_avs = (column(list(rows), "dt_av_m") for rows in zip(*both, strict=True))
     of_avs = statistics.paired_mean(before_avs, now_avs)
@@ -165,13 +193,12 @@ def line(
         *(f"{m.text(0, 100.0)} %" if m.known else "-" for m in missions),
         *(
             f"{np.mean(column(now, 'interventions')):.1f}",
-            further(sumos, then).text(1),
-            further(slower, then).text(1),
-            further(now, slower).text(1),
-            further(nearer, again).text(1),
-            further(faster, again).text(1),
-            f"{100.0 * np.mean(column(faster, 'speeding_share')):.1f} %"
-            f" ({max(column(faster, 'worst_speeding_mps')):.1f} m/s)",
+            further(beside[IDM], before).text(1),
+            further(beside[WITHIN], before).text(1),
+            further(lawful, beside[WITHIN]).text(1),
+            further(beside[SHORT], lawful).text(1),
+            further(beside[HURRIES], before).text(1),
+            further(beside[CLOSER], before).text(1),
             "missed: " + ", ".join(missed) if missed else "met",
         ),
     ]
@@ -179,14 +206,14 @@ def line(
 
 def driven(policy: str, preset: str, args: argparse.Namespace) -> dict[str, dict[int, Row]]:
     """World -> seed -> row; what is missing is driven."""
-    episodes = min(args.episodes, args.changed) if policy in (SHORT, HIGHER) else args.episodes
+    episodes = min(args.episodes, args.changed) if policy == SHORT else args.episodes
     seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + episodes)
     shipped = by_seed(SHIPPED, policy, preset)
     if all(shipped.get(world, {}).keys() >= set(seeds) for world in args.worlds):
         return {world: {seed: shipped[world][seed] for seed in seeds} for world in args.worlds}
     out = args.runs / f"{policy}-{preset}"
-    changed = {WITHIN: WithinLimit, SHORT: ShortHeadway, HIGHER: AimsHigher}.get(policy)
-    named = f"{policy}=benchmarks.lawful_worlds:{changed.__name__}" if changed else policy
+    own = OURS.get(policy)
+    named = f"{policy}=benchmarks.lawful_worlds:{own.__name__}" if own else policy
     words = [word for world in args.worlds for word in ("--scenario", world)]
     words += ["--demand", "dense", "--policy", named, "--preset", preset]
     words += ["--seeds", f"{seeds.start}:{seeds.stop}", "--resume", "--workers", args.workers]
@@ -202,7 +229,7 @@ def main() -> None:
     )
     parser.add_argument("--policies", nargs="+", default=["vfn-p"])
     parser.add_argument("--episodes", type=int, default=100)
-    parser.add_argument("--changed", type=int, default=40, help="episodes a world in cars that are changed")
+    parser.add_argument("--changed", type=int, default=40, help="episodes a world in a car that is changed")
     parser.add_argument("--worlds", nargs="+", default=sumo_scenarios.names(), choices=sumo_scenarios.names())
     parser.add_argument("--runs", type=Path, default=Path("runs/lawful"), help="where episodes are kept")
     parser.add_argument("--out", type=Path, default=PAGE)
@@ -218,18 +245,22 @@ def main() -> None:
         "hard brakings at most, the distance of all not below (interval). Rates with Wilson, differences",
         "with bootstrap intervals (95 %). `idm`: SUMO's own driver in every vehicle, up to the limit. Within",
         "the limit: the same networks in `unguarded`, but no command leads above the limit of the lane.",
-        "Short headway: in `lawful`, but the car keeps no longer headway before humans; aiming higher: nor",
-        f"does its driver, an IDM that aims at {ABOVE:g} times the limit, slow down as it nears the limit",
-        f"(both on the first {min(args.episodes, args.changed)} seeds).",
+        "Short headway: in `lawful`, but the car keeps no longer headway before humans (on the first",
+        f"{min(args.episodes, args.changed)} seeds). In a hurry: SUMO's Krauss driver without imperfections",
+        f"in every AV, which accelerates with {ACCEL:g} m/s2 up to the limit and follows its leader",
+        f"{Hurries.TIME_GAP:g} s and {Hurries.STANDSTILL:g} m behind; closer:",
+        f"{HurriesCloser.TIME_GAP:g} s and {HurriesCloser.STANDSTILL:g} m.",
         "",
         "Made by `python -m benchmarks.lawful_worlds`.",
     ]
-    beside = [driven(WITHIN, Preset.UNGUARDED, args)]
-    beside += [driven(name, Preset.LAWFUL, args) for name in (IDM, SHORT, HIGHER)]
+    presets = {WITHIN: Preset.UNGUARDED, **dict.fromkeys((IDM, SHORT, HURRIES, CLOSER), Preset.LAWFUL)}
+    beside = {name: driven(name, preset, args) for name, preset in presets.items()}
     for policy in args.policies:
         lawful, before = (driven(policy, preset, args) for preset in (Preset.LAWFUL, Preset.UNGUARDED))
-        arms = lawful, before, *beside
-        rows = [line(world, *(arm[world] for arm in arms)) for world in sorted(lawful)]
+        rows = [
+            line(world, lawful[world], before[world], {name: arm[world] for name, arm in beside.items()})
+            for world in sorted(lawful)
+        ]
         lines += ["", f"## {policy}", "", markdown_row(COLUMNS), markdown_row(["---"] * len(COLUMNS))]
         lines += map(markdown_row, rows)
     write_page(args.out, lines)

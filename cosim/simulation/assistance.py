@@ -387,9 +387,10 @@ class Assistance(Commander):
 
     def _mind_inside(self, name: str, lane: str, speed: float, state: Assisted) -> None:
         """Who stands inside a junction stays there while somebody is in its way, or may soon be; for longer
-        than `PATIENCE` only while somebody is. Who drives stops before who stands there, for so long before
-        its line."""
-        inside, long = lane.startswith(":"), state.held >= PATIENCE
+        than `PATIENCE` only while somebody is. Who drives stops before who stands there; before its line for
+        so long that he can take his gap first."""
+        inside = lane.startswith(":")
+        long = state.held >= (PATIENCE if inside else PATIENCE + WAITS)
         if inside and speed < STARTS:
             state.stays = state.holds or self._junctions.blocked(name, lane, present=long)
         else:

@@ -190,7 +190,7 @@ def behaviors(place: Place) -> list[list[str]]:
 
 def real_nets(place: Place) -> list[list[str]]:
     """A scenario of another project."""
-    few = ["--duration", "4"] if place.small else []
+    few = ["--duration", "4", "--seeds", "1"] if place.small else []
     anew = ["--runs", str(place.work / "real_nets")]
     return [["benchmarks.real_nets", *few, *anew, "--out", str(place.out / "real_nets.md")]]
 

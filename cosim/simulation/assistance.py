@@ -80,6 +80,7 @@ class Assisted(Controlled):
     lateral: float = 0.0  # m, on its lane
     corrected: float = -math.inf  # s, when the car last drove otherwise
     gap_for: str = ""  # who asked for a gap
+    stopped: float = 0.0  # s, for which it has stood for who did
     gives_way: bool = False  # at the next junction, or in this one
     waited: float = 0.0  # s, to give way
     impatience: float = 0.0
@@ -148,8 +149,11 @@ class Assistance(Commander):
                 target = max(target, min(KEEPS_MOVING, state.limit))
             target = min(target, get.getAllowedSpeed(name))
             state.raw, state.accel = wished_accel(speed, target, state.accel, self._step)
+            if speed >= KEEPS_MOVING:
+                state.stopped = 0.0
             if state.gap_for and not flees:
                 state.accel = min(state.accel, self._yielding(name, speed, state))
+                state.stopped += self._step * (speed < STARTS)
             if inside:
                 state.has_let = 0.0
             elif lane and (now < state.lets or state.holds):
@@ -432,7 +436,8 @@ class Assistance(Commander):
             return COMFORT
         room, headway = GAP
         near = max(speed**2 - theirs**2, 0.0) / (2.0 * brakes)  # m
-        if get.getWaitingTime(state.gap_for) > PATIENCE:  # the first that can stops for it
+        # the first that can stops for who has stood for long, until something else may keep him there
+        if get.getWaitingTime(state.gap_for) > PATIENCE and state.stopped < PATIENCE:
             room, least = room + STOOD, 0.0
             near += room
         if gap < near:

@@ -38,7 +38,6 @@ IDM = "idm"
 WITHIN = "within-limit"  # `WithinLimit`, in `unguarded`
 SHORT = "short-headway"  # `ShortHeadway`, in `lawful`
 HURRIES, CLOSER = "hurries", "hurries-closer"  # `Hurries`, `HurriesCloser`, in `lawful`
-EMERGENCY = 9.0  # m/s2
 FEWER = 3.0  # how many times fewer hard brakings are asked for
 COLUMNS = (
     "world", "episodes", "crashed", "hard brakings of AVs", "of it in unguarded", "distance of all, m",
@@ -94,7 +93,7 @@ class Hurries(Idm):
     """SUMO's Krauss driver without imperfections in every AV: as fast as the limit and its leader let it, as
     close to him as `TIME_GAP` and `STANDSTILL` say, on nobody's behalf but its own."""
 
-    name = "hurries"
+    name = HURRIES
     TIME_GAP, STANDSTILL, DECEL = 0.5, 1.0, 4.5  # s, m, m/s2
 
     def reset(self, context: PolicyContext) -> None:
@@ -115,7 +114,6 @@ class Hurries(Idm):
             get.setMinGap(av, self.STANDSTILL)
             get.setAccel(av, ACCEL)
             get.setDecel(av, self.DECEL)
-            get.setEmergencyDecel(av, EMERGENCY)
             for name, value in AV_LANE_CHANGE.items():
                 get.setParameter(av, name, value)
         self._changed |= histories.keys()
@@ -123,9 +121,9 @@ class Hurries(Idm):
 
 
 class HurriesCloser(Hurries):
-    """The same, so close that nobody could answer for it."""
+    """The same, nearer to its leader than any driver may be."""
 
-    name = "hurries-closer"
+    name = CLOSER
     TIME_GAP, STANDSTILL, DECEL = 0.2, 0.5, 8.0
 
 

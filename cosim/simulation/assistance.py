@@ -80,7 +80,7 @@ class Assisted(Controlled):
     lateral: float = 0.0  # m, on its lane
     corrected: float = -math.inf  # s, when the car last drove otherwise
     gap_for: str = ""  # who asked for a gap
-    stopped: float = 0.0  # s, for which it has stood for who did
+    stopped: float = 0.0  # s, for which it has stood while somebody asked for one
     gives_way: bool = False  # at the next junction, or in this one
     waited: float = 0.0  # s, to give way
     impatience: float = 0.0
@@ -436,7 +436,7 @@ class Assistance(Commander):
             return COMFORT
         room, headway = GAP
         near = max(speed**2 - theirs**2, 0.0) / (2.0 * brakes)  # m
-        # the first that can stops for who has stood for long, until something else may keep him there
+        # the first that can stops for who has stood for long, but not for ever: other things may keep him
         if get.getWaitingTime(state.gap_for) > PATIENCE and state.stopped < PATIENCE:
             room, least = room + STOOD, 0.0
             near += room

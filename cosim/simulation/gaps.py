@@ -91,8 +91,8 @@ class Gaps:
 
     def brakes(self, name: str, lane: str, via: str, step: float, comes: Callable[[str], bool]) -> float:
         """m/s2 with which the drivers of those with the right of way would brake at most, if `name` went on
-        from `lane`, on which it nears its line or waits behind it, over the lane `via`. They stop, so that
-        their gap to it stays what they want, where the lanes meet.
+        from `lane`, on which it nears its line or waits behind it, over the lane `via`. SUMO's
+        drivers stop their `minGap` before the place where the lanes meet.
 
         Args:
             lane: as of `take`.
@@ -115,7 +115,7 @@ class Gaps:
                 continue
             if mine is None:
                 mine = self._inside.through(name, into, 0.0)
-                mine[4] += 2.0 * (road.lanes[into].width - mine[4])  # so much wider are lanes than cars
+                mine[4] += 2.0 * (road.lanes[into].width - mine[4])  # both as wide as the lanes
             met = self._meet(mine, other, number)
             if met is not None:
                 gap = max(before + met[1] - get.getMinGap(other) - there * speed, 0.1)

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.foresight import shaded
-from benchmarks.learned import asked, drivers, options, share
+from benchmarks.learned import asked, drivers, driving, options, share
 from benchmarks.papers.agents import Agent, build
 from benchmarks.tables import markdown_row, write_page
 from cosim.cli.main import main as cosim
@@ -185,8 +185,8 @@ def main() -> None:
     arms = [ARMS[0], *arms] if args.weights else arms
     words = [word for world in args.worlds for word in ("--scenario", world)]
     words += [word for arm in arms for word in ("--policy", f"{_label(arm)}=benchmarks.alone:{arm}")]
-    words += ["--demand", args.demand, "--seeds", seeds, "--svo", str(SVO), "--preset", "unguarded"]
-    code = cosim(["evaluate", *words, "--workers", args.workers, "--resume", "--out", str(args.runs)])
+    words += [*driving(args), "--svo", str(SVO), "--preset", "unguarded"]
+    code = cosim(["evaluate", *words, "--out", str(args.runs)])
     if code:
         raise SystemExit(code)
     rows = [row for row in run_folder.read(args.runs).rows if row["status"] == OK]

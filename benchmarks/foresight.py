@@ -24,7 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.learned import asked, drivers, of, options, share
+from benchmarks.learned import asked, drivers, driving, of, options, share
 from benchmarks.tables import markdown_row, write_page
 from benchmarks.turn import resampled
 from benchmarks.worlds import WITH_MISSION
@@ -174,9 +174,8 @@ def drive(arms: Sequence[str], worlds: Sequence[str], out: Path, args: argparse.
     """The rows of these arms in these worlds; what is in `out` is not driven again."""
     words = [word for world in worlds for word in ("--scenario", world)]
     words += [word for arm in arms for word in ("--policy", arm)]
-    words += ["--demand", args.demand, "--behavior", BEHAVIOR, "--errors", LEVEL, "--svo", str(SVO)]
-    words += ["--seeds", f"{args.seeds_from}:{args.seeds_from + args.episodes}", "--no-report"]
-    if code := cosim(["evaluate", *words, "--workers", args.workers, "--resume", "--out", str(out)]):
+    words += [*driving(args), "--behavior", BEHAVIOR, "--errors", LEVEL, "--svo", str(SVO)]
+    if code := cosim(["evaluate", *words, "--no-report", "--out", str(out)]):
         raise SystemExit(code)
     return [row for row in run_folder.read(out).rows if row["status"] == OK]
 

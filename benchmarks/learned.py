@@ -131,12 +131,16 @@ def options(parser: argparse.ArgumentParser, name: str, demand: str, worlds: Seq
     parser.add_argument("--demand", default=demand)
     parser.add_argument("--worlds", nargs="+", default=list(worlds), choices=worlds)
     parser.add_argument("--seeds-from", type=int, default=FIRST_TEST_SEED)
+    parser.add_argument("--duration", metavar="S", help="counted s an episode; default: the worlds' own")
     parser.add_argument("--runs", type=Path, default=Path("runs", name), help="where episodes are kept")
     parser.add_argument("--workers", default="2")
     parser.add_argument("--out", type=Path, default=Path("docs/results", f"{name}.md"))
 
 
-ASKED = ("episodes", "demand", "errors", "worlds", "seeds_from", "others", "arms", "weights", "halves")
+ASKED = (
+    *("episodes", "demand", "errors", "worlds", "seeds_from", "duration"),
+    *("others", "arms", "weights", "halves"),
+)
 
 
 def asked(parser: argparse.ArgumentParser, args: argparse.Namespace) -> str:
@@ -148,6 +152,13 @@ def asked(parser: argparse.ArgumentParser, args: argparse.Namespace) -> str:
             text = " ".join(value) if isinstance(value, list) else value
             words.append(f" --{name.replace('_', '-')} {text}")
     return "".join(words)
+
+
+def driving(args: argparse.Namespace) -> list[str]:
+    """What `cosim evaluate` is told of `options`, but for the worlds and the place of the episodes."""
+    words = ["--demand", args.demand, "--seeds", f"{args.seeds_from}:{args.seeds_from + args.episodes}"]
+    words += ["--duration", args.duration] if args.duration else []
+    return [*words, "--workers", args.workers, "--resume"]
 
 
 def main() -> None:
@@ -163,14 +174,13 @@ def main() -> None:
     seeds = f"{args.seeds_from}:{args.seeds_from + args.episodes}"
     where = [word for world in args.worlds for word in ("--scenario", world)]
     where += [word for level in args.errors for word in ("--errors", level)]
-    which = ["--demand", args.demand, "--seeds", seeds, "--workers", args.workers, "--resume"]
     for part, policies, phi in (
         (MINE, [args.policy], ("0", str(SVO))),
         (THEIRS, args.others, (str(SVO),)),
     ):
         words = [word for policy in policies for word in ("--policy", policy)]
         words += [word for degrees in phi for word in ("--svo", degrees)]
-        code = cosim(["evaluate", *where, *words, *which, "--out", str(args.runs / part)])
+        code = cosim(["evaluate", *where, *words, *driving(args), "--out", str(args.runs / part)])
         if code:
             raise SystemExit(code)
     rows = run_folder.read(args.runs / MINE).rows

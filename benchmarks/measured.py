@@ -30,6 +30,7 @@ PREDICTED = (  # what `cosim bench predict` leaves of figures
 
 
 USES = ("attribution.md", "attribution.png", "attribution.csv", "closed_loop.csv")
+SHORT = ["--duration", "4", "--workers", "1"]  # of episodes, in small
 
 
 @dataclass(frozen=True)
@@ -104,14 +105,14 @@ def startup(place: Place) -> list[list[str]]:
 def reward_balance(place: Place) -> list[list[str]]:
     """Whether yielding pays."""
     flags = ["--seeds", "150100:150101" if place.small else "150100:150120"]
-    flags += ["--scenario", "merge"] if place.small else []
+    flags += ["--scenario", "merge", *SHORT] if place.small else []
     return [["benchmarks.reward_balance", *flags, "--out", str(place.out / "reward_balance.md")]]
 
 
 def reward_by_driving(place: Place) -> list[list[str]]:
     """What each way of driving earns."""
     flags = ["--ways", "--workers", "2", "--seeds", "150100:150101" if place.small else "150100:150106"]
-    flags += ["--scenario", "merge"] if place.small else []
+    flags += ["--scenario", "merge", *SHORT] if place.small else []
     return [["benchmarks.reward_balance", *flags, "--out", str(place.out / "reward_by_driving.md")]]
 
 
@@ -125,7 +126,7 @@ def attribution(place: Place) -> list[list[str]]:
         "150000:150001" if place.small else "150000:150006",
     ]
     others = ["--policy", "vfn-demonstrated", "--policy", "vfn-p-egoistic"]
-    flags += ["--duration", "2"] if place.small else others
+    flags += SHORT if place.small else others
     return [["cosim.cli.main", "bench", "attribution", *flags, "--out", str(place.work / "attribution")]]
 
 
@@ -135,7 +136,7 @@ def uses(place: Place) -> list[list[str]]:
     flags = ["--policy", LEARNED, "--demand", "contested", "--svo", "60", "--workers", "2", "--closed-loop"]
     flags += [word for world in worlds for word in ("--scenario", world)]
     flags += ["--replace", "all maps", "--replace", "map branch"]
-    flags += ["--seeds", "200000:200001", "--duration", "2"] if place.small else ["--seeds", "200000:200020"]
+    flags += ["--seeds", "200000:200001", *SHORT] if place.small else ["--seeds", "200000:200020"]
     return [["cosim.cli.main", "bench", "attribution", *flags, "--out", str(place.out / "uses")]]
 
 
@@ -150,20 +151,19 @@ def action_values(place: Place) -> list[list[str]]:
 def turn(place: Place) -> list[list[str]]:
     """At which phi it begins to yield."""
     flags = ["--worlds", "merge", "--episodes", "1"] if place.small else ["--episodes", "20"]
-    flags += ["--rows", str(place.out / "data" / "turn.csv"), "--workers", "2"]
+    flags += ["--rows", str(place.out / "data" / "turn.csv"), *(SHORT if place.small else [])]
     return [["benchmarks.turn", *flags, "--out", str(place.out / "turn.md")]]
 
 
 def seeing(place: Place) -> list[list[str]]:
     """What the frame encoder reads off a map."""
-    return [
-        ["benchmarks.seeing", "--drives", "1" if place.small else "4", "--out", str(place.out / "seeing.md")]
-    ]
+    flags = ["--drives", "1", "--worlds", "merge"] if place.small else ["--drives", "4"]
+    return [["benchmarks.seeing", *flags, "--out", str(place.out / "seeing.md")]]
 
 
 def learned(place: Place) -> list[list[str]]:
     """What the network that learned from rewards alone does."""
-    flags = ["--errors", "none", *(["--worlds", "merge", "--episodes", "1"] if place.small else [])]
+    flags = ["--errors", "none", *(["--worlds", "merge", "--episodes", "1", *SHORT] if place.small else [])]
     flags += ["--runs", str(place.work / "learned_runs")]
     return [["benchmarks.learned", LEARNED, *flags, "--out", str(place.out / "learned.md")]]
 
@@ -171,13 +171,14 @@ def learned(place: Place) -> list[list[str]]:
 def alone(place: Place) -> list[list[str]]:
     """What networks drive into without the mask."""
     flags = ["--episodes", "1" if place.small else "20", "--runs", str(place.work / "alone_runs")]
-    flags += ["--worlds", "merge"] if place.small else []
+    flags += ["--worlds", "merge", *SHORT] if place.small else []
     return [["benchmarks.alone", *flags, "--out", str(place.out / "alone.md")]]
 
 
 def foresight(place: Place) -> list[list[str]]:
     """What prediction is worth where humans err."""
-    flags = ["--worlds", "merge", "--episodes", "1"] if place.small else ["--halves", "exit", "intersection"]
+    few = ["--worlds", "merge", "--episodes", "1", *SHORT]
+    flags = few if place.small else ["--halves", "exit", "intersection"]
     kept = ["--runs", str(place.work / "foresight_runs"), "--out", str(place.out / "foresight.md")]
     return [["benchmarks.foresight", *flags, *kept]]
 
@@ -190,9 +191,9 @@ def behaviors(place: Place) -> list[list[str]]:
 
 def real_nets(place: Place) -> list[list[str]]:
     """A scenario of another project."""
-    few = ["--duration", "4", "--seeds", "1"] if place.small else []
-    anew = ["--runs", str(place.work / "real_nets")]
-    return [["benchmarks.real_nets", *few, *anew, "--out", str(place.out / "real_nets.md")]]
+    flags = ["--runs", str(place.work / "real_nets"), "--out", str(place.out / "real_nets.md")]
+    few = ["--nets", "A10KW", "DRT", "fkk_in", "rail", "--duration", "4", "--seeds", "1"]
+    return [["benchmarks.real_nets", *flags, *(few if place.small else [])]]
 
 
 def joining(place: Place) -> list[list[str]]:
@@ -226,7 +227,7 @@ def law_stress(place: Place) -> list[list[str]]:
 
 def lawful_worlds(place: Place) -> list[list[str]]:
     """Our worlds in preset lawful."""
-    flags = ["--worlds", "merge", "--episodes", "1"] if place.small else []
+    flags = ["--worlds", "merge", "--episodes", "1", *SHORT] if place.small else []
     kept = ["--runs", str(place.work / "lawful_runs"), "--out", str(place.out / "lawful_worlds.md")]
     return [["benchmarks.lawful_worlds", *flags, *kept]]
 

@@ -1,7 +1,7 @@
 """Nets that none of us wrote, driven as they stand: those of the eclipse-sumo package.
 
-    python -m benchmarks.real_nets [--duration S] [--seeds N] [--workers N] [--runs FOLDER] [--held]
-                                   [--out docs/results/real_nets.md]
+    python -m benchmarks.real_nets [--duration S] [--seeds N] [--nets NAME ...] [--workers N] [--runs FOLDER]
+                                   [--held] [--out docs/results/real_nets.md]
 
 Drives A10KW, a motorway interchange, to its end with SUMO's driver and with the agent, and every other
 configuration of eclipse-sumo's games that loads; lists every collision with an explanation, the overlaps that
@@ -592,6 +592,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--duration", type=float, metavar="S", help="default: to each scenario's end")
     parser.add_argument("--seeds", type=int, metavar="N", help=f"at most; default: {SEEDS}")
+    parser.add_argument("--nets", nargs="+", metavar="NAME", help="these alone: A10KW, grid6 ...")
     parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes (1)")
     parser.add_argument("--runs", type=Path, default=KEPT, metavar="FOLDER")
     parser.add_argument(
@@ -602,6 +603,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given = {"duration": args.duration, "seeds": args.seeds}
     limit = "".join(f" --{name} {value:g}" for name, value in given.items() if value is not None)
     runs = list(wanted(args.seeds, args.duration))
+    if args.nets:
+        limit += f" --nets {' '.join(args.nets)}"
+        known = {run.config.stem for run in runs}
+        if unknown := set(args.nets) - known:
+            parser.error(f"--nets: {', '.join(sorted(unknown))}: none of {', '.join(sorted(known))}")
+        runs = [run for run in runs if run.config.stem in args.nets]
     with ThreadPoolExecutor(args.workers) as pool:
         found = list(pool.map(lambda run: drive(run, args.runs, args.held), runs))
     write_page(args.out, page(runs, found, f"python -m benchmarks.real_nets{limit}"))

@@ -134,15 +134,17 @@ def driven(
     return spread(LocalEngine(Paid, workers=workers), tasks, "rewards")
 
 
-def case_of(policy: str, world: str, demand: str, svo_deg: float) -> EpisodeId:
-    """Any seed of it."""
-    return Order(Agent(policy), world, demand, DEMANDS[demand], 1, svo_deg).case
+def case_of(policy: str, world: str, demand: str, svo_deg: float, duration: float | None) -> EpisodeId:
+    """Any seed of it; `duration`: counted s, None: the world's own."""
+    return replace(Order(Agent(policy), world, demand, DEMANDS[demand], 1, svo_deg).case, duration=duration)
 
 
-def balance(worlds: Sequence[str], seeds: range, command: str, workers: int) -> list[str]:
+def balance(
+    worlds: Sequence[str], seeds: range, command: str, workers: int, duration: float | None
+) -> list[str]:
     """The altruist's gain, paired, as a share of what the egoist earns."""
     cells = [
-        case_of("demonstrator", world, "contested", phi)
+        case_of("demonstrator", world, "contested", phi, duration)
         for world in worlds
         for phi in (0.0, DEMONSTRATED_PHI)
     ]
@@ -177,10 +179,12 @@ def balance(worlds: Sequence[str], seeds: range, command: str, workers: int) -> 
     return [*lines, "| *mission vehicles served, egoist to altruist* | " + " | ".join(served) + " |"]
 
 
-def by_way(worlds: Sequence[str], seeds: range, command: str, workers: int) -> list[str]:
+def by_way(
+    worlds: Sequence[str], seeds: range, command: str, workers: int, duration: float | None
+) -> list[str]:
     """Mean reward of every way of driving under every reward, and whether the wanted way earns most."""
     keys = list(itertools.product(WAYS, worlds, DEMANDS))
-    cells = [replace(case_of(*key, PHI), preset=Preset.LAWFUL) for key in keys]
+    cells = [replace(case_of(*key, PHI, duration), preset=Preset.LAWFUL) for key in keys]
     cases = [cell.with_seed(seed) for cell in cells for seed in seeds]
     found = driven(cases, LEARNED, PHI, workers)
     drives = {key: found[k * len(seeds) : (k + 1) * len(seeds)] for k, key in enumerate(keys)}
@@ -236,15 +240,18 @@ def main() -> None:
     parser.add_argument("--ways", action="store_true", help="what each way of driving earns")
     parser.add_argument("--seeds", metavar="A:B", help="default 150100:150120; --ways: 150100:150106")
     parser.add_argument("--scenario", action="append", default=[])
+    parser.add_argument("--duration", type=float, metavar="S", help="counted s an episode; the worlds' own")
     parser.add_argument("--workers", type=int, default=1, metavar="N")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     seeds = args.seeds or ("150100:150106" if args.ways else "150100:150120")
     worlds = args.scenario or list(WORLDS if args.ways else WITH_MISSION)
     flags = "".join(f" --scenario {w}" for w in args.scenario)
+    flags += "" if args.duration is None else f" --duration {args.duration:g}"
     command = f"python -m benchmarks.reward_balance{' --ways' if args.ways else ''} --seeds {seeds}{flags}"
     make_page = by_way if args.ways else balance
-    text = "\n".join(make_page(worlds, range(*map(int, seeds.split(":"))), command, args.workers)).rstrip()
+    wanted = range(*map(int, seeds.split(":")))
+    text = "\n".join(make_page(worlds, wanted, command, args.workers, args.duration)).rstrip()
     if args.out:
         args.out.write_text(text + "\n")
     else:

@@ -1,6 +1,7 @@
 """What the frame encoder reads off a velocity map, on drives that it has never seen.
 
-    python -m benchmarks.seeing [--drives N] [--workers N] [--weights FILE] [--out docs/results/seeing.md]
+    python -m benchmarks.seeing [--drives N] [--worlds NAME ...] [--workers N] [--weights FILE]
+                                [--out docs/results/seeing.md]
 
 R2 of every reading, by world, from the map alone: 1 is all, 0 no more than the mean. Perceived frames and
 frames that were predicted (the HPN's hypotheses, up to 4 s ahead) apart.
@@ -67,17 +68,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Drive, read, write the page."""
     parser = argparse.ArgumentParser(description="What the frame encoder reads off a velocity map.")
     parser.add_argument("--drives", type=int, default=6, metavar="N", help="of every demand (6)")
+    parser.add_argument("--worlds", nargs="+", default=list(names()), choices=names(), metavar="NAME")
     parser.add_argument("--workers", type=int, default=1, metavar="N")
     parser.add_argument("--weights", type=Path, default=SHIPPED / "encoder.safetensors", metavar="FILE")
     parser.add_argument("--out", type=Path, default=Path("docs/results/seeing.md"), metavar="FILE")
     args = parser.parse_args(arguments)
-    file, worlds = configuration("compact").file, list(names())
+    file = configuration("compact").file
     try:
         network = sight.load(args.weights, file.encoder)
         seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + args.drives)
-        found = gather(agent_config("vfn-p", file), file.sight, worlds, seeds, args.workers, "drives")
-        command = f"python -m benchmarks.seeing --drives {args.drives}"
-        write_page(args.out, page(found, sight.read_all(network, found.maps), worlds, args.drives, command))
+        found = gather(agent_config("vfn-p", file), file.sight, args.worlds, seeds, args.workers, "drives")
+        some = "" if args.worlds == list(names()) else f" --worlds {' '.join(args.worlds)}"
+        command = f"python -m benchmarks.seeing --drives {args.drives}{some}"
+        readings = sight.read_all(network, found.maps)
+        write_page(args.out, page(found, readings, args.worlds, args.drives, command))
     except CosimError as error:
         print(f"seeing: {error}", file=sys.stderr)
         return error.exit_code

@@ -256,6 +256,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=seeds_of, help="in place of --episodes of the test seeds")
     parser.add_argument("--worlds", nargs="+", default=list(WITH_MISSION), choices=WITH_MISSION)
     parser.add_argument("--errors", default=NONE, help="of human drivers: none, field, stress or a file")
+    parser.add_argument("--duration", type=float, help="counted s an episode; default: the worlds' own")
     parser.add_argument("--rows", type=Path, help="default docs/results/data/turn.csv")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--out", type=Path, help="default docs/results/turn.md, or turn_stress.md")
@@ -265,10 +266,13 @@ def main() -> None:
     seeds = args.seeds or range(FIRST_TEST_SEED, FIRST_TEST_SEED + args.episodes)
     asked = f"--seeds {seeds.start}:{seeds.stop}" if args.seeds else f"--episodes {args.episodes}"
     asked += "" if args.errors == NONE else f" --errors {args.errors}"
+    asked += "" if args.duration is None else f" --duration {args.duration:g}"
     policy, weights = read_name(args.policy).text, weights_of(args.policy)
     done = {k: d for k, d in read(kept).items() if d.policy != policy or d.weights == weights}
     for world in args.worlds:
-        plan = partial(planned, [world], [DEMAND], [], [policy], seeds, errors=args.errors)
+        plan = partial(
+            planned, [world], [DEMAND], [], [policy], seeds, duration=args.duration, errors=args.errors
+        )
         cases = [
             case
             for phi in PHIS

@@ -20,7 +20,7 @@ from cosim.policies import make
 from cosim.report.statistics import holm, mean, paired_mean, paired_share, share, signed_rank
 from cosim.scenario.episode_id import EpisodeId
 from cosim.workers.engines import LocalEngine
-from cosim.workers.tasks import Progress
+from cosim.workers.tasks import Progress, Task
 from policy.agents.oracle import Oracle
 from policy.agents.prediction_aware import PredictionAware
 from policy.attribution import ORACLE, SUMS, Questioned, Replaced, replacements
@@ -71,16 +71,23 @@ class Asking(EpisodeRunner):
 class Replacing(EpisodeRunner):
     """Hosted by an engine's worker: drives by what the network answers with one input replaced."""
 
-    def __init__(self, what: tuple[str, str] | None) -> None:
-        super().__init__()
-        self._what = what
+    _what: tuple[str, str] = NOTHING
+
+    def run(  # type: ignore[override]
+        self, case: EpisodeId, warnings: tuple[str, ...], what: tuple[str, str], progress: Progress
+    ) -> dict[str, Any]:
+        """One episode with `what` replaced; the document of `cosim run --json`."""
+        if what != self._what:
+            self.close()  # the host of the same cell, whose agent has another input replaced
+            self._what = what
+        return super().run(case, warnings, None, progress)
 
     def policy(self, case: EpisodeId) -> PredictionAware:
         """The policy of `case`, with that input replaced."""
         agent = questioned(case.policy)
         if self._what == ORACLE:
             return Oracle(agent.name, agent.config)
-        return Replaced(agent.name, agent.config, self._what)
+        return Replaced(agent.name, agent.config, None if self._what == NOTHING else self._what)
 
 
 def attribution(
@@ -137,20 +144,22 @@ def _ways(agent: PredictionAware) -> list[tuple[str, str]]:
 
 
 def closed(plan: Plan, workers: int = 1, replaced: Sequence[str] = ()) -> Iterator[list[dict[str, Any]]]:
-    """Per policy, world and replacement (none first; of `replaced` inputs alone, where some are named): a row
-    per episode, SHARED and FIGURES."""
+    """Per policy and world: a row per replacement (none first; of `replaced` inputs alone, where some are
+    named) and episode, SHARED and FIGURES."""
+    keys = ("policy", "scenario", "seed", *SHARED, *FIGURES)
     for cell in plan.cells:
-        agent = questioned(cell.case.policy)
-        tasks = [one.task(case) for one, case in plan.cases() if one is cell]
-        asked = [what for what in _ways(agent) if not replaced or what[0] in replaced]
-        for what in (NOTHING, *asked):
-            engine = LocalEngine(Replacing, (None if what is NOTHING else what,), workers=workers)
-            driven = spread(engine, tasks, f"{cell.case.what}: {' '.join(what).strip()}")
-            keys = ("policy", "scenario", "seed", *SHARED, *FIGURES)
-            yield [
-                dict(zip(("input", "replacement"), what, strict=True)) | {key: episode[key] for key in keys}
-                for episode in driven
-            ]
+        cases = [case for one, case in plan.cases() if one is cell]
+        asked = [what for what in _ways(questioned(cell.case.policy)) if not replaced or what[0] in replaced]
+        arms = [(what, case) for what in (NOTHING, *asked) for case in cases]
+        tasks = [
+            Task(f"{case.key} {' '.join(what)}", " ".join(what), (case, cell.scenario.warnings, what))
+            for what, case in arms
+        ]
+        driven = spread(LocalEngine(Replacing, workers=workers), tasks, f"{cell.case.what}, inputs replaced")
+        yield [
+            dict(zip(("input", "replacement"), what, strict=True)) | {key: episode[key] for key in keys}
+            for (what, _), episode in zip(arms, driven, strict=True)
+        ]
 
 
 def closed_markdown(rows: Sequence[Mapping[str, Any]], by: str = BY) -> str:

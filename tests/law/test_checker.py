@@ -345,7 +345,7 @@ def test_where_sumo_drives_nobody_passes_on_red_or_through_a_stop_sign(
 ) -> None:
     episodes = cases(law_worlds, ["idm"], (0.2, 1.0), range(FIRST, FIRST + 1), Preset.LAWFUL)
 
-    rows = driven(episodes, 2, None, None)
+    rows = driven(episodes, 1, None, None)
 
     assert {row["world"] for row in rows} == set(NAMES)
     for row in rows:
@@ -363,7 +363,7 @@ def keep_lane(worlds: dict[str, Path], names: Sequence[str], seeds: int) -> list
 
 
 def test_on_keep_lane_the_checker_counts_what_the_figures_count(law_worlds: dict[str, Path]) -> None:
-    rows = driven(keep_lane(law_worlds, NAMES, 2), 2, None, None)
+    rows = driven(keep_lane(law_worlds, NAMES, 1), 1, None, None)
 
     law = {
         name: sum(row["law"][name] for row in rows)

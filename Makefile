@@ -2,6 +2,8 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
+# Uncompiled: Python compiles what is imported, once; compiling all of every package takes a minute longer.
+PIP = $(BIN)/pip install --quiet --no-compile -c constraints.txt
 RUN ?= runs/demo
 SCALE ?= 1
 WORKERS ?= 2
@@ -66,12 +68,12 @@ nets: $(VENV)/.installed-dev
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet -c constraints.txt torch
-	$(BIN)/pip install --quiet -c constraints.txt -e .
+	$(PIP) torch
+	$(PIP) -e .
 	touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed
-	$(BIN)/pip install --quiet -c constraints.txt -e '.[dev]'
+	$(PIP) -e '.[dev]'
 	touch $@
 
 # The container: docker/build.sh says what it needs, with a Docker engine or without (docs/container.md).

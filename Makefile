@@ -12,14 +12,16 @@ PROCESSES ?= 2
 # A file's tests stay in one process, in the order of the folders: the longest files come first. A core each: no threads.
 PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(PROCESSES) --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test quick unit check kernels nets results pages results-small audit image smoke clean
+.PHONY: demo test quick pytest unit check kernels nets results pages results-small audit image smoke clean
 
 demo: $(VENV)/.installed
 	$(BIN)/cosim run merge --demand contested --policy vfn-p --out $(RUN)
 
-# Lint and kernels side by side, so that the tests' processes do not compile the same ones at once.
 test: $(VENV)/.installed-dev
-	$(MAKE) --no-print-directory -j 2 check kernels
+	$(MAKE) --no-print-directory -j 2 check pytest
+
+# Kernels first, so that the tests' processes do not compile the same ones at once.
+pytest: kernels
 	$(PYTEST)
 
 # What a developer wants to know after every change: lint, and the tests that neither train nor need SUMO.

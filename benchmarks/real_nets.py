@@ -83,6 +83,11 @@ LAW = {
     "interventions": "interventions",
 }
 LOOKED_AT = {  # (net, collider, victim) -> what the pictures show
+    ("A10KW", "veh200", "veh194"): (
+        "SUMO's drivers': two ways through the junction begin in one lane; on the right one a car stands at"
+        " the end of the queue before the next signal, with 2 m of its tail still in the junction, and the"
+        " other passes it on the left one and touches that tail at 3.9 m/s"
+    ),
     ("fkk_in", "1_horizontal.0", "2_left.0"): (
         "the net's: the car stands where `:gneJ21_12_0` ends, the place inside the junction at which the net"
         " lets it wait, and its front reaches into the way of the lorry, a stiff box of 16 m that turns past"

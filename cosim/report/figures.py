@@ -78,19 +78,21 @@ RATES: dict[str, Measure] = {
 
 CRASHES = "crash_rate_per_million_km"
 # Events per distance and per vehicle time: all of them over all of it (docs/definitions.md, Near-misses).
-INCIDENCES: dict[str, Measure] = {
+CRASH_RATES: dict[str, Measure] = {
     name: Measure(name, column, f"per million {km}", "lower", per=per, scale=1e6, more=more)
     for name, column, more, km, per in (
         (CRASHES, "av_involved_collisions", (), "AV-km", "av_km"),
         (f"av_caused_{CRASHES}", "av_caused_collisions", (), "AV-km", "av_km"),
         (f"all_{CRASHES}", "av_involved_collisions", ("hv_hv_collisions",), "vehicle-km", "vehicle_km"),
     )
-} | {
+}
+NEAR_MISS_RATES: dict[str, Measure] = {
     name: Measure(name, f"{who}near_misses_{kind}", f"per {hour}", "lower", per=hours)
     for who, hour, hours in (("av_", "AV-hour", "av_hours"), ("", "vehicle-hour", "vehicle_hours"))
     for kind in ("ttc", "drac", "pet")
     for name in (f"{who}near_misses_{kind}_per_{hour.lower().replace('-', '_')}",)
 }
+INCIDENCES = CRASH_RATES | NEAR_MISS_RATES
 
 HEADLINE = tuple(filter(None, FIRST.values()))  # what reports and comparisons show first
 

@@ -11,7 +11,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from cosim.files import cannot, whole
 from cosim.report import wording
-from cosim.report.figures import HEADLINE, INCIDENCES, Row
+from cosim.report.figures import CRASH_RATES, HEADLINE, NEAR_MISS_RATES, Row
 from cosim.report.html import tables
 from cosim.report.html.blocks import Block, Difference, blocks
 from cosim.report.html.plots import plots
@@ -60,7 +60,9 @@ def html(run: Run, shown: str | None = None) -> str:
     )
     found = blocks(run)
     differences = [block.differences(COMPARED) for block in found]
-    closer = [block.differences(INCIDENCES) for block in found]
+    crashes, closer = (
+        [block.differences(which) for block in found] for which in (CRASH_RATES, NEAR_MISS_RATES)
+    )
     folder = str(run.path) if shown is None else shown
     wrong = [row for row in run.rows if row["status"] != OK]
     return environment.get_template("page.html").render(
@@ -70,8 +72,11 @@ def html(run: Run, shown: str | None = None) -> str:
         shown=FINDINGS,
         figures=tables.figures(found, run.measures) if found else None,
         law=tables.law(found, run.measures),
-        near_misses=tables.near_misses(found, run.measures),
-        sections=[_section(b, differences[k], closer[k], k < PLOTTED) for k, b in enumerate(found)],
+        crashes=tables.incidences(found, run.measures, CRASH_RATES),
+        near_misses=tables.incidences(found, run.measures, NEAR_MISS_RATES),
+        sections=[
+            _section(b, differences[k], crashes[k], closer[k], k < PLOTTED) for k, b in enumerate(found)
+        ],
         plotted=PLOTTED,
         worst=[
             {
@@ -153,7 +158,11 @@ def _findings(found: Sequence[Block], differences: Sequence[list[Difference]]) -
 
 
 def _section(
-    block: Block, differences: list[Difference], closer: list[Difference], draw: bool
+    block: Block,
+    differences: list[Difference],
+    crashes: list[Difference],
+    closer: list[Difference],
+    draw: bool,
 ) -> dict[str, Any]:
     return {
         "title": wording.group(block.identity),
@@ -161,6 +170,7 @@ def _section(
         "drawn": draw,
         "ok": sum(len(s.ok) for s in block.series),
         "differences": tables.differences(differences),
+        "crashes": tables.differences([d for d in crashes if any(f.n for f in d.figures.values())]),
         "near_misses": tables.differences([d for d in closer if any(f.n for f in d.figures.values())]),
         "everything": tables.everything(block),
     }

@@ -1,13 +1,13 @@
 """The tables of the report, as plain cells: what is written, what it is sorted by, what is said beside it."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from cosim.report import wording
 from cosim.report.compare import PairedFigure
-from cosim.report.figures import HEADLINE, INCIDENCES, Measure
+from cosim.report.figures import CRASH_RATES, HEADLINE, NEAR_MISS_RATES, Measure
 from cosim.report.html.blocks import Block, Difference, Series
 from cosim.report.result import LAW, NEAR_MISSES
 from cosim.report.statistics import CONFIDENCE, Figure
@@ -34,10 +34,11 @@ TITLES = {
     "veto_rate": "vetoes",
     **LAW,
     "av_trips_completed": "AV trips completed",
+    **dict(zip(CRASH_RATES, ("with an AV", "AV-caused", "all crashes"), strict=True)),
     **{
-        m.name: f"{what}, {'AVs' if m.per == 'av_hours' else 'all'}"
+        m.name: what
         for kind, what in NEAR_MISSES.items()
-        for m in INCIDENCES.values()
+        for m in NEAR_MISS_RATES.values()
         if m.column.endswith(kind)
     },
 }
@@ -96,10 +97,12 @@ def law(blocks: Sequence[Block], known: dict[str, Measure]) -> Table | None:
     return Table(["policy", *(head(known[n]) for n in (*names, *more))], rows, [])
 
 
-def near_misses(blocks: Sequence[Block], known: dict[str, Measure]) -> Table | None:
-    """One row per cell with its near-misses per vehicle time; None without any such column."""
+def incidences(
+    blocks: Sequence[Block], known: dict[str, Measure], which: Mapping[str, Measure]
+) -> Table | None:
+    """One row per cell with its crashes per distance or near-misses per time; None without any such column."""
     series, varying = _series(blocks)
-    names = [n for n in INCIDENCES if any(s.counts(n).get("n") for s in series)]
+    names = [n for n in which if any(s.counts(n).get("n") for s in series)]
     if not names:
         return None
     rows = [[_named(s, varying), *(_figure(s.counts(n), known[n]) for n in names)] for s in series]
@@ -108,10 +111,10 @@ def near_misses(blocks: Sequence[Block], known: dict[str, Measure]) -> Table | N
 
 def differences(found: Sequence[Difference]) -> Table | None:
     """Every series of a block against its baseline, pair by pair; None where there is no pair."""
-    if not found:
-        return None
-    measures = found[0].figures
+    measures = found[0].figures if found else {}
     shown = [n for n in measures if any(d.figures[n].n for d in found)]
+    if not shown:
+        return None
     rows = [
         [
             Cell(d.series.label, d.series.label, (f"against {d.baseline.label}",)),
@@ -136,9 +139,10 @@ def everything(block: Block) -> Table:
 
 
 def head(measure: Measure) -> str:
-    """The short name of a measure with the direction that is better."""
+    """The short name of a measure, of an incidence its unit, and the direction that is better."""
     arrow = {"higher": "\N{NO-BREAK SPACE}↑", "lower": "\N{NO-BREAK SPACE}↓"}.get(measure.better, "")
-    return TITLES.get(measure.name, measure.name) + arrow
+    unit = f" {measure.unit}" * bool(measure.per)
+    return TITLES.get(measure.name, measure.name) + unit + arrow
 
 
 def tone(figure: PairedFigure) -> str:
@@ -194,6 +198,7 @@ def _episodes(series: Series) -> Cell:
 
 def _figure(counts: dict[str, Any], measure: Measure) -> Cell:
     """Value above, interval and counts below."""
+    measure = replace(measure, unit="") if measure.per else measure  # stands in the head
     n, na = counts.get("n", 0), counts.get("na", 0)
     if not n:
         return Cell(wording.NA_TEXT, "", (f"{na} NA",) if na else ())
@@ -209,7 +214,8 @@ def _figure(counts: dict[str, Any], measure: Measure) -> Cell:
 def _difference(figure: PairedFigure) -> Cell:
     if not figure.n:
         return Cell(wording.NA_TEXT, "")
-    text, bounds = _split(wording.interval(figure.difference, figure.measure, signed=True))
+    measure = replace(figure.measure, unit="") if figure.measure.per else figure.measure
+    text, bounds = _split(wording.interval(figure.difference, measure, signed=True))
     p = "" if figure.p is None else wording.p_value(figure.p)
     pairs = f"{figure.n} pairs" if figure.na else ""
     small = tuple(filter(None, (bounds, ", ".join(filter(None, (p, pairs))))))

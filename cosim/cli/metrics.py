@@ -28,7 +28,11 @@ def add(commands: arguments.SubCommands) -> None:
         metavar="FILE",
         help="route or additional file with the vTypes: lengths and widths; repeatable",
     )
-    arguments.add(metrics, "--av-type", help="measure the vehicles of this vType (default: all)")
+    arguments.add(
+        metrics,
+        "--av-type",
+        help="measure the vehicles of this vType (cosim.: all AVs of a run of ours); default: all",
+    )
     arguments.add(metrics, "--av-ids", help="measure the vehicles whose id matches")
     metrics.add_argument(
         "--begin", type=float, default=-math.inf, metavar="S", help="leave out what is earlier"

@@ -19,7 +19,7 @@ from cosim.files.xml_input import Progress
 from cosim.metrics import METRICS, MetricContext
 from cosim.metrics.post_encroachment import LONGEST
 from cosim.road import Lane, RoadMap
-from cosim.simulation.conventions import centres, type_names
+from cosim.simulation.conventions import OURS, centres, type_names
 from cosim.types import Kind, Metric, Snapshot, Timing
 
 FIGURES = ("time_to_collision", "post_encroachment", "drac", "hard_braking", "jerk", "headway", "exposure")
@@ -37,7 +37,7 @@ WHOLE_LANE = 1e6  # m, of a lane whose length is not known
 class Roles:
     """Whose conflicts, braking, jerk and headways are counted: everybody's unless something is given."""
 
-    av_type: str | None = None
+    av_type: str | None = None  # a vType; `cosim.`: every AV of a file that cosim had SUMO write
     av_ids: re.Pattern[str] | None = None  # full match
     mission: re.Pattern[str] | None = None  # full match
 
@@ -51,7 +51,8 @@ class Roles:
             return Kind.AV, False
         if self.mission is not None and self.mission.fullmatch(vehicle):
             return Kind.HV, True
-        is_av = self.av_type in type_names(vehicle_type)
+        ours = self.av_type == OURS and vehicle_type.startswith(OURS)
+        is_av = ours or self.av_type in type_names(vehicle_type)
         if self.av_ids is not None:
             is_av = self.av_ids.fullmatch(vehicle) is not None
         return (Kind.AV if is_av else Kind.HV), False

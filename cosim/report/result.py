@@ -65,9 +65,8 @@ def table(result: EpisodeResult, *, first: bool = True) -> str:
     for c in result.collisions:
         who = f"{c.kind}, {'AV-caused' if c.av_caused else 'not AV-caused'}"
         who += _error(c, result.errors_begun)
-        lines.append(
-            f"  collision at {_clock(c.time, result)}: {c.collider} hit {c.victim} on {c.lane} ({who})"
-        )
+        where = f"on {c.lane}" if c.lane else "off the lanes"
+        lines.append(f"  collision at {_clock(c.time, result)}: {c.collider} hit {c.victim} {where} ({who})")
     lines += [f"  not comparable: {reason}" for reason in result.validity]
     lines += [f"  not passed on to SUMO: {option}" for option in result.manifest["options_not_passed_on"]]
     lines.append(f"  trace_hash               {result.trace_hash}")

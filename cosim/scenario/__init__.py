@@ -403,7 +403,7 @@ def checked_fleet(fleet: Fleet, file: object = None, prefix: str = "--av-") -> F
     if fleet.ids is not None:
         check_pattern(fleet.ids, f"{prefix}ids", file)
     share = fleet.penetration
-    if share is not None and not 0.0 <= share <= 1.0:
+    if share is not None and not (isinstance(share, int | float) and 0.0 <= share <= 1.0):
         field = "--penetration" if file is None else f"{prefix}penetration"
         raise BadInput("must be between 0 and 1", file=file, field=field, value=share)
     return fleet

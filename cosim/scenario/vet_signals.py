@@ -7,7 +7,8 @@ from cosim.errors import BadInput
 from cosim.scenario.vet_rules import Place, Reader, seconds
 
 STATES = frozenset("rugGyYsoO")  # a signal's letters in a phase (SUMO, Simulation/Traffic_Lights)
-PHASELESS = frozenset({"rail_signal", "rail_crossing", "off"})  # types that have none, or make their own
+OFF = "off"  # a type, and a program's name: the signal is switched off
+PHASELESS = frozenset({"rail_signal", "rail_crossing", OFF})  # types that have none, or make their own
 
 
 class SignalReader(Reader):
@@ -30,7 +31,7 @@ class SignalReader(Reader):
             key = (self._owner, attributes.get("programID", ""))
             if key in self.programs:
                 self._refuse(tag, "programID", key[1], "is there twice", self._owner, line)
-            self._needs_phases = attributes.get("type", "static") not in PHASELESS
+            self._needs_phases = attributes.get("type", "static") not in PHASELESS and key[1] != OFF
             self._opened, self._signals = Place(self._path, "tlLogic.id", self._owner, line), None
             self.programs[key] = 0
         elif tag == "phase" and self._opened is not None:

@@ -6,7 +6,8 @@ import numpy.typing as npt
 from cosim.types import Floats
 
 # The types of AVs in SUMO's outputs begin so, and nobody else's: then follows the name of their own type.
-AV_TYPE = "cosim.av."
+OURS = "cosim."
+AV_TYPE = f"{OURS}av."
 
 
 def centres(

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-OUTPUTS = ("fcd", "tripinfo", "vehroute", "collision")  # of `cosim run --sumo-output`
+OUTPUTS = ("fcd", "tripinfo", "vehroute", "collision")  # of `cosim run --output`
 OPTIONS = {  # that make the floating-car data hold every step
     "device.fcd.begin": "0",
     "device.fcd.period": "0",

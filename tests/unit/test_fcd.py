@@ -217,6 +217,8 @@ def test_only_the_chosen_vehicles_are_watched(fcd: Any) -> None:
     assert nobody.watched == 0
     assert value(nobody, "min_headway_s") is None
     assert any("nothing to count" in note for note in nobody.notes)
+    ours = fcd(re.sub('(id="fast".*?type=")car', r"\1cosim.av.car/lawful@fast", following()))
+    assert analyse(ours, roles=Roles(av_type="cosim.")).watched == 1
     one = analyse(path, roles=Roles(av_ids=re.compile("fast")))
     assert one.watched == 1
     assert value(one, "min_headway_s") == pytest.approx(1.5, rel=1e-3)

@@ -95,7 +95,8 @@ def test_figures_stand_with_intervals_and_counts(full: tuple[Path, Page]) -> Non
     assert "mission success +100.0 pp" in text
     assert "10 of 11 1 sim_crash" in text
     assert "(untrained)" in text
-    assert "10.0 per vehicle-hour 6.7 to 14.3 30 in 3 h" in text  # Garwood: 20.2 to 42.8
+    assert "TTC < 1.5 s per vehicle-hour" in text
+    assert "10.0 6.7 to 14.3 30 in 3 h" in text  # Garwood: 20.2 to 42.8
 
 
 def test_worst_episodes_come_with_their_replay_command(full: tuple[Path, Page]) -> None:

@@ -416,6 +416,10 @@ def test_sound_signals_pass(case: Case) -> None:
     assert case(net=lit()).warnings == ()
 
 
+def test_a_program_that_switches_a_signal_off_needs_no_phase(case: Case) -> None:
+    assert case(net=lit(LOGIC + '<tlLogic id="b" type="static" programID="off"/>')).warnings == ()
+
+
 @pytest.mark.parametrize(
     ("old", "new", "field", "value", "word"),
     [

@@ -100,7 +100,7 @@ def law(blocks: Sequence[Block], known: dict[str, Measure]) -> Table | None:
 def incidences(
     blocks: Sequence[Block], known: dict[str, Measure], which: Mapping[str, Measure]
 ) -> Table | None:
-    """One row per cell with its crashes per distance or near-misses per time; None without any such column."""
+    """One row per cell with its crashes per distance or near-misses per time; None without such columns."""
     series, varying = _series(blocks)
     names = [n for n in which if any(s.counts(n).get("n") for s in series)]
     if not names:

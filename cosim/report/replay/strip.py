@@ -18,6 +18,7 @@ from cosim.types import Actor, Floats, Kind, MetaAction
 
 FINE = 2  # drawn this much larger, then reduced: smooth edges
 ACROSS = 200.0  # m of road in the picture's width
+SEEN = 10.0  # pixels that persons and bicycles are long at least
 SIGMAS = 2.0  # half the width of a predicted interval, in standard deviations
 
 GROUND, ROAD, EDGE, JUNCTION = (238, 241, 244), (201, 206, 214), (255, 255, 255), (188, 194, 203)
@@ -200,7 +201,8 @@ class Strip:
     def shape(self, parts: Shape, p: Pose, colour: Colour) -> None:
         """Parts of a shape, at the size that is drawn at least."""
         least = LEAST.get(p.track.actor, (0.0, 0.0))
-        size = max(p.track.length, least[0]), max(p.track.width, least[1])
+        grown = max(SEEN * FINE / (self._scale * max(least)), 1.0) if any(least) else 1.0
+        size = max(p.track.length, grown * least[0]), max(p.track.width, grown * least[1])
         fills: Mapping[str, Colour] = {BODY: colour, LIGHT: (255, 255, 255, 205), DARK: HOUSING}
         for name, points in parts:
             pixels = self._pixels(_placed(np.array(points) * size, p.x, p.y, p.heading))

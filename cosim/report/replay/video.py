@@ -115,24 +115,29 @@ class _Camera:
     """Whom the film follows, where it looks while that vehicle is not on the road, and what stands there."""
 
     def __init__(self, replay: ReplayData, follow: str | None) -> None:
-        def rank(t: Track) -> tuple[bool, bool, bool]:
-            return t.id != follow, not t.mission, t.kind != Kind.AV
+        def rank(t: Track) -> tuple[bool, bool, bool, int]:
+            return t.id != follow, not t.mission, t.kind != Kind.AV, t.first
 
         self.lines = stop_lines(replay.road)
         self.follow = min(replay.tracks, key=rank, default=None)
+        self.any_av = self.follow is not None and self.follow.kind == Kind.AV and self.follow.id != follow
         self.x = self.y = 0.0  # m, the middle of the picture
         if self.follow is not None:
             self.x, self.y = float(self.follow.x[0]), float(self.follow.y[0])
 
     def look(self, poses: list[Pose]) -> Pose | None:
-        """Move to the followed vehicle; the AV whose decision is explained: itself, else the nearest one."""
+        """Move to the followed vehicle; the AV whose decision is explained: itself, else the nearest one, to
+        which the camera moves where an AV is followed that nobody asked for."""
         here = next((p for p in poses if self.follow and p.track.id == self.follow.id), None)
         if here is not None:
             self.x, self.y = here.x, here.y
             if here.track.kind == Kind.AV:
                 return here
         avs = [p for p in poses if p.track.kind == Kind.AV]
-        return min(avs, key=lambda p: math.hypot(p.x - self.x, p.y - self.y), default=None)
+        nearest = min(avs, key=lambda p: math.hypot(p.x - self.x, p.y - self.y), default=None)
+        if here is None and nearest is not None and self.any_av:
+            self.follow, self.x, self.y = nearest.track, nearest.x, nearest.y
+        return nearest
 
 
 def picture_at(r: ReplayData, time: float, camera: _Camera, *, small: bool = False) -> Image.Image:
@@ -229,7 +234,7 @@ class _Board:
         f, line = r.facts, self._line_top
         label = f" ({f['policy_label']})" if f.get("policy_label") else ""
         title = f"{f.get('scenario')} / {f.get('demand')} / {f.get('policy')}{label}"
-        self._line(14, line + 8, title, TEXT, 15, bold=True)
+        self._wrapped(14, line + 8, title, TEXT, SPLIT - 24, most=1, bold=True)
         self._line(
             14, line + 30, f"seed {f.get('seed')}, {f.get('preset')}, svo {f.get('svo_deg'):g}°", QUIET
         )
@@ -287,23 +292,25 @@ class _Board:
         for k, (row, _) in enumerate(rows):
             self._line(left, top + 67 + 17 * k, row, QUIET, 13)
 
-    def _wrapped(self, x: float, y: float, text: str, colour: Colour, room: float, *, most: int = 2) -> int:
+    def _wrapped(
+        self, x: float, y: float, text: str, colour: Colour, room: float, *, most: int = 2, bold: bool = False
+    ) -> int:
         """Text within `room` pixels on `most` lines, the last one cut with dots; how many it took."""
-        lines = [""]
+        lines, letters = [""], font(13, bold)
         for word in text.split():
             longer = f"{lines[-1]} {word}".strip()
-            if self._pen.textlength(longer, font(13)) <= room:
+            if self._pen.textlength(longer, letters) <= room:
                 lines[-1] = longer
             else:
                 lines.append(word)
         lines = [line for line in lines if line]
         shown = lines[:most]
-        if shown and (len(lines) > most or self._pen.textlength(shown[-1], font(13)) > room):
-            while shown[-1] and self._pen.textlength(f"{shown[-1]} ...", font(13)) > room:
+        if shown and (len(lines) > most or self._pen.textlength(shown[-1], letters) > room):
+            while shown[-1] and self._pen.textlength(f"{shown[-1]} ...", letters) > room:
                 shown[-1] = shown[-1][:-1]
             shown[-1] += " ..."
         for k, line in enumerate(shown):
-            self._line(x, y + 16 * k, line, colour)
+            self._line(x, y + 16 * k, line, colour, bold=bold)
         return max(len(shown), 1)
 
     def _line(

@@ -236,7 +236,8 @@ function start(data, live = null) {
     $$("pick").replaceChildren();
     fillHead(data); fillFigures(data); fillKinds(state); fillEvents(state); refresh();
     const there = [...$$("pick").options].slice(1).map((option) => data.vehicles[option.value]);
-    const first = same || there.find((v) => stateOf(data, v, state.t)) || there[0];
+    const soonest = [...there].sort((a, b) => b.mission - a.mission || b.av - a.av || a.tracks[0].first - b.tracks[0].first)[0];
+    const first = same || there.find((v) => stateOf(data, v, state.t)) || soonest;
     if (first) state.choose(first, same ? following : true);
     return first;
   }

@@ -2,8 +2,10 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-# Uncompiled: Python compiles what is imported, once; compiling all of every package takes a minute longer.
+# pip compiles on one core, and what nobody imports too. Not to compile is no way: where Python may write no
+# bytecode (PYTHONDONTWRITEBYTECODE), every process would compile what it imports, torch for one, again.
 PIP = $(BIN)/pip install --quiet --no-compile -c constraints.txt
+COMPILE = $(BIN)/python -W ignore -m compileall -qq -j 0 -x '/tests?/|/sumo/' $(VENV)/lib || true
 RUN ?= runs/demo
 SCALE ?= 1
 WORKERS ?= 2
@@ -72,10 +74,12 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(PIP) torch
 	$(PIP) -e .
+	$(COMPILE)
 	touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed
 	$(PIP) -e '.[dev]'
+	$(COMPILE)
 	touch $@
 
 # The container: docker/build.sh says what it needs, with a Docker engine or without (docs/container.md).

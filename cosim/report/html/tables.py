@@ -198,7 +198,7 @@ def _episodes(series: Series) -> Cell:
 
 def _figure(counts: dict[str, Any], measure: Measure) -> Cell:
     """Value above, interval and counts below."""
-    measure = replace(measure, unit="") if measure.per else measure  # stands in the head
+    measure = _bare(measure)
     n, na = counts.get("n", 0), counts.get("na", 0)
     if not n:
         return Cell(wording.NA_TEXT, "", (f"{na} NA",) if na else ())
@@ -214,12 +214,16 @@ def _figure(counts: dict[str, Any], measure: Measure) -> Cell:
 def _difference(figure: PairedFigure) -> Cell:
     if not figure.n:
         return Cell(wording.NA_TEXT, "")
-    measure = replace(figure.measure, unit="") if figure.measure.per else figure.measure
-    text, bounds = _split(wording.interval(figure.difference, measure, signed=True))
+    text, bounds = _split(wording.interval(figure.difference, _bare(figure.measure), signed=True))
     p = "" if figure.p is None else wording.p_value(figure.p)
     pairs = f"{figure.n} pairs" if figure.na else ""
     small = tuple(filter(None, (bounds, ", ".join(filter(None, (p, pairs))))))
     return Cell(text, repr(figure.difference.value), small, tone(figure))
+
+
+def _bare(measure: Measure) -> Measure:
+    """The measure as its cells write it: without the unit that `head` says."""
+    return replace(measure, unit="") if measure.per else measure
 
 
 def _split(interval: str) -> tuple[str, str]:

@@ -16,7 +16,7 @@ from cosim.envs.spaces import Observation
 from cosim.errors import BadInput, hint
 from cosim.observation.view import View
 from cosim.scenario import Scenario
-from cosim.types import COMPACT, Bytes, ObservationConfig
+from cosim.types import COMPACT, Bytes, MetaAction, ObservationConfig
 
 MAX_AGENTS = 32  # slots: about twice the AVs on the road in our worlds; SUMO drives any further ones
 NATIVE_RANDOM = 0  # the seed of the seeds, until reset(seed=...) gives another
@@ -35,11 +35,14 @@ class SumoParallelEnv(ParallelEnv):  # type: ignore[misc]
     """All AVs learn; one step is one decision (0.4 s); rewards are their SVO rewards (cosim.rewards).
 
     `possible_agents` are slots av_0, av_1, ...: the k-th AV of the episode by departure (those that depart
-    in the same step by id) has slot k, until the episode is over; `info["av"]` is its SUMO id. AVs beyond
-    the last slot are driven by SUMO. An AV joins `agents` when it has departed and leaves when it is
+    in the same step by id) has slot k, until the episode is over; `vehicles[agent]` is its SUMO id. AVs
+    beyond the last slot are driven by SUMO. An AV joins `agents` when it has departed and leaves when it is
     terminated (it or the mission vehicle crashed) or truncated (the duration is over, it left the road,
-    another AV's collision ended the episode). While no agent is on the road and the episode goes on, it is
-    driven on until one is.
+    another AV's collision ended the episode). While no AV with a slot is on the road and the episode goes
+    on, it is driven on until one is.
+
+    `padded`: for libraries whose agents are all there from the reset on (TorchRL, BenchMARL). An agent whose
+    AV has not departed yet observes zeros, may only idle, earns 0, and is truncated with the episode.
     """
 
     metadata = {  # noqa: RUF012 - PettingZoo's own form
@@ -58,6 +61,7 @@ class SumoParallelEnv(ParallelEnv):  # type: ignore[misc]
         flatten: str | None = None,
         render_mode: str | None = None,
         continuous: bool = False,
+        padded: bool = False,
         **words: Any,
     ) -> None:
         observation = spaces.checked(observation, flatten, render_mode)
@@ -68,10 +72,10 @@ class SumoParallelEnv(ParallelEnv):  # type: ignore[misc]
             a: spaces.observation_space(observation, flatten) for a in self.possible_agents
         }
         self.action_spaces = {a: spaces.action_space(continuous) for a in self.possible_agents}
-        self._continuous = continuous
+        self._continuous, self._padded = continuous, padded
         self._config, self._flatten = observation, flatten
         self._rng = np.random.default_rng(NATIVE_RANDOM)
-        self._slots: dict[str, str] = {}  # SUMO id -> agent, for all that had one in this episode
+        self.vehicles: dict[str, str] = {}  # agent -> SUMO id, of all that have had one in this episode
         self._session: Session = sessions.open(config, observation=observation, **words)
 
     @property
@@ -95,13 +99,13 @@ class SumoParallelEnv(ParallelEnv):  # type: ignore[misc]
             seed = spaces.training_seed(self._rng)
         else:
             self._rng = np.random.default_rng(seed)
-        self._slots = {}
+        self.vehicles = {}
         self._views: dict[str, View] = {}
-        self.agents = []
+        self.agents = [*self.possible_agents] if self._padded else []
         views = self._session.reset(seed)
         self._join(views)
         self._drive_on()
-        if not self.agents:
+        if not self._driving:
             raise no_av(seed, None)
         return self._observations(self.agents), {a: self._info(a) for a in self.agents}
 
@@ -111,40 +115,37 @@ class SumoParallelEnv(ParallelEnv):  # type: ignore[misc]
         if unknown:
             problem = f"no such agent{hint(str(unknown[0]), self.agents)}"
             raise BadInput(problem, field="actions", value=unknown[0])
-        av_of = {agent: av for av, agent in self._slots.items()}
-        acting = self.agents
+        driving, before = self._driving, self.agents
         step = self._session.act(
-            {av_of[a]: spaces.action_of(actions[a], self._continuous) for a in acting if a in actions}
+            {av: spaces.action_of(actions[a], self._continuous) for a, av in driving.items() if a in actions}
         )
-        terminated = {a: step.terminated[av_of[a]] for a in acting}
-        truncated = {a: step.truncated[av_of[a]] for a in acting}
-        rewards = {a: step.rewards[av_of[a]] for a in acting}
-        self.agents = [a for a in acting if not (terminated[a] or truncated[a])]
+        self.agents = [a for a in before if driving.get(a) not in step.ended]
         self._join(step.observations)
-        infos = {a: self._info(a) for a in acting}
-        for agent in acting:
-            name = av_of[agent]
-            infos[agent] |= spaces.decision_info(step, name)
-            if name in step.ended:
-                infos[agent]["ended"] = step.ended[name]
         self._drive_on()
-        if self._session.over:
+        over = self._session.over
+        everyone = list(dict.fromkeys((*before, *self.agents)))  # those who departed in this step behind
+        waiting = [a for a in everyone if a not in driving]
+        rewards = dict.fromkeys(waiting, 0.0) | {a: step.rewards[av] for a, av in driving.items()}
+        terminated = dict.fromkeys(waiting, False) | {a: step.terminated[av] for a, av in driving.items()}
+        truncated = dict.fromkeys(waiting, over) | {a: step.truncated[av] for a, av in driving.items()}
+        infos = {a: self._info(a) for a in everyone}
+        for agent, av in driving.items():
+            infos[agent] |= spaces.decision_info(step, av)
+            if av in step.ended:
+                infos[agent]["ended"] = step.ended[av]
+        if over:
+            self.agents = []
             result = self._session.result()
-            for agent in acting:
+            for agent in driving:
                 infos[agent]["episode_metrics"] = {key: m.value for key, m in result.metrics.items()}
                 infos[agent]["trace_hash"] = result.trace_hash
-        for agent in self.agents:
-            if agent not in acting:  # departed in this step
-                rewards[agent], terminated[agent], truncated[agent] = 0.0, False, False
-                infos[agent] = self._info(agent)
-        return self._observations(list(rewards)), rewards, terminated, truncated, infos
+        return self._observations(everyone), rewards, terminated, truncated, infos
 
     def render(self) -> Bytes | None:
         """[160, 640, 3] RGB from above, the first agent in the middle looking to the right."""
         if self.render_mode != "rgb_array":
             return None
-        av = next((name for name, agent in self._slots.items() if agent in self.agents), None)
-        return self._session.picture(av)
+        return self._session.picture(next(iter(self._driving.values()), None))
 
     def close(self) -> None:
         """End the simulation and its process."""
@@ -155,25 +156,33 @@ class SumoParallelEnv(ParallelEnv):  # type: ignore[misc]
     def _join(self, views: dict[str, View]) -> None:
         """Give every AV that is new on the road the next slot; remember what each agent sees."""
         departed = {name: k for k, name in enumerate(self._session.events.departed)}
-        new = [name for name in views if name not in self._slots]
+        new = views.keys() - self.vehicles.values()
+        free = self.possible_agents[len(self.vehicles) :]
         if not self._session.over:
-            for name in sorted(new, key=lambda n: (departed.get(n, -1), n))[: self._free()]:
-                agent = self._slots[name] = self.possible_agents[len(self._slots)]
-                self.agents.append(agent)
-        for name, view in views.items():
-            if name in self._slots:
-                self._views[self._slots[name]] = view
+            in_order = sorted(new, key=lambda n: (departed.get(n, -1), n))
+            self.vehicles |= (joined := dict(zip(free, in_order, strict=False)))
+            self.agents += [agent for agent in joined if agent not in self.agents]
+        self._views |= {agent: views[av] for agent, av in self.vehicles.items() if av in views}
 
-    def _free(self) -> int:
-        return len(self.possible_agents) - len(self._slots)
+    @property
+    def _driving(self) -> dict[str, str]:
+        """The agents whose AVs are on the road, and those."""
+        return {agent: self.vehicles[agent] for agent in self.agents if agent in self.vehicles}
 
     def _drive_on(self) -> None:
-        while not self.agents and not self._session.over and self._free():
+        waits = len(self.vehicles) < len(self.possible_agents)
+        while waits and not self._driving and not self._session.over:
             self._join(self._session.act({}).observations)
 
     def _observations(self, agents: Sequence[str]) -> dict[str, Observation]:
-        return {a: spaces.observation(self._views[a], self._config, self._flatten) for a in agents}
+        return {a: self._observation(a) for a in agents}
+
+    def _observation(self, agent: str) -> Observation:
+        if agent in self._views:
+            return spaces.observation(self._views[agent], self._config, self._flatten)
+        return spaces.nothing(self.observation_spaces[agent])
 
     def _info(self, agent: str) -> dict[str, Any]:
-        av = next(name for name, slot in self._slots.items() if slot == agent)
-        return {"action_mask": self._views[agent].action_mask.astype(np.int8), "av": av}
+        seen = self._views.get(agent)
+        mask = np.arange(len(MetaAction)) == MetaAction.IDLE if seen is None else seen.action_mask
+        return {"action_mask": mask.astype(np.int8)}

@@ -234,7 +234,7 @@ class Session(contextlib.AbstractContextManager["Session"]):
             terminated={name: ended.get(name) in TERMINAL for name in reply.rewards},
             truncated={name: name in ended and ended[name] not in TERMINAL for name in reply.rewards},
             ended=ended,
-            receipts={receipt.vehicle: receipt for receipt in reply.receipts},
+            receipts=self.receipts,
             events=reply.events,
             info={"time": reply.time, "elapsed": reply.elapsed, "steps": reply.steps, "over": self.over},
         )
@@ -299,6 +299,7 @@ class Session(contextlib.AbstractContextManager["Session"]):
         self._views = self._unpacker.unpack(reply.packed)
         self.avs = reply.avs
         self.events = reply.events
+        self.receipts = {receipt.vehicle: receipt for receipt in reply.receipts}
         self.elapsed = reply.elapsed
         self.over = reply.terminated or reply.truncated
 

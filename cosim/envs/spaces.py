@@ -1,5 +1,6 @@
 """Views as Gymnasium observations: the spaces and the numbers in them, scaled and bounded."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, cast
 
@@ -67,7 +68,7 @@ def observation_space(config: ObservationConfig, flatten: str | None) -> Space:
         return cast(Space, gymnasium.spaces.Box(-BOUND, BOUND, (size,), np.float32))
     spaces: dict[str, gymnasium.Space[object]] = {
         "kinematics": gymnasium.spaces.Box(-BOUND, BOUND, (n, r, f), np.float32),
-        "valid": gymnasium.spaces.MultiBinary((n, r)),
+        "valid": gymnasium.spaces.MultiBinary(n * r),  # [N*R]: TorchRL knows no other than one axis
         "ego": gymnasium.spaces.Box(-BOUND, BOUND, (e,), np.float32),
         "law": gymnasium.spaces.Box(-1.0, BOUND, (len(LAW_FEATURES),), np.float32),
     }
@@ -118,13 +119,20 @@ def observation(view: View, config: ObservationConfig, flatten: str | None) -> O
         return np.concatenate(parts)
     result: dict[str, npt.NDArray[np.generic]] = {
         "kinematics": kinematics(view.kinematics),
-        "valid": view.valid.astype(np.int8),
+        "valid": view.valid.ravel().astype(np.int8),
         "ego": ego(view),
         "law": law(view),
     }
     if config.maps:
         result["velocity_map"] = view.velocity_map
     return result
+
+
+def nothing(space: Space) -> Observation:
+    """What an agent without a vehicle observes: zeros."""
+    parts: Mapping[str, Any] = getattr(space, "spaces", {"": space})
+    zeros = {name: np.zeros(part.shape, part.dtype) for name, part in parts.items()}
+    return zeros.get("", zeros)
 
 
 def kinematics(matrix: Floats32) -> Floats32:
@@ -179,10 +187,10 @@ def neighbours(view: View) -> tuple[Floats, Floats]:
 
 
 def decision_info(step: StepResult, av: str) -> dict[str, Any]:
-    """One AV's decision in the `info` of both environments: the reward's terms, its command's result."""
+    """One AV's decision in the `info` of both environments, in numbers: the reward's terms, whether its
+    command was executed (`Session.receipts` says why not)."""
     receipt = step.receipts.get(av)
     return {
         "reward_terms": step.terms[av]._asdict(),
         "executed": receipt is not None and receipt.executed,
-        "blocked": (receipt and receipt.blocked) or "",
     }

@@ -92,14 +92,69 @@ def test_gymnasium_and_stable_baselines_accept_the_environment(make: Make, flatt
     check_env_of_sb3(env, warn=flatten is not None)
 
 
-def test_pettingzoo_accepts_the_parallel_environment() -> None:
+@pytest.mark.parametrize("padded", [False, True])
+def test_pettingzoo_accepts_the_parallel_environment(padded: bool) -> None:
+    words = {"simulator": fake_worlds.platoon, "max_agents": 5 if padded else 3, "padded": padded, **FAST}
+
     def build() -> SumoParallelEnv:
-        return parallel_env(fake_worlds.scenario(), simulator=fake_worlds.platoon, max_agents=3, **FAST)
+        return parallel_env(fake_worlds.scenario(), **words)
 
     env = build()
     parallel_api_test(env, num_cycles=30)
     env.close()
     parallel_seed_test(build, num_cycles=30)
+
+
+def numbers(value: object) -> bool:
+    """Whether numbers are all that it holds."""
+    if isinstance(value, dict):
+        return all(map(numbers, value.values()))
+    return np.issubdtype(np.asarray(value).dtype, np.number) or isinstance(value, bool)
+
+
+@pytest.mark.parametrize("padded", [False, True])
+def test_what_a_decision_says_is_numbers_and_valid_has_one_axis(make: Make, padded: bool) -> None:
+    env = make(fake_worlds.platoon)
+    seen, _ = env.reset(seed=1)
+    assert seen["valid"].shape == (SMOKE.frames * SMOKE.rows,) == env.observation_space["valid"].shape
+    assert seen["valid"].reshape(SMOKE.frames, SMOKE.rows)[-1, :4].tolist() == [1, 1, 1, 0]  # of three AVs
+    assert numbers(env.step(np.int64(1))[-1])
+    words = {"simulator": fake_worlds.platoon, "worker": False, "max_agents": 5, "padded": padded, **FAST}
+    several = parallel_env(fake_worlds.scenario(), **words)
+    assert numbers(several.reset(seed=1)[1])
+    assert several.vehicles == {"av_0": "a", "av_1": "b", "av_2": "c"}
+    assert numbers(several.step(dict.fromkeys(several.agents, 1))[-1])
+    several.close()
+
+
+def test_agents_without_a_vehicle_wait_from_the_reset_on_where_it_is_padded() -> None:
+    with_fake = {"simulator": fake_worlds.short_road, "max_agents": 4, "worker": False, **FAST}
+    env = parallel_env(fake_worlds.scenario(), padded=True, **with_fake)
+    seen, infos = env.reset(seed=1)
+    waiting = ["av_2", "av_3"]  # two AVs are all that ever drive
+    assert env.agents == ["av_0", "av_1", *waiting]
+    assert [*env.vehicles] == ["av_0", "av_1"]
+    gone: dict[str, int] = {}
+    for step in range(1, 12):
+        assert all(not value.any() for agent in waiting for value in seen[agent].values())
+        assert all(env.observation_space(agent).contains(seen[agent]) for agent in seen)
+        assert all(infos[agent]["action_mask"].tolist() == [0, 1, 0, 0, 0] for agent in waiting)
+        seen, rewards, terminated, truncated, infos = env.step(dict.fromkeys(env.agents, 3))
+        assert [rewards[agent] for agent in waiting] == [0.0, 0.0]
+        gone |= {a: step for a in seen if terminated[a] or truncated[a]}
+        if not env.agents:
+            break
+    assert gone["av_0"] < gone["av_1"] == gone["av_2"] == gone["av_3"] == 10, "the episode's 4 s of 0.4 s"
+    env.close()
+
+
+def test_without_any_av_a_padded_environment_says_so_too() -> None:
+    env = parallel_env(
+        fake_worlds.scenario(), simulator=fake_worlds.nobody, worker=False, padded=True, **FAST
+    )
+    with pytest.raises(BadInput, match="no AV was ever on the road"):
+        env.reset(seed=1)
+    env.close()
 
 
 def test_the_checkers_accept_continuous_actions(make: Make) -> None:
@@ -223,12 +278,13 @@ def test_the_mask_forbids_lane_changes_off_the_road_and_during_a_change(make: Ma
     _, info = env.reset(seed=1)
     assert info["action_mask"].tolist() == [1, 1, 0, 1, 1]  # a drives on the right lane of two
     *_, info = env.step(np.int64(MetaAction.LANE_RIGHT))
-    assert (info["executed"], info["blocked"]) == (False, "no lane on that side")
+    assert not info["executed"]
+    assert env.session.receipts["a"].blocked == "no lane on that side"
     *_, info = env.step(np.int64(MetaAction.LANE_LEFT))
     assert info["executed"]
     assert info["action_mask"].tolist() == [0, 1, 0, 1, 1]
     *_, info = env.step(np.int64(MetaAction.LANE_LEFT))
-    assert info["blocked"] == "a lane change is under way"
+    assert env.session.receipts["a"].blocked == "a lane change is under way"
     for _ in range(4):
         *_, info = env.step(np.int64(MetaAction.IDLE))
     assert info["action_mask"].tolist() == [0, 1, 1, 1, 1]
@@ -415,6 +471,16 @@ def test_importing_cosim_is_light() -> None:
     code = f"import sys, cosim; print(sorted({heavy} & set(sys.modules)), sorted(cosim.__all__))"
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert said.strip() == "[] ['Session', 'StepResult', 'View', '__version__', 'open']"
+
+
+@pytest.mark.parametrize("first", ["sys", "cosim", "gymnasium, cosim", "cosim.envs", "cosim.envs.gym"])
+def test_gymnasium_finds_the_worlds_by_cosim_whichever_is_imported_first(first: str) -> None:
+    code = (
+        f"import {first}; from gymnasium.envs.registration import _find_spec as of;"
+        "print(*(of(f'{where}cosim/Merge-v0').entry_point for where in ('cosim:', 'cosim.envs:', '')))"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert said.split() == ["cosim.envs.gym:SumoEnv"] * 3
 
 
 def test_opening_a_session_loads_neither_sumo_nor_the_agent_here() -> None:

@@ -115,10 +115,10 @@ def test_avs_join_on_departure_in_the_parallel_environment() -> None:
     with warnings.catch_warnings():  # slots whose AV departs after the episode's end, or never
         warnings.filterwarnings("ignore", message="No agents present but not all possible_agents")
         parallel_api_test(env, num_cycles=40)
-    _, infos = env.reset(seed=SEED)
+    env.reset(seed=SEED)
     first = list(env.agents)
     assert first == [f"av_{k}" for k in range(len(first))]
-    assert {infos[a]["av"] for a in first} == set(env.session.avs)
+    assert {env.vehicles[a] for a in first} == set(env.session.avs)
     everyone = set(first)
     while env.agents:
         _, rewards, *_ = env.step(dict.fromkeys(env.agents, int(MetaAction.IDLE)))

@@ -210,7 +210,8 @@ def load(
 def chosen_preset(what: str, policy: str, preset: str | None) -> str:
     """The preset that an episode of scenario `what` is driven in by `policy`, where `preset` is asked for.
 
-    A policy of `ALWAYS` has one of its own; without a word a user's world decides, else it is `lawful`.
+    A policy of `ALWAYS` has one of its own; else it is `preset`, else that of a user's `scenario.yaml` (which
+    cannot ask for `unguarded`), else `lawful`.
     """
     own = ALWAYS.get(policy) or preset
     if own is None and not sumo_scenarios.ships(what) and is_there(Path(what) / DEFINITION):
@@ -285,8 +286,9 @@ def _world(folder: Path) -> Scenario:
         warmup=top.warmup,
         duration=top.duration,
         timing=top.timing,
-        # the files of our worlds, part of every shipped episode's key, say how those were driven
-        preset=Preset.LAWFUL if ships else preset,
+        # only the caller takes the guard away: the files of our worlds, whose digests are part of every
+        # shipped episode's key, say `unguarded`, and so do copies of them
+        preset=Preset.LAWFUL if preset == Preset.UNGUARDED else preset,
         mission=top.mission,
         zones=tuple(replace(z, name=z.name or f"zone{i}") for i, z in enumerate(top.conflict_zones)),
         fleet=checked_fleet(top.fleet, file, "fleet."),

@@ -20,6 +20,7 @@ from cosim.policies import make
 from cosim.report import run_folder
 from cosim.scenario import load, place
 from cosim.simulation.fake import FakeSimulator, FakeVehicle
+from cosim.types import MetaAction
 from policy.predictors import make_predictor
 
 CODE = """
@@ -118,6 +119,18 @@ def test_reward_metric_and_policy_of_ones_own_drive_in_a_world_of_ones_own(own: 
     assert {av: terms.ego for av, terms in step.terms.items()} == step.rewards
     assert set(step.receipts) == set(before), "the policy commands them all"
     assert theirs.metrics["frames"].value == round(timing.decision / timing.frame)
+
+
+def test_a_copy_drives_as_the_world_that_ships(own: Path) -> None:
+    driven = {}
+    for what, preset in (("merge", None), (str(own / "mine"), None), ("merge", "unguarded")):
+        with cosim.open(what, demand="contested", preset=preset) as session:
+            session.reset(140_007)
+            for _ in range(6):  # a queue that always asks for more: the lawful car keeps its distance
+                session.act(dict.fromkeys(session.avs, MetaAction.ACCELERATE))
+            driven[what, preset] = session.result().trace_hash
+    ours, copy, unguarded = driven.values()
+    assert ours == copy != unguarded
 
 
 def test_a_share_of_all_vehicles_may_be_avs(own: Path) -> None:

@@ -1,6 +1,7 @@
 """A scenario is read from our worlds and from anybody's .sumocfg; what is wrong is named."""
 
 import gzip
+import shutil
 from pathlib import Path
 
 import pytest
@@ -8,7 +9,7 @@ import pytest
 import sumo_scenarios
 from cosim import scenario
 from cosim.errors import BadInput
-from cosim.scenario import Fleet, Mission, load, sumocfg
+from cosim.scenario import Fleet, Mission, chosen_preset, load, sumocfg
 from cosim.types import Preset
 
 WORLD = """
@@ -190,6 +191,33 @@ def test_contested_demand_has_moderate_drivers_and_a_users_file_its_own(world: P
 def test_the_command_lines_fleet_and_preset_win(world: Path) -> None:  # noqa: ARG001
     s = load("lane", fleet=Fleet(penetration=0.2), preset="guarded")
     assert (s.fleet.describe(), s.preset) == ("penetration 0.2", "guarded")
+
+
+@pytest.mark.parametrize("name", [*sumo_scenarios.names(), *sumo_scenarios.practice()])
+def test_a_copied_world_is_driven_in_the_preset_of_the_original(name: str, tmp_path: Path) -> None:
+    copy = tmp_path / "mine"
+    shutil.copytree(sumo_scenarios.folder(name), copy)
+    own = Path(name).name
+    (copy / f"{own}.sumocfg").rename(copy / "mine.sumocfg")
+    definition = copy / "scenario.yaml"
+    definition.write_text(definition.read_text().replace(f"name: {own}", "name: mine"))
+    for what in (name, str(copy)):
+        assert load(what).preset == chosen_preset(what, "idm", None) == Preset.LAWFUL
+        assert load(what, preset="unguarded").preset == Preset.UNGUARDED
+        assert (
+            chosen_preset(what, "idm", "unguarded") == chosen_preset(what, "keep-lane", None) == "unguarded"
+        )
+
+
+@pytest.mark.parametrize(("line", "preset"), [("guarded", "guarded"), ("unguarded", "lawful")])
+def test_a_world_may_ask_for_another_guard_but_not_for_none(
+    line: str, preset: str, world: Path, tmp_path: Path
+) -> None:
+    own = tmp_path / "own"
+    shutil.copytree(world, own)
+    (own / "lane.sumocfg").rename(own / "own.sumocfg")
+    (own / "scenario.yaml").write_text(f"name: own\npreset: {line}\ndemand: dense\n")
+    assert load(str(own)).preset == chosen_preset(str(own), "idm", None) == preset
 
 
 @pytest.mark.parametrize(

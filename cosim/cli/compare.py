@@ -20,7 +20,9 @@ thresholds:  METRIC[.upper|.lower]  >|<  [+|-]NUMBER[UNIT]
   dt_av_m < -5%                   B's AVs get 5 % less far than A's
   dt_mission_m < +50m             B's mission vehicle does not get 50 m further than A's
 
-exit codes:  0 passed, 1 a threshold failed, 2 bad input, 3 simulations failed among the compared
+An unfinished batch is shown as far as it is; its thresholds are not judged (exit code 2) without --partial.
+
+exit codes:  0 passed, 1 a threshold failed, 2 bad input or an unfinished batch, 3 simulations failed
 """
 
 
@@ -48,6 +50,9 @@ def add(commands: arguments.SubCommands) -> None:
     }
     arguments.texts(compare, once)
     arguments.texts(compare, repeatable, action="append", default=[])
+    compare.add_argument(
+        "--partial", action="store_true", help="judge an unfinished batch by the episodes that there are"
+    )
     arguments.add(compare, "--json")
     compare.set_defaults(work=work)
 
@@ -65,7 +70,7 @@ def work(args: argparse.Namespace) -> int:
     b = side(args.b) if args.b is not None else a
     a = a if args.baseline is None else chosen(a.run, args.baseline)
     b = b if args.candidate is None else chosen(b.run, args.candidate)
-    found = compare(a, b, args.fail_on, across=args.across)
+    found = compare(a, b, args.fail_on, across=args.across, partial=args.partial)
     if args.junit is not None:
         with cannot("write", field="--junit", value=args.junit):
             verdict.junit(found, Path(args.junit))

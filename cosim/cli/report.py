@@ -12,7 +12,7 @@ def add(commands: arguments.SubCommands) -> None:
         "report",
         help="write a run's report: one HTML file",
         description="Write report.html: tables with intervals, plots, worst episodes, manifest. The file "
-        "needs no network.",
+        "needs no network. Of an unfinished run: of the episodes that there are.",
     )
     report.add_argument("run", metavar="DIR", help="run folder of `cosim evaluate`")
     arguments.add(report, "--out", metavar="FILE", help="write it here (default: DIR/report.html)")
@@ -25,5 +25,5 @@ def work(args: argparse.Namespace) -> int:
     from cosim.report.run_folder import read
 
     out = None if args.out is None else Path(args.out)
-    print(report.write(read(args.run), out, shown=args.run))
+    print(report.write(read(args.run, unfinished=True), out, shown=args.run))
     return 0

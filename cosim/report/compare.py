@@ -119,10 +119,18 @@ class Comparison:
     groups: list[Compared]
     checks: list[Check]
     alone: tuple[list[str], list[str]]  # cells that only A, only B has
+    unfinished: tuple[str, ...] = ()  # `37 of 80 episodes of DIR are driven`, of each run that lacks some
+    partial: bool = False  # thresholds are held against an unfinished run all the same
+
+    @property
+    def open(self) -> bool:
+        """Whether thresholds are given that only finished runs can pass or fail."""
+        return bool(self.unfinished and self.checks) and not self.partial
 
     @property
     def exit_code(self) -> int:
-        """0 passed, 1 a threshold failed, 2 input refused, 3 simulations failed among the compared."""
+        """0 passed, 1 a threshold failed, 2 input refused or unfinished, 3 simulations failed among the
+        compared."""
         return self._judged[0]
 
     @property
@@ -132,6 +140,8 @@ class Comparison:
 
     @property
     def _judged(self) -> tuple[int, str]:
+        if self.open:
+            return 2, "no verdict: the batch is unfinished (--partial judges the episodes that there are)"
         if refused := sum(len(g.group.refused) for g in self.groups):
             return 2, f"no verdict: {refused} compared episodes had bad input"
         if failed := sum(len(g.group.failed) for g in self.groups):
@@ -141,15 +151,23 @@ class Comparison:
             return 1, f"failed: {count[FAILED]} of {len(self.checks)} checks"
         passed = f"passed: {count[PASSED]} of {len(self.checks)} checks" if count else ""
         skipped = f", {count[SKIPPED]} do not apply" if count[SKIPPED] else ""
-        return 0, passed + skipped or "compared, no threshold was given"
+        part = ", on a part of the episodes" if count and self.unfinished else ""
+        return 0, passed + skipped + part or "compared, no threshold was given"
 
 
 def compare(
-    a: Side, b: Side, fail_on: Sequence[str] = (), *, across: Sequence[str] = (), seed: int = 0
+    a: Side,
+    b: Side,
+    fail_on: Sequence[str] = (),
+    *,
+    across: Sequence[str] = (),
+    partial: bool = False,
+    seed: int = 0,
 ) -> Comparison:
     """Pair the episodes and hold every threshold against every group.
 
-    `across`: what A and B may differ in, e.g. ("svo_deg",). `seed` fixes the bootstrap.
+    `across`: what A and B may differ in, e.g. ("svo_deg",). `partial`: thresholds judge unfinished runs by
+    what there is of them. `seed` fixes the bootstrap.
 
     Raises:
         BadInput: see `pair`; a threshold that cannot be read, that applies to no group, or that is on a
@@ -172,7 +190,9 @@ def compare(
         if all(check.status == SKIPPED for check in checks if check.threshold is threshold):
             problem = f"{threshold.measure.name} is NA in every compared episode"
             raise BadInput(problem, field="--fail-on", value=threshold.text)
-    return Comparison(title(a), title(b), groups, checks, alone)
+    runs = [one.run for one in (a, b) if one.run.missing]
+    unfinished = dict.fromkeys(f"{len(r.rows)} of {r.planned} episodes of {r.path} are driven" for r in runs)
+    return Comparison(title(a), title(b), groups, checks, alone, tuple(unfinished), partial)
 
 
 def paired(measure: Measure, pairs: Sequence[tuple[Row, Row]], seed: int = 0) -> PairedFigure:

@@ -80,15 +80,15 @@ def errors_begun(pairs: Iterable[tuple[Row, Row]]) -> tuple[int, int, int]:
 
 
 def side(text: str) -> Side:
-    """`DIR` or `DIR:POLICY`.
+    """`DIR` or `DIR:POLICY`; of an unfinished run the episodes that there are.
 
     Raises:
         BadInput: no such run, or no such policy in it.
     """
     folder, _, policy = text.rpartition(":")
     if Path(text).is_dir() or not folder:
-        return Side(run_folder.read(text))
-    return chosen(run_folder.read(folder), policy)
+        return Side(run_folder.read(text, unfinished=True))
+    return chosen(run_folder.read(folder, unfinished=True), policy)
 
 
 def chosen(run: Run, policy: str) -> Side:

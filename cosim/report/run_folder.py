@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet
 
 from cosim.batch import export as files
-from cosim.batch.store import FILE
+from cosim.batch.store import FILE, Store
 from cosim.errors import BadInput
 from cosim.files import read_json
 from cosim.report.figures import Measure, Row, measures
@@ -50,6 +50,11 @@ class Run:
             return None
         return len(cells) * (int(seeds[1]) - int(seeds[0]))
 
+    @property
+    def missing(self) -> int:
+        """How many of these have no row."""
+        return max((self.planned or 0) - len(self.rows), 0)
+
     def case(self, row: Row) -> dict[str, Any]:
         """What was asked for (`EpisodeId`), without policy and seed; {} where not known."""
         return {k: v for k, v in self._cell(row).get("case", {}).items() if k not in ("policy", "seed")}
@@ -82,11 +87,11 @@ def export(folder: Path, rows: Sequence[Row], manifest: Mapping[str, Any], plann
     return summary
 
 
-def read(path: str | Path) -> Run:
-    """The run in the folder `path`.
+def read(path: str | Path, *, unfinished: bool = False) -> Run:
+    """The run in the folder `path`; `unfinished`: also one that goes on or was stopped, as far as it is.
 
     Raises:
-        BadInput: no such folder, no `episodes.parquet` in it, or one that is not ours.
+        BadInput: no such folder, no `episodes.parquet` in it, or one that is not ours; no episode yet.
     """
     folder = Path(path)
     if not folder.is_dir():
@@ -94,6 +99,8 @@ def read(path: str | Path) -> Run:
     file = folder / "episodes.parquet"
     if not file.is_file():
         if (folder / FILE).is_file():
+            if unfinished:
+                return _so_far(folder)
             raise BadInput(f"is not finished: `cosim evaluate --resume --out {folder}` goes on", file=folder)
         raise BadInput("holds no episodes.parquet: is it a run of `cosim evaluate`?", file=folder)
     try:
@@ -106,6 +113,15 @@ def read(path: str | Path) -> Run:
     file = folder / "manifest.json"
     manifest = checked(read_json(file), file) if file.is_file() else {}
     return Run(folder, _named_alike(rows, manifest.get("cells", {})), manifest)
+
+
+def _so_far(folder: Path) -> Run:
+    """What the store of an unfinished run holds, as it will be read when the run has ended."""
+    with Store.in_folder(folder) as store:
+        if not (rows := store.rows()):
+            raise BadInput("has no episode yet", file=folder)
+        manifest = {**store.document(), "cells": store.cells()}
+    return Run(folder, _named_alike(files.arrow(rows).to_pylist(), manifest["cells"]), manifest)
 
 
 def _named_alike(rows: list[dict[str, Any]], cells: Mapping[str, Any]) -> list[Row]:

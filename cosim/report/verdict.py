@@ -27,6 +27,7 @@ def document(comparison: Comparison) -> dict[str, Any]:
         "b": comparison.b,
         "verdict": comparison.verdict,
         "exit_code": comparison.exit_code,
+        "unfinished": [*comparison.unfinished],
         "checks": [
             {
                 "threshold": check.threshold.text,
@@ -44,7 +45,7 @@ def document(comparison: Comparison) -> dict[str, Any]:
 
 def text(comparison: Comparison) -> str:
     """Tables and verdict for a terminal."""
-    lines = [f"A  {comparison.a}", f"B  {comparison.b}", ""]
+    lines = [f"A  {comparison.a}", f"B  {comparison.b}", *_unfinished(comparison), ""]
     for compared in comparison.groups:
         lines += [compared.group.name, *(f"  {note}" for note in _notes(compared))]
         table = [("", "A", "B", "B - A"), *(_cells(figure) for figure in _shown(comparison, compared))]
@@ -64,6 +65,7 @@ def markdown(comparison: Comparison) -> str:
     """Tables and verdict for a pull request comment."""
     lines = [f"### cosim compare: {comparison.verdict}", ""]
     lines += [f"A: `{comparison.a}`, B: `{comparison.b}`; 95 % intervals, pairs on equal seeds", ""]
+    lines += [part for line in _unfinished(comparison) for part in (f"**{_html(line)}**", "")]
     if comparison.checks:
         lines += ["| | fails on | group | finding |", "|---|---|---|---|"]
         for check in comparison.checks:
@@ -82,7 +84,8 @@ def markdown(comparison: Comparison) -> str:
 
 def junit(comparison: Comparison, path: Path) -> None:
     """Write the file that every CI server reads, whole or not at all: a test case per threshold and group,
-    and one per group with simulations that gave no figures. Raises OSError."""
+    one per group with simulations that gave no figures, and one where the batch is unfinished. Raises
+    OSError."""
     suite = TestSuite("cosim compare")
     for name, value in (("a", comparison.a), ("b", comparison.b), ("verdict", comparison.verdict)):
         suite.add_property(name, _clean(value))
@@ -95,6 +98,10 @@ def junit(comparison: Comparison, path: Path) -> None:
             case.result = [Skipped(message)]
         else:
             case.system_out = message
+        suite.add_testcase(case)
+    if comparison.open:
+        case = TestCase("every episode was driven", classname="cosim compare")
+        case.result = [Error(_clean("; ".join(comparison.unfinished)), "unfinished")]
         suite.add_testcase(case)
     for group in (compared.group for compared in comparison.groups):
         if rows := [*group.failed, *group.refused]:
@@ -195,6 +202,12 @@ def _notes(compared: Compared) -> list[str]:
         notes.append(f"{row['status']} {row['key']} ({row['policy']}, seed {row['seed']}): {_reason(row)}")
     hidden = len(group.failed) + len(group.refused) - _SHOWN
     return [*notes, f"and {hidden} more"] if hidden > 0 else notes
+
+
+def _unfinished(comparison: Comparison) -> list[str]:
+    """What a reader must know first: of how much of the batch all of this is."""
+    pairs = sum(len(compared.group.pairs) for compared in comparison.groups)
+    return [f"unfinished: {'; '.join(comparison.unfinished)}, {pairs} pairs"] if comparison.unfinished else []
 
 
 def _alone(comparison: Comparison) -> list[str]:

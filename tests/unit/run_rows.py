@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from cosim.batch.export import export
+from cosim.batch.store import Store
 from cosim.report.summary import summarize
 from cosim.scenario.episode_id import EpisodeId
 
@@ -120,17 +121,32 @@ def write(
 ) -> Path:
     """The run folder; `planned`: seeds of every cell (None: as many as the first one has)."""
     folder.mkdir(parents=True)
-    pairs = [pair for one in cells for pair in one]
-    rows = [found for _, found in pairs]
-    document = {
-        "command": "cosim evaluate --scenario merge",
-        "seeds": [200_000, 200_000 + (len(cells[0]) if planned is None else planned)],
-        "versions": {"cosim": "0.1.0", "libsumo": "1.28.0"},
-        "units": UNITS,
-        "better": BETTER,
-        "cells": {c.cell: {"case": c.document(), "manifest": {}} for c, _ in pairs},
-    }
+    rows = [found for one in cells for _, found in one]
+    document = _document(len(cells[0]) if planned is None else planned) | {"cells": _cells(*cells)}
     export(folder, rows, document, summarize(rows, UNITS, BETTER))
     if not manifest:
         (folder / "manifest.json").unlink()
     return folder
+
+
+def begin(folder: Path, *cells: list[tuple[EpisodeId, dict[str, Any]]], planned: int) -> Path:
+    """The folder of a run that is still being driven: `planned` seeds of every cell, these rows so far."""
+    folder.mkdir(parents=True)
+    with Store.in_folder(folder) as store:
+        store.begin("hash", _document(planned), [{"cell": c} | about for c, about in _cells(*cells).items()])
+        store.add(found for one in cells for _, found in one)
+    return folder
+
+
+def _document(seeds: int) -> dict[str, Any]:
+    return {
+        "command": "cosim evaluate --scenario merge",
+        "seeds": [200_000, 200_000 + seeds],
+        "versions": {"cosim": "0.1.0", "libsumo": "1.28.0"},
+        "units": UNITS,
+        "better": BETTER,
+    }
+
+
+def _cells(*cells: list[tuple[EpisodeId, dict[str, Any]]]) -> dict[str, dict[str, Any]]:
+    return {c.cell: {"case": c.document(), "manifest": {}} for one in cells for c, _ in one}

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 from junitparser import Error, Failure, JUnitXml, Skipped
-from run_rows import CASE, cell, failed, row, write
+from run_rows import CASE, begin, cell, failed, row, write
 
 from cosim.cli.main import main
 from cosim.errors import BadInput
@@ -336,6 +337,45 @@ def test_episodes_without_figures_leave_no_verdict(
     errors = [case for suite in JUnitXml.fromfile(str(junit)) for case in suite if case.result]
     assert isinstance(errors[0].result[0], Error)
     assert broken.key in errors[0].system_err
+
+
+@pytest.mark.parametrize("made", [begin, write])  # still driven; ended without the rows of some
+def test_an_unfinished_batch_is_shown_as_far_as_it_is(
+    made: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    columns = {"crashed": [True, False, False]}
+    folder = made(tmp_path / "run", cell("idm", 10), cell("rash", 3, columns=columns), planned=10)
+    sides = (folder, "--baseline", "idm", "--candidate", "rash")
+    said = f"unfinished: 13 of 20 episodes of {folder} are driven, 3 pairs"
+    code, out, _ = run(capsys, *sides)
+    assert code == 0
+    assert out.splitlines()[2] == said
+    assert "7 episodes of A have no partner and do not count" in out
+    document = json.loads(run(capsys, *sides, "--json")[1])
+    assert document["unfinished"] == [f"13 of 20 episodes of {folder} are driven"]
+    assert document["groups"][0]["figures"]["collision_rate"]["hits_b"] == 1
+
+
+def test_an_unfinished_batch_passes_no_gate_unless_that_is_asked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    columns = {"crashed": [True, False, False]}
+    folder = begin(tmp_path / "run", cell("idm", 10), cell("rash", 3, columns=columns), planned=10)
+    junit, markdown = tmp_path / "junit.xml", tmp_path / "comment.md"
+    files = ("--junit", junit, "--markdown", markdown)
+    sides = (f"{folder}:idm", f"{folder}:rash", *files, "--fail-on")
+    code, out, _ = run(capsys, *sides, "collision_rate > +50pp")
+    assert code == 2
+    assert out.splitlines()[-1].startswith("no verdict: the batch is unfinished (--partial")
+    assert "+33.3 pp" in out, "it is shown all the same"
+    assert "**unfinished: 13 of 20 episodes" in markdown.read_text()
+    (error,) = [c for suite in JUnitXml.fromfile(str(junit)) for c in suite if c.result]
+    assert isinstance(error.result[0], Error)
+    code, out, _ = run(capsys, *sides, "collision_rate > +50pp", "--partial")
+    assert code == 0
+    assert out.splitlines()[-1] == "passed: 1 of 1 checks, on a part of the episodes"
+    assert not [c for suite in JUnitXml.fromfile(str(junit)) for c in suite if c.result]
+    assert run(capsys, *sides, "collision_rate > +20pp", "--partial")[0] == 1
 
 
 def test_failed_episodes_that_have_no_partner_are_left_out(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
-from run_rows import CASE, cell, failed, row, write
+from run_rows import CASE, begin, cell, failed, row, write
 
 from cosim.cli.main import main
 from cosim.errors import BadInput
@@ -169,10 +169,21 @@ def test_a_run_that_lacks_episodes_says_so(tmp_path: Path) -> None:
     folder = write(tmp_path / "run", cell("idm", 2), cell("own", 1), planned=2)
     page = Page(report.write(read(folder)).read_text())
     assert "1 of 4 episodes not driven: `cosim evaluate --resume` goes on" in page.text
-    (folder / "episodes.parquet").unlink()
-    (folder / "store.sqlite").touch()
+
+
+def test_an_unfinished_run_is_reported_as_far_as_it_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = begin(tmp_path / "run", cell("idm", 2), cell("own", 1), planned=2)
     with pytest.raises(BadInput, match="is not finished: `cosim evaluate --resume --out"):
         read(folder)
+    whole = read(write(tmp_path / "whole", cell("idm", 2), cell("own", 1), planned=2))
+    assert read(folder, unfinished=True).rows == whole.rows
+    assert main(["report", str(folder)]) == 0
+    page = Page(Path(capsys.readouterr().out.strip()).read_text())
+    assert "1 of 4 episodes not driven: `cosim evaluate --resume` goes on" in page.text
+    with pytest.raises(BadInput, match="has no episode yet"):
+        read(begin(tmp_path / "empty", planned=2), unfinished=True)
 
 
 def test_na_everywhere_is_shown_as_na(tmp_path: Path) -> None:

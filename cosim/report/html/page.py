@@ -103,7 +103,7 @@ def _verdict(run: Run, found: Sequence[Block]) -> dict[str, Any]:
     """What can be said of the run as a whole: whether all was driven, and whether it may be compared."""
     status = {name: count for name, count in status_counts(run.rows).items() if count}
     total, ok = len(run.rows), status.get(OK, 0)
-    missing = max((run.planned or 0) - total, 0)
+    missing = run.missing
     odd = sum(not_comparable(row) for row in run.rows)
     if missing:
         words = (

@@ -1,4 +1,4 @@
-"""Train Stable-Baselines3's DQN on `cosim/Merge-v0` for a few thousand steps; its figures before and after.
+"""Train Stable-Baselines3's DQN on `cosim:cosim/Merge-v0` for a few thousand steps; its figures before and after.
 
     python examples/train_sb3_dqn.py --steps 5000 --out runs/sb3-dqn.zip    # driven by examples/sb3_policy.py
 
@@ -13,8 +13,6 @@ import statistics
 from typing import TYPE_CHECKING
 
 import gymnasium
-
-import cosim.envs  # noqa: F401 - registers the ids
 
 if TYPE_CHECKING:
     from stable_baselines3 import DQN
@@ -38,8 +36,8 @@ def main(arguments: list[str] | None = None) -> None:
 
     torch.set_num_threads(1)
     with_mlp = {"demand": args.demand, "svo": args.svo, "flatten": "kinematics"}
-    env = gymnasium.make("cosim/Merge-v0", **with_mlp)
-    test_env = gymnasium.make("cosim/Merge-v0", **with_mlp)
+    env = gymnasium.make("cosim:cosim/Merge-v0", **with_mlp)
+    test_env = gymnasium.make("cosim:cosim/Merge-v0", **with_mlp)
     model = DQN(
         "MlpPolicy",
         env,

@@ -1,4 +1,4 @@
-"""Train Stable-Baselines3's DQN on `cosim:cosim/Merge-v0` for a few thousand steps; its figures before and after.
+"""Train Stable-Baselines3's DQN on the environment of `merge` for a while; its figures before and after.
 
     python examples/train_sb3_dqn.py --steps 5000 --out runs/sb3-dqn.zip    # driven by examples/sb3_policy.py
 

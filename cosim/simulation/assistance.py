@@ -12,6 +12,7 @@ ahead of it are told (V2V), and make room before the end of their queue has used
 """
 
 import math
+from collections.abc import Set
 from dataclasses import dataclass
 
 from cosim.control import COMFORT, COMFORT_TIME, wished_accel
@@ -21,7 +22,8 @@ from cosim.simulation.backend import sumo
 from cosim.simulation.commands import SPEED_MODE, Commander, Controlled
 from cosim.simulation.fleet import set_type
 from cosim.simulation.gaps import Gaps
-from cosim.simulation.inside import Inside
+from cosim.simulation.inside import FREE, SWERVES, Ahead, Inside
+from cosim.simulation.waves import NOBODY, Waves
 from cosim.types import Intervention, Preset
 
 # sumo_scenarios/types.add.xml: an IDM that brakes comfortably, and one that brakes late
@@ -96,6 +98,7 @@ class Assisted(Controlled):
     goes: str = ""  # the lane from which it takes its gap
     lets: float = -math.inf  # s, until when it stops before its line for who takes one
     has_let: float = 0.0  # s, for which it has done so at this one
+    side: float = 0.0  # m to the left of its lane's centre, where it drives
     holds: bool = False  # for an AV that would have to brake hard
 
     @property
@@ -113,6 +116,7 @@ class Assistance(Commander):
         super().__init__(Preset.LAWFUL, step)
         self._junctions = Inside(road)
         self._gaps = Gaps(road, self._junctions)
+        self._waves = Waves()
         self._looked = -math.inf  # s
         self._begun: list[Intervention] = []
         self._standing_gaps: dict[str, float] = {}  # human -> m
@@ -204,7 +208,13 @@ class Assistance(Commander):
 
     def _hand_back(self, name: str) -> None:
         """It keeps its comfortable driver."""
+        self._waves.set(name, NOBODY)
         _drive_as(name, LAWFUL_TYPE)
+
+    def drop(self, name: str) -> None:
+        """Also of one that crashed."""
+        super().drop(name)
+        self._waves.set(name, NOBODY)
 
     def _forbidden(self, name: str, lane: str, offset: int) -> str | None:
         why = super()._forbidden(name, lane, offset)
@@ -390,35 +400,55 @@ class Assistance(Commander):
         return False
 
     def _mind_inside(self, name: str, lane: str, speed: float, state: Assisted) -> None:
-        """Who stands inside a junction stays there while somebody is in its way, or may soon be; for longer
-        than `PATIENCE` only while somebody is. Who drives stops before who stands there; before its line for
-        so long that he can take his gap first."""
-        inside = lane.startswith(":")
-        long = state.held >= (PATIENCE if inside else PATIENCE + WAITS)
+        """An AV passes vehicles that stand in its way inside a junction within its lane, or stops for them:
+        before its line, as long as it can stop there, else before their way out of the junction. One that
+        stands inside stays there while somebody is in its way, or for at most `PATIENCE` may soon be.
+
+        So that nobody waits for ever, the AV that has stopped waves the vehicle in its way through.
+        """
+        inside, waved = lane.startswith(":"), self._waves.of(name)
+        line = math.inf
         if inside and speed < STARTS:
-            state.stays = state.holds or self._junctions.blocked(name, lane, present=long)
+            ahead = self._junctions.blocked(name, lane, state.held >= PATIENCE, waved)
+            state.stays = state.holds or ahead.room < math.inf
         else:
             brakes, left = STOPS_FOR
             needs = speed * speed / (2.0 * brakes) + left  # m
-            room, line = self._room(name, lane, inside)
-            state.stays = room < needs or (
-                room < math.inf and line < needs and not long and line > needs - left
-            )
+            ahead, line = self._room(name, lane, inside, waved)
+            state.stays = ahead.room < needs or (ahead.room < math.inf and needs - left < line < needs)
+        waves = set()
         if state.stays:
             state.accel = -COMFORT
             state.held += self._step
+            if speed < STARTS:
+                waves = {one for one in ahead.standing if one in waved or self._junctions.can_pass(one, name)}
+                waves |= {one for one in waved if self._junctions.inside(one)}
         elif not inside and speed >= KEEPS_MOVING:
             state.held = 0.0
+        self._waves.set(name, waves)
+        self._move_aside(name, speed, state, ahead.side)
 
-    def _room(self, name: str, lane: str, inside: bool) -> tuple[float, float]:
-        """m to who stands in its way inside a junction, inf where nobody does; m to its line, or inf."""
+    def _room(self, name: str, lane: str, inside: bool, waved: Set[str]) -> tuple[Ahead, float]:
+        """Its way through the junction that it is in, or comes to; m to its line, or inf."""
         if inside:
-            return self._junctions.room(name, lane), math.inf
+            return self._junctions.room(name, lane, waved), math.inf
         away = sumo.lane.getLength(lane) - sumo.vehicle.getLanePosition(name) if lane else math.inf
         links = sumo.vehicle.getNextLinks(name) if away < LOOKS_IN else ()
         if not links or not links[0][4] or links[0][5] in RED + YELLOW:
-            return math.inf, away
-        return away + self._junctions.room(name, links[0][4], 0.0), away
+            return FREE, away
+        ahead = self._junctions.room(name, links[0][4], waved, 0.0, away)
+        return ahead._replace(room=away + ahead.room), away
+
+    def _move_aside(self, name: str, speed: float, state: Assisted, side: float) -> None:
+        """Drive `side` m to the left of the lane's centre, reached by and by."""
+        if side == state.side or state.changing(sumo.simulation.getTime()):
+            return
+        most = SWERVES * speed * self._step
+        moved = min(max(side - state.side, -most), most)
+        if moved:
+            state.side += moved
+            state.lateral += moved  # it is no change of lanes
+            sumo.vehicle.setLateralLanePosition(name, state.side)
 
     def _give(self, asked: list[str], name: str) -> None:
         for other in asked:

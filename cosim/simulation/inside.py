@@ -8,9 +8,10 @@ looked at who is inside the junction with a part of his body, or soon will be, a
 
 import math
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence, Set
 from functools import cached_property
 from itertools import takewhile
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,11 +24,25 @@ from cosim.types import Floats
 
 STOPS = 4.5  # m/s2, with which who is slow comes to a stand
 SLOW = 3.0  # m/s: who is faster passes
+STOPS_BEFORE = 0.1  # m before the end of a lane, where SUMO's drivers wait inside a junction
 SPACING = 0.25  # m between the places that are looked at
 BESIDE = np.array([[0.0], [0.0], [0.0], [0.0], [0.2]])  # m of width more, for who stands
 CREEPS = 0.5  # m/s: who is slower stands, for those who drive
 PERSON = 0.5  # m, across
+SIDE = 0.1  # m between the places beside its lane's centre at which an AV may pass
+SWERVES = 0.2  # m to the side on each m driven
 SOON = 3.0, 10.0  # s, or m, from a green line: who is so near will be inside
+
+
+class Ahead(NamedTuple):
+    """An AV's way out of a junction."""
+
+    room: float  # m that it can drive; inf: all of it
+    standing: tuple[str, ...] = ()  # the vehicles that stand in its way
+    side: float = 0.0  # m to the left of its lane's centre, where it passes those who stand
+
+
+FREE = Ahead(math.inf)
 
 
 class Inside:
@@ -37,35 +52,78 @@ class Inside:
         self._road = road
         self._ways: dict[int, tuple[LanePath, tuple[int, ...]]] = {}
 
-    def blocked(self, name: str, lane: str, present: bool = False) -> bool:
-        """Whether the AV `name`, which stands on the internal lane `lane`, would touch somebody on its way
-        out of the junction: who stands there, drives or walks through, or may soon wait there; `present`: who
-        is there."""
-        own = self._road.index.get(lane, -1)
-        if own < 0:
-            return False
-        mine = None
-        for theirs in self._others(own, present):
-            if mine is None:
-                mine = self.through(name, own, sumo.vehicle.getLanePosition(name))
-            if _comes_to(mine + BESIDE, theirs) or _comes_to(mine, theirs):
-                return True
-        return False
+    def blocked(self, name: str, lane: str, present: bool, waved: Set[str]) -> Ahead:
+        """What keeps the AV `name`, which stands on the internal lane `lane`, from driving out of the
+        junction; the room is 0 or inf.
 
-    def room(self, name: str, lane: str, at: float | None = None) -> float:
-        """m that the AV `name` can drive over the internal lane `lane`, from where it is or from `at` (m),
-        until it touches somebody who stands in the junction, or slowly comes to where he waits in it, or, if
-        it is inside itself, walks there; inf where nobody does but who is beside it."""
+        Args:
+            present: count only those who are in its way now, not those who drive or may soon wait there.
+            waved: vehicles that the AV lets pass: their whole way out of the junction is theirs.
+        """
+        own = self._road.index.get(lane, -1)
+        others = [] if own < 0 else list(self._others(own, present, waved))
+        if not others:
+            return FREE
+        get = sumo.vehicle
+        still = [bool(other) and get.getSpeed(other) < CREEPS for other, _ in others]
+        mine = self.through(name, own, get.getLanePosition(name))
+        for side in self._sides(name, own):
+            way = _aside(mine, get.getLateralLanePosition(name), side)
+            touched = [
+                (not stands and _comes_to(way + BESIDE, theirs)) or _comes_to(way, theirs)
+                for stands, (_, theirs) in zip(still, others, strict=True)
+            ]
+            if not any(touched):
+                return Ahead(math.inf, (), side)
+            if any(one and not stands for one, stands in zip(touched, still, strict=True)):
+                break  # nobody dodges those who drive or walk
+        standing = (o for (o, _), stands, one in zip(others, still, touched, strict=True) if stands and one)
+        return Ahead(0.0, tuple(standing))
+
+    def room(
+        self, name: str, lane: str, waved: Set[str], at: float | None = None, before: float = 0.0
+    ) -> Ahead:
+        """What keeps the AV `name` from driving over the internal lane `lane` and out of the junction: those
+        who stand in it, or slowly come to where they wait in it, and, if it is inside itself, who walks there;
+        not those beside it.
+
+        Of those who stand in its way the room ends where their way out of the junction begins, as far as the
+        AV has not come to it yet, so that they can go first.
+
+        Args:
+            waved: see `blocked`.
+            at: m on that lane from which it drives, where it is not there yet, but `before` m before it.
+        """
         own = self._road.index.get(lane, -1)
         get = sumo.vehicle
-        standing = [] if own < 0 else list(self._standing(own, inside=at is None))
+        standing = [] if own < 0 else list(self._standing(own, at is None, waved))
         if not standing:
-            return math.inf
+            return FREE
         mine = self.through(name, own, get.getLanePosition(name) if at is None else at)
-        theirs = Boxes(*np.concatenate(standing, 1)[:, None, :])
-        touched = overlap(Boxes(*mine[:, :, None]), theirs)  # [places, who]
-        places = np.flatnonzero(touched[:, ~touched[0]].any(1))
-        return float(places[0]) * SPACING if len(places) else math.inf
+        found = FREE
+        for side in self._sides(name, own):
+            way = _aside(mine, get.getLateralLanePosition(name), side, before)
+            ahead = self._until(way, standing)
+            if ahead.room == math.inf:
+                return ahead._replace(side=side)
+            found = ahead if found is FREE else found
+            if "" in found.standing:  # nobody dodges those who walk
+                break
+        return found._replace(standing=tuple(filter(None, found.standing)))
+
+    def can_pass(self, other: str, name: str) -> bool:
+        """Whether a vehicle inside the junction gets out of it without touching the AV `name`, which stands."""
+        way = self.way_out(other)
+        return way is not None and not overlap(Boxes(*way), Boxes(*_body(name))).any()
+
+    def inside(self, name: str) -> bool:
+        """Whether the front of a vehicle is inside a junction."""
+        return self._lane_inside(name) >= 0
+
+    def way_out(self, name: str) -> Floats | None:
+        """`through` of a vehicle inside a junction from where it is; None for one that is not inside."""
+        lane = self._lane_inside(name)
+        return None if lane < 0 else self.through(name, lane, sumo.vehicle.getLanePosition(name))
 
     def through(self, name: str, lane: int, at: float) -> Floats:
         """[5,k] x, y (m), heading (rad), length and width (m) of a vehicle every `SPACING` m on its way from
@@ -93,25 +151,60 @@ class Inside:
 
     # ---- inside ----
 
-    def _standing(self, own: int, inside: bool) -> Iterator[Floats]:
+    def _lane_inside(self, name: str) -> int:
+        try:
+            lane = self._road.index.get(sumo.vehicle.getLaneID(name), -1)
+        except sumo.TraCIException:  # it has left the road
+            return -1
+        return lane if lane >= 0 and self._road.lanes[lane].internal else -1
+
+    def _until(self, mine: Floats, standing: Sequence[tuple[str, Floats]]) -> Ahead:
+        """The way `mine` until it touches somebody of `standing`; "" in it stands for those who walk."""
+        room, names = math.inf, []
+        for other, theirs in standing:
+            away = _first_touch(mine, theirs)
+            if away == math.inf:
+                continue
+            if not other:
+                names.append(other)
+            elif sumo.vehicle.getSpeed(other) < CREEPS:
+                names.append(other)
+                way = self.way_out(other)
+                away = away if way is None else min(away, _first_touch(mine, way))
+            room = min(room, away)
+        return Ahead(room, tuple(names))
+
+    def _sides(self, name: str, own: int) -> Iterator[float]:
+        """m to the left of its lane's centre at which the AV `name` can drive out of the junction from the
+        lane `own`, within the lanes; the nearest to the centre first."""
+        width = min(self._road.lanes[k].width for k in self._way(own)[1])
+        yield 0.0
+        for k in range(1, int(0.5 * (width - sumo.vehicle.getWidth(name)) / SIDE) + 1):
+            yield k * SIDE
+            yield -k * SIDE
+
+    def _standing(self, own: int, inside: bool, waved: Set[str]) -> Iterator[tuple[str, Floats]]:
         """Who stands in the junction of the lane `own`, with his tail at least, or slowly comes to a place
         where the net lets him wait in it; not on the way over that lane, where SUMO's driver heeds them.
-        `inside`: who walks over its crossings too."""
+        `inside`: who walks over its crossings too (without a name)."""
         lanes, get = self._road.lanes, sumo.vehicle
         for lane in self._lanes[lanes[own].start]:
             if lane in self._way(own)[1]:
                 continue
             for other in sumo.lane.getLastStepVehicleIDs(lanes[lane].id):
                 speed = get.getSpeed(other)
-                if speed < CREEPS:
-                    yield _body(other)
-                if speed < SLOW and self._road.waits_inside(lane):
-                    yield self.through(other, lane, lanes[lane].length)[:, :1]
+                if other in waved:
+                    yield other, self.through(other, lane, get.getLanePosition(other))
+                elif speed < CREEPS:
+                    yield other, _body(other)
+                elif speed < SLOW and self._road.waits_inside(lane):
+                    yield other, self.through(other, lane, lanes[lane].length - STOPS_BEFORE)[:, :1]
         for other in self._tails(own):
             if get.getSpeed(other) < CREEPS:
-                yield _body(other)
+                yield other, _body(other)
         if inside:
-            yield from self.walkers(lanes[own].start, SOON[0], "c")
+            for walker in self.walkers(lanes[own].start, SOON[0], "c"):
+                yield "", walker
 
     def _tails(self, own: int) -> Iterator[str]:
         """Who has left that junction but for his tail."""
@@ -122,13 +215,16 @@ class Inside:
                 if get.getLanePosition(other) < get.getLength(other):
                     yield other
 
-    def _others(self, own: int, present: bool) -> Iterator[Floats]:
+    def _others(self, own: int, present: bool, waved: Set[str]) -> Iterator[tuple[str, Floats]]:
         """The places, as `through`'s, of those who are on other ways through the junction of the lane `own`,
-        or soon will be: where they stand, will wait, drive or walk; `present`: where they are."""
+        or soon will be: where they stand, will wait, drive or walk (persons without a name); `present`: where
+        they are."""
         get, lanes, (_, way) = sumo.vehicle, self._road.lanes, self._way(own)
         seconds, metres = SOON
-        yield from self.walkers(lanes[own].start, 0.0 if present else seconds)
-        yield from map(_body, self._tails(own))
+        for walker in self.walkers(lanes[own].start, 0.0 if present else seconds):
+            yield "", walker
+        for other in self._tails(own):
+            yield other, _body(other)
         for lane in self._lanes[lanes[own].start]:
             if lane in way:  # SUMO's driver heeds them
                 continue
@@ -136,12 +232,15 @@ class Inside:
             for other in sumo.lane.getLastStepVehicleIDs(lanes[lane].id):
                 at, speed = get.getLanePosition(other), get.getSpeed(other)
                 through = self.through(other, lane, at)
-                if present:
-                    yield through[:, :1]
+                if other in waved:
+                    yield other, through
+                    continue
+                if present or speed < CREEPS:
+                    yield other, through[:, :1]
                     continue
                 stands = min(at + speed**2 / (2.0 * STOPS), end) - at
-                last = end - at if waits else stands if speed < SLOW else math.inf
-                yield through[:, : int(min(last / SPACING, through.shape[1])) + 1]
+                last = end - STOPS_BEFORE - at if waits else stands if speed < SLOW else math.inf
+                yield other, through[:, : int(min(max(last, 0.0) / SPACING, through.shape[1])) + 1]
             for origin in self._origins[lane] if waits and not present else ():
                 for other in sumo.lane.getLastStepVehicleIDs(lanes[origin].id):
                     away = lanes[origin].length - get.getLanePosition(other)
@@ -149,7 +248,7 @@ class Inside:
                         continue
                     links = get.getNextLinks(other)
                     if links and links[0][4] == lanes[lane].id and links[0][5] not in RED + YELLOW:
-                        yield self.through(other, lane, end)[:, :1]
+                        yield other, self.through(other, lane, end - STOPS_BEFORE)[:, :1]
 
     def _way(self, lane: int) -> tuple[LanePath, tuple[int, ...]]:
         """The path over a lane inside a junction from the line on, and its lanes up to the junction's end."""
@@ -198,6 +297,22 @@ class Inside:
         for link in self._road.links:
             found[link.via].append(link.origin)
         return found
+
+
+def _aside(way: Floats, now: float, side: float, before: float = 0.0) -> Floats:
+    """The way of one that is `now` m to the left of its lane's centre, `before` m before the way begins, and
+    moves to `side` m."""
+    driven = SWERVES * (before + SPACING * np.arange(way.shape[1]))
+    left = now + np.clip(side - now, -driven, driven)
+    return np.concatenate([[way[0] - left * np.sin(way[2]), way[1] + left * np.cos(way[2])], way[2:]])
+
+
+def _first_touch(mine: Floats, theirs: Floats) -> float:
+    """m on the way `mine` until it touches `theirs`; inf where it never does, or does now: to stay is no
+    help against who is beside it."""
+    touched = overlap(Boxes(*mine[:, :, None]), Boxes(*theirs[:, None, :]))  # [places, places]
+    places = np.flatnonzero(touched[:, ~touched[0]].any(1))
+    return float(places[0]) * SPACING if len(places) else math.inf
 
 
 def _comes_to(mine: Floats, theirs: Floats) -> bool:

@@ -282,11 +282,11 @@ def test_who_stands_inside_a_junction_stays_for_who_may_come_but_not_for_ever_as
     class Full:
         there = False
 
-        def blocked(self, name: str, lane: str, present: bool) -> bool:
-            return self.there or not present
+        def blocked(self, name: str, lane: str, present: bool, waved: object) -> inside.Ahead:
+            return inside.Ahead(0.0) if self.there or not present else inside.FREE
 
-        def room(self, name: str, lane: str) -> float:
-            return 3.0 if self.there else math.inf
+        def room(self, name: str, lane: str, waved: object) -> inside.Ahead:
+            return inside.Ahead(3.0) if self.there else inside.FREE
 
     car, full = assistance.Assistance(STEP, RoadMap((), ())), Full()
     car._junctions = full  # type: ignore[assignment]
@@ -306,10 +306,8 @@ def test_who_stands_inside_a_junction_stays_for_who_may_come_but_not_for_ever_as
     full.there = True
     assert stays(":k_0_0", 0.0, 200) == 200, "somebody stands there"
     assert [stays(":k_0_0", speed) for speed in (2.0, 4.0)] == [0, 1], "it stops before him"
-    state.held = 0.0
-    car._room = lambda *_: (3.0, 2.0)  # type: ignore[method-assign]
-    first = assistance.PATIENCE + assistance.WAITS
-    assert stays("w_0", 2.9, 400) == pytest.approx(first / STEP, abs=1), "he can take his gap first"
+    car._room = lambda *_: (inside.Ahead(3.0), 2.0)  # type: ignore[method-assign]
+    assert stays("w_0", 2.9, 400) == 400, "before its line it waits as long as he stands there"
 
 
 def test_it_comes_to_a_stop_comfortably_and_does_not_creep_there(start: Start) -> None:

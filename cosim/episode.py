@@ -159,6 +159,7 @@ class Episode:
             mission_guessed=self.scenario.mission.guessed,
             goal=self.simulator.goal_lanes,
             duration=self.scenario.duration,
+            ends=self.scenario.on_collision == OnCollision.END,
         )
         self._metrics.reset(self.snapshot, context)
         self._observer.reset()

@@ -187,6 +187,13 @@ class HumanError:
         return in_time and (self.who in pair or self.near in pair)
 
 
+class Due(NamedTuple):
+    """A vehicle that is to depart and has found no room so far."""
+
+    since: float  # s, its wished departure
+    is_av: bool  # what it will be
+
+
 @dataclass(frozen=True, slots=True)
 class Events:
     """What happened since the last snapshot; ids in SUMO's order."""
@@ -198,6 +205,7 @@ class Events:
     emergency_stopped: tuple[str, ...] = ()
     entries: tuple[Entry, ...] = ()
     interventions: tuple[Intervention, ...] = ()
+    depart_delays: tuple[float, ...] = ()  # s that each of `departed` waited to be inserted
     stopped: tuple[str, ...] = ()  # stand at a stop of their plan at the frame's end
     wrecked: tuple[str, ...] = ()  # crashed in an episode that goes on: they stand
     wrecks_removed: tuple[str, ...] = ()  # and were taken off the road
@@ -244,6 +252,11 @@ class Snapshot:
     signals: Bytes = field(default_factory=lambda: np.zeros(0, np.uint8))
     # [s] s until the next phase of each signal's light, as it is planned now; empty in recordings
     switches: Floats = field(default_factory=lambda: np.zeros(0))
+    # [n] s lost since departure against free flow (SUMO's timeLoss); nan where not known, as in recordings
+    time_loss: Floats = field(default_factory=lambda: np.zeros(0))
+    # [n] g/s of CO2 at this moment, by SUMO's emission model; nan where not known, as in recordings
+    co2: Floats = field(default_factory=lambda: np.zeros(0))
+    waiting: Mapping[str, Due] | None = None  # who is to depart and has found no room; None: not known
 
     def __post_init__(self) -> None:
         if len(self.actor) != len(self.kind):
@@ -251,6 +264,9 @@ class Snapshot:
             object.__setattr__(self, "actor", actor)
         if len(self.place) != len(self.lane):
             object.__setattr__(self, "place", self.lane)
+        for name in ("time_loss", "co2"):
+            if len(getattr(self, name)) != len(self.kind):
+                object.__setattr__(self, name, np.full(len(self.kind), np.nan))
 
     @cached_property
     def row(self) -> dict[str, int]:

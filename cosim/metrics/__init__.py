@@ -6,16 +6,19 @@ from numbers import Number
 
 from cosim.errors import BadInput
 from cosim.files import code
+from cosim.metrics.arrivals import Arrivals
 from cosim.metrics.collisions import Collisions
 from cosim.metrics.context import EpisodeMetric, MetricContext
 from cosim.metrics.distance import Distance
 from cosim.metrics.drac import DecelerationRate
+from cosim.metrics.emissions import Emissions
 from cosim.metrics.events import TrafficEvents
 from cosim.metrics.hard_braking import HardBraking
 from cosim.metrics.headway import Headway
 from cosim.metrics.human_errors import HumanErrors
 from cosim.metrics.jerk import Jerk
 from cosim.metrics.law import AvCounts, StopLines
+from cosim.metrics.mean_speed import MeanSpeed
 from cosim.metrics.mission import MissionSuccess
 from cosim.metrics.near_misses import Exposure
 from cosim.metrics.persons import PersonConflicts
@@ -23,7 +26,9 @@ from cosim.metrics.post_encroachment import PostEncroachment
 from cosim.metrics.speeding import Speeding
 from cosim.metrics.standing import Standing
 from cosim.metrics.time_to_collision import TimeToCollision
+from cosim.metrics.total_delay import TotalDelay
 from cosim.metrics.trips import Interventions, Trips
+from cosim.metrics.waits import Waits
 from cosim.types import RESERVED, Kind, Metric, Offence, Snapshot
 
 __all__ = ["METRICS", "EpisodeMetric", "MetricContext", "MetricFactory", "Metrics", "joined", "read"]
@@ -49,6 +54,11 @@ METRICS: dict[str, type[EpisodeMetric]] = {
     "interventions": Interventions,
     "exposure": Exposure,
     "human_errors": HumanErrors,
+    "total_delay": TotalDelay,
+    "arrivals": Arrivals,
+    "mean_speed": MeanSpeed,
+    "waits": Waits,
+    "emissions": Emissions,
 }
 
 

@@ -1,18 +1,18 @@
-"""The context of an episode's metrics, the protocol of a metric, and tables of vehicles over time."""
+"""The context of an episode's metrics, and the protocol of a metric."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from cosim.geometry import Conflicts, boxes, conflicts
 from cosim.geometry.compiled import compiled
+from cosim.metrics.everybody import Everybody
 from cosim.metrics.lane_courses import LaneCourses
 from cosim.road import RoadMap
-from cosim.types import Bools, Floats, Ints, Kind, Metric, Snapshot, Timing
+from cosim.types import Bools, Floats, Kind, Metric, Snapshot, Timing
 
 AV = int(Kind.AV)  # comparing arrays with an IntEnum member costs five times as much
 PERSON = int(Kind.PERSON)
@@ -52,6 +52,7 @@ class MetricContext:
     goal: frozenset[int]  # lanes (indices into RoadMap.lanes) on which the mission has succeeded
     duration: float  # s, counted
     mission_guessed: bool = False  # nobody named the mission vehicle: it counts in its own figures alone
+    ends: bool = False  # a crash ends the episode before its time
 
     @cached_property
     def courses(self) -> LaneCourses:
@@ -62,6 +63,11 @@ class MetricContext:
     def conflicts(self) -> ConflictView:
         """Shared by the metrics of one episode."""
         return ConflictView(self.road, self.mission_guessed)
+
+    @cached_property
+    def everybody(self) -> Everybody:
+        """Shared by the metrics of one episode."""
+        return Everybody(self.duration, self.ends)
 
 
 class EpisodeMetric(Protocol):
@@ -91,41 +97,3 @@ def slow(kind: npt.NDArray[np.int8], speed: Floats, wanted: int, below: float) -
         if kind[k] == wanted and speed[k] < below:
             found += 1
     return found
-
-
-class Slots:
-    """Gives every vehicle of an episode a lasting number, in order of appearance (until `keep`)."""
-
-    def __init__(self) -> None:
-        self.of: dict[str, int] = {}
-        self._ids: tuple[str, ...] = ()
-        self._rows: Ints = np.zeros(0, dtype=np.int64)
-
-    def __len__(self) -> int:
-        return len(self.of)
-
-    def rows(self, ids: Sequence[str]) -> Ints:
-        """[n] the numbers of these vehicles; new ones get the next free numbers."""
-        names = tuple(ids)
-        if names != self._ids:
-            found = list(map(self.of.get, names))
-            if None in found:
-                found = [self.of.setdefault(name, len(self.of)) for name in names]
-            self._rows = np.array(found, dtype=np.int64)
-            self._ids = names
-        return self._rows
-
-    def keep(self, numbers: Ints) -> None:
-        """Keep only these numbers, which become 0, 1, 2, ... in this order."""
-        new = {int(old): k for k, old in enumerate(numbers)}
-        self.of = {name: new[old] for name, old in self.of.items() if old in new}
-        self._ids, self._rows = (), np.zeros(0, dtype=np.int64)
-
-
-def grown(table: npt.NDArray[Any], needed: int, fill: float, axis: int = 0) -> npt.NDArray[Any]:
-    """The table itself while `needed` entries fit along `axis`, else a copy for twice as many."""
-    if table.shape[axis] >= needed:
-        return table
-    added = [(0, 0)] * table.ndim
-    added[axis] = (0, 2 * needed - table.shape[axis])
-    return np.pad(table, added, constant_values=fill)

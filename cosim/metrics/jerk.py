@@ -4,7 +4,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cosim.geometry.compiled import compiled
-from cosim.metrics.context import AV, MetricContext, Slots, grown
+from cosim.metrics.context import AV, MetricContext
+from cosim.metrics.slots import Slots, grown
 from cosim.types import Floats, Ints, Kind, Metric, Snapshot
 
 

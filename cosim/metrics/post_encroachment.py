@@ -4,8 +4,9 @@ how often anybody's was short."""
 import numpy as np
 
 from cosim.geometry.kernels import encroachment, record
-from cosim.metrics.context import MetricContext, Slots, grown, watched
+from cosim.metrics.context import MetricContext, watched
 from cosim.metrics.near_misses import NearMisses
+from cosim.metrics.slots import Slots, grown
 from cosim.types import Ints, Metric, Snapshot
 
 LONGEST = 5.0  # s, a later passage is no encounter any more (Allen et al. 1978 look at 1 to 5 s)

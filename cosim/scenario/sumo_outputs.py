@@ -35,7 +35,8 @@ def _plain(name: str, *settings: tuple[str, str]) -> tuple[str, Output]:
 OUTPUTS: dict[str, Output] = dict(
     (
         # vehicles are still on the road when an episode ends: without this the file would be empty
-        _plain("tripinfo", ("tripinfo-output.write-unfinished", "true")),
+        _plain("tripinfo", ("tripinfo-output.write-unfinished", "true"),
+                           ("tripinfo-output.write-undeparted", "true")),
         _plain("vehroute", ("vehroute-output.write-unfinished", "true")),
         _plain("stop", ("stop-output.write-unfinished", "true")),
         _plain("fcd"),

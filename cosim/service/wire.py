@@ -20,7 +20,7 @@ from cosim.envs.host import Reply
 from cosim.errors import BadInput
 from cosim.observation.view import Packed
 from cosim.rewards import RewardTerms
-from cosim.types import IDENTITY, Collision, EpisodeResult, Events, Metric, Receipt, Snapshot
+from cosim.types import IDENTITY, Collision, Due, EpisodeResult, Events, Metric, Receipt, Snapshot
 
 MEDIA = "application/vnd.cosim.step"  # what a client accepts that wants bytes
 _DOCUMENT = "document"  # the key of the metadata
@@ -98,15 +98,16 @@ def of_snapshot(snapshot: Snapshot) -> bytes:
     """Every vehicle."""
     values = {f.name: getattr(snapshot, f.name) for f in fields(Snapshot)}
     arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
-    document = {"time": snapshot.time, "ids": snapshot.ids, "events": asdict(snapshot.events)}
-    return pack(arrays, document)
+    names = ("time", "ids", "waiting")
+    return pack(arrays, {name: values[name] for name in names} | {"events": asdict(snapshot.events)})
 
 
 def to_snapshot(data: bytes) -> Snapshot:
     """The way back."""
     arrays, found = unpack(data)
-    events = to_events(found["events"])
-    return Snapshot(time=found["time"], ids=tuple(found["ids"]), events=events, **arrays)
+    waiting = found["waiting"] and {name: Due(*due) for name, due in found["waiting"].items()}
+    about: dict[str, Any] = {"time": found["time"], "ids": tuple(found["ids"]), "waiting": waiting}
+    return Snapshot(**about | arrays, events=to_events(found["events"]))
 
 
 def to_result(document: Mapping[str, Any]) -> EpisodeResult:

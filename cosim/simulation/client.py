@@ -29,6 +29,8 @@ VEHICLES = {
     "getSpeed": tc.VAR_SPEED,
     "getAcceleration": tc.VAR_ACCELERATION,
     "getLanePosition": tc.VAR_LANEPOSITION,
+    "getTimeLoss": tc.VAR_TIMELOSS,
+    "getCO2Emission": tc.VAR_CO2EMISSION,
     "getLaneID": tc.VAR_LANE_ID,  # the last one: it has no fixed size
 }
 AVS = {
@@ -62,10 +64,11 @@ SIMULATION = {
     "getPendingVehicles": tc.VAR_PENDING_VEHICLES,
 }
 # How SUMO sends them of one vehicle: of each the variable, a status of 0, its type and its value.
-_ROW, _SIZE = struct.Struct("!3s2d3sd3sd3sd3sd3si"), struct.Struct("!i")
-_TYPES = (tc.POSITION_2D, *[tc.TYPE_DOUBLE] * 4, tc.TYPE_STRING)
+_NUMBERS = len(VEHICLES) - 2  # but for the position and the lane
+_ROW, _SIZE = struct.Struct(f"!3s2d{_NUMBERS * '3sd'}3si"), struct.Struct("!i")
+_TYPES = (tc.POSITION_2D, *[tc.TYPE_DOUBLE] * _NUMBERS, tc.TYPE_STRING)
 _HEADS = tuple(bytes((variable, 0, kind)) for variable, kind in zip(VEHICLES.values(), _TYPES, strict=True))
-Row = tuple[tuple[float, float], float, float, float, float, str]  # the values, in their order
+Row = tuple[Any, ...]  # the values, in their order
 # Commands that change nothing of the above before the next step; after any other one SUMO is asked anew.
 LATER = {"setSpeed", "setTau", "setMinGap", "setSpeedMode", "setLaneChangeMode", "changeLaneRelative"}
 
@@ -255,11 +258,11 @@ def _rows(content: bytes, at: int, count: int) -> tuple[dict[str, Row], int]:
     for _ in range(count):
         end = at + 4 + _SIZE.unpack_from(content, at)[0]
         name = content[at + 4 : end].decode()
-        a, x, y, b, angle, c, speed, d, accel, e, position, f, size = _ROW.unpack_from(content, end)
-        if (a, b, c, d, e, f) != _HEADS:
+        first, x, y, *others, last, size = _ROW.unpack_from(content, end)
+        if (first, *others[::2], last) != _HEADS:
             raise struct.error
         at = end + _ROW.size + size
-        found[name] = (x, y), angle, speed, accel, position, content[at - size : at].decode()
+        found[name] = (x, y), *others[1::2], content[at - size : at].decode()
     return found, at
 
 

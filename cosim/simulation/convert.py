@@ -16,12 +16,19 @@ from cosim.road import ConflictZone, Crossing, Lane, Link, RoadMap, Rule
 from cosim.scenario import Zone
 from cosim.simulation.backend import sumo
 from cosim.simulation.conventions import centres
-from cosim.types import Actor, Bytes, Events, Floats, Kind, Snapshot
+from cosim.types import Actor, Bytes, Due, Events, Floats, Kind, Snapshot
 
-READ = ("Position", "Angle", "Speed", "Acceleration", "LaneID", "LanePosition")  # of every vehicle
+# Of every vehicle.
+READ = (
+    *("Position", "Angle", "Speed", "Acceleration", "LaneID", "LanePosition"),
+    *("TimeLoss", "CO2Emission"),  # s, mg/s
+)
 # The same of persons, of whose acceleration SUMO says nothing. No lane is theirs: they walk beside, along,
 # against and across those of vehicles.
-NOT_OF_PERSONS: tuple[Callable[[str], Any], ...] = (lambda _: 0.0, lambda _: "", lambda _: 0.0)
+NOT_OF_PERSONS: tuple[Callable[[str], Any], ...] = (
+    *(lambda _: 0.0, lambda _: "", lambda _: 0.0),
+    *(lambda _: 0.0, lambda _: 0.0),
+)
 PERSON = "person:"  # a person's name in a snapshot: this and its id, which may be a vehicle's too
 GIVE_WAY = "mswZ"  # link states: minor, stop, all-way stop, zipper (SUMO, Networks/SUMO_Road_Networks)
 # link states at a stop line without signals (SUMO, Networks/SUMO_Road_Networks)
@@ -81,12 +88,15 @@ class SnapshotReader:
         are those of the whole day."""
         self._persons = None
 
-    def read(self, bodies: dict[str, Body], events: Events) -> Snapshot:
+    def read(
+        self, bodies: dict[str, Body], events: Events, waiting: Mapping[str, Due] | None = None
+    ) -> Snapshot:
         """One snapshot of every vehicle and every walking person on the road, sorted by id.
 
         Args:
             bodies: what is constant of each vehicle that has departed, by id; new persons are added.
             events: what happened since the last snapshot.
+            waiting: see `Snapshot`.
         """
         persons = self._walking() if sumo.person.getIDCount() else {}
         ids = tuple(sorted((*sumo.vehicle.getIDList(), *persons)))
@@ -101,7 +111,7 @@ class SnapshotReader:
             )
             self._ids = ids
         kind, mission, length, width, actor = self._static
-        position, angle, speed, accel, lane, lane_position = (
+        position, angle, speed, accel, lane, lane_position, time_loss, co2 = (
             list(map(vehicle, ids))
             if not persons
             else [person(persons[i]) if i in persons else vehicle(i) for i in ids]
@@ -135,6 +145,9 @@ class SnapshotReader:
             place=place,
             signals=self._signals(),
             switches=self._switches(),
+            time_loss=np.array(time_loss, np.float64),
+            co2=np.array(co2, np.float64) * 1e-3,
+            waiting=waiting,
         )
 
     def _walking(self) -> dict[str, str]:

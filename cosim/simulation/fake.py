@@ -31,6 +31,7 @@ class FakeVehicle:
     goal_lane: int = -1  # while a lane change is under way
     offset: float = 0.0  # m, lateral, from the centre of `lane`
     accel: float = 0.0
+    time_loss: float = 0.0  # s, against its desired speed
     length: float = 5.0
     width: float = 2.0
 
@@ -62,6 +63,7 @@ class FakeSimulator:
         rng = np.random.default_rng(seed)
         self._time = 0.0
         self._hit: set[frozenset[str]] = set()
+        self._arrived: list[str] = []
         self._vehicles = {v.id: replace(v, x=v.x + rng.uniform(-1, 1)) for v in self._template}
         return (self._snapshot(),)
 
@@ -80,6 +82,7 @@ class FakeSimulator:
         """The next frames; nobody errs."""
         other = copy.copy(self)
         other._vehicles, other._hit = copy.deepcopy(self._vehicles), set(self._hit)
+        other._arrived = [*self._arrived]
         for command in commands:
             other._take(command)
         return other._drive(frames)
@@ -138,6 +141,7 @@ class FakeSimulator:
             v.speed = wanted
         for v in list(self._vehicles.values()):
             v.x += v.speed * step
+            v.time_loss += step * (1.0 - v.speed / v.desired)
             if v.goal_lane >= 0:
                 side = 1 if v.goal_lane > v.lane else -1
                 v.offset += side * LATERAL_SPEED * step
@@ -148,6 +152,7 @@ class FakeSimulator:
                 v.offset -= float(np.sign(v.offset)) * min(abs(v.offset), LATERAL_SPEED * step)
             if v.x > self._length:
                 del self._vehicles[v.id]
+                self._arrived.append(v.id)
         self._time = round(self._time + step, 9)
 
     def _idm(self, v: FakeVehicle, speeds: dict[str, float]) -> float:
@@ -165,6 +170,7 @@ class FakeSimulator:
     def _snapshot(self) -> Snapshot:
         vs = [self._vehicles[name] for name in sorted(self._vehicles)]
         centre_y = np.array([(v.lane + 0.5) * LANE_WIDTH + v.offset for v in vs])
+        arrived, self._arrived = tuple(self._arrived), []
         return Snapshot(
             time=self._time,
             ids=tuple(v.id for v in vs),
@@ -179,7 +185,9 @@ class FakeSimulator:
             width=np.array([v.width for v in vs]),
             lane=np.array([v.lane for v in vs], np.int32),
             lane_position=np.array([v.x for v in vs]),
-            events=Events(collisions=tuple(self._collisions(vs, centre_y))),
+            events=Events(collisions=tuple(self._collisions(vs, centre_y)), arrived=arrived),
+            time_loss=np.array([v.time_loss for v in vs]),
+            waiting={},
         )
 
     def _collisions(self, vs: list[FakeVehicle], y: np.ndarray) -> list[Collision]:

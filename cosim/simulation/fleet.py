@@ -43,8 +43,7 @@ class Fleet:
     def depart(self, vehicle: str, seed: int) -> Body:
         """A vehicle departed: give it its driver; what it is."""
         get, s = sumo.vehicle, self._scenario
-        mission = s.mission.includes(vehicle)
-        is_av = not mission and self._is_av(vehicle, seed)
+        is_av = self.is_av(vehicle, seed)
         if is_av:
             self._take_av_type(vehicle)
             for name, value in self._idm.items():  # SUMO ignores these silently in `setParameter`
@@ -55,7 +54,7 @@ class Fleet:
             self._drivers.apply(vehicle)
         size = get.getLength(vehicle), get.getWidth(vehicle)
         actor = ACTORS.get(get.getVehicleClass(vehicle), Actor.CAR)
-        return Body(Kind.AV if is_av else Kind.HV, mission, *size, actor)
+        return Body(Kind.AV if is_av else Kind.HV, s.mission.includes(vehicle), *size, actor)
 
     def _take_av_type(self, vehicle: str) -> None:
         """In our worlds an AV drives as its type says, one of a user's file by IDM."""
@@ -74,8 +73,12 @@ class Fleet:
             if self._scenario.preset == Preset.LAWFUL and sumo.vehicle.getSpeed(vehicle) > limit:
                 sumo.vehicle.setPreviousSpeed(vehicle, limit)  # its file asks for more
 
-    def _is_av(self, vehicle: str, seed: int) -> bool:
+    def is_av(self, vehicle: str, seed: int) -> bool:
+        """Whether a vehicle that waits or has just departed is an AV; once it has its driver, type says no
+        more."""
         rule = self._scenario.fleet
+        if self._scenario.mission.includes(vehicle):
+            return False
         if rule.ids is not None:
             return re.fullmatch(rule.ids, vehicle) is not None
         if rule.penetration is not None:

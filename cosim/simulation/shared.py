@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
@@ -38,11 +38,6 @@ class SharedSimulator(SumoSimulator):
     _SHARED = True
     _LOST = ""  # what it means that SUMO fails; "": what the client says
     _over = False  # nothing more can be asked of SUMO
-    _pending: Sequence[str] = ()  # vehicles that waited at the last step
-
-    def counts(self) -> dict[str, int]:
-        """As alone, up to the last step."""
-        return {"inserted": self._inserted, "waiting": len(self._waited.union(self._pending))}
 
     def _simulate(self) -> None:
         before = sumo.simulation.getTime()
@@ -57,7 +52,6 @@ class SharedSimulator(SumoSimulator):
             raise self._explain(error) from None
         if sumo.simulation.getTime() <= before:
             self._end("the last TraCI program has left")
-        self._pending = sumo.simulation.getPendingVehicles()
         here = set(sumo.vehicle.getIDList())
         for name in [name for name in self._commander.controlled if name not in here]:
             self._commander.drop(name)  # another program has removed it

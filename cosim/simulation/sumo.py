@@ -1,5 +1,6 @@
 """Starts SUMO through libsumo and advances it one decision at a time: the only simulation of its process."""
 
+import contextlib
 import re
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -33,7 +34,7 @@ from cosim.simulation.fork import forked
 from cosim.simulation.human_errors import HumanErrors
 from cosim.simulation.stderr import SumoStderr
 from cosim.simulation.xerces import keep_initialized
-from cosim.types import Collision, Command, Events, Kind, OnCollision, Preset, Receipt, Snapshot
+from cosim.types import Collision, Command, Due, Events, Kind, OnCollision, Preset, Receipt, Snapshot
 
 # Ours, where a user's file does not say otherwise. A teleport would let a vehicle appear on the road.
 DEFAULTS = {
@@ -128,7 +129,7 @@ class SumoSimulator:
         self._mission_found = not self._scenario.mission.guessed
         self._inserted = 0
         self._stopped: set[str] = set()  # at a stop of their plan
-        self._waited: set[str] = set()  # only where SUMO gives up: seen waiting, not inserted since
+        self._waiting: dict[str, Due] = {}  # due and not inserted, whether SUMO has dropped them or not
         self._happened: list[tuple[Any, ...]] = []  # per step since the last frame: the fields of Events
         steps = round(self._scenario.warmup / self._scenario.timing.step)
         first_kept = steps - (self._history - 1) * self._steps_per_frame
@@ -220,10 +221,9 @@ class SumoSimulator:
         return (0.0, {}) if self._errors is None else (self._errors.log_ratio, self._errors.weighed)
 
     def counts(self) -> dict[str, int]:
-        """Vehicles since the start: `inserted`, and `waiting`: due and not inserted, whether SUMO has dropped
-        them (`max-depart-delay`) or not."""
-        waiting = self._waited.union(sumo.simulation.getPendingVehicles())
-        return {"inserted": self._inserted, "waiting": len(waiting)}
+        """Vehicles since the start: `inserted`, and `waiting` at the last frame: due and not inserted, also
+        those that SUMO has dropped (`max-depart-delay`)."""
+        return {"inserted": self._inserted, "waiting": len(self._waiting)}
 
     def write_outputs(self, files: Mapping[str, Path]) -> None:
         """SUMO's own outputs (name -> file, `cosim.scenario.sumo_outputs`) from the next episode on."""
@@ -321,8 +321,8 @@ class SumoSimulator:
         self._simulate()
         departed = simulation.getDepartedIDList()
         self._inserted += len(departed)
-        self._waited.difference_update(departed)
         for name in departed:
+            self._waiting.pop(name, None)
             self._bodies[name] = self._fleet.depart(name, self._seed)
             if self._errors is not None:
                 self._errors.depart(name, self._bodies[name])
@@ -349,15 +349,27 @@ class SumoSimulator:
                 simulation.getEmergencyStoppingVehiclesIDList(),
                 self._entries.step(now, [i for i in departed if self._bodies[i].kind == Kind.AV]),
                 self._commander.observe(now),
+                [sumo.vehicle.getDepartDelay(name) for name in departed],
             )
         )
         self._stopped.update(simulation.getStopStartingVehiclesIDList())
         self._stopped.difference_update(simulation.getStopEndingVehiclesIDList())
         if self._gives_up:
-            self._waited.update(simulation.getPendingVehicles())
+            self._look_who_waits()
         self._drivers.step(now)
         if self._errors is not None:
             self._errors.step(now)
+
+    def _look_who_waits(self) -> None:
+        """Where SUMO gives up, whoever was seen waiting and is not inserted still waits."""
+        pending = sumo.simulation.getPendingVehicles()
+        if not self._gives_up and self._waiting:
+            self._waiting = {name: self._waiting[name] for name in pending if name in self._waiting}
+        for name in pending:
+            if name not in self._waiting:
+                with contextlib.suppress(sumo.TraCIException):  # another program has removed it
+                    since = sumo.simulation.getTime() - sumo.vehicle.getDepartDelay(name)
+                    self._waiting[name] = Due(since, self._fleet.is_av(name, self._seed))
 
     def _crashed(self, collisions: list[Collision]) -> list[Collision]:
         """Make wrecks of their vehicles where the episode goes on; the same collisions, attributed."""
@@ -373,7 +385,8 @@ class SumoSimulator:
         happened = (tuple(chain.from_iterable(field)) for field in zip(*self._happened, strict=True))
         events = replace(Events(*happened), stopped=tuple(sorted(self._stopped)))
         self._happened.clear()
-        snapshot = self._reader.read(self._bodies, events)
+        self._look_who_waits()
+        snapshot = self._reader.read(self._bodies, events, dict(self._waiting))
         if not self._mission_found:
             snapshot = self._find_mission(snapshot)
         self._detector.lane_changes(snapshot, self.road, self._commander)
@@ -418,4 +431,4 @@ class SumoSimulator:
         self._bodies[name] = replace(self._bodies[name], mission=True, guessed=True)
         self._mission_found = True
         self._reader.bodies_changed()
-        return self._reader.read(self._bodies, snapshot.events)
+        return self._reader.read(self._bodies, snapshot.events, snapshot.waiting)

@@ -1,0 +1,99 @@
+"""Everybody who wanted to depart, so that no policy changes who is counted (definitions.md, Everybody)."""
+
+import numpy as np
+
+from cosim.metrics.slots import Slots, grown
+from cosim.types import Bools, Floats, Ints, Kind, Snapshot
+
+
+class Everybody:
+    """The vehicles on the road in the counted time, a slot each, and those that wait to be inserted.
+
+    A vehicle that cannot drive on loses the time up to the horizon: a wreck that was taken off the road, and
+    all of them where a crash ends the episode (`ends`) before the counted time of `duration` s is over.
+    """
+
+    def __init__(self, duration: float, ends: bool) -> None:
+        self._duration, self._ends = duration, ends
+        self._slots = Slots()
+        self._crashed = False
+        self._removed: dict[str, float] = {}  # wreck -> s, when it was taken off the road
+        self._av: Bools = np.zeros(64, np.bool_)
+        self._entry: Floats = np.zeros(64)  # [slots] s
+        self._rows: Ints = np.zeros(0, np.int64)
+        self._newest: Snapshot | None = None
+
+    def of(self, snapshot: Snapshot) -> Ints:
+        """[n] the slots of the vehicles of this frame, the newest; a frame counts once, however many ask."""
+        if snapshot is self._newest:
+            return self._rows
+        vehicles, known = snapshot.vehicles, self._rows
+        self._rows = self._slots.rows(vehicles.ids)
+        if self._rows is not known:  # a vehicle came or left
+            self._av = grown(self._av, len(self), False)
+            self._entry = grown(self._entry, len(self), 0.0)
+            self._av[self._rows] = vehicles.kind == int(Kind.AV)
+        if self._newest is None:
+            self._begin = snapshot.time
+        else:
+            self._happen(snapshot)
+        self._newest = snapshot
+        return self._rows
+
+    def __len__(self) -> int:
+        return len(self._slots)
+
+    def number(self, vehicle: str) -> int:
+        """The slot of a vehicle, -1 for one that was in no frame."""
+        found: int = self._slots.of.get(vehicle, -1)
+        return found
+
+    @property
+    def av(self) -> Bools:
+        """[slots] which are AVs."""
+        return self._av[: len(self)]
+
+    @property
+    def entry(self) -> Floats:
+        """[slots] s of counted time that each waited to be inserted."""
+        return self._entry[: len(self)]
+
+    @property
+    def rest(self) -> Floats:
+        """[slots] s from each vehicle's last frame to the horizon, where it cannot drive on; else 0."""
+        found = np.zeros(len(self))
+        if self._crashed:
+            found[self._rows] = self._horizon - self._now
+        for wreck, when in self._removed.items():
+            found[self.number(wreck)] = self._horizon - when
+        return found
+
+    @property
+    def waiting(self) -> tuple[Floats, Bools]:
+        """[w] s of counted time up to the horizon that those not inserted have waited, and which of them will
+        be AVs; one of nan where they are not known."""
+        if self._newest is None or self._newest.waiting is None:
+            return np.full(1, np.nan), np.zeros(1, np.bool_)
+        due = self._newest.waiting.values()
+        since = np.array([max(one.since, self._begin) for one in due], np.float64)
+        return self._horizon - since, np.array([one.is_av for one in due], np.bool_)
+
+    # ---- inside ----
+
+    @property
+    def _now(self) -> float:
+        return self._newest.time if self._newest is not None else 0.0
+
+    @property
+    def _horizon(self) -> float:
+        """s, up to which everybody is counted."""
+        return self._begin + self._duration if self._crashed else self._now
+
+    def _happen(self, snapshot: Snapshot) -> None:
+        events = snapshot.events
+        for vehicle, delay in zip(events.departed, events.depart_delays, strict=False):
+            if (slot := self.number(vehicle)) >= 0:
+                self._entry[slot] = min(delay, snapshot.time - self._begin)
+        gone = (name for name in events.wrecks_removed if self.number(name) >= 0)
+        self._removed.update(dict.fromkeys(gone, snapshot.time))
+        self._crashed |= self._ends and any(c.crash for c in events.collisions)

@@ -27,6 +27,21 @@ FIRST = {
     "vehicles_never_inserted": "",
 }
 
+# What happened to all vehicles that wanted to depart (definitions.md, Everybody), in words.
+EVERYBODY = {
+    "total_delay_s": "delay of all",
+    "total_delay_av_s": "delay of AVs",
+    "total_delay_hv_s": "delay of humans",
+    "total_delay_slowest_tenth_s": "delay of the slowest tenth",
+    "arrivals": "arrivals",
+    "arrivals_av": "arrivals of AVs",
+    "arrivals_hv": "arrivals of humans",
+    "mean_speed_mps": "mean speed",
+    "longest_wait_s": "longest wait",
+    "mean_squared_wait_s2": "mean squared wait",
+    "co2_kg": "CO2",
+    "co2_kg_per_vehicle_km": "CO2 per vehicle-km",
+}
 # What an AV must not do (definitions.md, The law), in words: shown together, in red when it is not 0.
 LAW = {
     "red_light_violations": "red lights",
@@ -61,7 +76,7 @@ def table(result: EpisodeResult, *, first: bool = True) -> str:
         lines.append(f"  mission vehicle {result.mission_vehicle}" + f", {GUESSED}" * result.mission_guessed)
     shown = [name for name in FIRST if name in result.metrics] if first else result.metrics
     lines += [f"  {name:<24} {figure(result.metrics[name])}" for name in shown]
-    lines += near_miss_lines(result) + law_lines(result)
+    lines += everybody_lines(result) + near_miss_lines(result) + law_lines(result)
     for c in result.collisions:
         who = f"{c.kind}, {'AV-caused' if c.av_caused else 'not AV-caused'}"
         who += _error(c, result.errors_begun)
@@ -86,6 +101,18 @@ def _error(collision: Collision, begun: Sequence[HumanError]) -> str:
     if last is None:
         return ", a human had erred" * collision.human_error_involved
     return f"; {collision.time - last.time:.1f} s before: {last.who} {last.what}"
+
+
+def everybody_lines(result: EpisodeResult) -> list[str]:
+    """`everybody   delay of all 12.6 s, delay of AVs 13.4 s, ...`, two lines; what is NA is left out."""
+    found = [
+        f"{words} {figure(result.metrics[name])}"
+        for name, words in EVERYBODY.items()
+        if name in result.metrics and result.metrics[name].value is not None
+    ]
+    shown = (found[:4], found[4:])
+    heads = ("everybody", "")
+    return [f"  {head:<24} {', '.join(line)}" for head, line in zip(heads, shown, strict=True) if line]
 
 
 def near_miss_lines(result: EpisodeResult) -> list[str]:

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -9,10 +10,11 @@ from junitparser import Error, Failure, JUnitXml, Skipped, TestCase, TestSuite
 
 from cosim.files import whole
 from cosim.report import wording
+from cosim.report.changes import changes
 from cosim.report.compare import FAILED, PASSED, SKIPPED, Compared, Comparison, PairedFigure
 from cosim.report.figures import HEADLINE, INCIDENCES, Row
 from cosim.report.pairing import who
-from cosim.report.result import LAW
+from cosim.report.result import EVERYBODY, LAW
 
 _MARK = {PASSED: "pass", FAILED: "FAIL", SKIPPED: "n/a "}
 _EMOJI = {PASSED: "✅ pass", FAILED: "❌ **fail**", SKIPPED: "n/a"}
@@ -47,7 +49,8 @@ def text(comparison: Comparison) -> str:
     """Tables and verdict for a terminal."""
     lines = [f"A  {comparison.a}", f"B  {comparison.b}", *_unfinished(comparison), ""]
     for compared in comparison.groups:
-        lines += [compared.group.name, *(f"  {note}" for note in _notes(compared))]
+        said = (*_notes(compared), *changes(compared.figures).lines)
+        lines += [compared.group.name, *(f"  {note}" for note in said)]
         table = [("", "A", "B", "B - A"), *(_cells(figure) for figure in _shown(comparison, compared))]
         widths = [max(len(row[k]) for row in table) for k in range(4)]
         lines += [
@@ -74,7 +77,7 @@ def markdown(comparison: Comparison) -> str:
         lines.append("")
     for compared in comparison.groups:
         lines += ["<details>", f"<summary>{_html(compared.group.name)}</summary>", ""]
-        lines += [f"{_html(note)}  " for note in _notes(compared)]
+        lines += [f"{_html(note)}  " for note in (*_notes(compared), *changes(compared.figures).lines)]
         lines += ["", "| | A | B | B - A |", "|---|---|---|---|"]
         lines += [_row([_html(cell) for cell in _cells(figure)]) for figure in _shown(comparison, compared)]
         lines += ["", "</details>", ""]
@@ -145,17 +148,17 @@ def _group_document(compared: Compared) -> dict[str, Any]:
         "refused": [row["key"] for row in group.refused],
         "only_in_a": group.unpaired[0],
         "only_in_b": group.unpaired[1],
+        **asdict(changes(compared.figures)),
         "figures": {name: figure.document() for name, figure in compared.figures.items()},
     }
 
 
 def _shown(comparison: Comparison, compared: Compared) -> list[PairedFigure]:
-    """Headline figures, those of the law and of near-misses that are not 0, and those a threshold asks for,
-    where they apply."""
+    """Headline figures and everybody's, those of the law and of near-misses that are not 0, and those a
+    threshold asks for, where they apply."""
     asked = [check.threshold.measure.name for check in comparison.checks]
-    names = [
-        name for name in dict.fromkeys((*HEADLINE, *INCIDENCES, *LAW, *asked)) if name in compared.figures
-    ]
+    every = dict.fromkeys((*HEADLINE, *EVERYBODY, *INCIDENCES, *LAW, *asked))
+    names = [name for name in every if name in compared.figures]
     rare = {*INCIDENCES, *LAW} - {*asked}
     happened = {n for n in rare if (f := compared.figures.get(n)) and (f.a.value > 0.0 or f.b.value > 0.0)}
     names = [name for name in names if name not in rare or name in happened]

@@ -11,10 +11,12 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from cosim.files import cannot, whole
 from cosim.report import wording
+from cosim.report.changes import changes
 from cosim.report.figures import CRASH_RATES, HEADLINE, NEAR_MISS_RATES, Row
 from cosim.report.html import tables
 from cosim.report.html.blocks import Block, Difference, blocks
 from cosim.report.html.plots import plots
+from cosim.report.result import EVERYBODY
 from cosim.report.run_folder import Run
 from cosim.report.summary import mission_guessed, not_comparable, reasons, status_counts
 from cosim.workers.tasks import OK
@@ -25,13 +27,6 @@ FINDINGS = 8  # before the fold
 WORST, FAILURES = 12, 50  # listed by name
 MANIFEST = 200_000  # characters of it on the page
 COMPARED = tuple(name for name in HEADLINE if name != "veto_rate")  # of each block against its baseline
-IN_WORDS = {  # of these in the verdict, in words
-    "collision_rate": "collisions",
-    "av_caused_collision_rate": "AV-caused collisions",
-    "mission_success_rate": "mission success",
-    "dt_mission_m": "the mission vehicle's distance",
-    "dt_av_m": "the AVs' distance",
-}
 
 
 def write(run: Run, path: Path | None = None, shown: str | None = None) -> Path:
@@ -59,23 +54,25 @@ def html(run: Run, shown: str | None = None) -> str:
         lstrip_blocks=True,
     )
     found = blocks(run)
-    differences = [block.differences(COMPARED) for block in found]
-    crashes, closer = (
-        [block.differences(which) for block in found] for which in (CRASH_RATES, NEAR_MISS_RATES)
+    differences, everybody, crashes, closer = (
+        [block.differences(which) for block in found]
+        for which in (COMPARED, EVERYBODY, CRASH_RATES, NEAR_MISS_RATES)
     )
     folder = str(run.path) if shown is None else shown
     wrong = [row for row in run.rows if row["status"] != OK]
     return environment.get_template("page.html").render(
         name=run.path.resolve().name,
         verdict=_verdict(run, found),
-        findings=_findings(found, differences),
+        findings=_findings(found, differences, everybody),
         shown=FINDINGS,
         figures=tables.figures(found, run.measures) if found else None,
+        everybody=tables.chosen(found, run.measures, EVERYBODY),
         law=tables.law(found, run.measures),
-        crashes=tables.incidences(found, run.measures, CRASH_RATES),
-        near_misses=tables.incidences(found, run.measures, NEAR_MISS_RATES),
+        crashes=tables.chosen(found, run.measures, CRASH_RATES),
+        near_misses=tables.chosen(found, run.measures, NEAR_MISS_RATES),
         sections=[
-            _section(b, differences[k], crashes[k], closer[k], k < PLOTTED) for k, b in enumerate(found)
+            _section(b, differences[k], everybody[k], crashes[k], closer[k], k < PLOTTED)
+            for k, b in enumerate(found)
         ],
         plotted=PLOTTED,
         worst=[
@@ -129,29 +126,22 @@ def _verdict(run: Run, found: Sequence[Block]) -> dict[str, Any]:
     }
 
 
-def _findings(found: Sequence[Block], differences: Sequence[list[Difference]]) -> list[dict[str, Any]]:
-    """Per block and series: what differs from the baseline beyond chance, and what does not."""
+def _findings(
+    found: Sequence[Block],
+    differences: Sequence[list[Difference]],
+    everybody: Sequence[list[Difference]],
+) -> list[dict[str, Any]]:
+    """Per block and series: what is better and worse than the baseline beyond chance, and what is not."""
     lines = []
-    for block, mine in zip(found, differences, strict=True):
-        for difference in mine:
-            known = {name: f for name, f in difference.figures.items() if name in IN_WORDS and f.n}
-            tones = {name: tables.tone(figure) for name, figure in known.items()}
+    for block, mine, everybodys in zip(found, differences, everybody, strict=True):
+        for difference, others in zip(mine, everybodys, strict=True):
             lines.append(
                 {
                     "block": wording.group(block.identity),
                     "series": difference.series.label,
                     "baseline": difference.baseline.label,
                     "pairs": difference.pairs,
-                    "changed": [
-                        {
-                            "name": IN_WORDS[name],
-                            "value": wording.interval(f.difference, f.measure, signed=True),
-                            "tone": tones[name],
-                        }
-                        for name, f in known.items()
-                        if tones[name]
-                    ],
-                    "alike": [IN_WORDS[name] for name in known if not tones[name]],
+                    "changes": changes(difference.figures | others.figures),
                 }
             )
     return lines
@@ -160,6 +150,7 @@ def _findings(found: Sequence[Block], differences: Sequence[list[Difference]]) -
 def _section(
     block: Block,
     differences: list[Difference],
+    everybody: list[Difference],
     crashes: list[Difference],
     closer: list[Difference],
     draw: bool,
@@ -170,6 +161,7 @@ def _section(
         "drawn": draw,
         "ok": sum(len(s.ok) for s in block.series),
         "differences": tables.differences(differences),
+        "everybody": tables.differences([d for d in everybody if any(f.n for f in d.figures.values())]),
         "crashes": tables.differences([d for d in crashes if any(f.n for f in d.figures.values())]),
         "near_misses": tables.differences([d for d in closer if any(f.n for f in d.figures.values())]),
         "everything": tables.everything(block),

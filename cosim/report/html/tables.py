@@ -1,16 +1,17 @@
 """The tables of the report, as plain cells: what is written, what it is sorted by, what is said beside it."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from cosim.report import wording
+from cosim.report.changes import tone
 from cosim.report.compare import PairedFigure
 from cosim.report.figures import CRASH_RATES, HEADLINE, NEAR_MISS_RATES, Measure
 from cosim.report.html.blocks import Block, Difference, Series
-from cosim.report.result import LAW, NEAR_MISSES
-from cosim.report.statistics import CONFIDENCE, Figure
+from cosim.report.result import EVERYBODY, LAW, NEAR_MISSES
+from cosim.report.statistics import Figure
 from cosim.report.summary import GROUP
 
 TITLES = {
@@ -32,6 +33,7 @@ TITLES = {
     "min_ttc_s": "min TTC",
     "hard_brakings_av": "hard brakings of AVs",
     "veto_rate": "vetoes",
+    **EVERYBODY,
     **LAW,
     "av_trips_completed": "AV trips completed",
     **dict(zip(CRASH_RATES, ("with an AV", "AV-caused", "all crashes"), strict=True)),
@@ -97,10 +99,8 @@ def law(blocks: Sequence[Block], known: dict[str, Measure]) -> Table | None:
     return Table(["policy", *(head(known[n]) for n in (*names, *more))], rows, [])
 
 
-def incidences(
-    blocks: Sequence[Block], known: dict[str, Measure], which: Mapping[str, Measure]
-) -> Table | None:
-    """One row per cell with its crashes per distance or near-misses per time; None without such columns."""
+def chosen(blocks: Sequence[Block], known: dict[str, Measure], which: Iterable[str]) -> Table | None:
+    """One row per cell with the figures `which`; None where no episode has one of them."""
     series, varying = _series(blocks)
     names = [n for n in which if any(s.counts(n).get("n") for s in series)]
     if not names:
@@ -143,19 +143,6 @@ def head(measure: Measure) -> str:
     arrow = {"higher": "\N{NO-BREAK SPACE}↑", "lower": "\N{NO-BREAK SPACE}↓"}.get(measure.better, "")
     unit = f" {measure.unit}" * bool(measure.per)
     return TITLES.get(measure.name, measure.name) + unit + arrow
-
-
-def tone(figure: PairedFigure) -> str:
-    """Whether a difference is good or bad news; "" where chance may have made it.
-
-    That is where its interval holds 0, or, of a rate, McNemar's exact p is 5 % or more: with a handful of
-    crashes Tango's interval can leave 0 out where the exact test does not agree.
-    """
-    d = figure.difference
-    chance = math.isnan(d.low) or d.low <= 0.0 <= d.high
-    if chance or (figure.p is not None and figure.p >= 1.0 - CONFIDENCE) or not figure.measure.better:
-        return ""
-    return "good" if (d.value > 0.0) == (figure.measure.better == "higher") else "bad"
 
 
 # ---- inside ----

@@ -148,6 +148,9 @@ function fillTally() {
   lines("missions", tally.mission_success ? `${(100 * tally.mission_success.value).toFixed(1)} %` : "\u2013",
     figure("mission_success") == null ? "none in this world" : before(tally.mission_success));
   lines("distance", number(figure("dt_mean_m"), 0, " m"), `AVs ${number(figure("dt_av_m"), 0)}, mission ${number(figure("dt_mission_m"), 0)} m`);
+  const who = ["av", "hv"].map((kind) => number(figure(`total_delay_${kind}_s`), 1)), wait = number(figure("longest_wait_s"), 0, " s");
+  lines("everybody", number(figure("total_delay_s"), 1, " s delay"),
+    `AVs ${who[0]}, humans ${who[1]} s, longest wait ${wait}, ${number(figure("arrivals"), 0)} arrived, ${number(figure("co2_kg"), 1, " kg CO2")}`);
   const least = tally.min_ttc_s == null ? "" : `, in all ${number(tally.min_ttc_s, 2)} s`;
   lines("ttc", figure("min_ttc_s") == null ? "> 10 s" : number(figure("min_ttc_s"), 2, " s"), `smallest in this episode${least}`);
 }

@@ -61,7 +61,9 @@ def number(trip: ElementTree.Element, name: str) -> float:
 def config(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two lanes become one behind a bend, and many more want to depart than it can take."""
     place = tmp_path_factory.mktemp("jam")
-    nodes = '<nodes><node id="a" x="0" y="0"/><node id="b" x="400" y="0"/><node id="c" x="600" y="80"/></nodes>'
+    nodes = (
+        '<nodes><node id="a" x="0" y="0"/><node id="b" x="400" y="0"/><node id="c" x="600" y="80"/></nodes>'
+    )
     (place / "n.nod.xml").write_text(nodes)
     edges = '<edge id="ab" from="a" to="b" numLanes="2" speed="20"/>'
     edges += '<edge id="bc" from="b" to="c" numLanes="1" speed="8"/>'

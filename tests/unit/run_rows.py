@@ -23,6 +23,7 @@ UNITS = {
     "min_ttc_s": "s",
     "hard_brakings_av": "events",
     "veto_rate": "share",
+    "total_delay_s": "s",
 }
 BETTER = {
     "crashed": "lower",
@@ -35,6 +36,7 @@ BETTER = {
     "min_ttc_s": "higher",
     "hard_brakings_av": "lower",
     "veto_rate": "lower",
+    "total_delay_s": "lower",
 }
 CASE = EpisodeId(
     what="merge",

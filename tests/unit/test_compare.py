@@ -508,3 +508,20 @@ def test_a_failed_episode_bears_the_name_its_policy_gives_itself(tmp_path: Path)
     rows = [(cases[0], row(cases[0], policy="vfn-p")), (cases[1], failed(cases[1]))]
     folder = write(tmp_path / "run", cell("idm", 2), rows)
     assert compare(side(f"{folder}:idm"), side(f"{folder}:vfn-p")).exit_code == 3
+
+
+def test_everybodys_delay_is_gated_and_named_as_worse(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    late = [10.0 + 0.1 * k for k in range(10)]
+    columns = {"mission_success": [False] * 10, "total_delay_s": late}
+    later = {"total_delay_s": [1.05 * x for x in late]}
+    folder = write(tmp_path / "run", cell("idm", 10, columns=columns), cell("kind", 10, columns=later))
+    code, out, _ = run(capsys, f"{folder}:idm", f"{folder}:kind", "--fail-on", "total_delay_s > +2%")
+    assert code == 1
+    assert "  better: mission success +100.0 pp" in out
+    assert "  worse: everybody's delay +0.52" in out
+    assert "FAIL  total_delay_s > +2%:  B / A - 1 is +5.0 %" in out
+    code, out, _ = run(capsys, f"{folder}:idm", f"{folder}:kind", "--json")
+    group = json.loads(out)["groups"][0]
+    assert [group["worse"][0].split(" +")[0], len(group["worse"])] == ["everybody's delay", 1]

@@ -224,3 +224,23 @@ def test_the_command_writes_the_report_and_refuses_other_folders(
     (folder / "episodes.parquet").write_bytes(b"PAR1 no parquet at all")
     assert main(["report", str(folder)]) == 2
     assert main(["report", str(folder), "--out", str(tmp_path / "none" / "r.html")]) == 2
+
+
+def test_the_verdict_names_what_got_worse_for_everybody_beside_what_got_better(tmp_path: Path) -> None:
+    """The mission gains, everybody is a second later; a run from before these figures has no such table."""
+    late = [10.0 + 0.1 * k for k in range(10)]
+    egoists = {"mission_success": [False] * 10, "total_delay_s": late}
+    folder = write(
+        tmp_path / "run",
+        cell("idm", 10, columns=egoists),
+        cell("altruist-rule", 10, columns={"total_delay_s": [x + 1.0 + 0.01 * x for x in late]}),
+    )
+    text = Page(report.write(read(folder)).read_text()).text
+    better, worse, alike = (text.index(word) for word in ("better: ", "worse: ", "no difference shown: "))
+    assert "mission success +100.0 pp" in text[better:worse]
+    assert "everybody's delay +1.1" in text[worse:alike].replace("’", "'")
+    assert "collisions" in text[alike:]
+    assert "everybody's delay" not in text[alike : text.index("Figures", alike)]
+    assert "Everybody on equal seeds" in text
+    before = write(tmp_path / "before", cell("idm", 10), cell("rash", 10))
+    assert "Everybody" not in Page(report.write(read(before)).read_text()).text

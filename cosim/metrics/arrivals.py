@@ -14,13 +14,10 @@ class Arrivals:
 
     def add(self, snapshot: Snapshot) -> None:
         self._everybody.of(snapshot)
-        if not snapshot.events.arrived:
-            return
-        removed = snapshot.events.wrecks_removed
         for vehicle in snapshot.events.arrived:
-            slot = self._everybody.number(vehicle)
-            if vehicle in removed:
+            if vehicle in self._everybody.wrecks:
                 continue
+            slot = self._everybody.number(vehicle)
             if slot >= 0 and self._everybody.av[slot]:
                 self._avs += 1
             else:

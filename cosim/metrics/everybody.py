@@ -17,7 +17,7 @@ class Everybody:
         self._duration, self._ends = duration, ends
         self._slots = Slots()
         self._crashed = False
-        self._removed: dict[str, float] = {}  # wreck -> s, when it was taken off the road
+        self.wrecks: dict[str, float] = {}  # that were taken off the road -> s, when each was seen last
         self._av: Bools = np.zeros(64, np.bool_)
         self._entry: Floats = np.zeros(64)  # [slots] s
         self._rows: Ints = np.zeros(0, np.int64)
@@ -36,7 +36,7 @@ class Everybody:
         if self._newest is None:
             self._begin = snapshot.time
         else:
-            self._happen(snapshot)
+            self._happen(snapshot, self._newest.time)
         self._newest = snapshot
         return self._rows
 
@@ -64,7 +64,7 @@ class Everybody:
         found = np.zeros(len(self))
         if self._crashed:
             found[self._rows] = self._horizon - self._now
-        for wreck, when in self._removed.items():
+        for wreck, when in self.wrecks.items():
             found[self.number(wreck)] = self._horizon - when
         return found
 
@@ -89,11 +89,12 @@ class Everybody:
         """s, up to which everybody is counted."""
         return self._begin + self._duration if self._crashed else self._now
 
-    def _happen(self, snapshot: Snapshot) -> None:
+    def _happen(self, snapshot: Snapshot, before: float) -> None:
+        """What happened since the frame of `before` (s)."""
         events = snapshot.events
         for vehicle, delay in zip(events.departed, events.depart_delays, strict=False):
             if (slot := self.number(vehicle)) >= 0:
                 self._entry[slot] = min(delay, snapshot.time - self._begin)
         gone = (name for name in events.wrecks_removed if self.number(name) >= 0)
-        self._removed.update(dict.fromkeys(gone, snapshot.time))
+        self.wrecks.update(dict.fromkeys(gone, before))
         self._crashed |= self._ends and any(c.crash for c in events.collisions)

@@ -154,13 +154,13 @@ def _group_document(compared: Compared) -> dict[str, Any]:
 
 
 def _shown(comparison: Comparison, compared: Compared) -> list[PairedFigure]:
-    """Headline figures and everybody's, those of the law and of near-misses that are not 0, and those a
+    """Headline figures, those of everybody, of the law and of near-misses that are not 0, and those a
     threshold asks for, where they apply."""
     asked = [check.threshold.measure.name for check in comparison.checks]
     every = dict.fromkeys((*HEADLINE, *EVERYBODY, *INCIDENCES, *LAW, *asked))
     names = [name for name in every if name in compared.figures]
-    rare = {*INCIDENCES, *LAW} - {*asked}
-    happened = {n for n in rare if (f := compared.figures.get(n)) and (f.a.value > 0.0 or f.b.value > 0.0)}
+    rare = {*EVERYBODY, *INCIDENCES, *LAW} - {*asked}
+    happened = {n for n in rare if (f := compared.figures.get(n)) and (f.a.value or f.b.value)}
     names = [name for name in names if name not in rare or name in happened]
     return [compared.figures[name] for name in names if compared.figures[name].n]
 

@@ -165,6 +165,27 @@ def test_waits_are_those_of_the_speeds_that_sumo_writes(drive: Drive) -> None:
     assert driven.figures["mean_squared_wait_s2"] == pytest.approx(mean, rel=0.01)
 
 
+def test_wrecks_lose_the_rest_of_the_time_and_have_not_arrived(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    end = 150.0  # s
+    words = ["run", "merge", "--demand", "dense", "--policy", "random", "--preset", "unguarded"]
+    words += ["--on-collision", "continue", "--penetration", "0.4", "--warmup", "0", "--seed", "140003"]
+    words += ["--duration", f"{end:g}", "--output", "tripinfo", "--out", str(tmp_path / "run"), "--json"]
+    assert main(words) == 0
+    driven = Driven(json.loads(capsys.readouterr().out), tmp_path / "run")
+    late, arrived, wrecks = [], 0, 0
+    for trip in driven.trips.values():
+        gone = number(trip, "arrival") >= 0.0
+        wreck = gone and trip.get("vaporized") == "traci"
+        rest = end - number(trip, "arrival") if wreck else 0.0
+        late.append(number(trip, "departDelay") + number(trip, "timeLoss") + rest)
+        wrecks, arrived = wrecks + wreck, arrived + (gone and not wreck)
+    assert wrecks == driven.figures["wrecks_removed"] > 5
+    assert driven.figures["arrivals"] == arrived > 0
+    assert driven.figures["total_delay_s"] == pytest.approx(np.mean(late), abs=TRIP)
+
+
 def test_a_run_prints_everybodys_figures_together(config: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run", str(config), "--duration", "20", "--penetration", "0", "--seed", str(SEED)]) == 0
     line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("  everybody"))

@@ -100,14 +100,14 @@ def test_who_is_never_inserted_waits_to_the_horizon() -> None:
 
 
 def test_who_left_keeps_its_delay_and_has_arrived_unless_it_was_a_wreck() -> None:
-    """a arrives; b, an AV, is taken off the road 0.6 s before the end, which it loses too."""
+    """a arrives; b, an AV, is taken off the road, last seen 0.8 s before the end, which it loses too."""
     cars = {"a": Car(0.5), "b": Car(1.0, kind=Kind.AV), "c": Car(0.0)}
     begun = {"a": Car(), "b": Car(kind=Kind.AV), "c": Car()}
     gone = Events(arrived=("a", "b"), wrecks_removed=("b",))
     found = figures([frame(0, begun), frame(1, cars), frame(2, {"c": Car()}, gone), frame(5, {"c": Car()})])
     assert (found["arrivals"], found["arrivals_av"], found["arrivals_hv"]) == (1, 0, 1)
     assert found["total_delay_hv_s"] == pytest.approx(0.25)
-    assert found["total_delay_av_s"] == pytest.approx(1.0 + 0.6)
+    assert found["total_delay_av_s"] == pytest.approx(1.0 + 0.8)
 
 
 @pytest.mark.parametrize("ends", [True, False])

@@ -1,14 +1,12 @@
 """Total delay: the time lost by everybody who wanted to depart, on the road and before it."""
 
-import math
-
 import numpy as np
 
 from cosim.metrics.context import MetricContext
 from cosim.metrics.slots import grown
 from cosim.types import Floats, Metric, Snapshot
 
-SLOWEST = 0.1  # share of the vehicles, those with the largest delay
+SLOWEST = 10  # one of so many vehicles, rounded up, is among the slowest
 
 
 class TotalDelay:
@@ -31,7 +29,7 @@ class TotalDelay:
         lost[: len(self._before)] -= self._before
         waited, to_come = everybody.waiting
         delay, av = np.concatenate([lost, waited]), np.concatenate([everybody.av, to_come])
-        slowest = np.sort(delay)[len(delay) - math.ceil(SLOWEST * len(delay)) :]
+        slowest = np.sort(delay)[::-1][: -(-len(delay) // SLOWEST)]
         due = None if np.isnan(waited).any() else len(delay)
         known = not np.isnan(delay).any()
         return {

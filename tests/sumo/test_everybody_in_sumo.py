@@ -165,6 +165,18 @@ def test_waits_are_those_of_the_speeds_that_sumo_writes(drive: Drive) -> None:
     assert driven.figures["mean_squared_wait_s2"] == pytest.approx(mean, rel=0.01)
 
 
+def test_of_a_warm_up_nothing_counts(config: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What all lose in the second minute is what they lose in two, less what they lose in the first."""
+
+    def lost(*flags: str) -> float:
+        assert main(["run", str(config), "--seed", str(SEED), "--penetration", "0.3", "--json", *flags]) == 0
+        found = json.loads(capsys.readouterr().out)
+        return float(found["total_delay_s"] * found["vehicles_due"])
+
+    first, both = lost("--duration", "60"), lost("--duration", "120")
+    assert lost("--warmup", "60", "--duration", "60") == pytest.approx(both - first, rel=1e-3)
+
+
 def test_wrecks_lose_the_rest_of_the_time_and_have_not_arrived(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -27,6 +27,7 @@ FINDINGS = 8  # before the fold
 WORST, FAILURES = 12, 50  # listed by name
 MANIFEST = 200_000  # characters of it on the page
 COMPARED = tuple(name for name in HEADLINE if name != "veto_rate")  # of each block against its baseline
+OF_ALL = tuple(name for name in EVERYBODY if name != "co2_kg")  # which stands per km too
 
 
 def write(run: Run, path: Path | None = None, shown: str | None = None) -> Path:
@@ -56,7 +57,7 @@ def html(run: Run, shown: str | None = None) -> str:
     found = blocks(run)
     differences, everybody, crashes, closer = (
         [block.differences(which) for block in found]
-        for which in (COMPARED, EVERYBODY, CRASH_RATES, NEAR_MISS_RATES)
+        for which in (COMPARED, OF_ALL, CRASH_RATES, NEAR_MISS_RATES)
     )
     folder = str(run.path) if shown is None else shown
     wrong = [row for row in run.rows if row["status"] != OK]
@@ -66,7 +67,7 @@ def html(run: Run, shown: str | None = None) -> str:
         findings=_findings(found, differences, everybody),
         shown=FINDINGS,
         figures=tables.figures(found, run.measures) if found else None,
-        everybody=tables.chosen(found, run.measures, EVERYBODY),
+        everybody=tables.chosen(found, run.measures, OF_ALL),
         law=tables.law(found, run.measures),
         crashes=tables.chosen(found, run.measures, CRASH_RATES),
         near_misses=tables.chosen(found, run.measures, NEAR_MISS_RATES),

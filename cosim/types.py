@@ -257,6 +257,8 @@ class Snapshot:
     # [n] g/s of CO2 at this moment, by SUMO's emission model; nan where not known, as in recordings
     co2: Floats = field(default_factory=lambda: np.zeros(0))
     waiting: Mapping[str, Due] | None = None  # who is to depart and has found no room; None: not known
+    # lane -> m/s where the limit is not the road's: variable speed signs, calibrators; none in recordings
+    limits: Mapping[int, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if len(self.actor) != len(self.kind):

@@ -79,7 +79,7 @@ def work(args: argparse.Namespace) -> int:
         try:
             scenario, seed = theirs(client, args.net)
             host = Host(
-                _as_asked(scenario, args, fleet),
+                _as_asked(scenario, args, fleet, client.place),
                 driver,
                 math.radians(args.svo),
                 simulator=joining(client),
@@ -104,13 +104,16 @@ def work(args: argparse.Namespace) -> int:
     return 130 if simulator.leave else 0
 
 
-def _as_asked(scenario: Scenario, args: argparse.Namespace, fleet: Fleet) -> Scenario:
-    """What SUMO simulates, with what the flags say besides."""
+def _as_asked(scenario: Scenario, args: argparse.Namespace, fleet: Fleet, place: str) -> Scenario:
+    """What the SUMO at `place` simulates, with what the flags say besides."""
+    from cosim.simulation.shared import lost
+
     given = {name: getattr(args, name) for name in ("preset", "duration", "warmup", "on_collision")}
     if args.mission is not None:
         given["mission"] = chosen_mission(scenario.mission, args.mission)
     known = {name: value for name, value in given.items() if value is not None}
-    return replace(scenario, fleet=fleet, **known)
+    asked = replace(scenario, fleet=fleet, **known)
+    return replace(asked, warnings=(*asked.warnings, *(f"{place}: {words}" for words in lost(asked))))
 
 
 @contextmanager

@@ -20,7 +20,11 @@ class Speeding:
         self.add(first)
 
     def add(self, snapshot: Snapshot) -> None:
-        frames, above, worst = _excess(snapshot.kind, snapshot.speed, snapshot.lane, self._limits)
+        limits = self._limits
+        if snapshot.limits:
+            limits = limits.copy()
+            limits[list(snapshot.limits)] = list(snapshot.limits.values())
+        frames, above, worst = _excess(snapshot.kind, snapshot.speed, snapshot.lane, limits)
         self._frames += frames
         self._above += above
         self._worst = max(self._worst, worst)

@@ -85,6 +85,7 @@ class Observer:
             target, change = commanded(name)
             place, length = float(positions[b, 0]), float(s.length[e])
             ahead = self._road.ahead(int(lanes[b, 0]), place, length, route(name))
+            ahead = ahead._replace(speed_limit=s.limits.get(int(lanes[b, 0]), ahead.speed_limit))
             way = ahead.paths[1]
             assert way is not None
             if not c.share_perception and b:
@@ -113,8 +114,9 @@ class Observer:
         return perceived(self._newest, self._egos, c.perception_range, c.share_perception)
 
     def _moment(self, s: Snapshot, seen: Bools) -> Moment:
-        """The signals, and the persons among the `seen` [n] (with V2V: whom all AVs perceive)."""
+        """The signals, the limits that have changed, and the persons among the `seen` [n] (with V2V: whom all
+        AVs perceive)."""
         who = np.flatnonzero((s.kind == int(Kind.PERSON)) & seen)
         persons = np.stack([s.x, s.y, s.heading, s.speed], axis=1)[who] if len(who) else None
         told = self._config.signal_timing and len(s.switches)
-        return Moment(s.signals, s.switches if told else None, persons)
+        return Moment(s.signals, s.switches if told else None, persons, s.limits)

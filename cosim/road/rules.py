@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
+from collections.abc import Mapping
 from itertools import pairwise
+from types import MappingProxyType
 from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -21,6 +23,7 @@ BESIDE = 2.0  # m from a crossing's end within which a person waits at it
 STANDING = 0.1  # m/s
 TOWARDS = 0.5  # cosine: a person who walks within 60 degrees of the crossing's direction is about to enter it
 STEP = 0.25  # m, how finely the place of a crossing along a lane is sought
+UNCHANGED: Mapping[int, float] = MappingProxyType({})  # no limit but the road's
 _GRID = 16.0  # m, persons are looked up in squares of this size
 
 
@@ -56,7 +59,11 @@ class Moment:
     """What of the law changes, at one time: the states of signals, and where persons are."""
 
     def __init__(
-        self, signals: Bytes | None = None, switches: Floats | None = None, persons: Floats | None = None
+        self,
+        signals: Bytes | None = None,
+        switches: Floats | None = None,
+        persons: Floats | None = None,
+        limits: Mapping[int, float] = UNCHANGED,
     ) -> None:
         """Take the state of all signals.
 
@@ -65,7 +72,9 @@ class Moment:
                 and every line asks for what it asks without its signal.
             switches: [s] s until the next phase of every signal's light; None: not told.
             persons: [p,4] x m, y m, heading rad, speed m/s of the persons who are perceived.
+            limits: lane -> m/s where the limit is not the road's.
         """
+        self.limits = limits
         self.states = "" if signals is None else signals.tobytes().decode("latin-1")
         self.switches = switches
         self.taken: dict[int, bool] = {}  # crossings that were looked at
@@ -129,7 +138,10 @@ class RuleBook:
             if self._taken(number, now):
                 person_at = distance
                 break
-        limits = way.limits[: bisect_left(way.starts, horizon)].copy()
+        begin, starts = way.limits, way.starts
+        if now.limits and not now.limits.keys().isdisjoint(path.lanes):
+            begin, starts = self._limits(path, now.limits)
+        limits = begin[: bisect_left(starts, horizon)].copy()
         limits[:, 0] -= front
         limits[0, 0] = 0.0
         switch = -1.0
@@ -158,15 +170,20 @@ class RuleBook:
             if number is not None:
                 lines.append((starts[place], number, road.links[number]))
         crossings = []
-        limits: list[tuple[float, float]] = []
         for start, lane in zip(starts, path.lanes, strict=True):
-            limit = road.lanes[lane].speed_limit
-            if not limits or limit != limits[-1][1]:
-                limits.append((start, limit))
             for number in self._crossed.get(lane, ()):
                 near, far = self._crossings[number].place_on(road.lanes[lane].shape)
                 crossings.append((start + near, start + far, number))
-        return _Way(tuple(lines), tuple(sorted(crossings)), np.array(limits), [arc for arc, _ in limits])
+        return _Way(tuple(lines), tuple(sorted(crossings)), *self._limits(path, UNCHANGED))
+
+    def _limits(self, path: LanePath, changed: Mapping[int, float]) -> tuple[Floats, list[float]]:
+        """`_Way.limits` and `_Way.starts`, with the limits that have changed."""
+        limits: list[tuple[float, float]] = []
+        for start, lane in zip(path.lane_start.tolist(), path.lanes, strict=True):
+            limit = changed.get(lane, self._road.lanes[lane].speed_limit)
+            if not limits or limit != limits[-1][1]:
+                limits.append((start, limit))
+        return np.array(limits), [arc for arc, _ in limits]
 
 
 class _Zebra:

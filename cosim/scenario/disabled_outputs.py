@@ -1,12 +1,16 @@
-"""Keep a user's additional files from writing: copies of them in which no output is written.
+"""A user's files as SUMO is given them: copies in which no output is written and lists of types are whole.
 
 Detectors, edgeData and timed events write wherever their `file` or `dest` says, beside the scenario as a
 rule (A10KW: netstate.xml, tlsstate.xml). That fails in a read-only folder, is overwritten by the next run,
 races between workers, and `host:port` opens a connection. The elements stay, so that whatever refers to a
 detector still finds it; only the name of the file becomes SUMO's own word for no file.
+
+Rerouters, detectors, calibrators and signals can be for some vehicle types alone. An AV drives as another
+type than its own (`cosim.scenario.vehicle_types`), which such lists then name too.
 """
 
 import re
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from xml.parsers import expat
@@ -14,7 +18,7 @@ from xml.sax.saxutils import escape
 
 from cosim.files.xml_input import content
 from cosim.scenario import Scenario
-from cosim.scenario.vet_demand import OUTPUT_PARAMETERS, OUTPUTS
+from cosim.scenario.vet_demand import OUTPUT_PARAMETERS, OUTPUTS, TYPE_LISTS
 
 NOWHERE = "NUL"  # SUMO's OutputDevice makes no file of it, on every system
 # Attributes by which a file reads another one, relative to itself: absolute in a copy.
@@ -25,25 +29,28 @@ _INPUTS = {
     "poly": "imgFile",
     "poi": "imgFile",
 }
+Also = Callable[[str], Iterable[str]]  # a type's name -> what vehicles of it may be called besides
 _TAG = re.compile(rb"<(?:[^\"'>]|\"[^\"]*\"|'[^']*')*>")
 
 
-def disable_outputs(scenario: Scenario, folder: Path) -> Scenario:
+def disable_outputs(scenario: Scenario, folder: Path, also: Also = lambda _: ()) -> Scenario:
     """`scenario` with its writing files replaced by copies in `folder` that write nothing; the others stay.
 
-    Call after `cosim.scenario.vet.vet`: the files are taken to be sound XML.
+    Lists of types get the names that `also` gives to those they hold. Call after `cosim.scenario.vet.vet`:
+    the files are taken to be sound XML.
     """
     return replace(
         scenario,
-        additional=tuple(_disabled(path, folder) for path in scenario.additional),
-        demand=tuple(_disabled(path, folder) for path in scenario.demand),
+        net=_disabled(scenario.net, folder, also, only=b"vTypes"),  # its signals may be for some types
+        additional=tuple(_disabled(path, folder, also) for path in scenario.additional),
+        demand=tuple(_disabled(path, folder, also) for path in scenario.demand),
     )
 
 
-def _disabled(path: Path, folder: Path) -> Path:
-    """`path` itself when it writes nothing, else its copy in `folder`."""
+def _disabled(path: Path, folder: Path, also: Also, only: bytes = b"") -> Path:
+    """`path` itself when nothing in it has to change, or `only` is not in it, else its copy in `folder`."""
     whole = content(path)
-    edits = _edits(whole, path, folder)
+    edits = _edits(whole, path, folder, also) if only in whole else []
     if not any(writes for *_, writes in edits):
         return path
     for begin, end, value, _ in sorted(edits, reverse=True):  # from the back, so that places stay
@@ -54,27 +61,39 @@ def _disabled(path: Path, folder: Path) -> Path:
     return copy
 
 
-def _edits(whole: bytes, path: Path, folder: Path) -> list[tuple[int, int, bytes, bool]]:
-    """(first byte, byte after the last, new value, whether it is about writing), in the file's order."""
+def _edits(whole: bytes, path: Path, folder: Path, also: Also) -> list[tuple[int, int, bytes, bool]]:
+    """(first byte, byte after the last, new value, whether the file must change), in the file's order."""
     found: list[tuple[int, int, bytes, bool]] = []
     parser = expat.ParserCreate()
+    owner = ""  # the tag that parameters belong to
 
     def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal owner
+        owner = owner if tag in ("param", "phase") else tag
         is_parameter = tag == "param" and attributes.get("key") in OUTPUT_PARAMETERS
         written = "value" if is_parameter else OUTPUTS.get(tag)
         if written is not None and attributes.get(written):
             found.append((*_place(whole, parser.CurrentByteIndex, written), NOWHERE.encode(), True))
+        of_signal = tag == "param" and owner == "tlLogic" and attributes.get("key") == "vTypes"
+        listed = "value" if of_signal else TYPE_LISTS.get(tag)
+        names = attributes.get(listed, "").split() if listed is not None else []
+        if listed is not None and (more := [other for name in names for other in also(name)]):
+            text = _quoted(" ".join((*names, *more)))
+            found.append((*_place(whole, parser.CurrentByteIndex, listed), text, True))
         read = _INPUTS.get(tag)
         if read is not None and attributes.get(read):
             source = path.parent / attributes[read]
-            target = _disabled(source, folder) if tag == "include" else source
-            text = escape(str(target.absolute()), {'"': "&quot;", "'": "&apos;"})
+            target = _disabled(source, folder, also) if tag == "include" else source
             place = _place(whole, parser.CurrentByteIndex, read)
-            found.append((*place, text.encode(), target != source))
+            found.append((*place, _quoted(str(target.absolute())), target != source))
 
     parser.StartElementHandler = start
     parser.Parse(whole, True)
     return found
+
+
+def _quoted(value: str) -> bytes:
+    return escape(value, {'"': "&quot;", "'": "&apos;"}).encode("ascii", "xmlcharrefreplace")
 
 
 def _place(whole: bytes, tag_begin: int, attribute: str) -> tuple[int, int]:

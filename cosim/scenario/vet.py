@@ -6,7 +6,7 @@ numbers are checked, and every name it refers to must exist. Files that have not
 """
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -15,24 +15,22 @@ from cosim.errors import BadInput, hint
 from cosim.files.xml_input import regular_file
 from cosim.scenario import Scenario
 from cosim.scenario.sumocfg import FILE_OPTIONS
-from cosim.scenario.vet_demand import Demand, read_demand
+from cosim.scenario.vet_demand import DEFAULT_TYPE, Demand, read_demand
 from cosim.scenario.vet_net import Net, read_net
 from cosim.scenario.vet_rules import OFF_ROAD, some
 from cosim.scenario.vet_signals import check_lengths
 
 MAX_WARNINGS = 20  # of one kind
 MAX_INCLUDES = 64  # files; more is a cycle
-# Types SUMO always has.
-DEFAULT_TYPES = frozenset(
-    {
-        "DEFAULT_VEHTYPE",
-        "DEFAULT_PEDTYPE",
-        "DEFAULT_BIKETYPE",
-        "DEFAULT_TAXITYPE",
-        "DEFAULT_RAILTYPE",
-        "DEFAULT_CONTAINERTYPE",
-    }
-)
+# Types SUMO always has, and their classes.
+DEFAULT_TYPES: Mapping[str, str] = {
+    DEFAULT_TYPE: "passenger",
+    "DEFAULT_PEDTYPE": "pedestrian",
+    "DEFAULT_BIKETYPE": "bicycle",
+    "DEFAULT_TAXITYPE": "taxi",
+    "DEFAULT_RAILTYPE": "rail",
+    "DEFAULT_CONTAINERTYPE": "container",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,9 +52,9 @@ def vet(scenario: Scenario) -> VetReport:
     """
     config = scenario.config
     net = _net(*_stamp(regular_file(scenario.net, file=config, field="net-file")))
-    demands = [*_all(scenario.additional, config, additional=True), *_all(scenario.demand, config)]
+    demands = demand_files(scenario)
     _check_options(scenario)
-    types = DEFAULT_TYPES.union(*(d.types for d in demands))
+    types = frozenset(DEFAULT_TYPES).union(*(d.types for d in demands), *(d.distributions for d in demands))
     _check_references(net, demands, types)
     for demand in demands:
         check_lengths(demand.path, demand.programs, net.signals)
@@ -88,6 +86,15 @@ def vetted(scenario: Scenario) -> Scenario:
         BadInput: see `vet`.
     """
     return replace(scenario, warnings=vet(scenario).warnings)
+
+
+def demand_files(scenario: Scenario) -> list[Demand]:
+    """What every additional and route file of `scenario` holds, in SUMO's order of loading.
+
+    Raises BadInput: see `read_demand`.
+    """
+    config = scenario.config
+    return [*_all(scenario.additional, config, additional=True), *_all(scenario.demand, config)]
 
 
 def _all(paths: Iterable[Path], config: Path, *, additional: bool = False) -> list[Demand]:
@@ -188,7 +195,12 @@ def _unsupported(scenario: Scenario, demands: list[Demand]) -> list[str]:
             found.append(
                 f"{scenario.config}: {name}={value}: without SUMO's sublane model the traffic is another"
             )
-    used = {name for demand in demands for name in (*demand.used["vehicle type"], *demand.mixtures)}
+    used = {
+        name
+        for demand in demands
+        for names in (demand.used["vehicle type"], *demand.distributions.values())
+        for name in names
+    }
     off_road = {
         name: kind for d in demands for name, kind in d.classes.items() if kind in OFF_ROAD and name in used
     }

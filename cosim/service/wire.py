@@ -99,7 +99,8 @@ def of_snapshot(snapshot: Snapshot) -> bytes:
     values = {f.name: getattr(snapshot, f.name) for f in fields(Snapshot)}
     arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
     names = ("time", "ids", "waiting")
-    return pack(arrays, {name: values[name] for name in names} | {"events": asdict(snapshot.events)})
+    document = {name: values[name] for name in names} | {"events": asdict(snapshot.events)}
+    return pack(arrays, document | {"limits": list(snapshot.limits.items())})
 
 
 def to_snapshot(data: bytes) -> Snapshot:
@@ -107,6 +108,7 @@ def to_snapshot(data: bytes) -> Snapshot:
     arrays, found = unpack(data)
     waiting = found["waiting"] and {name: Due(*due) for name, due in found["waiting"].items()}
     about: dict[str, Any] = {"time": found["time"], "ids": tuple(found["ids"]), "waiting": waiting}
+    about["limits"] = dict(found["limits"])
     return Snapshot(**about | arrays, events=to_events(found["events"]))
 
 

@@ -20,14 +20,13 @@ from cosim.road import RoadMap
 from cosim.road.rules import RED, YELLOW
 from cosim.simulation.backend import sumo
 from cosim.simulation.commands import SPEED_MODE, Commander, Controlled
+from cosim.simulation.derived_types import LATE_TYPE, LAWFUL_TYPE, derive, is_known, own_type, suffix
 from cosim.simulation.fleet import set_type
 from cosim.simulation.gaps import Gaps
 from cosim.simulation.inside import FREE, SWERVES, Ahead, Inside
 from cosim.simulation.waves import NOBODY, Waves
 from cosim.types import Intervention, Preset
 
-# sumo_scenarios/types.add.xml: an IDM that brakes comfortably, and one that brakes late
-LAWFUL_TYPE, LATE_TYPE = "cosim.av.lawful", "cosim.av.late"
 CORRECTED = 1.0  # m/s2 more braking than asked for: from there on the car drives otherwise than commanded
 STALLED = 0.2, 1.5  # m/s2, or so little acceleration where so much was asked for
 RESPITE = 2.0  # s without a correction: the next one is a new one
@@ -477,16 +476,17 @@ class Assistance(Commander):
 
 
 def _lawful(own: str, base: str) -> str:
-    """The type of a commanded AV whose own one is this, driving as `base`; outputs name it (`type_names`)."""
-    name = f"{own.partition('@')[0].partition('/')[0]}/{base.rpartition('.')[2]}"
-    if name not in sumo.vehicletype.getIDList():
-        sumo.vehicletype.copy(base, name)
+    """The type of a commanded AV whose present one is this, driving as `base`; outputs name it."""
+    av = own.removesuffix(suffix(LAWFUL_TYPE)).removesuffix(suffix(LATE_TYPE))
+    name = f"{av}{suffix(base)}"
+    if not is_known(name):
+        derive(name, own, base)
     return name
 
 
 def _drive_as(name: str, kind: str, impatience: float = 0.0) -> None:
     """Give an AV another driver; how impatient it is no type decides."""
-    set_type(name, _lawful(sumo.vehicle.getTypeID(name), kind))
+    set_type(name, _lawful(own_type(name), kind))
     sumo.vehicletype.setImpatience(sumo.vehicle.getTypeID(name), impatience)
 
 

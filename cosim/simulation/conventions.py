@@ -25,5 +25,5 @@ def type_names(vehicle_type: str) -> tuple[str, ...]:
     """The type as SUMO writes it, then what it was made of: `type@vehicle` is one vehicle's own copy,
     `type/class` one of ours, `cosim.av.type` that of an AV."""
     of_copy = vehicle_type.partition("@")[0]
-    ours = of_copy.partition("/")[0]
-    return vehicle_type, of_copy, ours, ours.removeprefix(AV_TYPE)
+    ours = of_copy.rpartition("/")[0] or of_copy  # a user's types may have slashes too
+    return vehicle_type, of_copy, ours, of_copy.removeprefix(AV_TYPE), ours.removeprefix(AV_TYPE)

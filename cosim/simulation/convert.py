@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import repeat
 from pathlib import Path
@@ -67,8 +67,11 @@ class Body:
 class SnapshotReader:
     """Reads every vehicle with plain getters (measured faster than subscriptions, docs/sumo.md)."""
 
-    def __init__(self, road: RoadMap) -> None:
+    def __init__(self, road: RoadMap, variable: Iterable[int] = ()) -> None:
+        """`variable`: the lanes whose speed limit may change."""
         self._lane_index = road.index
+        self._variable = [(k, road.lanes[k].id, road.lanes[k].speed_limit) for k in variable]
+        self._limit_of = sumo.getter("lane", "MaxSpeed")
         self._edges = road.contact.edges
         self._lights = Counter(light for light, _ in road.signals)  # -> how many signals, in their order
         self._of_vehicles = tuple(sumo.getter("vehicle", name) for name in READ)
@@ -148,6 +151,7 @@ class SnapshotReader:
             time_loss=np.array(time_loss, np.float64),
             co2=np.array(co2, np.float64) * 1e-3,
             waiting=waiting,
+            limits={k: m for k, name, usual in self._variable if (m := self._limit_of(name)) != usual},
         )
 
     def _walking(self) -> dict[str, str]:

@@ -5,38 +5,10 @@ import hashlib
 from cosim.errors import BadInput, one_of
 from cosim.scenario.behaviors import AS_IS, DRIVER_MODELS, MOBIL, Behaviors, DriverClass, load_behaviors
 from cosim.simulation.backend import sumo
+from cosim.simulation.derived_types import IDM_TYPE, derive, is_known, own_type, table_ii
 from cosim.simulation.mobil import MobilDriving
 
-# A vehicle cannot be given another car-following model while it drives, except through its type. A network
-# whose types do not use IDM gets this one as an additional file (sumo_scenarios/types.add.xml).
-IDM_TYPE = "cosim.idm"
-
-# What a derived type keeps of its original: getters and setters of sumo.vehicletype, in this order.
-BODY = ("VehicleClass", "Length", "Width", "Height", "MaxSpeed", "ShapeClass", "Color")
-
-EMERGENCY_DECELERATION = 9.0  # m/s2, the limit of the tyres (SUMO's default)
 LARGEST_DRAW = 1.0 - 1e-12  # in (0, 1): the division rounds up to 1 for the largest integers
-
-
-def derive_idm_type(original: str, name: str) -> None:
-    """Make vehicle type `name`: IDM with the size, class, maximum speed, shape and color of type `original`.
-
-    Raises BadInput if `original` does not use IDM and the base type has not been loaded.
-    """
-    get = sumo.vehicletype
-    if IDM_TYPE in get.getIDList():
-        get.copy(IDM_TYPE, name)
-        for parameter in BODY:
-            getattr(get, f"set{parameter}")(name, getattr(get, f"get{parameter}")(original))
-    elif get.getImperfection(original) == -1.0:  # SUMO's IDM has no driver imperfection: the value is -1
-        get.copy(original, name)
-    else:
-        raise BadInput(
-            "Table II needs the IDM car-following model, which this type does not use; "
-            f"load {IDM_TYPE} from sumo_scenarios/types.add.xml",
-            field="vType",
-            value=original,
-        )
 
 
 class Drivers:
@@ -61,7 +33,7 @@ class Drivers:
         self.behavior, self.driver_model, self.seed = behavior, driver_model, seed
         self.classes: dict[str, str] = {}  # vehicle -> class, of all HVs so far
         self.mobil = MobilDriving(self.behaviors.mobil_period) if driver_model == MOBIL else None
-        self._types: dict[tuple[str, str], str] = {}
+        self._types: set[str] = set()  # known to SUMO
 
     def draws(self, vehicle: str) -> tuple[float, float, float]:
         """Three uniform numbers in (0, 1) of one vehicle: for its class, desired speed and phase."""
@@ -79,7 +51,7 @@ class Drivers:
         u_class, u_speed, u_phase = self.draws(vehicle)
         driver = self.behaviors.draw(self.behavior, u_class)
         set_ = sumo.vehicle
-        set_.setType(vehicle, self._type(set_.getTypeID(vehicle), driver))
+        set_.setType(vehicle, self._type(own_type(vehicle), driver))
         # setType leaves the lane-change parameters of the old type in place (SUMO 1.28): set each of them.
         for key, value in driver.lc2013:
             set_.setParameter(vehicle, f"laneChangeModel.{key}", repr(value))
@@ -110,28 +82,21 @@ class Drivers:
             self.mobil.step()
 
     def _type(self, original: str, driver: DriverClass) -> str:
-        """The vehicle type of a class, derived from a vehicle's own type once per episode."""
-        name = self._types.get((original, driver.name))
-        if name is None:
-            name = f"{original}/{driver.name}"
-            draft = f"{name}/draft"
-            derive_idm_type(original, draft)
-            set_, idm = sumo.vehicletype, driver.idm
-            parameters = {
-                "Tau": idm.time_headway,
-                "MinGap": idm.minimum_gap,
-                "Accel": idm.max_acceleration,
-                # before Decel: SUMO warns when it is below the comfortable one
-                "EmergencyDecel": max(EMERGENCY_DECELERATION, idm.comfortable_deceleration),
-                "Decel": idm.comfortable_deceleration,
-                "ApparentDecel": idm.comfortable_deceleration,
-                "SpeedDeviation": 0.0,
-            }
-            for parameter, value in parameters.items():
-                getattr(set_, f"set{parameter}")(draft, value)
-            set_.setActionStepLength(draft, sumo.simulation.getDeltaT(), True)
-            # SUMO's IDM keeps the 2 sqrt(a b) of its construction: setAccel and setDecel change a and b, but
-            # not d* (measured: -0.06 instead of -0.44 m/s2). Copying the type constructs the model anew.
-            set_.copy(draft, name)
-            self._types[original, driver.name] = name
+        """The vehicle type of a class with a vehicle's own type."""
+        name = f"{original}/{driver.name}"
+        if name not in self._types:
+            self._types.add(name)
+            if not is_known(name):
+                self._derive(name, original, driver)
         return name
+
+    def _derive(self, name: str, original: str, driver: DriverClass) -> None:
+        """While SUMO drives: see `cosim.simulation.derived_types`."""
+        draft, set_ = f"{name}/draft", sumo.vehicletype
+        derive(draft, original, IDM_TYPE)
+        for parameter, value in table_ii(driver, sumo.simulation.getDeltaT()).items():
+            getattr(set_, f"set{parameter[0].upper()}{parameter[1:]}")(draft, value)
+        set_.setSpeedDeviation(draft, 0.0)
+        # SUMO's IDM keeps the 2 sqrt(a b) of its construction: setAccel and setDecel change a and b, but
+        # not d* (measured: -0.06 instead of -0.44 m/s2). Copying the type constructs the model anew.
+        set_.copy(draft, name)

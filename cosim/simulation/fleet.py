@@ -12,7 +12,8 @@ from cosim.seeding import uniform
 from cosim.simulation.backend import sumo
 from cosim.simulation.conventions import AV_TYPE
 from cosim.simulation.convert import ACTORS, Body
-from cosim.simulation.drivers import IDM_TYPE, Drivers
+from cosim.simulation.derived_types import IDM_TYPE, derive, is_known, own_type
+from cosim.simulation.drivers import Drivers
 from cosim.types import Actor, Kind, Preset
 
 # definitions.md, Vehicles: what an AV drives with while it has no command (egoistic IDM).
@@ -32,13 +33,21 @@ KEPT = (
 class Fleet:
     """Decides for every vehicle that departs; the draws depend on (seed, id) only, never on the order."""
 
-    def __init__(self, scenario: Scenario, drivers: Drivers, av_parameters: Mapping[str, str]) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        drivers: Drivers,
+        av_parameters: Mapping[str, str],
+        av_types: frozenset[str] = frozenset(),
+    ) -> None:
+        """`av_types`: the types that are meant where the scenario's fleet is one by type."""
         self._scenario = scenario
         self._drivers = drivers
         self._idm = {name: _number(name, av_parameters.get(name, usual)) for name, usual in AV_IDM.items()}
         others = {key: text for key, text in av_parameters.items() if key not in AV_IDM}
         self._av_parameters = {**AV_LANE_CHANGE, **others}
-        self._av_types: dict[str, str] = {}  # a vehicle's own type -> the type of such an AV
+        self._meant = av_types or {scenario.fleet.type}
+        self._av_types: set[str] = set()  # of AVs, known to SUMO
 
     def depart(self, vehicle: str, seed: int) -> Body:
         """A vehicle departed: give it its driver; what it is."""
@@ -58,11 +67,12 @@ class Fleet:
 
     def _take_av_type(self, vehicle: str) -> None:
         """In our worlds an AV drives as its type says, one of a user's file by IDM."""
-        own, ours = sumo.vehicle.getTypeID(vehicle), self._scenario.built_in
-        name = self._av_types.get(own)
-        if name is None:
-            name = self._av_types[own] = AV_TYPE + own
-            sumo.vehicletype.copy(own if ours else IDM_TYPE, name)
+        own, ours = own_type(vehicle), self._scenario.built_in
+        name = AV_TYPE + own
+        if name not in self._av_types:
+            self._av_types.add(name)
+            if not is_known(name):
+                derive(name, own, own if ours else IDM_TYPE)
         if ours:
             sumo.vehicle.setType(vehicle, name)
         else:
@@ -85,13 +95,12 @@ class Fleet:
             drawn = uniform(seed, "av", vehicle) < rule.penetration
             return drawn and sumo.vehicle.getVehicleClass(vehicle) not in NOT_CARS
         if rule.type is not None:
-            name: str = sumo.vehicle.getTypeID(vehicle)
-            return name == rule.type or name.startswith(f"{rule.type}@")
+            return own_type(vehicle) in self._meant
         return False
 
 
 def set_type(vehicle: str, name: str) -> None:
-    """Give a vehicle another type; its size, class and maximum speed stay.
+    """Give a vehicle another type; what it has of its own (`type@vehicle`) stays.
 
     `setType` replaces the car-following model (Krauss in most files); nothing else can.
     """

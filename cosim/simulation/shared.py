@@ -15,10 +15,12 @@ from cosim.errors import BadInput, SimulationEnded, SimulationError
 from cosim.files.xml_input import is_there, regular_file
 from cosim.scenario import FOREIGN_DURATION, Scenario, check_timing, file_name
 from cosim.scenario.sumocfg import time_of
+from cosim.scenario.vehicle_types import VehicleTypes, vehicle_types
 from cosim.scenario.vet_net import read_net
+from cosim.scenario.vet_rules import some
 from cosim.simulation.backend import sumo
 from cosim.simulation.client import Client
-from cosim.simulation.drivers import IDM_TYPE, Drivers
+from cosim.simulation.derived_types import IDM_TYPE, drivers, not_derived
 from cosim.simulation.fleet import Fleet, set_type
 from cosim.simulation.net import NetReader
 from cosim.simulation.sumo import DEFAULTS, FORCED, GIVES_UP, SumoSimulator
@@ -83,6 +85,10 @@ class ServingSimulator(SharedSimulator):
     def _arguments(self, seed: int) -> list[str]:
         return [*super()._arguments(seed), *self._remote]
 
+    def _variable(self) -> list[int]:
+        """Other programs may change any of them."""
+        return list(range(len(self.road.lanes)))
+
     def _explain(self, error: Exception, *, starting: bool = False) -> Exception:
         found = super()._explain(error, starting=starting)
         if "listening socket" in str(found):
@@ -93,8 +99,8 @@ class ServingSimulator(SharedSimulator):
 class LentFleet(Fleet):
     """AVs that are given back as they were."""
 
-    def __init__(self, scenario: Scenario, drivers: Drivers, av_parameters: Mapping[str, str]) -> None:
-        super().__init__(scenario, drivers, av_parameters)
+    def __init__(self, *settings: Any) -> None:
+        super().__init__(*settings)
         self._own: dict[str, tuple[str, float, dict[str, str]]] = {}  # AV -> type, speed factor, parameters
 
     def _take_av_type(self, vehicle: str) -> None:
@@ -150,6 +156,13 @@ class TraciSimulator(SharedSimulator):
             self._wrecks.release()
         fleet.hand_back()
 
+    def _types_of(self, scenario: Scenario) -> VehicleTypes:
+        return _readable_types(scenario)
+
+    def _given(self, scenario: Scenario, folder: Path) -> Scenario:
+        """SUMO has its files."""
+        return scenario
+
     def _open(self) -> None:
         reader = NetReader(self._scenario.net)  # in this process: over the socket each call takes 0.1 ms
         try:
@@ -168,6 +181,30 @@ class TraciSimulator(SharedSimulator):
 
     def _explain(self, error: Exception, *, starting: bool = False) -> Exception:
         return SimulationError(f"{self._client.place}: SUMO failed: {error}")
+
+
+def lost(scenario: Scenario) -> list[str]:
+    """What AVs of a joined SUMO are not as its files say: warnings, as far as these can be read here."""
+    found, fleet = _readable_types(scenario), scenario.fleet
+    if not drivers(scenario, frozenset()):
+        return []
+    meant = found.types if fleet.type is None else found.named(fleet.type)
+    missing = {
+        f"{name}: {', '.join(words)}"
+        for name, kind in found.types.items()
+        if name in meant and (words := sorted(not_derived(kind)))
+    }
+    decided = {name for name in found.listed if not found.named(name).isdisjoint(meant)}
+    words = [*sorted(missing), *(f"what is decided by type {name!r}" for name in sorted(decided))]
+    return [f"AVs lose what only a type's file can say ({some(words)})"] if words else []
+
+
+def _readable_types(scenario: Scenario) -> VehicleTypes:
+    """As far as the files of a joined SUMO are found right: it is SUMO that judges them."""
+    try:
+        return vehicle_types(scenario)
+    except BadInput:
+        return VehicleTypes({}, {}, frozenset(), frozenset())
 
 
 def theirs(client: Client, net: str | None = None) -> tuple[Scenario, int]:

@@ -22,11 +22,13 @@ from cosim.scenario.behaviors import AS_IS
 from cosim.scenario.disabled_outputs import disable_outputs
 from cosim.scenario.sumo_outputs import sumo_options
 from cosim.scenario.sumocfg import time_of
+from cosim.scenario.vehicle_types import VehicleTypes, vehicle_types
 from cosim.simulation.assistance import Assistance
 from cosim.simulation.backend import sumo
 from cosim.simulation.collisions import CollisionDetector, Wrecks
 from cosim.simulation.commands import Commander, force
 from cosim.simulation.convert import Body, SnapshotReader, read_road, struggling_lanes
+from cosim.simulation.derived_types import drivers
 from cosim.simulation.drivers import Drivers
 from cosim.simulation.entries import EntryWatcher
 from cosim.simulation.fleet import Fleet
@@ -57,6 +59,7 @@ WRONG_DEMAND = re.compile(
     r"[Ii]nvalid depart|Departure \w+ .*for vehicle|has no valid route|No connection between edge|[Pp]erson '"
 )
 GIVES_UP = "max-depart-delay"  # SUMO drops vehicles that waited so long, without a message
+DERIVED = "types.add.xml"  # what drives as another type than its own
 NOBODY: Mapping[str, float] = MappingProxyType({})
 
 _in_use = False
@@ -69,7 +72,7 @@ class SumoSimulator:
     """
 
     _SHARED = False  # whether other programs change things too
-    _FLEET = Fleet
+    _FLEET: type[Fleet] = Fleet
 
     def __init__(
         self, scenario: Scenario, *, av_parameters: Mapping[str, str] | None = None, history: int = 10
@@ -80,9 +83,11 @@ class SumoSimulator:
                 "this process already runs a simulation, and libsumo would silently replace it: "
                 "use one process per simulation (cosim.envs and cosim.open do)"
             )
+        self._types = self._types_of(scenario)
+        fleet = scenario.fleet.type
+        self._av_types = frozenset() if fleet is None else self._types.named(fleet)
         self._scratch = tempfile.TemporaryDirectory(prefix="cosim-")
-        # a user's detectors would write beside the scenario, and workers would overwrite one another's files
-        self._scenario = scenario if scenario.ships else disable_outputs(scenario, Path(self._scratch.name))
+        self._scenario = self._given(scenario, Path(self._scratch.name))
         self._av_parameters = dict(av_parameters or {})
         self._history = history
         self._stderr = SumoStderr()
@@ -100,7 +105,7 @@ class SumoSimulator:
         except BaseException:
             self.close()
             raise
-        self._reader = SnapshotReader(self.road)
+        self._reader = SnapshotReader(self.road, self._variable())
         self._entries = EntryWatcher(self.road, scenario.timing.step, self._SHARED)
 
     def reset(self, seed: int) -> tuple[Snapshot, ...]:
@@ -108,7 +113,7 @@ class SumoSimulator:
         self._load(seed)
         self._seed = seed
         self._drivers = Drivers(self._scenario.behavior, self._scenario.driver_model, seed)
-        self._fleet = self._FLEET(self._scenario, self._drivers, self._av_parameters)
+        self._fleet = self._FLEET(self._scenario, self._drivers, self._av_parameters, self._av_types)
         preset, step = self._scenario.preset, self._scenario.timing.step
         self._commander = Assistance(step, self.road) if preset == Preset.LAWFUL else Commander(preset, step)
         self._commander.shared = self._SHARED
@@ -254,6 +259,27 @@ class SumoSimulator:
         self._stderr.close()
         self._scratch.cleanup()
         _in_use = False
+
+    def _types_of(self, scenario: Scenario) -> VehicleTypes:
+        """The types that the scenario's files define."""
+        return vehicle_types(scenario)
+
+    def _given(self, scenario: Scenario, folder: Path) -> Scenario:
+        """The scenario as SUMO gets it, some of its files as copies in `folder`."""
+        ours = drivers(scenario, self._av_types)
+        if not scenario.ships:
+            # a user's detectors would write beside the scenario, and workers overwrite one another's files
+            scenario = disable_outputs(scenario, folder, partial(self._types.also, drivers=ours))
+        if not ours:
+            return scenario
+        derived = folder / DERIVED
+        self._types.write(derived, ours)
+        return replace(scenario, additional=(*scenario.additional, derived))
+
+    def _variable(self) -> list[int]:
+        """The lanes whose speed limit may change while SUMO drives."""
+        may = self._types.variable
+        return [k for k, lane in enumerate(self.road.lanes) if lane.id in may or lane.edge in may]
 
     def _open(self) -> None:
         """Read what stays the same in all episodes."""

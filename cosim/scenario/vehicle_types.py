@@ -1,0 +1,129 @@
+"""The vehicle types of a scenario's files, written once more for every driver that replaces their own.
+
+SUMO's car-following model belongs to the type, so that nothing but another type changes it while a vehicle
+drives. A type that is made at run time knows only what SUMO's calls can set: no capacities, no parking, no
+parameters. So each type is written again before SUMO starts, all attributes and parameters its own but for
+the driver's, and lists of types (rerouters, detectors, signals, ...) name it beside the original
+(`cosim.scenario.disabled_outputs`).
+"""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+from cosim.scenario import Scenario
+from cosim.scenario.vet import DEFAULT_TYPES, demand_files
+from cosim.scenario.vet_demand import WrittenType
+from cosim.scenario.vet_rules import words
+
+# What describes a driver, not a vehicle: of a family all attributes are replaced, or none.
+_FAMILIES = {
+    "lc": "lane changes",
+    "jm": "junctions",
+    **dict.fromkeys(
+        words(
+            "carFollowModel actionStepLength tau minGap accel decel emergencyDecel apparentDecel sigma delta "
+            "stepping startupDelay collisionMinGapFactor maxAccelProfile desAccelProfile"
+        ),
+        "car following",
+    ),
+    "laneChangeModel": "lane changes",
+}
+_FILES = ("imgFile", "osgFile")  # attributes that name a file, relative to their own
+_MODEL = "carFollowing-"  # the children of a vType that describe its driver
+
+
+@dataclass(frozen=True, slots=True)
+class Driver:
+    """A driver who replaces that of a type; such a type's name is `prefix` + the type's own + `suffix`.
+
+    `attributes` are the driver's, by SUMO's names; none: as the type's own. `types`: whose; None: all.
+    """
+
+    prefix: str
+    suffix: str
+    attributes: Mapping[str, str]
+    types: frozenset[str] | None = None
+
+    def of(self, own: str) -> str:
+        """The name of type `own` with this driver."""
+        return f"{self.prefix}{own}{self.suffix}"
+
+    def replaces(self, attribute: str) -> bool:
+        """Whether an attribute of a type is replaced, or dropped."""
+        family = _family(attribute)
+        return attribute in self.attributes or (family != "" and family in map(_family, self.attributes))
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleTypes:
+    """All types of a scenario's files, and those of SUMO's own that they use."""
+
+    types: Mapping[str, WrittenType]
+    distributions: Mapping[str, Sequence[str]]  # of types -> the types
+    listed: frozenset[str]  # what rerouters, detectors and the like are for
+    variable: frozenset[str]  # lanes and edges whose speed limit may change while SUMO drives
+
+    def named(self, name: str) -> frozenset[str]:
+        """The types that `name` means: the members of a distribution, or the type itself."""
+        return frozenset(self.distributions.get(name, (name,)))
+
+    def write(self, file: Path, drivers: Sequence[Driver]) -> None:
+        """An additional file: every type with each of these drivers."""
+        written = (
+            _written(name, kind, who)
+            for who in drivers
+            for name, kind in self.types.items()
+            if who.types is None or name in who.types
+        )
+        file.write_text("\n".join(("<additional>", *written, "</additional>", "")), encoding="utf-8")
+
+    def also(self, name: str, drivers: Iterable[Driver]) -> Iterator[str]:
+        """Where a list of types names `name`: what such vehicles with these drivers are called."""
+        return (
+            who.of(own)
+            for who in drivers
+            for own in sorted(self.named(name))
+            if who.types is None or own in who.types
+        )
+
+
+def vehicle_types(scenario: Scenario) -> VehicleTypes:
+    """The types of a scenario's files. Raises BadInput: see `cosim.scenario.vet_demand.read_demand`."""
+    found = demand_files(scenario)
+    used = {name for demand in found for name in demand.used["vehicle type"] if name in DEFAULT_TYPES}
+    return VehicleTypes(
+        {
+            **{name: WrittenType(Path(), {"vClass": DEFAULT_TYPES[name]}, []) for name in sorted(used)},
+            **{name: kind for demand in found for name, kind in demand.types.items()},
+        },
+        {name: members for demand in found for name, members in demand.distributions.items()},
+        frozenset[str]().union(*(demand.listed for demand in found)),
+        frozenset[str]().union(*(demand.variable for demand in found)),
+    )
+
+
+def describes_driver(attribute: str) -> bool:
+    """Whether an attribute of a type says how its driver drives."""
+    return _family(attribute) != ""
+
+
+def _family(attribute: str) -> str:
+    return _FAMILIES.get(attribute) or _FAMILIES.get(attribute[:2], "")
+
+
+def _written(name: str, kind: WrittenType, who: Driver) -> str:
+    own = {key: value for key, value in kind.attributes.items() if not who.replaces(key)}
+    files = {key: str((kind.file.parent / own[key]).absolute()) for key in _FILES if own.get(key)}
+    children = [
+        f"<{tag}{_attributes(values)}/>"
+        for tag, values in kind.children
+        if not (who.attributes and tag.startswith(_MODEL))
+    ]
+    attributes = {**own, **files, **who.attributes, "id": who.of(name)}
+    return f"<vType{_attributes(attributes)}>{''.join(children)}</vType>"
+
+
+def _attributes(values: Mapping[str, str]) -> str:
+    return "".join(f" {name}={quoteattr(value)}" for name, value in values.items())

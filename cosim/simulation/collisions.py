@@ -184,8 +184,8 @@ class Wrecks:
         self._stopped += new
         return new
 
-    def remove(self, now: float) -> None:
-        """Take those off the road that have stood long enough."""
+    def remove(self, now: float) -> bool:
+        """Take those off the road that have stood long enough, and whoever rides in them; whether any did."""
         due = [name for name, since in self._since.items() if now - since >= WRECK_STANDS - 1e-6]
         on_road = frozenset(sumo.vehicle.getIDList()) if due else frozenset()
         for name in due:
@@ -193,6 +193,7 @@ class Wrecks:
             if name in on_road:
                 sumo.vehicle.remove(name)
                 self._removed.append(name)
+        return bool(due)
 
     def release(self) -> None:
         """Let those that stand go: SUMO drives them."""

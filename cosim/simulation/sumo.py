@@ -364,8 +364,8 @@ class SumoSimulator:
         self._detector.inserted((*departed, *simulation.getEndingTeleportIDList()), now)
         collisions = self._detector.from_sumo(self._bodies, self._commander.lane_changes, now)
         collisions = self._crashed(collisions)
-        if self._wrecks is not None:
-            self._wrecks.remove(now)
+        if self._wrecks is not None and self._wrecks.remove(now):
+            self._reader.persons_changed()
         self._happened.append(
             (
                 collisions,

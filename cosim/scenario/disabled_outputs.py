@@ -18,7 +18,8 @@ from xml.sax.saxutils import escape
 
 from cosim.files.xml_input import content
 from cosim.scenario import Scenario
-from cosim.scenario.vet_demand import OUTPUT_PARAMETERS, OUTPUTS, TYPE_LISTS
+from cosim.scenario.vehicle_types import TYPE_LISTS
+from cosim.scenario.vet_demand import OUTPUT_PARAMETERS, OUTPUTS
 
 NOWHERE = "NUL"  # SUMO's OutputDevice makes no file of it, on every system
 # Attributes by which a file reads another one, relative to itself: absolute in a copy.

@@ -8,13 +8,13 @@ the driver's, and lists of types (rerouters, detectors, signals, ...) name it be
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
+from cosim.files.xml_input import scan
 from cosim.scenario import Scenario
-from cosim.scenario.vet import DEFAULT_TYPES, demand_files
-from cosim.scenario.vet_demand import WrittenType
+from cosim.scenario.vet import DEFAULT_TYPES
 from cosim.scenario.vet_rules import words
 
 # What describes a driver, not a vehicle: of a family all attributes are replaced, or none.
@@ -32,6 +32,29 @@ _FAMILIES = {
 }
 _FILES = ("imgFile", "osgFile")  # attributes that name a file, relative to their own
 _MODEL = "carFollowing-"  # the children of a vType that describe its driver
+
+
+# Who heeds vehicles of some types only, and the attribute that lists these; of signals it is a parameter.
+TYPE_LISTS: Mapping[str, str] = dict.fromkeys(
+    words(
+        "rerouter calibrator routeProbe edgeData laneData inductionLoop e1Detector instantInductionLoop "
+        "laneAreaDetector e2Detector entryExitDetector e3Detector"
+    ),
+    "vTypes",
+)
+# Who changes speed limits, and the attributes that say where.
+_LIMITS = {"variableSpeedSign": ("lanes", "edges"), "calibrator": ("lane", "edge")}
+_DRIVERS = words("vehicle trip flow")
+DEFAULT_TYPE = "DEFAULT_VEHTYPE"  # of a vehicle that names none
+
+
+@dataclass(frozen=True, slots=True)
+class WrittenType:
+    """A vType as its file has it."""
+
+    file: Path
+    attributes: dict[str, str]
+    children: list[tuple[str, dict[str, str]]] = field(default_factory=list)  # such as parameters
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,18 +113,71 @@ class VehicleTypes:
 
 
 def vehicle_types(scenario: Scenario) -> VehicleTypes:
-    """The types of a scenario's files. Raises BadInput: see `cosim.scenario.vet_demand.read_demand`."""
-    found = demand_files(scenario)
-    used = {name for demand in found for name in demand.used["vehicle type"] if name in DEFAULT_TYPES}
+    """The types of a scenario's files. Raises BadInput: see `cosim.files.xml_input.scan`."""
+    return read_types((*scenario.additional, *scenario.demand))
+
+
+def read_types(files: Iterable[Path]) -> VehicleTypes:
+    """The types of these files and of those that they include. Raises BadInput: see `vehicle_types`."""
+    reader, waiting = _Reader(), list(files)
+    while waiting:
+        waiting += reader.read(waiting.pop(0))
+    defaults = {
+        name: WrittenType(Path(), {"vClass": DEFAULT_TYPES[name]}) for name in sorted(reader.defaults)
+    }
     return VehicleTypes(
-        {
-            **{name: WrittenType(Path(), {"vClass": DEFAULT_TYPES[name]}, []) for name in sorted(used)},
-            **{name: kind for demand in found for name, kind in demand.types.items()},
-        },
-        {name: members for demand in found for name, members in demand.distributions.items()},
-        frozenset[str]().union(*(demand.listed for demand in found)),
-        frozenset[str]().union(*(demand.variable for demand in found)),
+        defaults | reader.types, reader.distributions, frozenset(reader.listed), frozenset(reader.variable)
     )
+
+
+class _Reader:
+    """What the files read so far say of types."""
+
+    def __init__(self) -> None:
+        self.types: dict[str, WrittenType] = {}
+        self.distributions: dict[str, list[str]] = {}
+        self.defaults: set[str] = set()  # of SUMO's own types, those that are used
+        self.listed: set[str] = set()
+        self.variable: set[str] = set()
+        self._read: set[Path] = set()
+
+    def read(self, path: Path) -> list[Path]:
+        """One file; the files that it includes."""
+        if path in self._read:
+            return []
+        self._read.add(path)
+        owners: list[tuple[str, str]] = []  # tag and id of every open element
+        includes: list[Path] = []
+
+        def start(tag: str, attributes: dict[str, str], _: int) -> None:
+            owner, of = owners[-1] if owners else ("", "")
+            name = attributes.get("id", attributes.get("refId", ""))
+            owners.append((tag, name))
+            if tag in _DRIVERS:
+                kind = attributes.get("type", DEFAULT_TYPE)
+                if kind in DEFAULT_TYPES:
+                    self.defaults.add(kind)
+            elif tag == "vType":
+                if "id" in attributes:
+                    self.types[name] = WrittenType(path, attributes)
+                if owner == "vTypeDistribution":
+                    self.distributions[of].append(name)
+            elif owner == "vType" and of in self.types:
+                self.types[of].children.append((tag, attributes))
+            elif tag == "vTypeDistribution":
+                self.distributions[name] = attributes.get("vTypes", "").split()
+            elif tag == "include":
+                includes.append(path.parent / attributes.get("href", ""))
+            if tag in TYPE_LISTS:
+                self.listed.update(attributes.get(TYPE_LISTS[tag], "").split())
+            for where in _LIMITS.get(tag, ()):
+                self.variable.update(attributes.get(where, "").split())
+
+        def end(_: str) -> None:
+            owners.pop()
+
+        scan(path, (), start, end)
+        return includes
 
 
 def describes_driver(attribute: str) -> bool:

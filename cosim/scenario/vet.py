@@ -15,7 +15,7 @@ from cosim.errors import BadInput, hint
 from cosim.files.xml_input import regular_file
 from cosim.scenario import Scenario
 from cosim.scenario.sumocfg import FILE_OPTIONS
-from cosim.scenario.vet_demand import DEFAULT_TYPE, Demand, read_demand
+from cosim.scenario.vet_demand import Demand, read_demand
 from cosim.scenario.vet_net import Net, read_net
 from cosim.scenario.vet_rules import OFF_ROAD, some
 from cosim.scenario.vet_signals import check_lengths
@@ -24,7 +24,7 @@ MAX_WARNINGS = 20  # of one kind
 MAX_INCLUDES = 64  # files; more is a cycle
 # Types SUMO always has, and their classes.
 DEFAULT_TYPES: Mapping[str, str] = {
-    DEFAULT_TYPE: "passenger",
+    "DEFAULT_VEHTYPE": "passenger",
     "DEFAULT_PEDTYPE": "pedestrian",
     "DEFAULT_BIKETYPE": "bicycle",
     "DEFAULT_TAXITYPE": "taxi",
@@ -52,9 +52,9 @@ def vet(scenario: Scenario) -> VetReport:
     """
     config = scenario.config
     net = _net(*_stamp(regular_file(scenario.net, file=config, field="net-file")))
-    demands = demand_files(scenario)
+    demands = [*_all(scenario.additional, config, additional=True), *_all(scenario.demand, config)]
     _check_options(scenario)
-    types = frozenset(DEFAULT_TYPES).union(*(d.types for d in demands), *(d.distributions for d in demands))
+    types = frozenset(DEFAULT_TYPES).union(*(d.types for d in demands))
     _check_references(net, demands, types)
     for demand in demands:
         check_lengths(demand.path, demand.programs, net.signals)
@@ -86,15 +86,6 @@ def vetted(scenario: Scenario) -> Scenario:
         BadInput: see `vet`.
     """
     return replace(scenario, warnings=vet(scenario).warnings)
-
-
-def demand_files(scenario: Scenario) -> list[Demand]:
-    """What every additional and route file of `scenario` holds, in SUMO's order of loading.
-
-    Raises BadInput: see `read_demand`.
-    """
-    config = scenario.config
-    return [*_all(scenario.additional, config, additional=True), *_all(scenario.demand, config)]
 
 
 def _all(paths: Iterable[Path], config: Path, *, additional: bool = False) -> list[Demand]:
@@ -195,12 +186,7 @@ def _unsupported(scenario: Scenario, demands: list[Demand]) -> list[str]:
             found.append(
                 f"{scenario.config}: {name}={value}: without SUMO's sublane model the traffic is another"
             )
-    used = {
-        name
-        for demand in demands
-        for names in (demand.used["vehicle type"], *demand.distributions.values())
-        for name in names
-    }
+    used = {name for demand in demands for name in (*demand.used["vehicle type"], *demand.mixtures)}
     off_road = {
         name: kind for d in demands for name, kind in d.classes.items() if kind in OFF_ROAD and name in used
     }

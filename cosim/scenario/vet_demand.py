@@ -37,9 +37,6 @@ _ON_A_LANE = words(
     "stop busStop trainStop containerStop chargingStation parkingArea inductionLoop e1Detector "
     "instantInductionLoop laneAreaDetector e2Detector detEntry detExit"
 )
-DEFAULT_TYPE = "DEFAULT_VEHTYPE"  # of a vehicle that names none
-# Who changes speed limits, and the attributes that say where.
-_LIMITS = {"variableSpeedSign": ("lanes", "edges"), "calibrator": ("lane", "edge")}
 # Attributes by which an additional file writes files; `file` of other elements is read.
 OUTPUTS: Mapping[str, str] = {
     **dict.fromkeys(
@@ -52,24 +49,7 @@ OUTPUTS: Mapping[str, str] = {
     "timedEvent": "dest",
     "calibrator": "output",
 }
-# Who heeds vehicles of some types only, and the attribute that lists these.
-TYPE_LISTS: Mapping[str, str] = dict.fromkeys(
-    words(
-        "rerouter calibrator routeProbe edgeData laneData inductionLoop e1Detector instantInductionLoop "
-        "laneAreaDetector e2Detector entryExitDetector e3Detector"
-    ),
-    "vTypes",
-)
 OUTPUT_PARAMETERS = frozenset({"device.ssm.file", "device.toc.file", "device.rerouting.output"})
-
-
-@dataclass(frozen=True, slots=True)
-class WrittenType:
-    """A vType as its file has it."""
-
-    file: Path
-    attributes: dict[str, str]
-    children: list[tuple[str, dict[str, str]]]  # parameters, for one: tag, attributes
 
 
 @dataclass(slots=True)
@@ -77,8 +57,7 @@ class Demand:
     """What one route or additional file defines and what it refers to."""
 
     path: Path
-    types: dict[str, WrittenType] = field(default_factory=dict)
-    distributions: dict[str, list[str]] = field(default_factory=dict)  # of types -> the types
+    types: set[str] = field(default_factory=set)
     routes: set[str] = field(default_factory=set)
     vehicles: dict[str, int] = field(default_factory=dict)  # vehicle or trip -> line
     flows: dict[str, tuple[int, float]] = field(default_factory=dict)  # -> line, vehicles at most
@@ -88,8 +67,7 @@ class Demand:
     includes: list[Path] = field(default_factory=list)
     walks: dict[tuple[str, str], Place] = field(default_factory=dict)  # (edge, next edge) of walks
     classes: dict[str, str] = field(default_factory=dict)  # vehicle type -> its class, where it is given
-    listed: set[str] = field(default_factory=set)  # vehicle types that something is decided by
-    variable: set[str] = field(default_factory=set)  # lanes and edges whose speed limit may change
+    mixtures: set[str] = field(default_factory=set)  # types that are part of a distribution
     programs: dict[tuple[str, str], int] = field(default_factory=dict)  # as `SignalReader.programs`
     makes_vehicles: bool = False  # by calibrators, whose vehicles have names of SUMO's
     outputs: list[str] = field(default_factory=list)  # files SUMO would write, as written
@@ -141,23 +119,22 @@ class _DemandReader(Reader):
             if idle := sorted(SL2015_ONLY & attributes.keys()):
                 self._warn(f"vType {owner!r}: {', '.join(idle)} only work with SL2015, LC2013 drives here")
             self.found.classes[owner] = attributes.get("vClass", "")
-            self._type(attributes)
+            if self._owners and self._owners[-1][0] == "vTypeDistribution":
+                self.found.mixtures.add(owner)
         elif tag in _MOVING:
             self._driver(tag, attributes, owner, line)
         elif tag in ("tlLogic", "phase"):
             self._signals.start(tag, attributes, line)
         elif tag == "vTypeDistribution":
-            self.found.distributions[owner] = attributes.get("vTypes", "").split()
-        elif tag in _LIMITS:
-            self.found.variable.update(*(attributes.get(name, "").split() for name in _LIMITS[tag]))
+            self.found.mixtures.update(attributes.get("vTypes", "").split())
         elif tag == "include":
             self._include(attributes, line)
-        if "id" in attributes and tag in ("route", "routeDistribution"):
+        if "id" in attributes and (is_type or tag == "vTypeDistribution"):
+            self.found.types.add(attributes["id"])
+        elif "id" in attributes and tag in ("route", "routeDistribution"):
             self.found.routes.add(attributes["id"])
         elif tag == "calibrator":
             self.found.makes_vehicles = True
-        if self._owners and self._owners[-1][0] == "vType" and owner in self.found.types:
-            self.found.types[owner].children.append((tag, attributes))
         if tag in _PERSONS:
             self._person, self._stages = Place(self._path, f"{tag}.id", "", line), 0
             self._picked_up = attributes.get("depart") == "triggered"
@@ -165,7 +142,6 @@ class _DemandReader(Reader):
             self._stage(tag, attributes, owner, line)
         if tag in _TRAVEL:
             self._edges(tag, attributes, owner, line)
-        self.found.listed.update(attributes.get(TYPE_LISTS.get(tag, ""), "").split())
         if tag in _ON_A_LANE and "lane" in attributes:
             self._use("lane", attributes["lane"], tag, "lane", owner, line)
         if tag in OUTPUTS and OUTPUTS[tag] in attributes:
@@ -204,15 +180,6 @@ class _DemandReader(Reader):
             )
         return self.found
 
-    def _type(self, attributes: dict[str, str]) -> None:
-        name = attributes.get("id", attributes.get("refId"))
-        if name is None:
-            return
-        if "id" in attributes:
-            self.found.types[name] = WrittenType(self._path, attributes, [])
-        if self._owners and self._owners[-1][0] == "vTypeDistribution":
-            self.found.distributions[self._owners[-1][1]].append(name)
-
     def _unknown(self, tag: str, name: str, value: str, owner: str, line: int) -> None:
         """An attribute of a vehicle type that SUMO would ignore without a word."""
         if name.startswith("xsi:") or name.startswith("xmlns"):
@@ -226,9 +193,8 @@ class _DemandReader(Reader):
         self._warn(f"vType {owner!r}: SUMO ignores the unknown attribute {name!r}{near}")
 
     def _driver(self, tag: str, attributes: dict[str, str], owner: str, line: int) -> None:
-        kind = attributes.get("type", DEFAULT_TYPE if tag in _DRIVERS else None)
-        if kind is not None:
-            self._use("vehicle type", kind, tag, "type", owner, line)
+        if "type" in attributes:
+            self._use("vehicle type", attributes["type"], tag, "type", owner, line)
         if tag not in _DRIVERS or "id" not in attributes:
             return  # flows inside a calibrator have no id of their own
         name = attributes["id"]

@@ -9,8 +9,7 @@ import sumo_scenarios
 from cosim.errors import BadInput
 from cosim.scenario import Fleet, Scenario
 from cosim.scenario.behaviors import AS_IS, MIXED, DriverClass, load_behaviors
-from cosim.scenario.vehicle_types import Driver, describes_driver
-from cosim.scenario.vet_demand import WrittenType, read_demand
+from cosim.scenario.vehicle_types import Driver, WrittenType, describes_driver, read_types
 from cosim.simulation.backend import sumo
 from cosim.simulation.conventions import AV_TYPE
 from cosim.types import Preset
@@ -44,7 +43,7 @@ def drivers(scenario: Scenario, av_types: frozenset[str]) -> tuple[Driver, ...]:
     """
     base = {
         name: {key: value for key, value in kind.attributes.items() if key != "id"}
-        for name, kind in read_demand(sumo_scenarios.TYPES, additional=True).types.items()
+        for name, kind in read_types([sumo_scenarios.TYPES]).types.items()
     }
     found = []
     if scenario.fleet != Fleet():

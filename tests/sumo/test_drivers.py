@@ -14,7 +14,8 @@ import sumo
 import sumo_scenarios
 from cosim.errors import BadInput
 from cosim.scenario.behaviors import load_behaviors
-from cosim.simulation.drivers import IDM_TYPE, Drivers
+from cosim.simulation.derived_types import IDM_TYPE
+from cosim.simulation.drivers import Drivers
 from cosim.simulation.mobil import STRATEGIC_ONLY, idm_acceleration
 
 CLASSES = ("aggressive", "moderate", "conservative")

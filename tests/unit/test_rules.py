@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -142,6 +144,15 @@ def test_a_signal_that_is_on_counts_in_place_of_the_sign() -> None:
     assert (permissive.stop_distance, permissive.yield_distance) == (np.inf, pytest.approx(37.5))
     arrow = look(road, snapshot("sGr")).rules
     assert arrow.stop_distance == arrow.yield_distance == pytest.approx(37.5)
+
+
+def test_a_limit_that_a_sign_has_changed_is_the_limit() -> None:
+    seen = replace(snapshot("GGr"), limits={0: 20.0, 2: 20.0})
+    history = look(street(), seen)
+    wanted = [[0.0, 20.0], [37.5, 8.0], [57.5, 20.0], [137.5, 13.9], [157.5, 20.0]]
+    assert history.rules.limits == pytest.approx(np.array(wanted))
+    assert history.route.speed_limit == 20.0
+    assert look(street(), snapshot("GGr")).route.speed_limit == 13.9
 
 
 def test_limits_are_known_with_the_places_where_they_begin_junctions_included() -> None:

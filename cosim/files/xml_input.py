@@ -28,7 +28,7 @@ Start = Callable[[str, dict[str, str], int], None]  # tag, attributes, line
 End = Callable[[str], None]
 Progress = Callable[[float, float], None]  # bytes of the file read, of all
 
-_GZIP_MAGIC = b"\x1f\x8b"
+GZIP_MAGIC = b"\x1f\x8b"
 _UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 
 
@@ -133,7 +133,7 @@ def chunks(path: Path, unpacked: float | None = None, progress: Progress | None 
             raise BadInput("is not UTF-8", file=path, field="encoding", value="UTF-16")
         size = path.stat().st_size
         for chunk in (
-            iter(lambda: raw.read(CHUNK), b"") if head != _GZIP_MAGIC else _unpacked(raw, path, most)
+            iter(lambda: raw.read(CHUNK), b"") if head != GZIP_MAGIC else _unpacked(raw, path, most)
         ):
             yield chunk
             if progress is not None:

@@ -21,8 +21,8 @@ from cosim.policies import NAMES
 from cosim.rewards import REWARDS
 from cosim.scenario import BEHAVIORS, human_errors, load
 from cosim.scenario.sumo_outputs import OUTPUTS
-from cosim.service import landlock
 from cosim.service.clerk import Clerks
+from cosim.service.confined import lacking
 from cosim.service.documents import Catalogue, Health, Problem, World
 from cosim.service.gate import Gate
 from cosim.service.jobs import Jobs
@@ -180,7 +180,7 @@ def _about(figures: Figures) -> APIRouter:
 
     @router.get("/health", summary="Does the server answer?")
     def health() -> Health:
-        return Health(status="ok", version=__version__, uploads=landlock.version() > 0)
+        return Health(status="ok", version=__version__, uploads=not lacking())
 
     @router.get("/metrics", summary="Figures in Prometheus' format", response_class=Response)
     def metrics() -> Response:

@@ -2,28 +2,33 @@
 
 import gzip
 import stat
+import struct
 import zipfile
 import zlib
+from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import IO
 
 from cosim.errors import BadInput
+from cosim.files.xml_input import GZIP_MAGIC
 from cosim.service.settings import MB, Limits
 
 CHUNK = 1 << 18  # bytes
 LONGEST, DEEPEST = 200, 8  # characters of a name, folders in it
 _PLAIN = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _ENCRYPTED = 1  # a bit of an entry's flags
+_BROKEN = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, UnicodeError, ValueError, struct.error)
 
 
 def unpack(archive: Path, folder: Path, suffixes: tuple[str, ...], limits: Limits) -> list[Path]:
     """Write the files of `archive` below `folder`, which is there and empty; their paths, sorted.
 
-    Only files whose names end with one of `suffixes` are taken. What a .gz holds is counted too, unpacked.
+    Only files whose names end with one of `suffixes` are taken. All that they hold is counted together: what a
+    gzip file holds too, whatever its name is, as whoever reads it later goes by its first bytes.
 
     Raises:
         BadInput: no zip file; a name that leads elsewhere, is there twice or of another kind; links, devices,
-            encryption; more files, more bytes or deeper folders than `limits` say.
+            encryption; gzip within gzip; more files, more bytes or deeper folders than `limits` say.
     """
     try:
         with zipfile.ZipFile(archive) as found:
@@ -42,12 +47,14 @@ def unpack(archive: Path, folder: Path, suffixes: tuple[str, ...], limits: Limit
                     raise BadInput("is there twice", field="archive", value=name)
                 path.parent.mkdir(parents=True, exist_ok=True)
                 with found.open(entry) as source, path.open("xb") as target:
-                    left -= _copied(source, target, left, limits)
-                if name.endswith(".gz"):
-                    left -= _unpacked_size(path, name, left, limits)
+                    for chunk in _counted(source, left, limits):
+                        left -= len(chunk)
+                        target.write(chunk)
+                for chunk in _held(path, name, left, limits):
+                    left -= len(chunk)
                 paths.append(path)
             return sorted(paths)
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, UnicodeError) as error:
+    except _BROKEN as error:
         raise BadInput(f"is no zip file that can be read: {error}", field="archive") from None
     except OSError as error:
         raise BadInput(f"cannot be unpacked: {error.strerror or error}", field="archive") from None
@@ -78,24 +85,29 @@ def _name(entry: zipfile.ZipInfo, suffixes: tuple[str, ...]) -> str:
     return name
 
 
-def _copied(source: IO[bytes] | gzip.GzipFile, target: IO[bytes] | None, most: int, limits: Limits) -> int:
-    """How many bytes were copied. Raises BadInput behind `most`, whatever the archive says of its sizes."""
+def _counted(source: IO[bytes] | gzip.GzipFile, most: int, limits: Limits) -> Iterator[bytes]:
+    """What is read there. Raises BadInput behind `most` bytes, whatever the archive says of its sizes."""
     total = 0
     while chunk := source.read(CHUNK):
         total += len(chunk)
         if total > most:
             raise _too_much(limits)
-        if target is not None:
-            target.write(chunk)
-    return total
+        yield chunk
 
 
-def _unpacked_size(path: Path, name: str, most: int, limits: Limits) -> int:
-    try:
-        with gzip.open(path) as packed:
-            return _copied(packed, None, most, limits)
-    except (OSError, EOFError, zlib.error) as error:
-        raise BadInput(f"broken gzip file: {error}", field="archive", value=name) from None
+def _held(path: Path, name: str, most: int, limits: Limits) -> Iterator[bytes]:
+    """What a gzip file holds; nothing for another one."""
+    with path.open("rb") as raw:
+        if raw.read(len(GZIP_MAGIC)) != GZIP_MAGIC:
+            return
+        raw.seek(0)
+        try:
+            with gzip.GzipFile(fileobj=raw) as packed:
+                if packed.peek(len(GZIP_MAGIC)).startswith(GZIP_MAGIC):
+                    raise BadInput("holds a gzip file in a gzip file", field="archive", value=name)
+                yield from _counted(packed, most, limits)
+        except (OSError, EOFError, zlib.error) as error:
+            raise BadInput(f"broken gzip file: {error}", field="archive", value=name) from None
 
 
 def _too_much(limits: Limits) -> BadInput:

@@ -1,4 +1,5 @@
-"""Whether an uploaded scenario's files refer to one another only: checked before anybody follows a name."""
+"""Which file of an upload is the one meant, and whether its files refer to one another only: checked before
+anybody follows a name."""
 
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -22,6 +23,14 @@ def config_of(files: list[Path]) -> Path:
     found = [file for file in files if file.suffix == ".sumocfg"]
     if len(found) != 1:
         raise BadInput(f"one .sumocfg is needed, there are {len(found)}", field="archive")
+    return found[0]
+
+
+def weights_of(files: list[Path]) -> Path:
+    """The weights, their card beside them. Raises BadInput."""
+    found = [file for file in files if file.suffix == ".safetensors"]
+    if len(found) != 1 or files != sorted([found[0], found[0].with_suffix(".json")]):
+        raise BadInput("one NAME.safetensors and its card NAME.json are needed, no more", field="archive")
     return found[0]
 
 

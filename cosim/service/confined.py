@@ -1,5 +1,9 @@
 """What runs uploads: a process that reads its upload and our code, writes its own folder, and has limits.
 
+Landlock says which files it sees, seccomp which system calls it makes (no sockets, programs, processes), its
+resources are limited, and root is not root in it. It is started without the server's environment, and what it
+answers is read as plain data (`cosim.workers.untrusted`).
+
 Nothing of the simulation is imported before the process is confined: numba settles on its cache when it is
 imported, and gets a copy of its own, which nobody else ever reads.
 """
@@ -20,9 +24,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cosim.errors import BadInput
-from cosim.service import landlock
+from cosim.errors import BadInput, CosimError
+from cosim.service import disk, landlock, privileges, seccomp
 from cosim.service.settings import Limits, Settings
+from cosim.workers.untrusted import untrusted
 
 if TYPE_CHECKING:
     from cosim.envs.host import PolicyFactory, Reply
@@ -33,7 +38,14 @@ if TYPE_CHECKING:
     from cosim.workers.tasks import Progress
 
 OPEN_FILES = 512
-_SYSTEM = ("/usr", "/lib", "/lib64", "/etc", "/proc", "/sys", "/dev")
+SCENARIO, POLICY = KINDS = ("scenario", "policy")
+SUFFIXES = {SCENARIO: (".sumocfg", ".xml", ".xml.gz"), POLICY: (".safetensors", ".json")}
+_SYSTEM = (
+    "/usr", "/lib", "/lib64",
+    "/etc/ld.so.cache", "/etc/localtime", "/etc/fonts", "/etc/ssl/openssl.cnf",
+    "/proc/self", "/proc/cpuinfo", "/proc/meminfo", "/proc/stat", "/sys/devices/system",
+    "/dev/random", "/dev/urandom",
+)  # fmt: skip
 _DEVICES = ("/dev/null", "/dev/zero")
 _PACKAGES = ("cosim", "policy", "sumo_scenarios")
 _NUMBA = "NUMBA_CACHE_DIR"
@@ -49,14 +61,19 @@ class Room:
     limits: Limits = Limits()
 
     def enter(self) -> None:
-        """Confine this process, for good. Raises CosimError without Landlock."""
-        scratch = tempfile.tempdir = tempfile.mkdtemp(dir=self.scratch)
+        """Confine this process, for good. Raises CosimError where `lacking` says something."""
+        if problem := lacking():
+            raise CosimError(problem)
+        os.dup2(2, 1)  # which is the server's
+        privileges.drop((self.scratch, *self.writes))
+        scratch = tempfile.tempdir = tempfile.mkdtemp(prefix=disk.folder_prefix(), dir=self.scratch)
         packages = [_folder(name) for name in _PACKAGES]
         _own_numba_cache(Path(scratch, "numba"), packages)
-        for name in ("MPLCONFIGDIR", "TORCHINDUCTOR_CACHE_DIR"):
+        for name in ("HOME", "MPLCONFIGDIR", "TORCHINDUCTOR_CACHE_DIR"):
             os.environ[name] = scratch
         os.chdir(scratch)
         limit_resources(self.limits)
+        _limit(resource.RLIMIT_NPROC, privileges.tasks() + self.limits.tasks)
         python = [Path(path) for path in (sys.prefix, sys.base_prefix) if path != "/"]
         imports = [Path(path) for path in sys.path if os.path.isabs(path)]
         installed = [path for path in imports if path.name in ("site-packages", "dist-packages")]
@@ -68,18 +85,32 @@ class Room:
             [Path(scratch), *map(Path, (*_DEVICES, *self.writes))],
             imports,
         )
+        seccomp.restrict()
+
+
+def lacking() -> str:
+    """Why uploads cannot be confined here; empty where they can."""
+    if not landlock.version():
+        return "this kernel has no Landlock to confine uploads"
+    if not seccomp.available():
+        return "this kernel has no seccomp to confine uploads, or is none of x86_64 and aarch64"
+    return "" if privileges.droppable() else "root may not become an ordinary user here to confine uploads"
 
 
 @contextlib.contextmanager
-def room(settings: Settings, uploads: Sequence[str], *writes: Path) -> Iterator[Room | None]:
-    """The room of what uses these uploads, its scratch folder removed afterwards; None without uploads."""
+def room(settings: Settings, uploads: Sequence[str | Path], *writes: Path) -> Iterator[Room | None]:
+    """The room of what uses these uploads (ids, or a file), its scratch folder removed afterwards; None without uploads.
+
+    Raises BadInput when too much was written in it.
+    """
     if not uploads:
         yield None
         return
     scratch = tempfile.mkdtemp(dir=settings.scratch)
     reads = tuple(str(settings.uploads / upload) for upload in uploads)
     try:
-        yield Room(scratch, reads, tuple(map(str, writes)), settings.limits)
+        with disk.limited(Path(scratch), writes, settings.limits):
+            yield Room(scratch, reads, tuple(map(str, writes)), settings.limits)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
 
@@ -92,9 +123,13 @@ def limit_resources(limits: Limits) -> None:
         (resource.RLIMIT_CORE, 0),
         (resource.RLIMIT_NOFILE, OPEN_FILES),
     ):
-        hard = resource.getrlimit(limit)[1]
-        most = most if hard == resource.RLIM_INFINITY else min(most, hard)
-        resource.setrlimit(limit, (most, most))
+        _limit(limit, most)
+
+
+def _limit(limit: int, most: int) -> None:
+    hard = resource.getrlimit(limit)[1]
+    most = most if hard == resource.RLIM_INFINITY else min(most, hard)
+    resource.setrlimit(limit, (most, most))
 
 
 def allow_processor_time(seconds: float) -> None:
@@ -104,6 +139,7 @@ def allow_processor_time(seconds: float) -> None:
     resource.setrlimit(resource.RLIMIT_CPU, (soft, resource.getrlimit(resource.RLIMIT_CPU)[1]))
 
 
+@untrusted
 class ConfinedRunner:
     """An `EpisodeRunner` in a confined process."""
 
@@ -127,6 +163,7 @@ class ConfinedRunner:
         self._runner.close()
 
 
+@untrusted
 class Drawer:
     """Drives an episode again and draws it; confined in a room, and within the limits without one too."""
 
@@ -159,12 +196,31 @@ class Drawer:
             episode.draw([recording], Path(target))
 
 
+@untrusted
 class Examiner:
-    """Looks at an upload in a confined process: whatever happens there, the server goes on."""
+    """Takes an upload in a confined process: whatever happens there, the server goes on."""
 
     def __init__(self, room: Room) -> None:
+        self._limits = room.limits
         room.enter()
         allow_processor_time(room.limits.check)
+
+    def take(self, archive: str, folder: str, kind: str) -> tuple[str, dict[str, Any]]:
+        """Unpack an archive into `folder`: the name of its .sumocfg or weights there, and what it holds.
+
+        Raises BadInput.
+        """
+        from cosim.service.archive import unpack
+        from cosim.service.bundle import check_references, config_of, weights_of
+
+        place = Path(folder)
+        files = unpack(Path(archive), place, SUFFIXES[kind], self._limits)
+        if kind == POLICY:
+            main = weights_of(files)
+            return str(main.relative_to(place)), self.policy(str(main))
+        main = config_of(files)
+        check_references(files, place)
+        return str(main.relative_to(place)), self.scenario(str(main))
 
     def scenario(self, config: str) -> dict[str, Any]:
         """What a .sumocfg holds. Raises BadInput as `cosim.scenario.vet.vet`, and what SUMO refuses."""
@@ -208,6 +264,7 @@ def session_host(
     return WatchedHost(scenario, observation, svo, read(reward, "reward"), others, None)
 
 
+@untrusted
 def confined_host(room: Room, *arguments: Any) -> WatchedHost:
     """The host of a session in a confined process; `arguments` are those of `session_host`."""
     room.enter()

@@ -1,4 +1,4 @@
-"""Linux's Landlock: this process, and what it starts, sees no files but those it is given, and no network.
+"""Linux's Landlock: this process sees no files but those it is given, starts none of them, and has no TCP.
 
 Needs no privilege (https://docs.kernel.org/userspace-api/landlock.html, system call numbers of every Linux
 architecture but alpha). What was open before stays open.
@@ -16,10 +16,12 @@ _CREATE, _ADD, _RESTRICT = 444, 445, 446  # system calls
 _VERSION = 1  # landlock_create_ruleset's flag: say which version the kernel has
 _PATH_BENEATH = 1
 _NO_NEW_PRIVILEGES = 38  # linux/prctl.h
-_EXECUTE, _WRITE_FILE, _READ_FILE, _READ_DIR = 1, 2, 4, 8
-_ALL = 0x1FFF  # of version 1: those, and to remove and make what there is in a folder
+_EXECUTE, _WRITE_FILE, _READ_FILE, _READ_DIR, _REMOVE, _MAKE_FOLDER, _MAKE_FILE = 1, 2, 4, 8, 0x30, 0x80, 0x100
+_ALL = 0x1FFF  # of version 1: those, and to make links, sockets, FIFOs and devices
 _REFER, _TRUNCATE, _DEVICES = 1 << 13, 1 << 14, 1 << 15  # since 2, 3, 5
-_OF_FILES = _EXECUTE | _WRITE_FILE | _READ_FILE | _TRUNCATE | _DEVICES
+_READ = _READ_FILE | _READ_DIR
+_WRITE = _READ | _WRITE_FILE | _REMOVE | _MAKE_FOLDER | _MAKE_FILE | _REFER | _TRUNCATE
+_OF_FILES = _WRITE_FILE | _READ_FILE | _TRUNCATE
 _TCP = 3  # to bind and to connect, since 4
 _SCOPE = 3  # abstract sockets and signals, since 6
 
@@ -41,14 +43,17 @@ def version() -> int:
 
 
 def restrict(reads: Iterable[Path], writes: Iterable[Path], lists: Iterable[Path] = ()) -> None:
-    """From now on this thread, and what it starts, may only read below `reads`, write below `writes` too, and
-    see the names of what is below `lists`.
+    """From now on this process may only read below `reads`, read and write below `writes`, and see the names
+    of what is below `lists`. It starts no program.
 
-    TCP is shut as well where the kernel can (version 4). Raises CosimError without Landlock.
+    TCP is shut as well where the kernel can (version 4), signals to others too (6). Raises CosimError without
+    Landlock, and in a process of several threads: it holds for the thread that asks.
     """
     abi = version()
     if not abi:
         raise CosimError("this kernel has no Landlock: uploads cannot be driven on it")
+    if len(os.listdir("/proc/self/task")) != 1:
+        raise CosimError("Landlock: this process has several threads already")
     every = _ALL | (abi >= 2) * _REFER | (abi >= 3) * _TRUNCATE | (abi >= 5) * _DEVICES
     libc = ctypes.CDLL(None, use_errno=True)
 
@@ -62,7 +67,7 @@ def restrict(reads: Iterable[Path], writes: Iterable[Path], lists: Iterable[Path
     size = 8 if abi < 4 else 16 if abi < 6 else 24  # what the kernel knows of it
     rules = call(_CREATE, ctypes.byref(ruleset), ctypes.c_size_t(size), 0)
     try:
-        rights = (reads, _EXECUTE | _READ_FILE | _READ_DIR), (writes, every & ~_EXECUTE), (lists, _READ_DIR)
+        rights = (reads, _READ), (writes, _WRITE), (lists, _READ_DIR)
         for paths, allowed in rights:
             for path in filter(Path.exists, paths):
                 here = allowed & every if path.is_dir() else allowed & every & _OF_FILES

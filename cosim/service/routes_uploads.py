@@ -11,13 +11,13 @@ from pydantic import BaseModel, Field
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 
-from cosim.service import landlock
+from cosim.service.confined import KINDS, lacking
 from cosim.service.ids import PATTERN
 from cosim.service.problems import Conflict
 from cosim.service.runs import Runs
 from cosim.service.sessions import Sessions
 from cosim.service.settings import Settings
-from cosim.service.uploads import KINDS, Uploads
+from cosim.service.uploads import Uploads
 
 UploadId = Annotated[str, Path(pattern=PATTERN, examples=["0c44d1e5f2ab"])]
 Kind = Enum("Kind", {name: name for name in KINDS}, type=str)  # type: ignore[misc]
@@ -52,10 +52,11 @@ def uploads_router(uploads: Uploads, runs: Runs, sessions: Sessions, settings: S
     async def send(
         request: Request, kind: Kind, name: Annotated[str, Query(max_length=200)] = ""
     ) -> UploadDocument:
-        if not landlock.version():
-            raise HTTPException(403, "this kernel has no Landlock to confine uploads: none are taken")
+        if problem := lacking():
+            raise HTTPException(403, f"{problem}: none are taken")
         handle, path = tempfile.mkstemp(suffix=".zip", dir=settings.scratch)
         try:
+            os.fchmod(handle, 0o644)  # what unpacks it may be another user
             with os.fdopen(handle, "wb") as file:
                 async for chunk in request.stream():
                     file.write(chunk)

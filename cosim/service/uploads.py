@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import os
 import shutil
+import stat
 import threading
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -14,17 +16,13 @@ from typing import Any
 
 from cosim.errors import BadInput, SimulationCrashed, SimulationTimeout
 from cosim.files import whole
-from cosim.service.archive import unpack
-from cosim.service.bundle import check_references, config_of
 from cosim.service.confined import Examiner, room
 from cosim.service.ids import ID, new_id
 from cosim.service.jobs import now
 from cosim.service.problems import NotFound, Unavailable
-from cosim.service.settings import Settings
+from cosim.service.settings import Limits, Settings
 from cosim.workers.worker import Worker
 
-SCENARIO, POLICY = KINDS = ("scenario", "policy")
-SUFFIXES = {SCENARIO: (".sumocfg", ".xml", ".xml.gz"), POLICY: (".safetensors", ".json")}
 EXAMINED_AT_ONCE = 2
 ABOUT = ".json"  # beside the upload's folder
 log = logging.getLogger("cosim.service")
@@ -35,7 +33,7 @@ class Upload:
     """One of them; `file` is its .sumocfg or its weights, below its own folder."""
 
     id: str
-    kind: str  # one of KINDS
+    kind: str  # scenario or policy
     name: str
     created: str  # UTC
     file: str
@@ -62,20 +60,19 @@ class Uploads:
         part = settings.uploads / f"{upload}.part"
         part.mkdir()
         try:
-            files = unpack(archive, part, SUFFIXES[kind], limits)
             with _of_the_archive(part):
-                main = config_of(files) if kind == SCENARIO else _weights(files)
-                if kind == SCENARIO:
-                    check_references(files, part)
-                about = self._examine(part, kind, main)
+                main, about = self._taken(archive, part, kind)
+                sizes = _settled(part, limits)
+            if main not in sizes:
+                raise BadInput("holds no such file", field="archive", value=main)
             found = Upload(
                 id=upload,
                 kind=kind,
-                name=name or main.name,
+                name=name or Path(main).name,
                 created=now(),
-                file=str(main.relative_to(part)),
-                files=[str(file.relative_to(part)) for file in files],
-                bytes=sum(file.stat().st_size for file in files),
+                file=main,
+                files=[*sizes],
+                bytes=sum(sizes.values()),
                 about=about,
             )
             part.rename(settings.uploads / upload)
@@ -84,7 +81,7 @@ class Uploads:
         except BaseException:
             shutil.rmtree(part, ignore_errors=True)
             raise
-        log.info("upload taken", extra={"upload": upload, "kind": kind, "files": len(files)})
+        log.info("upload taken", extra={"upload": upload, "kind": kind, "files": len(sizes)})
         return found
 
     def all(self) -> list[Upload]:
@@ -117,18 +114,34 @@ class Uploads:
 
     # ---- inside ----
 
-    def _examine(self, part: Path, kind: str, main: Path) -> dict[str, Any]:
-        """What a confined process finds of it. Raises BadInput, also where that process ends or hangs."""
+    def _taken(self, archive: Path, part: Path, kind: str) -> tuple[str, dict[str, Any]]:
+        """What a confined process unpacks into `part` and finds there; nothing of it is read here.
+
+        Raises BadInput, also where that process ends or hangs.
+        """
         limit = self._settings.limits.check
-        with self._examined, room(self._settings, [part.name]) as confined:
+        late = threading.Event()
+        with self._examined, room(self._settings, [archive], part) as confined:
+
+            def end() -> None:
+                late.set()
+                worker.kill()
+
             try:
-                with Worker(Examiner, confined, timeout=limit, name="cosim-examiner") as worker:
-                    found: dict[str, Any] = worker.call(kind, str(main))
-                    return found
-            except SimulationTimeout:
-                raise BadInput(f"takes more than {limit:g} s to look at", file=main) from None
+                with Worker(
+                    Examiner, confined, timeout=limit, name="cosim-examiner", wait=False
+                ) as worker:
+                    clock = threading.Timer(limit, end)
+                    clock.start()
+                    try:
+                        found: tuple[str, dict[str, Any]] = worker.call("take", str(archive), str(part), kind)
+                        return found
+                    finally:
+                        clock.cancel()
             except SimulationCrashed as error:
-                raise BadInput(f"ends the process that reads it: {error}", file=main) from None
+                if late.is_set() or isinstance(error, SimulationTimeout):
+                    raise BadInput(f"takes more than {limit:g} s to look at", field="archive") from None
+                raise BadInput(f"ends the process that reads it: {error}", field="archive") from None
 
     def _about(self, upload: str) -> Path:
         return self._settings.uploads / f"{upload}{ABOUT}"
@@ -153,9 +166,27 @@ def _of_the_archive(folder: Path) -> Iterator[None]:
         ) from None
 
 
-def _weights(files: list[Path]) -> Path:
-    """The weights, their card beside them."""
-    found = [file for file in files if file.suffix == ".safetensors"]
-    if len(found) != 1 or files != sorted([found[0], found[0].with_suffix(".json")]):
-        raise BadInput("one NAME.safetensors and its card NAME.json are needed, no more", field="archive")
-    return found[0]
+def _settled(folder: Path, limits: Limits) -> dict[str, int]:
+    """Name -> bytes of every file below `folder`; they belong to this process's user from now on.
+
+    Whoever wrote them has ended. Raises BadInput: links, or what is neither a file nor a folder; too much.
+    """
+    found: dict[str, int] = {}
+    for path, folders, names in os.walk(folder, onerror=_raise):
+        for name in (*folders, *names):
+            one = Path(path, name)
+            about = one.lstat()
+            if not (stat.S_ISDIR(about.st_mode) or (stat.S_ISREG(about.st_mode) and about.st_nlink == 1)):
+                raise BadInput("is no regular file", field="archive", value=name)
+            os.chown(one, os.geteuid(), os.getegid())
+            one.chmod(0o755 if name in folders else 0o644)
+            if name in names:
+                found[str(one.relative_to(folder))] = about.st_size
+    os.chown(folder, os.geteuid(), os.getegid())
+    if len(found) > limits.files or sum(found.values()) > limits.unpacked:
+        raise BadInput("is more than was unpacked", field="archive")
+    return dict(sorted(found.items()))
+
+
+def _raise(error: OSError) -> None:
+    raise error

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from cosim.errors import CosimError, SimulationCrashed, SimulationTimeout
+from cosim.workers import untrusted
 from cosim.workers.memory import keep_freed_memory
 
 STDERR_KEPT = 4000  # characters of a process's stderr that the error of its crash holds
@@ -40,7 +41,8 @@ class Worker(contextlib.AbstractContextManager["Worker"]):
     each call (default: the same). Raises whatever CosimError the method raised,
     SimulationCrashed when the process ended, SimulationTimeout without a heartbeat. A worker whose process
     has ended cannot be used again: make a new one. Without `wait` the first call waits for the start, and
-    raises what the factory raised.
+    raises what the factory raised. Where the factory is marked by `untrusted`, the process is none that the
+    caller believes (`cosim.workers.untrusted`).
     """
 
     def __init__(
@@ -59,7 +61,8 @@ class Worker(contextlib.AbstractContextManager["Worker"]):
         self._stderr = Path(path)
         self._call_begin = 0  # bytes of it that belong to earlier calls
         self._pipe, theirs = _CONTEXT.Pipe()
-        self._process = _CONTEXT.Process(
+        self._untrusted = untrusted.is_untrusted(factory, *arguments)
+        self._process = (untrusted.Process if self._untrusted else _CONTEXT.Process)(
             target=_serve, args=(theirs, factory, arguments, path), name=name, daemon=True
         )
         # Ctrl-C reaches the parent alone, which decides: blocked signals stay blocked in a new process
@@ -146,7 +149,7 @@ class Worker(contextlib.AbstractContextManager["Worker"]):
                     )
                     self.close()
                     raise error
-                kind, value = self._pipe.recv()
+                kind, value = self._received()
                 limit = self._timeout
             except (EOFError, ConnectionResetError):
                 raise self._crashed(method) from None
@@ -157,6 +160,23 @@ class Worker(contextlib.AbstractContextManager["Worker"]):
                 raise value
             else:
                 return value
+
+    def _received(self) -> tuple[str, Any]:
+        if not self._untrusted:
+            return self._pipe.recv()  # type: ignore[no-any-return]
+        try:
+            kind, value = untrusted.load(self._pipe.recv_bytes(untrusted.LARGEST))
+            if kind in ("value", "progress") or isinstance(value, CosimError):
+                return kind, value
+        except (EOFError, ConnectionResetError):
+            raise
+        except Exception as error:  # whatever its bytes make of the unpickler
+            problem = f"{type(error).__name__}: {error}"
+        else:
+            problem = "an error that is none"
+        self.kill()
+        self.close()
+        raise SimulationCrashed(f"the simulation's process answered what is no plain data ({problem})")
 
     def _crashed(self, method: str) -> SimulationCrashed:
         self._process.join(5.0)
@@ -172,7 +192,9 @@ class Worker(contextlib.AbstractContextManager["Worker"]):
 
     def _call_stderr(self) -> str:
         """What the process wrote during this call."""
-        return self._stderr.read_bytes()[self._call_begin :].decode("utf-8", "replace").strip()[-STDERR_KEPT:]
+        with self._stderr.open("rb") as file:
+            file.seek(max(self._call_begin, self._stderr.stat().st_size - 4 * STDERR_KEPT))
+            return file.read(4 * STDERR_KEPT).decode("utf-8", "replace").strip()[-STDERR_KEPT:]
 
 
 @contextlib.contextmanager

@@ -1,0 +1,81 @@
+"""How much confined processes write: who writes more than a room has is ended."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import signal
+import threading
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from cosim.errors import BadInput
+from cosim.service.settings import MB, Limits
+
+LOOKS = 1.0  # s between two looks
+_BLOCK, _LEAST = 512, 4096  # bytes in one of st_blocks; that a file without any takes
+_BEGAN = 19  # place of a process's start in /proc/PID/stat, behind its name
+
+
+def folder_prefix() -> str:
+    """How the name of this process's folder begins, by which it is found."""
+    pid = os.getpid()
+    return f"{pid}-{_began(pid)}-"
+
+
+@contextlib.contextmanager
+def limited(scratch: Path, writes: Sequence[Path], limits: Limits) -> Iterator[None]:
+    """During the block those processes are ended that have a folder in `scratch`, when there is more than
+    `limits.disk` in it and new in `writes`, or less than `limits.spare` is free.
+
+    Raises BadInput when that was so.
+    """
+    before = sum(map(_used, writes))
+    ended = threading.Event()
+    problem = ""
+
+    def watch() -> None:
+        nonlocal problem
+        while not ended.wait(LOOKS):
+            if sum(map(_used, (scratch, *writes))) - before > limits.disk:
+                problem = f"writes more than {limits.disk // MB} MB"
+            elif shutil.disk_usage(scratch).free < limits.spare:
+                problem = f"no space left on device: {limits.spare // MB} MB are kept free"
+            if problem:
+                _end_all(scratch)
+
+    thread = threading.Thread(target=watch, name="cosim-disk", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+        if problem:
+            raise BadInput(problem, field="upload") from None
+
+
+def _used(folder: Path) -> int:
+    """Bytes on the disk, links not followed."""
+    total = 0
+    for path, _, names in os.walk(folder):
+        for name in names:
+            with contextlib.suppress(OSError):  # removed meanwhile
+                total += max(os.lstat(os.path.join(path, name)).st_blocks * _BLOCK, _LEAST)
+        total += _LEAST
+    return total
+
+
+def _end_all(scratch: Path) -> None:
+    """End the processes that have a folder there; whoever has got the number of one since is another."""
+    for folder in scratch.iterdir():
+        pid, began, _ = folder.name.split("-", 2)
+        with contextlib.suppress(OSError):
+            if _began(int(pid)) == began:
+                os.kill(int(pid), signal.SIGKILL)
+
+
+def _began(pid: int) -> str:
+    """When a process began, in ticks of the system's clock."""
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[_BEGAN]

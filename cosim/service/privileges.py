@@ -1,0 +1,66 @@
+"""Gives up for good what a process may do beyond an ordinary user: root becomes nobody in particular."""
+
+import ctypes
+import os
+from collections.abc import Iterable
+
+from cosim.errors import CosimError
+
+NOBODY = 64_000  # user and group: of no account, in the range that systemd gives to services without one
+_CHOWN, _READ_SEARCH, _SETGID, _SETUID = 1 << 0, 1 << 2, 1 << 6, 1 << 7  # linux/capability.h
+_VERSION = 0x20080522
+_SET_END, _GET_END, _KEEP, _SECURE = 1, 2, 8, 28  # PR_SET_PDEATHSIG, PR_GET_, PR_SET_KEEPCAPS, _SECUREBITS
+_NO_FIXUP = 1 << 2  # SECBIT_NO_SETUID_FIXUP: access(2), by which SUMO looks for files, heeds what was kept
+
+
+def droppable() -> bool:
+    """Whether this process is no root, or a root that may become somebody else."""
+    return os.geteuid() != 0 or not (_CHOWN | _SETGID | _SETUID) & ~_capabilities()
+
+
+def drop(folders: Iterable[str]) -> None:
+    """Give up every capability; root becomes NOBODY, to whom `folders` then belong.
+
+    What was root keeps the one to read and to enter folders (of those that it has): Landlock says which.
+    """
+    libc = ctypes.CDLL(None, use_errno=True)
+    ended_by = ctypes.c_int()
+    libc.prctl(_GET_END, ctypes.byref(ended_by))
+    kept = 0
+    if os.geteuid() == 0:
+        kept = _READ_SEARCH & _capabilities()
+        try:
+            for folder in folders:
+                os.chown(folder, NOBODY, NOBODY)
+            libc.prctl(_KEEP, 1, 0, 0, 0)
+            libc.prctl(_SECURE, _NO_FIXUP, 0, 0, 0)
+            os.setgroups(())
+            os.setresgid(NOBODY, NOBODY, NOBODY)
+            os.setresuid(NOBODY, NOBODY, NOBODY)
+        except OSError as error:
+            raise CosimError(f"root cannot become an ordinary user: {error.strerror}") from None
+    head = (ctypes.c_uint32 * 2)(_VERSION, 0)
+    sets = (ctypes.c_uint32 * 6)(kept, kept, 0, 0, 0, 0)  # effective, permitted, inheritable; once more
+    if libc.capset(head, sets):
+        raise CosimError(f"capabilities: {os.strerror(ctypes.get_errno())}")
+    libc.prctl(_SET_END, ended_by.value, 0, 0, 0)  # a change of user forgot it
+
+
+def tasks() -> int:
+    """How many processes and threads this user has, as far as can be seen."""
+    number, user = 0, os.getuid()
+    for entry in os.scandir("/proc"):
+        if entry.name.isdecimal():
+            try:
+                if os.stat(entry).st_uid == user:
+                    number += len(os.listdir(f"/proc/{entry.name}/task"))
+            except OSError:  # it has ended
+                continue
+    return number
+
+
+def _capabilities() -> int:
+    """Those of this process that are in effect, a bit each."""
+    head = (ctypes.c_uint32 * 2)(_VERSION, 0)
+    sets = (ctypes.c_uint32 * 6)()
+    return 0 if ctypes.CDLL(None).capget(head, sets) else int(sets[0])

@@ -87,6 +87,7 @@ def examine(environment: Mapping[str, str]) -> Iterator[Check]:
     yield processors()
     yield numba_cache(environment)
     yield worlds()
+    yield confinement()
     if library.state != FAIL:
         yield one_second()
 
@@ -202,6 +203,15 @@ def worlds() -> Check:
 
     names = ", ".join(sumo_scenarios.names())
     return Check("scenarios", OK, names) if names else Check("scenarios", FAIL, "none found", INSTALL)
+
+
+def confinement() -> Check:
+    """Whether a server on this machine takes uploads."""
+    from cosim.service.confined import lacking
+
+    if problem := lacking():
+        return Check("uploads", WARN, f"{problem}: cosim serve takes none", "docs/service.md, Uploads")
+    return Check("uploads", OK, "confined by Landlock and seccomp")
 
 
 def lanes(what: str) -> Check:

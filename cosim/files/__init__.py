@@ -53,7 +53,7 @@ def read_json(path: Path, absent: str = "no such file") -> dict[str, Any]:
             if not path.exists():
                 raise BadInput(absent, file=path)
             found = json.loads(path.read_text("utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise BadInput(f"not JSON: {error}", file=path) from None
     if not isinstance(found, dict):
         raise BadInput("not a JSON object", file=path)

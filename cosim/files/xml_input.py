@@ -132,9 +132,7 @@ def chunks(path: Path, unpacked: float | None = None, progress: Progress | None 
         if head in _UTF16_MARKS:
             raise BadInput("is not UTF-8", file=path, field="encoding", value="UTF-16")
         size = path.stat().st_size
-        for chunk in (
-            iter(lambda: raw.read(CHUNK), b"") if head != GZIP_MAGIC else _unpacked(raw, path, most)
-        ):
+        for chunk in iter(lambda: raw.read(CHUNK), b"") if head != GZIP_MAGIC else _unpacked(raw, path, most):
             yield chunk
             if progress is not None:
                 progress(raw.tell(), size)

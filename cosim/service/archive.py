@@ -17,14 +17,22 @@ CHUNK = 1 << 18  # bytes
 LONGEST, DEEPEST = 200, 8  # characters of a name, folders in it
 _PLAIN = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _ENCRYPTED = 1  # a bit of an entry's flags
-_BROKEN = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, UnicodeError, ValueError, struct.error)
+_BROKEN = (
+    zipfile.BadZipFile,
+    zlib.error,
+    EOFError,
+    NotImplementedError,
+    UnicodeError,
+    ValueError,
+    struct.error,
+)
 
 
 def unpack(archive: Path, folder: Path, suffixes: tuple[str, ...], limits: Limits) -> list[Path]:
     """Write the files of `archive` below `folder`, which is there and empty; their paths, sorted.
 
-    Only files whose names end with one of `suffixes` are taken. All that they hold is counted together: what a
-    gzip file holds too, whatever its name is, as whoever reads it later goes by its first bytes.
+    Only files whose names end with one of `suffixes` are taken. All that they hold is counted together, what
+    gzip files hold too: SUMO and our reader know gzip by its first bytes, not by a name.
 
     Raises:
         BadInput: no zip file; a name that leads elsewhere, is there twice or of another kind; links, devices,

@@ -99,9 +99,9 @@ def lacking() -> str:
 
 @contextlib.contextmanager
 def room(settings: Settings, uploads: Sequence[str | Path], *writes: Path) -> Iterator[Room | None]:
-    """The room of what uses these uploads (ids, or a file), its scratch folder removed afterwards; None without uploads.
+    """The room of what uses these uploads (ids, or a file); None without uploads.
 
-    Raises BadInput when too much was written in it.
+    Its scratch folder is removed afterwards. Raises BadInput when too much was written in it.
     """
     if not uploads:
         yield None

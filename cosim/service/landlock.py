@@ -16,7 +16,15 @@ _CREATE, _ADD, _RESTRICT = 444, 445, 446  # system calls
 _VERSION = 1  # landlock_create_ruleset's flag: say which version the kernel has
 _PATH_BENEATH = 1
 _NO_NEW_PRIVILEGES = 38  # linux/prctl.h
-_EXECUTE, _WRITE_FILE, _READ_FILE, _READ_DIR, _REMOVE, _MAKE_FOLDER, _MAKE_FILE = 1, 2, 4, 8, 0x30, 0x80, 0x100
+_EXECUTE, _WRITE_FILE, _READ_FILE, _READ_DIR, _REMOVE, _MAKE_FOLDER, _MAKE_FILE = (
+    1,
+    2,
+    4,
+    8,
+    0x30,
+    0x80,
+    0x100,
+)
 _ALL = 0x1FFF  # of version 1: those, and to make links, sockets, FIFOs and devices
 _REFER, _TRUNCATE, _DEVICES = 1 << 13, 1 << 14, 1 << 15  # since 2, 3, 5
 _READ = _READ_FILE | _READ_DIR

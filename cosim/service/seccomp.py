@@ -14,8 +14,8 @@ from collections.abc import Iterator
 
 from cosim.errors import CosimError
 
-# name, number on x86_64, on aarch64 (asm/unistd_64.h, asm-generic/unistd.h). Not among them: sockets, programs,
-# processes, changes of owners, modes, times and attributes, links, devices, mounts, other processes' memory.
+# name, number on x86_64, on aarch64 (asm/unistd_64.h, asm-generic/unistd.h). Not among them: sockets,
+# programs, processes, changes of owners, modes, times and attributes, links, devices, mounts, others' memory.
 _CALLS = """
 read 0 63, write 1 64, readv 19 65, writev 20 66, pread64 17 67, pwrite64 18 68, preadv 295 69,
 pwritev 296 70, close 3 57, close_range 436 436, lseek 8 62, fsync 74 82, fdatasync 75 83,
@@ -92,7 +92,7 @@ def restrict() -> None:
     if not available():
         raise CosimError("this kernel has no seccomp that we know: uploads cannot be driven on it")
     machine = platform.machine()
-    lines = [*_filter(*_ARCHITECTURES[machine])]
+    lines = [_Instruction(*line) for line in _filter(*_ARCHITECTURES[machine])]
     program = _Program(len(lines), (_Instruction * len(lines))(*lines))
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(_NO_NEW_PRIVILEGES, 1, 0, 0, 0) or libc.syscall(

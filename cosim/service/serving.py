@@ -11,6 +11,7 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from cosim.errors import BadInput
 from cosim.files import cannot
 from cosim.service.app import create
+from cosim.service.confined import lacking
 from cosim.service.monitor import log_json
 from cosim.service.settings import TOKEN, DataFolder, Settings
 
@@ -82,6 +83,8 @@ def serve(data: str, *, host: str, port: int, said: TextIO, **settings: Any) -> 
                 if token is None
                 else f"the token is in {file or 'the variable ' + TOKEN}"
             )
+            if problem := lacking():
+                print(f"cosim: no uploads are taken: {problem}", file=said, flush=True)
             print(f"cosim: http://{shown}:{port} ({asks})", file=said, flush=True)
             config = uvicorn.Config(
                 app,

@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from cosim.errors import BadInput, SimulationCrashed, SimulationTimeout
+from cosim.errors import BadInput, CosimError, SimulationCrashed, SimulationTimeout
 from cosim.files import whole
 from cosim.service.confined import Examiner, room
 from cosim.service.ids import ID, new_id
@@ -128,9 +128,7 @@ class Uploads:
                 worker.kill()
 
             try:
-                with Worker(
-                    Examiner, confined, timeout=limit, name="cosim-examiner", wait=False
-                ) as worker:
+                with Worker(Examiner, confined, timeout=limit, name="cosim-examiner", wait=False) as worker:
                     clock = threading.Timer(limit, end)
                     clock.start()
                     try:
@@ -142,6 +140,11 @@ class Uploads:
                 if late.is_set() or isinstance(error, SimulationTimeout):
                     raise BadInput(f"takes more than {limit:g} s to look at", field="archive") from None
                 raise BadInput(f"ends the process that reads it: {error}", field="archive") from None
+            except BadInput:
+                raise
+            except CosimError as error:  # a fault of ours that an upload has found
+                log.exception("an upload could not be examined")
+                raise BadInput(f"cannot be read: {str(error).splitlines()[-1]}", field="archive") from None
 
     def _about(self, upload: str) -> Path:
         return self._settings.uploads / f"{upload}{ABOUT}"

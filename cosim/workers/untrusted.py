@@ -20,7 +20,17 @@ from multiprocessing.process import BaseProcess
 from typing import Any, TypeVar
 
 LARGEST = 1 << 28  # bytes of an answer
-_VARIABLES = ("HOME", "LANG", "LANGUAGE", "LD_LIBRARY_PATH", "MPLBACKEND", "PATH", "SUMO_HOME", "TMPDIR", "TZ")
+_VARIABLES = (
+    "HOME",
+    "LANG",
+    "LANGUAGE",
+    "LD_LIBRARY_PATH",
+    "MPLBACKEND",
+    "PATH",
+    "SUMO_HOME",
+    "TMPDIR",
+    "TZ",
+)
 _PREFIXES = ("GOMP_", "LC_", "MKL_", "NUMBA_", "OMP_", "OPENBLAS_", "PROJ_", "PYTHON")
 _ARRAYS = {"_reconstruct", "scalar", "_frombuffer", "ndarray", "dtype"}
 _PLAIN = {"set", "frozenset", "complex", "bytearray", "slice", "range"}
@@ -41,9 +51,7 @@ def is_untrusted(*made_of: object) -> bool:
 def environment() -> dict[str, str]:
     """What such a process is told of this one's variables."""
     return {
-        name: value
-        for name, value in os.environ.items()
-        if name in _VARIABLES or name.startswith(_PREFIXES)
+        name: value for name, value in os.environ.items() if name in _VARIABLES or name.startswith(_PREFIXES)
     }
 
 
@@ -52,11 +60,11 @@ def load(answer: bytes) -> Any:
     return _Reader(io.BytesIO(answer)).load()
 
 
-class Process(multiprocessing.get_context("spawn").Process):  # type: ignore[name-defined, misc]
+class Process(multiprocessing.get_context("spawn").Process):  # type: ignore[misc]
     """A process that is not trusted."""
 
     @staticmethod
-    def _Popen(process: BaseProcess) -> _Popen:  # noqa: N802 - multiprocessing's name
+    def _Popen(process: BaseProcess) -> _Popen:
         return _Popen(process)
 
 
@@ -79,7 +87,7 @@ class _Popen(popen_spawn_posix.Popen):
         try:
             # without the tracker of named semaphores, which would remove any for it
             command = spawn.get_command_line(tracker_fd=None, pipe_handle=begin)
-            handles = (*self._fds, theirs, begin)
+            handles = (*self._fds, theirs, begin)  # type: ignore[attr-defined]
             started = subprocess.Popen(command, env=environment(), pass_fds=handles)
             started.returncode = 0  # multiprocessing waits for it
             self.pid = started.pid
@@ -91,9 +99,14 @@ class _Popen(popen_spawn_posix.Popen):
             os.close(theirs)
             os.close(begin)
         self.sentinel = ended
-        self.finalizer = util.Finalize(self, util.close_fds, (ended, ours))
+        self.finalizer = util.Finalize(self, _close, (ended, ours))
         with open(ours, "wb", closefd=False) as pipe:
             pipe.write(message.getbuffer())
+
+
+def _close(*handles: int) -> None:
+    for handle in handles:
+        os.close(handle)
 
 
 class _Reader(pickle.Unpickler):

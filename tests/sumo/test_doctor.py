@@ -9,6 +9,7 @@ import pytest
 
 from cosim.cli import doctor
 from cosim.cli.doctor import FAIL, OK, WARN
+from cosim.service import confined
 
 
 def test_a_sound_installation_passes_with_a_simulated_second(capsys: pytest.CaptureFixture[str]) -> None:
@@ -75,3 +76,10 @@ def test_a_numba_cache_that_cannot_be_written_is_a_warning(tmp_path: Path) -> No
     broken = doctor.numba_cache({"NUMBA_CACHE_DIR": str(file / "cache")})
     assert broken.state == WARN
     assert "NUMBA_CACHE_DIR" in broken.fix
+
+
+def test_whether_uploads_can_be_confined_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert doctor.confinement().state == OK
+    monkeypatch.setattr(confined, "lacking", lambda: "this kernel has no seccomp")
+    found = doctor.confinement()
+    assert (found.state, found.detail) == (WARN, "this kernel has no seccomp: cosim serve takes none")

@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cosim.errors import BadInput, CosimError
+from cosim.files import cannot
 from cosim.service import disk, landlock, privileges, seccomp
 from cosim.service.settings import Limits, Settings
 from cosim.workers.untrusted import untrusted
@@ -66,7 +67,8 @@ class Room:
             raise CosimError(problem)
         os.dup2(2, 1)  # which is the server's
         privileges.drop((self.scratch, *self.writes))
-        scratch = tempfile.tempdir = tempfile.mkdtemp(prefix=disk.folder_prefix(), dir=self.scratch)
+        with cannot("make a folder there as an ordinary user", file=self.scratch):
+            scratch = tempfile.tempdir = tempfile.mkdtemp(prefix=disk.folder_prefix(), dir=self.scratch)
         packages = [_folder(name) for name in _PACKAGES]
         _own_numba_cache(Path(scratch, "numba"), packages)
         for name in ("HOME", "MPLCONFIGDIR", "TORCHINDUCTOR_CACHE_DIR"):

@@ -27,7 +27,7 @@ def folder_prefix() -> str:
 @contextlib.contextmanager
 def limited(scratch: Path, writes: Sequence[Path], limits: Limits) -> Iterator[None]:
     """During the block those processes are ended that have a folder in `scratch`, when there is more than
-    `limits.disk` in it and new in `writes`, or less than `limits.spare` is free.
+    `limits.disk` in it and new in `writes`, or less than `limits.free` is free.
 
     Raises BadInput when that was so.
     """
@@ -40,8 +40,8 @@ def limited(scratch: Path, writes: Sequence[Path], limits: Limits) -> Iterator[N
         while not ended.wait(LOOKS):
             if sum(map(_used, (scratch, *writes))) - before > limits.disk:
                 problem = f"writes more than {limits.disk // MB} MB"
-            elif shutil.disk_usage(scratch).free < limits.spare:
-                problem = f"no space left on device: {limits.spare // MB} MB are kept free"
+            elif shutil.disk_usage(scratch).free < limits.free:
+                problem = f"no space left on device: {limits.free // MB} MB are kept free"
             if problem:
                 _end_all(scratch)
 

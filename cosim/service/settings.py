@@ -31,7 +31,7 @@ class Limits:
     memory: int = 8192 * MB  # address space of a confined process
     file: int = 512 * MB  # that a confined process writes
     disk: int = 8192 * MB  # that all processes of a run, a session or a check with uploads write
-    spare: int = 256 * MB  # that they leave free
+    free: int = 256 * MB  # on the disk, that they leave
     tasks: int = 1024  # threads that a confined process adds to those of its user
     cpu: float = 900.0  # processor time of one episode, or between two resets of a session, when confined
 

@@ -331,7 +331,7 @@ def test_threads_are_limited(place: Path) -> None:
         assert 0 < worker.call("threads") <= 64
 
 
-@pytest.mark.parametrize("limits", [{"disk": 20 << 20}, {"spare": 1 << 60}])
+@pytest.mark.parametrize("limits", [{"disk": 20 << 20}, {"free": 1 << 60}])
 def test_whoever_fills_the_disk_is_ended(tmp_path: Path, limits: dict[str, int]) -> None:
     with DataFolder(str(tmp_path / "data")) as folder:
         settings = Settings(folder.path, limits=Limits(**limits))

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import pickle
 import signal
 import socket
+import stat
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -146,11 +150,25 @@ class Endless(Killed):
         signal.pause()
 
 
+class Babbling(Killed):
+    """It says that it goes on, for ever."""
+
+    def take(self, *_: str) -> None:
+        message = pickle.dumps(("progress", ()))
+        while True:
+            for handle in map(int, os.listdir("/proc/self/fd")):
+                with contextlib.suppress(OSError):
+                    if stat.S_ISSOCK(os.fstat(handle).st_mode):
+                        os.write(handle, len(message).to_bytes(4, "big") + message)
+            time.sleep(0.1)
+
+
 @pytest.mark.parametrize(
     ("examiner", "limit", "says"),
     [
         (Killed, 120.0, "ends the process that reads it: .*SIGSEGV.*the net is broken"),
         (Endless, 5.0, "takes more than 5 s"),
+        (Babbling, 5.0, "takes more than 5 s"),
     ],
 )
 def test_an_upload_that_ends_or_stops_its_process_is_refused(
@@ -201,3 +219,24 @@ def test_a_confined_session_is_watched_and_explained(server: Server) -> None:
         _, steps = drawn(socket, 1.6)
     assert any(step["decided"][1] for step in steps)
     assert server.http.delete(f"/api/sessions/{session}").status_code == 204
+
+
+def test_what_an_examination_leaves_is_plain_files_of_the_server_s_own(tmp_path: Path) -> None:
+    (tmp_path / "below").mkdir(mode=0o700)
+    file = tmp_path / "below" / "a.xml"
+    file.write_bytes(b"<a/>")
+    file.chmod(0o4000)
+    assert uploads._settled(tmp_path, Limits()) == {"below/a.xml": 4}
+    assert stat.S_IMODE(file.stat().st_mode) == 0o644
+    with pytest.raises(BadInput, match="more than was unpacked"):
+        uploads._settled(tmp_path, Limits(unpacked=3))
+    for leave in (
+        lambda path: path.symlink_to("/etc/passwd"),
+        lambda path: path.symlink_to("/etc"),
+        lambda path: path.hardlink_to(file),
+        os.mkfifo,
+    ):
+        leave(tmp_path / "more.xml")  # type: ignore[no-untyped-call]
+        with pytest.raises(BadInput, match="no regular file"):
+            uploads._settled(tmp_path, Limits())
+        (tmp_path / "more.xml").unlink()

@@ -75,9 +75,10 @@ class Uploads:
                 bytes=sum(sizes.values()),
                 about=about,
             )
+            text = json.dumps(asdict(found), indent=1) + "\n"
             part.rename(settings.uploads / upload)
             with whole(self._about(upload)) as draft:
-                draft.write_text(json.dumps(asdict(found), indent=1) + "\n")
+                draft.write_text(text)
         except BaseException:
             shutil.rmtree(part, ignore_errors=True)
             raise
@@ -132,8 +133,8 @@ class Uploads:
                     clock = threading.Timer(limit, end)
                     clock.start()
                     try:
-                        found: tuple[str, dict[str, Any]] = worker.call("take", str(archive), str(part), kind)
-                        return found
+                        main, about = worker.call("take", str(archive), str(part), kind)
+                        return str(main), dict(about)
                     finally:
                         clock.cancel()
             except SimulationCrashed as error:

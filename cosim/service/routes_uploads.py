@@ -6,19 +6,20 @@ from enum import Enum
 from pathlib import Path as File
 from typing import Annotated, Any
 
+from anyio import CapacityLimiter, to_thread
 from fastapi import APIRouter, Path, Query, Request
 from pydantic import BaseModel, Field
-from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 
 from cosim.service.confined import KINDS, lacking
 from cosim.service.ids import PATTERN
-from cosim.service.problems import Conflict
+from cosim.service.problems import Conflict, Unavailable
 from cosim.service.runs import Runs
 from cosim.service.sessions import Sessions
 from cosim.service.settings import Settings
 from cosim.service.uploads import Uploads
 
+EXAMINED, WAITING = 2, 16  # uploads at once, and those that wait for it
 UploadId = Annotated[str, Path(pattern=PATTERN, examples=["0c44d1e5f2ab"])]
 Kind = Enum("Kind", {name: name for name in KINDS}, type=str)  # type: ignore[misc]
 BODY = {
@@ -47,6 +48,7 @@ class UploadDocument(BaseModel):
 def uploads_router(uploads: Uploads, runs: Runs, sessions: Sessions, settings: Settings) -> APIRouter:
     """All of them."""
     router = APIRouter(prefix="/api", tags=["uploads"])
+    examined = CapacityLimiter(EXAMINED)  # threads of their own: no other request waits for an upload
 
     @router.post("/uploads", status_code=201, summary="Send a scenario or weights", openapi_extra=BODY)
     async def send(
@@ -60,7 +62,9 @@ def uploads_router(uploads: Uploads, runs: Runs, sessions: Sessions, settings: S
             with os.fdopen(handle, "wb") as file:
                 async for chunk in request.stream():
                     file.write(chunk)
-            found = await run_in_threadpool(uploads.add, File(path), kind.value, name)
+            if examined.statistics().tasks_waiting >= WAITING:
+                raise Unavailable(f"{WAITING} uploads wait to be examined: try again later")
+            found = await to_thread.run_sync(uploads.add, File(path), kind.value, name, limiter=examined)
         finally:
             os.unlink(path)
         return UploadDocument.model_validate(found, from_attributes=True)

@@ -23,7 +23,6 @@ from cosim.service.problems import NotFound, Unavailable
 from cosim.service.settings import Limits, Settings
 from cosim.workers.worker import Worker
 
-EXAMINED_AT_ONCE = 2
 ABOUT = ".json"  # beside the upload's folder
 log = logging.getLogger("cosim.service")
 
@@ -47,7 +46,6 @@ class Uploads:
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        self._examined = threading.Semaphore(EXAMINED_AT_ONCE)
         for part in settings.uploads.glob("*.part"):  # of a server that was killed
             shutil.rmtree(part, ignore_errors=True)
 
@@ -122,7 +120,7 @@ class Uploads:
         """
         limit = self._settings.limits.check
         late = threading.Event()
-        with self._examined, room(self._settings, [archive], part) as confined:
+        with room(self._settings, [archive], part) as confined:
 
             def end() -> None:
                 late.set()

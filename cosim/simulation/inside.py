@@ -77,15 +77,15 @@ class Inside:
                 return Ahead(math.inf, (), side)
             if any(one and not stands for one, stands in zip(touched, still, strict=True)):
                 break  # nobody dodges those who drive or walk
-        standing = (o for (o, _), stands, one in zip(others, still, touched, strict=True) if stands and one)
-        return Ahead(0.0, tuple(standing))
+        in_the_way = zip(others, still, touched, strict=True)
+        return Ahead(0.0, tuple(other for (other, _), stands, hit in in_the_way if stands and hit))
 
     def room(
         self, name: str, lane: str, waved: Set[str], at: float | None = None, before: float = 0.0
     ) -> Ahead:
-        """What keeps the AV `name` from driving over the internal lane `lane` and out of the junction: those
-        who stand in it, or slowly come to where they wait in it, and, if it is inside itself, who walks there;
-        not those beside it.
+        """What keeps the AV `name` from driving over the internal lane `lane` and out of the junction: vehicles
+        that stand in it, or slowly come to where they wait in it, and, if the AV is inside itself, persons who
+        walk there; not those beside it.
 
         Of those who stand in its way the room ends where their way out of the junction begins, as far as the
         AV has not come to it yet, so that they can go first.
@@ -160,7 +160,8 @@ class Inside:
 
     def _until(self, mine: Floats, standing: Sequence[tuple[str, Floats]]) -> Ahead:
         """The way `mine` until it touches somebody of `standing`; "" in it stands for those who walk."""
-        room, names = math.inf, []
+        room = math.inf
+        names: list[str] = []
         for other, theirs in standing:
             away = _first_touch(mine, theirs)
             if away == math.inf:

@@ -1,9 +1,8 @@
 """AVs wave vehicles through: the driver of a waved vehicle no longer waits for that AV at the junction.
 
-SUMO's driver never goes before a vehicle with the right of way, though that one stands and waits for it. A waved
-vehicle ignores the AV as a foe (`junctionModel.ignoreIDs`,
-https://sumo.dlr.de/docs/TraCI/Change_Vehicle_State.html#relevant_for_the_junction_model); all other foes count
-as before.
+SUMO's driver never goes before a vehicle with the right of way, though that vehicle stands and waits for it.
+A waved vehicle ignores the AV as a foe (`junctionModel.ignoreIDs`,
+https://sumo.dlr.de/docs/TraCI/Change_Vehicle_State.html); all other foes count as before.
 """
 
 from collections.abc import Set

@@ -1,4 +1,4 @@
-"""Junctions drawn from a seed: arms, angles, lanes and traffic of every junction type that SUMO has rules for."""
+"""Junctions drawn from a seed: arms, angles, lanes and traffic, of every type that SUMO has rules for."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def draw(folder: Path, kind: str, seed: int) -> Path:
     command = [str(Path(sumo.SUMO_HOME) / "bin" / "netconvert"), "-n", "x.nod.xml", "-e", "x.edg.xml"]
     command += [*left_hand, "--no-turnarounds", "true", "-o", "net.net.xml"]
     subprocess.run(command, cwd=folder, check=True, capture_output=True)
-    (folder / "demand.rou.xml").write_text(f"<routes>{TYPES}{''.join(_flows(ends, rng))}</routes>")
+    (folder / "demand.rou.xml").write_text(f"<routes>{TYPES}{''.join(_flows(kind, ends, rng))}</routes>")
     config = folder / "run.sumocfg"
     config.write_text(CONFIG.format(end=END))
     return config
@@ -82,9 +82,10 @@ def _centres(
     return [("k", "k") if math.cos(angle) > 0.0 else ("j", "j") for angle in slots]
 
 
-def _flows(ends: list[str], rng: random.Random) -> list[str]:
-    """A flow between any two arms, by the time at which it begins, as SUMO wants them."""
-    pairs = [(start, end) for start in ends for end in ends if start != end]
+def _flows(kind: str, ends: list[str], rng: random.Random) -> list[str]:
+    """A flow between any two arms (at a zipper from all to the last one), by the time at which it begins."""
+    goals = ends[-1:] if kind == "zipper" else ends
+    pairs = [(start, end) for start in ends for end in goals if start != end]
     period = 4.0 * len(ends), 16.0 * len(ends)  # s
     begins = sorted(rng.uniform(0.0, 10.0) for _ in pairs)
     return [

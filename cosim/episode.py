@@ -38,6 +38,8 @@ from cosim.types import (
     Receipt,
     Simulator,
     Snapshot,
+    Timing,
+    Traffic,
 )
 
 # Of the vehicles that were due: if more were never inserted, the demand is above capacity. Fewer are a queue
@@ -218,7 +220,7 @@ class Episode:
         """What a policy gets to know of the episode `seed` before it starts; `svo` (phi) in rad."""
         return PolicyContext(
             road=self.simulator.road,
-            timing=self.scenario.timing,
+            timing=Timing() if self.scenario.traffic == Traffic.AS_IS else self.scenario.timing,  # no AV comes
             observation=self.observation,
             svo=svo,
             rng=generator(seed, "policy"),

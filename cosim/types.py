@@ -89,6 +89,14 @@ class OnCollision:
     ALL = (END, CONTINUE)
 
 
+class Traffic:
+    """Whose SUMO options drive a user's file (docs/definitions.md, Traffic): every result names it."""
+
+    AS_IS = "as-is"  # the file's own: as plain SUMO drives it
+    CONTROLLED = "controlled"  # with what AVs, other drivers and figures need, each change named
+    ALL = (AS_IS, CONTROLLED)
+
+
 INSERTION = "insertion"  # `Collision.kind`
 
 

@@ -12,10 +12,11 @@ from cosim.batch.spec import AXES, Spec
 from cosim.errors import BadInput
 from cosim.files import code
 from cosim.rewards import read as read_reward
-from cosim.scenario import Scenario, chosen_preset, sumo_outputs
+from cosim.scenario import CONFIG, Scenario, chosen_preset, sumo_outputs
 from cosim.scenario.episode_id import EpisodeId
 from cosim.scenario.manifest import manifest
 from cosim.scenario.vet import vetted
+from cosim.types import Traffic
 from cosim.workers.tasks import Task
 
 CheckPolicy = Callable[[str], None]  # raises BadInput for a name that is none
@@ -66,8 +67,17 @@ class Plan:
 
 
 def cells(spec: Spec) -> Iterator[EpisodeId]:
-    """The case of every cell's first seed; each once, though one policy may have one preset only."""
-    yield from dict.fromkeys(_cells(spec))
+    """The case of every cell's first seed; each once, though one policy may have one preset only.
+
+    Cells with and without AVs are compared: in all of them traffic is controlled if in one of them cosim drives.
+    """
+    found = [*dict.fromkeys(_cells(spec))]
+    if spec.traffic is None and any(case.drives for case in found):
+        found = [
+            case if case.drives or not case.what.endswith(CONFIG) else replace(case, traffic=Traffic.CONTROLLED)
+            for case in found
+        ]
+    yield from found
 
 
 def _cells(spec: Spec) -> Iterator[EpisodeId]:
@@ -86,6 +96,7 @@ def _cells(spec: Spec) -> Iterator[EpisodeId]:
             metrics=spec.metric,
             reward=spec.reward,
             on_collision=spec.on_collision,
+            traffic=spec.traffic,
         )
 
 

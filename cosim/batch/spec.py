@@ -19,7 +19,7 @@ from cosim.files.yaml_input import NonNegative, Positive, check_known, document,
 from cosim.scenario import BEHAVIORS, human_errors, policy_name
 from cosim.scenario.behaviors import DRIVER_MODELS
 from cosim.seeding import FIRST_TEST_SEED
-from cosim.types import OnCollision, Preset
+from cosim.types import OnCollision, Preset, Traffic
 
 MAX_SEED = 2**62
 MAX_EPISODES = 1_000_000  # more is a slip of the keyboard: 3 GB of rows
@@ -65,6 +65,7 @@ class Spec:
     output: tuple[str, ...] = ()  # SUMO's outputs to keep, by SUMO's names
     metric: tuple[str, ...] = ()  # measured besides, FILE.py:NAME or MODULE:NAME, files absolute
     on_collision: str | None = None  # of `OnCollision`; None: the scenario's own
+    traffic: str | None = None  # of `Traffic`; None: as-is where cosim drives nobody in any cell
     reward: str | None = None  # paid and reported: a name of `cosim.rewards.REWARDS`, or code likewise
 
     @property
@@ -193,6 +194,8 @@ def _checked(spec: Spec, file: object) -> Spec:
             one_of(word, allowed, field, file)
     if spec.on_collision is not None:
         one_of(spec.on_collision, OnCollision.ALL, "on_collision", file)
+    if spec.traffic is not None:
+        one_of(spec.traffic, Traffic.ALL, "traffic", file)
     labels = [policy_name.label(text) for text in spec.policy]
     if twice := next((name for name in labels if labels.count(name) > 1), None):
         raise BadInput(f"two are called {twice}: label them, LABEL=...", file=file, field="policy")

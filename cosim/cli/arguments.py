@@ -34,7 +34,7 @@ def _shared() -> dict[str, dict[str, Any]]:
     """Flag -> its settings. Made on demand: the names of behaviours are read from a file."""
     from cosim.scenario import BEHAVIORS
     from cosim.scenario.behaviors import DRIVER_MODELS
-    from cosim.types import OnCollision, Preset
+    from cosim.types import OnCollision, Preset, Traffic
 
     return {
         "--scenario": {"metavar": "NAME|FILE", "help": "a world, its folder, or a .sumocfg"},
@@ -54,6 +54,11 @@ def _shared() -> dict[str, dict[str, Any]]:
         "--on-collision": {
             "choices": OnCollision.ALL,
             "help": "of an AV or the mission vehicle (default: worlds end, your own .sumocfg continue)",
+        },
+        "--traffic": {
+            "choices": Traffic.ALL,
+            "help": "SUMO options of your own .sumocfg: as-is, or controlled, as AVs need them "
+            "(default: as-is where cosim drives nobody; in a batch, in any cell)",
         },
         "--errors": {
             "metavar": "LEVEL|FILE",

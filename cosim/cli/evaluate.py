@@ -60,7 +60,7 @@ def add_matrix(command: argparse.ArgumentParser, errors: str = "none") -> None:
     arguments.add(axes, "--errors", action="append", help=levels + errors)
     arguments.add(axes, "--output", "--metric", action="append")
     arguments.add(command, "--av-type", "--av-ids", "--duration", "--warmup", "--mission")
-    arguments.add(command, "--reward", "--on-collision")
+    arguments.add(command, "--reward", "--on-collision", "--traffic")
 
 
 def add_work(command: argparse.ArgumentParser) -> Any:

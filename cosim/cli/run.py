@@ -49,7 +49,7 @@ def add(commands: arguments.SubCommands) -> None:
     arguments.add(run, "--policy", default="idm")
     arguments.add(run, "--svo", default=45.0)
     arguments.add(run, "--behavior", "--preset", "--duration", "--warmup", "--mission")
-    arguments.add(run, "--on-collision", "--errors", "--reward", "--out")
+    arguments.add(run, "--on-collision", "--errors", "--traffic", "--reward", "--out")
     arguments.add(run, "--driver-model", default="lc2013", help="of the human drivers (default lc2013)")
     arguments.add(run.add_mutually_exclusive_group(), "--av-type", "--av-ids", "--penetration")
     arguments.add(run, "--seed", default=FIRST_TEST_SEED, help=f"default {FIRST_TEST_SEED}")
@@ -224,7 +224,7 @@ def _programs(count: int) -> str:
 def case_of(args: argparse.Namespace) -> EpisodeId:
     """The episode that the flags describe; files by absolute path, so that it can be found again."""
     same = ["behavior", "driver_model", "penetration", "av_type", "av_ids", "duration", "seed"]
-    same += ["warmup", "mission", "on_collision"]
+    same += ["warmup", "mission", "on_collision", "traffic"]
     what, policy = place(args.what), read(args.policy).text
     return EpisodeId(
         what=what,

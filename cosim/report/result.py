@@ -68,6 +68,7 @@ def table(result: EpisodeResult, *, first: bool = True) -> str:
         f"  behaviour {result.behavior}, drivers {result.driver_model}, preset {result.preset}, "
         f"svo {result.svo_deg:g} deg, seed {result.seed}, {result.steps} decisions",
     ]
+    lines += traffic_lines(result)
     if result.errors is not None:
         begun = Counter(error.kind for error in result.errors_begun).most_common()
         words = ", ".join(f"{count} {kind}" for kind, count in begun) or "none"
@@ -88,6 +89,15 @@ def table(result: EpisodeResult, *, first: bool = True) -> str:
     times = ", ".join(f"{name.removesuffix('_s')} {value:.2f} s" for name, value in result.timings.items())
     lines.append(f"  time spent               {times}")
     return "\n".join(lines)
+
+
+def traffic_lines(result: EpisodeResult) -> list[str]:
+    """`traffic as-is`, or what was changed of a user's file."""
+    if "traffic" not in result.manifest:
+        return []
+    changed = result.manifest.get("changed_options", {})
+    words = ", ".join(f"{name} {c['file']} -> {c['used']}" for name, c in changed.items())
+    return [f"  traffic {result.manifest['traffic']}" + f": {words}" * bool(words)]
 
 
 def error_of(collision: Collision, begun: Sequence[HumanError]) -> HumanError | None:

@@ -17,10 +17,10 @@ from cosim.report.figures import Measure, Row, measures
 from cosim.report.summary import summarize
 from cosim.scenario import CONFIG, file_name
 from cosim.scenario.manifest import checked
-from cosim.types import OnCollision
+from cosim.types import OnCollision, Traffic
 from cosim.workers.tasks import OK
 
-SETTINGS = ("duration", "warmup", "mission", "on_collision", "errors_sha256", "tilt")
+SETTINGS = ("duration", "warmup", "mission", "on_collision", "errors_sha256", "tilt", "traffic")
 NEEDED = ("key", "cell", "status", "scenario", "demand", "policy", "seed")
 
 
@@ -70,6 +70,7 @@ class Run:
             "on_collision": driven.get("on_collision", asked.get("on_collision") or OnCollision.END),
             "errors_sha256": driven.get("errors", {}).get("sha256"),
             "tilt": driven.get("tilt"),
+            "traffic": driven.get("traffic", Traffic.CONTROLLED),
         }
 
     def _cell(self, row: Row) -> Mapping[str, Any]:

@@ -3,7 +3,7 @@
 import math
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,7 +16,8 @@ from cosim.scenario import human_errors, sumocfg
 from cosim.scenario.behaviors import AS_IS, DRIVER_MODELS, LC2013, MIXED, load_behaviors
 from cosim.scenario.human_errors import Errors
 from cosim.scenario.tilt import Tilt
-from cosim.types import Identity, OnCollision, Preset, Timing
+from cosim.scenario.traffic import STEP, SUMO_STEP, Changed, check_timing, clocks, settled
+from cosim.types import Identity, OnCollision, Preset, Timing, Traffic
 
 BEHAVIORS = load_behaviors().names
 CONFIG = ".sumocfg"
@@ -64,6 +65,10 @@ class Fleet:
     ids: str | None = None  # regular expression, full match
     penetration: float | None = None  # 0..1, drawn per vehicle id from the seed
 
+    @property
+    def may_have_avs(self) -> bool:
+        return self.type is not None or self.ids is not None or bool(self.penetration)
+
     def describe(self) -> str:
         if self.type is not None:
             return f"type {self.type}"
@@ -94,6 +99,8 @@ class Scenario:
     additional: tuple[Path, ...] = ()
     options: tuple[tuple[str, str], ...] = ()  # further SUMO options that change the traffic
     ignored: tuple[str, ...] = ()  # options of the .sumocfg that were not passed on (outputs and such)
+    traffic: str = Traffic.CONTROLLED
+    changed: tuple[Changed, ...] = ()  # options of a user's file, for controlled traffic
     begin: float = 0.0  # s
     warmup: float = 0.0  # s, not counted
     duration: float = 60.0  # s, counted
@@ -162,25 +169,28 @@ def load(
     mission: str | None = None,
     on_collision: str | None = None,
     errors: str | None = None,
+    traffic: str | None = None,
     options: Sequence[str] = (),
 ) -> Scenario:
     """The scenario `what` (a world's name or folder, a .sumocfg), with what the command line says otherwise.
 
     `demand`: names of the world's demands or files; `options`: SUMO options as typed after `--`, which win
     over the file's. `duration`, `warmup` in s. `mission`: a vehicle's id or a pattern of ids (full match),
-    "none" or "auto". `errors`: of human drivers, a level or a file (`cosim.scenario.human_errors`). Only this
-    file's own syntax is checked: `cosim.scenario.vet` reads the rest.
+    "none" or "auto". `errors`: of human drivers, a level or a file (`cosim.scenario.human_errors`). `traffic`:
+    of `Traffic`, None where `cosim.scenario.traffic` decides. Only this file's own syntax is checked:
+    `cosim.scenario.vet` reads the rest.
 
     Raises:
         BadInput: names file (or option), field and value, with the nearest name where one is near.
     """
     chosen = sumocfg.command_line(options)
+    replaced = chosen.keys() | ({"route-files"} if demand else set())
     if sumo_scenarios.ships(what):
         scenario = _world(sumo_scenarios.folder(what))
     elif is_there(Path(what) / DEFINITION):
         scenario = _world(Path(os.path.abspath(what)))
     else:
-        scenario = _foreign(what)
+        scenario = _foreign(what, replaced)
     if demand:
         scenario = _with_demand(scenario, demand)
     scenario = _with_sumo_options(scenario, chosen)
@@ -196,7 +206,7 @@ def load(
         scenario = replace(scenario, mission=chosen_mission(scenario.mission, mission))
     if behavior is None:
         behavior = _default_behavior(scenario)
-    return replace(
+    scenario = replace(
         scenario,
         behavior=one_of(behavior, BEHAVIORS, "--behavior"),
         driver_model=one_of(driver_model, DRIVER_MODELS, "--driver-model"),
@@ -205,6 +215,7 @@ def load(
         fleet=scenario.fleet if fleet is None else checked_fleet(fleet),
         errors=human_errors.read(errors, world=scenario.name if scenario.ships else ""),
     )
+    return settled(scenario, chosen, traffic)
 
 
 def chosen_preset(what: str, policy: str, preset: str | None) -> str:
@@ -261,7 +272,7 @@ def _world(folder: Path) -> Scenario:
         raise BadInput(
             "a world that ships is called so: name yours otherwise", file=file, field="name", value=name
         )
-    config = sumocfg.read(folder / f"{name}{CONFIG}")
+    config = sumocfg.read(folder / f"{name}{CONFIG}", ("route-files",))  # its demands are in their folder
     demands = {_demand_name(path): path for path in sorted((folder / "demand").glob("*.rou.xml"))}
     if not demands:
         raise BadInput("holds no *.rou.xml", file=file, field="demand", value=str(folder / "demand"))
@@ -295,14 +306,14 @@ def _world(folder: Path) -> Scenario:
     )
 
 
-def _foreign(what: str) -> Scenario:
-    """A user's .sumocfg: its own duration, types and options; our clocks."""
+def _foreign(what: str, replaced: Collection[str]) -> Scenario:
+    """A user's .sumocfg as plain SUMO drives it. `replaced`: its files that the command line replaces."""
     path = Path(what)
     if not is_there(path) and path.suffix != CONFIG:
         sumo_scenarios.folder(what)  # raises, with the nearest name
     if path.is_dir():
         raise BadInput(f"a world's folder holds {DEFINITION}", field="scenario", value=what)
-    config = sumocfg.read(regular_file(path, file=None, field="scenario"))
+    config = sumocfg.read(regular_file(path, file=None, field="scenario"), replaced)
     if config.end is not None and config.end <= config.begin:
         raise BadInput("ends before it begins", file=path, field="end", value=f"{config.end:g}")
     return Scenario(
@@ -313,6 +324,8 @@ def _foreign(what: str) -> Scenario:
         additional=config.additional,
         options=config.options,
         ignored=config.ignored,
+        traffic=Traffic.AS_IS,
+        timing=clocks(sumocfg.time_of(dict(config.options).get(STEP, SUMO_STEP), path, STEP)),
         begin=config.begin,
         duration=FOREIGN_DURATION if config.end is None else config.end - config.begin,
         on_collision=OnCollision.CONTINUE,
@@ -350,10 +363,6 @@ def _with_sumo_options(scenario: Scenario, chosen: Mapping[str, str]) -> Scenari
         duration = sumocfg.time_of(chosen["end"], place, "--end") - begin
     if duration <= 0.0:
         raise BadInput("ends before it begins", file=place, field="--begin/--end", value=f"{duration:g} s")
-    timing = scenario.timing
-    if "step-length" in chosen:
-        timing = replace(timing, step=sumocfg.time_of(chosen["step-length"], place, "--step-length"))
-        check_timing(timing, place, "--step-length", chosen["step-length"])
     files = {
         name: sumocfg.files(chosen[name], here, place, f"--{name}")
         for name in sumocfg.INPUTS
@@ -367,7 +376,6 @@ def _with_sumo_options(scenario: Scenario, chosen: Mapping[str, str]) -> Scenari
         additional=files.get("additional-files", scenario.additional),
         begin=begin,
         duration=duration,
-        timing=timing,
         options=tuple({**dict(scenario.options), **others}.items()),
     )
 
@@ -387,18 +395,6 @@ def chosen_mission(own: Mission, wanted: str) -> Mission:
         raise BadInput("name a vehicle, none or auto", field="--mission", value=wanted)
     check_pattern(wanted, "--mission")
     return replace(own, vehicles=wanted, kind=AUTO if own.kind == NONE else own.kind)
-
-
-def check_timing(timing: Timing, file: object, field: str, value: object) -> None:
-    """Each clock must be a whole number of the one below it (definitions.md, Time)."""
-    for name, long, short in (
-        ("frame", timing.frame, timing.step),
-        ("decision", timing.decision, timing.frame),
-    ):
-        ratio = long / short if short > 0.0 else 0.0
-        if ratio < 0.999 or abs(ratio - round(ratio)) > 1e-6:
-            problem = f"a {name} of {long:g} s is not a whole number of {short:g} s"
-            raise BadInput(problem, file=file, field=field, value=value)
 
 
 def checked_fleet(fleet: Fleet, file: object = None, prefix: str = "--av-") -> Fleet:

@@ -14,6 +14,7 @@ from cosim.errors import BadInput, Range, inside
 from cosim.files.yaml_input import dataclass_from, mapping
 from cosim.scenario import Scenario, chosen_fleet, load, tilt
 from cosim.scenario.behaviors import LC2013
+from cosim.scenario.traffic import driven
 from cosim.types import Preset
 
 OPTIONAL = (
@@ -24,6 +25,7 @@ OPTIONAL = (
     "on_collision",
     "errors",
     "tilt",
+    "traffic",
 )  # named only where they are asked for: older keys stay as they are
 KEY_LENGTH = 12  # hexadecimal digits of a cell: 48 bits, a collision among 10,000 cells has odds of 2e-7
 
@@ -55,6 +57,7 @@ class EpisodeId:
     on_collision: str | None = None  # of `OnCollision`; None: the scenario's own
     errors: str | None = None  # of human drivers: a level, or an absolute path; None: none
     tilt: str | None = None  # of these errors (`cosim.scenario.tilt`); None: drawn as they happen
+    traffic: str | None = None  # of `Traffic`; None: as `cosim.scenario.traffic` decides
 
     @cached_property
     def cell(self) -> str:
@@ -93,6 +96,12 @@ class EpisodeId:
         numbers = {name: given[name] for name in names if isinstance(given[name], int | float)}
         return replace(found, **numbers)  # an angle of 45 stays 45: the cell is a hash of its text
 
+    @property
+    def drives(self) -> bool:
+        """Whether cosim may drive anybody where the scenario's own file does not say so."""
+        fleet = chosen_fleet(self.av_type, self.av_ids, self.penetration)
+        return bool(driven(fleet, self.behavior, self.errors))
+
     def with_seed(self, seed: int) -> EpisodeId:
         """Another episode of the same cell."""
         return replace(self, seed=seed)
@@ -115,6 +124,7 @@ class EpisodeId:
             mission=self.mission,
             on_collision=self.on_collision,
             errors=self.errors,
+            traffic=self.traffic,
             options=options,
         )
         return found if self.tilt is None else replace(found, tilt=tilt.read(self.tilt, "tilt"))

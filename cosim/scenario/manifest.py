@@ -20,6 +20,8 @@ POLICY_FILES = "policy_files"  # what decides how the policy drives: weights, or
 _KINDS: Mapping[str, Any] = {  # what is read again of the documents of `cosim run` and `cosim evaluate`
     **dict.fromkeys(("files", POLICY_FILES, "sumo_options", "units", "better"), Mapping[str, str]),
     "versions": Mapping[str, str | None],
+    "traffic": str,
+    "changed_options": Mapping[str, Mapping[str, str]],
     "sumo_arguments": tuple[str, ...],
     "seed": int,
     "seeds": tuple[int, int],
@@ -39,6 +41,8 @@ def manifest(scenario: Scenario, seed: int) -> dict[str, Any]:
         # named where they are not a world's own: episodes are told apart by this document, older ones too
         **({"on_collision": goes_on} if (goes_on := scenario.on_collision) != OnCollision.END else {}),
         **({} if scenario.built_in else {"mission": scenario.mission.vehicles or scenario.mission.kind}),
+        **({} if scenario.built_in else {"traffic": scenario.traffic}),
+        **({"changed_options": _changed(scenario)} if scenario.changed else {}),
         **({} if scenario.errors is None else {"errors": _errors(scenario.errors)}),
         **({} if scenario.tilt is None else {"tilt": scenario.tilt.text()}),
         "driver_model": scenario.driver_model,
@@ -113,6 +117,11 @@ def named(files: Iterable[Path]) -> dict[str, Path]:
         unique = (n for n in lengths if sum(end(other, n) == end(path, n) for other in each) == 1)
         found[end(path, next(unique, len(path.parts)))] = path
     return found
+
+
+def _changed(scenario: Scenario) -> dict[str, dict[str, str]]:
+    """SUMO option -> the file's value, the one that is used, and why."""
+    return {c.option: {"file": c.file, "used": c.used, "why": c.why} for c in scenario.changed}
 
 
 def _errors(errors: Errors) -> dict[str, str]:

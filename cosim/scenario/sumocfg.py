@@ -6,7 +6,7 @@ A foreign configuration is never handed to SUMO as it is: its outputs could writ
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,7 +38,6 @@ _SYNONYMS = {
     "C": "save-configuration",
     "save-config": "save-configuration",
 }
-_AS_OURS = {("step-length", "0.1"), ("collision.action", "warn")}  # nothing is lost with these
 # SUMO takes any root in a configuration; these are files of another kind, given by mistake.
 OTHER_ROOTS = frozenset(
     {"net", "nodes", "edges", "connections", "types", "routes", "trips", "additional", "add"}
@@ -60,7 +59,8 @@ _KEPT = re.compile(
     r"""weight-(files|attribute) | load-state(\..+)? | junction-taz | step-method\.ballistic
     | extrapolate-departpos | route-steps | no-internal-links
     | ignore-(junction-blocker|route-errors|accidents)
-    | collision\.(stoptime|check-junctions|check-junctions\.mingap|mingap-factor)
+    | step-length | lateral-resolution
+    | collision\.(action|stoptime|check-junctions|check-junctions\.mingap|mingap-factor)
     | intermodal-collision\.(action|stoptime) | keep-after-arrival | max-num-(vehicles|persons|teleports)
     | scale | scale-suffix | time-to-(teleport|impatience)(\..+)? | waiting-time-memory
     | startup-wait-threshold | max-depart-delay | (sloppy|eager|emergency)-insert | insertion-checks
@@ -88,14 +88,12 @@ _REFUSED = {
     "help": "SUMO would print its help and stop",
     "version": "use `cosim doctor`",
     "mesosim": "the mesoscopic model has no vehicle positions",
-    "lateral-resolution": "LC2013, which is what drives here, has no sublane model",
+    "lateral-resolution": "say it in a .sumocfg: AVs change lanes by LC2013, which has no sublane model",
 }
 # Why an option of a .sumocfg is set aside, where that is not plain.
 _SET_ASIDE = {
-    "step-length": " (cosim's own step is used; `-- --step-length X` overrides it)",
     "seed": " (the episode's --seed decides)",
     "random": " (the episode's --seed decides)",
-    "collision.action": " (collisions are counted, never removed)",
 }
 
 
@@ -113,17 +111,19 @@ class SumoConfig:
     ignored: tuple[str, ...]  # set aside, "name=value" with the reason where there is one
 
 
-def read(path: Path) -> SumoConfig:
+def read(path: Path, replaced: Collection[str] = ()) -> SumoConfig:
     """The configuration `path` with its relative names resolved against its own folder.
+
+    `replaced`: names of `INPUTS` that are given otherwise: those of the file need not be there.
 
     Raises:
         BadInput: the file is missing or malformed, names no net, or names files that are not there.
     """
     path = path.absolute()
-    values = _values(path)
+    values = {name: value for name, value in _values(path).items() if name not in INPUTS or name not in replaced}
     folder = path.parent
     net = files(values.get("net-file", ""), folder, path, "net-file")
-    if len(net) != 1:
+    if len(net) != 1 and "net-file" not in replaced:
         raise BadInput("one net is needed", file=path, field="net-file", value=values.get("net-file", ""))
     kept, ignored = [], []
     for name, value in values.items():
@@ -132,7 +132,7 @@ def read(path: Path) -> SumoConfig:
         if name == "mesosim" and boolean(value):
             raise BadInput(_REFUSED["mesosim"], file=path, field=name, value=value)
         _check_finite(value, path, name)
-        if (name, value) in _AS_OURS:
+        if name == "lateral-resolution" and _off(value, path):
             continue
         if not keeps(name):
             ignored.append(f"{name}={value}{_SET_ASIDE.get(name, '')}")
@@ -143,7 +143,7 @@ def read(path: Path) -> SumoConfig:
     end = time_of(values["end"], path, "end") if "end" in values else None
     return SumoConfig(
         path=path,
-        net=net[0],
+        net=(*net, path)[0],
         routes=files(values.get("route-files", ""), folder, path, "route-files"),
         additional=files(values.get("additional-files", ""), folder, path, "additional-files"),
         begin=time_of(values["begin"], path, "begin") if "begin" in values else 0.0,
@@ -175,8 +175,6 @@ def command_line(arguments: Sequence[str]) -> dict[str, str]:
             value = rest.pop(0) if rest and not re.match(r"--?[A-Za-z]", rest[0]) else "true"
         if name in _REFUSED and boolean(value):
             raise BadInput(_REFUSED[name], field=f"--{name}", value=value)
-        if name == "collision.action" and value != "warn":
-            raise BadInput("collisions are counted, never removed", field=f"--{name}", value=value)
         _check_finite(value, None, f"--{name}")
         options[name] = value
     return options
@@ -246,6 +244,15 @@ def files(value: str, folder: Path, file: object, field: str) -> tuple[Path, ...
             except BadInput as error:
                 raise BadInput(error.problem, file=file, field=field, value=part) from None
     return tuple(found)
+
+
+def _off(lateral_resolution: str, file: object) -> bool:
+    """Whether no sublane model drives. Raises BadInput."""
+    try:
+        return float(lateral_resolution) <= 0.0
+    except ValueError:
+        field = "lateral-resolution"
+        raise BadInput("is not a number", file=file, field=field, value=lateral_resolution) from None
 
 
 def _check_finite(value: str, file: object, field: str) -> None:

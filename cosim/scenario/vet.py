@@ -180,12 +180,11 @@ def _gaps(net: Net, demands: list[Demand]) -> list[str]:
 def _unsupported(scenario: Scenario, demands: list[Demand]) -> list[str]:
     """What cosim does not know, though SUMO drives it (definitions.md, Not supported): these are warnings."""
     found = []
-    for option in scenario.ignored:
-        name, _, value = option.partition("=")
-        if name == "lateral-resolution" and value.split()[0].strip() not in ("0", "0.0", "-1"):
-            found.append(
-                f"{scenario.config}: {name}={value}: without SUMO's sublane model the traffic is another"
-            )
+    found += [
+        f"{scenario.config}: {c.option}={c.file}: without SUMO's sublane model the traffic is another"
+        for c in scenario.changed
+        if c.option == "lateral-resolution"
+    ]
     used = {name for demand in demands for name in (*demand.used["vehicle type"], *demand.mixtures)}
     off_road = {
         name: kind for d in demands for name, kind in d.classes.items() if kind in OFF_ROAD and name in used

@@ -17,7 +17,7 @@ from cosim.rewards import REWARDS
 from cosim.scenario import BEHAVIORS
 from cosim.scenario.behaviors import DRIVER_MODELS
 from cosim.scenario.sumo_outputs import OUTPUTS
-from cosim.types import OnCollision, Preset
+from cosim.types import OnCollision, Preset, Traffic
 
 UPLOAD = "upload:"  # before an upload's id, where a scenario or a policy is named
 LONGEST = 1000  # characters of a text, items of a list
@@ -32,6 +32,7 @@ _ALLOWED: dict[str, Iterable[str]] = {
     "driver_model": DRIVER_MODELS,
     "preset": Preset.ALL,
     "on_collision": OnCollision.ALL,
+    "traffic": Traffic.ALL,
     "output": OUTPUTS,
 }
 _ABOUT = {

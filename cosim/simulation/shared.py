@@ -15,6 +15,7 @@ from cosim.errors import BadInput, SimulationEnded, SimulationError
 from cosim.files.xml_input import is_there, regular_file
 from cosim.scenario import FOREIGN_DURATION, Scenario, check_timing, file_name
 from cosim.scenario.sumocfg import time_of
+from cosim.scenario.traffic import FORCED, USUAL
 from cosim.scenario.vehicle_types import VehicleTypes, vehicle_types
 from cosim.scenario.vet_net import read_net
 from cosim.scenario.vet_rules import some
@@ -23,13 +24,13 @@ from cosim.simulation.client import Client
 from cosim.simulation.derived_types import IDM_TYPE, drivers, not_derived
 from cosim.simulation.fleet import Fleet, set_type
 from cosim.simulation.net import NetReader
-from cosim.simulation.sumo import DEFAULTS, FORCED, GIVES_UP, SumoSimulator
+from cosim.simulation.sumo import GIVES_UP, SumoSimulator
 from cosim.types import OnCollision, Snapshot, Timing
 
 # Options that decide what figures mean, as `cosim run` sets them.
 OURS = {
-    "lanechange.duration": DEFAULTS["lanechange.duration"],
-    **{name: FORCED[name] for name in FORCED if name.startswith("collision.")},
+    "lanechange.duration": USUAL["lanechange.duration"],
+    **FORCED,
     "random": "false",
 }
 

@@ -22,6 +22,7 @@ from cosim.scenario.behaviors import AS_IS
 from cosim.scenario.disabled_outputs import disable_outputs
 from cosim.scenario.sumo_outputs import sumo_options
 from cosim.scenario.sumocfg import time_of
+from cosim.scenario.traffic import FORCED, USUAL
 from cosim.scenario.vehicle_types import VehicleTypes, vehicle_types
 from cosim.simulation.assistance import Assistance
 from cosim.simulation.backend import sumo
@@ -36,19 +37,10 @@ from cosim.simulation.fork import forked
 from cosim.simulation.human_errors import HumanErrors
 from cosim.simulation.stderr import SumoStderr
 from cosim.simulation.xerces import keep_initialized
-from cosim.types import Collision, Command, Due, Events, Kind, OnCollision, Preset, Receipt, Snapshot
+from cosim.types import Collision, Command, Due, Events, Kind, OnCollision, Preset, Receipt, Snapshot, Traffic
 
-# Ours, where a user's file does not say otherwise. A teleport would let a vehicle appear on the road.
-DEFAULTS = {
-    "lanechange.duration": "2",  # continuous lateral motion, definitions.md
-    "time-to-teleport": "-1",
-}
 ONE_SPEED = {"default.speeddev": "0"}  # our drivers' speeds are drawn by `cosim.scenario.behaviors`
-# Ours whatever the file says: collisions must be reported (docs/sumo.md: never `collision.action none`).
-FORCED = {
-    "collision.action": "warn",
-    "collision.check-junctions": "true",
-    "collision.mingap-factor": "0",
+QUIET = {
     "no-step-log": "true",
     "no-warnings": "true",
     "duration-log.disable": "true",
@@ -123,6 +115,7 @@ class SumoSimulator:
         errors = self._scenario.errors
         # with errors humans hit humans, and an episode that only an AV's crash ends goes on
         goes_on = self._scenario.on_collision == OnCollision.CONTINUE or errors is not None
+        goes_on = goes_on and self._scenario.traffic == Traffic.CONTROLLED  # else SUMO does what the file asks
         self._wrecks = Wrecks(self._commander, self._drivers) if goes_on else None
         self._errors = (
             None
@@ -306,21 +299,24 @@ class SumoSimulator:
 
     def _arguments(self, seed: int) -> list[str]:
         s = self._scenario
-        types = () if s.built_in and s.preset != Preset.LAWFUL else (sumo_scenarios.TYPES,)
+        controlled = s.traffic == Traffic.CONTROLLED
+        without = not controlled or (s.built_in and s.preset != Preset.LAWFUL)
+        types = () if without else (sumo_scenarios.TYPES,)
         additional = (*s.additional, *types)
         settings, files = sumo_options(self._outputs, s)
         options = {
             "net-file": str(s.net),
             "route-files": ",".join(map(str, s.demand)),
             "additional-files": ",".join(map(str, additional)),
-            "begin": f"{s.begin:g}",
-            "step-length": f"{s.timing.step:g}",
+            "begin": f"{s.begin:.12g}",
+            "step-length": f"{s.timing.step:.12g}",
             "seed": str(seed % (2**31 - 1)),
-            **DEFAULTS,
+            **(USUAL if controlled else {}),
             **(ONE_SPEED if s.ships or s.behavior != AS_IS else {}),
             **settings,
             **dict(s.options),
-            **FORCED,
+            **(FORCED if controlled else {}),
+            **QUIET,
             **files,
         }
         return [text for key, value in options.items() if value for text in (f"--{key}", value)]

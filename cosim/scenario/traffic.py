@@ -1,0 +1,148 @@
+"""Whose SUMO options drive a user's file: the file's own (`as-is`), or those that cosim's drivers and
+figures need (`controlled`). What that changes is named in every result (docs/definitions.md, Traffic)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, NamedTuple
+
+from cosim.errors import BadInput, one_of
+from cosim.scenario.behaviors import AS_IS
+from cosim.scenario.sumocfg import boolean, time_of
+from cosim.types import Timing, Traffic
+
+if TYPE_CHECKING:
+    from cosim.scenario import Fleet, Scenario
+
+STEP, STEP_NEEDED = "step-length", "AVs are commanded, and conflicts measured, every 0.1 s"
+SUMO_STEP = "1"  # s, where a file names none
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """A SUMO option of controlled traffic."""
+
+    default: str  # SUMO's own
+    used: str  # "": the option is not passed on
+    why: str
+    forced: bool = True  # over the file's own value
+
+
+RULES: Mapping[str, Rule] = {
+    "lateral-resolution": Rule("-1", "", "AVs change lanes by LC2013, which has no sublane model"),
+    # continuous lateral motion, definitions.md
+    "lanechange.duration": Rule("0", "2", "a lane change is a movement that others can see", forced=False),
+    "time-to-teleport": Rule("300", "-1", "a teleport would put a vehicle before an AV", forced=False),
+    # docs/sumo.md: never `none`, nothing would be reported
+    "collision.action": Rule("teleport", "warn", "collisions are counted, and who crashed stands"),
+    "collision.check-junctions": Rule("false", "true", "collisions inside junctions are counted"),
+    "collision.mingap-factor": Rule("-1", "0", "only contact is a collision"),
+}
+ONLY_AS_IS = ("collision.action", "lateral-resolution")
+USUAL = {name: rule.used for name, rule in RULES.items() if not rule.forced}
+FORCED = {name: rule.used for name, rule in RULES.items() if rule.forced and rule.used}
+
+
+class Changed(NamedTuple):
+    """An option that is not as the file has it."""
+
+    option: str
+    file: str  # the file's value, SUMO's default where the file names none
+    used: str
+    why: str
+
+
+def clocks(step: float) -> Timing:
+    """The usual clocks where SUMO's step divides them, else the next whole multiples; `step` in s."""
+    usual = Timing()
+    frame = step * _times(usual.frame, step)
+    return Timing(step=step, frame=frame, decision=frame * _times(usual.decision, frame))
+
+
+def check_timing(timing: Timing, file: object, field: str, value: object) -> None:
+    """Each clock must be a whole number of the one below it (definitions.md, Time)."""
+    for name, long, short in (
+        ("frame", timing.frame, timing.step),
+        ("decision", timing.decision, timing.frame),
+    ):
+        ratio = long / short if short > 0.0 else 0.0
+        if ratio < 0.999 or abs(ratio - round(ratio)) > 1e-6:
+            problem = f"a {name} of {long:g} s is not a whole number of {short:g} s"
+            raise BadInput(problem, file=file, field=field, value=value)
+
+
+def stepped(timing: Timing, typed: Mapping[str, str], traffic: str) -> Timing:
+    """`timing` with the step length typed after `--`, where there is one. Raises BadInput."""
+    if STEP not in typed:
+        return timing
+    place, field, text = "command line", f"--{STEP}", typed[STEP]
+    step = time_of(text, place, field)
+    if traffic == Traffic.AS_IS:
+        if step <= 0.0:
+            raise BadInput("must be above 0", file=place, field=field, value=text)
+        return clocks(step)
+    found = replace(timing, step=step)
+    check_timing(found, place, field, text)
+    return found
+
+
+def settled(scenario: Scenario, typed: Mapping[str, str], wanted: str | None) -> Scenario:
+    """`scenario` with its clocks and options as its traffic wants them.
+
+    Where cosim drives nobody (`driven`), the traffic of a user's .sumocfg is as it is. `typed`: options of
+    the command line, which win. `wanted`: `--traffic`.
+
+    Raises:
+        BadInput: `as-is` where cosim drives somebody; a step that does not divide a frame.
+    """
+    errors = None if scenario.errors is None else scenario.errors.name
+    who = driven(scenario.fleet, scenario.behavior, errors)
+    who = "the scenario's own file says how it drives" if scenario.built_in else who
+    if wanted is not None and one_of(wanted, Traffic.ALL, "--traffic") == Traffic.AS_IS and who:
+        raise BadInput(f"cannot be: {who}", field="--traffic", value=wanted)
+    traffic = wanted or (Traffic.CONTROLLED if who else Traffic.AS_IS)
+    if traffic == Traffic.CONTROLLED and typed.get("collision.action", "warn") != "warn":
+        problem = "collisions are counted, never removed"
+        raise BadInput(problem, field="--collision.action", value=typed["collision.action"])
+    keeps = scenario.built_in or traffic == Traffic.AS_IS
+    timing = stepped(scenario.timing if keeps else Timing(), typed, traffic)
+    own = dict(scenario.options)
+    file_step = own.pop(STEP, None)
+    if traffic == Traffic.AS_IS:
+        return replace(scenario, traffic=traffic, timing=timing, options=tuple(own.items()))
+    changed = []
+    rules = {STEP: Rule(SUMO_STEP, f"{timing.step:g}", STEP_NEEDED, forced=STEP not in typed), **RULES}
+    written = own if file_step is None else {STEP: file_step, **own}
+    for name, rule in rules.items():
+        if scenario.built_in and name not in written:
+            continue  # its own file leaves it to cosim
+        file, used = written.get(name, rule.default), rule.used or rule.default
+        if (rule.forced or name not in written) and not _same(file, used):
+            changed.append(Changed(name, file, used, rule.why))
+    overruled = {*ONLY_AS_IS, *(c.option for c in changed)}
+    options = tuple((k, v) for k, v in own.items() if k not in overruled)
+    return replace(scenario, traffic=traffic, timing=timing, options=options, changed=tuple(changed))
+
+
+def driven(fleet: Fleet | None, behavior: str | None, errors: str | None) -> str:
+    """Whom cosim may drive in a user's file, in words; "" for nobody. None: as the file has it."""
+    if fleet is not None and fleet.may_have_avs:
+        return f"AVs are driven (by {fleet.describe()})"
+    if behavior not in (None, AS_IS):
+        return f"human drivers are of Table II ({behavior})"
+    return "" if errors is None else f"human drivers make errors ({errors})"
+
+
+def _times(wanted: float, unit: float) -> int:
+    """How often `unit` fits into `wanted`, rounded up."""
+    return max(math.ceil(wanted / unit - 1e-6), 1)
+
+
+def _same(a: str, b: str) -> bool:
+    """Whether SUMO reads two values of these options alike."""
+    try:
+        return float(a) == float(b)
+    except ValueError:
+        return a == b or (b in ("true", "false") and boolean(a) == boolean(b))

@@ -220,7 +220,9 @@ class Episode:
         """What a policy gets to know of the episode `seed` before it starts; `svo` (phi) in rad."""
         return PolicyContext(
             road=self.simulator.road,
-            timing=Timing() if self.scenario.traffic == Traffic.AS_IS else self.scenario.timing,  # no AV comes
+            timing=Timing()
+            if self.scenario.traffic == Traffic.AS_IS
+            else self.scenario.timing,  # no AV comes
             observation=self.observation,
             svo=svo,
             rng=generator(seed, "policy"),
@@ -320,7 +322,8 @@ class Episode:
             reasons.append(f"{waiting} vehicles found no room and were never inserted: demand above capacity")
         if teleports := metrics["teleports"].value:
             reasons.append(f"{teleports} vehicles were teleported by SUMO")
-        if self.steps and not self._tally["decisions"] and not self._metrics.had_avs:
+        none_wanted = self.scenario.fleet.penetration == 0.0
+        if self.steps and not none_wanted and not self._tally["decisions"] and not self._metrics.had_avs:
             reasons.append("no AV was ever on the road")
         return tuple(reasons)
 

@@ -69,12 +69,14 @@ class Plan:
 def cells(spec: Spec) -> Iterator[EpisodeId]:
     """The case of every cell's first seed; each once, though one policy may have one preset only.
 
-    Cells with and without AVs are compared: in all of them traffic is controlled if in one of them cosim drives.
+    Cells with and without AVs are compared: traffic is controlled in all of them if cosim drives in one.
     """
     found = [*dict.fromkeys(_cells(spec))]
     if spec.traffic is None and any(case.drives for case in found):
         found = [
-            case if case.drives or not case.what.endswith(CONFIG) else replace(case, traffic=Traffic.CONTROLLED)
+            case
+            if case.drives or not case.what.endswith(CONFIG)
+            else replace(case, traffic=Traffic.CONTROLLED)
             for case in found
         ]
     yield from found

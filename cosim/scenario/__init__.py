@@ -176,8 +176,8 @@ def load(
 
     `demand`: names of the world's demands or files; `options`: SUMO options as typed after `--`, which win
     over the file's. `duration`, `warmup` in s. `mission`: a vehicle's id or a pattern of ids (full match),
-    "none" or "auto". `errors`: of human drivers, a level or a file (`cosim.scenario.human_errors`). `traffic`:
-    of `Traffic`, None where `cosim.scenario.traffic` decides. Only this file's own syntax is checked:
+    "none" or "auto". `errors`: of human drivers, a level or a file (`cosim.scenario.human_errors`).
+    `traffic`: of `Traffic`; None: `cosim.scenario.traffic` decides. Only this file's own syntax is checked:
     `cosim.scenario.vet` reads the rest.
 
     Raises:

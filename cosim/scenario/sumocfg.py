@@ -120,14 +120,15 @@ def read(path: Path, replaced: Collection[str] = ()) -> SumoConfig:
         BadInput: the file is missing or malformed, names no net, or names files that are not there.
     """
     path = path.absolute()
-    values = {name: value for name, value in _values(path).items() if name not in INPUTS or name not in replaced}
+    unread = {*INPUTS} & {*replaced}
+    values = {name: value for name, value in _values(path).items() if name not in unread}
     folder = path.parent
     net = files(values.get("net-file", ""), folder, path, "net-file")
     if len(net) != 1 and "net-file" not in replaced:
         raise BadInput("one net is needed", file=path, field="net-file", value=values.get("net-file", ""))
     kept, ignored = [], []
     for name, value in values.items():
-        if name in INPUTS or name in ("begin", "end"):
+        if name in (*INPUTS, "begin", "end"):
             continue
         if name == "mesosim" and boolean(value):
             raise BadInput(_REFUSED["mesosim"], file=path, field=name, value=value)

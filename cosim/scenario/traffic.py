@@ -97,8 +97,7 @@ def settled(scenario: Scenario, typed: Mapping[str, str], wanted: str | None) ->
     Raises:
         BadInput: `as-is` where cosim drives somebody; a step that does not divide a frame.
     """
-    errors = None if scenario.errors is None else scenario.errors.name
-    who = driven(scenario.fleet, scenario.behavior, errors)
+    who = _driven(scenario)
     who = "the scenario's own file says how it drives" if scenario.built_in else who
     if wanted is not None and one_of(wanted, Traffic.ALL, "--traffic") == Traffic.AS_IS and who:
         raise BadInput(f"cannot be: {who}", field="--traffic", value=wanted)
@@ -133,6 +132,18 @@ def driven(fleet: Fleet | None, behavior: str | None, errors: str | None) -> str
     if behavior not in (None, AS_IS):
         return f"human drivers are of Table II ({behavior})"
     return "" if errors is None else f"human drivers make errors ({errors})"
+
+
+def check(scenario: Scenario) -> None:
+    """Raises BadInput where traffic is as it is though cosim drives somebody: they came after `load`."""
+    if scenario.traffic == Traffic.AS_IS and (who := _driven(scenario)):
+        raise BadInput(f"{who}: load the scenario with them", field="traffic", value=scenario.traffic)
+
+
+def _driven(scenario: Scenario) -> str:
+    return driven(
+        scenario.fleet, scenario.behavior, None if scenario.errors is None else scenario.errors.name
+    )
 
 
 def _times(wanted: float, unit: float) -> int:

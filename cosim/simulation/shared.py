@@ -13,9 +13,9 @@ import libsumo
 import sumo_scenarios
 from cosim.errors import BadInput, SimulationEnded, SimulationError
 from cosim.files.xml_input import is_there, regular_file
-from cosim.scenario import FOREIGN_DURATION, Scenario, check_timing, file_name
+from cosim.scenario import FOREIGN_DURATION, Scenario, file_name
 from cosim.scenario.sumocfg import time_of
-from cosim.scenario.traffic import FORCED, USUAL
+from cosim.scenario.traffic import FORCED, USUAL, check_timing
 from cosim.scenario.vehicle_types import VehicleTypes, vehicle_types
 from cosim.scenario.vet_net import read_net
 from cosim.scenario.vet_rules import some

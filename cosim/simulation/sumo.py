@@ -22,7 +22,7 @@ from cosim.scenario.behaviors import AS_IS
 from cosim.scenario.disabled_outputs import disable_outputs
 from cosim.scenario.sumo_outputs import sumo_options
 from cosim.scenario.sumocfg import time_of
-from cosim.scenario.traffic import FORCED, USUAL
+from cosim.scenario.traffic import FORCED, USUAL, check
 from cosim.scenario.vehicle_types import VehicleTypes, vehicle_types
 from cosim.simulation.assistance import Assistance
 from cosim.simulation.backend import sumo
@@ -75,6 +75,7 @@ class SumoSimulator:
                 "this process already runs a simulation, and libsumo would silently replace it: "
                 "use one process per simulation (cosim.envs and cosim.open do)"
             )
+        check(scenario)
         self._types = self._types_of(scenario)
         fleet = scenario.fleet.type
         self._av_types = frozenset() if fleet is None else self._types.named(fleet)
@@ -115,7 +116,8 @@ class SumoSimulator:
         errors = self._scenario.errors
         # with errors humans hit humans, and an episode that only an AV's crash ends goes on
         goes_on = self._scenario.on_collision == OnCollision.CONTINUE or errors is not None
-        goes_on = goes_on and self._scenario.traffic == Traffic.CONTROLLED  # else SUMO does what the file asks
+        # as it is, SUMO does with those who crashed what the file asks for
+        goes_on = goes_on and self._scenario.traffic == Traffic.CONTROLLED
         self._wrecks = Wrecks(self._commander, self._drivers) if goes_on else None
         self._errors = (
             None

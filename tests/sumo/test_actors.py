@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -138,9 +137,7 @@ def street(net: Path, request: pytest.FixtureRequest, tmp_path: Path) -> Iterato
         f'<configuration><net-file value="{net}"/><route-files value="d.rou.xml"/><end value="60"/>'
         '<step-length value="0.1"/></configuration>'
     )
-    scenario = replace(
-        load(str(config)), fleet=Fleet(type="av"), duration=12.0, warmup=0.2, preset=Preset.UNGUARDED
-    )
+    scenario = load(str(config), fleet=Fleet(type="av"), duration=12.0, warmup=0.2, preset=Preset.UNGUARDED)
     worker = Worker(Street, scenario, timeout=60.0)
     yield worker
     worker.close()

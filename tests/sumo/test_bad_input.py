@@ -189,7 +189,11 @@ ARGUMENTS: dict[str, tuple[list[str], str, str]] = {
     "unknown AV type": (["--av-type", "trukc"], "trukc", "'truck'"),
     "AV pattern": (["--av-ids", "("], "--av-ids", "regular expression"),
     "SUMO seed": (["--", "--seed", "3"], "--seed", "cosim's own"),
-    "step that does not divide": (["--", "--step-length", "0.3"], "--step-length='0.3'", "whole number"),
+    "step that does not divide": (
+        ["--penetration", "1", "--", "--step-length", "0.3"],
+        "--step-length='0.3'",
+        "whole number",
+    ),
     "output path below a file": (["--out", "{folder}/mine.sumocfg/run"], "mine.sumocfg", ""),
 }
 

@@ -80,13 +80,14 @@ def test_a_foreign_configuration_keeps_its_traffic_and_loses_its_outputs(foreign
         "time-to-teleport": "120",
         "lanechange.duration": "3",
         "device.rerouting.period": "60",
+        "collision.action": "none",
     }
     ignored = " ".join(s.ignored)
-    for name in ("tripinfo-output", "fcd-output", "remote-port", "seed", "step-length", "collision.action"):
+    for name in ("tripinfo-output", "fcd-output", "remote-port", "seed"):
         assert f"{name}=" in ignored
     assert (s.begin, s.duration, s.warmup) == (60.0, 140.0, 0.0)
     assert (s.behavior, s.demand_name, s.preset) == ("as-is", "as-is", Preset.LAWFUL)
-    assert s.timing.step == 0.1
+    assert (s.timing.step, s.traffic, s.changed) == (0.5, "as-is", ())
     assert not s.built_in
 
 

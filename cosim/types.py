@@ -97,7 +97,7 @@ class Traffic:
     ALL = (AS_IS, CONTROLLED)
 
 
-INSERTION = "insertion"  # `Collision.kind`
+INSERTION, INSIDE = "insertion", "junction"  # of `Collision.kind`
 
 
 @dataclass(frozen=True, slots=True)

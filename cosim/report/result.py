@@ -6,7 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cosim.files import cannot, whole
-from cosim.types import Collision, EpisodeResult, HumanError, Metric
+from cosim.report.wording import traffic
+from cosim.scenario.traffic import CHECKS_INSIDE
+from cosim.types import INSIDE, Collision, EpisodeResult, HumanError, Metric
 
 # Columns that the table of an episode shows -> the measure of them that reports and comparisons show first.
 FIRST = {
@@ -68,7 +70,8 @@ def table(result: EpisodeResult, *, first: bool = True) -> str:
         f"  behaviour {result.behavior}, drivers {result.driver_model}, preset {result.preset}, "
         f"svo {result.svo_deg:g} deg, seed {result.seed}, {result.steps} decisions",
     ]
-    lines += traffic_lines(result)
+    if whose := traffic(result.manifest):
+        lines.append(f"  traffic {whose}")
     if result.errors is not None:
         begun = Counter(error.kind for error in result.errors_begun).most_common()
         words = ", ".join(f"{count} {kind}" for kind, count in begun) or "none"
@@ -83,6 +86,10 @@ def table(result: EpisodeResult, *, first: bool = True) -> str:
         who += _error(c, result.errors_begun)
         where = f"on {c.lane}" if c.lane else "off the lanes"
         lines.append(f"  collision at {_clock(c.time, result)}: {c.collider} hit {c.victim} {where} ({who})")
+    if overlooked := _overlooked(result):
+        lines.append(
+            f"  {overlooked} of these: humans inside junctions, where the file has SUMO not look; they drive on"
+        )
     lines += [f"  not comparable: {reason}" for reason in result.validity]
     lines += [f"  not passed on to SUMO: {option}" for option in result.manifest["options_not_passed_on"]]
     lines.append(f"  trace_hash               {result.trace_hash}")
@@ -91,13 +98,11 @@ def table(result: EpisodeResult, *, first: bool = True) -> str:
     return "\n".join(lines)
 
 
-def traffic_lines(result: EpisodeResult) -> list[str]:
-    """`traffic as-is`, or what was changed of a user's file."""
-    if "traffic" not in result.manifest:
-        return []
-    changed = result.manifest.get("changed_options", {})
-    words = ", ".join(f"{name} {c['file']} -> {c['used']}" for name, c in changed.items())
-    return [f"  traffic {result.manifest['traffic']}" + f": {words}" * bool(words)]
+def _overlooked(result: EpisodeResult) -> int:
+    """Collisions of two humans that the options of the user's file would not have shown: none is a wreck."""
+    if CHECKS_INSIDE not in result.manifest.get("changed_options", {}) or result.errors is not None:
+        return 0
+    return sum(c.kind == INSIDE and not (c.collider_is_av or c.victim_is_av) for c in result.collisions)
 
 
 def error_of(collision: Collision, begun: Sequence[HumanError]) -> HumanError | None:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from cosim.scenario import Fleet, Scenario
 
 STEP, STEP_NEEDED = "step-length", "AVs are commanded, and conflicts measured, every 0.1 s"
+CHECKS_INSIDE = "collision.check-junctions"
 SUMO_STEP = "1"  # s, where a file names none
 
 
@@ -37,7 +38,7 @@ RULES: Mapping[str, Rule] = {
     "time-to-teleport": Rule("300", "-1", "a teleport would put a vehicle before an AV", forced=False),
     # docs/sumo.md: never `none`, nothing would be reported
     "collision.action": Rule("teleport", "warn", "collisions are counted, and who crashed stands"),
-    "collision.check-junctions": Rule("false", "true", "collisions inside junctions are counted"),
+    CHECKS_INSIDE: Rule("false", "true", "collisions inside junctions are counted"),
     "collision.mingap-factor": Rule("-1", "0", "only contact is a collision"),
 }
 ONLY_AS_IS = ("collision.action", "lateral-resolution")

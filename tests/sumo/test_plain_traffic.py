@@ -168,3 +168,23 @@ def test_a_policy_that_predicts_waits_for_nobody_in_traffic_as_it_is(
     found = document(capsys, str(user), "--duration", "4", "--policy", "vfn-p", "--penetration", "0")
     assert found["steps"] == 4
     assert found["comparable"] is True
+
+
+@pytest.mark.parametrize(("checks", "wrecks"), [("false", False), ("true", True)])
+@pytest.mark.parametrize("user", [("priority", "SUMO's defaults")], indirect=True)
+def test_humans_overlap_inside_a_junction_as_their_file_lets_them(
+    user: Path, checks: str, wrecks: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    blind = (
+        '<vType id="DEFAULT_VEHTYPE" jmIgnoreJunctionFoeProb="1" jmIgnoreFoeProb="1" jmIgnoreFoeSpeed="99"/>'
+    )
+    (user.parent / "a.add.xml").write_text(f"<additional>{blind}</additional>")
+    more = f'<additional-files value="a.add.xml"/><collision.check-junctions value="{checks}"/>'
+    user.write_text(user.read_text().replace("</conf", f"{more}</conf"))
+    flags = ["run", str(user), "--traffic", "controlled", "--duration", "60", "--mission", "none"]
+    assert main([*flags, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [c["kind"] for c in found["collision_list"]].count("junction") > 2
+    assert (found["wrecks_removed"] > 0) == wrecks
+    assert main(flags) == 0
+    assert ("of these: humans inside junctions" in capsys.readouterr().out) != wrecks

@@ -90,6 +90,7 @@ def html(run: Run, shown: str | None = None) -> str:
         ],
         more_wrong=max(len(wrong) - FAILURES, 0),
         reasons=reasons([row for row in run.rows if not_comparable(row)]),
+        traffic=_traffic(run),
         manifest=_manifest(run),
     )
 
@@ -199,6 +200,13 @@ def _last_line(row: Row) -> str:
     """Of an episode without figures: the last thing its simulation said, else our own words."""
     lines = [line.strip() for line in str(row.get("stderr") or "").splitlines() if line.strip()]
     return lines[-1] if lines else str(row.get("error") or "no reason given")
+
+
+def _traffic(run: Run) -> dict[str, str]:
+    """A user's file -> whose options drove its traffic."""
+    cells = run.manifest.get("cells", {})
+    about = {row["scenario"]: cells.get(row["cell"], {}).get("manifest", {}) for row in run.rows}
+    return {name: words for name, driven in about.items() if (words := wording.traffic(driven))}
 
 
 def _manifest(run: Run) -> dict[str, Any]:

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cosim.files import cannot, whole
-from cosim.report.wording import traffic
-from cosim.scenario.traffic import CHECKS_INSIDE
+from cosim.scenario.traffic import CHECKS_INSIDE, in_words
 from cosim.types import INSIDE, Collision, EpisodeResult, HumanError, Metric
 
 # Columns that the table of an episode shows -> the measure of them that reports and comparisons show first.
@@ -70,7 +69,7 @@ def table(result: EpisodeResult, *, first: bool = True) -> str:
         f"  behaviour {result.behavior}, drivers {result.driver_model}, preset {result.preset}, "
         f"svo {result.svo_deg:g} deg, seed {result.seed}, {result.steps} decisions",
     ]
-    if whose := traffic(result.manifest):
+    if whose := in_words(result.manifest):
         lines.append(f"  traffic {whose}")
     if result.errors is not None:
         begun = Counter(error.kind for error in result.errors_begun).most_common()
@@ -87,9 +86,7 @@ def table(result: EpisodeResult, *, first: bool = True) -> str:
         where = f"on {c.lane}" if c.lane else "off the lanes"
         lines.append(f"  collision at {_clock(c.time, result)}: {c.collider} hit {c.victim} {where} ({who})")
     if overlooked := _overlooked(result):
-        lines.append(
-            f"  {overlooked} of these: humans inside junctions, where the file has SUMO not look; they drive on"
-        )
+        lines.append(f"  {overlooked} of these: humans inside junctions, not checked in the file: they go on")
     lines += [f"  not comparable: {reason}" for reason in result.validity]
     lines += [f"  not passed on to SUMO: {option}" for option in result.manifest["options_not_passed_on"]]
     lines.append(f"  trace_hash               {result.trace_hash}")

@@ -53,13 +53,6 @@ def sample(counts: Mapping[str, Any]) -> str:
     return f"{text}, {counts['na']} NA" if counts.get("na") else text
 
 
-def traffic(manifest: Mapping[str, Any]) -> str:
-    """`as-is`, or `controlled: step-length 1 -> 0.1, ...` of a user's file; "" of a scenario of ours."""
-    changed = manifest.get("changed_options", {})
-    words = ", ".join(f"{name} {c['file']} -> {c['used']}" for name, c in changed.items())
-    return ": ".join(filter(None, (manifest.get("traffic", ""), words)))
-
-
 def events(count: int, exposure: float, per: str) -> str:
     """`12 in 3.4 h`, `1 in 850 km`; `per`: the column of the exposure."""
     return f"{count} in {_digits(exposure, False)} {'km' if per.endswith('km') else 'h'}"

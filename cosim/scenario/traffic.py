@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from cosim.errors import BadInput, one_of
 from cosim.scenario.behaviors import AS_IS
@@ -133,6 +133,13 @@ def driven(fleet: Fleet | None, behavior: str | None, errors: str | None) -> str
     if behavior not in (None, AS_IS):
         return f"human drivers are of Table II ({behavior})"
     return "" if errors is None else f"human drivers make errors ({errors})"
+
+
+def in_words(manifest: Mapping[str, Any]) -> str:
+    """`as-is`, or `controlled: step-length 1 -> 0.1, ...` of a user's file; "" of a scenario of ours."""
+    changed = manifest.get("changed_options", {})
+    words = ", ".join(f"{name} {c['file']} -> {c['used']}" for name, c in changed.items())
+    return ": ".join(filter(None, (manifest.get("traffic", ""), words)))
 
 
 def check(scenario: Scenario) -> None:

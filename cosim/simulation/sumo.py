@@ -419,8 +419,10 @@ class SumoSimulator:
         return collisions
 
     def _overlooked(self, collision: Collision) -> bool:
-        """Whether it is of two humans inside a junction where the file has SUMO not look: many nets have lanes
-        there that lie too close. They drive on, as they would without AVs."""
+        """Whether it is of two humans inside a junction, which the file does not have SUMO check.
+
+        Many nets have lanes there that lie too close. They drive on, as they would without AVs.
+        """
         avs = collision.collider_is_av or collision.victim_is_av
         return self._looks_inside and collision.kind == INSIDE and not avs and self._errors is None
 

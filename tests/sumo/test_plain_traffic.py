@@ -175,13 +175,11 @@ def test_a_policy_that_predicts_waits_for_nobody_in_traffic_as_it_is(
 def test_humans_overlap_inside_a_junction_as_their_file_lets_them(
     user: Path, checks: str, wrecks: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    blind = (
-        '<vType id="DEFAULT_VEHTYPE" jmIgnoreJunctionFoeProb="1" jmIgnoreFoeProb="1" jmIgnoreFoeSpeed="99"/>'
-    )
-    (user.parent / "a.add.xml").write_text(f"<additional>{blind}</additional>")
+    blind = 'jmIgnoreJunctionFoeProb="1" jmIgnoreFoeProb="1" jmIgnoreFoeSpeed="99" length="16"'
+    (user.parent / "a.add.xml").write_text(f'<additional><vType id="DEFAULT_VEHTYPE" {blind}/></additional>')
     more = f'<additional-files value="a.add.xml"/><collision.check-junctions value="{checks}"/>'
     user.write_text(user.read_text().replace("</conf", f"{more}</conf"))
-    flags = ["run", str(user), "--traffic", "controlled", "--duration", "60", "--mission", "none"]
+    flags = ["run", str(user), "--traffic", "controlled", "--duration", "120", "--mission", "none"]
     assert main([*flags, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert [c["kind"] for c in found["collision_list"]].count("junction") > 2

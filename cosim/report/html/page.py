@@ -19,6 +19,7 @@ from cosim.report.html.plots import plots
 from cosim.report.result import EVERYBODY
 from cosim.report.run_folder import Run
 from cosim.report.summary import mission_guessed, not_comparable, reasons, status_counts
+from cosim.scenario.traffic import in_words
 from cosim.workers.tasks import OK
 
 FILE = "report.html"
@@ -206,7 +207,7 @@ def _traffic(run: Run) -> dict[str, str]:
     """A user's file -> whose options drove its traffic."""
     cells = run.manifest.get("cells", {})
     about = {row["scenario"]: cells.get(row["cell"], {}).get("manifest", {}) for row in run.rows}
-    return {name: words for name, driven in about.items() if (words := wording.traffic(driven))}
+    return {name: words for name, driven in about.items() if (words := in_words(driven))}
 
 
 def _manifest(run: Run) -> dict[str, Any]:

@@ -83,10 +83,13 @@ def work(args: argparse.Namespace) -> int:
     """
     from cosim.batch import execution, matrix
     from cosim.policies import check
+    from cosim.scenario.vet import watched
+    from cosim.workers.progress import Progress
 
     if args.out is None and (continued(args) or not args.dry_run):
         raise BadInput("name the run's folder", field="--out")
-    plan = matrix.plan(*asked(args), check)
+    with Progress("evaluate: checking files", "MB") as checking, watched(checking):
+        plan = matrix.plan(*asked(args), check)
     if not args.resume:
         matrix.check_names(plan)
     engine = engine_of(args)

@@ -131,7 +131,7 @@ def work(args: argparse.Namespace) -> int:
     from cosim.policies import check
     from cosim.scenario import sumo_outputs
     from cosim.scenario.manifest import TRACI, remembered
-    from cosim.scenario.vet import vetted
+    from cosim.scenario.vet import vetted, watched
     from cosim.workers.progress import Progress
 
     with contextlib.ExitStack() as undone:
@@ -139,7 +139,8 @@ def work(args: argparse.Namespace) -> int:
             check(case.policy)
             scenario = case.scenario(args.sumo_options)
             sumo_outputs.check(case.outputs, scenario.options)
-            scenario = vetted(scenario)
+            with Progress(f"{scenario.name}: checking its files", "MB") as checking, watched(checking):
+                scenario = vetted(scenario)
             folder = undone.enter_context(new_folder(args.out or None))
         except BaseException:
             worker.kill()  # it is still loading, and has nothing to put away

@@ -5,6 +5,7 @@ import numpy.typing as npt
 
 from cosim.geometry.compiled import compiled
 from cosim.metrics.context import AV, MetricContext
+from cosim.road.lane import NO_LIMIT
 from cosim.types import Floats, Metric, Snapshot
 
 TOLERATED = 0.5  # m/s
@@ -14,7 +15,8 @@ class Speeding:
     """Over all frames of AVs on a lane of the map, lanes inside junctions included."""
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
-        self._limits = np.array([lane.speed_limit for lane in context.road.lanes], np.float64)  # [l] m/s
+        limits = np.array([lane.speed_limit for lane in context.road.lanes], np.float64)  # [l] m/s
+        self._limits = np.where(limits == NO_LIMIT, np.inf, limits)
         self._frames = self._above = 0
         self._worst = 0.0  # m/s
         self.add(first)

@@ -4,6 +4,9 @@ from dataclasses import dataclass
 
 from cosim.arrays import Floats
 
+FASTEST_ROAD = 150.0  # m/s: a file that lets a lane be faster says that it has no limit
+NO_LIMIT = 200.0 / 3.6  # m/s, SUMO's default for the top speed of a car: what such a lane counts as
+
 
 @dataclass(frozen=True)
 class Lane:
@@ -18,10 +21,15 @@ class Lane:
     shape: Floats  # [p,2] m, centre line
     length: float  # m, SUMO's length: lane positions run from 0 to here
     width: float  # m
-    speed_limit: float  # m/s
+    speed_limit: float  # m/s; `NO_LIMIT` where there is none
     successors: tuple[int, ...] = ()  # lanes that follow directly (internal lanes included)
     left: int = -1
     right: int = -1
     internal: bool = False  # lies inside a junction
     start: str = ""  # junction where its edge begins (its own junction for an internal lane)
     end: str = ""  # junction where its edge ends
+
+
+def limit(speed: float) -> float:
+    """The speed limit in m/s of a lane whose file names this one."""
+    return speed if speed <= FASTEST_ROAD else NO_LIMIT

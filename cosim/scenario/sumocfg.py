@@ -54,7 +54,8 @@ FILE_OPTIONS = frozenset(
         "device.fcd-replay.files",
     }
 )
-# Everything of SUMO's topics `processing`, `routing` and of the devices that change how vehicles drive.
+# Everything of SUMO's topics `processing`, `routing` and `emissions`, and of devices that change how vehicles
+# drive or what tripinfo says of them; not of those that only fill a file of their own (ssm, fcd, btreceiver).
 _KEPT = re.compile(
     r"""weight-(files|attribute) | load-state(\..+)? | junction-taz | step-method\.ballistic
     | extrapolate-departpos | route-steps | no-internal-links
@@ -68,8 +69,9 @@ _KEPT = re.compile(
     | (tls|railsignal|default|overhead-wire|pedestrian|ride|mapmatch|weights|persontrip|railway|astar)\..+
     | railsignal-moving-block | slope-centered | emergencydecel\.warning-threshold | parking\.maneuver
     | use-stop-(ended|started) | routing-algorithm | replay-rerouting
+    | emissions\..+ | phemlight-(year|temperature)
     | (person-)?device\.(rerouting|toc|driverstate|bluelight|taxi|glosa|friction|stationfinder|battery
-        |elechybrid|fcd-replay)\..+""",
+        |elechybrid|fcd-replay|emissions|tripinfo|vehroute)\..+""",
     re.VERBOSE,
 )
 _NEVER_KEPT = re.compile(

@@ -5,17 +5,20 @@ file is read once as a stream (memory does not grow with the demand's size, exce
 numbers are checked, and every name it refers to must exist. Files that have not changed are not read again.
 """
 
+import contextlib
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 
 from cosim.errors import BadInput, hint
-from cosim.files.xml_input import regular_file
+from cosim.files.xml_input import Progress, is_there, regular_file
 from cosim.scenario import Scenario
 from cosim.scenario.sumocfg import FILE_OPTIONS
-from cosim.scenario.vet_demand import Demand, read_demand
+from cosim.scenario.vet_demand import WALKED, Demand, read_demand
 from cosim.scenario.vet_net import Net, read_net
 from cosim.scenario.vet_rules import OFF_ROAD, some
 from cosim.scenario.vet_signals import check_lengths
@@ -51,6 +54,7 @@ def vet(scenario: Scenario) -> VetReport:
         BadInput: the first thing that is wrong, with file, field and value.
     """
     config = scenario.config
+    _read.set(_Read(scenario.net, *scenario.additional, *scenario.demand))
     net = _net(*_stamp(regular_file(scenario.net, file=config, field="net-file")))
     demands = [*_all(scenario.additional, config, additional=True), *_all(scenario.demand, config)]
     _check_options(scenario)
@@ -88,6 +92,16 @@ def vetted(scenario: Scenario) -> Scenario:
     return replace(scenario, warnings=vet(scenario).warnings)
 
 
+@contextlib.contextmanager
+def watched(progress: Progress) -> Iterator[None]:
+    """In this block `progress` is told how many MB of a scenario's files are read, of how many."""
+    before = _progress.set(progress)
+    try:
+        yield
+    finally:
+        _progress.reset(before)
+
+
 def _all(paths: Iterable[Path], config: Path, *, additional: bool = False) -> list[Demand]:
     """The files and what they include, in SUMO's order of loading."""
     waiting = [
@@ -123,6 +137,7 @@ def _check_references(net: Net, demands: list[Demand], types: frozenset[str]) ->
         ("junction", net.junctions.__contains__, here, ()),
         ("vehicle type", types.__contains__, "", sorted(types)),
         ("route", routes.__contains__, "", sorted(routes)[:5000]),
+        (WALKED, routes.__contains__, "", sorted(routes)[:5000]),
     )
     for demand in demands:
         for kind, exists, where, known in kinds:
@@ -158,15 +173,21 @@ def _check_drivers(demands: list[Demand]) -> list[str]:
 def _gaps(net: Net, demands: list[Demand]) -> list[str]:
     """Where nobody can drive or walk, which SUMO finds out only on the way or never: these are warnings."""
     found = []
+    driven = frozenset[str]().union(*(d.driven for d in demands))
+    on_foot = frozenset[str]().union(*(d.used[WALKED] for d in demands)) - driven  # either way, on any edge
     for demand in demands:
-        broken = [(pair, place) for pair, place in demand.steps.items() if pair not in net.links]
+        steps, walks = dict(demand.steps), dict(demand.walks)
+        for name, (edges, place) in demand.named.items():
+            for pair in pairwise(edges.split()):
+                (walks if name in on_foot else steps).setdefault(pair, place)
+        broken = [(pair, place) for pair, place in steps.items() if pair not in net.links]
         for (a, b), place in broken[:3]:
             found.append(f"{demand.path}: impossible route ({place}): no connection from {a!r} to {b!r}")
         if len(broken) > 3:
             found.append(f"{demand.path}: {len(broken) - 3} further pairs of edges without a connection")
         apart = [
             (pair, place)
-            for pair, place in demand.walks.items()
+            for pair, place in walks.items()
             if not set(net.ends.get(pair[0], ())) & set(net.ends.get(pair[1], ()))
             and not any(edge.startswith(":") for edge in pair)
         ]
@@ -213,6 +234,26 @@ def _check_mission(scenario: Scenario, demands: list[Demand]) -> None:
         )
 
 
+class _Read:
+    """How much of a scenario's files is read."""
+
+    def __init__(self, *files: Path) -> None:
+        self._all = sum(
+            path.stat().st_size for path in files if is_there(path)
+        )  # bytes, without what they include
+        self._done = 0  # bytes, of whole files
+
+    def next(self, size: int) -> Progress:
+        """The progress of the next file, of `size` bytes."""
+        before, self._done = self._done, self._done + size
+        tell = _progress.get()
+        return lambda read, _: tell((before + read) / 1e6, max(self._all, self._done) / 1e6)
+
+
+_progress: ContextVar[Progress] = ContextVar("progress", default=lambda _, __: None)
+_read: ContextVar[_Read] = ContextVar("read")
+
+
 def _stamp(path: Path) -> tuple[Path, int, int]:
     """A key that changes when the file does: path, modification time in ns, size in bytes."""
     status = path.stat()
@@ -221,9 +262,9 @@ def _stamp(path: Path) -> tuple[Path, int, int]:
 
 @lru_cache(maxsize=8)
 def _net(path: Path, modified: int, size: int) -> Net:  # noqa: ARG001 - a changed file is read anew
-    return read_net(path)
+    return read_net(path, _read.get().next(size))
 
 
 @lru_cache(maxsize=64)
 def _demand(path: Path, modified: int, size: int, additional: bool) -> Demand:  # noqa: ARG001
-    return read_demand(path, additional=additional)
+    return read_demand(path, additional=additional, progress=_read.get().next(size))

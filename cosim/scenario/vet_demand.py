@@ -7,7 +7,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from cosim.errors import BadInput, hint
-from cosim.files.xml_input import regular_file, scan
+from cosim.files.xml_input import Progress, regular_file, scan
 from cosim.scenario.sumocfg import time_of
 from cosim.scenario.vet_rules import (
     DEMAND,
@@ -37,6 +37,7 @@ _ON_A_LANE = words(
     "stop busStop trainStop containerStop chargingStation parkingArea inductionLoop e1Detector "
     "instantInductionLoop laneAreaDetector e2Detector detEntry detExit"
 )
+WALKED = "route of a walk"  # a kind of what is `used`
 # Attributes by which an additional file writes files; `file` of other elements is read.
 OUTPUTS: Mapping[str, str] = {
     **dict.fromkeys(
@@ -62,8 +63,12 @@ class Demand:
     vehicles: dict[str, int] = field(default_factory=dict)  # vehicle or trip -> line
     flows: dict[str, tuple[int, float]] = field(default_factory=dict)  # -> line, vehicles at most
     used: defaultdict[str, dict[str, Place]] = field(default_factory=lambda: defaultdict(dict))
-    # kind (edge, lane, junction, vehicle type, route) -> name -> where it is first used
-    steps: dict[tuple[str, str], Place] = field(default_factory=dict)  # (edge, next edge) of whole routes
+    # kind (edge, lane, junction, vehicle type, route, `WALKED`) -> name -> where it is first used
+    steps: dict[tuple[str, str], Place] = field(default_factory=dict)  # (edge, next edge) of vehicles' routes
+    named: dict[str, tuple[str, Place]] = field(
+        default_factory=dict
+    )  # route of its own -> its edges as written
+    driven: set[str] = field(default_factory=set)  # routes that vehicles may take
     includes: list[Path] = field(default_factory=list)
     walks: dict[tuple[str, str], Place] = field(default_factory=dict)  # (edge, next edge) of walks
     classes: dict[str, str] = field(default_factory=dict)  # vehicle type -> its class, where it is given
@@ -74,8 +79,9 @@ class Demand:
     warnings: list[str] = field(default_factory=list)
 
 
-def read_demand(path: Path, *, additional: bool) -> Demand:
-    """The file `path`, its numbers and lane-change attributes checked, its references noted.
+def read_demand(path: Path, *, additional: bool, progress: Progress | None = None) -> Demand:
+    """The file `path`, its numbers and lane-change attributes checked, its references noted; `progress` in
+    bytes.
 
     Raises:
         BadInput: what `cosim.files.xml_input.scan` refuses; NaN, infinite or negative numbers; unknown
@@ -83,7 +89,7 @@ def read_demand(path: Path, *, additional: bool) -> Demand:
             person without a plan, a walk from or to nowhere; malformed signal programs.
     """
     reader = _DemandReader(path, additional)
-    scan(path, (), reader.start, reader.end)
+    scan(path, (), reader.start, reader.end, progress=progress)
     return reader.finish()
 
 
@@ -95,7 +101,7 @@ class _DemandReader(Reader):
         self._additional = additional
         self.found = Demand(path)
         self._owners: list[tuple[str, str]] = []  # (tag, id) of every open element
-        self._seen_lists: set[str] = set()
+        self._seen_lists: set[tuple[str, bool, str]] = set()  # tag, whether it has a name, edges
         self._last_depart = 0.0  # s
         self._unsorted: list[str] = []
         self._signals = SignalReader(path)
@@ -123,6 +129,8 @@ class _DemandReader(Reader):
                 self.found.mixtures.add(owner)
         elif tag in _MOVING:
             self._driver(tag, attributes, owner, line)
+            if "id" in attributes:  # flows inside a calibrator have none
+                self._departs(tag, attributes)
         elif tag in ("tlLogic", "phase"):
             self._signals.start(tag, attributes, line)
         elif tag == "vTypeDistribution":
@@ -135,6 +143,7 @@ class _DemandReader(Reader):
             self.found.routes.add(attributes["id"])
         elif tag == "calibrator":
             self.found.makes_vehicles = True
+        self.found.driven.update(self._driven(tag, attributes))
         if tag in _PERSONS:
             self._person, self._stages = Place(self._path, f"{tag}.id", "", line), 0
             self._picked_up = attributes.get("depart") == "triggered"
@@ -150,6 +159,14 @@ class _DemandReader(Reader):
             self.found.outputs.append(attributes["value"])
         self._owners.append((tag, owner))
 
+    def _driven(self, tag: str, attributes: dict[str, str]) -> list[str]:
+        """The routes that an element gives to vehicles."""
+        if tag == "routeDistribution":
+            return attributes.get("routes", "").split()
+        in_distribution = tag == "route" and self._parent == "routeDistribution"
+        name = "id" if in_distribution or tag == "routeProbReroute" else "route" if tag in _DRIVERS else ""
+        return [attributes[name]] if name in attributes else []
+
     def end(self, tag: str) -> None:
         _, owner = self._owners.pop()
         self._signals.end(tag)
@@ -161,6 +178,8 @@ class _DemandReader(Reader):
     def _stage(self, tag: str, attributes: dict[str, str], owner: str, line: int) -> None:
         """A stage of a plan: the first one says where it begins, each where it ends."""
         self._stages += 1
+        if "route" in attributes:
+            self._use(WALKED, attributes["route"], tag, "route", owner, line)
         if tag in ("stop", "access"):
             return
         if not attributes.get("edges", "x").strip():
@@ -196,7 +215,7 @@ class _DemandReader(Reader):
         if "type" in attributes:
             self._use("vehicle type", attributes["type"], tag, "type", owner, line)
         if tag not in _DRIVERS or "id" not in attributes:
-            return  # flows inside a calibrator have no id of their own
+            return
         name = attributes["id"]
         first = self.found.flows.get(name, (None,))[0] if tag == "flow" else self.found.vehicles.get(name)
         if first is not None:
@@ -207,13 +226,17 @@ class _DemandReader(Reader):
             self.found.vehicles[name] = line
         if "route" in attributes:
             self._use("route", attributes["route"], tag, "route", owner, line)
+
+    def _departs(self, tag: str, attributes: dict[str, str]) -> None:
+        """Note who is written behind somebody that departs later: SUMO drops it, persons too."""
         # a flow that names no begin begins with the simulation, so it is late behind anything later
-        depart = attributes.get("begin", "0") if tag == "flow" else attributes.get("depart", "")
+        is_flow = tag.lower().endswith("flow")
+        depart = attributes.get("begin", "0") if is_flow else attributes.get("depart", "")
         if self._additional or not depart[:1].isdigit():  # an additional file is loaded whole: order is free
             return
         when = time_of(depart, self._path, f"{tag}.depart")
         if when < self._last_depart:
-            self._unsorted.append(name)
+            self._unsorted.append(attributes["id"])
         else:
             self._last_depart = when
 
@@ -223,17 +246,27 @@ class _DemandReader(Reader):
                 self._use(kind, attributes[name], tag, name, owner, line)
         for name in _EDGE_LISTS:
             value = attributes.get(name)
-            if value is None or value in self._seen_lists:
+            if value is None:
                 continue
-            self._seen_lists.add(value)
             place = Place(self._path, f"{tag}.{name}", owner, line)
+            named = tag == "route" and "id" in attributes and self._parent not in _DRIVERS
+            if named:
+                self.found.named[owner] = value, place
+            if (tag, named, value) in self._seen_lists:
+                continue
+            self._seen_lists.add((tag, named, value))
             edges = value.split()
             for edge in edges:
                 self.found.used["edge"].setdefault(edge, place)
-            if name == "edges" and tag in ("route", "walk"):
+            if name == "edges" and tag in ("route", "walk") and not named:
                 steps = self.found.steps if tag == "route" else self.found.walks
                 for pair in pairwise(edges):
                     steps.setdefault(pair, place)
+
+    @property
+    def _parent(self) -> str:
+        """The tag that the present element is in."""
+        return self._owners[-1][0] if self._owners else ""
 
     def _use(self, kind: str, used: str, tag: str, name: str, owner: str, line: int) -> None:
         self.found.used[kind].setdefault(used, Place(self._path, f"{tag}.{name}", owner, line))

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from cosim.errors import BadInput
-from cosim.files.xml_input import scan
+from cosim.files.xml_input import Progress, scan
 from cosim.scenario.vet_hands import Hands
 from cosim.scenario.vet_rules import NET, Reader, some
 from cosim.scenario.vet_signals import PHASELESS, SignalReader, check_lengths
@@ -33,18 +33,18 @@ class Net:
         return index.isdigit() and int(index) < self.lanes.get(edge, 0)
 
 
-def read_net(path: Path) -> Net:
-    """The net `path`, checked.
+def read_net(path: Path, progress: Progress | None = None) -> Net:
+    """The net `path`, checked; `progress` in bytes.
 
     Raises:
         BadInput: what `cosim.files.xml_input.scan` refuses; no `version` (SUMO crashes); NaN, infinite or
-            negative numbers; lanes without a speed limit or above 150 m/s; gaps in lane indices; connections
+            negative numbers; lanes whose speed limit is 0; gaps in lane indices; connections
             to lanes that are not there; junctions whose right-of-way table does not fit their connections
             (SUMO crashes too); signals without a program or with a malformed one; lanes on the other side
             than `lefthand` says.
     """
     reader = _NetReader(path)
-    scan(path, ("net",), reader.start, reader.end)
+    scan(path, ("net",), reader.start, reader.end, progress=progress)
     return reader.finish()
 
 

@@ -35,7 +35,6 @@ TIME = Number(0.0, time=True)
 WORD_OR_TIME = Number(0.0, words=True, time=True)
 WORD_OR_NON_NEGATIVE = Number(0.0, words=True)
 WORD_OR_FINITE = Number(words=True)
-LANE_SPEED = Number(0.0, above=True, high=150.0)  # m/s: no road is faster, though SUMO 1.28 takes 1e308
 
 _NOT_A_SHAPE = re.compile(r"[^0-9eE+\-., \t\r\n]")  # NaN and inf have letters that no coordinate has
 _CALL = re.compile(r"\s*[A-Za-z]\w*\((.*)\)\s*", re.DOTALL)
@@ -58,8 +57,7 @@ NOT_CARS = OFF_ROAD | words("bicycle moped motorcycle scooter wheelchair pedestr
 
 _NET: Mapping[str, Mapping[str, Number]] = {
     "lane": {
-        **_each(POSITIVE, "length width"),
-        "speed": LANE_SPEED,
+        **_each(POSITIVE, "length width speed"),
         "index": INDEX,
         **_each(FINITE, "endOffset"),
     },

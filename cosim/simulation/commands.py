@@ -71,7 +71,8 @@ class Commander:
             state = self.controlled[name] = self._take_over(name)
             sumo.vehicle.setSpeedMode(name, SPEED_MODE[self._preset])
             sumo.vehicle.setLaneChangeMode(name, LANE_CHANGE_MODE[self._preset])
-        state.target, state.limit, state.asks = command.target_speed, command.limit, command.accel
+        state.target = min(command.target_speed, sumo.vehicle.getMaxSpeed(name))
+        state.limit, state.asks = command.limit, command.accel
         if command.lane_offset == 0:
             return Receipt(name, True)
         why = (

@@ -13,6 +13,7 @@ import numpy as np
 from cosim.errors import BadInput
 from cosim.files.xml_input import scan
 from cosim.road import ConflictZone, Crossing, Lane, Link, RoadMap, Rule
+from cosim.road.lane import limit
 from cosim.scenario import Zone
 from cosim.simulation.backend import sumo
 from cosim.simulation.conventions import centres
@@ -205,7 +206,7 @@ def read_road(zones: Sequence[Zone], scenario_file: object) -> RoadMap:
                 shape=np.array(get.getShape(name), np.float64)[:, :2],
                 length=get.getLength(name),
                 width=get.getWidth(name),
-                speed_limit=get.getMaxSpeed(name),
+                speed_limit=limit(get.getMaxSpeed(name)),
                 successors=tuple(place[i] for i in dict.fromkeys(followers) if i in place),
                 left=_beside(name, place, 1),
                 right=_beside(name, place, -1),

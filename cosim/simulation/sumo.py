@@ -19,7 +19,7 @@ from cosim.errors import BadInput, SimulationError, SimulationInUse
 from cosim.road import RoadMap
 from cosim.scenario import Scenario
 from cosim.scenario.behaviors import AS_IS
-from cosim.scenario.disabled_outputs import disable_outputs
+from cosim.scenario.disabled_outputs import NOWHERE, disable_outputs
 from cosim.scenario.sumo_outputs import sumo_options
 from cosim.scenario.sumocfg import time_of
 from cosim.scenario.traffic import CHECKS_INSIDE, FORCED, USUAL, check
@@ -62,6 +62,7 @@ QUIET = {
 WRONG_DEMAND = re.compile(
     r"[Ii]nvalid depart|Departure \w+ .*for vehicle|has no valid route|No connection between edge|[Pp]erson '"
 )
+NO_FILES = {"device.ssm.file": NOWHERE}  # a type may have this device: a file for every vehicle
 GIVES_UP = "max-depart-delay"  # SUMO drops vehicles that waited so long, without a message
 DERIVED = "types.add.xml"  # what drives as another type than its own
 NOBODY: Mapping[str, float] = MappingProxyType({})
@@ -328,6 +329,7 @@ class SumoSimulator:
             "seed": str(seed % (2**31 - 1)),
             **(USUAL if controlled else {}),
             **(ONE_SPEED if s.ships or s.behavior != AS_IS else {}),
+            **({} if s.ships else NO_FILES),
             **settings,
             **dict(s.options),
             **(FORCED if controlled else {}),

@@ -118,7 +118,7 @@ def test_a_device_that_fills_files_of_its_own_writes_none(config: Write, drive: 
 WAY = '<route id="way" edges="bc ab"/>'
 PLANS = {
     "a walk against the traffic": f'{WAY}<person id="p" depart="1"><walk route="way"/></person>',
-    "a flow's walks": f'{WAY}<personFlow id="p" begin="1" period="5" number="4"><walk route="way"/></personFlow>',
+    "a flow": f'{WAY}<personFlow id="p" begin="1" period="5" number="4"><walk route="way"/></personFlow>',
     "a ride": '<person id="p" depart="1"><ride from="ab" to="bc" lines="f.1"/></person>',
     "a container": '<container id="p" depart="1"><transport from="ab" to="bc" lines="f.1"/></container>',
     "a container on its own": '<container id="p" depart="1"><tranship from="bc" to="ab"/></container>',

@@ -85,6 +85,7 @@ def open(
     mission: str | None = None,
     on_collision: str | None = None,
     errors: str | None = None,
+    traffic: str | None = None,
     options: Sequence[str] = (),
     seed: int | None = None,
     observation: ObservationConfig = COMPACT,
@@ -99,9 +100,8 @@ def open(
 
     The same words mean the same as in `cosim run`: `penetration`, `av_type` and `av_ids` (or a `Fleet`)
     say who is an AV, `duration` and `warmup` are in s, `mission` is a vehicle's id, a pattern, "none" or
-    "auto"; `errors` are those of human drivers; `svo` is in degrees (it weighs the reward). A `Scenario`
-    holds them: beside it they are
-    refused. `seed` is the first episode's. `reward`: a `cosim.rewards.Reward` (a `RewardConfig`, a
+    "auto"; `errors` are those of human drivers; `traffic` is "as-is" or "controlled"; `svo` is in degrees
+    (it weighs the reward). A `Scenario` holds them: beside it they are refused. `seed` is the first episode's. `reward`: a `cosim.rewards.Reward` (a `RewardConfig`, a
     function of your own), a name of `REWARDS`, FILE.py:NAME or MODULE:NAME; without it P's. `metrics`:
     classes like those of `cosim.metrics`, or FILE.py:NAME, measured besides. `others` builds a policy for
     the AVs you do not command (without it SUMO's IDM drives them). What is no text must be importable: it
@@ -125,7 +125,7 @@ def open(
         }
         given |= {"penetration": penetration, "av_type": av_type, "av_ids": av_ids}
         given |= {"duration": duration, "warmup": warmup, "mission": mission, "options": options or None}
-        given |= {"on_collision": on_collision, "errors": errors}
+        given |= {"on_collision": on_collision, "errors": errors, "traffic": traffic}
         for name, value in given.items():
             if value is not None:
                 raise BadInput("is part of the Scenario that is given", field=name, value=value)
@@ -143,6 +143,7 @@ def open(
             mission=mission,
             on_collision=on_collision,
             errors=errors,
+            traffic=traffic,
             options=options,
         )
     if simulator is None:

@@ -101,7 +101,8 @@ def open(
     The same words mean the same as in `cosim run`: `penetration`, `av_type` and `av_ids` (or a `Fleet`)
     say who is an AV, `duration` and `warmup` are in s, `mission` is a vehicle's id, a pattern, "none" or
     "auto"; `errors` are those of human drivers; `traffic` is "as-is" or "controlled"; `svo` is in degrees
-    (it weighs the reward). A `Scenario` holds them: beside it they are refused. `seed` is the first episode's. `reward`: a `cosim.rewards.Reward` (a `RewardConfig`, a
+    (it weighs the reward). A `Scenario` holds them: beside it they are refused.
+    `seed` is the first episode's. `reward`: a `cosim.rewards.Reward` (a `RewardConfig`, a
     function of your own), a name of `REWARDS`, FILE.py:NAME or MODULE:NAME; without it P's. `metrics`:
     classes like those of `cosim.metrics`, or FILE.py:NAME, measured besides. `others` builds a policy for
     the AVs you do not command (without it SUMO's IDM drives them). What is no text must be importable: it

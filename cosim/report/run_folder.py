@@ -70,7 +70,7 @@ class Run:
             "on_collision": driven.get("on_collision", asked.get("on_collision") or OnCollision.END),
             "errors_sha256": driven.get("errors", {}).get("sha256"),
             "tilt": driven.get("tilt"),
-            "traffic": driven.get("traffic", Traffic.CONTROLLED),
+            "traffic": driven.get("traffic", asked.get("traffic") or Traffic.CONTROLLED),
         }
 
     def _cell(self, row: Row) -> Mapping[str, Any]:

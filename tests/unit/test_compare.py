@@ -161,6 +161,7 @@ def test_cells_that_cannot_be_distinguished_are_refused(tmp_path: Path) -> None:
         ("mission", "m1", "none"),
         ("on_collision", "end", "continue"),
         ("preset", "lawful", "unguarded"),
+        ("traffic", "as-is", "controlled"),
     ],
 )
 def test_runs_that_were_driven_otherwise_are_not_compared(

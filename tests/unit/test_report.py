@@ -244,3 +244,14 @@ def test_the_verdict_names_what_got_worse_for_everybody_beside_what_got_better(t
     assert "Everybody on equal seeds" in text
     before = write(tmp_path / "before", cell("idm", 10), cell("rash", 10))
     assert "Everybody" not in Page(report.write(read(before)).read_text()).text
+
+
+def test_options_of_a_users_file_that_were_changed_are_named(tmp_path: Path) -> None:
+    folder = write(tmp_path / "run", cell("idm", 2))
+    file = folder / "manifest.json"
+    document = json.loads(file.read_text())
+    changed = {"step-length": {"file": "1", "used": "0.1", "why": "AVs are commanded"}}
+    for about in document["cells"].values():
+        about["manifest"] = {"traffic": "controlled", "changed_options": changed}
+    file.write_text(json.dumps(document))
+    assert "merge: controlled: step-length 1 -> 0.1" in Page(report.html(read(folder))).text

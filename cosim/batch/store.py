@@ -8,6 +8,7 @@ many runs, each under its name.
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,8 @@ from cosim.errors import BadInput, CosimError
 FILE = "store.sqlite"
 _NAME = sa.String(200)
 
-_tables = sa.MetaData()
+# `version` of a set of tables rises when their columns change.
+TABLES = _tables = sa.MetaData(info={"part": "rows", "version": 1})
 _runs = sa.Table(
     "cosim_runs",
     _tables,
@@ -48,6 +50,16 @@ _episodes = sa.Table(
     sa.Column("trace_hash", sa.String(64)),
     sa.Column("row", sa.JSON, nullable=False),  # every column of `cosim.batch.records`
 )
+_schemas = sa.Table(
+    "cosim_schemas",
+    sa.MetaData(),
+    sa.Column("part", sa.String(32), primary_key=True),
+    sa.Column("version", sa.Integer, nullable=False),
+)
+_FIRST = 1  # version of tables that were made before versions were kept
+# How soon libpq notices that a connection is lost: s, s, s, number, ms.
+_LIBPQ = {"connect_timeout": 10, "keepalives_idle": 5, "keepalives_interval": 2, "keepalives_count": 3}
+_LIBPQ |= {"tcp_user_timeout": 10_000}
 
 
 class Store(contextlib.AbstractContextManager["Store"]):
@@ -186,20 +198,47 @@ class Store(contextlib.AbstractContextManager["Store"]):
 
 
 def connect(url: str, tables: sa.MetaData, field: str = "--store") -> sa.Engine:
-    """The database `url` with these tables in it. Raises BadInput (naming `field`): it cannot be reached."""
+    """The database `url` with these tables in it.
+
+    Raises BadInput (naming `field`): it cannot be reached, or holds them in another version.
+    """
     try:
-        engine = sa.create_engine(url, pool_pre_ping=True)  # a connection may have been lost meanwhile
+        libpq = sa.engine.make_url(url).get_dialect().driver in ("psycopg", "psycopg2")
+        # a connection may have been lost meanwhile
+        engine = sa.create_engine(url, pool_pre_ping=True, connect_args=_LIBPQ if libpq else {})
         if engine.dialect.name == "sqlite":
             sa.event.listen(engine, "connect", _sqlite)
+        found, needed = _version(engine, tables), tables.info["version"]
+        if found != needed:
+            engine.dispose()
+            age = "an older" if found < needed else "a newer"
+            problem = f"its tables are those of {age} cosim: version {found}, this one has {needed}"
+            raise BadInput(problem, field=field, value=shown(url))
         tables.create_all(engine)
     except ArgumentError:
-        raise BadInput("is no database URL", field=field, value=url) from None
+        masked = re.sub(r"://.*@", "://***@", url)
+        raise BadInput("is no database URL", field=field, value=masked) from None
     except ModuleNotFoundError as error:
         problem = f"needs the package {error.name} (pip install 'cosim-sumo[postgresql]')"
         raise BadInput(problem, field=field, value=shown(url)) from None
     except SQLAlchemyError as error:
         raise BadInput(_first_line(error), field=field, value=shown(url)) from None
     return engine
+
+
+def _version(engine: sa.Engine, tables: sa.MetaData) -> int:
+    """The version of these tables in a database; where there are none yet it is noted down as ours."""
+    there = {*sa.inspect(engine).get_table_names()}
+    if there.isdisjoint(tables.tables):
+        _schemas.create(engine, checkfirst=True)
+        with contextlib.suppress(IntegrityError), engine.begin() as connection:  # two may begin at once
+            connection.execute(_schemas.insert().values(**tables.info))
+    elif _schemas.name not in there:
+        return _FIRST
+    with engine.connect() as connection:
+        noted = sa.select(_schemas.c.version).where(_schemas.c.part == tables.info["part"])
+        found = connection.execute(noted).scalar()
+    return _FIRST if found is None else int(found)
 
 
 def shown(url: str) -> str:

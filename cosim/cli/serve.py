@@ -15,12 +15,14 @@ def add(commands: arguments.SubCommands) -> None:
         description="Serve runs and sessions over HTTP until it is ended (Ctrl-C, SIGTERM). What is queued "
         "or running then goes on after the next start with the same --data. Bound to another address "
         "than loopback it asks for a bearer token: the variable COSIM_TOKEN, or else what DIR/token "
-        "holds, which is made at the first start.",
+        "holds, which is made at the first start. The variable COSIM_DATABASE_URL names a database where no "
+        "flag does.",
     )
     texts = {
         "--host": ("HOST", "address to bind (default 127.0.0.1)"),
         "--data": ("DIR", "where runs and uploads are kept (default ./cosim-data)"),
         "--database": ("URL", "a database instead of DIR/service.sqlite"),
+        "--database-file": ("FILE", "a file that holds its URL, which a command line shows to all"),
         "--ray-address": ("A", "an existing cluster (default: a local one)"),
     }
     arguments.texts(serve, texts)
@@ -38,13 +40,15 @@ def work(args: argparse.Namespace) -> int:
         import uvicorn  # noqa: F401
 
         from cosim.service.serving import serve
+        from cosim.service.settings import database
     except ModuleNotFoundError as error:
         problem = f"needs the package {error.name}: pip install 'cosim-sumo[service]'"
         raise BadInput(problem, field="serve") from None
     if args.engine == "local" and args.ray_address is not None:
         raise BadInput("goes with --engine ray", field="--ray-address", value=args.ray_address)
-    given = {name: getattr(args, name) for name in ("host", "port", "database", "workers", "engine")}
-    return serve(args.data, ray_address=args.ray_address, said=sys.stderr, **given)
+    given = {name: getattr(args, name) for name in ("host", "port", "workers", "engine", "ray_address")}
+    url = database(args.database, args.database_file)
+    return serve(args.data, said=sys.stderr, database=url, **given)
 
 
 def _port(text: str) -> int:

@@ -5,6 +5,7 @@ import errno
 import json
 import logging
 import os
+import shutil
 from collections.abc import AsyncIterator
 from typing import Any
 
@@ -16,6 +17,7 @@ from starlette.requests import ClientDisconnect
 
 import sumo_scenarios
 from cosim import __version__
+from cosim.batch.store import TABLES, connect
 from cosim.errors import BadInput, CosimError, hint
 from cosim.policies import NAMES
 from cosim.rewards import REWARDS
@@ -23,11 +25,14 @@ from cosim.scenario import BEHAVIORS, human_errors, load
 from cosim.scenario.sumo_outputs import OUTPUTS
 from cosim.service.clerk import Clerks
 from cosim.service.confined import lacking
-from cosim.service.documents import Catalogue, Health, Problem, World
+from cosim.service.documents import Catalogue, Health, Problem, Ready, World
 from cosim.service.gate import Gate
 from cosim.service.jobs import Jobs
+from cosim.service.lanes import Lane, Lanes
 from cosim.service.monitor import Figures
+from cosim.service.openapi import describe
 from cosim.service.problems import Refused
+from cosim.service.readiness import Check, Readiness
 from cosim.service.replays import Replays
 from cosim.service.requests import RunRequest
 from cosim.service.routes_live import live_router
@@ -37,8 +42,9 @@ from cosim.service.routes_sessions import sessions_router
 from cosim.service.routes_uploads import uploads_router
 from cosim.service.runs import Runs, shown
 from cosim.service.sessions import Sessions
-from cosim.service.settings import Settings
+from cosim.service.settings import MB, Settings
 from cosim.service.uploads import Uploads
+from cosim.service.warm import Warmth
 from cosim.types import Preset
 
 log = logging.getLogger("cosim.service")
@@ -50,11 +56,15 @@ def create(settings: Settings) -> FastAPI:
     """The application. Raises BadInput: the database cannot be reached, Ray is not installed."""
     uploads = Uploads(settings)
     jobs = Jobs(settings.jobs_url)
-    limits = settings.limits
-    clerks = Clerks(settings.runs, settings.database, limits.cells, limits.check)
+    if settings.database is not None:
+        connect(settings.database, TABLES, "--database").dispose()  # rows of runs stand there too
+    clerks = Clerks(settings.runs, settings.database, settings.limits)
     runs = Runs(settings, jobs, clerks, lambda number: figures.episodes.inc(number))
-    replays = Replays(settings, runs, uploads, clerks)
-    sessions = Sessions(settings, clerks, lambda seconds: figures.steps.observe(seconds))
+    warmth = Warmth()
+    replays = Replays(settings, runs, uploads, clerks, warmth)
+    sessions = Sessions(settings, clerks, warmth, lambda seconds: figures.steps.observe(seconds))
+    lanes = Lanes(settings.limits)
+    ready = Readiness({"database": jobs.problem, "disk": _disk(settings), "workers": _workers(runs, warmth)})
     pool = runs.pool
     figures = Figures(
         {
@@ -74,10 +84,14 @@ def create(settings: Settings) -> FastAPI:
 
     @contextlib.asynccontextmanager
     async def life(_: FastAPI) -> AsyncIterator[None]:
+        warmth.start()
         runs.start()
         sessions.start()
         log.info("ready", extra={"host": settings.host, "port": settings.port, "data": str(settings.data)})
         yield
+        warmth.close()
+        lanes.close()
+        ready.close()
         sessions.close()
         replays.close()
         runs.close()
@@ -96,7 +110,7 @@ def create(settings: Settings) -> FastAPI:
             413: "too large",
             422: "bad input: field and value are named",
             429: "the server is at its limit",
-            503: "the database does not answer",
+            503: "the database does not answer, or another server drives its runs",
             507: "the server's disk is full",
         }.items()
     }
@@ -107,12 +121,13 @@ def create(settings: Settings) -> FastAPI:
     )  # fmt: skip
     app.state.runs = runs
     _answer_problems(app, settings)
-    app.include_router(_about(figures))
-    app.include_router(runs_router(runs, replays, uploads))
+    app.include_router(_about(figures, ready, lanes.reads))
+    app.include_router(runs_router(runs, replays, uploads, lanes))
     app.include_router(uploads_router(uploads, runs, sessions, settings))
-    app.include_router(sessions_router(sessions, uploads))
-    app.include_router(live_router(sessions))
+    app.include_router(sessions_router(sessions, uploads, lanes))
+    app.include_router(live_router(sessions, lanes.sessions))
     app.include_router(page_router(settings))
+    describe(app)
     app.add_middleware(Gate, settings=settings, figures=figures)
     return app
 
@@ -129,7 +144,10 @@ def _answer_problems(app: FastAPI, settings: Settings) -> None:
     @app.exception_handler(CosimError)
     def ours(_: Request, error: CosimError) -> Response:
         if isinstance(error, Refused):
-            return answer(error.status, str(error))
+            found = answer(error.status, str(error))
+            if error.retry_after is not None:
+                found.headers["Retry-After"] = str(error.retry_after)
+            return found
         if isinstance(error, BadInput):
             e = shown(error, settings)
             if os.strerror(errno.ENOSPC).lower() in e.problem:
@@ -174,19 +192,48 @@ def _answer_problems(app: FastAPI, settings: Settings) -> None:
         return found
 
 
-def _about(figures: Figures) -> APIRouter:
+def _disk(settings: Settings) -> Check:
+    """Whether runs can be kept."""
+
+    def problem() -> str | None:
+        free, least = shutil.disk_usage(settings.data).free, settings.limits.free
+        if free < least:
+            return f"{free // MB} MB are free where runs are kept, at least {least // MB} are needed"
+        return None if os.access(settings.data, os.W_OK) else "cannot be written"
+
+    return problem
+
+
+def _workers(runs: Runs, warmth: Warmth) -> Check:
+    """Whether runs and sessions can be driven."""
+    return lambda: runs.problem() or warmth.problem()
+
+
+def _about(figures: Figures, ready: Readiness, reads: Lane) -> APIRouter:
     """What the server is and has."""
     router = APIRouter(tags=["server"])
+    uploads = not lacking()
 
     @router.get("/health", summary="Does the server answer?")
-    def health() -> Health:
-        return Health(status="ok", version=__version__, uploads=not lacking())
+    async def health() -> Health:
+        return Health(status="ok", version=__version__, uploads=uploads)
+
+    @router.get(
+        "/ready", summary="Can the server do its work now? 503 and what is wrong where it cannot",
+        responses={503: {"model": Ready, "description": "a part of it is not there"}},
+    )  # fmt: skip
+    async def is_ready(response: Response) -> Ready:
+        problems = await ready.problems()
+        response.status_code = 503 if problems else 200
+        return Ready(ready=not problems, problems=problems)
 
     @router.get("/metrics", summary="Figures in Prometheus' format", response_class=Response)
+    @reads
     def metrics() -> Response:
         return Response(figures.text(), media_type="text/plain; version=0.0.4; charset=utf-8")
 
     @router.get("/api/catalogue", summary="Worlds, policies and words that a run can name")
+    @reads
     def catalogue() -> Catalogue:
         worlds = [load(name) for name in sumo_scenarios.names()]
         return Catalogue(

@@ -16,28 +16,32 @@ from cosim.policies import check
 from cosim.scenario import Scenario
 from cosim.scenario.episode_id import EpisodeId
 from cosim.scenario.vet import vetted
+from cosim.service.settings import Limits
 from cosim.workers.worker import Worker
+
+CLERKS = 2
 
 
 class Clerk:
     """Hosted in a process whose working folder is that of the runs; the reports are imported when needed."""
 
-    def __init__(self, runs: str, database: str | None, cells: int) -> None:
+    def __init__(self, runs: str, database: str | None, limits: Limits) -> None:
         os.chdir(runs)
-        self._database, self._cells = database, cells
+        self._database, self._limits = database, limits
 
     def spec(self, flags: Mapping[str, Any]) -> Plan:
         """The plan of a request. Raises BadInput, as `cosim evaluate` does."""
         wanted = spec.read(None, flags)
         seeds = range(*wanted.seeds)
-        if (cells := wanted.episodes // len(seeds)) > self._cells:
-            problem = f"{cells} cells are more than {self._cells}: ask for several runs"
+        if (cells := wanted.episodes // len(seeds)) > self._limits.cells:
+            problem = f"{cells} cells are more than {self._limits.cells}: ask for several runs"
             raise BadInput(problem, field="scenario")
         found = matrix.plan([*matrix.cells(wanted)], seeds, check)
         matrix.check_names(found)
         for cell in found.cells:
             if cell.refused:
                 raise BadInput(cell.refused, field="scenario")
+            self._check_length(cell.scenario)
         return found
 
     def plan(self, cases: Sequence[EpisodeId], seeds: range) -> Plan:
@@ -48,7 +52,9 @@ class Clerk:
         """What a session is opened on. Raises BadInput, as `cosim run` does."""
         (case,) = matrix.cells(spec.read(None, flags))
         check(case.policy)
-        return vetted(case.scenario()), case
+        scenario = vetted(case.scenario())
+        self._check_length(scenario)
+        return scenario, case
 
     def finish(self, run: str, plan: Plan) -> None:
         """Write the tables, the manifest and the summary of a run."""
@@ -82,16 +88,23 @@ class Clerk:
 
         return verdict.document(compare(side(a), side(b), fail_on, across=across))
 
+    def _check_length(self, scenario: Scenario) -> None:
+        """Raises BadInput for an episode that would hold a process for ever."""
+        most = self._limits.simulated
+        if scenario.warmup + scenario.duration > most:
+            problem = f"an episode and its warm-up have at most {most:g} s"
+            raise BadInput(problem, field="duration", value=scenario.duration)
+
 
 class Clerks:
     """`number` processes that each host a `Clerk`; `call` waits for a free one.
 
-    Raises BadInput: what was asked for takes longer than `limit` s, or what the method raises.
+    Raises BadInput: what was asked for takes longer than `limits.check` s, or what the method raises.
     """
 
-    def __init__(self, runs: Path, database: str | None, cells: int, limit: float, number: int = 2) -> None:
-        self._arguments = str(runs), database, cells
-        self._limit = limit
+    def __init__(self, runs: Path, database: str | None, limits: Limits, number: int = CLERKS) -> None:
+        self._arguments = str(runs), database, limits
+        self._limit = limits.check
         self._free: queue.Queue[int] = queue.Queue()
         self._workers: list[Worker | None] = [None] * number
         for k in range(number):

@@ -22,6 +22,15 @@ class Health(BaseModel):
     uploads: bool = Field(description="whether uploads can be confined here (Landlock), so are taken")
 
 
+class Ready(BaseModel):
+    """Whether the server can do its work."""
+
+    ready: bool
+    problems: dict[str, str] = Field(
+        description="by part: database, disk, workers", examples=[{"database": "cannot be reached or used"}]
+    )
+
+
 class World(BaseModel):
     """A world that ships."""
 

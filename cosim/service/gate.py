@@ -22,7 +22,8 @@ Receive = Callable[[], Awaitable[Message]]
 Send = Callable[[Message], Awaitable[None]]
 App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
-OPEN = ("/health", "/login")  # need no token
+PROBES = ("/health", "/ready")
+OPEN = (*PROBES, "/login")  # need no token
 PARTS = "/page/"  # nor do the parts of the page, which hold nobody's data
 PAGES = ("/", "/runs")  # where a browser without a token is sent to the form
 COOKIE = "cosim"
@@ -135,7 +136,11 @@ class Gate:
         self._figures.requests.labels(known, route, str(status)).inc()
         if scope["type"] == "http":  # a socket stays open
             self._figures.seconds.labels(known, route).observe(seconds)
-        level = logging.DEBUG if route in ("/health", "/metrics") or "/sessions/" in route else logging.INFO
+        level = (
+            logging.DEBUG
+            if route in ("/health", "/ready", "/metrics") or "/sessions/" in route
+            else logging.INFO
+        )
         fields = {"method": known, "path": scope["path"], "status": status, "seconds": round(seconds, 6)}
         log.log(level, "request", extra=fields)
 

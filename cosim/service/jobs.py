@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
 import sqlalchemy as sa
 
-from cosim.batch.store import connect, shown
-from cosim.errors import BadInput
+from cosim.batch.store import connect
+from cosim.service.claim import Claim
 
 QUEUED, RUNNING, FINISHED, CANCELLED, FAILED = STATUSES = (
     "queued",
@@ -21,10 +21,9 @@ QUEUED, RUNNING, FINISHED, CANCELLED, FAILED = STATUSES = (
     "failed",
 )
 OPEN = (QUEUED, RUNNING)
-LOCK = int.from_bytes(b"cosim")  # PostgreSQL's number of it
-CLAIMING = 5.0  # s that the database may take to notice the end of a server that was killed
 
-_tables = sa.MetaData()
+# `version` rises when their columns change.
+_tables = sa.MetaData(info={"part": "runs", "version": 1})
 _jobs = sa.Table(
     "cosim_jobs",
     _tables,
@@ -64,12 +63,13 @@ class Job:
 class Jobs:
     """The list. Raises BadInput (`--database`): its database cannot be reached, or another server has it.
 
-    PostgreSQL is locked until `close`, or until the connection is lost; SQLite lies in a locked folder.
+    PostgreSQL is claimed until `close` (`claim`); SQLite lies in a locked folder. What writes raises
+    Superseded where another server has claimed it since.
     """
 
     def __init__(self, url: str) -> None:
         self._engine = connect(url, _tables, "--database")
-        self._claim = self._claimed(url) if self._engine.dialect.name == "postgresql" else None
+        self.claim = Claim(self._engine, url) if self._engine.dialect.name == "postgresql" else None
 
     def add(self, run: str, name: str, request: dict[str, Any], uploads: Sequence[str], episodes: int) -> Job:
         """A run that waits."""
@@ -81,7 +81,7 @@ class Jobs:
             "uploads": [*uploads],
         }
         values |= {"episodes": episodes, "done": 0, "created": now()}
-        with self._engine.begin() as connection:
+        with self._writing() as connection:
             connection.execute(_jobs.insert().values(**values))
         found = self.get(run)
         assert found is not None
@@ -89,12 +89,12 @@ class Jobs:
 
     def set(self, run: str, **values: Any) -> None:
         """Change these columns of one run."""
-        with self._engine.begin() as connection:
+        with self._writing() as connection:
             connection.execute(_jobs.update().where(_jobs.c.run == run).values(**values))
 
     def remove(self, run: str) -> None:
         """Forget a run."""
-        with self._engine.begin() as connection:
+        with self._writing() as connection:
             connection.execute(_jobs.delete().where(_jobs.c.run == run))
 
     def get(self, run: str) -> Job | None:
@@ -118,23 +118,23 @@ class Jobs:
             found = {status: int(n) for status, n in connection.execute(query)}
         return {status: found.get(status, 0) for status in STATUSES}
 
+    def problem(self) -> str | None:
+        """Why this server cannot drive its runs now; None where it can. Raises SQLAlchemyError."""
+        self.counts()
+        return None if self.claim is None or self.claim.held else "another server drives its runs, or may"
+
     def close(self) -> None:
         """Let go of the database."""
-        if self._claim is not None:
-            self._claim.close()
+        if self.claim is not None:
+            self.claim.close()
         self._engine.dispose()
 
-    def _claimed(self, url: str) -> sa.Connection:
-        """A connection that holds the lock."""
-        connection = self._engine.connect().execution_options(isolation_level="AUTOCOMMIT")
-        deadline = time.monotonic() + CLAIMING
-        while not connection.execute(sa.select(sa.func.pg_try_advisory_lock(LOCK))).scalar_one():
-            if time.monotonic() > deadline:
-                connection.close()
-                self._engine.dispose()
-                raise BadInput("another server is working in it", field="--database", value=shown(url))
-            time.sleep(0.1)
-        return connection
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[sa.Connection]:
+        with self._engine.begin() as connection:
+            if self.claim is not None:
+                self.claim.check(connection)
+            yield connection
 
     def _read(self, query: sa.Select[Any]) -> list[Job]:
         with self._engine.connect() as connection:

@@ -21,6 +21,7 @@ from prometheus_client import (
 from prometheus_client.core import GaugeMetricFamily, Metric
 
 _OWN = frozenset(vars(logging.makeLogRecord({})))  # fields that every record has
+log = logging.getLogger("cosim.service")
 STEP_BUCKETS = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # s
 
 
@@ -63,7 +64,12 @@ class _States:
         """Each as a gauge."""
         for name, (about, label, values) in self._states.items():
             family = GaugeMetricFamily(name, about, labels=[label])
-            for key, value in values().items():
+            try:
+                now = values()
+            except Exception as error:  # the database is gone: the other figures are wanted most then
+                log.warning("a figure is not known", extra={"figure": name, "error": str(error)})
+                continue
+            for key, value in now.items():
                 family.add_metric([key], value)
             yield family
 

@@ -7,6 +7,7 @@ class Refused(CosimError):
     """A request that is not carried out, for a reason that is no fault of the server's."""
 
     status = 400
+    retry_after: int | None = None  # s, after which it may be carried out
 
 
 class NotFound(Refused):
@@ -25,3 +26,4 @@ class Unavailable(Refused):
     """The server is at its limit: later it will do."""
 
     status = 429
+    retry_after = 5

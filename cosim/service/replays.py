@@ -17,6 +17,7 @@ from cosim.service.problems import Conflict, NotFound, Unavailable
 from cosim.service.runs import SUMMARY, Runs
 from cosim.service.settings import Settings
 from cosim.service.uploads import Uploads
+from cosim.service.warm import Warmth
 from cosim.workers.worker import Worker
 
 AT_ONCE, WAITING = 2, 16  # replays that are drawn, and those and what waits for them
@@ -26,8 +27,11 @@ HEARTBEAT = 60.0  # s
 class Replays:
     """Draws them, two at a time; whoever asks for what is being drawn waits for the same."""
 
-    def __init__(self, settings: Settings, runs: Runs, uploads: Uploads, clerks: Clerks) -> None:
+    def __init__(
+        self, settings: Settings, runs: Runs, uploads: Uploads, clerks: Clerks, warmth: Warmth
+    ) -> None:
         self._settings, self._runs, self._uploads, self._clerks = settings, runs, uploads, clerks
+        self._warmth = warmth
         self._threads = ThreadPoolExecutor(AT_ONCE, "cosim-replay")
         self._lock = threading.Lock()
         self._asked: dict[tuple[str, str], Future[Path]] = {}
@@ -96,6 +100,7 @@ class Replays:
     def _draw(self, uploads: list[str], draft: Path, *episode: Any) -> None:
         """Write the page of an episode, as `Drawer.page` wants it."""
         settings = self._settings
+        self._warmth.wait()
         with room(settings, uploads, draft.parent) as confined:
             worker = Worker(
                 Drawer, confined, settings.limits, timeout=HEARTBEAT, start_timeout=2.0 * HEARTBEAT,

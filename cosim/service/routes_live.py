@@ -2,13 +2,14 @@
 
 import asyncio
 import contextlib
+import functools
 import json
 
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
-from fastapi.concurrency import run_in_threadpool
 from pydantic import BaseModel, ConfigDict, Field, StrictInt, ValidationError
 
 from cosim.errors import CosimError
+from cosim.service.lanes import Lane
 from cosim.service.live import Viewer
 from cosim.service.sessions import Open, Sessions
 
@@ -26,7 +27,7 @@ class Asked(BaseModel):
     explain: str | None = Field(None, max_length=200)  # the AV whose choices are explained; "": nobody
 
 
-def live_router(sessions: Sessions) -> APIRouter:
+def live_router(sessions: Sessions, lane: Lane) -> APIRouter:
     """The one route."""
     router = APIRouter(prefix="/api")
 
@@ -36,7 +37,7 @@ def live_router(sessions: Sessions) -> APIRouter:
         viewer = Viewer(asyncio.get_running_loop())
         try:
             one = sessions.get(session)
-            await run_in_threadpool(one.watch, viewer)
+            await lane.run(functools.partial(one.watch, viewer))
         except CosimError as error:
             await socket.send_text(json.dumps({"ended": str(error)}))
             await socket.close(GONE)

@@ -1,6 +1,7 @@
 """The routes of runs: submit, list, watch, cancel, read, compare."""
 
 import asyncio
+import functools
 import json
 import mimetypes
 from enum import Enum
@@ -13,6 +14,7 @@ from pydantic import BaseModel
 from cosim.service.documents import Estimate, FileEntry, Progressing, Rows, RunDocument, RunList
 from cosim.service.ids import PATTERN
 from cosim.service.jobs import STATUSES, Job
+from cosim.service.lanes import Lanes
 from cosim.service.problems import Conflict, NotFound
 from cosim.service.replays import Replays
 from cosim.service.requests import EXAMPLE, LONGEST, RunRequest, flags, plain
@@ -39,7 +41,7 @@ SANDBOX = {
 Status = Enum("Status", {name: name for name in STATUSES}, type=str)  # type: ignore[misc]
 
 
-def runs_router(runs: Runs, replays: Replays, uploads: Uploads) -> APIRouter:
+def runs_router(runs: Runs, replays: Replays, uploads: Uploads, lanes: Lanes) -> APIRouter:
     """All of them."""
     router = APIRouter(prefix="/api", tags=["runs"])
 
@@ -78,16 +80,19 @@ def runs_router(runs: Runs, replays: Replays, uploads: Uploads) -> APIRouter:
         return FileResponse(found, media_type=kind, headers=headers)
 
     @router.post("/runs", status_code=201, summary="Submit a run: a matrix of episodes")
+    @lanes.checks
     def submit(request: Requested) -> RunDocument:
         given, used = asked(request)
         sent = request.model_dump(exclude_unset=True)
         return document(runs.submit(str(sent.pop("name", "")), sent, given, used))
 
     @router.post("/estimates", summary="How long a run would take; drives a few short episodes of it")
+    @lanes.estimates
     def estimate(request: Requested) -> Estimate:
         return Estimate(**runs.estimate(*asked(request)))
 
     @router.get("/runs", summary="Runs, the newest first")
+    @lanes.reads
     def listing(
         status: Status | None = None,
         scenario: Annotated[str | None, Query(max_length=100)] = None,
@@ -103,18 +108,29 @@ def runs_router(runs: Runs, replays: Replays, uploads: Uploads) -> APIRouter:
         return RunList(total=len(found), runs=[document(job) for job in found[offset : offset + limit]])
 
     @router.get("/runs/{run}", summary="One run and how far it is")
+    @lanes.reads
     def status(run: RunId) -> RunDocument:
         return document(runs.get(run))
 
     @router.post("/runs/{run}/cancel", summary="End a run; its rows so far are kept")
+    @lanes.reads
     def cancel(run: RunId) -> RunDocument:
         return document(runs.cancel(run))
 
+    @router.post("/runs/{run}/resume", summary="Go on with a run that failed or was cancelled")
+    @lanes.reads
+    def resume(run: RunId) -> RunDocument:
+        for upload in runs.get(run).uploads:
+            uploads.get(upload)
+        return document(runs.resume(run))
+
     @router.delete("/runs/{run}", status_code=204, summary="Forget a run that has ended, and its files")
+    @lanes.reads
     def remove(run: RunId) -> None:
         runs.remove(run)
 
     @router.get("/runs/{run}/rows", summary="One row per episode, also while it runs")
+    @lanes.reads
     def rows(
         run: RunId,
         limit: Annotated[int, Query(ge=1, le=10_000)] = 1000,
@@ -124,6 +140,7 @@ def runs_router(runs: Runs, replays: Replays, uploads: Uploads) -> APIRouter:
         return Rows(total=len(found), rows=found[offset : offset + limit])
 
     @router.get("/runs/{run}/summary", summary="Figures per cell with intervals, of a run that has finished")
+    @lanes.reads
     def summary(run: RunId) -> dict[str, Any]:
         file(run, SUMMARY)
         with runs.reading(run) as folder:
@@ -131,9 +148,10 @@ def runs_router(runs: Runs, replays: Replays, uploads: Uploads) -> APIRouter:
         return found
 
     @router.get("/runs/{run}/report", summary="The report: one HTML file", response_class=FileResponse)
-    def report(run: RunId) -> Response:
-        runs.report(run)
-        return file(run, REPORT, SANDBOX)
+    async def report(run: RunId) -> Response:
+        if not await lanes.reads.run(lambda: REPORT in runs.files(run)):
+            await lanes.tables.run(lambda: runs.report(run))
+        return await lanes.reads.run(lambda: file(run, REPORT, SANDBOX))
 
     @router.get(
         "/runs/{run}/replay",
@@ -142,19 +160,23 @@ def runs_router(runs: Runs, replays: Replays, uploads: Uploads) -> APIRouter:
         responses={200: {"content": {"text/html": {"example": "<!DOCTYPE html>..."}}}},
     )
     async def replay(run: RunId, episode: Episode) -> Response:
-        page = await asyncio.shield(asyncio.wrap_future(replays.ask(run, episode)))
+        drawn = await lanes.reads.run(functools.partial(replays.ask, run, episode))
+        page = await asyncio.shield(asyncio.wrap_future(drawn))
         return FileResponse(page, media_type="text/html", headers=SANDBOX)
 
     @router.get("/runs/{run}/files", summary="The files of a run")
+    @lanes.reads
     def files(run: RunId) -> list[FileEntry]:
         with runs.reading(run):
             return [FileEntry(name=name, bytes=path.stat().st_size) for name, path in runs.files(run).items()]
 
     @router.get("/runs/{run}/files/{name:path}", summary="One file of a run", response_class=FileResponse)
+    @lanes.reads
     def artefact(run: RunId, name: Annotated[str, Path(examples=["episodes.csv"])]) -> Response:
         return file(run, name, SANDBOX)
 
     @router.get("/compare", summary="Two runs, or two policies, on equal seeds: what `cosim compare` says")
+    @lanes.tables
     def compare(a: Side, b: Side, fail_on: Texts = [], across: Texts = []) -> dict[str, Any]:  # noqa: B006
         for text in (*fail_on, *across):
             plain(text, "fail_on" if text in fail_on else "across")

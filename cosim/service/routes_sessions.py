@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, StrictFloat, StrictInt
 from cosim.errors import BadInput, hint
 from cosim.service import views, wire
 from cosim.service.ids import PATTERN
+from cosim.service.lanes import Lanes
 from cosim.service.problems import Conflict
 from cosim.service.requests import SESSION_EXAMPLE, SessionRequest, flags, plain
 from cosim.service.sessions import Open, Sessions
@@ -48,7 +49,7 @@ class Act(BaseModel):
     model_config = ConfigDict(
         extra="forbid",
         json_schema_extra={
-            "examples": [{"actions": {"av_0": "ACCELERATE", "av_1": {"accel": -1.5, "lane_offset": 0}}}]
+            "examples": [{"actions": {"av.0": "ACCELERATE", "av.1": {"accel": -1.5, "lane_offset": 0}}}]
         },
     )
 
@@ -104,7 +105,7 @@ BINARY: dict[int | str, dict[str, Any]] = {200: {"content": {MAPS: {}}}}
 PNG: dict[int | str, dict[str, Any]] = {200: {"content": {"image/png": {}}}}
 
 
-def sessions_router(sessions: Sessions, uploads: Uploads) -> APIRouter:
+def sessions_router(sessions: Sessions, uploads: Uploads, lanes: Lanes) -> APIRouter:
     """All of them."""
     router = APIRouter(prefix="/api", tags=["sessions"])
 
@@ -135,6 +136,7 @@ def sessions_router(sessions: Sessions, uploads: Uploads) -> APIRouter:
         return accept is not None and wire.MEDIA in accept
 
     @router.post("/sessions", status_code=201, summary="Open a session")
+    @lanes.sessions
     def open_one(
         request: Annotated[SessionRequest, Body(openapi_examples={"a merge": {"value": SESSION_EXAMPLE}})],
     ) -> SessionDocument:
@@ -156,21 +158,25 @@ def sessions_router(sessions: Sessions, uploads: Uploads) -> APIRouter:
         return document(opened)
 
     @router.get("/sessions", summary="The sessions that are open")
+    @lanes.reads
     def listing() -> list[SessionDocument]:
         return [document(one) for one in sessions.all()]
 
     @router.get(AVS, summary="One session")
+    @lanes.reads
     def one(session: SessionId) -> SessionDocument:
         return document(sessions.get(session))
 
     @router.delete(AVS, status_code=204, summary="Close a session")
+    @lanes.sessions
     def close(session: SessionId) -> None:
         sessions.end(session)
 
     @router.post(AVS + "/reset", summary="Begin an episode", response_model=Step, responses=BYTES)
+    @lanes.sessions
     def reset(session: SessionId, begin: Reset, accept: Accept = None) -> Response:
         one = sessions.get(session)
-        with one.using() as found:
+        with one.asked() as found:
             one.live.program = True
             found.reset(begin.seed, passes_on=wants_bytes(accept))
             if found.passes_on:
@@ -178,10 +184,11 @@ def sessions_router(sessions: Sessions, uploads: Uploads) -> APIRouter:
             return answer(views.step(found, None))
 
     @router.post(AVS + "/act", summary="Carry out one decision", response_model=Step, responses=BYTES)
+    @lanes.sessions
     def act(session: SessionId, decision: Act, accept: Accept = None) -> Response:
         actions = {av: _action(av, action) for av, action in decision.actions.items()}
         one = sessions.get(session)
-        with one.using() as found:
+        with one.asked() as found:
             if not wants_bytes(accept):
                 found.check_observed()
             elif not found.passes_on:
@@ -193,16 +200,18 @@ def sessions_router(sessions: Sessions, uploads: Uploads) -> APIRouter:
             return answer(views.step(found, result))
 
     @router.get(AVS + "/observation", summary="What each AV sees now", response_model=Step)
+    @lanes.sessions
     def observation(session: SessionId) -> Response:
-        with sessions.get(session).using() as found:
+        with sessions.get(session).asked() as found:
             found.check_observed()
             found.observe()  # begins an episode if none has
             return answer(views.step(found, None))
 
     @router.get(AVS + "/maps", summary="The VelocityMaps of each AV, as safetensors", responses=BINARY,
                 response_class=Response)  # fmt: skip
+    @lanes.sessions
     def maps(session: SessionId, av: Vehicle | None = None) -> Response:
-        with sessions.get(session).using() as found:
+        with sessions.get(session).asked() as found:
             found.check_observed()
             seen = found.observe()
             if av is not None:
@@ -213,29 +222,33 @@ def sessions_router(sessions: Sessions, uploads: Uploads) -> APIRouter:
 
     @router.get(AVS + "/vehicles", summary="Every vehicle, person and signal: the simulation's truth",
                 responses=BYTES)  # fmt: skip
+    @lanes.sessions
     def vehicles(session: SessionId, accept: Accept = None) -> dict[str, Any]:
-        with sessions.get(session).using() as found:
+        with sessions.get(session).asked() as found:
             now = found.snapshot()
             if wants_bytes(accept):
                 return Response(wire.of_snapshot(now), media_type=wire.MEDIA)  # type: ignore[return-value]
             return answer(views.snapshot(now))  # type: ignore[return-value]
 
     @router.get(AVS + "/result", summary="The figures of the episode so far")
+    @lanes.sessions
     def result(
         session: SessionId, policy: Annotated[str, Query(pattern=r"^[\w.+-]{1,100}$")] = "external"
     ) -> dict[str, Any]:
-        with sessions.get(session).using() as found:
+        with sessions.get(session).asked() as found:
             return answer(found.result(policy).document())  # type: ignore[return-value]
 
     @router.get(AVS + "/partner", summary="The AV that would have to yield to the mission vehicle")
+    @lanes.sessions
     def partner(session: SessionId) -> str:
-        with sessions.get(session).using() as found:
+        with sessions.get(session).asked() as found:
             return found.partner()
 
     @router.get(AVS + "/picture", summary="The road around an AV from above", responses=PNG,
                 response_class=Response)  # fmt: skip
+    @lanes.sessions
     def picture(session: SessionId, av: Vehicle | None = None) -> Response:
-        with sessions.get(session).using() as found:
+        with sessions.get(session).asked() as found:
             if av is not None:
                 _known(av, found.snapshot().avs)
             whole = io.BytesIO()

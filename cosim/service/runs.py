@@ -1,4 +1,4 @@
-"""The runs of a server: submitted, queued, driven a few at a time, cancelled, resumed by a restart."""
+"""The runs of a server: submitted, queued, driven a few at a time, cancelled, resumed, tried again."""
 
 from __future__ import annotations
 
@@ -22,12 +22,14 @@ from cosim.batch.estimate import estimate
 from cosim.batch.folder import RunFolder
 from cosim.batch.matrix import Plan
 from cosim.batch.store import FILE, Store
-from cosim.errors import BadInput, CosimError
+from cosim.errors import BadInput, CosimError, SimulationTimeout
 from cosim.scenario.sumo_outputs import DRAFT
+from cosim.service.claim import LOOKS, Superseded
 from cosim.service.clerk import Clerks
 from cosim.service.confined import ConfinedRunner, Room, room
 from cosim.service.ids import ID, new_id
 from cosim.service.jobs import CANCELLED, FAILED, FINISHED, QUEUED, RUNNING, Job, Jobs, now
+from cosim.service.limited import LimitedRunner
 from cosim.service.problems import Conflict, NotFound, Unavailable
 from cosim.service.settings import Settings
 from cosim.workers.engines import Engine, LocalEngine, cores
@@ -36,7 +38,8 @@ from cosim.workers.ray_engine import RayEngine
 from cosim.workers.supervisor import Limits as WorkerLimits
 
 ENDING = 10.0  # s that runs may take to end when the server does
-RETRY = 5.0  # s until a database that could not be used is tried again
+RETRY = 5.0  # s until a database that could not be used is tried again, and first until a run is,
+TRIES = 8  # times in a row without a new row: each time twice as long, 11 min in all
 ACTIVE = 8  # runs that are driven at once on the processes of this machine
 REPORT, SUMMARY = "report.html", "summary.json"
 OUTPUTS = "outputs"  # the folder of SUMO's own
@@ -52,7 +55,13 @@ class Drive:
         self.before = 0  # driven by an earlier server
         self.began = time.monotonic()
         self.cancelled = threading.Event()
+        self.left = False  # to another server, or the next start
         self.engine: Engine | None = None
+
+    def leave(self) -> None:
+        """End it at once; what became of it is not noted."""
+        self.left = True
+        self.cancel()
 
     def cancel(self) -> None:
         """End it at once."""
@@ -80,11 +89,26 @@ class Drive:
         return (time.monotonic() - self.began) / driven * (self.episodes - self.done)
 
 
+class Waiting:
+    """A run that waits to be tried again after a fault that may pass."""
+
+    def __init__(self, tries: int, rows: int) -> None:
+        self.tries = tries  # so far, since it had fewer rows
+        self.rows = rows  # that it had when the last try began
+        self.since = time.monotonic()
+        self.seconds = RETRY * 2.0 ** (tries - 1)
+
+    @property
+    def left(self) -> float:
+        """s until it is tried again."""
+        return self.since + self.seconds - time.monotonic()
+
+
 class Runs:
     """Every run of the server; `count` is told how many episodes were driven.
 
     `start` it once; `close` leaves what runs and waits to the next start, and closes
-    the clerks.
+    the clerks. Nothing is driven while the database is another server's, or may be.
     """
 
     def __init__(self, settings: Settings, jobs: Jobs, clerks: Clerks, count: Callable[[int], None]) -> None:
@@ -92,7 +116,9 @@ class Runs:
         self._changed = threading.Condition()
         self._queue: deque[str] = deque()
         self._plans: dict[str, Plan] = {}  # of runs that wait, as they were checked
+        self._waiting: dict[str, Waiting] = {}  # of those that were tried before
         self._drives: dict[str, Drive] = {}
+        self._driving = False
         self._closed = False
         self._reporting = threading.Lock()
         self._threads: list[threading.Thread] = []
@@ -105,13 +131,13 @@ class Runs:
 
     def start(self) -> None:
         """Go on with what an earlier server left, and take what comes."""
-        for job in self._jobs.open():
-            self._jobs.set(job.run, status=QUEUED)
-            self._queue.append(job.run)
-        if self._queue:
-            log.info("runs picked up", extra={"runs": len(self._queue)})
-        for k in range(ACTIVE if self.pool else 1):
-            thread = threading.Thread(target=self._work, name=f"cosim-run-{k}", daemon=True)
+        works = [(f"cosim-run-{k}", self._work) for k in range(ACTIVE if self.pool else 1)]
+        if self._jobs.claim is None:
+            self._take_up()
+        else:
+            works.append(("cosim-claim", self._keep))
+        for name, work in works:
+            thread = threading.Thread(target=work, name=name, daemon=True)
             thread.start()
             self._threads.append(thread)
 
@@ -120,7 +146,7 @@ class Runs:
         with self._changed:
             self._closed = True
             for drive in self._drives.values():
-                drive.cancel()
+                drive.leave()
             self._changed.notify_all()
         if self.pool is not None:
             self.pool.close()
@@ -131,28 +157,35 @@ class Runs:
         if self._cluster is not None:
             self._cluster.disconnect()
 
+    def problem(self) -> str | None:
+        """Why runs are not driven now; None where they are."""
+        if ended := sum(not thread.is_alive() for thread in self._threads):
+            return f"{ended} of {len(self._threads)} threads have ended"
+        if self.pool is not None and (lost := self.pool.workers - self.pool.alive):
+            return f"{lost} of {self.pool.workers} processes are supervised by nobody"
+        return None
+
     # ---- what users ask ----
 
     def submit(
         self, name: str, request: dict[str, Any], flags: dict[str, Any], uploads: Sequence[str]
     ) -> Job:
         """Check a run and queue it. Raises BadInput, Unavailable when too many wait."""
-        if len(self._queue) >= self._settings.limits.queued:
-            raise Unavailable(f"{len(self._queue)} runs wait already: try again later")
+        self._check_queue()
         plan: Plan = self._clerks.call("spec", flags)
         run = new_id()
         folder = self.folder(run)
         try:
             with RunFolder(str(folder), resume=False, episodes=plan.episodes), self._store(run) as store:
                 execution.begin(plan, store, {"command": "cosim serve", "began": now()})
-            job = self._jobs.add(run, name, request, uploads, plan.episodes)
+            with self._changed:
+                job = self._jobs.add(run, name, request, uploads, plan.episodes)
+                self._plans[run] = plan
+                self._queue.append(run)
+                self._changed.notify()
         except BaseException:
             self._forget(run)
             raise
-        with self._changed:
-            self._plans[run] = plan
-            self._queue.append(run)
-            self._changed.notify()
         log.info("run submitted", extra={"run": run, "episodes": plan.episodes})
         return job
 
@@ -207,6 +240,7 @@ class Runs:
                 self._jobs.set(run, status=CANCELLED, ended=now())
                 self._queue.remove(run)
                 self._plans.pop(run, None)
+                self._waiting.pop(run, None)
                 return self.get(run)
             drive = self._drives.get(run)
         if drive is None:
@@ -215,6 +249,22 @@ class Runs:
         deadline = time.monotonic() + 10.0
         while run in self._drives and time.monotonic() < deadline:
             time.sleep(0.01)
+        return self.get(run)
+
+    def resume(self, run: str) -> Job:
+        """Queue a run that failed or was cancelled: its rows are kept, what is missing is driven.
+
+        Raises Conflict when it is none of these, Unavailable when too many wait.
+        """
+        self._check_queue()
+        with self._changed:
+            self._changed.wait_for(lambda: run not in self._drives, timeout=ENDING)  # its last moments
+            if (status := self.get(run).status) not in (FAILED, CANCELLED):
+                raise Conflict(f"run {run} is {status}: a run that failed or was cancelled is resumed")
+            self._jobs.set(run, status=QUEUED, error=None, ended=None)
+            self._queue.append(run)
+            self._changed.notify()
+        log.info("run resumed", extra={"run": run})
         return self.get(run)
 
     def remove(self, run: str) -> None:
@@ -256,6 +306,44 @@ class Runs:
 
     # ---- inside ----
 
+    def _check_queue(self) -> None:
+        if len(self._queue) >= self._settings.limits.queued:
+            raise Unavailable(f"{len(self._queue)} runs wait already: try again later")
+
+    def _take_up(self) -> None:
+        """Go on with what the database says is to be driven."""
+        with self._changed:
+            found = [job.run for job in self._jobs.open()]
+            for run in found:
+                self._jobs.set(run, status=QUEUED)
+            self._queue = deque(found)
+            self._driving = True
+            self._changed.notify_all()
+        if found:
+            log.info("runs picked up", extra={"runs": len(found)})
+
+    def _keep(self) -> None:
+        """A thread: see to it that the database is this server's, and drive nothing while it is not."""
+        claim = self._jobs.claim
+        assert claim is not None
+        while not self._closed:
+            with contextlib.suppress(SQLAlchemyError, Superseded):
+                if not claim.keep():
+                    self._stand_by()
+                elif not self._driving and not self._drives and time.monotonic() >= claim.drives_from:
+                    self._take_up()
+            with self._changed:
+                self._changed.wait_for(lambda: self._closed, timeout=LOOKS)
+
+    def _stand_by(self) -> None:
+        """Drive nothing: another server may."""
+        with self._changed:
+            if self._driving:
+                log.error("the database is not this server's now: no run is driven")
+            self._driving = False
+            for drive in self._drives.values():
+                drive.leave()
+
     def _store(self, run: str) -> Store:
         return Store.in_folder(self.folder(run), self._settings.database)
 
@@ -271,8 +359,8 @@ class Runs:
 
     def _engine(self, confined: Room | None = None, *, probes: bool = False) -> Engine:
         """Of one run, or of `probes`; in a room its processes are confined."""
-        factory: Callable[..., Any] = EpisodeRunner
-        arguments: tuple[Any, ...] = ()
+        factory: Callable[..., Any] = LimitedRunner
+        arguments: tuple[Any, ...] = (self._settings.limits,)
         if confined is not None:
             factory, arguments = ConfinedRunner, (confined,)
         once = None if confined is None else WorkerLimits(step=60.0, start=120.0, crashes=1)
@@ -285,49 +373,89 @@ class Runs:
 
     def _work(self) -> None:
         """A thread: one run after the other."""
-        while True:
-            with self._changed:
-                while not self._queue and not self._closed:
-                    self._changed.wait()
-                if self._closed:
-                    return
-                run = self._queue.popleft()
-                plan = self._plans.pop(run, None)
-                drive = self._drives[run] = Drive()
+        while (run := self._next()) is not None:
+            drive = self._drives[run]
             try:
-                self._run(self._patiently(self.get, run), plan, drive)
+                self._run(self._patiently(self.get, run), self._plans.pop(run, None), drive)
+            except Superseded:
+                log.warning("run left to another server", extra={"run": run})
             except Exception:  # the database was gone until the server's end
                 log.exception("run lost until the next start", extra={"run": run})
             finally:
-                self._drives.pop(run, None)
+                with self._changed:
+                    if self._drives.get(run) is drive:
+                        del self._drives[run]
+                    self._changed.notify_all()
+
+    def _next(self) -> str | None:
+        """The next run, whose drive begins; waits. None: the server ends."""
+        with self._changed:
+            while not self._closed:
+                left = {run: self._waiting[run].left if run in self._waiting else 0.0 for run in self._queue}
+                run = next((run for run in self._queue if left[run] <= 0.0), None) if self._driving else None
+                if run is not None:
+                    self._queue.remove(run)
+                    self._drives[run] = Drive()
+                    return run
+                self._changed.wait(timeout=min(left.values(), default=None) if self._driving else None)
+            return None
 
     def _run(self, job: Job, plan: Plan | None, drive: Drive) -> None:
         """Drive one run and note what became of it."""
         run, drive.episodes = job.run, job.episodes
-        self._patiently(self._jobs.set, run, status=RUNNING, began=job.began or now())
+        self._patiently(self._jobs.set, run, status=RUNNING, began=job.began or now(), error=None)
         log.info("run began", extra={"run": run})
-        status, error = FINISHED, None
+        status, error, passes = FINISHED, None, False
         try:
             faults = self._episodes(job, plan, drive)
             if faults:
-                status, error = FAILED, "\n".join(faults)
+                status, error, passes = FAILED, "\n".join(faults), True
         except Cancelled:
             status = CANCELLED
-        except BadInput as problem:
-            status, error = FAILED, str(shown(problem, self._settings))
-        except CosimError as problem:  # a store names its database, and the command line's way to go on
-            text = re.sub(r"\w[\w+]*://\S+?: ", "the database: ", str(problem))
-            status, error = FAILED, text.replace(" (--resume goes on from here)", "")
         except Exception as problem:
-            log.exception("a fault of the server's own", extra={"run": run})
-            status, error = FAILED, f"a fault of the server's own: {type(problem).__name__}"
-        if self._closed and status != FINISHED:  # the next start goes on with it
+            status, error, passes = FAILED, self._said(run, problem), may_pass(problem)
+        if drive.left and status != FINISHED:  # the next start, or the next server, goes on with it
             return
+        if passes and self._again(run, drive, str(error)):
+            return
+        if passes and drive.cancelled.is_set():
+            status, error = CANCELLED, None
+        self._waiting.pop(run, None)
         for part in self.folder(run).glob(f"{OUTPUTS}/*/{DRAFT}"):
             shutil.rmtree(part, ignore_errors=True)
         self._patiently(self._jobs.set, run, status=status, error=error, ended=now(), done=drive.done)
         seconds = round(time.monotonic() - drive.began, 3)
         log.info("run ended", extra={"run": run, "status": status, "seconds": seconds})
+
+    def _said(self, run: str, problem: Exception) -> str:
+        """What a user is told of it: nothing of the server's own."""
+        if isinstance(problem, BadInput):
+            return str(shown(problem, self._settings))
+        if isinstance(problem, CosimError):  # a store names its database, the command line's way to go on
+            text = re.sub(r"\w[\w+]*://\S+?: ", "the database: ", str(problem))
+            return text.replace(" (--resume goes on from here)", "")
+        log.error("a fault of the server's own", exc_info=problem, extra={"run": run})
+        return f"a fault of the server's own: {type(problem).__name__}"
+
+    def _again(self, run: str, drive: Drive, error: str) -> bool:
+        """Queue a run that met a fault, unless it was tried often enough; later each time."""
+        last = self._waiting.get(run)
+        fresh = last is None or drive.before > last.rows
+        wait = Waiting(1 if last is None or fresh else last.tries + 1, drive.before)
+        if wait.tries > TRIES:
+            return False
+        log.warning("run waits", extra={"run": run, "error": error, "seconds": wait.seconds})
+        said = f"{error} (tried again {wait.seconds:g} s later, {wait.tries} of {TRIES})"
+        self._patiently(self._jobs.set, run, status=QUEUED, error=said, done=drive.done)
+        with self._changed:
+            if drive.cancelled.is_set() and not drive.left:
+                return False
+            if not drive.left:
+                self._waiting[run] = wait
+                self._queue.append(run)
+            del self._drives[run]
+            self._changed.notify_all()
+        return True
 
     def _patiently(self, ask: Callable[..., T], *arguments: Any, **values: Any) -> T:
         """What the database answers, as soon as it does; raises SQLAlchemyError if the server ends before."""
@@ -364,6 +492,12 @@ class Runs:
             (folder / OUTPUTS).rmdir()  # where no output was asked for
         self._clerks.call("finish", run, plan)
         return [f"{fault.key}: {fault.error}" for fault in faults]
+
+
+def may_pass(problem: Exception) -> bool:
+    """Whether the same run may go well later: all but what is wrong with the request itself."""
+    reason = problem.__context__ if isinstance(problem, BadInput) else problem
+    return reason is problem or isinstance(reason, OSError | SQLAlchemyError | SimulationTimeout)
 
 
 def shown(error: BadInput, settings: Settings) -> BadInput:

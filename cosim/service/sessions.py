@@ -20,12 +20,14 @@ from cosim.scenario import Scenario
 from cosim.scenario.episode_id import EpisodeId
 from cosim.scenario.policy_name import label
 from cosim.service.clerk import Clerks
-from cosim.service.confined import confined_host, room, session_host
+from cosim.service.confined import confined_host, room
 from cosim.service.ids import ID, new_id
 from cosim.service.jobs import now
+from cosim.service.limited import limited_host
 from cosim.service.live import Live, Viewer
 from cosim.service.problems import Conflict, NotFound, Unavailable
 from cosim.service.settings import Settings
+from cosim.service.warm import Warmth
 from cosim.types import COMPACT, ObservationConfig
 from cosim.workers.worker import Worker
 
@@ -34,6 +36,7 @@ if TYPE_CHECKING:
 
 NOTHING = Packer().pack({}, None)
 TIMEOUT = 120.0  # s without an answer of the simulation
+CALLS = 4  # requests of one session at a time
 LOOKS = 1.0  # s between looks for idle sessions
 log = logging.getLogger("cosim.service")
 
@@ -101,9 +104,21 @@ class Open:
         self.request, self.session, self.idle, self.uploads = request, session, idle, uploads
         self._end, self._took = end, took
         self._lock = threading.Lock()
+        self._calls = threading.BoundedSemaphore(CALLS)
         self._used = time.monotonic()
         self.ended = False
         self.live = session.live = Live(session, self._drive, self._reset, self._explain)
+
+    @contextlib.contextmanager
+    def asked(self) -> Iterator[Served]:
+        """`using` it for one of at most `CALLS` requests. Raises Unavailable."""
+        if not self._calls.acquire(blocking=False):
+            raise Unavailable(f"{CALLS} requests of session {self.id} wait already: try again later")
+        try:
+            with self.using() as session:
+                yield session
+        finally:
+            self._calls.release()
 
     @contextlib.contextmanager
     def using(self) -> Iterator[Served]:
@@ -168,8 +183,10 @@ class Open:
 class Sessions:
     """Those that are open. `took` is told the s of every decision."""
 
-    def __init__(self, settings: Settings, clerks: Clerks, took: Callable[[float], None]) -> None:
-        self._settings, self._clerks, self._took = settings, clerks, took
+    def __init__(
+        self, settings: Settings, clerks: Clerks, warmth: Warmth, took: Callable[[float], None]
+    ) -> None:
+        self._settings, self._clerks, self._warmth, self._took = settings, clerks, warmth, took
         self._open: dict[str, Open] = {}
         self._opening = 0
         self._lock = threading.Lock()
@@ -215,6 +232,7 @@ class Sessions:
             self._opening += 1
         try:
             scenario, case = self._clerks.call("session", flags)
+            self._warmth.wait()
             found = self._begin(request, scenario, case, uploads, observation, seed, reward, idle)
             self._open[found.id] = found
         except SimulationError as error:
@@ -267,7 +285,8 @@ class Sessions:
         confined = rooms.enter_context(room(self._settings, uploads))
 
         def connect() -> Worker:
-            host = (session_host,) if confined is None else (confined_host, confined)
+            limits = self._settings.limits
+            host = (limited_host, limits) if confined is None else (confined_host, confined)
             return Worker(*host, *arguments, timeout=TIMEOUT, name="cosim-session")
 
         try:

@@ -8,9 +8,11 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
-from cosim.files import lock, prepare_folder, whole
+from cosim.errors import BadInput
+from cosim.files import cannot, lock, prepare_folder, whole
 
 TOKEN = "COSIM_TOKEN"  # the variable that names the bearer token
+DATABASE = "COSIM_DATABASE_URL"  # the variable that names the database
 MB = 1 << 20
 
 
@@ -24,16 +26,18 @@ class Limits:
     files: int = 200  # in it
     uploads: int = 1000  # kept
     cells: int = 1000  # of a run
+    simulated: float = 86_400.0  # of an episode, warm-up included
     queued: int = 1000  # runs that wait
+    waiting: int = 16  # requests that wait for each kind of work that takes long
     sessions: int = 16  # open at once
     idle: float = 600.0  # until a session ends by itself
     check: float = 120.0  # to check a request
-    memory: int = 8192 * MB  # address space of a confined process
-    file: int = 512 * MB  # that a confined process writes
+    memory: int = 8192 * MB  # address space of a process that simulates
+    file: int = 512 * MB  # that such a process writes
     disk: int = 8192 * MB  # that all processes of a run, a session or a check with uploads write
-    free: int = 256 * MB  # on the disk, that they leave
+    free: int = 256 * MB  # that they leave on the disk; with less a server is not ready
     tasks: int = 1024  # threads that a confined process adds to those of its user
-    cpu: float = 900.0  # processor time of one episode, or between two resets of a session, when confined
+    cpu: float = 900.0  # processor time of one episode, or between two resets of a session
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +73,25 @@ class Settings:
     def jobs_url(self) -> str:
         """The database of the list of runs."""
         return self.database or f"sqlite:///{self.data / 'service.sqlite'}"
+
+
+def database(url: str | None, file: str | None) -> str | None:
+    """The database's URL: given, or what `file` holds, or else what the variable `DATABASE` does.
+
+    The variable is taken out of the environment, so that no process of the server's inherits it.
+
+    Raises BadInput.
+    """
+    variable = os.environ.pop(DATABASE, "").strip()
+    if file is None:
+        return url or variable or None
+    if url is not None:
+        raise BadInput("excludes --database: give one of them", field="--database-file", value=file)
+    with cannot("read", field="--database-file", value=file):
+        found = Path(file).read_text("utf-8", "replace").strip()
+    if not found:
+        raise BadInput("holds no database URL", field="--database-file", value=file)
+    return found
 
 
 def is_loopback(host: str) -> bool:

@@ -45,7 +45,7 @@ class Notes(Hook):
     """What happened in the episode so far, and how the session's earlier episodes ended."""
 
     def __init__(self) -> None:
-        self.ended: list[dict[str, Any]] = []  # figures of whole episodes
+        self.ended: dict[int, dict[str, Any]] = {}  # seed -> figures of its last whole episode
         self.picture: Picture | None = None
 
     def on_start(self, episode: Episode) -> None:
@@ -63,7 +63,8 @@ class Notes(Hook):
         self.interventions += events.interventions
         self.errors += events.errors
         if episode.over:
-            self.ended.append({name: m.value for name, m in episode.result("").metrics.items()})
+            result = episode.result("")
+            self.ended[result.seed] = {name: m.value for name, m in result.metrics.items()}
         if self.picture is not None:
             self.picture.draw(episode, step)
 
@@ -132,7 +133,7 @@ class Picture:
         result = episode.result(self._policy.name, self._policy.label, self._svo).document()
         if not episode.over:
             result["trace_hash"] = None
-        return {**facts(result), "tally": tally(self._notes.ended)}
+        return {**facts(result), "tally": tally([*self._notes.ended.values()])}
 
     def _now(self, episode: Episode) -> dict[str, Any]:
         return {"elapsed": round(episode.elapsed, 3), "over": episode.over}
@@ -222,8 +223,8 @@ class WatchedHost(SessionHost):
 
 
 def tally(ended: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Of whole episodes: how many, shares of crashes (C%) and missions with 95 % intervals, mean DT in m,
-    least time to collision in s."""
+    """Of whole episodes, one a seed: how many, shares of crashes (C%) and missions with 95 % intervals, mean
+    DT in m, least time to collision in s."""
     if not ended:
         return {"episodes": 0}
     from cosim.report.statistics import share  # scipy.stats: at the end of the first episode

@@ -38,6 +38,11 @@ class Pool:
         """How many of the processes work at a task."""
         return sum(seat.batch is not None for seat in self._seats)
 
+    @property
+    def alive(self) -> int:
+        """How many of them have a thread that supervises them."""
+        return sum(seat.thread.is_alive() for seat in self._seats)
+
     def engine(
         self, factory: Factory, arguments: tuple[Any, ...] = (), *, limits: Limits | None = None
     ) -> PoolEngine:

@@ -1,0 +1,74 @@
+"""Blocking work on threads of its own, a bounded number of requests waiting: one kind holds up no other."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import threading
+from collections.abc import Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import ParamSpec, TypeVar
+
+from cosim.service.clerk import CLERKS
+from cosim.service.problems import Unavailable
+from cosim.service.sessions import CALLS
+from cosim.service.settings import Limits
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+class Lane:
+    """`threads` pieces of work at once and `waiting` more. Decorates a route that blocks.
+
+    `work` names it to users. Raises Unavailable (429) when full.
+    """
+
+    def __init__(self, work: str, threads: int, waiting: int) -> None:
+        self._work, self._most = work, threads + waiting
+        self._threads = ThreadPoolExecutor(threads, "cosim-lane")
+        self._lock = threading.Lock()
+        self._taken = 0
+
+    def __call__(self, route: Callable[P, T]) -> Callable[P, Awaitable[T]]:
+        """The route, off the server's loop."""
+
+        @functools.wraps(route)
+        async def queued(*arguments: P.args, **named: P.kwargs) -> T:
+            return await self.run(functools.partial(route, *arguments, **named))
+
+        return queued
+
+    async def run(self, work: Callable[[], T]) -> T:
+        """What `work` returns or raises."""
+        with self._lock:
+            if self._taken >= self._most:
+                raise Unavailable(f"{self._most} {self._work} are asked for already: try again later")
+            self._taken += 1
+        future = self._threads.submit(work)
+        future.add_done_callback(self._leave)  # not when its client goes away: the thread is still taken
+        return await asyncio.wrap_future(future)
+
+    def close(self) -> None:
+        """What waits is not begun."""
+        self._threads.shutdown(wait=False, cancel_futures=True)
+
+    def _leave(self, _: object) -> None:
+        with self._lock:
+            self._taken -= 1
+
+
+class Lanes:
+    """Those of a server."""
+
+    def __init__(self, limits: Limits) -> None:
+        self.reads = Lane("answers", 16, 8 * limits.waiting)
+        self.checks = Lane("checks of runs", CLERKS, 4 * limits.waiting)
+        self.estimates = Lane("estimates", CLERKS, limits.waiting)
+        self.tables = Lane("reports and comparisons", CLERKS, limits.waiting)
+        self.sessions = Lane("sessions' answers", (CALLS + 1) * limits.sessions, limits.waiting)
+
+    def close(self) -> None:
+        """What waits is not begun."""
+        for lane in vars(self).values():
+            lane.close()

@@ -1,0 +1,46 @@
+"""Whether the server can do its work now: each part asked by a thread of its own, and waited for a little."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+
+PATIENCE = 3.0  # s that a part may take to answer
+Check = Callable[[], str | None]  # what is wrong; None: nothing
+log = logging.getLogger("cosim.service")
+
+
+class Readiness:
+    """`checks`: by the name of the part."""
+
+    def __init__(self, checks: Mapping[str, Check]) -> None:
+        self._checks = checks
+        self._threads = ThreadPoolExecutor(len(checks), "cosim-ready")
+        self._asked: dict[str, Future[str | None]] = {}
+
+    async def problems(self) -> dict[str, str]:
+        """What is wrong, by part; a part that has not answered the last time is not asked once more."""
+        for part, check in self._checks.items():
+            if part not in self._asked or self._asked[part].done():
+                self._asked[part] = self._threads.submit(_outcome, part, check)
+        asked = dict(self._asked)
+        await asyncio.wait([asyncio.wrap_future(future) for future in asked.values()], timeout=PATIENCE)
+        said = {
+            part: future.result() if future.done() else f"no answer within {PATIENCE:g} s"
+            for part, future in asked.items()
+        }
+        return {part: problem for part, problem in said.items() if problem is not None}
+
+    def close(self) -> None:
+        """Ask no more."""
+        self._threads.shutdown(wait=False, cancel_futures=True)
+
+
+def _outcome(part: str, check: Check) -> str | None:
+    try:
+        return check()
+    except Exception as error:
+        log.error("not ready", extra={"part": part, "error": str(error.__cause__ or error)})
+        return "cannot be reached or used"

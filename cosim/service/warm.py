@@ -1,0 +1,84 @@
+"""The kernels, compiled when the server starts: no decision of a session waits for a compiler.
+
+numba keeps what it compiled on disk, for the processor and version that it was compiled for.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+import math
+import threading
+
+import sumo_scenarios
+from cosim.policies import make
+from cosim.scenario import load
+from cosim.service.confined import session_host
+from cosim.types import COMPACT
+from cosim.workers.supervisor import Limits, Supervisor
+from cosim.workers.tasks import Progress, Task
+
+POLICY = "vfn-p"  # it calls every kernel there is
+DECISIONS = 3
+HEARTBEAT = 1800.0  # s for a session's start and decisions, compiled: half a minute on a quick machine
+log = logging.getLogger("cosim.service")
+
+
+class Warmth:
+    """`start` it once; `wait` until the kernels are there."""
+
+    def __init__(self) -> None:
+        self._done = threading.Event()
+        self._closed = False
+        self._supervisor: Supervisor | None = None
+        self._thread = threading.Thread(target=self._work, name="cosim-warm", daemon=True)
+
+    def start(self) -> None:
+        """Compile from now on."""
+        self._thread.start()
+
+    def wait(self) -> None:
+        """Until they are compiled, or cannot be."""
+        self._done.wait()
+
+    def problem(self) -> str | None:
+        """Why a session would wait now."""
+        return None if self._done.is_set() else "kernels are being compiled"
+
+    def close(self) -> None:
+        """Give up."""
+        self._closed = True
+        if self._supervisor is not None:
+            self._supervisor.kill()
+        self._done.set()
+
+    def _work(self) -> None:
+        self._supervisor = Supervisor(Warmer, (), Limits(step=HEARTBEAT, start=HEARTBEAT, crashes=1))
+        try:
+            outcome = self._supervisor.run(Task("kernels", "kernels", ()))
+        finally:
+            self._done.set()
+            self._supervisor.close()
+        if outcome.ok:
+            log.info("kernels are compiled", extra={"seconds": round(outcome.seconds, 3)})
+        elif not self._closed:
+            log.error("kernels cannot be compiled", extra={"error": outcome.error})
+
+
+class Warmer:
+    """Hosted in a process: begins a session on every world and looks at it, as a page does."""
+
+    def run(self, progress: Progress) -> None:
+        """A few decisions of each."""
+        for name in sumo_scenarios.names():
+            others = functools.partial(make, POLICY)
+            host = session_host(load(name), COMPACT, math.pi / 4, "p", others)
+            host.reset(0)
+            host.scene()
+            for k in range(DECISIONS):
+                host.act({}, None)
+                progress(k, DECISIONS)
+            host.close()
+
+    def close(self) -> None:
+        """The process ends."""

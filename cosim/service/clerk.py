@@ -16,6 +16,7 @@ from cosim.policies import check
 from cosim.scenario import Scenario
 from cosim.scenario.episode_id import EpisodeId
 from cosim.scenario.vet import vetted
+from cosim.service.passing import told_apart
 from cosim.service.settings import Limits
 from cosim.workers.worker import Worker
 
@@ -46,7 +47,8 @@ class Clerk:
 
     def plan(self, cases: Sequence[EpisodeId], seeds: range) -> Plan:
         """The plan of a run that was begun."""
-        return matrix.plan(cases, seeds, check)
+        with told_apart():
+            return matrix.plan(cases, seeds, check)
 
     def session(self, flags: Mapping[str, Any]) -> tuple[Scenario, EpisodeId]:
         """What a session is opened on. Raises BadInput, as `cosim run` does."""
@@ -61,7 +63,7 @@ class Clerk:
         from cosim.report import run_folder
 
         folder = Path.cwd() / run
-        with Store.in_folder(folder, self._database) as store:
+        with told_apart(), Store.in_folder(folder, self._database) as store:
             run_folder.export(folder, store.rows(), execution.manifest(plan, store), plan.episodes)
 
     def report(self, run: str) -> None:

@@ -7,7 +7,8 @@
         while not session.over:
             views = session.act({av: my_agent(seen) for av, seen in views.items()}).observations
 
-Needs nothing but cosim itself; the token, where the server asks for one, is `token` or COSIM_TOKEN.
+`client.resume` goes on with a run that failed. Needs nothing but cosim itself; the token, where the server
+asks for one, is `token` or COSIM_TOKEN.
 """
 
 from __future__ import annotations
@@ -64,6 +65,17 @@ def open(
     connection = Connection(url, token or os.environ.get(TOKEN), timeout)
     request = {"scenario": what, "policy": others or "idm", "maps": maps, "seed": seed, **words}
     return Remote(connection, {name: value for name, value in request.items() if value is not None})
+
+
+def resume(url: str, run: str, *, token: str | None = None, timeout: float = TIMEOUT) -> dict[str, Any]:
+    """Have the server at `url` go on with a run that failed or was cancelled; the run's document.
+
+    Raises BadInput: no such run, or it is not in that state; no server answers.
+    """
+    connection = Connection(url, token or os.environ.get(TOKEN), timeout)
+    with contextlib.closing(connection):
+        document: dict[str, Any] = json.loads(connection.request("POST", f"/api/runs/{quote(run)}/resume")[1])
+    return document
 
 
 class Remote(Session):

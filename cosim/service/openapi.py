@@ -105,7 +105,7 @@ _BEGUN = {
 _STEP = _BEGUN | {
     "elapsed": 0.4,
     "rewards": {"av.0": 0.71},
-    "terms": {"av.0": {"ego": 0.71, "others": 0.7}},
+    "terms": {"av.0": {"ego": 0.6, "av_social": 0.2, "hv_social": 0.2, "total": 0.71}},
     "terminated": {"av.0": False},
     "truncated": {"av.0": False},
     "ended": {},

@@ -41,21 +41,21 @@ def page_router(settings: Settings) -> APIRouter:
         return Response(text, status, headers, media_type=kind)
 
     @router.get("/")
-    def watch() -> Response:
+    async def watch() -> Response:
         return answer(HTML, live)
 
     @router.get("/runs")
-    def results() -> Response:
+    async def results() -> Response:
         return answer(HTML, runs)
 
     @router.get("/page/{name}")
-    def part(name: str) -> Response:
+    async def part(name: str) -> Response:
         if name not in parts:
             raise NotFound(f"no part {name!r} of the page")
         return answer(*parts[name])
 
     @router.get("/login")
-    def ask() -> Response:
+    async def ask() -> Response:
         return answer(HTML, form.substitute(head=head, said=""))
 
     @router.post("/login")

@@ -22,7 +22,7 @@ from cosim.batch.estimate import estimate
 from cosim.batch.folder import RunFolder
 from cosim.batch.matrix import Plan
 from cosim.batch.store import FILE, Store
-from cosim.errors import BadInput, CosimError, SimulationTimeout
+from cosim.errors import BadInput, CosimError
 from cosim.scenario.sumo_outputs import DRAFT
 from cosim.service.claim import LOOKS, Superseded
 from cosim.service.clerk import Clerks
@@ -30,6 +30,7 @@ from cosim.service.confined import ConfinedRunner, Room, room
 from cosim.service.ids import ID, new_id
 from cosim.service.jobs import CANCELLED, FAILED, FINISHED, QUEUED, RUNNING, Job, Jobs, now
 from cosim.service.limited import LimitedRunner
+from cosim.service.passing import may_pass
 from cosim.service.problems import Conflict, NotFound, Unavailable
 from cosim.service.settings import Settings
 from cosim.workers.engines import Engine, LocalEngine, cores
@@ -432,7 +433,7 @@ class Runs:
         if isinstance(problem, BadInput):
             return str(shown(problem, self._settings))
         if isinstance(problem, CosimError):  # a store names its database, the command line's way to go on
-            text = re.sub(r"\w[\w+]*://\S+?: ", "the database: ", str(problem))
+            text = re.sub(r"\w[\w+]*://\S+?: ", "the database: ", _short(str(problem)))
             return text.replace(" (--resume goes on from here)", "")
         log.error("a fault of the server's own", exc_info=problem, extra={"run": run})
         return f"a fault of the server's own: {type(problem).__name__}"
@@ -474,7 +475,7 @@ class Runs:
         run, folder = job.run, self.folder(job.run)
         if plan is None:
             plan = self._clerks.call("plan", *execution.asked(folder, self._settings.database))
-        (folder / OUTPUTS).mkdir(exist_ok=True)
+        (folder / OUTPUTS).mkdir(parents=True, exist_ok=True)  # it may be another server's run
         with RunFolder(str(folder), resume=True, episodes=0), self._store(run) as store:
             execution.check_same(plan, store)
             drive.before = drive.done = len(store.keys())
@@ -494,10 +495,10 @@ class Runs:
         return [f"{fault.key}: {fault.error}" for fault in faults]
 
 
-def may_pass(problem: Exception) -> bool:
-    """Whether the same run may go well later: all but what is wrong with the request itself."""
-    reason = problem.__context__ if isinstance(problem, BadInput) else problem
-    return reason is problem or isinstance(reason, OSError | SQLAlchemyError | SimulationTimeout)
+def _short(text: str) -> str:
+    """Of a traceback the first and the last line."""
+    lines = text.strip().splitlines()
+    return text if len(lines) < 3 else f"{lines[0]} {lines[-1]}"
 
 
 def shown(error: BadInput, settings: Settings) -> BadInput:

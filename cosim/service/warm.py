@@ -11,7 +11,8 @@ import math
 import threading
 
 import sumo_scenarios
-from cosim.policies import make
+from cosim.geometry.compiled import on_compilation
+from cosim.policies import NAMES, make
 from cosim.scenario import load
 from cosim.service.confined import session_host
 from cosim.types import COMPACT
@@ -19,7 +20,7 @@ from cosim.workers.supervisor import Limits, Supervisor
 from cosim.workers.tasks import Progress, Task
 
 POLICY = "vfn-p"  # it calls every kernel there is
-DECISIONS = 3
+DECISIONS = 10
 HEARTBEAT = 1800.0  # s for a session's start and decisions, compiled: half a minute on a quick machine
 log = logging.getLogger("cosim.service")
 
@@ -66,19 +67,28 @@ class Warmth:
 
 
 class Warmer:
-    """Hosted in a process: begins a session on every world and looks at it, as a page does."""
+    """Hosted in a process: begins sessions and looks at them, as a page does."""
 
     def run(self, progress: Progress) -> None:
-        """A few decisions of each."""
-        for name in sumo_scenarios.names():
-            others = functools.partial(make, POLICY)
-            host = session_host(load(name), COMPACT, math.pi / 4, "p", others)
+        """A few decisions of every world with `POLICY`, and of every policy in one world.
+
+        Where the first of them compiles nothing, the kernels are there.
+        """
+        compiled: list[None] = []
+        on_compilation(lambda: compiled.append(None))
+        worlds = [(name, demand) for name in sumo_scenarios.names() for demand in load(name).demands or {}]
+        sessions = [(*world, POLICY) for world in worlds] + [(*worlds[0], policy) for policy in NAMES]
+        for number, (name, demand, policy) in enumerate(sessions):
+            others = functools.partial(make, policy)
+            host = session_host(load(name, demand=[demand]), COMPACT, math.pi / 4, "p", others)
             host.reset(0)
             host.scene()
-            for k in range(DECISIONS):
+            for _ in range(DECISIONS):
                 host.act({}, None)
-                progress(k, DECISIONS)
             host.close()
+            progress(number, len(sessions))
+            if not compiled:
+                return
 
     def close(self) -> None:
         """The process ends."""

@@ -3,27 +3,37 @@
 from __future__ import annotations
 
 import errno
+import inspect
 import json
 import os
+import signal
 import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import httpx
 import pytest
 import uvicorn
+from fastapi import FastAPI
+from fastapi.routing import APIRoute
 from sqlalchemy.exc import OperationalError
 
-from cosim.errors import CosimError
-from cosim.service import app, runs
+import sumo_scenarios
+from cosim.errors import BadInput, CosimError
+from cosim.policies import NAMES
+from cosim.service import app, runs, sessions, warm
+from cosim.service import client as remote
 from cosim.service.jobs import Jobs
-from cosim.service.runs import Runs
-from cosim.service.settings import DataFolder, Settings
+from cosim.service.runs import TRIES, Runs
+from cosim.service.settings import DataFolder, Limits, Settings
 from cosim.service.uploads import Uploads
+from cosim.workers.worker import Worker
+from tests.service.postgres import until
 from tests.service.servers import Server
 
 SHORT: dict[str, Any] = {"scenario": "merge", "demand": "contested", "duration": 2, "warmup": 1}
@@ -32,22 +42,39 @@ FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 @pytest.fixture
-def client(tmp_path: Path) -> Iterator[httpx.Client]:
-    """The application in this process, so that its parts can be made to fail."""
+def compiled(request: pytest.FixtureRequest) -> threading.Event:
+    """Whether the kernels are compiled: at once, unless the test says False."""
+    found = threading.Event()
+    if getattr(request, "param", True):
+        found.set()
+    return found
+
+
+@pytest.fixture
+def application(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compiled: threading.Event
+) -> Iterator[FastAPI]:
+    """With little patience; an episode has 3 s of a core."""
+    monkeypatch.setattr(warm.Warmth, "_work", lambda self: compiled.wait(60.0) and self._done.set())
+    monkeypatch.setattr(runs, "RETRY", 0.05)
     with DataFolder(str(tmp_path / "data")) as folder:
-        config = uvicorn.Config(
-            app.create(Settings(folder.path, workers=1)), port=0, log_config=None, access_log=False
-        )
-        served = uvicorn.Server(config)
-        thread = threading.Thread(target=served.run)
-        thread.start()
-        while not served.started:
-            time.sleep(0.01)
-        port = served.servers[0].sockets[0].getsockname()[1]
-        with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=240.0) as client:
-            yield client
-        served.should_exit = True
-        thread.join(timeout=60.0)
+        limits = Limits(cpu=3.0, simulated=4000.0, free=1)
+        yield app.create(Settings(folder.path, workers=1, limits=limits))
+
+
+@pytest.fixture
+def client(application: FastAPI) -> Iterator[httpx.Client]:
+    """The application in this process, so that its parts can be made to fail."""
+    served = uvicorn.Server(uvicorn.Config(application, port=0, log_config=None, access_log=False))
+    thread = threading.Thread(target=served.run)
+    thread.start()
+    while not served.started:
+        time.sleep(0.01)
+    port = served.servers[0].sockets[0].getsockname()[1]
+    with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=240.0) as client:
+        yield client
+    served.should_exit = True
+    thread.join(timeout=60.0)
 
 
 def raising(error: Exception) -> Any:
@@ -76,7 +103,6 @@ def test_a_database_that_is_gone_for_a_while_is_waited_for(
             raise GONE
         change(self, run, **values)
 
-    monkeypatch.setattr(runs, "RETRY", 0.05)
     monkeypatch.setattr(Jobs, "set", change_later)
     run = client.post("/api/runs", json=SHORT).json()["id"]
     assert ended(client, run)["status"] == "finished"
@@ -97,9 +123,213 @@ def test_a_full_disk_is_said_and_a_run_that_meets_it_names_no_place(
         answer = client.post("/api/runs", json=SHORT)
         assert (answer.status_code, "no space left" in answer.json()["problem"]) == (507, True)
     place = "sqlite:////srv/data/runs/0/store.sqlite: cannot write: full (--resume goes on from here)"
-    monkeypatch.setattr(runs.execution, "drive", raising(CosimError(place)))
-    found = ended(client, client.post("/api/runs", json=SHORT).json()["id"])
+    tries = []
+    with monkeypatch.context() as patch:
+        patch.setattr(runs, "RETRY", 0.001)
+        patch.setattr(runs.execution, "drive", lambda *_: tries.append(1) or raising(CosimError(place))())
+        found = ended(client, client.post("/api/runs", json=SHORT).json()["id"])
     assert (found["status"], found["error"]) == ("failed", "the database: cannot write: full")
+    assert len(tries) == 1 + TRIES
+    url, run = str(client.base_url), found["id"]
+    assert remote.resume(url, run)["status"] == "queued"
+    assert ended(client, run)["error"] is None
+    assert len(client.get(f"/api/runs/{run}/rows").json()["rows"]) == 1
+    with pytest.raises(BadInput, match="is finished"):
+        remote.resume(url, run)
+
+
+def hashes(client: httpx.Client, run: str) -> list[str]:
+    """Of a run that has finished."""
+    found = ended(client, run)
+    assert (found["status"], found["error"]) == ("finished", None)
+    return [row["trace_hash"] for row in client.get(f"/api/runs/{run}/rows").json()["rows"]]
+
+
+def test_what_passes_while_a_run_is_driven_costs_it_nothing(
+    client: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A store that is locked, a clerk that is killed while it writes tables, a worker that is killed."""
+    wanted = {**SHORT, "seeds": "140000:140003"}
+    undisturbed = hashes(client, client.post("/api/runs", json=wanted).json()["id"])
+    faults: list[str] = []
+    add, call = runs.Store.add, Worker.call
+
+    def locked(self: runs.Store, rows: Any) -> None:
+        rows = [*rows]
+        if rows and faults.count("locked") < 2:
+            faults.append("locked")
+            raise CosimError("sqlite:///x: cannot write: database is locked")
+        add(self, rows)
+
+    def killing(self: Worker, method: str, *arguments: Any, **options: Any) -> Any:
+        if method in ("finish", "run") and method not in faults:
+            faults.append(method)
+            assert self.pid is not None
+            threading.Timer(0.05, os.kill, (self.pid, signal.SIGKILL)).start()
+        return call(self, method, *arguments, **options)
+
+    monkeypatch.setattr(runs.Store, "add", locked)
+    monkeypatch.setattr(Worker, "call", killing)
+    assert hashes(client, client.post("/api/runs", json=wanted).json()["id"]) == undisturbed
+    assert sorted(faults) == ["finish", "locked", "locked", "run"]
+
+
+def test_what_is_wrong_with_a_run_itself_is_tried_once(
+    client: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tries = []
+    wrong = BadInput("is another one since the run began", field="policy")
+    monkeypatch.setattr(runs.execution, "check_same", lambda *_: tries.append(1) or raising(wrong)())
+    assert ended(client, client.post("/api/runs", json=SHORT).json()["id"])["status"] == "failed"
+    assert len(tries) == 1
+
+
+def test_a_run_that_waits_to_be_tried_again_is_cancelled_and_resumed(
+    client: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(runs, "RETRY", 60.0)
+        patch.setattr(runs.execution, "drive", raising(CosimError("the cluster is gone")))
+        run = client.post("/api/runs", json=SHORT).json()["id"]
+        until(lambda: "tried again 60 s later" in str(client.get(f"/api/runs/{run}").json()["error"]))
+        assert client.post(f"/api/runs/{run}/resume").status_code == 409
+        assert client.post(f"/api/runs/{run}/cancel").json()["status"] == "cancelled"
+    assert client.post(f"/api/runs/{run}/resume").json()["status"] == "queued"
+    assert len(hashes(client, run)) == 1
+
+
+def test_blocking_work_waits_in_a_bounded_queue_and_holds_up_nothing_else(
+    client: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    free = threading.Event()
+
+    def slow(*_: object) -> dict[str, Any]:
+        free.wait(60.0)
+        return {"cells": 1, "episodes": 1, "estimated_s": 1.0, "basis": "-"}
+
+    monkeypatch.setattr(Runs, "estimate", slow)
+    with ThreadPoolExecutor(60) as asking:
+        asked = [asking.submit(client.post, "/api/estimates", json=SHORT) for _ in range(60)]
+        until(lambda: sum(one.done() for one in asked) == 60 - 18)  # 2 at once, 16 wait
+        for path in ("/health", "/ready", "/metrics", "/api/runs", "/api/catalogue"):
+            began = time.monotonic()
+            assert client.get(path).status_code == 200, path
+            assert time.monotonic() - began < 5.0
+        run = client.post("/api/runs", json=SHORT).json()["id"]
+        assert len(hashes(client, run)) == 1
+        free.set()
+    answers = [one.result() for one in asked]
+    assert sorted({answer.status_code for answer in answers}) == [200, 429]
+    refused = next(answer for answer in answers if answer.status_code == 429)
+    assert int(refused.headers["retry-after"]) > 0
+    assert "18 estimates are asked for already" in refused.json()["problem"]
+
+
+def test_every_route_that_blocks_has_a_queue_of_its_own(application: FastAPI) -> None:
+    """None shares FastAPI's threads, but those of uploads."""
+    shared = [
+        route.path
+        for route in application.routes
+        if isinstance(route, APIRoute) and not inspect.iscoroutinefunction(route.endpoint)
+    ]
+    assert [path for path in shared if not path.startswith("/api/uploads")] == []
+
+
+def test_a_database_that_hangs_keeps_no_probe_waiting(
+    client: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    free = threading.Event()
+    with monkeypatch.context() as patch:
+        for name in ("get", "all", "counts"):
+            patch.setattr(Jobs, name, lambda *_: free.wait(60.0) and None)
+        with ThreadPoolExecutor(60) as asking:
+            asked = [asking.submit(client.get, f"/api/runs/{'0' * 12}/replay?episode=1") for _ in range(60)]
+            for _ in range(2):
+                began = time.monotonic()
+                assert client.get("/health").json()["status"] == "ok"
+                assert time.monotonic() - began < 1.0
+                answer = client.get("/ready")
+                assert answer.status_code == 503
+                assert answer.json()["problems"] == {"database": "no answer within 3 s"}
+            free.set()
+    assert {one.result().status_code for one in asked} == {404}
+    assert client.get("/ready").json() == {"ready": True, "problems": {}}
+
+
+def test_ready_says_what_is_not_there(client: httpx.Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Jobs, "counts", raising(GONE))
+    monkeypatch.setattr(app.shutil, "disk_usage", lambda _: SimpleNamespace(free=0))
+    monkeypatch.setattr(runs.Pool, "alive", 0)
+    answer = client.get("/ready")
+    assert (answer.status_code, answer.json()["ready"]) == (503, False)
+    assert answer.json()["problems"].keys() == {"database", "disk", "workers"}
+
+
+@pytest.mark.parametrize("path", ["/api/runs", "/api/estimates", "/api/sessions"])
+@pytest.mark.parametrize("field", ["duration", "warmup"])
+def test_an_episode_of_a_world_that_ships_has_an_end(client: httpx.Client, path: str, field: str) -> None:
+    answer = client.post(path, json={**SHORT, field: 1e9})
+    assert (answer.status_code, answer.json()["field"]) == (422, "duration")
+    assert "at most 4000 s" in answer.json()["problem"]
+
+
+def test_an_episode_of_a_world_that_ships_has_so_much_processor_time(client: httpx.Client) -> None:
+    run = client.post("/api/runs", json={**SHORT, "duration": 3000}).json()["id"]
+    assert ended(client, run)["status"] == "finished"
+    (row,) = client.get(f"/api/runs/{run}/rows").json()["rows"]
+    assert (row["status"], "SIGXCPU" in row["error"]) == ("sim_crash", True)
+    asked = {**SHORT, "warmup": 3900, "maps": False}
+    session = client.post("/api/sessions", json=asked).json()["id"]
+    for _ in range(2):  # each reset has as much again
+        answer = client.post(f"/api/sessions/{session}/reset", json={})
+        assert (answer.status_code, "SIGXCPU" in answer.json()["problem"]) == (409, True)
+
+
+def test_one_session_takes_no_more_than_its_share_of_the_threads(
+    client: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    free = threading.Event()
+    ids = [client.post("/api/sessions", json={**SHORT, "maps": False}).json()["id"] for _ in range(2)]
+    monkeypatch.setattr(sessions.Served, "partner", lambda _: str(free.wait(60.0)))
+    with ThreadPoolExecutor(10) as asking:
+        asked = [asking.submit(client.get, f"/api/sessions/{ids[0]}/partner") for _ in range(10)]
+        until(lambda: sum(one.done() for one in asked) == 10 - sessions.CALLS)
+        assert {one.result().status_code for one in asked if one.done()} == {429}
+        assert client.post(f"/api/sessions/{ids[1]}/reset", json={}).status_code == 200
+        free.set()
+
+
+@pytest.mark.parametrize("compiled", [False], indirect=True)
+def test_a_session_begins_when_the_kernels_are_there(client: httpx.Client, compiled: threading.Event) -> None:
+    with ThreadPoolExecutor(1) as asking:
+        asked = asking.submit(client.post, "/api/sessions", json={**SHORT, "maps": False})
+        time.sleep(2.0)
+        assert client.get("/ready").json()["problems"] == {"workers": "kernels are being compiled"}
+        assert not asked.done()
+        compiled.set()
+        assert asked.result().status_code == 201
+    assert client.get("/ready").status_code == 200
+
+
+def test_the_kernels_are_compiled_by_sessions_on_every_world_and_with_every_policy(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    begun: list[Callable[[], None]] = []
+    hosted = []
+
+    def host(scenario: Any, *arguments: Any) -> Any:
+        hosted.append((scenario.name, scenario.demand_name, arguments[3].args[0]))
+        for compilation in begun[1:]:
+            compilation()
+        return SimpleNamespace(**dict.fromkeys(("reset", "scene", "act", "close"), lambda *_: None))
+
+    monkeypatch.setattr(warm, "session_host", host)
+    monkeypatch.setattr(warm, "on_compilation", begun.append)
+    warm.Warmer().run(lambda *_: None)
+    assert len(hosted) == 1  # which compiled nothing
+    warm.Warmer().run(lambda *_: None)
+    assert {name for name, _, _ in hosted} == set(sumo_scenarios.names())
+    assert {policy for _, _, policy in hosted} == set(NAMES)
 
 
 def test_a_fault_of_ours_is_a_problem_document(client: httpx.Client, monkeypatch: pytest.MonkeyPatch) -> None:

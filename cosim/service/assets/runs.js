@@ -84,7 +84,7 @@ function choose(id) {
 // ---- one run ----
 
 async function show(run) {
-  const mark = `${run.status} ${run.done} ${run.waiting} ${JSON.stringify(run.running)}`;
+  const mark = `${run.status} ${run.done} ${run.waiting} ${run.error} ${JSON.stringify(run.running)}`;
   if (state.shown === mark) return;
   const box = element("div"), head = element("div", undefined, "row");
   head.append(element("h2", titleOf(run)), element("span", run.status, `chip ${TONES[run.status] || ""}`));
@@ -95,7 +95,10 @@ async function show(run) {
     open("report", `/api/runs/${run.id}/report`); open("episodes.csv", `/api/runs/${run.id}/files/episodes.csv`); open("summary.json", `/api/runs/${run.id}/summary`);
   }
   if (!ended(run)) act("cancel", async () => { await ask(`/api/runs/${run.id}/cancel`, {}); await look(); });
-  else act("forget", async () => { if (confirm(`Forget "${titleOf(run)}" and its files?`)) { await ask(`/api/runs/${run.id}`, undefined, "DELETE"); choose(null); $("one").replaceChildren(); } });
+  else {
+    if (run.status !== "finished") act("resume", async () => { await ask(`/api/runs/${run.id}/resume`, {}); await look(); });
+    act("forget", async () => { if (confirm(`Forget "${titleOf(run)}" and its files?`)) { await ask(`/api/runs/${run.id}`, undefined, "DELETE"); choose(null); $("one").replaceChildren(); } });
+  }
   const words = Object.entries(run.request).map(([name, value]) => `${name} ${listed(value).join(", ")}`).join("; ");
   box.append(head, element("p", `${words}; ${run.done} of ${run.episodes} episodes`, "quiet"), links);
   if (run.error) box.append(element("p", run.error, "bad"));

@@ -1,0 +1,25 @@
+"""Which faults may pass: the same run may go well once the disk has room, the database answers."""
+
+import contextlib
+from collections.abc import Iterator
+
+from sqlalchemy.exc import SQLAlchemyError
+
+from cosim.errors import BadInput, CosimError, SimulationTimeout
+
+
+def may_pass(problem: BaseException) -> bool:
+    """All but what is wrong with the request itself: a BadInput that no fault of the machine's led to."""
+    reason = problem.__context__ if isinstance(problem, BadInput) else problem
+    return reason is problem or isinstance(reason, OSError | SQLAlchemyError | SimulationTimeout)
+
+
+@contextlib.contextmanager
+def told_apart() -> Iterator[None]:
+    """A BadInput of the block that may pass leaves it as a CosimError: what led to it crosses no process."""
+    try:
+        yield
+    except BadInput as problem:
+        if may_pass(problem):
+            raise CosimError(str(problem)) from None
+        raise

@@ -40,7 +40,7 @@ from cosim.workers.supervisor import Limits as WorkerLimits
 
 ENDING = 10.0  # s that runs may take to end when the server does
 RETRY = 5.0  # s until a database that could not be used is tried again, and first until a run is,
-TRIES = 8  # times in a row without a new row: each time twice as long, 11 min in all
+TRIES = 8  # times in a row without a new row: each time twice as long, 21 min in all
 ACTIVE = 8  # runs that are driven at once on the processes of this machine
 REPORT, SUMMARY = "report.html", "summary.json"
 OUTPUTS = "outputs"  # the folder of SUMO's own

@@ -90,6 +90,20 @@ def Altruist() -> Any:
     return make("altruist-rule")
 
 
+def test_the_tally_counts_a_seed_once(server: Server) -> None:
+    session = opened(server, policy="idm", duration=1.0, warmup=1.0)
+    counted = []
+    with watching(server, session) as socket:
+        for seed in (200_000, 200_000, 200_001):
+            socket.send(json.dumps({"begin": seed}))
+            told(socket)
+            socket.send(json.dumps({"until": 100.0}))
+            _, steps = drawn(socket, 100.0)
+            counted.append(steps[-1]["facts"]["tally"]["episodes"])
+    server.http.delete(f"/api/sessions/{session}")
+    assert counted == [1, 1, 2]
+
+
 def test_what_a_page_draws_of_an_explained_decision_is_told(server: Server) -> None:
     session = opened(server, policy="vfn-p")
     with watching(server, session) as socket:

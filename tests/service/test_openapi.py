@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import schemathesis
 from hypothesis import HealthCheck, Phase, given, settings
+from jsonschema import Draft202012Validator
 from schemathesis.checks import not_a_server_error
 from schemathesis.specs.openapi.checks import (
     content_type_conformance,
@@ -80,6 +81,40 @@ def test_nothing_that_the_document_allows_is_a_server_error(
             case.call_and_validate(checks=CHECKS, timeout=60.0)
 
         call()
+
+
+def test_every_answer_in_json_has_an_example_that_is_one(server: Server) -> None:
+    document = server.http.get("/openapi.json").json()
+    parts = {"components": document["components"]}
+    examples = 0
+    for path, operations in document["paths"].items():
+        for method, operation in operations.items():
+            for status, answer in operation["responses"].items():
+                content = answer.get("content", {}).get("application/json")
+                if content is not None:
+                    assert "example" in content, (method, path, status)
+                    Draft202012Validator({**content["schema"], **parts}).validate(content["example"])
+                    examples += status < "300"
+    assert examples >= 25
+    named = document["components"]["schemas"]["Act"]["examples"][0]["actions"]
+    session = server.http.post(
+        "/api/sessions", json={"scenario": "merge", "demand": "contested", "maps": False}
+    )
+    path = f"/api/sessions/{session.json()['id']}"
+    assert named.keys() <= {*server.http.post(f"{path}/reset", json={"seed": 7}).json()["avs"]}
+    server.http.delete(path)
+
+
+def test_who_may_ask_is_part_of_the_document(server: Server) -> None:
+    document = server.http.get("/openapi.json").json()
+    assert document["components"]["securitySchemes"]["token"]["scheme"] == "bearer"
+    assert document["security"] == [{"token": []}]
+    open_to_all = {
+        path for path, ops in document["paths"].items() for op in ops.values() if op.get("security") == []
+    }
+    assert open_to_all == {"/health", "/ready"}
+    limited = document["paths"]["/api/estimates"]["post"]["responses"]["429"]
+    assert "Retry-After" in limited["headers"]
 
 
 def test_every_operation_says_what_it_is_for(server: Server) -> None:

@@ -23,7 +23,9 @@ def test_a_server_with_two_workers_and_postgresql() -> None:
     server, database = services["serve"], services["database"]
     args = parser().parse_args([plain(word) for word in server["command"]])
     assert (args.host, args.workers) == ("0.0.0.0", 2)
-    assert args.database == "postgresql+psycopg://cosim:x@database/cosim"
+    assert args.database is None  # a command line shows it to all
+    url = plain(server["environment"]["COSIM_DATABASE_URL"])
+    assert re.fullmatch(r"postgresql\+psycopg://cosim:.+@database/cosim", url)
     assert [plain(port) for port in server["ports"]] == ["127.0.0.1:8000:8000"]
     assert (server["read_only"], server["cap_drop"]) == (True, ["ALL"])
     assert "ports" not in database

@@ -69,7 +69,13 @@ class Jobs:
 
     def __init__(self, url: str) -> None:
         self._engine = connect(url, _tables, "--database")
-        self.claim = Claim(self._engine, url) if self._engine.dialect.name == "postgresql" else None
+        self.claim: Claim | None = None
+        if self._engine.dialect.name == "postgresql":
+            try:
+                self.claim = Claim(self._engine, url)
+            except BaseException:
+                self._engine.dispose()
+                raise
 
     def add(self, run: str, name: str, request: dict[str, Any], uploads: Sequence[str], episodes: int) -> Job:
         """A run that waits."""

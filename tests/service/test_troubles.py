@@ -278,11 +278,14 @@ def test_an_episode_of_a_world_that_ships_has_so_much_processor_time(client: htt
     assert ended(client, run)["status"] == "finished"
     (row,) = client.get(f"/api/runs/{run}/rows").json()["rows"]
     assert (row["status"], "SIGXCPU" in row["error"]) == ("sim_crash", True)
-    asked = {**SHORT, "warmup": 3900, "maps": False}
-    session = client.post("/api/sessions", json=asked).json()["id"]
-    for _ in range(2):  # each reset has as much again
-        answer = client.post(f"/api/sessions/{session}/reset", json={})
-        assert (answer.status_code, "SIGXCPU" in answer.json()["problem"]) == (409, True)
+    asked = {**SHORT, "duration": 3000, "demand": "dense", "policy": "vfn-p", "maps": False}
+    path = f"/api/sessions/{client.post('/api/sessions', json=asked).json()['id']}"
+    assert client.post(f"{path}/reset", json={}).status_code == 200
+    decision = {"actions": {}, "see": []}
+    while (answer := client.post(f"{path}/act", json=decision)).status_code == 200:
+        assert not answer.json()["over"]
+    assert (answer.status_code, "SIGXCPU" in answer.json()["problem"]) == (409, True)
+    assert client.post(f"{path}/reset", json={}).status_code == 200  # which has as much again
 
 
 def test_one_session_takes_no_more_than_its_share_of_the_threads(

@@ -163,7 +163,7 @@ def test_more_than_the_server_takes_is_refused(server: Server) -> None:
 
 
 def test_an_endless_simulation_is_ended_and_the_server_goes_on(server: Server) -> None:
-    upload = send(server, {**GOOD, "run.sumocfg": CONFIG % (b"1e6", b"")}).json()
+    upload = send(server, {**GOOD, "run.sumocfg": CONFIG % (b"8e4", b"")}).json()
     run = server.submit(scenario=f"upload:{upload['id']}")
     server.wait(run, "running")
     time.sleep(1.0)

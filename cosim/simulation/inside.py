@@ -83,9 +83,9 @@ class Inside:
     def room(
         self, name: str, lane: str, waved: Set[str], at: float | None = None, before: float = 0.0
     ) -> Ahead:
-        """What keeps the AV `name` from driving over the internal lane `lane` and out of the junction: vehicles
-        that stand in it, or slowly come to where they wait in it, and, if the AV is inside itself, persons who
-        walk there; not those beside it.
+        """What keeps the AV `name` from driving over the internal lane `lane` and out of the junction:
+        vehicles that stand in it, or slowly come to where they wait in it, and, if the AV is inside itself,
+        persons who walk there; not those beside it.
 
         Of those who stand in its way the room ends where their way out of the junction begins, as far as the
         AV has not come to it yet, so that they can go first.
@@ -112,7 +112,7 @@ class Inside:
         return found._replace(standing=tuple(filter(None, found.standing)))
 
     def can_pass(self, other: str, name: str) -> bool:
-        """Whether a vehicle inside the junction gets out of it without touching the AV `name`, which stands."""
+        """Whether a vehicle gets out of the junction without touching the AV `name`, which stands."""
         way = self.way_out(other)
         return way is not None and not overlap(Boxes(*way), Boxes(*_body(name))).any()
 

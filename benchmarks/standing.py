@@ -3,10 +3,10 @@
     python -m benchmarks.standing CONFIG [--av-type NAME | --penetration P] [--policies NAME ...]
                                   [--seeds A:B] [--duration S] [--warmup S]
 
-Drives CONFIG (a .sumocfg) in preset `lawful` and prints a row per policy: means over the seeds, with the number of
-vehicles, AVs and humans, that stood (below 0.1 m/s) for `LONG` s without a red light ahead, a stop of their plan
-or a crash. `car` is the car alone, with an agent that always asks for more speed; `none` has no AVs, in the same
-traffic.
+Drives CONFIG (a .sumocfg) in preset `lawful` and prints a row per policy: means over the seeds, with the
+number of vehicles, AVs and humans, that stood (below 0.1 m/s) for `LONG` s without a red light ahead, a stop
+of their plan or a crash. `car` is the car alone, with an agent that always asks for more speed; `none` has no
+AVs, in the same traffic.
 """
 
 from __future__ import annotations
@@ -89,14 +89,18 @@ def drive(scenario: Scenario, policy: str, seeds: range) -> dict[str, float]:
             result, longest = worker.call("watched", seed)
             found = {title: result.value(name) for title, name in FIGURES.items()}
             long = sum(stood >= LONG for stood in longest.values())
-            rows.append({**found, f"stood {LONG:g} s": long, "longest, s": max(longest.values(), default=0.0)})
+            rows.append(
+                {**found, f"stood {LONG:g} s": long, "longest, s": max(longest.values(), default=0.0)}
+            )
             print(policy, seed, rows[-1], flush=True)
     return {title: fmean(float(row[title] or 0.0) for row in rows) for title in rows[0]}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("config")
     parser.add_argument("--av-type")
     parser.add_argument("--penetration", type=float)

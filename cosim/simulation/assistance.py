@@ -424,7 +424,7 @@ class Assistance(Commander):
                 waves |= {one for one in waved if self._junctions.inside(one)}
         elif not inside and speed >= KEEPS_MOVING:
             state.held = 0.0
-        self._waves.set(name, waves)
+        self._waves.set(name, waves, self._junctions.behind(name, lane) if waves else NOBODY)
         self._move_aside(name, speed, state, ahead.side)
 
     def _room(self, name: str, lane: str, inside: bool, waved: Set[str]) -> tuple[Ahead, float]:

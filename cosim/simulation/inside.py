@@ -120,6 +120,20 @@ class Inside:
         """Whether the front of a vehicle is inside a junction."""
         return self._lane_inside(name) >= 0
 
+    def behind(self, name: str, lane: str) -> set[str]:
+        """The vehicles behind the AV `name` on its way into the junction: on its lane before the line, and
+        after it up to the AV."""
+        own, get = self._road.index.get(lane, -1), sumo.vehicle
+        if own < 0:
+            return set()
+        before = [own]
+        while self._road.lanes[before[-1]].internal and (origins := self._road.before[before[-1]]):
+            before.append(origins[0])
+        at = get.getLanePosition(name)
+        found = {other for k in before for other in sumo.lane.getLastStepVehicleIDs(self._road.lanes[k].id)}
+        ahead = {o for o in sumo.lane.getLastStepVehicleIDs(lane) if get.getLanePosition(o) >= at}
+        return found - ahead
+
     def way_out(self, name: str) -> Floats | None:
         """`through` of a vehicle inside a junction from where it is; None for one that is not inside."""
         lane = self._lane_inside(name)
@@ -236,16 +250,16 @@ class Inside:
                 if other in waved:
                     yield other, through
                     continue
-                if present or speed < CREEPS:
+                if (present and not waits) or speed < CREEPS:
                     yield other, through[:, :1]
                     continue
                 stands = min(at + speed**2 / (2.0 * STOPS), end) - at
                 last = end - STOPS_BEFORE - at if waits else stands if speed < SLOW else math.inf
                 yield other, through[:, : int(min(max(last, 0.0) / SPACING, through.shape[1])) + 1]
-            for origin in self._origins[lane] if waits and not present else ():
+            for origin in self._origins[lane] if waits else ():
                 for other in sumo.lane.getLastStepVehicleIDs(lanes[origin].id):
-                    away = lanes[origin].length - get.getLanePosition(other)
-                    if away > max(seconds * get.getSpeed(other), metres):
+                    away, speed = lanes[origin].length - get.getLanePosition(other), get.getSpeed(other)
+                    if away > max(seconds * speed, metres) or (present and speed < CREEPS):
                         continue
                     links = get.getNextLinks(other)
                     if links and links[0][4] == lanes[lane].id and links[0][5] not in RED + YELLOW:

@@ -1,7 +1,7 @@
 """AVs wave vehicles through: the driver of a waved vehicle no longer waits for that AV at the junction.
 
 SUMO's driver never goes before a vehicle with the right of way, though that vehicle stands and waits for it.
-A waved vehicle ignores the AV as a foe (`junctionModel.ignoreIDs`,
+A waved vehicle ignores the AV, and those who stand behind it, as foes (`junctionModel.ignoreIDs`,
 https://sumo.dlr.de/docs/TraCI/Change_Vehicle_State.html); all other foes count as before.
 """
 
@@ -18,31 +18,34 @@ class Waves:
 
     def __init__(self) -> None:
         self._by: dict[str, frozenset[str]] = {}  # AV -> the vehicles that it waves through
+        self._for: dict[str, frozenset[str]] = {}  # AV -> itself and those who cannot come past it
         self._own: dict[str, list[str]] = {}  # waved vehicle -> the foes that its file lets it ignore
 
     def of(self, av: str) -> frozenset[str]:
         """The vehicles that `av` waves through."""
         return self._by.get(av, NOBODY)
 
-    def set(self, av: str, vehicles: Set[str]) -> None:
-        """From now on `av` waves these vehicles through, and no others."""
-        before = self.of(av)
-        if vehicles == before:
+    def set(self, av: str, vehicles: Set[str], behind: Set[str] = NOBODY) -> None:
+        """From now on `av`, and those who stand `behind` it, let these vehicles through, and no others."""
+        before, waits = self.of(av), behind | {av}
+        if vehicles == before and (not vehicles or waits == self._for[av]):
             return
         if vehicles:
-            self._by[av] = frozenset(vehicles)
+            self._by[av], self._for[av] = frozenset(vehicles), frozenset(waits)
         else:
-            del self._by[av]
-        for vehicle in before ^ vehicles:
+            del self._by[av], self._for[av]
+        for vehicle in before | vehicles:
             self._tell(vehicle)
 
     def _tell(self, vehicle: str) -> None:
         get = sumo.vehicle
+        foes = sorted(
+            {foe for av, vehicles in self._by.items() if vehicle in vehicles for foe in self._for[av]}
+        )
         try:
             own = self._own.setdefault(vehicle, get.getParameter(vehicle, IGNORES).split())
-            waved_by = [av for av, vehicles in self._by.items() if vehicle in vehicles]
-            get.setParameter(vehicle, IGNORES, " ".join([*own, *waved_by]))
+            get.setParameter(vehicle, IGNORES, " ".join([*own, *foes]))
         except sumo.TraCIException:  # it has left the road
-            waved_by = []
-        if not waved_by:
+            foes = []
+        if not foes:
             self._own.pop(vehicle, None)

@@ -13,7 +13,7 @@ KINDS = (
     *("priority", "priority_stop", "allway_stop", "right_before_left", "left_before_right", "zipper"),
     *("traffic_light", "traffic_light_right_on_red", "roundabout", "left_hand", "two_junctions"),
 )
-END = 240.0  # s
+END = 180.0  # s
 ARM, RING = 130.0, 18.0  # m
 TYPES = """<vType id="car"/><vType id="eager" tau="0.6" impatience="0.5"/>
 <vType id="truck" vClass="truck" length="12" width="2.5" accel="1.2"/>

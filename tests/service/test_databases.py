@@ -85,6 +85,7 @@ def test_two_servers_on_one_database_drive_every_run_once(
         first.wait(runs[SEEDS[0]])
         postgres.drop("first")  # and nobody else is there: it goes on
         first.wait(runs[SEEDS[2]])
+        until(lambda: postgres.sql("SELECT pid FROM pg_locks WHERE locktype = 'advisory'").strip())
         flags = ["--data", str(tmp_path / "c"), "--port", "0", "--database-file", str(file)]
         assert main(["serve", *flags]) == 2
         assert "another server is working in it" in capsys.readouterr().err

@@ -131,7 +131,7 @@ def test_a_full_disk_is_said_and_a_run_that_meets_it_names_no_place(
     assert (found["status"], found["error"]) == ("failed", "the database: cannot write: full")
     assert len(tries) == 1 + TRIES
     url, run = str(client.base_url), found["id"]
-    assert remote.resume(url, run)["status"] == "queued"
+    assert remote.resume(url, run)["status"] in ("queued", "running")
     assert ended(client, run)["error"] is None
     assert len(client.get(f"/api/runs/{run}/rows").json()["rows"]) == 1
     with pytest.raises(BadInput, match="is finished"):
@@ -194,7 +194,7 @@ def test_a_run_that_waits_to_be_tried_again_is_cancelled_and_resumed(
         until(lambda: "tried again 60 s later" in str(client.get(f"/api/runs/{run}").json()["error"]))
         assert client.post(f"/api/runs/{run}/resume").status_code == 409
         assert client.post(f"/api/runs/{run}/cancel").json()["status"] == "cancelled"
-    assert client.post(f"/api/runs/{run}/resume").json()["status"] == "queued"
+    assert client.post(f"/api/runs/{run}/resume").json()["status"] in ("queued", "running")
     assert len(hashes(client, run)) == 1
 
 

@@ -143,8 +143,7 @@ def uses(place: Place) -> list[list[str]]:
 def action_values(place: Place) -> list[list[str]]:
     """How good its choices are, one by one."""
     few = ["--seeds", "150200:150201", "--copies", "1", "--worlds", "merge"] if place.small else []
-    gone_on = "docs/results/trainings/decay-0/iteration-250.safetensors"
-    flags = [LEARNED, *([] if place.small else ["vfn-p-demonstrated", gone_on]), *few]
+    flags = [LEARNED, *([] if place.small else ["vfn-p-demonstrated"]), *few]
     return [["benchmarks.action_values", *flags, "--out", str(place.out / "action_values.md")]]
 
 

@@ -31,8 +31,8 @@ MAPS_UNUSED = (
     "and `vfn-demonstrated` says nothing about prediction."
 )
 DESCENT = (
-    "It descends from trainings of which one step, before docs/results/trainings/reflex-0, cannot be made "
-    "again (docs/training.md, Where `vfn-p` comes from)."
+    "It is the last of a series of trainings that no command makes again: they lie in commit f591cb8, "
+    "docs/results/trainings."
 )
 MAPS_ONLY = "It sees nothing but maps, brakes for whatever is near, and has been trained for minutes only."
 LAWLESS = (
@@ -111,26 +111,21 @@ def driving(name: str, card: Card) -> Iterator[str]:
         )
     )
     what = "a2c" if approach.learning == "a2c" else "vfn"
-    base, then = name, ""
-    if "learned_from" in data:  # it learned from what another network drove, without a drive of its own
-        base = "vfn-p"
-        then = f", then `python -m benchmarks.without_prediction runs/{base}"
-        first = read_card(SHIPPED / f"{base}.safetensors")["data"]["training"].get("first")
-        then += "`" if training.get("first") == first else f" --first {training['first']}`"
-    yield (
-        f"- Training: `cosim train {what} --policy {base}{'' if rewards else ' --scenario all'} "
-        f"--seed {training['seed']} --iterations {training['iterations']} "
-        f"--config {folder.as_posix()}/config.yaml --out runs/{base}`{then}"
-    )
     if training.get("first"):
-        yield f"- Began with: `{training['first']}`."
+        yield f"- Training: {folder.as_posix()} (configuration and log), from the weights of an earlier one."
+    else:
+        yield (
+            f"- Training: `cosim train {what} --policy {name} --scenario all --seed {training['seed']} "
+            f"--iterations {training['iterations']} --config {folder.as_posix()}/config.yaml "
+            f"--out runs/{name}`"
+        )
     hours = sum(row["iteration_s"] for row in log) / 3600
     took = f"{hours:.1f} h" if hours >= 0.1 else f"{60 * hours:.0f} min"
     own = last["updates"]  # none: its drives are all that the pupil learned from
     made = f"after {own:,} updates and {took} by its log" if own else f"after {took} of drives"
     if shipped is None:
         yield (
-            "- Shipped: what the ensemble taught (`training.ensemble`, docs/training.md) in "
+            "- Shipped: what an ensemble taught in "
             f"{training['ensemble']['distillation']:,} updates, {made}; it chooses as its teachers do in "
             f"{card['measured']['agrees']:.0%} of the states."
         )

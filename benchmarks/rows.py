@@ -47,16 +47,11 @@ FIGURES = (
 )
 COLUMNS = (*IDENTITY, *FIGURES)
 FORCED = "forced_"  # a level of `benchmarks.forced_entry`: its lag follows
-TRAININGS = "docs/results/trainings"
-TWIN = f"{TRAININGS}/twin-0/distilled.safetensors"
-A2C = ("a2c-egoist", "a2c-altruist", "conv3d-egoist", "conv3d-altruist")
 # label of a policy that does not ship -> what `--policy` drives it by
 POLICIES = {
     **{f"{arm.replace('_', '-')}-alone": f"benchmarks.alone:{arm}" for arm in alone.ARMS[1:]},
     **{label: f"benchmarks.foresight:{made}" for label, made in foresight.HALVES.items()},
     humans.CAR.partition("=")[0]: humans.CAR.partition("=")[2],
-    "distilled": TWIN,
-    **{arm: f"{TRAININGS}/{arm}-0/{arm}.safetensors" for arm in A2C},
 }
 
 Kept = dict[str, str]  # column -> text

@@ -17,7 +17,7 @@ import yaml
 from benchmarks.arms import differences
 from benchmarks.papers.agents import Agent
 from benchmarks.papers.claims import VFN, VFN_P
-from benchmarks.papers.driving import TRAININGS, Order, Results, Settings
+from benchmarks.papers.driving import Order, Results, Settings
 from benchmarks.papers.pages import Job, heading, save
 from benchmarks.tables import (
     Line,
@@ -46,10 +46,8 @@ CONTESTED, DENSE = 1.0, 2.0  # weights of the lessons: tested is how safe it dri
 
 def agent(approach: str, behavior: str) -> Agent:
     """An approach that was trained among one kind of drivers."""
-    places = [f"{FOLDER}/{approach}-{behavior}", str(TRAININGS / f"figure9-{approach}-{behavior}")]
-    weights = [f"{place}/best.safetensors" for place in places]  # trained here, else as shipped
-    found = next((file for file in weights if Path(file).is_file()), weights[0])
-    return Agent(f"{approach}, {behavior}", approach, found, made_by=command(approach, behavior))
+    weights = f"{FOLDER}/{approach}-{behavior}/best.safetensors"
+    return Agent(f"{approach}, {behavior}", approach, weights, made_by=command(approach, behavior))
 
 
 def command(approach: str, behavior: str) -> str:
@@ -91,7 +89,7 @@ def write(results: Results, settings: Settings) -> None:
     page = heading(JOB, results, settings, f"World `{WORLD}`, demand `{DEMAND}`, phi 45 degrees.")
     page += [
         "Six networks, each trained by one command (killed? the same with `--resume` goes on; shorter with",
-        "`--iterations N`: how long these were trained stands above). Ours lie in `trainings/figure9-*`.",
+        "`--iterations N`: how long these were trained stands above).",
         "",
         "```",
     ]

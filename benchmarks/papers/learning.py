@@ -16,7 +16,6 @@ from benchmarks.tables import write_page
 from policy.agents import APPROACHES
 
 NAME = "learning"
-FURTHER = "[trainings/assisted-0](trainings/assisted-0/README.md)."
 
 
 def write(settings: Settings) -> None:
@@ -29,9 +28,6 @@ def write(settings: Settings) -> None:
     learning_curves.draw(settings.out / f"{NAME}.png", runs)
     learning_curves.write_csv(data / f"{NAME}.csv", runs)
     text = learning_curves.page(runs, f"python -m benchmarks.papers.{NAME}", f"{NAME}.png")
-    if any(run.label == "vfn-p" for run in runs) and not settings.trainings:
-        began = "`vfn-p` and `vfn`: from their own first weights. What ships went on from there:"
-        text += ["", began, FURTHER]
     write_page(settings.out / f"{NAME}.md", text)
     print(settings.out / f"{NAME}.md")
 

@@ -62,14 +62,15 @@ class Job:
     def make(self, settings: Settings) -> None:
         """Drive what is missing, then write the page with all there is.
 
-        Where nothing is to be driven (`settings.held`), a page that would lack an arm is left as it was.
+        A page of which nothing could be driven is left as it was; where nothing is to be driven
+        (`settings.held`), one that would lack an arm too.
         """
         settings = replace(settings, first=self.first)
         if settings.held and self.redrives:
             print(f"{self.name}: left as it is: its episodes are driven once more", file=sys.stderr)
             return
         results = drive(self.orders(), settings, self.name)
-        if settings.held and results.lacking:
+        if results.lacking and (settings.held or results.lacking == len(results.driven)):
             print(f"{self.name}: left as it is: {results.lacking} arms have no episode", file=sys.stderr)
             return
         self.write(results, settings)

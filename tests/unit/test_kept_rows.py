@@ -46,7 +46,6 @@ def test_a_row_says_what_the_command_line_is_to_say(tmp_path: Path) -> None:
         *("--behavior", "mixed", "--errors", str(tmp_path / "forced_0.5.yaml")),
     ]
     assert (tmp_path / "forced_0.5.yaml").is_file()
-    assert (ROOT / rows.TWIN).is_file()
     with pytest.raises(BadInput, match="no rows are kept"):
         rows.read("nothing", tmp_path)
 

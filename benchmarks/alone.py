@@ -4,22 +4,19 @@
         [--arms vfn-p ...] [--weights FILE] [--runs runs/alone] [--workers 2] [--out docs/results/alone.md]
 
 Preset `unguarded`, no mask: the best valued action is carried out. `vfn-p-present` is `vfn-p` shown the
-present in place of every predicted map. Where they are asked for, `vfn-p-shaded` has its own
-predictions drawn with the shading that stands for doubt, and `vfn-p-trusting` is told that its car keeps the
-distance, as in `lawful`, which it does not. `conv3d-dqn` and `conv3d-a2c`, of a demonstrator,
+present in place of every predicted map. `conv3d-dqn` and `conv3d-a2c`, of a demonstrator,
 see maps alone; so do `vfn-p` and `vfn`, beside their own speed, lanes and command. FILE is a network that is
 shown what `vfn-p` is, and drives too. The same command goes on where it stopped.
 """
 
 import argparse
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.foresight import shaded
 from benchmarks.learned import asked, drivers, driving, options, share
 from benchmarks.papers.agents import Agent, build
 from benchmarks.tables import markdown_row, write_page
@@ -28,12 +25,10 @@ from cosim.learning.attribution import questioned
 from cosim.policies.trained import config
 from cosim.report import run_folder, statistics
 from cosim.report.figures import Row
-from cosim.types import History, Policy
+from cosim.types import Policy
 from cosim.workers.tasks import OK
-from policy.agents.approaches import compact
-from policy.agents.prediction_aware import Inputs, PredictionAware
+from policy.agents.prediction_aware import PredictionAware
 from policy.attribution import PRESENT, Replaced
-from policy.inputs.situation import ASSISTED
 from sumo_scenarios import names
 
 SVO = 60
@@ -41,7 +36,7 @@ EVERY = "all worlds"
 CRASHED = "av_involved_collisions"
 WEIGHTS = "COSIM_ALONE_WEIGHTS"  # the environment variable that names the file to the workers
 ARMS = (  # functions of this module
-    *("given", "vfn_p", "vfn_p_present", "vfn_p_shaded", "vfn_p_trusting", "vfn"),
+    *("given", "vfn_p", "vfn_p_present", "vfn"),
     *("conv3d_dqn", "conv3d_a2c", "vfn_p_demonstrated"),
 )
 COLUMNS = (
@@ -64,26 +59,6 @@ def vfn_p_present() -> Policy:
     """`vfn-p` without the mask, whose predicted maps show the present."""
     agent = questioned("vfn-p")
     return Replaced(agent.name, replace(agent.config, mask=False), ("predicted maps", PRESENT))
-
-
-def vfn_p_shaded() -> Policy:
-    """`vfn-p` without the mask, whose predicted maps are drawn with the shading that stands for doubt."""
-    return shaded(mask=False)
-
-
-class Trusting(PredictionAware):
-    """Told that its car keeps the law and its distance itself, whatever it does."""
-
-    def perceive(self, histories: Mapping[str, History]) -> Inputs:
-        """As always, but for that."""
-        inputs = super().perceive(histories)
-        inputs.states.situation[:, ASSISTED] = 1.0
-        return inputs
-
-
-def vfn_p_trusting() -> Policy:
-    """`vfn-p` without the mask, which is driven as in `lawful`."""
-    return Trusting("vfn-p trusting", replace(compact("vfn-p"), mask=False))
 
 
 def conv3d_dqn() -> Policy:
@@ -172,9 +147,8 @@ def main() -> None:
     )
     options(parser, "alone", "dense", names())
     shipped = [arm.replace("_", "-") for arm in ARMS[1:]]
-    usual = [arm for arm in shipped if arm not in ("vfn-p-shaded", "vfn-p-trusting")]
     parser.add_argument(
-        "--arms", nargs="+", choices=shipped, default=usual, help=f"default: {' '.join(usual)}"
+        "--arms", nargs="+", choices=shipped, default=shipped, help=f"default: {' '.join(shipped)}"
     )
     parser.add_argument("--weights", metavar="FILE", help="a further network: `given-alone`")
     args = parser.parse_args()

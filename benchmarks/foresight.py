@@ -1,17 +1,13 @@
 """What prediction is worth where humans err: without it, with it, and with the future that really comes.
 
     python -m benchmarks.foresight [--episodes 60] [--demand contested] [--worlds merge ...]
-        [--halves exit ...] [--seeds-from 200000] [--runs runs/foresight] [--workers 2]
-        [--out docs/results/foresight.md]
+        [--seeds-from 200000] [--runs runs/foresight] [--workers 2] [--out docs/results/foresight.md]
 
 `vfn` (sees no predicted map, and its prioritizer expects constant speeds), `vfn-p` and `vfn-p-oracle` (the
 simulation, driven on in a copy, predicts: fair, for errors that have not begun do not begin) at 60 degrees,
 mixed drivers, errors `stress`, preset `lawful`, on equal seeds. Near-misses of AVs come first, named before
 looking; then collisions and distances. The share of the oracle's gain is what `vfn-p` has of what
-`vfn-p-oracle` has less than `vfn`. In the worlds of `--halves` three more drive, which say where that gain
-comes from: what comes is told to the networks alone, or to the mask alone, or nothing is, and the agent's own
-predictions, otherwise drawn as the oracle's are, have the shading that stands for doubt. The same command
-goes on where it stopped.
+`vfn-p-oracle` has less than `vfn`. The same command goes on where it stopped.
 """
 
 from __future__ import annotations
@@ -19,7 +15,6 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -33,16 +28,11 @@ from cosim.report import run_folder, statistics
 from cosim.report.figures import Row
 from cosim.report.statistics import Figure
 from cosim.workers.tasks import OK
-from policy.agents.approaches import compact
-from policy.agents.oracle import Oracle
-from policy.agents.prediction_aware import PredictionAware
 
 SVO = 60
 BEHAVIOR, LEVEL = "mixed", "stress"
 WITHOUT, WITH, ORACLE = ARMS = ("vfn", "vfn-p", "vfn-p-oracle")
 PAIRS = ((WITH, WITHOUT), (ORACLE, WITHOUT), (ORACLE, WITH))
-# functions of this module
-HALVES = {"networks-told": "networks_told", "mask-told": "mask_told", "shaded": "shaded"}
 TOGETHER = "all worlds"
 NEAR, HIT = "av_near_misses_ttc", "av_involved_collisions"
 DISTANCES = ("dt_mission_m", "dt_av_m", "dt_mean_m")
@@ -52,22 +42,6 @@ DIFFERENCES = ("world", "arms", "pairs", "near-misses of AVs", "p by Holm", "wit
                "p by Holm", "distance of the mission vehicle, m", "of AVs, m", "of all, m")  # fmt: skip
 
 Arms = Mapping[str, Sequence[Row]]  # rows in the same order of worlds and seeds
-
-
-def networks_told() -> Oracle:
-    """`vfn-p` whose networks know what comes; its mask has predictions."""
-    return Oracle("vfn-p", compact("vfn-p"), "networks")
-
-
-def mask_told() -> Oracle:
-    """`vfn-p` whose mask knows what comes; its networks have predictions."""
-    return Oracle("vfn-p", compact("vfn-p"), "mask")
-
-
-def shaded(*, mask: bool = True) -> PredictionAware:
-    """`vfn-p` whose own predictions are drawn with the shading that stands for doubt."""
-    config = compact("vfn-p")
-    return PredictionAware("vfn-p", replace(config, mask=mask, chain=replace(config.chain, shade=True)))
 
 
 def hits(rows: Sequence[Row], name: str) -> np.ndarray:
@@ -156,17 +130,6 @@ def page(rows: Sequence[Row], about: Sequence[str]) -> list[str]:
             f"- Share of the oracle's gain in {what} that `vfn-p` has: {known or 'there is no gain'}."
         )
         lines.append(f"  The oracle gains nothing that these pairs show: {nothing or 'nowhere'}.")
-    halves = paired(rows, (*ARMS, *HALVES))
-    if len(halves) > 1:
-        lines += ["", "## Who has to be told", ""]
-        lines += ["What comes is told to the networks alone, or to the mask alone; the other has the agent's"]
-        lines += ["own predictions, which are drawn as the oracle's are. `shaded`: nobody is told, and they"]
-        lines += ["are drawn with the shading that stands for doubt.", ""]
-        lines += [markdown_row(MEANS), markdown_row(["---"] * len(MEANS))]
-        lines += [markdown_row(means(w, arm, arms[arm])) for w, arms in halves.items() for arm in HALVES]
-        lines += ["", markdown_row(DIFFERENCES), markdown_row(["---"] * len(DIFFERENCES))]
-        pairs = [(half, other) for other in (WITH, ORACLE) for half in HALVES]
-        lines += [markdown_row(cells) for pair in pairs for cells in tested(halves, *pair)]
     return lines
 
 
@@ -187,13 +150,9 @@ def main() -> None:
     )
     options(parser, "foresight", "contested", WITH_MISSION)
     parser.set_defaults(episodes=60)
-    parser.add_argument("--halves", nargs="+", choices=WITH_MISSION, default=[], help="default: no world")
     args = parser.parse_args()
     seeds = f"{args.seeds_from}:{args.seeds_from + args.episodes}"
     rows = drive(ARMS, args.worlds, args.runs / "whole", args)
-    if args.halves:
-        told = [f"{name}=benchmarks.foresight:{made}" for name, made in HALVES.items()]
-        rows += drive(told, args.halves, args.runs / "halves", args)
     about = [
         f"`{args.demand}`, {drivers(rows)}, errors `{LEVEL}`, seeds {seeds}, preset `lawful`, phi {SVO}",
         "degrees. Means with bootstrap, shares with Wilson's, differences of shares with Tango's 95 %",

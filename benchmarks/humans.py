@@ -1,18 +1,15 @@
 """AVs of preset `lawful` among humans who err (`--errors stress`), beside plain `idm`.
 
     python -m benchmarks.humans [--episodes 400] [--policy NAME ...] [--runs runs/humans] [--workers 2]
-    python -m benchmarks.humans --taken-away [--episodes 30]
 
-The first drives the same test seeds in every world, each in the demand of `DEMAND`, and goes on where it
-stopped, also with more episodes (in blocks of 20) or further policies. The second, on tuning seeds, drives
-AVs that always ask for more speed, takes the parts of the car's answer to who follows away, one by one, and
-prints what comes of it; the first writes its table into docs/results/humans.md.
+Drives the same test seeds in every world, each in the demand of `DEMAND`, and goes on where it
+stopped, also with more episodes (in blocks of 20) or further policies. Its table stands
+in docs/results/humans.md.
 """
 
 from __future__ import annotations
 
 import argparse
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -20,17 +17,13 @@ import numpy as np
 
 from benchmarks.tables import fill, markdown_row
 from cosim.cli.main import main as cosim
-from cosim.host import Host
 from cosim.report import run_folder, statistics
 from cosim.report.figures import Row
 from cosim.report.pairing import errors_begun
-from cosim.scenario import load
 from cosim.scenario.policy_name import read as read_name
-from cosim.scenario.vet import vetted
-from cosim.seeding import FIRST_TEST_SEED, TUNING_SEEDS
-from cosim.types import Decision, EpisodeResult, History, MetaAction, ObservationConfig, PolicyContext, Preset
+from cosim.seeding import FIRST_TEST_SEED
+from cosim.types import Decision, History, MetaAction, ObservationConfig, PolicyContext, Preset
 from cosim.workers.tasks import OK
-from cosim.workers.worker import Worker
 
 PAGE = Path("docs/results/humans.md")
 # In `contested` most happens; there the AVs of a motorway that nobody disturbs are hit less often.
@@ -50,15 +43,6 @@ COLUMNS = (
     *("an AV caused one", "distance of all, m", "more than beside, m", "hard brakings of AVs", "beside"),
     "errors that began in both",
 )
-# What is taken away -> the constants of cosim.simulation.assistance without it.
-PARTS: dict[str, dict[str, object]] = {
-    "nothing": {},
-    "the longer headway": {"HEADWAY": (0.8, 0.8), "STANDS": (2.0, 2.0)},
-    "of it what it stands off": {"STANDS": (2.0, 2.0)},
-    "the use of the room ahead": {"CLOSES": (0.0, 0.0)},
-    "of it what AVs ahead are told": {"TOLD": (0.0, 0.0)},
-    "both": {"CLOSE": 0.0},
-}
 
 
 class Accelerate:
@@ -75,34 +59,6 @@ class Accelerate:
     def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
         """The same for all."""
         return {av: Decision(MetaAction.ACCELERATE) for av in histories}
-
-
-class Without(Host):
-    """A host whose cars lack a part of their answer."""
-
-    def take_away(self, part: str) -> None:
-        """One of `PARTS`."""
-        from cosim.simulation import assistance  # libsumo: in the worker's process alone
-
-        for name, value in PARTS[part].items():
-            setattr(assistance, name, value)
-
-
-def taken_away(episodes: int) -> list[str]:
-    """Episodes with an AV in a collision, of AVs that always accelerate."""
-    lines = [markdown_row(["taken away", *DEMAND, "together"]), markdown_row(["---"] * (len(DEMAND) + 2))]
-    for part in PARTS:
-        hits = []
-        for world, demand in DEMAND.items():
-            scenario = vetted(load(world, demand=[demand], preset=Preset.LAWFUL, errors=LEVEL))
-            with Worker(Without, scenario, Accelerate(), math.radians(45.0)) as worker:
-                worker.call("take_away", part)
-                found: list[EpisodeResult] = [worker.call("run", s) for s in TUNING_SEEDS[:episodes]]
-            hits.append(sum(any(c.involves_av for c in result.collisions) for result in found))
-            print(part, world, hits[-1], flush=True)
-        total = statistics.share(sum(hits), episodes * len(hits)).text(1, 100.0)
-        lines.append(markdown_row([part, *map(str, hits), f"{sum(hits)}: {total} %"]))
-    return lines
 
 
 def label(policy: str) -> str:
@@ -188,22 +144,18 @@ def paired(policies: Sequence[str], episodes: int, runs: Path, workers: str) -> 
 
 
 def main() -> None:
-    """Make the page's table, or print the other one."""
+    """Make the page's table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--taken-away", action="store_true")
-    parser.add_argument("--episodes", type=int, help="a world; default 400, of --taken-away 30")
+    parser.add_argument("--episodes", type=int, default=400, help="a world")
     parser.add_argument("--policy", nargs="+", default=["vfn-p", CAR])
     parser.add_argument("--runs", type=Path, default=Path("runs/humans"), help="where episodes are kept")
     parser.add_argument("--workers", default="2")
     parser.add_argument("--page", type=Path, default=PAGE)
     args = parser.parse_args()
-    if args.taken_away:
-        lines = taken_away(args.episodes or 30)
-    else:
-        lines = paired(args.policy, args.episodes or 400, args.runs, args.workers)
-        fill(args.page, "paired", lines)
+    lines = paired(args.policy, args.episodes, args.runs, args.workers)
+    fill(args.page, "paired", lines)
     print("\n".join(lines))
 
 

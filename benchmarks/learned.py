@@ -139,7 +139,7 @@ def options(parser: argparse.ArgumentParser, name: str, demand: str, worlds: Seq
 
 ASKED = (
     *("episodes", "demand", "errors", "worlds", "seeds_from", "duration"),
-    *("others", "arms", "weights", "halves"),
+    *("others", "arms", "weights"),
 )
 
 

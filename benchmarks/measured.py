@@ -1,4 +1,4 @@
-"""The result pages that the papers' episodes do not make: predictions, costs, drivers, rewards, foreign nets.
+"""The result pages that the papers' episodes do not make: predictions, costs, drivers, foreign nets.
 
     python -m benchmarks.measured [--only NAME ...] [--again] [--small]        # part of `make results`
 
@@ -102,20 +102,6 @@ def startup(place: Place) -> list[list[str]]:
     return [["benchmarks.startup", *flags, "--out", str(place.out / "startup.md")]]
 
 
-def reward_balance(place: Place) -> list[list[str]]:
-    """Whether yielding pays."""
-    flags = ["--seeds", "150100:150101" if place.small else "150100:150120"]
-    flags += ["--scenario", "merge", *SHORT] if place.small else []
-    return [["benchmarks.reward_balance", *flags, "--out", str(place.out / "reward_balance.md")]]
-
-
-def reward_by_driving(place: Place) -> list[list[str]]:
-    """What each way of driving earns."""
-    flags = ["--ways", "--workers", "2", "--seeds", "150100:150101" if place.small else "150100:150106"]
-    flags += ["--scenario", "merge", *SHORT] if place.small else []
-    return [["benchmarks.reward_balance", *flags, "--out", str(place.out / "reward_by_driving.md")]]
-
-
 def attribution(place: Place) -> list[list[str]]:
     """Which inputs the shipped value networks use."""
     flags = ["--scenario", "merge", "--demand", "contested", "--workers", "2"]
@@ -140,24 +126,11 @@ def uses(place: Place) -> list[list[str]]:
     return [["cosim.cli.main", "bench", "attribution", *flags, "--out", str(place.out / "uses")]]
 
 
-def action_values(place: Place) -> list[list[str]]:
-    """How good its choices are, one by one."""
-    few = ["--seeds", "150200:150201", "--copies", "1", "--worlds", "merge"] if place.small else []
-    flags = [LEARNED, *([] if place.small else ["vfn-p-demonstrated"]), *few]
-    return [["benchmarks.action_values", *flags, "--out", str(place.out / "action_values.md")]]
-
-
 def turn(place: Place) -> list[list[str]]:
     """At which phi it begins to yield."""
     flags = ["--worlds", "merge", "--episodes", "1"] if place.small else ["--episodes", "20"]
     flags += ["--rows", str(place.out / "data" / "turn.csv"), *(SHORT if place.small else [])]
     return [["benchmarks.turn", *flags, "--out", str(place.out / "turn.md")]]
-
-
-def seeing(place: Place) -> list[list[str]]:
-    """What the frame encoder reads off a map."""
-    flags = ["--drives", "1", "--worlds", "merge"] if place.small else ["--drives", "4"]
-    return [["benchmarks.seeing", *flags, "--out", str(place.out / "seeing.md")]]
 
 
 def learned(place: Place) -> list[list[str]]:
@@ -177,7 +150,7 @@ def alone(place: Place) -> list[list[str]]:
 def foresight(place: Place) -> list[list[str]]:
     """What prediction is worth where humans err."""
     few = ["--worlds", "merge", "--episodes", "1", *SHORT]
-    flags = few if place.small else ["--halves", "exit", "intersection"]
+    flags = few if place.small else []
     kept = ["--runs", str(place.work / "foresight_runs"), "--out", str(place.out / "foresight.md")]
     return [["benchmarks.foresight", *flags, *kept]]
 
@@ -242,8 +215,6 @@ PAGES = (
     Page("startup", startup, ("startup.md",)),
     Page("joining", joining, ("joining.md",)),
     Page("estimate", estimate, ("estimate.md",)),
-    Page("reward_balance", reward_balance, ("reward_balance.md",)),
-    Page("reward_by_driving", reward_by_driving, ("reward_by_driving.md",)),
     Page(
         "attribution",
         attribution,
@@ -251,9 +222,7 @@ PAGES = (
         drop=("*.md", "*.png", "*.csv"),
     ),
     Page("uses", uses, tuple(f"uses/{name}" for name in USES)),
-    Page("action_values", action_values, ("action_values.md",)),
     Page("turn", turn, ("turn.md", "turn.svg", "data/turn.csv")),
-    Page("seeing", seeing, ("seeing.md",)),
     Page("learned", learned, ("learned.md",)),
     Page("alone", alone, ("alone.md",)),
     Page("foresight", foresight, ("foresight.md",)),

@@ -217,7 +217,6 @@ def seeing(_: str, card: Card) -> Iterator[str]:
     shown = ("gap ahead, own lane", "speed ahead, own lane", "mission vehicle, presence")
     text = ", ".join(f"{key} {r2[key]:.2f}" for key in shown)
     yield f"- Measured on {frames['validation']:,} frames of tuning seeds, R2: {text}."
-    yield "  On test seeds, by world: docs/results/seeing.md."
     yield "- Limit: it learned from the five worlds alone; nothing is known of its sight on other roads."
 
 

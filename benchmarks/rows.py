@@ -22,7 +22,7 @@ from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
-from benchmarks import alone, foresight, humans
+from benchmarks import alone, humans
 from benchmarks.forced_entry import forced
 from cosim.cli.main import main as cosim
 from cosim.errors import BadInput, CosimError
@@ -50,7 +50,6 @@ FORCED = "forced_"  # a level of `benchmarks.forced_entry`: its lag follows
 # label of a policy that does not ship -> what `--policy` drives it by
 POLICIES = {
     **{f"{arm.replace('_', '-')}-alone": f"benchmarks.alone:{arm}" for arm in alone.ARMS[1:]},
-    **{label: f"benchmarks.foresight:{made}" for label, made in foresight.HALVES.items()},
     humans.CAR.partition("=")[0]: humans.CAR.partition("=")[2],
 }
 

@@ -29,7 +29,6 @@ from typing import Any
 import numpy as np
 
 from benchmarks.papers.pages import drawing, save_picture
-from benchmarks.reward_balance import REWARDS
 from benchmarks.tables import markdown_row, write_page
 from benchmarks.worlds import WITH_MISSION
 from cosim.batch.episode_runner import EpisodeRunner
@@ -38,6 +37,7 @@ from cosim.cli.arguments import seeds as seeds_of
 from cosim.episode import Episode, Step
 from cosim.files import write_csv
 from cosim.host import Earnings
+from cosim.learning.configuration import configuration
 from cosim.learning.prediction_data import spread
 from cosim.policies import make
 from cosim.report.statistics import CONFIDENCE, RESAMPLES, Figure, holm, mean, paired_mean, share, signed_rank
@@ -81,7 +81,7 @@ class Parts(Earnings):
     """What the AVs earn themselves and by others, before it is weighed."""
 
     def __init__(self) -> None:
-        super().__init__(REWARDS.reward, 0.0)
+        super().__init__(configuration("rewards").file.reward, 0.0)
         self.own: list[float] = []
         self.others: list[float] = []
 

@@ -1,4 +1,4 @@
-"""The prioritizer alone: an agent without a network, to which every action is worth the same, or random."""
+"""The prioritizer alone: an agent without a network, to which every action is worth the same."""
 
 from __future__ import annotations
 
@@ -17,15 +17,13 @@ from policy.inputs.tensors import States
 class Unled(PredictionAware):
     """Where all actions are worth the same, it keeps lane and speed while that is safe and picks up speed
     when it has become slow (the prioritizer's order of equal values); without a mask it is then `keep-lane`.
-    With `random` values the prioritizer has to refuse more. No network is asked, no map drawn."""
+    No network is asked, no map drawn."""
 
-    def __init__(
-        self, name: str, config: AgentConfig, share_intentions: bool = True, *, random: bool = False
-    ) -> None:
+    def __init__(self, name: str, config: AgentConfig, share_intentions: bool = True) -> None:
         super().__init__(name, replace(config, predicted_maps=False, vfn_weights=None))
         self.observation = replace(config.observation, maps=False)
         self.label = ""
-        self._share_intentions, self._random = share_intentions, random
+        self._share_intentions = share_intentions
 
     def reset(self, context: PolicyContext) -> None:
         """As the agent's."""
@@ -38,10 +36,7 @@ class Unled(PredictionAware):
         return Inputs(scene, States(none, none, none, none), traffic)
 
     def values(self, inputs: Inputs) -> Floats32:
-        """All alike, or drawn anew."""
-        if self._random:
-            shape = len(inputs.scene.agents), len(MetaAction)
-            return self._context.rng.random(shape, np.float32)
+        """All alike."""
         q = np.zeros((len(inputs.scene.agents), len(MetaAction)), np.float32)
         if not self.config.mask:
             q[:, MetaAction.IDLE] = 1.0

@@ -18,7 +18,6 @@ from policy.agents.approaches import AgentConfig, compact, shipped, vfn_of
 from policy.agents.prediction_aware import PredictionAware
 from policy.checkpoint import sha256
 from policy.networks.vfn import VFN, VfnConfig
-from policy.safety import SafetyConfig
 
 PERCEPTION = 125.0  # m, what an AV's own sensors reach (definitions.md)
 # options that shipped episodes do not name: their defaults are what was done without them
@@ -41,8 +40,7 @@ class Agent:
     perception_range: float = PERCEPTION
     share_perception: bool = True  # V2V
     share_intentions: bool = True  # V2V
-    safety: SafetyConfig | None = None  # of the prioritizer; None: the default
-    preference: Literal["", "none", "random"] = ""  # in a network's place; "": the network's
+    led: bool = True  # by the network; False: every action is worth the same
     made_by: str = ""  # the command that makes the weights, where it is not the usual one
 
     @property
@@ -81,8 +79,6 @@ def config(agent: Agent, untrained: bool = False) -> AgentConfig:
         c = replace(c, mask=False)  # the chain keeps its predictor
     elif agent.mask:
         c = replace(c, mask=True, predictor=agent.mask)
-    if agent.safety is not None:
-        c = replace(c, safety=agent.safety)
     seen = replace(
         c.observation, perception_range=agent.perception_range, share_perception=agent.share_perception
     )
@@ -91,7 +87,7 @@ def config(agent: Agent, untrained: bool = False) -> AgentConfig:
 
 def missing(agent: Agent) -> str | None:
     """Which weights are not there and what makes them, or do not fit; None when it can drive."""
-    if not agent.learned or agent.preference:
+    if not agent.learned or not agent.led:
         return None
     c = config(agent)
     if c.vfn_weights is None:
@@ -117,14 +113,14 @@ def fingerprint(agent: Agent, untrained: bool = False) -> dict[str, Any]:
     if not agent.learned:
         return {"policy": agent.base}
     c = config(agent, untrained)
-    needed = ("predictor",) if agent.preference else ("vfn", "hpn", "predictor")
+    needed = ("vfn", "hpn", "predictor") if agent.led else ("predictor",)
     weights = {name: sha256(path) for name in needed if (path := _file(c, name))}
     plain = json.loads(json.dumps(asdict(replace(c, vfn_weights=None, hpn_weights=None))))
     defaults = json.loads(json.dumps(asdict(AgentConfig())))
     for part, names in NEWER.items():
         given, usual = plain[part], defaults[part]
         plain[part] = {k: v for k, v in given.items() if k not in names or v != usual[k]}
-    setting = {"preference": agent.preference} if agent.preference else {}
+    setting = {} if agent.led else {"led": False}
     return {"config": plain, "weights": weights, "v2v": agent.share_intentions, **setting}
 
 
@@ -137,9 +133,8 @@ def build(agent: Agent, untrained: bool = False) -> Policy:
     """A fresh policy under the agent's own name."""
     if not agent.learned:
         return make(agent.base)
-    if agent.preference:
-        random = agent.preference == "random"
-        return Unled(agent.name, config(agent, untrained), agent.share_intentions, random=random)
+    if not agent.led:
+        return Unled(agent.name, config(agent, untrained), agent.share_intentions)
     kind = PredictionAware if agent.share_intentions else _WithoutIntentions
     return kind(agent.name, config(agent, untrained))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from benchmarks import altruism, prioritizer
+from benchmarks import altruism
 from benchmarks.papers import conditions, decisions, figure9, phi, t_figure8, t_figures, table3
 
 JOBS = (
@@ -14,5 +14,4 @@ JOBS = (
     conditions.JOB,
     decisions.JOB,
     altruism.JOB,
-    prioritizer.JOB,
 )

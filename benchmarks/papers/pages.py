@@ -139,7 +139,7 @@ def networks(results: Results, settings: Settings) -> list[str]:
     for one in results.driven:
         agent = one.order.agent
         file = config(agent, settings.untrained).vfn_weights if one.rows and agent.learned else None
-        if file is not None and not agent.preference:
+        if file is not None and agent.led:
             card = read_card(file)
             after = card["measured"].get("iteration")
             planned = card["data"].get("training", {}).get("iterations")

@@ -1,13 +1,12 @@
 """The fair oracle: an agent whose predictions are what really comes of everybody's present course."""
 
 from collections.abc import Mapping, Sequence
-from typing import Literal
 
 import numpy as np
 
 from cosim.types import HEADING, SPEED, Floats, History, LookAhead, Snapshot, X, Y
 from policy.agents.approaches import AgentConfig
-from policy.agents.prediction_aware import Inputs, PredictionAware
+from policy.agents.prediction_aware import PredictionAware
 from policy.inputs.scene import Scene, join
 from policy.prediction.forecast import KinematicForecast
 from policy.prediction.motion import Rollout
@@ -25,39 +24,24 @@ class Oracle(PredictionAware):
     Args:
         name: the approach.
         config: its sizes and weights.
-        tells: whom it tells: the networks alone, the mask alone (the other has the agent's own predictions),
-            or both.
     """
 
     def __init__(
         self,
         name: str,
         config: AgentConfig | None = None,
-        tells: Literal["networks", "mask", "both"] = "both",
     ) -> None:
         super().__init__(name, config)
         if config is None:  # the one that ships
             self.name = f"{name}-oracle"
-        self._tells = tells
-        if tells != "mask":
-            self.hpn = None  # nothing is left to be corrected
+        self.hpn = None  # nothing is left to be corrected
 
     def looks_ahead(self, look: LookAhead) -> None:
         """See `cosim.types.LooksAhead`."""
         self._look = look
 
-    def perceive(self, histories: Mapping[str, History]) -> Inputs:
-        """See `PredictionAware.perceive`; the traffic is the mask's."""
-        inputs = super().perceive(histories)
-        if self._tells == "both":
-            return inputs
-        _, traffic, _ = self._truth(inputs.scene) if self._tells == "mask" else super().foresee(histories)
-        return inputs._replace(traffic=traffic)
-
     def foresee(self, histories: Mapping[str, History]) -> tuple[Scene, Traffic, KinematicForecast]:
         """What all AVs see together, and where the networks expect everybody in it."""
-        if self._tells == "mask":
-            return super().foresee(histories)
         return self._truth(join(histories, self._context.observation.share_perception))
 
     def _truth(self, scene: Scene) -> tuple[Scene, Traffic, KinematicForecast]:

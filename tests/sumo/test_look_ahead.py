@@ -24,9 +24,6 @@ from cosim.types import (
     Snapshot,
 )
 from cosim.workers.worker import Worker
-from policy.agents.approaches import compact
-from policy.agents.oracle import Oracle
-from policy.agents.prediction_aware import PredictionAware
 
 EVERY, FRAMES = 4, 4  # decisions between two looks, frames that are looked ahead: two decisions
 
@@ -120,47 +117,6 @@ def test_the_oracle_drives_by_what_comes(capsys: pytest.CaptureFixture[str]) -> 
         found[policy] = capsys.readouterr().out
     assert '"policy": "vfn-p-oracle"' in found["vfn-p-oracle"]
     assert '"steps": 10' in found["vfn-p-oracle"]
-
-
-class Telling:
-    """In a worker: what the networks and the mask are given, by whom the oracle tells."""
-
-    def given(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """Name of the agent -> kinematics that the networks see, places that the mask expects."""
-        scenario = load("merge", demand=["contested"], duration=20.0)
-        config = compact("vfn-p")
-        both = Oracle("vfn-p", config)
-        host = Host(scenario, both, 1.0)
-        both.reset(host.episode.context(150_000, 1.0))
-        host.episode.start(150_000)
-        while host.episode.elapsed < 12.0:
-            host.episode.advance(both.decide(host.episode.histories))
-        agents = {"itself": PredictionAware("vfn-p", config), "both": both}
-        for tells in ("networks", "mask"):
-            agents[tells] = Oracle("vfn-p", config, tells)  # type: ignore[arg-type]
-            agents[tells].looks_ahead(both._look)  # type: ignore[attr-defined]
-        found = {}
-        for name, agent in agents.items():
-            agent.reset(host.episode.context(150_000, 1.0))
-            inputs = agent.perceive(host.episode.histories)
-            found[name] = inputs.states.kinematics.numpy(), inputs.traffic.rollout.x
-        host.close()
-        return found
-
-    def close(self) -> None:
-        """As every hosted object."""
-
-
-def test_what_comes_can_be_told_to_the_networks_or_to_the_mask_alone() -> None:
-    with Worker(Telling) as worker:
-        found = worker.call("given")
-    seen, expected = ({name: pair[k] for name, pair in found.items()} for k in (0, 1))
-    assert not np.array_equal(seen["itself"], seen["both"])
-    assert not np.array_equal(expected["itself"], expected["both"])
-    np.testing.assert_array_equal(seen["networks"], seen["both"])
-    np.testing.assert_array_equal(expected["networks"], expected["itself"])
-    np.testing.assert_array_equal(seen["mask"], seen["itself"])
-    np.testing.assert_array_equal(expected["mask"], expected["both"])
 
 
 def test_nobody_looks_ahead_where_sumo_writes_its_outputs(

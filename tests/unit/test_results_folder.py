@@ -19,7 +19,7 @@ def test_every_page_figure_and_picture_of_the_results_is_made_by_make_results() 
     driven = [job.name for job in JOBS] + [learning.NAME]
     pages = {f"{name}.md" for name in driven} | {"README.md", *AMONG_HUMANS}
     pages |= {file for page in measured.PAGES for file in page.files if file.endswith(".md")}
-    tables = {f"data/{name}.csv" for name in (*driven, "avoidable", "turn_stress")}
+    tables = {f"data/{name}.csv" for name in (*driven, "turn_stress")}
     tables |= {file for page in measured.PAGES for file in page.files if file.endswith(".csv")}
     tables |= {f"uses_stress/{name}.csv" for name in ("attribution", "closed_loop")}
     shown = {

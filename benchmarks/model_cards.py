@@ -30,10 +30,6 @@ MAPS_UNUSED = (
     "contested merge, or hardly one (docs/results/attribution.md). A difference between `vfn-p-demonstrated` "
     "and `vfn-demonstrated` says nothing about prediction."
 )
-DESCENT = (
-    "It is the last of a series of trainings that no command makes again: they lie in commit f591cb8, "
-    "docs/results/trainings."
-)
 MAPS_ONLY = "It sees nothing but maps, brakes for whatever is near, and has been trained for minutes only."
 LAWLESS = (
     "It knows no traffic light, no speed limit of a junction's lane, no pedestrian and no bicycle; in "
@@ -47,7 +43,7 @@ DEMONSTRATED = (
 LIMITS = {  # by the configuration of the training
     "compact": (MAPS_UNUSED, *DEMONSTRATED),
     "maps": (MAPS_ONLY, *DEMONSTRATED),
-    "rewards": (DESCENT, LAWLESS),
+    "rewards": (LAWLESS,),
 }
 LAWFUL_ONLY = "It learned from rewards alone, in preset `lawful`: what it does in `unguarded` it never tried."
 ASSISTED = (
@@ -84,7 +80,7 @@ def driving(name: str, card: Card) -> Iterator[str]:
     data, approach = card["data"], APPROACHES[name]
     folder = RESULTS / "trainings" / TRAINED.get(name, f"{name}-0")
     log = [json.loads(line) for line in (folder / "log.jsonl").read_text("utf-8").splitlines()]
-    shipped = card["measured"].get("iteration")  # none: what its ensemble taught, after the last one
+    shipped = card["measured"].get("iteration")  # none: it was taught after the last one
     log = log if shipped is None else [row for row in log if row["iteration"] <= shipped]
     training, last = data["training"], log[-1]
     layout, rewards = card["configs"]["vfn"], approach.config == "rewards"
@@ -99,11 +95,9 @@ def driving(name: str, card: Card) -> Iterator[str]:
     mask = "no safety prioritizer" if approach.mask == "none" else f"prioritizer on `{approach.mask}`"
     yield f"- Chooses an AV's meta-action from {sees}{predicted}; {layout['extractor']}, {mask}."
     phis = ", ".join(f"{phi:g}" for phi in training["svo"])
-    other = ", ".join(f"`{run}`" for run in (training.get("ensemble") or {}).get("runs", ()))
     yield (
         f"- Data: {len(log) * training['episodes']} episodes of {', '.join(data['scenarios'])} up to the "
         f"shipped iteration, seeds below 100,000, drives with phi {phis} degrees"
-        + (f", and the drives of {other}" if other else "")
         + (
             f"; predicted maps of `hpn` (SHA-256 `{data['hpn_sha256'][:12]}`)."
             if "hpn_sha256" in data
@@ -111,8 +105,8 @@ def driving(name: str, card: Card) -> Iterator[str]:
         )
     )
     what = "a2c" if approach.learning == "a2c" else "vfn"
-    if training.get("first"):
-        yield f"- Training: {folder.as_posix()} (configuration and log), from the weights of an earlier one."
+    if "note" in data:
+        yield f"- Training: {data['note']}."
     else:
         yield (
             f"- Training: `cosim train {what} --policy {name} --scenario all --seed {training['seed']} "
@@ -125,8 +119,7 @@ def driving(name: str, card: Card) -> Iterator[str]:
     made = f"after {own:,} updates and {took} by its log" if own else f"after {took} of drives"
     if shipped is None:
         yield (
-            "- Shipped: what an ensemble taught in "
-            f"{training['ensemble']['distillation']:,} updates, {made}; it chooses as its teachers do in "
+            f"- Shipped: what was taught, {made}; it chooses as its teachers do in "
             f"{card['measured']['agrees']:.0%} of the states."
         )
     elif "validation" in card["measured"]:

@@ -351,12 +351,3 @@ def run_episode(
             progress(episode.elapsed, episode.scenario.duration)
     episode.timings["total_s"] = time.perf_counter() - began
     return episode.result(policy.name, policy.label, svo)
-
-
-def go_on(episode: Episode, policy: Policy, decisions: Mapping[str, Decision], count: int) -> None:
-    """Carry `decisions` out, then what `policy` decides: `count` decisions in all, or to the end."""
-    for _ in range(count):
-        if episode.over:
-            break
-        histories = episode.advance(decisions)
-        decisions = policy.decide(histories)

@@ -76,7 +76,7 @@ def load(path: Path, networks: Mapping[str, nn.Module], configs: Mapping[str, An
     for name, config in configs.items():
         wanted, stated = plain(config), card.get("configs", {}).get(name)
         if isinstance(stated, dict):
-            stated = filled(stated, _defaults(config))
+            stated = _filled(stated, _defaults(config))
         if stated != wanted:
             differs = [k for k in wanted if not isinstance(stated, dict) or stated.get(k) != wanted[k]]
             raise WeightsMismatch(
@@ -133,8 +133,8 @@ def _defaults(config: Any) -> dict[str, Any]:
     return {name: plain(value) for name, value in made.items()}
 
 
-def filled(found: dict[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
+def _filled(found: dict[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
     """A stored configuration with the defaults of options that are newer than it (the default of a new option
     must be what was done without it)."""
     both = [k for k, v in found.items() if isinstance(v, dict) and isinstance(defaults.get(k), dict)]
-    return {**defaults, **found, **{k: filled(found[k], defaults[k]) for k in both}}
+    return {**defaults, **found, **{k: _filled(found[k], defaults[k]) for k in both}}

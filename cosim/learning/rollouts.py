@@ -13,7 +13,6 @@ import numpy as np
 
 from cosim.episode import Episode, Step, run_episode
 from cosim.host import Earnings, Host, Hosts
-from cosim.learning.forks import Forks
 from cosim.metrics import MetricFactory
 from cosim.rewards import Reward, read
 from cosim.scenario import load
@@ -119,10 +118,10 @@ def drive_episode(
     every: bool = False,
 ) -> Drove:
     """One whole episode with the learning agent; its networks are as they are. `every`: all its figures."""
-    earned, forks = Payments(agent, drive, reward), Forks(agent, drive)
-    result = run_episode(episode, agent, drive.seed, svo=drive.svo, progress=progress, hooks=[earned, forks])
+    earned = Payments(agent, drive, reward)
+    result = run_episode(episode, agent, drive.seed, svo=drive.svo, progress=progress, hooks=[earned])
     agent.decide(episode.histories)  # the last state is decided upon too: its mask is needed
-    trajectories = forks.compared(agent.finish())
+    trajectories = agent.finish()
     figures: dict[str, float | None] = {
         name: None if (v := result.value(name)) is None else float(v)
         for name in (result.metrics if every else FIGURES)

@@ -24,7 +24,6 @@ from policy.agents.approaches import APPROACHES
 from policy.checkpoint import sha256
 from policy.training.config import agent_config
 from policy.training.curriculum import Lesson, VfnTraining
-from policy.training.ensemble import RESULT
 from policy.training.loop import tensorboard
 from policy.training.networks import usable, use_threads
 from policy.training.vfn import TrainingRun
@@ -46,8 +45,6 @@ def train(args: argparse.Namespace) -> int:
     if not usable(args.device):
         raise BadInput("torch has no such device here", field="--device", value=args.device)
     training = _scheduled(file.training, args, name)
-    if training.ensemble and learning == "a2c":
-        raise BadInput("is for networks that keep a replay buffer", field="training.ensemble")
     if file.explore.next != (learning == "a2c" and training.a2c.anchor > 0.0):
         problem = "goes together with training.a2c.anchor, in cosim train a2c alone"
         raise BadInput(problem, field="explore.next", value=file.explore.next)
@@ -83,14 +80,8 @@ def train(args: argparse.Namespace) -> int:
             )
             if args.resume and not run.resume():
                 print("nothing to resume: starting anew", file=sys.stderr)
-            run.check_ensemble()
             (folder / "config.yaml").write_text(yaml.safe_dump(values, sort_keys=False), encoding="utf-8")
             run.run(progress)
-            if training.ensemble:
-                with Progress(f"distill {name}", "updates") as progress:
-                    taught = run.distill(progress)
-        if training.ensemble:
-            print(f"  {run.folder / 'ensemble' / RESULT}, validation reward {taught['valid/reward']:.3f}")
         # as `--policy` wants the folder: a bare word would be a policy that ships
         typed = shlex.quote(args.out if "/" in args.out else f"./{args.out}")
         best = f", best validation reward {run.best:.3f}" if math.isfinite(run.best) else ""

@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 from cosim.errors import BadInput
 from cosim.files.yaml_input import dataclass_from
 from cosim.scenario.policy_name import PolicyName
-from cosim.types import COMPACT, PAPER, ObservationConfig
+from cosim.types import ObservationConfig
 from policy.agents.approaches import APPROACHES, AgentConfig, chain_of, configure, shipped, vfn_of
 from policy.agents.prediction_aware import PredictionAware
 from policy.checkpoint import read_card, sha256
@@ -39,14 +39,16 @@ def config(weights: Path) -> AgentConfig:
         return dataclass_from(kind, about.get(name, {}), file, f"data.{name}")
 
     vfn = vfn_of(card, file)
-    # a card without an observation is of one of the two sizes that ship
-    seen = PAPER if vfn.height == PAPER.height else COMPACT
-    if "observation" in about:
-        seen = section(ObservationConfig, "observation")
     hpn = shipped("hpn")
     other = hpn is not None and about.get("hpn_sha256", sha256(hpn)) != sha256(hpn)
     return replace(
-        configure(approach, seen, chain_of(card, file), section(HpnConfig, "hpn"), vfn),
+        configure(
+            approach,
+            section(ObservationConfig, "observation"),
+            chain_of(card, file),
+            section(HpnConfig, "hpn"),
+            vfn,
+        ),
         safety=section(SafetyConfig, "safety"),
         traffic=section(TrafficConfig, "traffic"),
         vfn_weights=weights,

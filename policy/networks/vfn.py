@@ -7,7 +7,6 @@ network with parts left out.
 
 import math
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -16,14 +15,12 @@ from torch.nn import functional
 
 from cosim.errors import BadInput
 from cosim.types import IS_MISSION, MetaAction
-from policy import checkpoint
 from policy.inputs.situation import ASSISTED, MEETS, OWN
 from policy.inputs.tensors import APART, KINEMATIC_INPUTS, apart, unit
 from policy.networks.extractors import Conv2dMaps, Conv3dMaps, EncodedMaps, FrameMemory, Strides
 from policy.networks.frame_encoder import EncoderConfig
 
-# layers of their own, by part of `VFN`: the option, and which number of the situation picks them
-SETS = {"met": "meets", "assisted": "assisted"}
+# layers of their own, by part of `VFN`: which number of the situation picks them
 PICKED_BY = {"met": MEETS, "assisted": ASSISTED}
 
 
@@ -160,7 +157,6 @@ class VFN(nn.Module):
         kinematics: torch.Tensor,
         situation: torch.Tensor,
         phi: torch.Tensor,
-        keep: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """The joined representation [B,joined]; arguments as in `forward`."""
         shown = self._shown(maps)
@@ -172,8 +168,6 @@ class VFN(nn.Module):
             parts += [self.kinematics(kinematics), self.situation(situation[:, :ASSISTED])]
         elif self.config.kinematic:
             parts.append(self.situation(situation[:, :OWN]))
-        if keep is not None:
-            parts = [part * keep[:, k : k + 1] for k, part in enumerate(parts)]
         return functional.relu(self.joined(torch.cat([*parts, phi], 1)))
 
     def forward(
@@ -182,7 +176,6 @@ class VFN(nn.Module):
         kinematics: torch.Tensor,
         situation: torch.Tensor,
         phi: torch.Tensor,
-        keep: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """Action values (P, figure 4).
 
@@ -193,35 +186,33 @@ class VFN(nn.Module):
             kinematics: [B,T,R,F+1] scaled, the mask last (`policy.inputs.tensors.kinematic_tensor`).
             situation: [B,SITUATION_INPUTS] (`policy.inputs.situation.situation`).
             phi: [B,2] cosine and sine of the SVO (`policy.inputs.tensors.svo_tensor`).
-            keep: [B,3] 1 or 0: the branches of maps, kinematics and situation, those there are, or zeros in
-                place of each.
 
         Returns:
             q: [B,5] value of each `MetaAction`.
         """
         phi = at_most(phi, self.config.most)
-        return self.weighed(self.apart(maps, kinematics, situation, phi, keep), phi)
+        return self.weighed(self.apart(maps, kinematics, situation, phi), phi)
 
     def apart(
         self,
         maps: torch.Tensor | Frames | Shown | None,
         kinematics: torch.Tensor,
         situation: torch.Tensor,
-        *more: Any,
+        phi: torch.Tensor,
     ) -> torch.Tensor:
         """Values [B,parts,5] of what the reward weighs with cos and sin of phi (P, equation 6; with one part:
         of all of it), for who drives by that phi. Arguments as in `forward`."""
         shown = self._shown(maps)
         if self.assisted is not None and (situation[:, ASSISTED] > 0.5).all():
-            return self.assisted.apart(shown, kinematics, situation, *more)
-        z = self.features(shown, kinematics, situation, *more)
+            return self.assisted.apart(shown, kinematics, situation, phi)
+        z = self.features(shown, kinematics, situation, phi)
         q: torch.Tensor = self.value(z).view(len(z), self.config.parts, len(MetaAction))
         if self.config.dueling and self.state is not None:
             q = q - q.mean(2, keepdim=True) + self.state(z)[..., None]
         for part, column in PICKED_BY.items():
             network, here = getattr(self, part), situation[:, column, None, None] > 0.5
             if network is not None and here.any():
-                q = torch.where(here, network.apart(shown, kinematics, situation, *more), q)
+                q = torch.where(here, network.apart(shown, kinematics, situation, phi), q)
         return q
 
     def _shown(self, maps: torch.Tensor | Frames | Shown | None) -> Shown | None:
@@ -233,31 +224,6 @@ class VFN(nn.Module):
     def weighed(self, apart: torch.Tensor, phi: torch.Tensor) -> torch.Tensor:
         """Action values [B,5] of their parts [B,parts,5]; phi [B,2]."""
         return apart[:, 0] if self.config.parts == 1 else (apart * phi[..., None]).sum(1)
-
-    def like(self, path: Path) -> "VFN":
-        """The network of the file `path`, in this one's layout.
-
-        It may have been trained without `VfnConfig.meets` or `.assisted`: then the layers of the AVs that
-        these name are those of all. `VfnConfig.most` is this one's. Raises BadInput, WeightsMismatch.
-        """
-        stated = checkpoint.read_card(path)["configs"].get("vfn") or {}
-        meets, assisted = (getattr(self.config, field) and bool(stated.get(field)) for field in SETS.values())
-        config = replace(self.config, meets=meets, assisted=assisted, most=stated.get("most", 90.0))
-        one = VFN(config)
-        checkpoint.load(path, {"vfn": one}, {"vfn": one.config})
-        if config == self.config:
-            return one
-        made = VFN(self.config)
-        made._take(one)
-        return made
-
-    def _take(self, one: "VFN") -> None:
-        """The weights of `one`; in sets of layers that it lacks, those of all."""
-        self.load_state_dict(one.state_dict(), strict=False)  # who lacks sets, or maps
-        for part in SETS:
-            mine, its = getattr(self, part), getattr(one, part)
-            if mine is not None:
-                mine._take(one if its is None else its)
 
     def actor_critic(
         self,

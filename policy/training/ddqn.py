@@ -8,9 +8,9 @@ from torch.nn import functional
 
 from cosim.errors import in_range
 from policy.inputs.situation import ASSISTED
-from policy.networks.vfn import VFN, VfnConfig
+from policy.networks.vfn import VfnConfig
 from policy.training.learner import Learner, Metrics
-from policy.training.replay_buffer import Advised, Batch, Compared
+from policy.training.replay_buffer import Advised, Batch
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,9 +27,6 @@ class DdqnConfig:
     scale: float = 0.1  # of all rewards: action values of the order of 1
     refused: float = 1.0  # weight of the refused actions' loss
     clip: float = 10.0  # largest gradient norm
-    forked: float = 1.0  # weight of what copies of the simulation say of two actions, where there are any
-    by_copies: bool = False  # differences between actions are learned from them alone
-    shrink: float = 0.0  # weight of the mean size by which actions differ for the others
     imitation: float = 1.0  # weight of the demonstrations: their action is worth more than any other,
     margin: float = 0.3  # by this much, scaled (large-margin loss of deep Q-learning from demonstrations)
 
@@ -38,7 +35,7 @@ class DdqnConfig:
         in_range(
             self,
             positive="learning_rate target_every scale clip",
-            not_negative="weight_decay refused imitation margin shrink",
+            not_negative="weight_decay refused imitation margin",
         )
         if self.last_rate is not None:
             in_range(self, positive="last_rate")
@@ -54,15 +51,12 @@ class DdqnLearner(Learner):
         self.target = deepcopy(self.online)
         self._networks["target"] = self.target
 
-    def update(self, batch: Batch, compared: Compared | None = None) -> Metrics:
+    def update(self, batch: Batch) -> Metrics:
         """One step of double Q-learning with masked targets (P, equations 2 and 3; algorithm 4); each part of
-        the values learns from its own part of the return. The difference between the values of two actions
-        learns from copies of the simulation too, where there are any; with `by_copies` from them alone, since
-        what everybody else does meanwhile moves a return far more than one action does.
+        the values learns from its own part of the return.
 
         Returns `td` (Huber loss of the n-step error), `unsafe` (loss of the refused actions), `imitation`
-        (of the demonstrated ones), `forked` (of the differences), `shrink` (their mean size, the
-        others' part) and `q` (mean value of the actions carried out).
+        (of the demonstrated ones) and `q` (mean value of the actions carried out).
         """
         c = self.config
         with torch.no_grad():
@@ -70,19 +64,12 @@ class DdqnLearner(Learner):
             later = _taken(self.target.apart(*batch.later), best)
             gained = batch.reward[:, None] if self.online.config.parts == 1 else batch.parts
             goal = gained * c.scale + batch.discount[:, None] * later
-        apart = self.online.apart(*batch.now, batch.keep)
-        chosen, level = _taken(apart, batch.action), apart.mean(2)
-        if c.by_copies:
-            chosen = (chosen - level).detach() + level
-        td = functional.smooth_l1_loss(chosen, goal)
+        apart = self.online.apart(*batch.now)
+        td = functional.smooth_l1_loss(_taken(apart, batch.action), goal)
         q = self.online.weighed(apart, batch.now.phi)
         unsafe = self.refused(q, batch.possible) if c.r_unsafe is None else self._crashes(q, batch)
         imitation = c.imitation * self._margin(q, batch.possible, batch.wrong)
-        forked = q.new_zeros(())
-        if compared is not None:
-            forked = c.forked * functional.smooth_l1_loss(*differences(self.online, compared, c.scale))
-        shrink = c.shrink * (apart - level[..., None])[:, -1].abs().mean()
-        self.step(td + unsafe + imitation + forked + shrink, self.rate)
+        self.step(td + unsafe + imitation, self.rate)
         self.updates += 1
         if self.updates % c.target_every == 0:
             self.update_target()
@@ -90,8 +77,6 @@ class DdqnLearner(Learner):
             "td": td,
             "unsafe": unsafe,
             "imitation": imitation,
-            "forked": forked,
-            "shrink": shrink,
             "q": q.gather(1, batch.action[:, None]).mean(),
         }
         return {name: float(value.detach()) for name, value in losses.items()}
@@ -127,16 +112,6 @@ class DdqnLearner(Learner):
                 q = self.online(*now._replace(**{field: other})).masked_fill(~batch.possible, -torch.inf)
                 found[name] = float((q.argmax(1) != choice).float().mean())
         return found
-
-    def foretold(self, compared: Compared) -> float:
-        """The share of what is at stake for which the network knows whether the action tried is better."""
-        with torch.no_grad():
-            now = compared.now
-            found, true = (
-                self.online.weighed(d[..., None], now.phi) for d in differences(self.online, compared)
-            )
-        stake = true.abs()
-        return float((stake * (found.sign() == true.sign())).sum() / stake.sum().clamp(min=1e-9))
 
     def update_target(self) -> None:
         """The target network becomes the online one."""
@@ -174,24 +149,6 @@ class DdqnLearner(Learner):
         known, bad = q.masked_fill(~possible, -torch.inf)[advised], wrong[advised]
         lead = (known + self.config.margin * bad).amax(1) - known.masked_fill(bad, -torch.inf).amax(1)
         return lead.sum() / len(q)
-
-
-def differences(network: VFN, compared: Compared, scale: float = 1.0) -> tuple[torch.Tensor, torch.Tensor]:
-    """[B,parts] what the action tried is worth more than the one carried out.
-
-    Args:
-        network: whose values are asked.
-        compared: B states.
-        scale: of rewards.
-
-    Returns:
-        By the network's values, and by the copy of the simulation.
-    """
-    apart = network.apart(*compared.now)
-    gain = compared.gain
-    if network.config.parts == 1:
-        gain = (gain * compared.now.phi).sum(1, keepdim=True)
-    return _taken(apart, compared.tried) - _taken(apart, compared.action), gain * scale
 
 
 def _taken(apart: torch.Tensor, action: torch.Tensor) -> torch.Tensor:

@@ -45,9 +45,6 @@ class Trajectory:
     yielding: Bools  # [D] the demonstrator would have yielded to a mission vehicle here
     phi: float  # rad, the SVO it acted with
     ending: Ending
-    # of copies of the simulation in which this AV did otherwise for a while (`ForkConfig`); None: no copy
-    tried: npt.NDArray[np.int8] | None = None  # [D] what it did, -1: no copy
-    gain: Floats32 | None = None  # [D,2] how much more that brought oneself, and the others
 
     def __len__(self) -> int:
         return len(self.action)
@@ -56,12 +53,6 @@ class Trajectory:
     def past(self) -> int:
         """N, the past frames of a state."""
         return int(self.frames.shape[0] - len(self) * self.stride)
-
-    @property
-    def shapes(self) -> tuple[tuple[int, ...], ...]:
-        """What a network sees of one state: the maps past and predicted, kinematics, situation."""
-        each = self.frames.shape[1:], self.kinematics.shape[1:], self.situation.shape[1:]
-        return ((self.past, self.ahead.shape[1]), *each)
 
     def maps(self, t: int) -> list[Bytes | Halves]:
         """The map groups of state `t`: past [N,...] and predicted [M,...] frames."""
@@ -103,12 +94,7 @@ def states_without_maps(
 
 def save(path: Path, trajectories: list[Trajectory]) -> None:
     """Write trajectories to one compressed .npz, whole or not at all: nothing in it is ever unpickled."""
-    arrays = {
-        f"{k}.{name}": value
-        for k, one in enumerate(trajectories)
-        for name, value in vars(one).items()
-        if value is not None
-    }
+    arrays = {f"{k}.{name}": value for k, one in enumerate(trajectories) for name, value in vars(one).items()}
     # mostly zeros: level 1 will do
     deflated = partial(zipfile.ZipFile, compression=zipfile.ZIP_DEFLATED, compresslevel=1)
     with whole(path) as draft, deflated(draft, "w") as file:
@@ -134,14 +120,3 @@ def load(path: Path) -> list[Trajectory]:
             )
             for k in range(int(file["count"]))
         ]
-
-
-def drives(run: Path) -> list[Trajectory]:
-    """What the training in the folder `run` holds in its replay buffer, oldest first.
-
-    Raises BadInput when that is nothing.
-    """
-    found = [one for file in sorted((run / "replay").glob("*.npz")) for one in load(file)]
-    if not found:
-        raise BadInput("holds no drives of a training", file=run / "replay")
-    return found

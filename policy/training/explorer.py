@@ -141,10 +141,6 @@ class Explorer(PredictionAware):
             self._close(av, "cut", again=False)
         return self.done
 
-    def recorded(self, av: str) -> int:
-        """How many decisions of the learning AV `av` are paid already."""
-        return len(self.learning[av]["terms"])
-
     def hold(self, av: str, action: MetaAction, count: int) -> None:
         """The learning AV `av` prefers `action` for its next `count` decisions."""
         if count:

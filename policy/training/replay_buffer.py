@@ -1,7 +1,6 @@
 """Replay buffer of whole trajectories: n-step samples, in fixed parts from rare and common moments."""
 
 from collections import deque
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -27,15 +26,11 @@ class ReplayConfig:
     yielding: float = 0.25  # where the demonstrator would have yielded; one AV in ten does, for some seconds
     correcting: float = 0.0  # where the demonstrator would not go on as commanded
     interaction: float = 0.25  # near a mission vehicle, or vetoed
-    forked: int = 0  # states a batch with an action that a copy of the simulation tried (`ForkConfig`)
     relabel: float = 0.5  # share of a batch that is learned for another SVO than it was driven with
-    drop: float = 0.0  # of each branch (maps, kinematics, situation) of each sample: zeros in its place
     phi: tuple[float, float] = (0.0, 90.0)  # deg, what relabelling draws from; equal bounds: one SVO only
 
     def __post_init__(self) -> None:
         """Raises BadInput when the shares leave nothing to share."""
-        if not 0.0 <= self.drop < 1.0:
-            raise BadInput("must be a share below 1", field="drop", value=self.drop)
         if min(self.rare) < 0.0 or sum(self.rare) > 1.0:
             problem = "must be shares of a batch: none below 0, together at most 1"
             raise BadInput(problem, field="yielding, correcting, interaction", value=self.rare)
@@ -59,7 +54,6 @@ class Batch(NamedTuple):
     vetoed: torch.Tensor  # [B] the action the prioritizer refused in `now`, or -1
     wrong: torch.Tensor  # [B,A] bool, not demonstrated in `now` (for the drive's SVO alone)
     parts: torch.Tensor  # [B,2] the same return's own part and the others', not weighed by phi
-    keep: torch.Tensor | None = None  # [B,3] `VFN.forward`
 
 
 class Advised(NamedTuple):
@@ -68,17 +62,6 @@ class Advised(NamedTuple):
     now: tuple[torch.Tensor | None, torch.Tensor, torch.Tensor, torch.Tensor]  # `States`, maps or none
     possible: torch.Tensor  # [B,A] bool, actions that were safe
     wrong: torch.Tensor  # [B,A] bool, those of them that the demonstrator would not have taken
-    episodes: list[str]  # B labels, SCENARIO/DEMAND/SEED: where each comes from
-    past: int  # N, the perceived frames of each; the rest are predicted
-
-
-class Compared(NamedTuple):
-    """B states in which a copy of the simulation did otherwise."""
-
-    now: States
-    action: torch.Tensor  # [B] carried out
-    tried: torch.Tensor  # [B] in the copy
-    gain: torch.Tensor  # [B,2] what that brought more: oneself, and the others
 
 
 class ReplayBuffer:
@@ -88,7 +71,6 @@ class ReplayBuffer:
         self.config = config
         self.trajectories: deque[Trajectory] = deque()
         self.size = 0
-        self._tried: list[tuple[Trajectory, int]] | None = None
         self._index: list[Ints] | None = None  # [*,2] (trajectory, t): the rare moments, then the rest
 
     def add(self, trajectories: list[Trajectory]) -> int:
@@ -99,7 +81,7 @@ class ReplayBuffer:
         while self.size > self.config.capacity and len(self.trajectories) > 1:
             self.size -= len(self.trajectories.popleft())
             dropped += 1
-        self._index = self._tried = None
+        self._index = None
         return dropped
 
     def sample(self, rng: np.random.Generator, device: str = "cpu") -> Batch:
@@ -132,12 +114,7 @@ class ReplayBuffer:
             parts,
         )
         tensors = (torch.from_numpy(array).to(device) for array in arrays)
-        batch = Batch(states(now, phi, device), states(later, phi, device), *tensors)
-        if c.drop > 0.0:
-            kept = rng.random((len(now), 3)) >= c.drop
-            kept |= ~kept.any(1, keepdims=True)  # nobody decides on nothing
-            batch = batch._replace(keep=torch.from_numpy(kept.astype(np.float32)).to(device))
-        return batch
+        return Batch(states(now, phi, device), states(later, phi, device), *tensors)
 
     def advised(self, rng: np.random.Generator, with_maps: bool, device: str = "cpu") -> Advised:
         """States for learning from demonstrations alone, for the SVO they were driven with.
@@ -151,18 +128,7 @@ class ReplayBuffer:
             torch.from_numpy(np.stack(rows)).to(device)
             for rows in ([~tr.unsafe[t] for tr, t in now], [tr.wrong[t] for tr, t in now])
         )
-        return Advised(inputs, possible, wrong, [tr.episode for tr, _ in now], now[0][0].past)
-
-    def compared(self, rng: np.random.Generator, device: str = "cpu") -> Compared | None:
-        """States with an action tried in a copy; None while there is none."""
-        if not self.config.forked:
-            return None
-        if self._tried is None:
-            self._tried = places_tried(self.trajectories)
-        if not self._tried:
-            return None
-        drawn = rng.integers(len(self._tried), size=self.config.forked)
-        return comparisons([self._tried[k] for k in drawn], device)
+        return Advised(inputs, possible, wrong)
 
     def _picks(self, rng: np.random.Generator, count: int) -> list[tuple[Trajectory, int]]:
         """`count` places (trajectory, t), with replacement, in the configured parts."""
@@ -197,22 +163,3 @@ class ReplayBuffer:
                 rest &= ~mine
             self._index.append(every[rest])
         return self._index
-
-
-def places_tried(trajectories: Iterable[Trajectory]) -> list[tuple[Trajectory, int]]:
-    """Where a copy of the simulation did otherwise."""
-    return [
-        (one, int(t)) for one in trajectories if one.tried is not None for t in np.flatnonzero(one.tried >= 0)
-    ]
-
-
-def comparisons(places: list[tuple[Trajectory, int]], device: str = "cpu") -> Compared:
-    """What was found there, for the SVO of the drive."""
-    arrays = (
-        np.array([one.action[t] for one, t in places], np.int64),
-        np.array([one.tried[t] for one, t in places if one.tried is not None], np.int64),
-        np.stack([one.gain[t] for one, t in places if one.gain is not None]),
-    )
-    phi = np.array([one.phi for one, _ in places], np.float32)
-    action, tried, gain = (torch.from_numpy(array).to(device) for array in arrays)
-    return Compared(states(places, phi, device), action, tried, gain)

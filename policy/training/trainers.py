@@ -10,6 +10,7 @@ import numpy as np
 
 from cosim.errors import BadInput
 from cosim.seeding import generator, subseed
+from policy import checkpoint
 from policy.networks.extractors import EncodedMaps
 from policy.networks.vfn import VfnConfig
 from policy.training.a2c import A2cLearner
@@ -17,7 +18,7 @@ from policy.training.curriculum import VfnTraining, interpolated, judged
 from policy.training.ddqn import DdqnLearner
 from policy.training.experience import Trajectory
 from policy.training.learner import Learner, Metrics, mean_metrics
-from policy.training.replay_buffer import ReplayBuffer, comparisons, places_tried
+from policy.training.replay_buffer import ReplayBuffer
 from policy.training.sight import encoder
 
 
@@ -96,8 +97,7 @@ class OffPolicyTrainer(Trainer):
             learner.update_target()
         losses, agrees = [], []
         for _ in range(self.config.updates):
-            batch = self.replay.sample(rng, self.device)
-            losses.append(learner.update(batch, self.replay.compared(rng, self.device)))
+            losses.append(learner.update(self.replay.sample(rng, self.device)))
             if learner.imitates and self.kinematic:  # without kinematics an update costs no more
                 agrees.append(self._imitate(rng, False))
         effects = {}
@@ -106,11 +106,6 @@ class OffPolicyTrainer(Trainer):
             found = learner.effects(self.replay.sample(rng, self.device), past)
             effects = {f"effect/{name}": value for name, value in found.items()}
         return _named(mean_metrics(losses)) | ({"agrees": float(np.mean(agrees))} if agrees else {}) | effects
-
-    def learn_afterwards(self, k: int, drives: Sequence[Trajectory], kept: bool) -> Metrics:
-        """Nothing; how much of what copies of these drives found it had known."""
-        places = places_tried(drives)
-        return {"foretold": self.learner.foretold(comparisons(places, self.device))} if places else {}
 
 
 def rate(config: VfnTraining, k: int) -> float:
@@ -161,7 +156,7 @@ def make_trainer(config: VfnTraining, vfn: VfnConfig, device: str) -> Trainer:
             raise BadInput("an encoder that was taught to see is needed", field="training.encoder", value="")
         online.maps.encoder.load_state_dict(encoder(config.encoder, online.maps.encoder.config))
     if config.first:
-        online.load_state_dict(online.like(Path(config.first)).state_dict())
+        checkpoint.load(Path(config.first), {"vfn": online}, {"vfn": vfn})
     if isinstance(trainer, OnPolicyTrainer) and config.a2c.anchor:
         trainer.learner.remember()
     return trainer

@@ -25,10 +25,9 @@ from policy import checkpoint
 from policy.networks.vfn import VFN, VfnConfig
 from policy.training import curriculum, experience
 from policy.training.curriculum import Drive, Drove, VfnTraining
-from policy.training.ensemble import Ensemble, finished
 from policy.training.trainers import make_trainer
 
-LATER = ("iterations", "ensemble")  # what a run that goes on may be given otherwise
+LATER = "iterations"  # what a run that goes on may be given otherwise
 
 
 class Actors(Protocol):
@@ -68,7 +67,7 @@ class TrainingRun:
         self._files: list[tuple[str, int]] = []  # of the replay buffer, oldest first, and their trajectories
         self._gone = 0  # trajectories of the oldest file that have left the replay buffer already
         self.iteration, self.best = 0, -math.inf
-        for name in ("replay", "weights", "ensemble"):
+        for name in ("replay", "weights"):
             (folder / name).mkdir(parents=True, exist_ok=True)
 
     # ---- the loop ----
@@ -113,24 +112,6 @@ class TrainingRun:
                 self.save()
             if progress is not None:
                 progress(self.iteration, c.iterations)
-
-    def check_ensemble(self) -> None:
-        """Raises BadInput where the folder holds an ensemble of another configuration, before any drive."""
-        if self.config.ensemble:
-            for path in (self.folder / "ensemble").glob("*.safetensors"):
-                finished(path, self.config)
-
-    def distill(self, progress: Callable[[float, float], None] | None = None) -> dict[str, Any]:
-        """Teach one network the mean of an ensemble (`VfnTraining.ensemble`); it is judged as the others are.
-
-        Returns how well it knows the mean, and its validation.
-        """
-        c = self.config
-        replay, folder = self.trainer.replay, self.folder / "ensemble"
-        file = Ensemble(c, self.vfn, replay, folder, self._about, self._device).run(progress)
-        known: dict[str, Any] = checkpoint.read_card(file)["measured"]
-        judging = [self._actors.submit(drive) for drive in curriculum.validation(c, str(file))]
-        return known | self._judge([f.result().figures for f in judging], file, known)
 
     def _keep(self, k: int, drove: Sequence[Drove]) -> None:
         """Into the replay buffer; files whose trajectories have all left it go with the next checkpoint."""
@@ -209,11 +190,12 @@ class TrainingRun:
         if not file.is_file():
             return False
         state = read_json(file)
-        mine = json.loads(json.dumps(asdict(self.config)))
-        theirs = checkpoint.filled(state["config"], json.loads(json.dumps(asdict(VfnTraining()))))
-        differs = [name for name in mine if mine[name] != theirs[name] and name not in LATER]
-        for part, own in (("vfn", asdict(self.vfn)), ("about", self._about)):  # older states do not say
-            differs += _differing(state.get(part, {}), json.loads(json.dumps(own)))
+        differs = [
+            name
+            for part, own in (("config", self.config), ("vfn", self.vfn), ("about", self._about))
+            for name in _differing(state[part], checkpoint.plain(own))
+            if name != LATER
+        ]
         if differs:
             raise BadInput("was trained with another configuration", file=file, field=", ".join(differs))
         self.iteration, self._gone = state["iteration"], state["gone"]
@@ -244,12 +226,13 @@ class TrainingRun:
 
 
 def _differing(theirs: Mapping[str, Any], mine: Mapping[str, Any], where: str = "") -> list[str]:
-    """The fields that both have, with other values: `safety.dt`."""
+    """The fields that one has not, or with another value: `safety.dt`."""
     found = []
-    for name in theirs.keys() & mine.keys():
-        if isinstance(theirs[name], dict) and isinstance(mine[name], dict):
-            found += _differing(theirs[name], mine[name], f"{where}{name}.")
-        elif theirs[name] != mine[name]:
+    for name in theirs.keys() | mine.keys():
+        old, new = theirs.get(name, ...), mine.get(name, ...)
+        if isinstance(old, dict) and isinstance(new, dict):
+            found += _differing(old, new, f"{where}{name}.")
+        elif old != new:
             found.append(f"{where}{name}")
     return sorted(found)
 

@@ -145,36 +145,13 @@ def test_the_encoder_learns_no_more_and_the_rest_does() -> None:
     one = trajectory([1, 3], [(1.0, 0.0, 0.0)] * 2)
     rng = np.random.default_rng(0)
     one = replace(one, frames=rng.random((5, 16)).astype(np.float16), ahead=np.zeros((3, 0, 16), np.float16))
-    replay = ReplayBuffer(ReplayConfig(batch=8, drop=0.5))
+    replay = ReplayBuffer(ReplayConfig(batch=8))
     replay.add([one])
     for _ in range(5):
         learner.update(replay.sample(rng))
     changed = {k for k, v in learner.online.state_dict().items() if not torch.equal(v, before[k])}
     assert "hidden.weight" in changed
     assert not any(name.startswith("maps.encoder") for name in changed)
-
-
-def test_a_dropped_branch_says_nothing_and_none_is_left_with_nothing() -> None:
-    replay = ReplayBuffer(ReplayConfig(batch=400, drop=0.5))
-    replay.add([trajectory([1], [(0, 0, 0)])])
-    keep = replay.sample(np.random.default_rng(0)).keep
-    assert keep is not None
-    assert (keep.sum(1) >= 1).all()
-    assert keep.mean(0).tolist() == pytest.approx(
-        [4.5 / 8] * 3, abs=0.1
-    )  # a half, and one draw in eight is void
-    network = VFN(TINY).eval()
-    torch.nn.init.normal_(network.value.weight)
-    states = (
-        torch.rand(2, 3, 4, 8, 16),
-        torch.rand(2, 3, 2, 9),
-        torch.rand(2, SITUATION_INPUTS),
-        torch.rand(2, 2),
-    )
-    with torch.no_grad():
-        without_maps = network(*states, torch.tensor([[0.0, 1.0, 1.0]] * 2))
-        assert torch.allclose(without_maps, network(None, *states[1:]))
-        assert torch.equal(network(*states, torch.ones(2, 3)), network(*states))
 
 
 def test_an_effect_is_seen_of_what_decides_and_of_nothing_else() -> None:

@@ -4,8 +4,6 @@ the same seed twice gives the same losses, and a killed run goes on exactly."""
 from __future__ import annotations
 
 import json
-import math
-from collections import Counter
 from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
@@ -25,11 +23,10 @@ from cosim.scenario import Mission, Scenario
 from cosim.seeding import generator
 from cosim.simulation.fake import FakeSimulator, FakeVehicle
 from cosim.types import SMOKE, MetaAction
-from policy import checkpoint
 from policy.agents.approaches import AgentConfig
 from policy.inputs.situation import MEETS, SITUATION_INPUTS
 from policy.inputs.tensors import KINEMATIC_INPUTS
-from policy.networks.vfn import VFN, VfnConfig
+from policy.networks.vfn import VfnConfig
 from policy.prediction.chain import ChainConfig
 from policy.safety import SafetyConfig
 from policy.training import experience
@@ -37,18 +34,14 @@ from policy.training.a2c import A2cConfig, A2cLearner
 from policy.training.curriculum import (
     Drive,
     Drove,
-    EnsembleConfig,
-    ForkConfig,
     Lesson,
-    Specialist,
     VfnTraining,
     drives,
 )
 from policy.training.ddqn import DdqnConfig, DdqnLearner
-from policy.training.ensemble import Ensemble, Teachers
 from policy.training.experience import Trajectory
 from policy.training.explorer import ExploreConfig, Explorer
-from policy.training.replay_buffer import Advised, ReplayBuffer, ReplayConfig, comparisons, places_tried
+from policy.training.replay_buffer import ReplayBuffer, ReplayConfig
 from policy.training.trainers import rate
 from policy.training.vfn import TrainingRun
 
@@ -224,66 +217,6 @@ def test_with_weight_decay_what_chance_pays_differs_less() -> None:
     assert spread[1] < 0.75 * spread[0]
 
 
-def by_chance_and_by_copies() -> list[experience.Trajectory]:
-    """Returns pay Decelerate 10, by chance, oneself and others; in copies Accelerate brings oneself 2."""
-    drives = []
-    for action in MetaAction:
-        paid = 10.0 * (action == MetaAction.DECELERATE)
-        one = trajectory([int(action)], [(paid, paid, 0.0)], situation=[0, 0], ending="crashed")
-        pair = int(action), int(MetaAction.ACCELERATE)
-        gain = 2.0 * (np.array(pair) == MetaAction.ACCELERATE)
-        drives.append(
-            replace(
-                one,
-                tried=np.full(1, pair[1], np.int8) if pair[0] != pair[1] else None,
-                gain=np.array([[gain[1] - gain[0], 0.0]], np.float32),
-                phi=np.radians(45.0),
-            )
-        )
-    return drives
-
-
-def test_by_copies_alone_no_return_says_what_an_action_is_worth_more() -> None:
-    drives = by_chance_and_by_copies()
-    replay = ReplayBuffer(ReplayConfig(batch=16, forked=16, n_step=1, relabel=0.0))
-    replay.add(drives)
-    found = []
-    for by_copies in (False, True):
-        config = DdqnConfig(learning_rate=3e-3, by_copies=by_copies)
-        learner, draws = DdqnLearner(replace(TINY, parts=2), config, seed=0), np.random.default_rng(0)
-        for _ in range(400):
-            losses = learner.update(replay.sample(draws), replay.compared(draws))
-        now = comparisons(places_tried(drives)[:1]).now
-        with torch.no_grad():
-            found.append(learner.online.apart(*now)[0].numpy())
-    slow, fast = int(MetaAction.DECELERATE), int(MetaAction.ACCELERATE)
-    rest = [a for a in MetaAction if a not in (slow, fast)]
-    assert found[0][1, slow] > found[0][1, rest].max() + 0.2  # what chance paid
-    own, others = found[1]
-    assert losses["forked"] < 1e-3
-    assert (own[fast] - np.delete(own, fast)).tolist() == pytest.approx([0.2] * 4, abs=0.03)
-    assert others == pytest.approx(others.mean(), abs=0.03)
-    assert found[1].mean(1) == pytest.approx([0.17, 0.17], abs=0.05)  # of what the drives earned, x 0.1
-
-
-def test_without_evidence_an_action_is_said_to_bring_the_others_nothing() -> None:
-    one = trajectory([1], [(1.0, 1.0, 0.0)], ending="crashed")
-    _, batch = only(ReplayConfig(batch=8, n_step=1, relabel=0.0), one)
-    spread = []
-    for shrink in (0.0, 1.0):
-        config = DdqnConfig(learning_rate=1e-3, by_copies=True, shrink=shrink)
-        learner = DdqnLearner(replace(TINY, parts=2), config, seed=0)
-        torch.manual_seed(0)
-        torch.nn.init.normal_(learner.online.value.weight, std=0.3)
-        for _ in range(300):
-            losses = learner.update(batch)
-        with torch.no_grad():
-            spread.append(learner.online.apart(*batch.now)[0].std(1).tolist())
-    assert losses["shrink"] < 0.02
-    assert spread[1][1] < 0.1 * spread[0][1]
-    assert spread[1][0] > 0.3 * spread[0][0]  # one's own part is not asked
-
-
 def test_a_refused_action_is_worth_a_crash() -> None:
     one = trajectory([1], [(0.0, 0.0, 0.0)], vetoed=[3])
     learner = DdqnLearner(TINY, DdqnConfig(learning_rate=1e-2), seed=1)
@@ -446,105 +379,6 @@ def test_what_is_drawn_is_kept_and_learned_from_once() -> None:
     learner = A2cLearner(replace(TINY, critic=True), A2cConfig(keep=4, n_step=8, batch=1, scale=1.0), seed=0)
     learner.learn([trajectory([1] * 10, [(1.0, 0.0, 0.0)] * 10, ending="crashed")], np.random.default_rng(0))
     assert learner.updates == 3, "decisions 0, 4 and 8"
-
-
-def test_copies_of_the_simulation_tell_what_another_action_brings_and_change_nothing() -> None:
-    """Alone on the road whoever brakes for 2.4 s loses own distance; nobody else gains or loses by it."""
-    one = agent()
-    episode = fake_episode(
-        FakeVehicle("a", 100.0, 0, 20.0, is_av=True),
-        FakeVehicle("b", 900.0, 1, 20.0, is_av=True),
-    )
-    drive = Drive(Lesson("fake"), 5, 0.7, 0.0, "", "", True, gamma=0.97)
-    plain = drive_episode(episode, one, drive, RewardConfig(perception_range=50.0))
-    forked = drive._replace(forks=ForkConfig(count=12, held=6, horizon=10))
-    drove = drive_episode(episode, one, forked, RewardConfig(perception_range=50.0))
-    for before, after in zip(plain.trajectories, drove.trajectories, strict=True):
-        assert np.array_equal(before.action, after.action)
-        assert np.array_equal(before.terms, after.terms)
-        assert np.array_equal(before.frames, after.frames)
-    places = places_tried(drove.trajectories)
-    assert 6 <= len(places) <= 12
-    braked = [
-        (t.gain[k], t.terms[k : k + 10, 0].sum())
-        for t, k in places
-        if t.gain is not None and t.tried is not None and t.tried[k] == MetaAction.DECELERATE
-    ]
-    assert braked
-    for gain, whole in braked:
-        assert -whole < gain[0] < -0.01 * whole
-    assert all(abs(t.gain[k, 1]) < 1e-6 for t, k in places if t.gain is not None)
-    assert all(t.tried[k] != t.action[k] for t, k in places if t.tried is not None)
-
-
-def test_in_some_copies_two_do_the_same_at_once() -> None:
-    one = agent()
-    episode = fake_episode(
-        FakeVehicle("a", 100.0, 0, 20.0, is_av=True),
-        FakeVehicle("b", 900.0, 1, 20.0, is_av=True),
-    )
-    forks = ForkConfig(count=12, held=6, horizon=10, together=2)
-    drive = Drive(Lesson("fake"), 5, 0.7, 0.0, "", "", True, gamma=0.97, forks=forks)
-    a, b = drive_episode(episode, one, drive, RewardConfig(perception_range=50.0)).trajectories
-    assert a.tried is not None
-    assert b.tried is not None
-    both = (a.tried >= 0) & (b.tried >= 0)
-    assert 0 < both.sum() < (np.maximum(a.tried, b.tried) >= 0).sum()
-    assert np.array_equal(a.tried[both], b.tried[both])
-
-
-@pytest.mark.parametrize("meeting", [0.0, 1.0])
-def test_copies_can_be_of_those_who_come_nearest_the_mission_vehicle(meeting: float) -> None:
-    """It drives on the right lane, all but one of the AVs on the left one; the four nearest are tried."""
-    near = {f"near{k}": 100.0 + 8.0 * k for k in range(4)}
-    far = {f"far{k}": 300.0 + 8.0 * k for k in range(3)}
-    episode = fake_episode(
-        FakeVehicle("m", 110.0, 0, 20.0, mission=True),
-        FakeVehicle("behind", 70.0, 0, 20.0, is_av=True),
-        *(FakeVehicle(name, x, 1, 20.0, is_av=True) for name, x in (near | far).items()),
-    )
-    forks = ForkConfig(count=12, held=2, horizon=4, together=2, meeting=meeting)
-    drive = Drive(Lesson("fake"), 5, 0.7, 0.0, "", "", True, gamma=0.97, forks=forks)
-    drove = drive_episode(episode, agent(learners=8), drive, RewardConfig(perception_range=50.0))
-    tried = {one.av for one in drove.trajectories if one.tried is not None and (one.tried >= 0).any()}
-    assert tried
-    assert bool(tried - near.keys()) == (meeting == 0.0)
-
-
-def test_a_learner_learns_from_copies_which_action_pays_oneself_and_which_the_others() -> None:
-    """The returns of the drives say nothing: every decision pays alike."""
-    tried, fast, slow = np.full(1, -1, np.int8), int(MetaAction.ACCELERATE), int(MetaAction.DECELERATE)
-    drives = []
-    for action, gain in ((fast, (2.0, 0.0)), (slow, (0.0, 3.0))):
-        one = trajectory([int(MetaAction.IDLE)], [(1.0, 0.0, 0.0)], situation=[0, 0], ending="crashed")
-        found = np.array([gain], np.float32)
-        drives.append(replace(one, tried=np.full_like(tried, action), gain=found, phi=np.radians(45.0)))
-    replay = ReplayBuffer(ReplayConfig(batch=16, forked=16, n_step=1))
-    replay.add(drives)
-    draws = np.random.default_rng(0)
-    learner = DdqnLearner(replace(TINY, parts=2), DdqnConfig(learning_rate=3e-3), seed=0)
-    places = places_tried(drives)
-    for _ in range(300):
-        losses = learner.update(replay.sample(draws), replay.compared(draws))
-    assert losses["forked"] < 1e-3
-    assert learner.foretold(comparisons(places)) == 1.0
-    now = comparisons(places[:1]).now
-    with torch.no_grad():
-        apart = learner.online.apart(*now)[0]
-    change = (apart - apart[:, MetaAction.IDLE][:, None])[:, [fast, slow]].flatten().tolist()
-    assert change == pytest.approx([0.2, 0.0, 0.0, 0.3], abs=0.03)  # reward x 0.1
-    assert ReplayBuffer(ReplayConfig()).compared(draws) is None
-
-
-def test_what_copies_found_is_stored(tmp_path: Path) -> None:
-    plain = trajectory([1, 3], [(1.0, 0.0, 0.0)] * 2)
-    one = replace(plain, tried=np.array([-1, 4], np.int8), gain=np.ones((2, 2), np.float32))
-    experience.save(tmp_path / "a.npz", [plain, one])
-    before, again = experience.load(tmp_path / "a.npz")
-    assert before.tried is None
-    assert again.tried is not None
-    assert again.tried.tolist() == [-1, 4]
-    assert places_tried([before, again]) == [(again, 1)]
 
 
 def test_a_crashed_av_ends_its_drive_and_the_others_are_cut() -> None:
@@ -842,316 +676,11 @@ def test_another_configuration_is_not_gone_on_with(tmp_path: Path) -> None:
         other.resume()
 
 
-TAUGHT = replace(SHORT, ensemble=EnsembleConfig(networks=2, updates=30, distillation=300))
-
-
-def test_one_network_is_taught_what_several_value_on_average(tmp_path: Path) -> None:
-    run = TrainingRun(TAUGHT, TINY, Pretend(), tmp_path)
-    run.run()
-    found = run.distill()
-    assert found["agrees"] > 0.8  # of five actions whose worth is chance
-    assert found["lost"] < 0.02
-    folder = tmp_path / "ensemble"
-    networks = []
-    for name in ("network-0", "network-1", "distilled"):
-        networks.append(VFN(TINY))
-        checkpoint.load(folder / f"{name}.safetensors", {"vfn": networks[-1]}, {"vfn": TINY})
-    now = run.trainer.replay.sample(generator(0, "states")).now
-    with torch.no_grad():
-        one, other, pupil = (network.apart(*now) for network in networks)
-    one, other, pupil = (values - values.mean(2, keepdim=True) for values in (one, other, pupil))
-    mean = (one + other) / 2
-    assert (one - other).abs().mean() > 3 * (pupil - mean).abs().mean()
-
-
-def test_a_teacher_counts_beside_them_and_what_is_refused_comes_last(tmp_path: Path) -> None:
-    masked = np.zeros((13, 5), np.bool_)
-    masked[:, MetaAction.ACCELERATE] = True
-    drive = replace(trajectory([0, 1, 2, 4] * 3, [(1.0, 0.0, 0.0)] * 12, unsafe=masked), phi=0.5)
-    teacher = VFN(TINY)
-    teacher.value.bias.data[MetaAction.ACCELERATE] = 1.0  # it likes best what is refused here
-    checkpoint.save(tmp_path / "teacher.safetensors", {"vfn": teacher}, {"vfn": TINY})
-    ensemble = EnsembleConfig(
-        teachers=(str(tmp_path / "teacher.safetensors"),), distillation=400, refused=3.0
-    )
-    run = TrainingRun(replace(SHORT, ensemble=ensemble), TINY, Pretend(), tmp_path / "run")
-    run.trainer.replay.add([drive])
-    run.distill()
-    pupil = VFN(TINY)
-    checkpoint.load(tmp_path / "run" / "ensemble" / "distilled.safetensors", {"vfn": pupil}, {"vfn": TINY})
-    q = pupil(*run.trainer.replay.sample(generator(0, "states")).now).detach()
-    others = q[:, [a for a in MetaAction if a != MetaAction.ACCELERATE]]
-    assert (q[:, MetaAction.ACCELERATE] < others.amin(1) - 0.2).all()  # `DdqnConfig.margin` is 0.3
-    assert others.std(1).max() < 0.05  # the teacher's: alike
-
-
-def test_drives_that_are_named_count_more(tmp_path: Path) -> None:
-    drives = ("merge/contested", "merge/contested")
-    named = replace(SHORT, ensemble=EnsembleConfig(networks=1, drives=drives))
-    run = TrainingRun(named, TINY, Pretend(), tmp_path)
-    one, other = (trajectory([0, 1], [(1.0, 0.0, 0.0)] * 2) for _ in range(2))
-    run.trainer.replay.add(
-        [replace(one, episode="merge/contested/7"), replace(other, episode="merge/sparse/7")]
-    )
-    ensemble = Ensemble(named, TINY, run.trainer.replay, tmp_path, {})
-    counts = Counter(drive.episode for drive in ensemble.replay.trajectories)
-    assert counts == {"merge/contested/7": 3, "merge/sparse/7": 1}
-
-
 def test_drives_of_a_version_that_told_avs_something_else_are_bad_input(tmp_path: Path) -> None:
     one = trajectory([0, 1, 2, 4], [(1.0, 0.0, 0.0)] * 4)
     experience.save(tmp_path / "a.npz", [replace(one, situation=one.situation[:, :-1])])
     with pytest.raises(BadInput, match=rf"a.npz: situation={SITUATION_INPUTS - 1}: another version of cosim"):
         experience.load(tmp_path / "a.npz")
-
-
-def test_drives_of_other_trainings_join_in_front(tmp_path: Path) -> None:
-    (tmp_path / "other" / "replay").mkdir(parents=True)
-    theirs, own = (trajectory([0, 1], [(1.0, 0.0, 0.0)] * 2) for _ in range(2))
-    experience.save(tmp_path / "other" / "replay" / "0.npz", [replace(theirs, episode="exit/dense/1")])
-    replay = ReplayBuffer(SHORT.replay)
-    replay.add([own])
-    config = replace(SHORT, ensemble=EnsembleConfig(networks=1, runs=(str(tmp_path / "other"),)))
-    ensemble = Ensemble(config, TINY, replay, tmp_path, {})
-    assert [one.episode for one in ensemble.replay.trajectories] == ["exit/dense/1", "hand"]
-    small = replace(config, replay=replace(SHORT.replay, capacity=3))  # of four decisions: none is dropped
-    assert len(Ensemble(small, TINY, replay, tmp_path, {}).replay.trajectories) == 2
-    wide = replace(own, kinematics=own.kinematics[..., :-1])
-    experience.save(tmp_path / "other" / "replay" / "1.npz", [wide])
-    with pytest.raises(BadInput, match=r"training\.ensemble\.runs='.*other': was driven with other inputs"):
-        Ensemble(config, TINY, replay, tmp_path, {})
-    nobody = replace(config, ensemble=EnsembleConfig(networks=1, runs=(str(tmp_path / "none"),)))
-    with pytest.raises(BadInput, match="none/replay: holds no drives"):
-        Ensemble(nobody, TINY, replay, tmp_path, {})
-
-
-@pytest.mark.parametrize(
-    ("part", "value"), [("drives", "exit/dense"), ("specialists", Specialist("exit/dense", "a.b"))]
-)
-def test_worlds_that_no_lesson_drives_are_named_in_one_error(part: str, value: object) -> None:
-    with pytest.raises(BadInput, match=rf"training.ensemble.{part}='exit/dense': .*merge/contested"):
-        replace(SHORT, ensemble=replace(EnsembleConfig(networks=1), **{part: (value,)}))
-
-
-def test_a_specialist_alone_teaches_what_was_driven_in_its_world(tmp_path: Path) -> None:
-    drive = trajectory([0, 1, 2, 4] * 3, [(1.0, 0.0, 0.0)] * 12)
-    files = []
-    for name, action in (("brakes", MetaAction.DECELERATE), ("hurries", MetaAction.ACCELERATE)):
-        teacher = VFN(TINY)
-        teacher.value.bias.data[action] = 9.0
-        files.append(str(tmp_path / f"{name}.safetensors"))
-        checkpoint.save(Path(files[-1]), {"vfn": teacher}, {"vfn": TINY})
-    replay = ReplayBuffer(ReplayConfig(batch=64))
-    replay.add([replace(drive, episode=f"{world}/contested/7") for world in ("merge", "exit")])
-    networks = [VFN(TINY) for _ in files]
-    for network, file in zip(networks, files, strict=True):
-        checkpoint.load(Path(file), {"vfn": network}, {"vfn": TINY})
-    batch = replay.advised(generator(0, "drawn"), True)
-    teachers = Teachers(networks[:1], [(Specialist("exit/contested", files[1]), networks[1])])
-    best = teachers.values(batch).sum(1).argmax(1)
-    wanted = {"merge/contested/7": MetaAction.DECELERATE, "exit/contested/7": MetaAction.ACCELERATE}
-    assert best.tolist() == [wanted[label] for label in batch.episodes]
-    assert len(set(best.tolist())) == 2
-
-
-@pytest.mark.parametrize(("met", "taught"), [(False, [0, 1, 2]), (True, [2])])
-def test_a_specialist_may_be_kept_to_the_avs_that_meet_a_mission_vehicle(
-    met: bool, taught: list[int]
-) -> None:
-    kinematics = torch.zeros(3, 3, 2, KINEMATIC_INPUTS)
-    situation = torch.zeros(3, SITUATION_INPUTS)
-    situation[2, MEETS] = 1.0
-    now = (torch.zeros(3, 3, 4, 8, 16, dtype=torch.uint8), kinematics, situation, torch.zeros(3, 2))
-    possible = torch.ones(3, 5, dtype=torch.bool)
-    networks = [VFN(TINY), VFN(TINY)]
-    networks[1].value.bias.data[MetaAction.ACCELERATE] = 9.0
-    batch = Advised(now, possible, ~possible, ["exit/contested/7"] * 3, 3)
-    one = Specialist("exit/contested", "a.b", met)
-    values = Teachers(networks[:1], [(one, networks[1])]).values(batch)
-    assert values[:, 0, MetaAction.ACCELERATE].nonzero().flatten().tolist() == taught
-
-
-def test_a_specialist_may_teach_what_an_action_brings_the_others_alone() -> None:
-    layout = replace(TINY, parts=2)
-    networks = [VFN(layout), VFN(layout)]
-    for network, value in zip(networks, (1.0, 2.0), strict=True):
-        network.value.bias.data[[MetaAction.ACCELERATE, 5 + MetaAction.DECELERATE]] = value
-    now = (
-        *(torch.zeros(1, 3, 4, 8, 16, dtype=torch.uint8), torch.zeros(1, 3, 2, KINEMATIC_INPUTS)),
-        *(torch.zeros(1, SITUATION_INPUTS), torch.tensor([[0.6, 0.8]])),
-    )
-    batch = Advised(now, torch.ones(1, 5) > 0, torch.ones(1, 5) > 1, ["exit/contested/7"], 3)
-    one = Specialist("exit/contested", "a.b", others=True, weight=3.0)
-    values = Teachers(networks[:1], [(one, networks[1])]).values(batch)
-    own, others = (network.apart(*now) for network in networks)
-    torch.testing.assert_close(values, torch.cat([own[:, :1], 3.0 * others[:, 1:]], 1))
-
-
-def taught(
-    network: VFN, phi: float, turn: tuple[float, float] = (45.0, 45.0), most: float = 90.0
-) -> torch.Tensor:
-    """[1,A] action values that a pupil is taught for `phi` degrees by `network`, its only teacher."""
-    angle = torch.tensor([math.radians(phi)])
-    weights = torch.stack([angle.cos(), angle.sin()], 1)
-    now = (
-        *(torch.zeros(1, 3, 4, 8, 16, dtype=torch.uint8), torch.zeros(1, 3, 2, KINEMATIC_INPUTS)),
-        *(torch.zeros(1, SITUATION_INPUTS), weights),
-    )
-    batch = Advised(now, torch.ones(1, 5) > 0, torch.ones(1, 5) > 1, ["exit/contested/7"], 3)
-    turns = [] if turn[0] == turn[1] else [(Specialist("exit/contested", "a.b", turn=turn), network)]
-    return network.weighed(Teachers([network], turns, most).values(batch), weights)
-
-
-@pytest.fixture
-def two_parts() -> VFN:
-    torch.manual_seed(0)
-    network = VFN(replace(TINY, parts=2))
-    torch.nn.init.normal_(network.value.weight)
-    return network
-
-
-def test_no_teacher_is_asked_with_more_than_the_largest_phi(two_parts: VFN) -> None:
-    """What is worth most to it at 75 degrees its pupil is taught at 90, and at 60 what is at 60."""
-    for pupil, teacher in ((90.0, 75.0), (80.0, 75.0), (60.0, 60.0)):
-        torch.testing.assert_close(taught(two_parts, pupil, most=75.0), taught(two_parts, teacher))
-    assert not torch.allclose(taught(two_parts, 90.0), taught(two_parts, 75.0))
-
-
-def test_a_specialist_teaches_its_pupil_to_turn_at_another_phi(two_parts: VFN) -> None:
-    """What it chooses at 52 degrees its pupil is taught to choose at 26, and at 0 and 90 as it does there."""
-    turn = 26.0, 52.0
-    for pupil, teacher in ((26.0, 52.0), (13.0, 26.0), (58.0, 71.0)):
-        mine = taught(two_parts, pupil, turn)
-        torch.testing.assert_close(mine, taught(two_parts, teacher))
-        assert not torch.allclose(mine, taught(two_parts, pupil))
-    for phi in (0.0, 90.0):
-        torch.testing.assert_close(taught(two_parts, phi, turn), taught(two_parts, phi), atol=1e-2, rtol=1e-2)
-
-
-def test_an_angle_that_none_can_turn_at_is_bad_input() -> None:
-    with pytest.raises(BadInput, match=r"turn=\[0, 52\]: two angles between 0 and 90 degrees"):
-        Specialist("exit/contested", "a.b", turn=(0, 52))
-
-
-def test_only_who_meets_a_mission_vehicle_may_be_taught(tmp_path: Path) -> None:
-    """Whoever meets none drives by the first weights, to the bit."""
-    layout = replace(TINY, meets=True)
-    torch.manual_seed(3)
-    first, teacher = VFN(layout), VFN(TINY)
-    teacher.value.bias.data[MetaAction.ACCELERATE] = 3.0
-    files = [str(tmp_path / f"{name}.safetensors") for name in ("first", "teacher")]
-    for file, network in zip(files, (first, teacher), strict=True):
-        checkpoint.save(Path(file), {"vfn": network}, {"vfn": network.config})
-    nobody = trajectory([0, 1, 2, 4] * 3, [(1.0, 0.0, 0.0)] * 12)
-    situation = nobody.situation.copy()
-    situation[4:, MEETS] = 1.0
-    config = replace(
-        SHORT,
-        first=files[0],
-        lessons=(Lesson("merge"), Lesson("exit")),
-        ensemble=EnsembleConfig(
-            teachers=(files[1],),
-            specialists=(Specialist("exit/contested", files[1], met=True),),
-            distillation=60,
-            alone="met",
-        ),
-    )
-    replay = ReplayBuffer(config.replay)
-    replay.add([replace(nobody, episode="merge/contested/1")])
-    replay.add([replace(nobody, episode="exit/contested/1", situation=situation)])
-    ensemble = Ensemble(config, layout, replay, tmp_path, {})
-    assert [one.episode for one in ensemble.replay.trajectories] == ["exit/contested/1"]
-    taught = VFN(layout)
-    checkpoint.load(ensemble.run(), {"vfn": taught}, {"vfn": layout})
-    now = ensemble.replay.advised(generator(0, "drawn"), True).now
-    met = now[2][:, MEETS] > 0.5
-    assert met.any()
-    assert not met.all()
-    with torch.no_grad():
-        before, after = first.apart(*now), taught.apart(*now)
-    assert torch.equal(before[~met], after[~met])
-    assert not torch.allclose(before[met], after[met])
-    assert set(after[met].sum(1).argmax(1).tolist()) == {MetaAction.ACCELERATE}
-    with pytest.raises(BadInput, match=r"alone='met': needs layers .*vfn.meets"):
-        Ensemble(config, TINY, replay, tmp_path, {})
-    without = ReplayBuffer(config.replay)
-    without.add([nobody])
-    with pytest.raises(BadInput, match="alone='met': in no drive is there an AV"):
-        Ensemble(config, layout, without, tmp_path, {})
-
-
-def test_a_network_of_one_part_cannot_be_taught_the_others_part(tmp_path: Path) -> None:
-    specialist = Specialist("merge/contested", "a.safetensors", weight=2.0)
-    config = replace(SHORT, ensemble=EnsembleConfig(teachers=("a.safetensors",), specialists=(specialist,)))
-    with pytest.raises(BadInput, match=r"specialists='merge/contested': teaches the others' part"):
-        Ensemble(config, TINY, ReplayBuffer(config.replay), tmp_path, {})
-
-
-def test_what_a_state_is_worth_stays_what_the_first_weights_say(tmp_path: Path) -> None:
-    """Teachers may have learned from rewards of another size."""
-    first, teacher = VFN(TINY), VFN(TINY)
-    assert first.state is not None
-    assert teacher.state is not None
-    first.state.bias.data[:], teacher.state.bias.data[:] = 3.0, 90.0
-    teacher.value.bias.data[MetaAction.IDLE] = 1.0
-    for name, network in (("first", first), ("teacher", teacher)):
-        checkpoint.save(tmp_path / f"{name}.safetensors", {"vfn": network}, {"vfn": TINY})
-    ensemble = EnsembleConfig(teachers=(str(tmp_path / "teacher.safetensors"),), distillation=300)
-    config = replace(SHORT, ensemble=ensemble, first=str(tmp_path / "first.safetensors"))
-    run = TrainingRun(config, TINY, Pretend(), tmp_path / "run")
-    run.trainer.replay.add([trajectory([0, 1, 2, 4] * 3, [(1.0, 0.0, 0.0)] * 12)])
-    run.distill()
-    pupil = VFN(TINY)
-    checkpoint.load(tmp_path / "run" / "ensemble" / "distilled.safetensors", {"vfn": pupil}, {"vfn": TINY})
-    q = pupil(*run.trainer.replay.sample(generator(0, "states")).now).detach()
-    assert q.mean(1).numpy() == pytest.approx(3.0, abs=0.1)
-    assert (q[:, MetaAction.IDLE] - q[:, MetaAction.ACCELERATE]).numpy() == pytest.approx(1.0, abs=0.1)
-
-
-@pytest.mark.parametrize(
-    "asked", [{"ddqn": DdqnConfig(by_copies=True)}, {"ensemble": EnsembleConfig(by_copies=1)}]
-)
-def test_by_copies_without_any_is_refused(asked: dict[str, object]) -> None:
-    with pytest.raises(BadInput, match=r"training\.replay\.forked=0"):
-        replace(SHORT, **asked)  # type: ignore[arg-type]
-
-
-def test_a_network_by_copies_learns_beside_the_others(tmp_path: Path) -> None:
-    ensemble = EnsembleConfig(networks=1, by_copies=1, updates=200, distillation=20)
-    config = replace(SHORT, ensemble=ensemble, replay=replace(SHORT.replay, forked=16))
-    run = TrainingRun(config, replace(TINY, parts=2), Pretend(), tmp_path)
-    run.trainer.replay.add(by_chance_and_by_copies())
-    run.distill()
-    replay, choices = run.trainer.replay, []
-    for k in range(2):
-        network = VFN(replace(TINY, parts=2))
-        file = tmp_path / "ensemble" / f"network-{k}.safetensors"
-        checkpoint.load(file, {"vfn": network}, {"vfn": network.config})
-        choices.append(network.apart(*replay.sample(generator(0, "states")).now).detach())
-    spread = [c[:, 1].std(1).mean().item() for c in choices]
-    assert spread[1] < 0.3 * spread[0]  # returns say that the others gain, copies say nothing of the kind
-
-
-def test_a_killed_ensemble_goes_on_with_the_networks_that_it_has(tmp_path: Path) -> None:
-    run = TrainingRun(TAUGHT, TINY, Pretend(), tmp_path)
-    run.run()
-
-    def die(done: float, _: float) -> None:
-        if done == 45:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        run.distill(die)
-    first = tmp_path / "ensemble" / "network-0.safetensors"
-    assert [path.name for path in first.parent.glob("*.safetensors")] == [first.name]
-    written = first.stat().st_mtime_ns
-    again = TrainingRun(TAUGHT, TINY, Pretend(), tmp_path)
-    assert again.resume()
-    again.distill()
-    assert first.stat().st_mtime_ns == written
-    other = replace(TAUGHT, ensemble=replace(TAUGHT.ensemble, updates=31))
-    with pytest.raises(BadInput, match="another configuration"):
-        TrainingRun(other, TINY, Pretend(), tmp_path).distill()
 
 
 def test_the_learning_rate_falls_over_the_last_third() -> None:
@@ -1163,12 +692,13 @@ def test_the_learning_rate_falls_over_the_last_third() -> None:
     assert rate(replace(training, ddqn=replace(training.ddqn, last_rate=None)), 299) == 5e-4
 
 
-def test_a_run_of_before_goes_on_with_the_defaults_of_newer_options(tmp_path: Path) -> None:
+def test_a_run_with_other_options_is_not_gone_on_with(tmp_path: Path) -> None:
     TrainingRun(replace(SHORT, iterations=2), TINY, Pretend(), tmp_path).run()
     state = json.loads((tmp_path / "state.json").read_text())
-    del state["config"]["ddqn"]["last_rate"]
+    state["config"]["ddqn"]["gone"] = state["config"]["ddqn"].pop("last_rate")
     (tmp_path / "state.json").write_text(json.dumps(state))
-    assert TrainingRun(SHORT, TINY, Pretend(), tmp_path).resume()
+    with pytest.raises(BadInput, match=r"ddqn\.gone, ddqn\.last_rate"):
+        TrainingRun(SHORT, TINY, Pretend(), tmp_path).resume()
 
 
 def test_values_that_are_apart_are_weighed_by_phi() -> None:

@@ -153,22 +153,23 @@ def read(path: Path) -> Recording:
             about = json.loads((file.schema_arrow.metadata or {}).get(b"cosim", b"null"))
             if not isinstance(about, dict) or about.get("format") != FORMAT:
                 raise BadInput(f"not a recording of format {FORMAT}", file=path)
-            table = file.read()
-    except (pa.ArrowException, ValueError) as error:
+            return _recording(about, file.read().select(SCHEMA.names))
+    except (pa.ArrowException, ValueError, KeyError) as error:
         raise BadInput(f"not a recording: {error}", file=path) from None
+
+
+def _recording(about: Mapping[str, Any], table: pa.Table) -> Recording:
     fill = {"route": -1, "target_speed": float("nan")}
-    columns = {
-        name: (table[name].fill_null(fill[name]) if name in fill else table[name]).to_numpy()
-        for name in table.column_names
-    }
-    columns.setdefault("actor", np.zeros(len(table), np.int8))  # older recordings: cars
-    states = zlib.decompress(base64.b64decode(about["signals"])) if "signals" in about else b""
+    states = zlib.decompress(base64.b64decode(about["signals"]))
     return Recording(
         case=about["case"],
         times=np.array(about["times"], np.float64),
         ids=tuple(about["ids"]),
         first=about["first"],
-        table=columns,
+        table={
+            name: (table[name].fill_null(fill[name]) if name in fill else table[name]).to_numpy()
+            for name in table.column_names
+        },
         routes=tuple(tuple(route) for route in about["routes"]),
         events={int(k): _events(e) for k, e in about["events"].items()},
         signals=np.frombuffer(states, np.uint8).reshape(len(about["times"]), -1),

@@ -38,12 +38,11 @@ def read_road(file: Path) -> RoadMap:
             raise BadInput(f"not a road of format {FORMAT}", file=file, field="format")
         lanes = tuple(_read(Lane, lane) for lane in found["lanes"])
         zones = tuple(ConflictZone(zone["name"], frozenset(zone["lanes"])) for zone in found["zones"])
-        # older documents have no links
-        links = (_read(Link, k | {"rule": Rule(k["rule"])}) for k in found.get("links", ()))
-        crossings = (_read(Crossing, c) for c in found.get("crossings", ()))
+        links = (_read(Link, k | {"rule": Rule(k["rule"])}) for k in found["links"])
+        crossings = (_read(Crossing, c) for c in found["crossings"])
         outlines = tuple(np.array(outline, float) for outline in found["junctions"])
-        signals = tuple((light, index) for light, index in found.get("signals", ()))
-        closed = tuple(_read(Lane, lane) for lane in found.get("closed", ()))
+        signals = tuple((light, index) for light, index in found["signals"])
+        closed = tuple(_read(Lane, lane) for lane in found["closed"])
         return RoadMap(lanes, zones, outlines, tuple(links), signals, tuple(crossings), closed)
     except (ValueError, KeyError, TypeError) as error:
         raise BadInput(f"not a recorded road: {error}", file=file) from None

@@ -10,10 +10,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from cosim.errors import BadInput
 from cosim.files import whole
 from cosim.types import Bools, Bytes, Floats32
-from policy.inputs.situation import SITUATION_INPUTS
 from policy.inputs.tensors import States
 
 Ending = Literal["crashed", "left", "cut"]  # cut: the episode ended before the AV's drive did
@@ -104,18 +102,13 @@ def save(path: Path, trajectories: list[Trajectory]) -> None:
 
 
 def load(path: Path) -> list[Trajectory]:
-    """What `save` wrote. Raises BadInput for what a version wrote in which AVs were told something else."""
+    """What `save` wrote."""
     with np.load(path, allow_pickle=False) as file:
-        told = file["0.situation"].shape[1] if int(file["count"]) else SITUATION_INPUTS
-        if told != SITUATION_INPUTS:
-            problem = f"another version of cosim drove it: a situation has {SITUATION_INPUTS} numbers"
-            raise BadInput(problem, file=path, field="situation", value=told)
         return [
             Trajectory(
                 **{
-                    name: value if (value := file[key]).ndim else value.item()
+                    name: value if (value := file[f"{k}.{name}"]).ndim else value.item()
                     for name in Trajectory.__dataclass_fields__
-                    if (key := f"{k}.{name}") in file
                 }
             )
             for k in range(int(file["count"]))

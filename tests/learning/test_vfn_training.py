@@ -676,13 +676,6 @@ def test_another_configuration_is_not_gone_on_with(tmp_path: Path) -> None:
         other.resume()
 
 
-def test_drives_of_a_version_that_told_avs_something_else_are_bad_input(tmp_path: Path) -> None:
-    one = trajectory([0, 1, 2, 4], [(1.0, 0.0, 0.0)] * 4)
-    experience.save(tmp_path / "a.npz", [replace(one, situation=one.situation[:, :-1])])
-    with pytest.raises(BadInput, match=rf"a.npz: situation={SITUATION_INPUTS - 1}: another version of cosim"):
-        experience.load(tmp_path / "a.npz")
-
-
 def test_the_learning_rate_falls_over_the_last_third() -> None:
     training = replace(SHORT, iterations=300, ddqn=replace(SHORT.ddqn, learning_rate=5e-4, last_rate=2e-4))
     rates = [rate(training, k) for k in range(300)]

@@ -98,7 +98,7 @@ class Payments(Earnings):
         label = f"{d.lesson.scenario}/{d.lesson.demand}/{seed}"
         who = generator(seed, "explore")
         tries = generator(seed, "explore", str(d.attempt)) if d.attempt else who
-        self._agent.episode(label, d.epsilon, tries, who, d.guided, d.record)
+        self._agent.episode(label, d.epsilon, tries, who, d.guided, d.record, d.keep, d.floor)
 
     def on_step(self, episode: Episode, step: Step) -> None:
         """One decision."""

@@ -25,7 +25,7 @@ from policy.agents.approaches import AgentConfig
 from policy.agents.prediction_aware import PredictionAware
 from policy.training import loop as supervised
 from policy.training import sight
-from policy.training.config import agent_config
+from policy.training.config import agent_config, encoder_of
 from policy.training.networks import use_threads
 from policy.training.sight import Seen, SightTask, SightTraining
 from sumo_scenarios import names
@@ -133,13 +133,14 @@ def train(args: argparse.Namespace) -> int:
         checked = gather(
             agent, training, worlds, TUNING_SEEDS[: training.validation], args.workers, "checks on"
         )
-        task = SightTask(file.encoder, training, seen, checked, args.device)
+        encoder = encoder_of(file)
+        task = SightTask(encoder, training, seen, checked, args.device)
         about = {
             "scenarios": worlds,
             "frames": {"training": len(seen.maps), "validation": len(checked.maps)},
             "sight": asdict(training),
         }
-        layout = {"encoder": asdict(file.encoder), **about}
+        layout = {"encoder": asdict(encoder), **about}
         with Progress("train encoder", "updates") as progress:
             log = supervised.train(
                 task, training.loop, folder, layout=layout, resume=args.resume, progress=progress

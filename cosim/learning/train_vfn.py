@@ -5,7 +5,7 @@ import math
 import shlex
 import sys
 from contextlib import closing
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import yaml
 
@@ -22,14 +22,13 @@ from cosim.workers.memory import keep_freed_memory
 from cosim.workers.progress import Progress
 from policy.agents.approaches import APPROACHES
 from policy.checkpoint import sha256
-from policy.training.config import agent_config
+from policy.training.config import agent_config, described
 from policy.training.curriculum import Lesson, VfnTraining
 from policy.training.loop import tensorboard
 from policy.training.networks import usable, use_threads
 from policy.training.vfn import TrainingRun
 from sumo_scenarios import names
 
-ABOUT = ("observation", "hpn", "reward", "explore", "chain", "safety", "traffic")  # sections in the card
 WEIGHTS = {"contested": 2.0, "dense": 1.0}  # altruism is learned where an AV must yield
 
 
@@ -55,15 +54,8 @@ def train(args: argparse.Namespace) -> int:
     with working_in(args.out) as folder:
         if not args.resume and (folder / "state.json").exists():
             raise BadInput("holds a training run already: --resume goes on", field="--out", value=args.out)
-        explore = replace(file.explore, sample=0, floor=0.0)
-        if learning == "a2c":
-            explore = replace(explore, sample=training.a2c.keep, floor=training.a2c.floor)
-        file = replace(file, explore=explore)
-        about = {
-            "policy": name,
-            "scenarios": sorted({lesson.scenario for lesson in training.lessons}),
-            **{part: asdict(getattr(file, part)) for part in ABOUT},
-        }
+        about = described(name, agent, file)
+        about["scenarios"] = sorted({lesson.scenario for lesson in training.lessons})
         if training.reward:
             about["reward"] = training.reward
         if agent.predicted_maps and agent.chain.source == "hpn" and agent.hpn_weights is not None:
@@ -72,7 +64,7 @@ def train(args: argparse.Namespace) -> int:
         use_threads(args.threads)  # more threads than cores stall each other (docs/training.md)
         writer = tensorboard(folder)
         rollouts = Rollouts(
-            args.workers, name, agent, explore, training.reward or file.reward, training.metrics
+            args.workers, name, agent, file.explore, training.reward or file.reward, training.metrics
         )
         with closing(writer), Progress(f"train {name}", "iterations") as progress, rollouts as actors:
             run = TrainingRun(

@@ -1,6 +1,7 @@
 """One training run as one document: sizes, reward, exploration and schedule (policy/configs/*.yaml)."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
 
 from cosim.rewards import RewardConfig
 from cosim.types import ObservationConfig
@@ -9,7 +10,6 @@ from policy.networks.frame_encoder import EncoderConfig
 from policy.networks.hpn import HpnConfig
 from policy.networks.vfn import VfnConfig
 from policy.prediction.chain import ChainConfig
-from policy.prediction.traffic import TrafficConfig
 from policy.safety import SafetyConfig
 from policy.training.curriculum import VfnTraining
 from policy.training.explorer import ExploreConfig
@@ -23,19 +23,29 @@ class TrainingFile:
 
     observation: ObservationConfig = field(default_factory=ObservationConfig)
     chain: ChainConfig = field(default_factory=ChainConfig)
-    hpn: HpnConfig = field(default_factory=HpnConfig)
     vfn: VfnConfig = field(default_factory=VfnConfig)
     safety: SafetyConfig = field(default_factory=SafetyConfig)
-    traffic: TrafficConfig = field(default_factory=TrafficConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
     explore: ExploreConfig = field(default_factory=ExploreConfig)
     training: VfnTraining = field(default_factory=VfnTraining)
     prediction: HpnTraining = field(default_factory=HpnTraining)  # cosim train hpn
-    encoder: EncoderConfig = field(default_factory=EncoderConfig)
     sight: SightTraining = field(default_factory=SightTraining)  # cosim train encoder
 
 
 def agent_config(name: str, file: TrainingFile) -> AgentConfig:
     """The approach `name` at the sizes of `file`: its value network untrained, its HPN the shipped one."""
-    config = configure(name, file.observation, file.chain, file.hpn, file.vfn)
-    return replace(config, safety=file.safety, traffic=file.traffic, hpn_weights=shipped("hpn"))
+    config = configure(name, file.observation, file.chain, HpnConfig(), file.vfn)
+    return replace(config, safety=file.safety, hpn_weights=shipped("hpn"))
+
+
+def encoder_of(file: TrainingFile) -> EncoderConfig:
+    """The frame encoder for the maps of `file`, with as many numbers a frame as its value network takes."""
+    seen = file.observation
+    return EncoderConfig(seen.height, seen.width, latent=file.vfn.latent)
+
+
+def described(name: str, agent: AgentConfig, file: TrainingFile) -> dict[str, Any]:
+    """What the card of the approach's weights says of the agent, its rewards and its exploration."""
+    parts = ("observation", "hpn", "chain", "safety", "traffic")
+    about = {part: asdict(getattr(agent, part)) for part in parts}
+    return {"policy": name, **about, "reward": asdict(file.reward), "explore": asdict(file.explore)}

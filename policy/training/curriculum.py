@@ -95,6 +95,8 @@ class Drive(NamedTuple):
     errors: str = ""  # of the human drivers
     preset: str = Preset.UNGUARDED
     attempt: int = 0  # of those with the same traffic and learners (`A2cConfig.attempts`)
+    keep: int = 0  # decisions that an action drawn from the preferences is kept; 0: epsilon-greedy
+    floor: float = 0.0  # share of these draws that are even (`A2cConfig.floor`)
 
 
 class Drove(NamedTuple):
@@ -107,7 +109,7 @@ class Drove(NamedTuple):
 def drives(c: VfnTraining, k: int, weights: str, frozen: str, epsilon: float, guided: float) -> list[Drive]:
     """The episodes of iteration `k`; `guided`: the share of them that the demonstrator drives."""
     drawn = []
-    attempts = c.a2c.attempts if c.learning == "a2c" else 1
+    attempts, keep, floor = (c.a2c.attempts, c.a2c.keep, c.a2c.floor) if c.learning == "a2c" else (1, 0, 0.0)
     for j in range(c.episodes):
         draws = [uniform(c.seed, name, str(k), str(j)) for name in ("lesson", "svo", "guided")]
         lesson = _drawn(c.lessons, draws[0])
@@ -122,6 +124,8 @@ def drives(c: VfnTraining, k: int, weights: str, frozen: str, epsilon: float, gu
             guided=draws[2] < guided,
             errors=c.errors if uniform(c.seed, "errors", str(k), str(j)) < c.erring else "",
             preset=lesson.preset or c.preset,
+            keep=keep,
+            floor=floor,
         )
         # the demonstrator tries nothing
         drawn += [drive._replace(attempt=i) for i in range(1 if drive.guided else attempts)]

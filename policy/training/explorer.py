@@ -28,9 +28,6 @@ class ExploreConfig:
 
     learners: int = 4  # AVs that explore and are recorded; the others act with frozen weights (P, Alg. 4)
     repeat: float = 2.0  # decisions a random action is kept on average: a gap does not open in 0.4 s
-    # decisions that one drawn from the preferences is kept; 0: epsilon-greedy. `training.a2c.keep` sets it
-    sample: int = 0
-    floor: float = 0.0  # with `sample`: share of the draws that are even. `training.a2c.floor` sets it
     advised: bool = True  # whether the demonstrator is asked in every state; one that is imitated is
     near: float = 60.0  # m to the mission vehicle within which a decision counts as interaction
     # A2C: every AV of the first decision is recorded, and the first `learners` that arrive next behind a
@@ -39,7 +36,7 @@ class ExploreConfig:
 
     def __post_init__(self) -> None:
         """Raises BadInput for a number out of range."""
-        in_range(self, positive="learners repeat near", not_negative="sample", share="floor")
+        in_range(self, positive="learners repeat near")
 
 
 class Explorer(PredictionAware):
@@ -66,6 +63,8 @@ class Explorer(PredictionAware):
         who: np.random.Generator,
         guided: bool = False,
         record: bool = True,
+        keep: int = 0,
+        floor: float = 0.0,
     ) -> None:
         """A new episode.
 
@@ -76,9 +75,12 @@ class Explorer(PredictionAware):
             who: those who learn are; it may be `rng`.
             guided: the demonstrator drives every AV.
             record: False: no AV learns, all drive greedily by the frozen network.
+            keep: decisions that an action drawn from the preferences is kept; 0: epsilon-greedy.
+            floor: share of these draws that are even over all actions.
         """
         self._label, self._epsilon, self._rng, self._who = label, epsilon, rng, who
         self._guided, self._learners = guided, self.explore.learners if record else 0
+        self._keep, self._floor = keep, floor
         self._explorers: set[str] = set()  # who has explored in this episode, with `ExploreConfig.next`
         self._drawn: set[str] = set()  # who draws at this decision
         self._advised = guided or (record and self.explore.advised)
@@ -161,7 +163,7 @@ class Explorer(PredictionAware):
     def _explored(self, q: Floats32, inputs: Inputs) -> Floats32:
         """Random preferences in place of some learning AVs' values; the prioritizer still guards them."""
         q = q.copy()
-        if self.explore.sample:
+        if self._keep:
             self._draw(q, inputs)
             return q
         for b, av in enumerate(inputs.scene.agents):
@@ -195,11 +197,11 @@ class Explorer(PredictionAware):
             av = agents[b]
             if not self._holds(av, q[b]) and nears[b] and self._may(av):
                 self._drawn.add(av)
-                if c.floor:
+                if self._floor:
                     share = np.exp(q[b] - q[b].max())
-                    q[b] = np.log((1.0 - c.floor) * share / share.sum() + c.floor / len(share))
+                    q[b] = np.log((1.0 - self._floor) * share / share.sum() + self._floor / len(share))
                 q[b] += noises
-                self.hold(av, MetaAction(int(q[b].argmax())), c.sample - 1)
+                self.hold(av, MetaAction(int(q[b].argmax())), self._keep - 1)
 
     def _may(self, av: str) -> bool:
         """Whether `av` explores, if it comes next: so many may in an episode."""

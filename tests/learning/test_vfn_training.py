@@ -367,10 +367,10 @@ def test_what_is_stored_is_what_was_seen() -> None:
 
 def test_what_is_drawn_is_kept_and_learned_from_once() -> None:
     one = agent()
-    one.explore = ExploreConfig(sample=4, advised=False)
+    one.explore = ExploreConfig(advised=False)
     episode = fake_episode(FakeVehicle("a", 100.0, 0, 20.0, is_av=True))
     (drove,) = drive_episode(
-        episode, one, Drive(Lesson("fake"), 5, 0.7, 0.5, "", "", True), RewardConfig()
+        episode, one, Drive(Lesson("fake"), 5, 0.7, 0.5, "", "", True, keep=4), RewardConfig()
     ).trajectories
     preferred = [int(a if v < 0 else v) for a, v in zip(drove.action, drove.vetoed, strict=True)]
     blocks = np.reshape(preferred, (5, 4))  # 20 decisions
@@ -566,8 +566,8 @@ def test_attempts_have_the_same_traffic_and_differ_in_what_is_tried() -> None:
     tried = []
     for attempt in (0, 1):
         one = agent()
-        one.explore = ExploreConfig(learners=1, sample=4, advised=False)
-        drive = Drive(Lesson("fake"), 5, 0.7, 0.5, "", "", True, attempt=attempt)
+        one.explore = ExploreConfig(learners=1, advised=False)
+        drive = Drive(Lesson("fake"), 5, 0.7, 0.5, "", "", True, attempt=attempt, keep=4)
         (drove,) = drive_episode(fake_episode(*cars), one, drive, RewardConfig()).trajectories
         tried.append((drove.episode, drove.av, drove.action.tolist()))
     assert tried[0][:2] == tried[1][:2]
@@ -577,7 +577,7 @@ def test_attempts_have_the_same_traffic_and_differ_in_what_is_tried() -> None:
 def test_who_comes_next_to_the_mission_vehicle_alone_explores() -> None:
     """It drives on the right lane; all are recorded, and what is drawn is kept."""
     one = agent(learners=1)
-    one.explore = ExploreConfig(learners=1, sample=5, near=60.0, next=True, advised=False)
+    one.explore = ExploreConfig(learners=1, near=60.0, next=True, advised=False)
     episode = fake_episode(
         FakeVehicle("m", 110.0, 0, 20.0, mission=True),
         FakeVehicle("ahead", 150.0, 1, 20.0, is_av=True),
@@ -586,7 +586,7 @@ def test_who_comes_next_to_the_mission_vehicle_alone_explores() -> None:
     )
     with torch.no_grad():
         one.vfn.value.bias[int(MetaAction.IDLE)] = one.frozen.value.bias[int(MetaAction.IDLE)] = 2.0
-    drive = Drive(Lesson("fake"), 5, 0.7, 1.0, "", "", True)
+    drive = Drive(Lesson("fake"), 5, 0.7, 1.0, "", "", True, keep=5)
     drove = drive_episode(episode, one, drive, RewardConfig()).trajectories
     assert {t.av for t in drove} == {"ahead", "next", "later"}
     (explored,) = (t for t in drove if t.interacting.any())
@@ -607,10 +607,10 @@ def test_a_floor_tries_what_is_not_preferred() -> None:
     drawn = {}
     for floor in (0.0, 1.0):
         one = agent()
-        one.explore = ExploreConfig(sample=1, floor=floor, advised=False)
+        one.explore = ExploreConfig(advised=False)
         with torch.no_grad():
             one.vfn.value.bias[int(MetaAction.IDLE)] = 50.0
-        drive = Drive(Lesson("fake"), 5, 0.7, 1.0, "", "", True)
+        drive = Drive(Lesson("fake"), 5, 0.7, 1.0, "", "", True, keep=1, floor=floor)
         episode = fake_episode(FakeVehicle("a", 100.0, 0, 20.0, is_av=True))
         (drove,) = drive_episode(episode, one, drive, RewardConfig()).trajectories
         drawn[floor] = set(drove.action.tolist())

@@ -7,7 +7,7 @@ import shutil
 import sqlite3
 import subprocess
 import sys
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,6 @@ from cosim.batch.store import FILE
 from cosim.cli.main import main
 from cosim.errors import BadInput
 from cosim.learning.configuration import configuration
-from cosim.learning.train_vfn import ABOUT
 from cosim.policies import check, make
 from cosim.policies.trained import config
 from cosim.types import COMPACT
@@ -25,7 +24,7 @@ from policy import checkpoint
 from policy.agents.approaches import APPROACHES, compact
 from policy.checkpoint import SHIPPED
 from policy.networks.vfn import VFN
-from policy.training.config import agent_config
+from policy.training.config import agent_config, described
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 SEED = "200061"
@@ -119,7 +118,7 @@ def test_the_card_of_ones_own_training_says_its_sizes_and_thresholds(tmp_path: P
     file = configuration("smoke").file
     file = replace(file, safety=replace(file.safety, safe_th=2.5, ties=file.safety.ties[::-1]))
     wanted = agent_config("vfn", file)
-    about = {"policy": "vfn", **{part: asdict(getattr(file, part)) for part in ABOUT}}
+    about = described("vfn", wanted, file)
     weights = tmp_path / "best.safetensors"
     checkpoint.save(weights, {"vfn": VFN(wanted.vfn)}, {"vfn": wanted.vfn}, {}, about)
     assert config(weights) == replace(wanted, vfn_weights=weights)

@@ -14,7 +14,7 @@ PROCESSES ?= 2
 # A file's tests stay in one process, in the order of the folders: the longest files come first. A core each: no threads.
 PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(PROCESSES) --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test quick pytest unit check kernels nets results pages results-small audit image smoke clean
+.PHONY: demo test docs quick pytest unit check kernels nets results pages results-small audit image smoke clean
 
 demo: $(VENV)/.installed
 	$(BIN)/cosim run merge --demand contested --policy vfn-p --out $(RUN)
@@ -41,6 +41,10 @@ check: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# The documentation as a site, into site/: open site/index.html. A broken link fails.
+docs: $(VENV)/.installed-dev
+	PYTHONPATH=. $(BIN)/zensical build --strict --clean
 
 # Every table and figure of docs/results/: first what is measured (costs, predictions; better on an idle
 # machine), then what is driven. The same command continues after an interruption. SCALE=0.1: a tenth of the episodes. Those in
@@ -82,7 +86,7 @@ $(VENV)/.installed-dev: $(VENV)/.installed
 	$(COMPILE)
 	touch $@
 
-# The container: docker/build.sh says what it needs, with a Docker engine or without (docs/container.md).
+# The container: docker/build.sh says what it needs, with a Docker engine or without (docs/guides/container.md).
 image:
 	docker/build.sh
 

@@ -1,4 +1,4 @@
-"""The tables of docs/human_errors.md: rates, what `stress` does to IDM AVs, crashes of humans alone, cost.
+"""The tables of human_errors.md: rates, what `stress` does to IDM AVs, crashes of humans alone, cost.
 
     python -m benchmarks.error_levels [rates] [stress] [alone] [cost] [--episodes 40] [--page PAGE]
 
@@ -36,7 +36,7 @@ from cosim.seeding import TUNING_SEEDS
 from cosim.types import EpisodeResult
 from cosim.workers.worker import Worker
 
-PAGE = Path("docs/human_errors.md")
+PAGE = Path("docs/explanation/human_errors.md")
 DEMANDS = ("dense", "contested")
 MILLION = 1e6  # km
 RARE = 1e-15  # rate of an error that is drawn and never begins

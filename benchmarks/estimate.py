@@ -5,7 +5,7 @@
     python -m benchmarks.estimate page --runs runs/estimate [--out PAGE] [--intervals 400]
 
 `tune` drives tilted episodes of `idm` AVs on tuning seeds, and raises errors the more, the more the crashes
-after them weigh (docs/estimate.md); it prints the tilt for sumo_scenarios/tilts.yaml. `measure` drives what
+after them weigh (estimate.md); it prints the tilt for sumo_scenarios/tilts.yaml. `measure` drives what
 `page` shows, on test seeds: a case that brute force reaches, with and without a tilt, and `dense` at the
 level `field`. Both go on where they stopped. `page` adds the toy and writes docs/results/estimate.md.
 """
@@ -168,7 +168,7 @@ def page(runs: Path, out: Path, intervals: int) -> None:
     """Write it from the toy (`intervals` estimates a line) and from what `measure` left."""
     lines = ["# What the intervals of `cosim estimate` are worth", ""]
     lines += [
-        "Made by `python -m benchmarks.estimate page`; [what is estimated, and how](../estimate.md).",
+        "Made by `python -m benchmarks.estimate page`; [what is estimated, and how](../guides/estimate.md).",
         "",
     ]
     lines += [*_toy(intervals), *_real(runs), *_field(runs)]

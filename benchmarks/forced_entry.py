@@ -7,7 +7,7 @@
 An egoist and an altruist (a policy, at a phi in degrees) in the contested worlds with a mission vehicle, on
 equal test seeds, preset `lawful`. The error is `forced_entry` of `stress`; `lag` (s) is the shortest gap that
 it takes; with `--errors` it is another level's. Goes on where it stopped, and writes the table into the
-section of docs/human_errors.md.
+section of docs/results/forced_entry.md.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from benchmarks.error_levels import PAGE
 from benchmarks.tables import fill, markdown_row
 from benchmarks.worlds import WITH_MISSION
 from cosim.cli.main import main as cosim
@@ -31,6 +30,7 @@ from cosim.scenario.human_errors import levels
 from cosim.seeding import FIRST_TEST_SEED
 from cosim.workers.tasks import OK
 
+PAGE = Path("docs/results/forced_entry.md")
 ARMS = ("idm", "altruist-rule")
 COLUMNS = (
     *("world", "pairs", "a collision of the mission vehicle or an AV", "difference, pp", "p"),

@@ -160,7 +160,7 @@ def page(found: dict[str, list[Drive]], command: str) -> list[str]:
     return [
         "# How fast cosim drives in somebody else's SUMO",
         "",
-        f"Made by `{command}`: `cosim join` ([traci.md](../traci.md))",
+        f"Made by `{command}`: `cosim join` ([traci.md](../guides/traci.md))",
         f"on A10KW, the motorway interchange that SUMO's package ships, from {WARMUP:g} s on. All AVs are",
         "commanded at every decision, at random, without a network. SUMO, our agents and the other program",
         "are a process each and wait for one another: where the machine has nothing else to do both ratios",

@@ -1,6 +1,6 @@
 """A card for each network that ships: what it is, learned from, measured at, and what it is not good for.
 
-    python -m benchmarks.model_cards [--out docs/models.md]
+    python -m benchmarks.model_cards [--out docs/reference/models.md]
 
 Made of the JSON cards beside the weights (`policy.checkpoint`), the logs of their trainings and the figures
 of docs/results/data; nothing is driven.
@@ -36,7 +36,7 @@ LAWLESS = (
     "`unguarded` it drives through red lights."
 )
 DEMONSTRATED = (
-    "It learned from a scripted demonstrator (`altruist-rule` and a cruise rule, docs/training.md) as well "
+    "It learned from a scripted demonstrator (`altruist-rule` and a cruise rule, training.md) as well "
     "as from rewards, and chooses as that does in most states: what rewards added is not measured apart.",
     f"The human drivers of its training never err. {LAWLESS}",
 )
@@ -46,9 +46,7 @@ LIMITS = {  # by the configuration of the training
     "rewards": (LAWLESS,),
 }
 LAWFUL_ONLY = "It learned from rewards alone, in preset `lawful`: what it does in `unguarded` it never tried."
-ASSISTED = (
-    "What keeps its distance in `unguarded` are layers that this training left alone (docs/training.md)."
-)
+ASSISTED = "What keeps its distance in `unguarded` are layers that this training left alone (training.md)."
 EARLIER = "**Of an earlier agent**"  # on pages that are not driven anew
 # the folder of its training's log, where that is not NAME-0
 TRAINED = {"vfn-p": "assisted-0", "vfn": "assisted-0"}
@@ -175,7 +173,7 @@ def predicting(name: str, card: Card) -> Iterator[str]:
         recorded, training = commands["train recordings"], f"`{commands['train']}`"
         with (SHIPPED / f"{name}.csv").open(encoding="utf-8", newline="") as lines:
             steps = [row["update"] for row in csv.DictReader(lines)][-1]
-        yield "- Predicts the next velocity maps and kinematics of one AV's surroundings (docs/hpn.md)."
+        yield "- Predicts the next velocity maps and kinematics of one AV's surroundings (hpn.md)."
         page, unit = "docs/results/prediction_maps.md", "loss"
     else:
         train, check, steps = data["training"], data["validation"], data["fit"]["steps"]
@@ -183,7 +181,7 @@ def predicting(name: str, card: Card) -> Iterator[str]:
             train["commands"],
             "`cosim fit-predictors --training DIR --validation DIR --out DIR`",
         )
-        yield "- Predicts each vehicle's trajectory for 4 s (docs/prediction.md)."
+        yield "- Predicts each vehicle's trajectory for 4 s (docs/explanation/prediction.md)."
         page, unit = "docs/results/prediction.md", "m"
     count = len(recorded)
     then = " (`vfn` was the network of a demonstrator then)" if "--policy vfn" in recorded[0] else ""
@@ -201,7 +199,7 @@ def seeing(_: str, card: Card) -> Iterator[str]:
     """The lines about the frame encoder."""
     data, r2 = card["data"], card["measured"]["R2 on tuning seeds"]
     frames, sight = data["frames"], data["sight"]
-    yield "- Turns one velocity map into 128 numbers that tell what stands on it (docs/training.md, Seeing)."
+    yield "- Turns one velocity map into 128 numbers that tell what stands on it (training.md, Seeing)."
     yield (
         f"- Data: {frames['training']:,} frames, {sight['drives']} drives of every demand of "
         f"{', '.join(data['scenarios'])}, seeds below 100,000; labels from the simulation."
@@ -222,7 +220,7 @@ def worded(figure: str) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Write the page."""
     parser = argparse.ArgumentParser(description="Write the cards of the networks that ship.")
-    parser.add_argument("--out", type=Path, default=Path("docs/models.md"), metavar="FILE")
+    parser.add_argument("--out", type=Path, default=Path("docs/reference/models.md"), metavar="FILE")
     args = parser.parse_args(arguments)
     try:
         write_page(args.out, page())

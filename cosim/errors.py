@@ -5,7 +5,7 @@
     |   `-- WeightsMismatch         2   a checkpoint that does not fit its network
     |-- SimulationError             3   SUMO failed
     |   |-- SimulationInUse         3   a second simulation in one process
-    |   |-- SimulationEnded         3   another program ended the simulation (docs/traci.md)
+    |   |-- SimulationEnded         3   another program ended the simulation (docs/guides/traci.md)
     |   `-- SimulationCrashed       3   the process that ran SUMO ended
     |       `-- SimulationTimeout   3   ... or did not answer and was killed
     `-- ReplayDiffers               1   `cosim replay`: not the recorded episode (cosim.report.replay.episode)

@@ -169,7 +169,7 @@ def sumo(scenario: Scenario, av_parameters: Mapping[str, str], history: int) -> 
 
 
 def serving(port: int, clients: int) -> SimulatorFactory:
-    """SUMO in this process, which `clients` TraCI programs share at `port` (docs/traci.md)."""
+    """SUMO in this process, which `clients` TraCI programs share at `port` (docs/guides/traci.md)."""
 
     def simulator(scenario: Scenario, av_parameters: Mapping[str, str], history: int) -> Simulator:
         from cosim.simulation.shared import ServingSimulator

@@ -4,7 +4,7 @@
 # A head and a worker on a network of their own, with a token; the worker is killed in mid-run. Passes when every
 # episode is there and drove to the last bit as with the local engine. Wants an image with Ray in it:
 # EXTRAS=ray IMAGE=cosim:ray docker/build.sh. The same commands, one a machine, are a real cluster
-# (docs/container.md); the variables are those of engine.sh.
+# (docs/guides/container.md); the variables are those of engine.sh.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 IMAGE=${IMAGE:-cosim:ray}

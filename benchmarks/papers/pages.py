@@ -28,15 +28,15 @@ from cosim.seeding import FIRST_TEST_SEED
 from cosim.workers.tasks import OK
 from policy.checkpoint import read_card
 
-# First on every page that drives networks, in results/README.md and the README.
+# First on every page that drives networks and in results/README.md.
 SAID_FIRST = (
     "**The tables show networks of a demonstrator:** `vfn-p-demonstrated`, `vfn-demonstrated` and",
-    "`vfn-p-egoistic` learned from a script (`docs/training.md`) and do not use their maps, past or",
+    "`vfn-p-egoistic` learned from a script (`docs/guides/training.md`) and do not use their maps, past or",
     "predicted: what a map shows changes none of their choices, or hardly one",
     "(`docs/results/attribution.md`, by `cosim bench attribution --policy vfn-p-demonstrated --scenario",
     "merge --demand contested --seeds 150000:150006 --out DIR`). So the first against the second does not",
     "measure what predicted maps are worth. What `vfn-p` and `vfn`, which learned from rewards alone and",
-    "see other vehicles in their maps alone, were asked and show stands in `docs/agent.md`. On real",
+    "see other vehicles in their maps alone, were asked and show stands in `asked.md`. On real",
     "networks with signals the preset `unguarded` drives unlawfully, through red lights and faster than",
     "lanes allow.",
 )

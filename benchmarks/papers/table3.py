@@ -38,7 +38,7 @@ ABLATION = (
 )
 TRAINING = (
     "",
-    "Our networks saw two drives an iteration, a demonstrator's among them (docs/training.md); P's saw",
+    "Our networks saw two drives an iteration, a demonstrator's among them (training.md); P's saw",
     "thousands of episodes and no demonstrator.",
 )
 ABLATED = (

@@ -10,7 +10,7 @@ SubCommands = Any  # what ArgumentParser.add_subparsers returns: argparse keeps 
 
 POLICY = (
     "who commands the AVs (default idm): a name; RUN or FILE.safetensors of cosim train; FILE.py:NAME or "
-    "MODULE:NAME, your own (docs/own_policy.md). LABEL= before a file says what tables call it"
+    "MODULE:NAME, your own (docs/guides/extending.md). LABEL= before a file says what tables call it"
 )
 
 
@@ -62,7 +62,8 @@ def _shared() -> dict[str, dict[str, Any]]:
         },
         "--errors": {
             "metavar": "LEVEL|FILE",
-            "help": "of human drivers: none (default), field, stress, or a YAML file (docs/human_errors.md)",
+            "help": "of human drivers: none (default), field, stress, or a YAML file "
+            "(docs/explanation/human_errors.md)",
         },
         "--seed": {"type": seed, "metavar": "N"},
         "--seeds": {"metavar": "A:B", "help": "seeds A, A+1, ... B-1"},

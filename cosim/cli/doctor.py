@@ -20,7 +20,7 @@ OK, WARN, FAIL = "ok", "warn", "FAIL"
 DISTRIBUTION = "cosim-sumo"  # cosim's name on a package index
 INSTALL = "pip install -e . -c constraints.txt"
 REINSTALL = "pip install --force-reinstall libsumo"
-# What `import libsumo` misses on a bare Debian or Ubuntu (docs/sumo.md).
+# What `import libsumo` misses on a bare Debian or Ubuntu (docs/reference/sumo.md).
 APT_LINE = "apt-get install libx11-6 libxext6 libxrender1 libgl1 libatomic1"
 # One version for all of them: libsumo and sumolib are pinned together, eclipse-sumo rebuilds the nets.
 SUMO_PACKAGES = ("libsumo", "sumolib", "traci", "eclipse-sumo", "sumo-data")
@@ -210,7 +210,7 @@ def confinement() -> Check:
     from cosim.service.confined import lacking
 
     if problem := lacking():
-        return Check("uploads", WARN, f"{problem}: cosim serve takes none", "docs/service.md, Uploads")
+        return Check("uploads", WARN, f"{problem}: cosim serve takes none", "docs/guides/service.md, Uploads")
     return Check("uploads", OK, "confined by Landlock and seccomp")
 
 

@@ -12,7 +12,7 @@ from cosim.scenario.episode_id import EpisodeId
 FIELD = "field"  # the level of human errors that is estimated unless another one is named
 
 EPILOG = """\
-Most episodes are drawn with errors made more frequent (the tilt), and weigh less: docs/estimate.md.
+Most episodes are drawn with errors made more frequent (the tilt), and weigh less: docs/guides/estimate.md.
 `cosim compare A B --fail-on 'crash_rate_per_million_km > 2'` reads the folder as one of `cosim evaluate`.
 `--resume --out DIR --episodes N` lets a run go on to N episodes a cell.
 """

@@ -1,4 +1,4 @@
-"""`cosim join`: our agents drive vehicles of a SUMO that somebody else started (docs/traci.md)."""
+"""`cosim join`: our agents drive vehicles of a SUMO that somebody else started (docs/guides/traci.md)."""
 
 from __future__ import annotations
 

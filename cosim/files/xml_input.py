@@ -1,7 +1,7 @@
 """Read one XML file of unknown origin as a stream, so that nothing in it can hurt the process that reads.
 
 SUMO itself answers a bad file with "Process Error", with gigabytes of memory or with SIGSEGV
-(docs/sumo.md); everything SUMO is handed therefore passes through `scan` first. The
+(docs/reference/sumo.md); everything SUMO is handed therefore passes through `scan` first. The
 parser is expat with three refusals (entities, external references, encodings other than
 UTF-8 and Latin-1) and caps on depth, token length and unpacked size; memory does not grow
 with the file.

@@ -61,7 +61,7 @@ def train(args: argparse.Namespace) -> int:
         if agent.predicted_maps and agent.chain.source == "hpn" and agent.hpn_weights is not None:
             about["hpn_sha256"] = sha256(agent.hpn_weights)
         keep_freed_memory()
-        use_threads(args.threads)  # more threads than cores stall each other (docs/training.md)
+        use_threads(args.threads)  # more threads than cores stall each other (docs/guides/training.md)
         writer = tensorboard(folder)
         rollouts = Rollouts(
             args.workers, name, agent, file.explore, training.reward or file.reward, training.metrics

@@ -16,7 +16,7 @@ from cosim.types import Bools, Floats, Kind, Metric, Snapshot, Timing
 
 AV = int(Kind.AV)  # comparing arrays with an IntEnum member costs five times as much
 PERSON = int(Kind.PERSON)
-HORIZON = 10.0  # s, further ahead straight-line extrapolation says nothing (docs/paper_map.md)
+HORIZON = 10.0  # s, further ahead straight-line extrapolation says nothing (docs/reference/paper_map.md)
 CRITICAL = 1.5  # s, the usual bound of a serious conflict (van der Horst 1990); critical_th of P
 HARD = 3.35  # m/s2, of the DRAC: above it a crossing or following is a conflict (Archer 2005)
 

@@ -56,7 +56,7 @@ class Measure:
 
 
 def weights(rows: Sequence[Row]) -> list[float]:
-    """The likelihood ratio of each episode; 1 where its errors were not tilted (docs/estimate.md)."""
+    """The likelihood ratio of each episode; 1 where its errors were not tilted (docs/guides/estimate.md)."""
     return [1.0 if row.get(WEIGHT) is None else float(row[WEIGHT]) for row in rows]
 
 
@@ -77,7 +77,7 @@ RATES: dict[str, Measure] = {
 }
 
 CRASHES = "crash_rate_per_million_km"
-# Events per distance and per vehicle time: all of them over all of it (docs/definitions.md, Near-misses).
+# Events per distance and per vehicle time: all of them over all of it (definitions.md, Near-misses).
 CRASH_RATES: dict[str, Measure] = {
     name: Measure(name, column, f"per million {km}", "lower", per=per, scale=1e6, more=more)
     for name, column, more, km, per in (
@@ -104,7 +104,7 @@ def measures(
 
     `units` and `better` say by column what `cosim run --json` says of its metrics. Columns of yes and no
     give rates, of numbers means; so a metric that is new has its figure without being listed here. Of tilted
-    episodes (docs/estimate.md) only events per exposure and timings: what is not weighed is of no traffic.
+    episodes (estimate.md) only events per exposure and timings: what is not weighed is of no traffic.
     """
     units, better = units or {}, better or {}
     kinds: dict[str, set[type]] = {}  # of the values that are not NA

@@ -1,6 +1,6 @@
 """Values with 95 % intervals: shares, rates, means, quantiles, and differences of pairs on equal seeds.
 
-What is used where, and how it was checked: docs/evaluation_statistics.md. NA is nan in here, never 0.
+What is used where, and how it was checked: docs/explanation/statistics.md. NA is nan in here, never 0.
 """
 
 import math

@@ -1,7 +1,7 @@
 """Read a .sumocfg and the SUMO options of the command line, and sort them: kept, resolved, or set aside.
 
 A foreign configuration is never handed to SUMO as it is: its outputs could write anywhere and its
-`remote-port` would wait for ever (docs/sumo.md). What changes the traffic is kept.
+`remote-port` would wait for ever (docs/reference/sumo.md). What changes the traffic is kept.
 """
 
 import math
@@ -77,7 +77,7 @@ _KEPT = re.compile(
 _NEVER_KEPT = re.compile(
     r".+[.-](output|file)|.*output.*|tls\.actuated\.show-detectors|.*\.wkt|.*jupedsim\.py"
 )
-# Why an option of the command line cannot hold here (docs/sumo.md).
+# Why an option of the command line cannot hold here (docs/reference/sumo.md).
 _REFUSED = {
     "configuration-file": "name the .sumocfg in place of a scenario",
     "seed": "use cosim's own --seed",

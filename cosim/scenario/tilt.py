@@ -26,7 +26,7 @@ class Tilt:
     """The first two errors near AVs are drawn more often, in all but a share of the episodes.
 
     Importance sampling with a defensive mixture (Hesterberg, Technometrics 37 (1995) 185-194; Owen and Zhou,
-    JASA 95 (2000) 135-143): docs/estimate.md.
+    JASA 95 (2000) 135-143): docs/guides/estimate.md.
     """
 
     factors: Mapping[str, float] = field(default_factory=dict)  # `case` -> factor, 1 or more

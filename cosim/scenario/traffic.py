@@ -1,5 +1,5 @@
 """Whose SUMO options drive a user's file: the file's own (`as-is`), or those that cosim's drivers and
-figures need (`controlled`). What that changes is named in every result (docs/definitions.md, Traffic)."""
+figures need (`controlled`). What that changes is named in every result (definitions.md, Traffic)."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ RULES: Mapping[str, Rule] = {
     # continuous lateral motion, definitions.md
     "lanechange.duration": Rule("0", "2", "a lane change is a movement that others can see", forced=False),
     "time-to-teleport": Rule("300", "-1", "a teleport would put a vehicle before an AV", forced=False),
-    # docs/sumo.md: never `none`, nothing would be reported
+    # docs/reference/sumo.md: never `none`, nothing would be reported
     "collision.action": Rule("teleport", "warn", "collisions are counted, and who crashed stands"),
     CHECKS_INSIDE: Rule("false", "true", "collisions inside junctions are counted"),
     "collision.mingap-factor": Rule("-1", "0", "only contact is a collision"),

@@ -1,6 +1,6 @@
 """Vet everything a scenario hands to SUMO before SUMO sees it: bad input becomes one clear sentence.
 
-SUMO answers bad input with "Process Error", nothing or SIGSEGV (docs/sumo.md). Here every
+SUMO answers bad input with "Process Error", nothing or SIGSEGV (docs/reference/sumo.md). Here every
 file is read once as a stream (memory does not grow with the demand's size, except for its names), its
 numbers are checked, and every name it refers to must exist. Files that have not changed are not read again.
 """

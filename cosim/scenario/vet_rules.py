@@ -1,7 +1,7 @@
 """What the numbers in SUMO's files may be: tables for nets, vehicle types and vehicles, and one check.
 
 Taken from SUMO 1.28's own schemas (net_file.xsd, route.xsd), which SUMO does not apply to most inputs: it
-accepts NaN, infinities and negative speeds silently (docs/sumo.md). Words such as
+accepts NaN, infinities and negative speeds silently (docs/reference/sumo.md). Words such as
 `departPos="random"` are legal where the schema has them; SUMO itself refuses other words.
 """
 
@@ -149,7 +149,7 @@ _DRIVING = {
     "vehsPerHour": NON_NEGATIVE,
     "perHour": NON_NEGATIVE,
     "probability": SHARE,
-    "number": Number(0.0, high=1e6),  # 2e6 vehicles in one flow hang SUMO (docs/sumo.md)
+    "number": Number(0.0, high=1e6),  # 2e6 vehicles in one flow hang SUMO (docs/reference/sumo.md)
     "period": Number(0.0, above=True, time=True, distribution=True),
 }
 _WALKING = _each(WORD_OR_FINITE, "departPos arrivalPos speed duration")

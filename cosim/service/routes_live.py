@@ -1,4 +1,4 @@
-"""Watching a session: a WebSocket that tells what is driven and is asked to drive (docs/service.md)."""
+"""Watching a session: a WebSocket that tells what is driven and is asked to drive (service.md)."""
 
 import asyncio
 import contextlib

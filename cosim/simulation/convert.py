@@ -66,7 +66,7 @@ class Body:
 
 
 class SnapshotReader:
-    """Reads every vehicle with plain getters (measured faster than subscriptions, docs/sumo.md)."""
+    """Reads every vehicle with plain getters (measured faster than subscriptions, docs/reference/sumo.md)."""
 
     def __init__(self, road: RoadMap, variable: Iterable[int] = ()) -> None:
         """`variable`: the lanes whose speed limit may change."""

@@ -1,6 +1,6 @@
 """One object in a process of its own, supervised: when SUMO crashes, the caller does not.
 
-A net that crashes SUMO ends the process that imported libsumo (docs/sumo.md). So whatever drives a
+A net that crashes SUMO ends the process that imported libsumo (docs/reference/sumo.md). So whatever drives a
 simulation runs in a spawned worker, called through a pipe; its crash or missing heartbeat is an exception.
 """
 

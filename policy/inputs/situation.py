@@ -1,7 +1,7 @@
 """What an AV perceives in few numbers: its command, its lanes, who drives on them, and who has to yield.
 
 The maps and kinematic rows hold nearly all of it too, but from the few drives that two cores have time for
-a network does not find it there (docs/training.md, What it took to learn from few drives).
+a network does not find it there.
 """
 
 from collections.abc import Sequence

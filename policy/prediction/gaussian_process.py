@@ -3,7 +3,7 @@
 P, equations (1), (7), (8): a series is f ~ GP(m, k) with k = linear + RBF + white noise and time centred on
 the newest frame. All series share one time grid, so for a finite bank of kernels (P's reference [14])
 prediction is a matrix product with operators computed once. Per series the kernels are averaged by marginal
-likelihood times a prior over kernels; picking the best one is worse (measured, docs/prediction.md).
+likelihood times a prior over kernels; picking the best one is worse (measured, prediction.md).
 """
 
 import itertools

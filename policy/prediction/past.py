@@ -3,7 +3,7 @@
 A vehicle that came into view two frames ago has a past too, only an unknown one. A predictor fitted on
 complete histories only does not learn what missing frames mean: with one known frame the fitted
 prior erred by three times constant speed. So what is not known is taken to have been as the two oldest known
-frames show; with a single one, constant speed (measured on tuning seeds, docs/prediction.md).
+frames show; with a single one, constant speed (measured on tuning seeds, docs/explanation/prediction.md).
 """
 
 import numpy as np

@@ -10,7 +10,7 @@ from cosim.types import MetaAction
 
 @dataclass(frozen=True, slots=True)
 class SafetyConfig:
-    """Thresholds (docs/paper_map.md) and the driving limits behind them."""
+    """Thresholds (docs/reference/paper_map.md) and the driving limits behind them."""
 
     safe_th: float = 3.0  # s, P: safe_th
     critical_th: float = 1.5  # s, P: critical_th

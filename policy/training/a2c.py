@@ -32,7 +32,7 @@ class A2cConfig:
     # are more than 200 m behind it (with `explore.next`)
     anchor: float = 0.0
     keep: int = 1  # decisions that what is drawn is kept: nobody opens a gap within one of 0.4 s
-    n_step: int = 8  # as the DDQN's (docs/training.md); 1 is the papers'
+    n_step: int = 8  # as the DDQN's (docs/guides/training.md); 1 is the papers'
     gamma: float = 0.97  # a decision of 0.4 s
     batch: int = 64
     passes: int = 1  # over what an iteration drove; 1 is A2C

@@ -20,7 +20,7 @@ class ReplayConfig:
     capacity: int = 30_000  # decisions; P's 8,000 (Table I) are 20 episodes of 4 learners. 0.1 MB each
     batch: int = 64  # P, Table I
     advised: int = 64  # states to imitate on; with maps `batch`, for they cost as much
-    n_step: int = 8  # one step did not learn altruism (docs/training.md); 1 is the papers'
+    n_step: int = 8  # one step did not learn altruism (docs/guides/training.md); 1 is the papers'
     gamma: float = 0.97  # a decision of 0.4 s; P: 0.95
     # shares of a batch, however rare such moments are (P, Alg. 4: rebalanced):
     yielding: float = 0.25  # where the demonstrator would have yielded; one AV in ten does, for some seconds

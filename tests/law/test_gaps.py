@@ -174,7 +174,7 @@ def test_it_waits_for_who_comes_also_from_beyond_a_short_edge_and_when_handed_ba
 
 
 def test_a_little_impatience_makes_sumos_driver_wait_for_who_is_far_away(tmp_path: Path) -> None:
-    """docs/sumo.md: for who brakes comfortably and comes to the same lane, more than 200 m off."""
+    """docs/reference/sumo.md: for who brakes comfortably and comes to the same lane, more than 200 m off."""
     net = crossing_net(tmp_path, "whole")
     took = {}
     for impatience in (0.0, 0.1, 0.5):

@@ -59,7 +59,7 @@ ROUTES = """<routes>
              departSpeed="{foe_speed}"/>
 </routes>"""
 
-# Runs in a process of its own: one simulation per process (docs/sumo.md). Speeds given are held exactly;
+# Runs in a process of its own: one simulation per process (sumo.md). Speeds given are held exactly;
 # a vehicle without one is driven by IDM.
 DRIVER = """
 import json, sys

@@ -14,7 +14,7 @@ from benchmarks import model_cards
 from policy.checkpoint import SHIPPED, read_card, sha256
 
 ROOT = Path(__file__).parents[2]
-PAGE = ROOT / "docs" / "models.md"
+PAGE = ROOT / "docs" / "reference" / "models.md"
 
 
 @pytest.mark.parametrize("weights", sorted(SHIPPED.glob("*.safetensors")), ids=lambda path: path.stem)

@@ -246,7 +246,7 @@ def test_environments_give_the_law_as_bounded_numbers() -> None:
 
 
 def test_the_example_of_a_policy_that_keeps_the_law_stops_at_red() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "own_policy.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "guides" / "extending.md").read_text(encoding="utf-8")
     code = next(c for c in re.findall(r"```python\n(.*?)```", page, re.S) if "signal_distance" in c)
     space: dict[str, object] = {}
     exec(code, space)

@@ -129,7 +129,7 @@ def test_bootstrap_reaches_further_where_the_tail_is() -> None:
 
 
 def test_bootstrap_of_five_values_promises_too_much() -> None:
-    """docs/evaluation_statistics.md warns of it: four times in five, not nineteen in twenty."""
+    """docs/explanation/statistics.md warns of it: four times in five, not nineteen in twenty."""
     rng = np.random.default_rng(0)
     found = [mean(rng.normal(size=5)) for _ in range(100)]
     assert 0.7 < sum(f.low <= 0.0 <= f.high for f in found) / 100 < 0.9

@@ -183,7 +183,7 @@ class Runs:
                 job = self._jobs.add(run, name, request, uploads, plan.episodes)
                 self._plans[run] = plan
                 self._queue.append(run)
-                self._changed.notify()
+                self._changed.notify_all()  # others than workers wait on it too
         except BaseException:
             self._forget(run)
             raise
@@ -264,7 +264,7 @@ class Runs:
                 raise Conflict(f"run {run} is {status}: a run that failed or was cancelled is resumed")
             self._jobs.set(run, status=QUEUED, error=None, ended=None)
             self._queue.append(run)
-            self._changed.notify()
+            self._changed.notify_all()  # others than workers wait on it too
         log.info("run resumed", extra={"run": run})
         return self.get(run)
 

@@ -24,6 +24,10 @@ def test_links_pictures_and_files_named_in_a_page_exist(page: Path) -> None:
     assert [file for file in files if not (ROOT / file).exists() and "NAME" not in file] == []
 
 
+# Their text is part of the identity of shipped episodes: they name pages by the paths of then.
+AS_THEN = [f"sumo_scenarios/{name}.yaml" for name in ("behaviors", "errors", "tilts")]
+
+
 @pytest.mark.parametrize("folder", ["benchmarks", "cosim", "policy", "sumo_scenarios"])
 def test_pages_named_in_the_code_exist(folder: str) -> None:
     pages = {page.name for page in PAGES} | MADE
@@ -38,7 +42,7 @@ def test_pages_named_in_the_code_exist(folder: str) -> None:
         for file, name in named
         if (not (ROOT / name).exists() if name.startswith("docs/") else Path(name).name not in pages)
     }
-    assert sorted(gone) == []
+    assert sorted((file, name) for file, name in gone if file not in AS_THEN) == []
 
 
 def test_every_figure_of_an_episode_is_defined() -> None:

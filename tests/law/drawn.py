@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import random
 import subprocess
+from collections.abc import Sequence
 from pathlib import Path
 
 import sumo
@@ -14,6 +15,7 @@ KINDS = (
     *("traffic_light", "traffic_light_right_on_red", "roundabout", "left_hand", "two_junctions"),
 )
 END = 180.0  # s
+NO_TURNAROUNDS = ("--no-turnarounds", "true")
 ARM, RING = 130.0, 18.0  # m
 TYPES = """<vType id="car"/><vType id="eager" tau="0.6" impatience="0.5"/>
 <vType id="truck" vClass="truck" length="12" width="2.5" accel="1.2"/>
@@ -27,15 +29,26 @@ def draw(folder: Path, kind: str, seed: int) -> Path:
     rng = random.Random(f"{kind}/{seed}")
     folder.mkdir(parents=True, exist_ok=True)
     nodes, edges, ends = _roads(kind, rng)
-    (folder / "x.nod.xml").write_text("<nodes>" + "".join(nodes) + "</nodes>")
-    (folder / "x.edg.xml").write_text("<edges>" + "".join(edges) + "</edges>")
-    left_hand = ["--lefthand", "true"] if kind == "left_hand" else []
-    command = [str(Path(sumo.SUMO_HOME) / "bin" / "netconvert"), "-n", "x.nod.xml", "-e", "x.edg.xml"]
-    command += [*left_hand, "--no-turnarounds", "true", "-o", "net.net.xml"]
-    subprocess.run(command, cwd=folder, check=True, capture_output=True)
-    (folder / "demand.rou.xml").write_text(f"<routes>{TYPES}{''.join(_flows(kind, ends, rng))}</routes>")
+    left_hand = ("--lefthand", "true") if kind == "left_hand" else ()
+    build_net(folder, nodes, edges, *NO_TURNAROUNDS, *left_hand)
+    return configuration(folder, f"<routes>{TYPES}{''.join(_flows(kind, ends, rng))}</routes>", END)
+
+
+def build_net(folder: Path, nodes: Sequence[str], edges: Sequence[str], *options: str) -> str:
+    """The name of the net that netconvert makes in `folder` of nodes and edges, each in XML."""
+    for kind, root, parts in (("nod", "nodes", nodes), ("edg", "edges", edges)):
+        (folder / f"x.{kind}.xml").write_text(f"<{root}>{''.join(parts)}</{root}>")
+    netconvert = Path(sumo.SUMO_HOME) / "bin" / "netconvert"
+    files = ("-n", "x.nod.xml", "-e", "x.edg.xml", "-o", "net.net.xml")
+    subprocess.run([netconvert, *files, *options], cwd=folder, check=True, capture_output=True)
+    return "net.net.xml"
+
+
+def configuration(folder: Path, routes: str, end: float) -> Path:
+    """The .sumocfg in `folder` of its net and these routes, in XML; it ends at `end` (s)."""
+    (folder / "demand.rou.xml").write_text(routes)
     config = folder / "run.sumocfg"
-    config.write_text(CONFIG.format(end=END))
+    config.write_text(CONFIG.format(end=end))
     return config
 
 

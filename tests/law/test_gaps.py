@@ -16,11 +16,12 @@ from cosim.host import Host
 from cosim.scenario import chosen_fleet, load
 from cosim.types import Command, Decision, EpisodeResult, History, MetaAction, Preset
 from cosim.workers.worker import Worker
+from tests.law.drawn import build_net
 from tests.law.test_lawful import Always
 
-NODES = """<nodes><node id="w" x="-300" y="0"/><node id="m" x="-32" y="0"/>
+NODES = """<node id="w" x="-300" y="0"/><node id="m" x="-32" y="0"/>
 <node id="j" x="0" y="0" type="priority"/><node id="e" x="300" y="0"/>
-<node id="s" x="0" y="-150"/><node id="n" x="0" y="150"/></nodes>"""
+<node id="s" x="0" y="-150"/><node id="n" x="0" y="150"/>"""
 EDGE = '<edge id="{}" from="{}" to="{}" priority="{}" numLanes="1" speed="13.89"/>'
 MINOR = ("sj", "s", "j", 1), ("jn", "j", "n", 1)
 ROADS = {  # the major road; its edges from the west to the east
@@ -108,14 +109,7 @@ class Nears:
 
 def crossing_net(folder: Path, road: str) -> str:
     """The name of the net of a minor road that crosses a major one."""
-    edges = [EDGE.format(*edge) for edge in (*ROADS[road], *MINOR)]
-    parts = {"nod": NODES, "edg": "<edges>" + "".join(edges) + "</edges>"}
-    for kind, text in parts.items():
-        (folder / f"x.{kind}.xml").write_text(text)
-    netconvert = Path(sumo.SUMO_HOME) / "bin" / "netconvert"
-    files = ("-n", "x.nod.xml", "-e", "x.edg.xml", "-o", "x.net.xml")
-    subprocess.run([netconvert, *files], cwd=folder, check=True, capture_output=True)
-    return "x.net.xml"
+    return build_net(folder, NODES, [EDGE.format(*edge) for edge in (*ROADS[road], *MINOR)])
 
 
 def crossing(folder: Path, road: str, human: float) -> Path:

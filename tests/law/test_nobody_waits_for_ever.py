@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-import subprocess
 from pathlib import Path
 
 import pytest
-import sumo
 
 from benchmarks.humans import Accelerate
 from benchmarks.standing import Watcher
@@ -16,7 +14,7 @@ from cosim.scenario.vet import vetted
 from cosim.simulation import inside, waves
 from cosim.types import EpisodeResult, Preset
 from cosim.workers.worker import Worker
-from tests.law.drawn import KINDS, draw
+from tests.law.drawn import KINDS, NO_TURNAROUNDS, build_net, configuration, draw
 
 SEED = 140_000
 # Seeds of junctions where SUMO's own drivers stand for less than 60 s; others are overloaded.
@@ -27,8 +25,6 @@ TURNS = """<routes><vType id="car"/><vType id="cav"/>
 <flow id="left" type="car" from="wj" to="jn" begin="0" end="160" period="8" departSpeed="max"/>
 <flow id="av" type="cav" from="ej" to="jw" begin="1" end="160" period="12" departSpeed="max"/>
 <flow id="on" type="car" from="ej" to="jw" begin="4" end="160" period="6" departSpeed="max"/></routes>"""
-CONFIG = """<configuration><net-file value="net.net.xml"/><route-files value="demand.rou.xml"/>
-<begin value="0"/><end value="200"/></configuration>"""
 
 
 def narrow_junction(folder: Path) -> Path:
@@ -43,15 +39,8 @@ def narrow_junction(folder: Path) -> Path:
         for arm in places
         for a, b in ((arm, "j"), ("j", arm))
     ]
-    (folder / "x.nod.xml").write_text(f"<nodes>{''.join(nodes)}</nodes>")
-    (folder / "x.edg.xml").write_text(f"<edges>{''.join(edges)}</edges>")
-    netconvert = Path(sumo.SUMO_HOME) / "bin" / "netconvert"
-    files = ("-n", "x.nod.xml", "-e", "x.edg.xml", "-o", "net.net.xml", "--no-turnarounds", "true")
-    subprocess.run([netconvert, *files], cwd=folder, check=True, capture_output=True)
-    (folder / "demand.rou.xml").write_text(TURNS)
-    config = folder / "run.sumocfg"
-    config.write_text(CONFIG)
-    return config
+    build_net(folder, nodes, edges, *NO_TURNAROUNDS)
+    return configuration(folder, TURNS, 200.0)
 
 
 class Alone(Watcher):

@@ -14,34 +14,10 @@ import pytest
 from cosim.cli.main import main
 from cosim.errors import BadInput
 from cosim.scenario import load
+from tests.roads import two_lanes
 
 SPEED = "@@"
-NET = """<net version="1.20">
-  <location netOffset="0,0" convBoundary="0,0,2000,0" origBoundary="0,0,2000,0" projParameter="!"/>
-  <edge id=":b_0" function="internal">
-    <lane id=":b_0_0" index="0" speed="@@" length="0.1" shape="1000,-4.8 1000,-4.8"/>
-    <lane id=":b_0_1" index="1" speed="@@" length="0.1" shape="1000,-1.6 1000,-1.6"/>
-  </edge>
-  <edge id="ab" from="a" to="b" priority="-1">
-    <lane id="ab_0" index="0" speed="@@" length="1000" shape="0,-4.8 1000,-4.8"/>
-    <lane id="ab_1" index="1" speed="@@" length="1000" shape="0,-1.6 1000,-1.6"/>
-  </edge>
-  <edge id="bc" from="b" to="c" priority="-1">
-    <lane id="bc_0" index="0" speed="@@" length="1000" shape="1000,-4.8 2000,-4.8"/>
-    <lane id="bc_1" index="1" speed="@@" length="1000" shape="1000,-1.6 2000,-1.6"/>
-  </edge>
-  <junction id="a" type="dead_end" x="0" y="0" incLanes="" intLanes="" shape="0,0 0,-6.4"/>
-  <junction id="b" type="priority" x="1000" y="0" incLanes="ab_0 ab_1" intLanes=":b_0_0 :b_0_1"
-            shape="1000,0 1000,-6.4">
-    <request index="0" response="00" foes="00" cont="0"/>
-    <request index="1" response="00" foes="00" cont="0"/>
-  </junction>
-  <junction id="c" type="dead_end" x="2000" y="0" incLanes="bc_0 bc_1" intLanes="" shape="2000,-6.4 2000,0"/>
-  <connection from="ab" to="bc" fromLane="0" toLane="0" via=":b_0_0" dir="s" state="M"/>
-  <connection from="ab" to="bc" fromLane="1" toLane="1" via=":b_0_1" dir="s" state="M"/>
-  <connection from=":b_0" to="bc" fromLane="0" toLane="0" dir="s" state="M"/>
-  <connection from=":b_0" to="bc" fromLane="1" toLane="1" dir="s" state="M"/>
-</net>"""
+NET = two_lanes(1000, SPEED)
 CARS = """<routes>@@<vType id="car" maxSpeed="30" speedDev="0"/>
 <flow id="f" type="car" from="ab" to="bc" begin="0" end="30" period="5" departLane="best" departSpeed="max"/>
 @@</routes>"""

@@ -12,33 +12,9 @@ from cosim.files import xml_input
 from cosim.scenario import Fleet, load
 from cosim.scenario import vet as vetting
 from cosim.scenario.vet import VetReport, vet
+from tests.roads import two_lanes
 
-NET = """<net version="1.20">
-  <location netOffset="0,0" convBoundary="0,0,1000,0" origBoundary="0,0,1000,0" projParameter="!"/>
-  <edge id=":b_0" function="internal">
-    <lane id=":b_0_0" index="0" speed="25" length="0.1" shape="500,-4.8 500,-4.8"/>
-    <lane id=":b_0_1" index="1" speed="25" length="0.1" shape="500,-1.6 500,-1.6"/>
-  </edge>
-  <edge id="ab" from="a" to="b" priority="-1">
-    <lane id="ab_0" index="0" speed="25" length="500" shape="0,-4.8 500,-4.8"/>
-    <lane id="ab_1" index="1" speed="25" length="500" shape="0,-1.6 500,-1.6"/>
-  </edge>
-  <edge id="bc" from="b" to="c" priority="-1">
-    <lane id="bc_0" index="0" speed="25" length="500" shape="500,-4.8 1000,-4.8"/>
-    <lane id="bc_1" index="1" speed="25" length="500" shape="500,-1.6 1000,-1.6"/>
-  </edge>
-  <junction id="a" type="dead_end" x="0" y="0" incLanes="" intLanes="" shape="0,0 0,-6.4"/>
-  <junction id="b" type="priority" x="500" y="0" incLanes="ab_0 ab_1" intLanes=":b_0_0 :b_0_1"
-            shape="500,0 500,-6.4">
-    <request index="0" response="00" foes="00" cont="0"/>
-    <request index="1" response="00" foes="00" cont="0"/>
-  </junction>
-  <junction id="c" type="dead_end" x="1000" y="0" incLanes="bc_0 bc_1" intLanes="" shape="1000,-6.4 1000,0"/>
-  <connection from="ab" to="bc" fromLane="0" toLane="0" via=":b_0_0" dir="s" state="M"/>
-  <connection from="ab" to="bc" fromLane="1" toLane="1" via=":b_0_1" dir="s" state="M"/>
-  <connection from=":b_0" to="bc" fromLane="0" toLane="0" dir="s" state="M"/>
-  <connection from=":b_0" to="bc" fromLane="1" toLane="1" dir="s" state="M"/>
-</net>"""
+NET = two_lanes(500, "25")
 ROUTES = """<routes>
   <vType id="car" carFollowModel="IDM" length="5" tau="1.2" speedFactor="normc(1,0.1,0.2,2)" lcSpeedGain="3"/>
   <route id="r" edges="ab bc"/>

@@ -2,6 +2,7 @@
 
 import argparse
 import math
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
@@ -12,6 +13,7 @@ from cosim.episode import run_episode
 from cosim.errors import BadInput
 from cosim.files import working_in
 from cosim.host import Host, Hosts
+from cosim.learning.announcement import announce, curves
 from cosim.learning.configuration import configuration
 from cosim.learning.prediction_data import spread
 from cosim.scenario import load, place
@@ -126,6 +128,14 @@ def train(args: argparse.Namespace) -> int:
     file = configuration(args.config).file
     training, agent = file.sight, agent_config("vfn-p", file)
     worlds = [place(w) for w in args.scenario if w != "all"] or list(names())
+    announce(
+        f"train encoder: {training.loop.updates:,} updates on drives in {', '.join(worlds)}",
+        {
+            "learning begins": f"when {training.drives} drives of each demand are seen, and "
+            f"{training.validation} for validation",
+            "curves": curves(shlex.quote(args.out), "log.csv"),
+        },
+    )
     with working_in(args.out) as folder:
         keep_freed_memory()
         use_threads(args.threads)

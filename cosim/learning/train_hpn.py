@@ -3,6 +3,7 @@
 import argparse
 import hashlib
 import json
+import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -11,6 +12,7 @@ from typing import Any
 
 from cosim.errors import BadInput
 from cosim.files import working_in
+from cosim.learning.announcement import announce, curves
 from cosim.learning.configuration import configuration
 from cosim.learning.prediction_data import MAPLESS, EpisodeReader, episodes, followed, recorded_by, spread
 from cosim.recording.folder import Folder, seed_of
@@ -44,16 +46,24 @@ def train(args: argparse.Namespace) -> int:
         "train": _checked(args.recordings, TRAINING_SEEDS, "--recordings"),
         "validation": _checked(args.validation, TUNING_SEEDS, "--validation"),
     }
+    variant = hpn.VARIANTS[name]
+    loop = training.map_loop if variant.maps == "plain" else training.loop
+    announce(
+        f"train {name}: {loop.updates:,} updates on {len(found['train']):,} recorded episodes",
+        {
+            "learning begins": "when the recordings are read",
+            "curves": curves(shlex.quote(args.out), "log.csv"),
+            "validation": f"every {loop.validate_every:,} updates on {len(found['validation']):,} episodes",
+        },
+    )
     with working_in(args.out) as folder:
         keep_freed_memory()
         use_threads(args.threads)
         data = {part: _manifest(keys) for part, keys in found.items()}
         examples = {part: _gather(keys, name, training, args.workers, part) for part, keys in found.items()}
         task: KinematicTask | MapTask
-        variant, loop = hpn.VARIANTS[name], training.loop
         sets = examples["train"], examples["validation"]
         if variant.maps == "plain":
-            loop = training.map_loop
             task = MapTask(variant.map_branch, training.maps, loop.updates, *sets, args.device)
         else:
             task = KinematicTask(variant.kinematic, training.kinematics, loop.updates, *sets, args.device)

@@ -11,6 +11,7 @@ import yaml
 
 from cosim.errors import BadInput
 from cosim.files import code, working_in
+from cosim.learning.announcement import Announced, begin
 from cosim.learning.configuration import configuration
 from cosim.learning.rollouts import Rollouts
 from cosim.metrics import read as read_metric
@@ -66,12 +67,16 @@ def train(args: argparse.Namespace) -> int:
         rollouts = Rollouts(
             args.workers, name, agent, file.explore, training.reward or file.reward, training.metrics
         )
+        wanted = training.recorded_first
+        begin(name, training, wanted, shlex.quote(args.out))
         with closing(writer), Progress(f"train {name}", "iterations") as progress, rollouts as actors:
+            announced = Announced(actors, wanted, progress.say)
             run = TrainingRun(
-                training, agent.vfn, actors, folder, device=args.device, log=writer, about=about
+                training, agent.vfn, announced, folder, device=args.device, log=writer, about=about
             )
             if args.resume and not run.resume():
                 print("nothing to resume: starting anew", file=sys.stderr)
+            announced.recorded = run.trainer.replay.size
             (folder / "config.yaml").write_text(yaml.safe_dump(values, sort_keys=False), encoding="utf-8")
             run.run(progress)
         # as `--policy` wants the folder: a bare word would be a policy that ships

@@ -47,7 +47,7 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
         self._terminal = self._stream.isatty()
         self._bar: tqdm[Any] | None = None
         self._began = time.monotonic()
-        self._note = threading.Timer(3.0, self._say, [STARTING])
+        self._note = threading.Timer(3.0, self.say, [STARTING])
         self._note.daemon = True
 
     def starting(self, after: float = 3.0) -> None:
@@ -61,7 +61,7 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
             return
         self._note.cancel()
         if not total:
-            self._say(COMPILING)
+            self.say(COMPILING)
             return
         if self._bar is None:
             every = REDRAW if self._terminal else LINE_EVERY
@@ -94,9 +94,17 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
                 self._bar.refresh()  # the last line of long work
             self._bar.close()
 
-    def _say(self, line: str) -> None:
+    def say(self, line: str) -> None:
+        """Write a line, above the bar where there is one."""
+        if self._quiet:
+            return
+        bar = self._bar if self._terminal else None
         with contextlib.suppress(ValueError):  # the stream is closed
+            if bar is not None:
+                bar.clear()
             print(f"{self._title}: {line}", file=self._stream, flush=True)
+            if bar is not None:
+                bar.refresh()
 
 
 def shown(items: Iterable[Item], total: int, title: str, unit: str, *, quiet: bool = False) -> Iterator[Item]:

@@ -74,11 +74,17 @@ class VfnTraining:
             positive="iterations episodes updates epsilon_iterations disseminate validate_every save_every",
             not_negative="prefill warm_up warm_up_after validation",
         )
-        imitates = (self.a2c if self.learning == "a2c" else self.ddqn).imitation > 0.0
-        waits = max(self.prefill, self.warm_up_after) if imitates else self.prefill
-        if waits > WAITS * self.replay.capacity:
-            problem = f"nothing is learned before {waits} decisions are kept"
+        if self.recorded_first > WAITS * self.replay.capacity:
+            problem = f"nothing is learned before {self.recorded_first} decisions are kept"
             raise BadInput(problem, field="training.replay.capacity", value=self.replay.capacity)
+
+    @property
+    def recorded_first(self) -> int:
+        """Decisions that are recorded before the first update; A2C learns on-policy, but for imitation."""
+        imitates = (self.a2c if self.learning == "a2c" else self.ddqn).imitation > 0.0
+        if imitates:
+            return max(self.prefill, self.warm_up_after)
+        return 0 if self.learning == "a2c" else self.prefill
 
 
 class Drive(NamedTuple):

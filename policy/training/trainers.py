@@ -58,8 +58,7 @@ class Trainer:
     @property
     def _prefilling(self) -> bool:
         """Whether the replay buffer holds less than is wanted before anything is learned."""
-        c = self.config
-        return self.replay.size < (max(c.prefill, c.warm_up_after) if self.learner.imitates else c.prefill)
+        return self.replay.size < self.config.recorded_first
 
     def _imitate(self, rng: np.random.Generator, maps: bool) -> float:
         return self.learner.imitate(self.replay.advised(rng, maps, self.device))

@@ -1,0 +1,97 @@
+"""What a training says before it learns: what it does, when learning begins, where the curves are."""
+
+import math
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+
+from policy.training.curriculum import Drive, Drove, VfnTraining
+from policy.training.vfn import Actors
+
+LINE_EVERY = 10.0  # s between two lines about the decisions that are still wanted
+
+
+def announce(title: str, lines: Mapping[str, str]) -> None:
+    """`title: ...` with a line for each of `lines` below it, on stderr at once."""
+    width = max(map(len, lines))
+    said = [title, *(f"  {head:<{width}}  {text}" for head, text in lines.items())]
+    print("\n".join(said), file=sys.stderr, flush=True)
+
+
+def curves(folder: str, log: str) -> str:
+    """How to look at the curves of the training that writes into `folder`, and its file `log`."""
+    return f"tensorboard --logdir {folder}  (as lines: {folder}/{log})"
+
+
+def begin(name: str, training: VfnTraining, wanted: int, folder: str) -> None:
+    """Say what a training of a value network does. `wanted`: decisions before the first update; `folder`:
+    where it writes, as commands shall name it."""
+    demands: dict[str, list[str]] = {}
+    for lesson in training.lessons:
+        demands.setdefault(lesson.scenario, []).append(lesson.demand)
+    scenarios = ", ".join(f"{scenario} ({', '.join(found)})" for scenario, found in demands.items())
+    drives, judged = training.iterations * training.episodes, len(training.lessons) * training.validation
+    waits = f"after {wanted:,} recorded decisions of AVs; the first drive shows how long that takes"
+    announce(
+        f"train {name}: {training.iterations} iterations of {training.episodes} drives, {drives:,} in all",
+        {
+            "scenarios": scenarios,
+            "learning begins": waits if wanted else "with the first iteration",
+            "curves": curves(folder, "log.jsonl"),
+            "validation": f"every {training.validate_every} iterations, {judged} drives; "
+            "best.safetensors is the best so far",
+            "interrupt": f"Ctrl-C; --resume continues, at most {training.save_every} iterations are lost",
+        },
+    )
+
+
+class Announced:
+    """Actors that say until the first update how long it takes.
+
+    Args:
+        actors: where episodes are driven.
+        wanted: decisions of AVs that are recorded before the first update.
+        say: shows a line.
+    """
+
+    def __init__(self, actors: Actors, wanted: int, say: Callable[[str], None]) -> None:
+        self.recorded = 0  # decisions in the replay buffer
+        self._actors, self._wanted, self._say = actors, wanted, say
+        self._first: tuple[float, int] | None = None  # when the first drive ended, and what it recorded
+        self._began = time.monotonic()
+        self._said = -math.inf
+        self._lock = threading.Lock()  # drives end in threads of their own
+
+    def submit(self, drive: Drive) -> Future[Drove]:
+        """Drive it soon."""
+        future = self._actors.submit(drive)
+        if drive.record and self.recorded < self._wanted:
+            future.add_done_callback(self._ended)
+        return future
+
+    def _ended(self, future: "Future[Drove]") -> None:
+        if future.cancelled() or future.exception() is not None:
+            return
+        with self._lock:
+            now = time.monotonic()
+            self.recorded += sum(map(len, future.result().trajectories))
+            counted = f"{min(self.recorded, self._wanted):,} of {self._wanted:,} decisions recorded"
+            if self.recorded >= self._wanted and self._said < math.inf:
+                self._said = math.inf
+                self._say(f"{counted}, learning begins")
+            elif now - self._said >= LINE_EVERY:
+                self._said = now
+                self._say(f"{counted}, learning begins in {self._time_left(now)}")
+            self._first = self._first or (now, self.recorded)
+
+    def _time_left(self, now: float) -> str:
+        """In words. The first drive starts processes and compiles: later ones do not count its time."""
+        since, before = self._first or (self._began, 0)
+        speed = (self.recorded - before) / max(now - since, 1e-9)
+        if not speed:
+            return "an unknown time"
+        seconds = (self._wanted - self.recorded) / speed
+        words = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
+        return f"about {words}" if self._first else f"at most {words}"

@@ -1,4 +1,4 @@
-"""The tables of human_errors.md: rates, what `stress` does to IDM AVs, crashes of humans alone, cost.
+"""The tables of driver_errors.md: rates, what `stress` does to IDM AVs, crashes of humans alone, cost.
 
     python -m benchmarks.error_levels [rates] [stress] [alone] [cost] [--episodes 40] [--page PAGE]
 
@@ -36,7 +36,7 @@ from cosim.seeding import TUNING_SEEDS
 from cosim.types import EpisodeResult
 from cosim.workers.worker import Worker
 
-PAGE = Path("docs/explanation/human_errors.md")
+RATES, MEASURED = Path("docs/explanation/driver_errors.md"), Path("docs/results/driver_errors.md")
 DEMANDS = ("dense", "contested")
 MILLION = 1e6  # km
 RARE = 1e-15  # rate of an error that is drawn and never begins
@@ -275,10 +275,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("tables", nargs="*", choices=("rates", *TABLES), default=["rates"])
     parser.add_argument("--episodes", type=int, default=40)
-    parser.add_argument("--page", type=Path, default=PAGE)
+    parser.add_argument("--page", type=Path, metavar="PAGE", help=f"default: {RATES} (rates), {MEASURED}")
     args = parser.parse_args()
     for name in args.tables:
-        fill(args.page, name, rates() if name == "rates" else TABLES[name](args.episodes))
+        page = args.page or (RATES if name == "rates" else MEASURED)
+        fill(page, name, rates() if name == "rates" else TABLES[name](args.episodes))
 
 
 if __name__ == "__main__":

@@ -159,7 +159,7 @@ def main() -> None:
         "intervals; p by Wilcoxon's signed ranks and McNemar's test, over the worlds by Holm's method.",
         "`vfn` sees no predicted map, and its mask expects constant speeds; the oracle tells networks and",
         "mask where everybody is in 4 s if AVs do as commanded and no human error begins",
-        "(docs/reference/definitions.md).",
+        "(docs/reference/presets.md).",
         "",
         f"Made by `python -m benchmarks.foresight{asked(parser, args)}`.",
     ]

@@ -294,7 +294,7 @@ def page(
         "# The law of the road" + (" among humans who err" if errors else ""),
         "",
         *(
-            [f"Errors `{errors}` (docs/explanation/human_errors.md).", "", *beside_idm(rows), ""]
+            [f"Errors `{errors}` (docs/explanation/driver_errors.md).", "", *beside_idm(rows), ""]
             if errors
             else []
         ),
@@ -302,7 +302,7 @@ def page(
         f"`{preset}`, {len(seeds)} seeds from {seeds.start:,}, the same for every arm. Counted from SUMO's",
         "outputs by tests/law/checker.py, which shares no code with what drives; collisions caused,",
         "interventions, junctions blocked and conflicts with persons are the rows' own figures",
-        "(definitions.md). Events: how many, and how many an episode with the exact Poisson 95 %",
+        "(figures.md). Events: how many, and how many an episode with the exact Poisson 95 %",
         "interval. What is asked: no red light, no stop sign and no other vehicle's right of way taken (of",
         "the last at most as many as `idm` beside it), no step of 0.1 s above the limit by more than 1 m/s,",
         "no collision that an AV caused, nobody stuck; trips of AVs and distance of all at least 95 % of",

@@ -114,7 +114,7 @@ class Episode:
 
     `start` and `advance` return what every AV on the road observes; decisions given to `advance` are
     commanded, AVs without one are driven by SUMO. `terminated` after a collision of an AV or the mission
-    vehicle unless the scenario goes on, `truncated` when its duration is over (definitions.md, Episode), or
+    vehicle unless the scenario goes on, `truncated` when its duration is over (figures.md, Episode), or
     when another program has ended the simulation.
     `metrics` are measured besides those of `cosim.metrics.METRICS`.
     """
@@ -239,7 +239,7 @@ class Episode:
         return self.snapshot.time - self._begin
 
     def trace_hash(self) -> str:
-        """SHA-256 over every decision so far (definitions.md, Reproducibility)."""
+        """SHA-256 over every decision so far (figures.md, Reproducibility)."""
         return self._hash.hexdigest()
 
     def result(self, policy: str, label: str = "", svo: float = 0.0) -> EpisodeResult:

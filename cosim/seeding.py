@@ -5,7 +5,7 @@ import hashlib
 import numpy as np
 import numpy.typing as npt
 
-# What a result may rest on (definitions.md, Seeds); tests begin where tuning and validation end, and a
+# What a result may rest on (figures.md, Reproducibility); tests begin where tuning and validation end, and a
 # result on a test seed never changes a parameter.
 TRAINING_SEEDS = range(100_000)
 TUNING_SEEDS = range(100_000, 200_000)

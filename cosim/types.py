@@ -73,7 +73,7 @@ class Actor(IntEnum):
 
 
 class Preset:
-    """What the car does whoever commands it (definitions.md, Presets): every result names it."""
+    """What the car does whoever commands it (presets.md, Presets): every result names it."""
 
     LAWFUL = "lawful"  # the car keeps the law, comfortably, and brakes in an emergency
     UNGUARDED = "unguarded"  # commands are carried out within physical limits: the agent can crash
@@ -82,7 +82,7 @@ class Preset:
 
 
 class OnCollision:
-    """What a crash does to an episode (docs/reference/definitions.md, Episode)."""
+    """What a crash does to an episode (docs/reference/figures.md, Episode)."""
 
     END = "end"  # the episode ends
     CONTINUE = "continue"  # it goes on; the wrecks stand, and are taken off the road
@@ -90,7 +90,7 @@ class OnCollision:
 
 
 class Traffic:
-    """Whose SUMO options drive a user's file (definitions.md, Traffic): every result names it."""
+    """Whose SUMO options drive a user's file (formats.md, Traffic options): every result names it."""
 
     AS_IS = "as-is"  # the file's own: as plain SUMO drives it
     CONTROLLED = "controlled"  # with what AVs, other drivers and figures need, each change named
@@ -179,7 +179,7 @@ REMEMBERED = 5.0  # s after its end in which a human error still has a part in a
 
 @dataclass(frozen=True, slots=True)
 class HumanError:
-    """A human driver, or a person on foot, began to err (docs/reference/definitions.md, Human errors)."""
+    """A human driver, or a person on foot, began to err (docs/explanation/driver_errors.md)."""
 
     time: float  # s
     who: str
@@ -399,7 +399,7 @@ class Receipt(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ObservationConfig:
-    """What an AV sees. Defaults: the compact size (docs/reference/definitions.md); `PAPER` is P and T's."""
+    """What an AV sees. Defaults: the compact size (docs/reference/observation.md); `PAPER` is P and T's."""
 
     height: int = 32  # pixels across the road
     width: int = 128  # pixels along the road

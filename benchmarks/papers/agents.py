@@ -19,7 +19,7 @@ from policy.agents.prediction_aware import PredictionAware
 from policy.checkpoint import sha256
 from policy.networks.vfn import VFN, VfnConfig
 
-PERCEPTION = 125.0  # m, what an AV's own sensors reach (definitions.md)
+PERCEPTION = 125.0  # m, what an AV's own sensors reach
 # options that shipped episodes do not name: their defaults are what was done without them
 NEWER = {
     "chain": ("shade",),

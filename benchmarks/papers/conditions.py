@@ -60,7 +60,7 @@ def orders() -> list[Order]:
 
 def write(results: Results, settings: Settings) -> None:
     """conditions.md, conditions.png, data/conditions.csv."""
-    past = "Whoever is perceived has its whole past in the kinematic rows (definitions.md, Observation)."
+    past = "Whoever is perceived has its whole past in the kinematic rows (observation.md)."
     page = heading(JOB, results, settings, "phi 45 degrees, the egoistic twin's 0.", past)
     senses = {agent.name for agent in sensing()}
     lines: list[Line] = []

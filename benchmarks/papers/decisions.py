@@ -38,7 +38,7 @@ ELSEWHERE = {  # (agent, demand) that this page does without
     ("keep-lane", "contested"),  # nobody needs to see how hard that traffic is
     (VFN, "dense"),  # Table III has it, with more episodes
 }
-BEHAVIOR = {"dense": "mixed", "contested": "moderate"}  # definitions.md, Demand and behaviour
+BEHAVIOR = {"dense": "mixed", "contested": "moderate"}  # presets.md, Human drivers
 DIFFERENCES = (
     "mission_success_rate",
     "collision_rate",

@@ -63,7 +63,7 @@ def _shared() -> dict[str, dict[str, Any]]:
         "--errors": {
             "metavar": "LEVEL|FILE",
             "help": "of human drivers: none (default), field, stress, or a YAML file "
-            "(docs/explanation/human_errors.md)",
+            "(docs/explanation/driver_errors.md)",
         },
         "--seed": {"type": seed, "metavar": "N"},
         "--seeds": {"metavar": "A:B", "help": "seeds A, A+1, ... B-1"},

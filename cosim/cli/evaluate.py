@@ -56,7 +56,7 @@ def add_matrix(command: argparse.ArgumentParser, errors: str = "none") -> None:
     )
     arguments.add(axes, "--policy", "--behavior", "--driver-model", action="append")
     arguments.add(axes, "--penetration", "--svo", "--preset", action="append")
-    levels = "of human drivers: none, field, stress, or a file (docs/explanation/human_errors.md); default "
+    levels = "of human drivers: none, field, stress, or a file (docs/explanation/driver_errors.md); default "
     arguments.add(axes, "--errors", action="append", help=levels + errors)
     arguments.add(axes, "--output", "--metric", action="append")
     arguments.add(command, "--av-type", "--av-ids", "--duration", "--warmup", "--mission")

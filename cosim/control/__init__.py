@@ -1,4 +1,4 @@
-"""Meta-actions become commands: a target speed on a grid, and a lane (definitions.md, Vehicles)."""
+"""Meta-actions become commands: a target speed on a grid, and a lane (presets.md, Commands)."""
 
 import math
 from collections.abc import Mapping
@@ -24,11 +24,11 @@ COMFORT_TIME = 1.0  # s, with which a target speed is tracked comfortably
 LANE_CHANGE_TIME = 2.0  # s, the same as SUMO's --lanechange.duration
 _ACTIONS, _ACCELERATE, _DECELERATE = len(MetaAction), int(MetaAction.ACCELERATE), int(MetaAction.DECELERATE)
 _NEVER = 1e9  # s: longer than any rollout
-STEP = 0.1  # s, with which a rollout tracks the target speed (SUMO's step, definitions.md)
+STEP = 0.1  # s, with which a rollout tracks the target speed (SUMO's step)
 
 
 def next_target(target: float, speed: float, action: int, speed_limit: float) -> float:
-    """The target speed in m/s after a meta-action (definitions.md, Vehicles).
+    """The target speed in m/s after a meta-action (presets.md, Commands).
 
     Args:
         target, speed: m/s, the AV's present target and its own speed.

@@ -167,7 +167,7 @@ def _stop_line(lane: Lane, low: Floats, cell: float, shape: tuple[int, ...]) -> 
 def channel_indices(config: ObservationConfig) -> npt.NDArray[np.int64]:
     """[5] index of each of CHANNELS in the config's channels, -1 where it has none.
 
-    Without an "ego" channel the ego is drawn into "mission" (definitions.md: ego + mission vehicle).
+    Without an "ego" channel the ego is drawn into "mission" (observation.md: ego + mission vehicle).
     """
     found = [config.channels.index(c) if c in config.channels else -1 for c in CHANNELS]
     if found[4] < 0:

@@ -11,7 +11,7 @@ from cosim.types import Floats
 
 LEVEL = 0.9  # nominal coverage of an interval
 NORMAL = 1.645  # its half width in standard deviations
-REPORTED = (0.2, 0.4, 1.0, 2.0, 3.0, 4.0)  # s (definitions.md, Time)
+REPORTED = (0.2, 0.4, 1.0, 2.0, 3.0, 4.0)  # s (observation.md, Clocks)
 QUANTITIES = ("speed", "heading", "along", "across")  # the last two: position, in driving direction and aside
 
 

@@ -5,7 +5,7 @@ from cosim.types import Collision, Metric, Snapshot
 
 
 class Collisions:
-    """Every pair counts once an episode; definitions.md, Episode."""
+    """Every pair counts once an episode; figures.md, Collisions."""
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._pairs: dict[frozenset[str], Collision] = {}

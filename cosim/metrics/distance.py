@@ -10,7 +10,7 @@ from cosim.types import Bools, Floats, Ints, Metric, Snapshot
 
 
 class Distance:
-    """Mean over vehicles of the metres driven in the counted time (definitions.md, Episode).
+    """Mean over vehicles of the metres driven in the counted time (figures.md, Mission and distance).
 
     The vehicles are those on the road at the first frame, so that a policy cannot change which vehicles are
     counted; a vehicle that left keeps its distance. On a road that starts empty (a foreign scenario without

@@ -1,4 +1,4 @@
-"""Everybody who wanted to depart, so that no policy changes who is counted (definitions.md, Everybody)."""
+"""Everybody who wanted to depart, so that no policy changes who is counted (figures.md, Everybody)."""
 
 import numpy as np
 

@@ -5,7 +5,7 @@ from cosim.types import Metric, Snapshot
 
 
 class HumanErrors:
-    """Errors that began, and pairs with `Collision.human_error_involved` (definitions.md, Human errors)."""
+    """Errors that began, and pairs with `Collision.human_error_involved` (figures.md, Collisions)."""
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._begun = 0

@@ -1,4 +1,4 @@
-"""The law at stop lines: red lights, stop signs, the right of way (definitions.md, The law)."""
+"""The law at stop lines: red lights, stop signs, the right of way (figures.md, The law)."""
 
 from functools import cache
 

@@ -7,7 +7,7 @@ STANDING = 0.1  # m/s, SUMO's own threshold of a halting vehicle
 
 
 class MissionSuccess:
-    """Success is being on a goal lane without a collision before it (definitions.md, Episode).
+    """Success is being on a goal lane without a collision before it (figures.md, Mission and distance).
 
     With several mission vehicles all of them have to succeed, and the time is that of the last. NA without
     a mission, without a goal, or while no mission vehicle has been seen; without a goal of its own (`auto`),

@@ -15,7 +15,7 @@ SPEEDS = 2.0  # the present ones, times this, bound those of the last second
 
 
 class PersonConflicts(AvCounts):
-    """Distinct pairs of an AV and a person (definitions.md, Figures)."""
+    """Distinct pairs of an AV and a person (figures.md, Conflicts and comfort)."""
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         super().reset(first, context)

@@ -19,7 +19,7 @@ WAIT = frozenset(map(ord, "ruyY"))  # states of a signal that asks to wait
 
 
 class Standing(AvCounts):
-    """definitions.md, The law: `junctions_blocked` and `avs_stuck`."""
+    """figures.md, The law: `junctions_blocked` and `avs_stuck`."""
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         super().reset(first, context)

@@ -12,7 +12,7 @@ FORGETS = 2.0  # s of a wait that a second of driving takes away
 
 
 class Waits:
-    """Of everybody who wanted to depart, waiting to be inserted included (definitions.md, Everybody)."""
+    """Of everybody who wanted to depart, waiting to be inserted included (figures.md, Everybody)."""
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._everybody = context.everybody

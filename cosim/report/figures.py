@@ -77,7 +77,7 @@ RATES: dict[str, Measure] = {
 }
 
 CRASHES = "crash_rate_per_million_km"
-# Events per distance and per vehicle time: all of them over all of it (definitions.md, Near-misses).
+# Events per distance and per vehicle time: all of them over all of it (figures.md, Near-misses).
 CRASH_RATES: dict[str, Measure] = {
     name: Measure(name, column, f"per million {km}", "lower", per=per, scale=1e6, more=more)
     for name, column, more, km, per in (

@@ -28,7 +28,7 @@ FIRST = {
     "vehicles_never_inserted": "",
 }
 
-# What happened to all vehicles that wanted to depart (definitions.md, Everybody), in words.
+# What happened to all vehicles that wanted to depart (figures.md, Everybody), in words.
 EVERYBODY = {
     "total_delay_s": "delay of all",
     "total_delay_av_s": "delay of AVs",
@@ -43,7 +43,7 @@ EVERYBODY = {
     "co2_kg": "CO2",
     "co2_kg_per_vehicle_km": "CO2 per vehicle-km",
 }
-# What an AV must not do (definitions.md, The law), in words: shown together, in red when it is not 0.
+# What an AV must not do (figures.md, The law), in words: shown together, in red when it is not 0.
 LAW = {
     "red_light_violations": "red lights",
     "stop_sign_violations": "stop signs",
@@ -54,7 +54,7 @@ LAW = {
     "speeding_share": "speeding",
     "worst_speeding_mps": "worst speeding",
 }
-# Near-misses (definitions.md), by the end of their columns' names.
+# Near-misses (figures.md), by the end of their columns' names.
 NEAR_MISSES = {"ttc": "TTC < 1.5 s", "drac": "DRAC > 3.35 m/s2", "pet": "PET < 1 s"}
 LAW_IN_ANY_CASE = 3  # the first of them are said of one episode even when they are 0
 REASONS = 4  # of interventions, that are said

@@ -33,7 +33,7 @@ def no_limits() -> Floats:
 
 
 class RulesAhead(NamedTuple):
-    """The law on one vehicle's own way at one time (docs/reference/definitions.md, Observation).
+    """The law on one vehicle's own way at one time (docs/reference/observation.md).
 
     Distances in m from the front bumper along `RouteAhead.paths[1]`; inf: none within `PATH_HORIZON`, or
     none before the lane stops leading on. Which lanes serve the route, and how far: `RouteAhead.to_end`.

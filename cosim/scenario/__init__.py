@@ -381,7 +381,7 @@ def _with_sumo_options(scenario: Scenario, chosen: Mapping[str, str]) -> Scenari
 
 
 def _default_behavior(scenario: Scenario) -> str:
-    """definitions.md: a user's file drives as it is; ours `mixed`, and `contested` with moderate HVs."""
+    """presets.md: a user's file drives as it is; ours `mixed`, and `contested` with moderate HVs."""
     if scenario.demands is None or any(path not in scenario.demands.values() for path in scenario.demand):
         return AS_IS
     return "moderate" if scenario.demand_name == "contested" else MIXED

@@ -22,7 +22,7 @@ DIGITS = 8  # hexadecimal digits of a file's digest in its name
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """One kind of error: the probability of every trial (human_errors.md says what a trial is)."""
+    """One kind of error: the probability of every trial (driver_errors.md says what a trial is)."""
 
     rate: Probability
     source: str = ""  # where the rate is from

@@ -1,5 +1,5 @@
 """Whose SUMO options drive a user's file: the file's own (`as-is`), or those that cosim's drivers and
-figures need (`controlled`). What that changes is named in every result (definitions.md, Traffic)."""
+figures need (`controlled`). What that changes is named in every result (formats.md, Traffic options)."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Rule:
 
 RULES: Mapping[str, Rule] = {
     "lateral-resolution": Rule("-1", "", "AVs change lanes by LC2013, which has no sublane model"),
-    # continuous lateral motion, definitions.md
+    # continuous lateral motion
     "lanechange.duration": Rule("0", "2", "a lane change is a movement that others can see", forced=False),
     "time-to-teleport": Rule("300", "-1", "a teleport would put a vehicle before an AV", forced=False),
     # docs/reference/sumo.md: never `none`, nothing would be reported
@@ -63,7 +63,7 @@ def clocks(step: float) -> Timing:
 
 
 def check_timing(timing: Timing, file: object, field: str, value: object) -> None:
-    """Each clock must be a whole number of the one below it (definitions.md, Time)."""
+    """Each clock must be a whole number of the one below it (observation.md, Clocks)."""
     for name, long, short in (
         ("frame", timing.frame, timing.step),
         ("decision", timing.decision, timing.frame),

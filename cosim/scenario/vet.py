@@ -199,7 +199,7 @@ def _gaps(net: Net, demands: list[Demand]) -> list[str]:
 
 
 def _unsupported(scenario: Scenario, demands: list[Demand]) -> list[str]:
-    """What cosim does not know, though SUMO drives it (definitions.md, Not supported): these are warnings."""
+    """What cosim does not know, though SUMO drives it (formats.md, Not supported): these are warnings."""
     found = []
     found += [
         f"{scenario.config}: {c.option}={c.file}: without SUMO's sublane model the traffic is another"

@@ -19,7 +19,7 @@ from cosim.simulation.backend import sumo
 from cosim.simulation.foes import Foes
 from cosim.types import Entry
 
-LAST = 10.0  # m before the line over which the least speed is taken (docs/reference/definitions.md, The law)
+LAST = 10.0  # m before the line over which the least speed is taken (docs/reference/figures.md, The law)
 FOES_WITHIN = 100.0  # m before its own line, within which a vehicle with the right of way counts
 NEAR = LAST + 2.0  # m
 HARDEST = 4.0  # m/s2: no AV gains speed faster

@@ -12,7 +12,7 @@ from cosim.road import Lane, RoadMap
 from cosim.types import Collision, Command, Events, Kind, Receipt, Snapshot, Timing
 
 LANE_WIDTH = 3.2  # m, SUMO's default
-LATERAL_SPEED = LANE_WIDTH / 2.0  # m/s: a lane change takes 2 s (definitions.md)
+LATERAL_SPEED = LANE_WIDTH / 2.0  # m/s: a lane change takes 2 s
 
 
 @dataclass(slots=True)

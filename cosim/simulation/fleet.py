@@ -16,7 +16,7 @@ from cosim.simulation.derived_types import IDM_TYPE, derive, is_known, own_type
 from cosim.simulation.drivers import Drivers
 from cosim.types import Actor, Kind, Preset
 
-# definitions.md, Vehicles: what an AV drives with while it has no command (egoistic IDM).
+# presets.md, Policies: what an AV drives with while it has no command (egoistic IDM).
 AV_IDM = {"tau": 0.8, "minGap": 2.0, "accel": 3.0, "decel": 7.0}  # s, m, m/s2
 AV_LANE_CHANGE = {
     "laneChangeModel.lcCooperative": "0",

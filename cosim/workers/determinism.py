@@ -1,4 +1,4 @@
-"""One thread, deterministic kernels for whatever torch a policy brought (definitions.md, Reproducibility)."""
+"""One thread, deterministic kernels for whatever torch a policy brought (figures.md, Reproducibility)."""
 
 import sys
 

@@ -12,7 +12,7 @@ from cosim.types import Policy
 
 @dataclass(frozen=True, slots=True)
 class Approach:
-    """One row of definitions.md's table of approaches."""
+    """One row of paper_map.md's table of approaches."""
 
     extractor: Literal["conv3d", "conv2d"] = "conv3d"
     kinematics: bool = True  # K and the route join the maps

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 from cosim.types import Decision, History, ObservationConfig, PolicyContext
 
-# An AV as `idm` (definitions.md, Vehicles):
+# An AV as `idm` (presets.md, Policies):
 TIME_GAP, STANDSTILL, ACCEL, COMFORT = 0.8, 2.0, 3.0, 7.0  # s, m, m/s2, m/s2
 
 
@@ -25,7 +25,7 @@ def desired_gap(speed: float, leader_speed: float, time_gap: float = TIME_GAP) -
 
 
 class Idm:
-    """Egoistic IDM + LC2013 (definitions.md, Vehicles): no cooperation of any kind. The baseline `idm`.
+    """Egoistic IDM + LC2013 (presets.md, Policies): no cooperation of any kind. The baseline `idm`.
 
     Base of all policies that need no maps and leave SUMO's parameters as they are.
     """

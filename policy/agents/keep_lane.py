@@ -7,7 +7,7 @@ from policy.agents.idm import Idm
 
 
 class KeepLane(Idm):
-    """Always Idle. Its crash rate stands beside C% so that the difficulty can be seen (definitions.md)."""
+    """Always Idle. Its crash rate stands beside C% so that the difficulty can be seen."""
 
     name = "keep-lane"
 

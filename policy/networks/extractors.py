@@ -151,7 +151,7 @@ class FrameMemory:
 
 
 class Conv2dMaps(nn.Module):
-    """The frames as channels of one picture: the same kernels without time (definitions.md, conv2d-dqn)."""
+    """The frames as channels of one picture: the same kernels without time (paper_map.md, Approaches)."""
 
     def __init__(
         self,

@@ -22,7 +22,7 @@ class MapBranchConfig:
     channels: int = 4
     frames: int = 10  # N, 2 s of history (P, Table I)
     rows: int = 16
-    block: int = 5  # frames predicted per step; 1 is the paper's (definitions.md, Time)
+    block: int = 5  # frames predicted per step; 1 is the paper's (observation.md, Clocks)
     reading: Literal["s2fc", "pool"] = "pool"  # stride 2 then FC, or stride 2 with pooling
     history: bool = True  # False: the current frame only (P, figure 6)
     correct: bool = False  # True: see the rendered next map and predict its correction

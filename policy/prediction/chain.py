@@ -21,7 +21,7 @@ from policy.prediction.traffic import Traffic
 
 @dataclass(frozen=True, slots=True)
 class ChainConfig:
-    """How the next seconds are predicted (definitions.md, Time)."""
+    """How the next seconds are predicted (observation.md, Clocks)."""
 
     horizon: int = 20  # frames of 0.2 s: 4 s (P, Table I)
     every: int = 5  # the VFN takes every fifth frame, M = 4; paper: 1, M = 20

@@ -1,4 +1,4 @@
-"""How far predicted maps are from what followed: PRE and occupancy IoU (definitions.md, Observation)."""
+"""How far predicted maps are from what followed: PRE and occupancy IoU (observation.md)."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -17,8 +17,8 @@ from policy.prediction.chain import ChainConfig, predict
 from policy.prediction.traffic import TrafficConfig, foresee
 from policy.predictors import Predictor
 
-OCCUPIED = 0.05  # a pixel above this is occupied (definitions.md: IoU)
-HORIZONS = (0.2, 0.4, 1.0, 2.0, 3.0, 4.0)  # s (definitions.md, Time)
+OCCUPIED = 0.05  # a pixel above this is occupied (figures.md: IoU)
+HORIZONS = (0.2, 0.4, 1.0, 2.0, 3.0, 4.0)  # s (observation.md, Clocks)
 
 
 def frame_of(horizon: float, dt: float = 0.2) -> int:

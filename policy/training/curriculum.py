@@ -57,7 +57,7 @@ class VfnTraining:
     metrics: tuple[str, ...] = ()  # a user's, FILE.py:NAME: logged besides
     errors: str = ""  # of the human drivers: a level or a user's file; "": none
     erring: float = 1.0  # share of the drives in which they err
-    preset: str = Preset.UNGUARDED  # what the car does by itself (docs/reference/definitions.md, Presets)
+    preset: str = Preset.UNGUARDED  # what the car does by itself (docs/reference/presets.md, Presets)
     encoder: str = (
         ""  # weights of `cosim train encoder`, for a network of extractor `frames`: encoder, or a file
     )

@@ -14,7 +14,7 @@ from policy.agents import POLICIES, make
 
 @pytest.fixture(scope="module", autouse=True)
 def _one_thread() -> Iterator[None]:
-    """Torch as `cosim run` uses it (definitions.md, Reproducibility)."""
+    """Torch as `cosim run` uses it (figures.md, Reproducibility)."""
     import torch
 
     before = torch.get_num_threads()

@@ -91,13 +91,13 @@ def test_no_page_loads_anything_from_elsewhere(pages: list[Page], site: Path) ->
 def test_a_browser_searches_the_site_from_a_disk_and_asks_nobody(site: Path, wide: int) -> None:
     with launched() as browser:
         tab = Tab(browser, wide=wide)
-        tab.page.goto((site / "reference" / "definitions.html").as_uri())
+        tab.page.goto((site / "reference" / "figures.html").as_uri())
         assert tab.page.evaluate("document.documentElement.scrollWidth") <= wide
         tab.page.locator("label[for=__search]:visible, .md-search__button:visible").first.click()
         tab.page.keyboard.insert_text("near-miss")  # at once: no results of a part of it
         tab.page.get_by_text(re.compile(r"\d+ results")).wait_for()
         tab.page.keyboard.press("Enter")
-        tab.page.wait_for_url("**/definitions.html*#near-misses")
+        tab.page.wait_for_url("**/figures.html*#near-misses")
         assert tab.wrong == []
         assert {urlsplit(url).scheme for url in tab.asked} <= {"file", "data", "blob", "about"}
 

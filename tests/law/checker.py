@@ -2,7 +2,7 @@
 
 Reads the net and the outputs `fcd` (every simulation step, from the first), `tripinfo`, `vehroute` and
 `collision`. FCD stamps a step with the time at which it began; a signal's state in the step is that of its
-program at the stamp. Definitions: definitions.md, The law. Lengths of vehicles are in none of the files:
+program at the stamp. Definitions: figures.md, The law. Lengths of vehicles are in none of the files:
 all are taken to be cars.
 """
 

@@ -23,7 +23,7 @@ SEED = 140_000
 TRIP = 0.02  # s: an arrival's last reading is up to a frame old (0.2 s near free flow; measured: 0.018 s)
 # Twice as many as the lane can take: wished departure, s
 WISHED = {f"{'av' if k % 4 == 0 else 'hv'}.{k}": round(0.63 * k, 2) for k in range(180)}
-SLOW, FORGETS = 1.0, 2.0  # m/s, and s a second: docs/reference/definitions.md, Everybody
+SLOW, FORGETS = 1.0, 2.0  # m/s, and s a second: docs/reference/figures.md, Everybody
 
 Drive = Callable[..., "Driven"]
 

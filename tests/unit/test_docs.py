@@ -7,6 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from cosim.batch import spec
+from cosim.recording.file import SCHEMA
+from cosim.scenario.human_errors import KINDS
+from policy.agents import POLICIES
+
 ROOT = Path(__file__).parents[2]
 # The changelog names files as they were.
 PAGES = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "examples").rglob("*.md")]
@@ -50,6 +55,23 @@ def test_every_figure_of_an_episode_is_defined() -> None:
     named = {
         n for file in files for n in re.findall(r'"(\w+)": (?:Metric|self\._mean|_mean)', file.read_text())
     }
-    defined = (ROOT / "docs" / "reference" / "definitions.md").read_text()
+    defined = (ROOT / "docs" / "reference" / "figures.md").read_text()
     assert len(named) > 20
     assert sorted(name for name in named if f"`{name}`" not in defined) == []
+
+
+@pytest.mark.parametrize(
+    ("page", "names"),
+    [
+        ("reference/formats.md", spec.FIELDS),
+        ("reference/formats.md", SCHEMA.names),
+        ("reference/presets.md", tuple(POLICIES)),
+        ("explanation/driver_errors.md", KINDS),
+    ],
+    ids=["SPEC.yaml", "recordings", "policies", "driver errors"],
+)
+def test_every_name_that_a_user_may_write_or_read_stands_on_its_page(
+    page: str, names: tuple[str, ...]
+) -> None:
+    text = (ROOT / "docs" / page).read_text(encoding="utf-8")
+    assert [name for name in names if f"`{name}`" not in text] == []

@@ -12,7 +12,10 @@ from benchmarks.papers.jobs import JOBS
 RESULTS = Path(__file__).parents[2] / measured.RESULTS
 
 # by hand, or by commands of their own: docs/guides/reproduction.md
-AMONG_HUMANS = ("asked.md", "forced_entry.md", "humans.md", "turn_stress.md", "uses_stress/attribution.md")
+AMONG_HUMANS = (
+    *("asked.md", "driver_errors.md", "forced_entry.md", "humans.md", "turn_stress.md"),
+    "uses_stress/attribution.md",
+)
 
 
 def test_every_page_figure_and_picture_of_the_results_is_made_by_make_results() -> None:

@@ -23,8 +23,10 @@ from typing import Any
 
 import pyarrow.parquet
 
+from cosim.types import TIMINGS
+
 MATRIX = "--scenario merge --demand free --policy idm --policy keep-lane --duration 4 --seeds 200000:200008"
-TIMES = {"timings", "reset_s", "simulation_s", "observation_s", "decision_s", "total_s", "attempts"}
+TIMES = {"timings", "attempts", *TIMINGS}
 LIMIT = 600.0  # s for a round
 
 

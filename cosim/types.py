@@ -538,7 +538,8 @@ class Identity:
 
 
 IDENTITY = tuple(field.name for field in fields(Identity))
-TIMINGS = ("reset_s", "simulation_s", "observation_s", "decision_s", "total_s")  # wall time, never repeatable
+# Wall time, never repeatable: compilation of kernels counts in the total alone.
+TIMINGS = ("compilation_s", "reset_s", "simulation_s", "observation_s", "decision_s", "total_s")
 # What stands beside the figures in documents and rows: no figure may be called so.
 MISSION = ("mission_vehicle", "mission_guessed")
 WEIGHT = "weight"  # of an episode whose errors were drawn from tilted rates (docs/guides/estimate.md)
@@ -570,7 +571,7 @@ class EpisodeResult(Identity):
     trace_hash: str
     metrics: dict[str, Metric]
     collisions: tuple[Collision, ...]
-    timings: dict[str, float]  # s: simulation, observation, decision, reset, total
+    timings: dict[str, float]  # s, by the names of `TIMINGS`
     validity: tuple[str, ...]  # reasons why the result is not comparable; empty when it is
     mission_vehicle: str | None = None  # its id (of several: joined by ", "); None: none was on the road
     mission_guessed: bool = False  # nobody named it: its figures feed no gate

@@ -50,11 +50,12 @@ def probe(cells: Sequence[Cell], engine: Engine) -> dict[tuple[str, str], Cost]:
             if outcome.ok and outcome.value["steps"]:
                 cell, _ = tasks[outcome.key]
                 times = outcome.value["timings"]
+                drive = times["total_s"] - times["compilation_s"]
                 driven = outcome.value["steps"] * cell.scenario.timing.decision
                 costs[cell.case.what, cell.case.policy] = Cost(
-                    start=max(outcome.seconds - times["total_s"], 0.0),
+                    start=max(outcome.seconds - drive, 0.0),
                     reset=times["reset_s"],
-                    second=(times["total_s"] - times["reset_s"]) / driven,
+                    second=(drive - times["reset_s"]) / driven,
                 )
     return costs
 

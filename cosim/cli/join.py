@@ -100,7 +100,8 @@ def work(args: argparse.Namespace) -> int:
             host.close()
     result, replay = driven if args.replay else (driven, None)
     shared = {TRACI: {"joined": client.place, "order": args.order}}
-    show(args, replace(result, manifest=result.manifest | shared), replay, folder)
+    result = replace(result, manifest=result.manifest | shared)
+    show(args, [(result, replay)], folder, scenario.mission.kind)
     return 130 if simulator.leave else 0
 
 

@@ -56,6 +56,11 @@ def add(commands: arguments.SubCommands) -> None:
     outputs = "have SUMO write its NAME output (tripinfo, fcd, ssm, ...) to DIR/outputs; repeatable"
     arguments.add(run, "--output", action="append", default=[], help=outputs)
     arguments.add(run, "--metric", action="append", default=[])
+    run.add_argument(
+        "--beside",
+        metavar="POLICY",
+        help="drive the same traffic with this policy too, show both side by side",
+    )
     run.add_argument("--replay", action="store_true", help="draw DIR/replay.html and DIR/replay.mp4 too")
     arguments.add(run, "--json")
     run.add_argument(
@@ -119,43 +124,64 @@ class Driver:
 
 
 def work(args: argparse.Namespace) -> int:
-    """Drive it in a worker process, show the result."""
+    """Drive it in a worker process, and beside it what `--beside` names; show the results."""
     for flag, wanted in (("--output", args.output), ("--replay", args.replay)):
         if wanted and not args.out:
             raise BadInput("needs a run folder to write into: --out DIR", field=flag)
     served = _served(args)
-    case = case_of(args)
+    cases = [case_of(args)]
+    if args.beside is not None:
+        cases.append(_beside(args))
     limits = {} if served is None else {"timeout": args.traci_timeout or DEFAULT_TIMEOUT}
-    worker = Worker(Driver, case.policy, name="cosim-run", wait=False, **limits)
+    workers = [Worker(Driver, case.policy, name="cosim-run", wait=False, **limits) for case in cases]
     from cosim.files import new_folder
     from cosim.policies import check
     from cosim.scenario import sumo_outputs
-    from cosim.scenario.manifest import TRACI, remembered
     from cosim.scenario.vet import vetted, watched
     from cosim.workers.progress import Progress
 
     with contextlib.ExitStack() as undone:
         try:
-            check(case.policy)
-            scenario = case.scenario(args.sumo_options)
-            sumo_outputs.check(case.outputs, scenario.options)
-            with Progress(f"{scenario.name}: checking its files", "MB") as checking, watched(checking):
-                scenario = vetted(scenario)
+            for case, field in zip(cases, ("--policy", "--beside"), strict=False):
+                check(case.policy, field)
+            scenarios = [case.scenario(args.sumo_options) for case in cases]
+            sumo_outputs.check(cases[0].outputs, scenarios[0].options)
+            with Progress(f"{scenarios[0].name}: checking its files", "MB") as checking, watched(checking):
+                whole = vetted(scenarios[0])
+            scenarios = [replace(whole, preset=scenario.preset) for scenario in scenarios]
             folder = undone.enter_context(new_folder(args.out or None))
+            driven = [
+                _drive(args, *one, folder, served) for one in zip(workers, cases, scenarios, strict=True)
+            ]
         except BaseException:
-            worker.kill()  # it is still loading, and has nothing to put away
-            worker.close()
+            for worker in workers:
+                worker.kill()  # it is loading or driving, and has nothing to put away
+                worker.close()
             raise
-        files = folder / "outputs" if folder is not None and case.outputs else None
-        progress = Progress(f"{scenario.name} {label(case.policy)}", "s")
+    show(args, driven, folder, scenarios[0].mission.kind, cases[0].outputs)
+    return 0
+
+
+def _drive(
+    args: argparse.Namespace,
+    worker: Worker,
+    case: EpisodeId,
+    scenario: Scenario,
+    folder: Path | None,
+    served: tuple[int, int] | None,
+) -> tuple[EpisodeResult, Any]:
+    """One episode with its progress; its replay data or None."""
+    from cosim.scenario import sumo_outputs
+    from cosim.scenario.manifest import TRACI, remembered
+    from cosim.workers.progress import Progress
+
+    files = folder / "outputs" if folder is not None and case.outputs else None
+    with Progress(f"{scenario.name} {label(case.policy)}", "s") as progress:
         if served is None:
             progress.starting()
         else:
-            print(
-                f"cosim: SUMO waits for {_programs(served[1])} at port {served[0]}",
-                file=sys.stderr,
-                flush=True,
-            )
+            waiting = f"cosim: SUMO waits for {_programs(served[1])} at port {served[0]}"
+            print(waiting, file=sys.stderr, flush=True)
         try:
             result, replay = worker.call(
                 "drive", scenario, case, args.replay, files, served, progress=progress
@@ -163,49 +189,63 @@ def work(args: argparse.Namespace) -> int:
         except BaseException as error:
             worker.kill()
             if served is not None and isinstance(error, SimulationTimeout):
-                problem = (
-                    f"{_programs(served[1])} did not connect, or did not step, for {limits['timeout']:g} s"
-                )
+                seconds = args.traci_timeout or DEFAULT_TIMEOUT
+                problem = f"{_programs(served[1])} did not connect, or did not step, for {seconds:g} s"
                 raise SimulationTimeout(f"port {served[0]}: {problem}") from None
             raise
         finally:
             worker.close()
             if files is not None:  # what a simulation that crashed leaves behind
                 shutil.rmtree(files / sumo_outputs.DRAFT, ignore_errors=True)
-            progress.done()
     if served is None:
-        beside = remembered(case, args.sumo_options)
+        more = remembered(case, args.sumo_options)
     else:
-        beside = {TRACI: {"port": served[0], "clients": served[1]}}
-    result = replace(result, manifest=result.manifest | beside)
-    show(args, result, replay, folder, case.outputs)
-    return 0
+        more = {TRACI: {"port": served[0], "clients": served[1]}}
+    return replace(result, manifest=result.manifest | more), replay
 
 
 def show(
     args: argparse.Namespace,
-    result: EpisodeResult,
-    replay: Any,
+    driven: Sequence[tuple[EpisodeResult, Any]],
     folder: Path | None,
+    mission: str,
     outputs: Sequence[str] = (),
 ) -> None:
-    """Keep the result, and what a `replay` draws, in the run folder, where there is one; print it."""
+    """Print the episodes, of which the first is kept in the run folder, where there is one, with what the
+    replays draw. `mission`: of which kind it is."""
     from cosim.report import result as output
+    from cosim.report.episode_text import text
     from cosim.scenario.manifest import CASE
 
+    results, replays = zip(*driven, strict=True)
+    said = text(*results, mission=mission, every=bool(args.metric or args.reward))
     if folder is not None:
-        output.write_folder(folder, result, outputs)
-        if replay is not None:
+        output.write_folder(folder, results[0], said, outputs)
+        if args.replay:
             from cosim.report.replay.episode import draw
 
-            draw([replay], folder / "replay.html", folder / "replay.mp4")
+            draw(replays, folder / "replay.html", folder / "replay.mp4")
     if args.json:
-        print(json.dumps(result.document()))
-    else:
-        print(output.table(result, first=not (args.metric or args.reward)))  # else every figure
-        if folder is not None:
-            again = f" (cosim replay {shlex.quote(args.out)} draws it)" if CASE in result.manifest else ""
-            print(f"  run folder               {folder}{again}")
+        print(json.dumps(results[0].document()))
+        return
+    print(said)
+    if folder is not None:
+        print(f"  run folder: {args.out}")
+        if CASE in results[0].manifest:
+            beside = f" --beside {shlex.quote(args.beside)}" if len(results) > 1 else ""
+            print(f"  watch it: cosim replay {shlex.quote(args.out)}{beside}")
+
+
+def _beside(args: argparse.Namespace) -> EpisodeId:
+    """The same episode driven by `--beside`; SUMO writes no files of it. Raises BadInput."""
+    for flag, given in (("--json", args.json), ("--traci-port", args.traci_port is not None)):
+        if given:
+            raise BadInput(f"does not go together with {flag}", field="--beside", value=args.beside)
+    read(args.beside, field="--beside")
+    case = case_of(argparse.Namespace(**vars(args) | {"policy": args.beside, "output": []}))
+    if label(case.policy) == label(read(args.policy).text):
+        raise BadInput("is the policy that drives already", field="--beside", value=args.beside)
+    return case
 
 
 def _served(args: argparse.Namespace) -> tuple[int, int] | None:

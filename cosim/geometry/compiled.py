@@ -2,6 +2,7 @@
 
 import functools
 import importlib
+import time
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
@@ -19,6 +20,19 @@ _linalg = _numba.np.linalg
 _asked, _linalg.ensure_blas = _linalg.ensure_blas, lambda: None
 importlib.import_module("numba.np.arraymath")
 _linalg.ensure_blas = _asked
+
+_compiling = _numba.core.event.TimingListener()  # what lies inside another compilation counts once
+_numba.core.event.register("numba:compile", _compiling)
+
+
+def compilation_time() -> float:
+    """Time in s that this process has spent compiling kernels; loading one from the cache is not counted."""
+    return float(_compiling.duration) if _compiling.done else 0.0
+
+
+def clock() -> float:
+    """As `time.perf_counter` in s, but it stands still while a kernel is compiled."""
+    return time.perf_counter() - compilation_time()
 
 
 def on_compilation(begun: Callable[[], None]) -> None:

@@ -20,8 +20,20 @@ class Explainer(Protocol):
 NAMES = tuple(agents.POLICIES)  # of those that ship
 
 
-def check(text: str) -> None:
-    """Raises BadInput when there is no such policy: names the nearest, or what its file lacks."""
+def check(text: str, field: str = "--policy") -> None:
+    """Raises BadInput when there is no such policy: names the nearest, or what its file lacks.
+
+    `field`: where the policy was named.
+    """
+    try:
+        _check(text)
+    except BadInput as error:
+        if error.field != "--policy":
+            raise
+        raise BadInput(error.problem, file=error.file, field=field, value=text) from None
+
+
+def _check(text: str) -> None:
     name = read(text)
     if name.ships:
         if name.label not in agents.POLICIES and Path(name.label).is_dir():

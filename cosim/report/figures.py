@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cosim.report.result import FIRST
 from cosim.report.statistics import Figure, pooled_rate
 from cosim.types import RESERVED, TIMINGS, WEIGHT
 
@@ -94,7 +93,18 @@ NEAR_MISS_RATES: dict[str, Measure] = {
 }
 INCIDENCES = CRASH_RATES | NEAR_MISS_RATES
 
-HEADLINE = tuple(filter(None, FIRST.values()))  # what reports and comparisons show first
+# What reports and comparisons show first.
+HEADLINE = (
+    "collision_rate",
+    "av_caused_collision_rate",
+    "mission_success_rate",
+    "dt_mission_m",
+    "dt_av_m",
+    "dt_mean_m",
+    "min_ttc_s",
+    "hard_brakings_av",
+    "veto_rate",
+)
 
 
 def measures(

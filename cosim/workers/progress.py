@@ -15,7 +15,7 @@ Item = TypeVar("Item")
 REDRAW = 0.1  # s between redraws on a terminal
 LINE_EVERY = 10.0  # s between lines in a log; shorter work needs none
 COUNTED = "{n:.0f}/{total:.0f}{unit}, {rate_noinv_fmt}, {remaining} left"
-STARTING = "starting SUMO ..."
+STARTING = "starting SUMO, loading the policy ..."
 COMPILING = "compiling kernels (first use only: up to half a minute) ..."
 
 
@@ -47,10 +47,10 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
         self._terminal = self._stream.isatty()
         self._bar: tqdm[Any] | None = None
         self._began = time.monotonic()
-        self._note = threading.Timer(3.0, self.say, [STARTING])
+        self._note = threading.Timer(1.0, self.say, [STARTING])
         self._note.daemon = True
 
-    def starting(self, after: float = 3.0) -> None:
+    def starting(self, after: float = 1.0) -> None:
         """Say what takes so long if nothing has been done `after` s from now."""
         if not self._quiet:
             self._note.interval = after

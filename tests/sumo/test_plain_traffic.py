@@ -157,7 +157,7 @@ def test_the_result_says_whose_traffic_it_is_and_what_was_changed(
     assert mixed["sumo_options"]["time-to-teleport"] == "10"
     assert main(["run", *short, "--penetration", "0.5", "--", "--time-to-teleport", "300"]) == 0
     said = capsys.readouterr().out
-    assert re.search(r"traffic controlled: step-length 1 -> 0.1, .*collision.action remove -> warn", said)
+    assert re.search(r"(?s)traffic controlled: step-length 1 -> 0.1, .*collision.action remove -> warn", said)
     assert main(["replay", str(tmp_path / "alone"), "--html", str(tmp_path / "r.html")]) == 0
 
 

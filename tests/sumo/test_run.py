@@ -126,6 +126,31 @@ def test_the_run_folder_holds_result_manifest_and_table(tmp_path: Path) -> None:
     assert sorted(p.name for p in out.iterdir()) == ["manifest.json", "metrics.txt", "result.json"]
 
 
+def test_another_policy_drives_the_same_traffic_beside_it(tmp_path: Path) -> None:
+    contested = ["merge", "--demand", "contested", "--duration", "8", "--policy", "altruist-rule"]
+    out = tmp_path / "run"
+    done = run(*contested, "--beside", "idm", "--out", str(out))
+    alone = {policy: document(*contested[:-1], policy)["trace_hash"] for policy in ("altruist-rule", "idm")}
+    assert all(f"trace hash {policy}: {trace}" in done.stdout for policy, trace in alone.items())
+    assert "mission.0 is the mission vehicle: the human driver that has to merge." in done.stdout
+    assert f"cosim replay {out} --beside idm" in done.stdout
+    assert max(map(len, done.stdout.splitlines())) <= 100 + len(str(out))
+    assert json.loads((out / "result.json").read_text())["policy"] == "altruist-rule"
+
+
+@pytest.mark.parametrize(
+    ("beside", "said"),
+    [
+        (["imd"], "--beside='imd': unknown policy, did you mean 'idm'?"),
+        (["altruist-rule"], "--beside='altruist-rule': is the policy that drives already"),
+        (["idm", "--json"], "--beside='idm': does not go together with --json"),
+    ],
+)
+def test_what_cannot_drive_beside_is_refused(beside: list[str], said: str) -> None:
+    done = run("merge", "--policy", "altruist-rule", "--beside", *beside, expect=2)
+    assert said in done.stderr
+
+
 def test_sumo_s_own_options_pass_after_the_dashes() -> None:
     slow = document("merge", "--duration", "4", "--", "--scale", "0.2")
     assert slow["manifest"]["sumo_options"]["scale"] == "0.2"

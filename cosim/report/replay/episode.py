@@ -152,12 +152,7 @@ def beside(recorded: Recorded, policy: str) -> Recorded:
         BadInput: there is no such policy.
     """
     name = read(policy, field="--beside").text
-    try:
-        check(name)
-    except BadInput as error:
-        if error.field != "--policy":
-            raise
-        raise BadInput(error.problem, file=error.file, field="--beside", value=policy) from None
+    check(name, "--beside")
     return replace(recorded, case=replace(recorded.case, policy=name))
 
 

@@ -8,7 +8,7 @@ from cosim.errors import BadInput
 from cosim.files.yaml_input import dataclass_from
 from cosim.scenario.policy_name import PolicyName
 from cosim.types import ObservationConfig
-from policy.agents.approaches import APPROACHES, AgentConfig, chain_of, configure, shipped, vfn_of
+from policy.agents.approaches import APPROACHES, AgentConfig, chain_of, configure, predictor_of, shipped, vfn_of
 from policy.agents.prediction_aware import PredictionAware
 from policy.checkpoint import read_card, sha256
 from policy.networks.hpn import HpnConfig
@@ -41,14 +41,16 @@ def config(weights: Path) -> AgentConfig:
     vfn = vfn_of(card, file)
     hpn = shipped("hpn")
     other = hpn is not None and about.get("hpn_sha256", sha256(hpn)) != sha256(hpn)
+    agent = configure(
+        approach,
+        section(ObservationConfig, "observation"),
+        chain_of(card, file),
+        section(HpnConfig, "hpn"),
+        vfn,
+    )
     return replace(
-        configure(
-            approach,
-            section(ObservationConfig, "observation"),
-            chain_of(card, file),
-            section(HpnConfig, "hpn"),
-            vfn,
-        ),
+        agent,
+        predictor=predictor_of(card, agent),
         safety=section(SafetyConfig, "safety"),
         traffic=section(TrafficConfig, "traffic"),
         vfn_weights=weights,

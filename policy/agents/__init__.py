@@ -17,18 +17,18 @@ class Approach:
     extractor: Literal["conv3d", "conv2d"] = "conv3d"
     kinematics: bool = True  # K and the route join the maps
     predicted_maps: bool = True
-    mask: Literal["gp-indirect", "cs", "none"] = "gp-indirect"
+    mask: Literal["gp-indirect", "hold", "none"] = "gp-indirect"
     learning: Literal["ddqn", "a2c"] = "ddqn"
     config: Literal["compact", "maps", "rewards"] = "compact"  # of `cosim train`, for the weights that ship
 
 
 APPROACHES = {
     "vfn-p": Approach(config="rewards"),
-    "vfn": Approach(predicted_maps=False, mask="cs", config="rewards"),
+    "vfn": Approach(predicted_maps=False, mask="hold", config="rewards"),
     "vfn-p-demonstrated": Approach(),  # the same two, from a scripted demonstrator
-    "vfn-demonstrated": Approach(predicted_maps=False, mask="cs"),
+    "vfn-demonstrated": Approach(predicted_maps=False, mask="hold"),
     "vfn-p-egoistic": Approach(),  # the demonstrated one's twin: trained with phi = 0
-    "safe-dqn": Approach(kinematics=False, predicted_maps=False, mask="cs", config="maps"),
+    "safe-dqn": Approach(kinematics=False, predicted_maps=False, mask="hold", config="maps"),
     "conv3d-dqn": Approach(kinematics=False, predicted_maps=False, mask="none", config="maps"),
     "conv3d-a2c": Approach(
         kinematics=False, predicted_maps=False, mask="none", learning="a2c", config="maps"

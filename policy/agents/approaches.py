@@ -25,7 +25,7 @@ class AgentConfig:
     observation: ObservationConfig = COMPACT
     predicted_maps: bool = True  # False: the VFN sees the history only (Table III, `vfn`)
     mask: bool = True  # False: no safety prioritizer, the best valued action is taken
-    predictor: str = "gp-indirect"  # of the mask and of the chain's kinematics; `cs` for `vfn`
+    predictor: str = "gp-indirect"  # of the mask and of the chain's kinematics; `hold` for `vfn`
     chain: ChainConfig = field(default_factory=ChainConfig)
     hpn: HpnConfig = field(default_factory=HpnConfig)
     vfn: VfnConfig = field(default_factory=VfnConfig)
@@ -41,11 +41,13 @@ class AgentConfig:
 def compact(name: str) -> AgentConfig:
     """The compact configuration of an approach, with the weights that are shipped for it and, as their card
     says it, the layout of its network and how its predicted maps are drawn."""
-    weights, layout, chain = shipped(name), VfnConfig(), ChainConfig()
-    if weights is not None:
+    weights = shipped(name)
+    if weights is None:
+        config = configure(name, COMPACT, ChainConfig(), HpnConfig(), VfnConfig())
+    else:
         card, file = read_card(weights), weights.with_suffix(".json")
-        layout, chain = vfn_of(card, file), chain_of(card, file)
-    config = configure(name, COMPACT, chain, HpnConfig(), layout)
+        config = configure(name, COMPACT, chain_of(card, file), HpnConfig(), vfn_of(card, file))
+        config = replace(config, predictor=predictor_of(card, config))
     return replace(config, vfn_weights=weights, hpn_weights=shipped("hpn"))
 
 
@@ -101,6 +103,11 @@ def vfn_of(card: Mapping[str, Any], file: Path) -> VfnConfig:
 def chain_of(card: Mapping[str, Any], file: Path) -> ChainConfig:
     """How the maps were predicted that the network learned from. Raises BadInput as `vfn_of`."""
     return dataclass_from(ChainConfig, card["data"].get("chain", {}), file, "data.chain")
+
+
+def predictor_of(card: Mapping[str, Any], config: AgentConfig) -> str:
+    """What predicted the others for the mask that the network learned with."""
+    return str(card["data"].get("predictor", config.predictor))
 
 
 def shipped(name: str) -> Path | None:

@@ -6,7 +6,7 @@ from functools import partial
 from cosim.errors import BadInput, one_of
 from cosim.files import code
 from policy.prediction.forecast import KinematicForecast
-from policy.predictors.constant import ConstantAcceleration, ConstantSpeed
+from policy.predictors.constant import ConstantAcceleration, ConstantSpeed, Hold
 from policy.predictors.gp import GaussianProcessDirect, GaussianProcessIndirect
 from policy.predictors.learned import Learned, NetConfig
 from policy.predictors.protocol import Predictor
@@ -21,6 +21,7 @@ PREDICTORS: dict[str, Callable[[int, float], Predictor]] = {
     "gp-direct": GaussianProcessDirect,
     "gp-indirect": GaussianProcessIndirect,
 }
+MADE: dict[str, Callable[[int, float], Predictor]] = {"hold": Hold, **PREDICTORS}  # by name
 
 
 def make_predictor(name: str, horizon: int, dt: float) -> Predictor:
@@ -29,7 +30,7 @@ def make_predictor(name: str, horizon: int, dt: float) -> Predictor:
     Raises BadInput: there is none of that name; the user's cannot be loaded or called, or lacks something.
     """
     if not code.is_code(name):
-        return PREDICTORS[one_of(name, PREDICTORS, "predictor")](horizon, dt)
+        return MADE[one_of(name, MADE, "predictor")](horizon, dt)
     own = code.read(name, "predictor")
     made: Predictor = own.make("predictor", horizon, dt)
     if (made.horizon, made.dt, isinstance(made.name, str)) != (horizon, dt, True):

@@ -1,4 +1,4 @@
-"""The two simplest predictors (P's CS and CA): constant speed, and constant acceleration until standstill."""
+"""No prediction, and P's two simplest predictors: constant speed (CS), constant acceleration (CA)."""
 
 import numpy as np
 
@@ -26,6 +26,21 @@ class ConstantSpeed:
     def acceleration(self, kinematics: Floats, valid: Bools) -> Floats:
         """[V] m/s2; arguments as in `predict`."""
         return np.zeros(len(kinematics))
+
+
+class Hold:
+    """No prediction: everybody stays where they are, at the speed 0 from the next frame on."""
+
+    name = "hold"
+
+    def __init__(self, horizon: int = 20, dt: float = 0.2) -> None:
+        self.horizon, self.dt = horizon, dt
+
+    def predict(self, kinematics: Floats, valid: Bools) -> KinematicForecast:
+        """See `Predictor.predict`."""
+        now, known = newest(kinematics, valid)
+        x, y, _, heading = (np.repeat(now[:, k, None], self.horizon, 1) for k in range(4))
+        return KinematicForecast.without_spread(x, y, np.zeros_like(x), heading, known)
 
 
 class ConstantAcceleration(ConstantSpeed):

@@ -47,5 +47,6 @@ def encoder_of(file: TrainingFile) -> EncoderConfig:
 def described(name: str, agent: AgentConfig, file: TrainingFile) -> dict[str, Any]:
     """What the card of the approach's weights says of the agent, its rewards and its exploration."""
     parts = ("observation", "hpn", "chain", "safety", "traffic")
-    about = {part: asdict(getattr(agent, part)) for part in parts}
+    about: dict[str, Any] = {part: asdict(getattr(agent, part)) for part in parts}
+    about["predictor"] = agent.predictor
     return {"policy": name, **about, "reward": asdict(file.reward), "explore": asdict(file.explore)}

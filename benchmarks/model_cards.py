@@ -40,11 +40,6 @@ DEMONSTRATED = (
     "as from rewards, and chooses as that does in most states: what rewards added is not measured apart.",
     f"The human drivers of its training never err. {LAWLESS}",
 )
-LIMITS = {  # by the configuration of the training
-    "compact": (MAPS_UNUSED, *DEMONSTRATED),
-    "maps": (MAPS_ONLY, *DEMONSTRATED),
-    "rewards": (LAWLESS,),
-}
 LAWFUL_ONLY = "It learned from rewards alone, in preset `lawful`: what it does in `unguarded` it never tried."
 ASSISTED = "What keeps its distance in `unguarded` are layers that this training left alone (training.md)."
 EARLIER = "**Of an earlier agent**"  # on pages that are not driven anew
@@ -81,7 +76,7 @@ def driving(name: str, card: Card) -> Iterator[str]:
     shipped = card["measured"].get("iteration")  # none: it was taught after the last one
     log = log if shipped is None else [row for row in log if row["iteration"] <= shipped]
     training, last = data["training"], log[-1]
-    layout, rewards = card["configs"]["vfn"], approach.config == "rewards"
+    layout, rewards = card["configs"]["vfn"], name in TRAINED
     sees = "kinematics, situation and maps" if approach.kinematics else "maps"
     sees = sees if layout.get("others", True) else "its own speed and command, and maps"
     if layout.get("meets", False):
@@ -90,7 +85,7 @@ def driving(name: str, card: Card) -> Iterator[str]:
         own = "whether its car keeps the law and its distance itself (`lawful`; layers of their own)"
         sees = f"{own}, {sees}"
     predicted = ", predicted maps among them" if approach.predicted_maps else ""
-    mask = "no safety prioritizer" if approach.mask == "none" else f"prioritizer on `{approach.mask}`"
+    mask = "no safety prioritizer" if approach.mask == "none" else f"prioritizer on `{data['predictor']}`"
     yield f"- Chooses an AV's meta-action from {sees}{predicted}; {layout['extractor']}, {mask}."
     phis = ", ".join(f"{phi:g}" for phi in training["svo"])
     yield (
@@ -102,15 +97,8 @@ def driving(name: str, card: Card) -> Iterator[str]:
             else "."
         )
     )
-    what = "a2c" if approach.learning == "a2c" else "vfn"
-    if "note" in data:
-        yield f"- Training: {data['note']}."
-    else:
-        yield (
-            f"- Training: `cosim train {what} --policy {name} --scenario all --seed {training['seed']} "
-            f"--iterations {training['iterations']} --config {folder.as_posix()}/config.yaml "
-            f"--out runs/{name}`"
-        )
+    note = data.get("note", f"at commit f591cb8, with `{folder.as_posix()}/config.yaml`")
+    yield f"- Training: {note}."
     hours = sum(row["iteration_s"] for row in log) / 3600
     took = f"{hours:.1f} h" if hours >= 0.1 else f"{60 * hours:.0f} min"
     own = last["updates"]  # none: its drives are all that the pupil learned from
@@ -139,7 +127,8 @@ def driving(name: str, card: Card) -> Iterator[str]:
         yield f"- Measured {where if there else 'in no table yet'}."
     if rewards and not any(lesson.get("preset") for lesson in training["lessons"]):
         yield f"- Limit: {ASSISTED if layout.get('assisted') else LAWFUL_ONLY}"
-    yield from (f"- Limit: {text}" for text in LIMITS[approach.config])
+    limits = (LAWLESS,) if rewards else (MAPS_UNUSED if approach.kinematics else MAPS_ONLY, *DEMONSTRATED)
+    yield from (f"- Limit: {text}" for text in limits)
 
 
 def measured(name: str) -> Iterator[str]:

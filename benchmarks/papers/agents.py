@@ -58,11 +58,7 @@ class Agent:
         """What makes its weights."""
         if self.made_by:
             return self.made_by
-        approach, name = APPROACHES[self.base], self.base
-        what = "a2c" if approach.learning == "a2c" else "vfn"
-        schedule = "" if approach.config == "compact" else f" --config {approach.config}"
-        worlds = "" if approach.config == "rewards" else " --scenario all"  # `rewards` names its own
-        return f"cosim train {what} --policy {name}{schedule}{worlds} --out runs/{name}"
+        return f"cosim train {self.base} --out runs/{self.base}"
 
 
 def config(agent: Agent, untrained: bool = False) -> AgentConfig:

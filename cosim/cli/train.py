@@ -3,8 +3,9 @@
 import argparse
 
 from cosim.cli import arguments
+from policy.agents import TRAINABLE
 
-WHAT = ("vfn", "a2c", "hpn", "encoder")
+WHAT = (*TRAINABLE, "hpn", "encoder")
 VARIANTS = ("hpn", "hpn-no-history", "hpn-plain")
 
 
@@ -12,21 +13,20 @@ def add(commands: arguments.SubCommands) -> None:
     """Register the command and its flags."""
     train = commands.add_parser(
         "train",
-        help="train the value network, one of the baselines, or the predictor",
+        help="train one of the papers' agents, or the predictor",
         description="Train a network. The folder --out then holds log.jsonl, tensorboard/, best and last "
         "weights with their configuration, and everything that --resume needs.",
     )
     train.add_argument("what", choices=WHAT, help="which network")
     train.add_argument(
-        "--config", default="compact", metavar="FILE", help="compact, maps, paper, smoke, or a YAML file"
+        "--config", default="papers", metavar="FILE", help="papers (default), paper, smoke, or a YAML file"
     )
-    arguments.add(train, "--policy", metavar="NAME", help="the approach (default: vfn-p; a2c: conv3d-a2c)")
     train.add_argument(
         "--scenario",
         action="append",
         default=[],
         metavar="NAME",
-        help="a world, its folder, or all (merge)",
+        help="a scenario, its folder, or all (default: the file's)",
     )
     arguments.add(train, "--reward", help="learn from this: p, t, or your own (default: the file's)")
     arguments.add(train, "--metric", action="append", default=[])

@@ -96,9 +96,7 @@ class Payments(Earnings):
         """The agent begins to explore and to remember."""
         d, seed = self._drive, episode.seed
         label = f"{d.lesson.scenario}/{d.lesson.demand}/{seed}"
-        who = generator(seed, "explore")
-        tries = generator(seed, "explore", str(d.attempt)) if d.attempt else who
-        self._agent.episode(label, d.epsilon, tries, who, d.guided, d.record, d.keep, d.floor)
+        self._agent.episode(label, d.epsilon, generator(seed, "explore"), d.record, d.keep)
 
     def on_step(self, episode: Episode, step: Step) -> None:
         """One decision."""

@@ -21,7 +21,6 @@ from cosim.scenario.manifest import digests
 from cosim.scenario.policy_name import BEST
 from cosim.workers.memory import keep_freed_memory
 from cosim.workers.progress import Progress
-from policy.agents.approaches import APPROACHES
 from policy.checkpoint import sha256
 from policy.training.config import agent_config, described
 from policy.training.curriculum import Lesson, VfnTraining
@@ -34,22 +33,13 @@ WEIGHTS = {"contested": 2.0, "dense": 1.0}  # altruism is learned where an AV mu
 
 
 def train(args: argparse.Namespace) -> int:
-    """`cosim train vfn|a2c`. Raises BadInput for whatever is wrong before anything is driven."""
+    """`cosim train NAME` for an agent. Raises BadInput for whatever is wrong before anything is driven."""
     values, file = configuration(args.config)
-    name = args.policy or ("conv3d-a2c" if args.what == "a2c" else "vfn-p")
+    name = args.what
     agent = agent_config(name, file)
-    learning = APPROACHES[name].learning
-    if (learning == "a2c") != (args.what == "a2c"):
-        command = "a2c" if learning == "a2c" else "vfn"
-        raise BadInput(f"is trained by cosim train {command}", field="--policy", value=name)
     if not usable(args.device):
         raise BadInput("torch has no such device here", field="--device", value=args.device)
-    training = _scheduled(file.training, args, name)
-    if file.explore.next != (learning == "a2c" and training.a2c.anchor > 0.0):
-        problem = "goes together with training.a2c.anchor, in cosim train a2c alone"
-        raise BadInput(problem, field="explore.next", value=file.explore.next)
-    if file.explore.next and not training.first:
-        raise BadInput("the weights that the anchor holds to are needed", field="training.first", value="")
+    training, own = _scheduled(file.training, args)
     for lesson in training.lessons:
         load(lesson.scenario, demand=[lesson.demand], behavior=lesson.behavior)
     with working_in(args.out) as folder:
@@ -57,6 +47,7 @@ def train(args: argparse.Namespace) -> int:
             raise BadInput("holds a training run already: --resume goes on", field="--out", value=args.out)
         about = described(name, agent, file)
         about["scenarios"] = sorted({lesson.scenario for lesson in training.lessons})
+        about |= {"code": own} if own else {}
         if training.reward:
             about["reward"] = training.reward
         if agent.predicted_maps and agent.chain.source == "hpn" and agent.hpn_weights is not None:
@@ -67,7 +58,7 @@ def train(args: argparse.Namespace) -> int:
         rollouts = Rollouts(
             args.workers, name, agent, file.explore, training.reward or file.reward, training.metrics
         )
-        wanted = training.recorded_first
+        wanted = 0 if agent.vfn.critic else training.prefill  # decisions before the first update
         begin(name, training, wanted, shlex.quote(args.out))
         with closing(writer), Progress(f"train {name}", "iterations") as progress, rollouts as actors:
             announced = Announced(actors, wanted, progress.say)
@@ -87,14 +78,12 @@ def train(args: argparse.Namespace) -> int:
         return 0
 
 
-def _scheduled(training: VfnTraining, args: argparse.Namespace, name: str) -> VfnTraining:
-    """The file's schedule with what the command line and the approach say otherwise."""
+def _scheduled(training: VfnTraining, args: argparse.Namespace) -> tuple[VfnTraining, dict[str, str]]:
+    """The file's schedule with what the command line says otherwise; the user's files and their SHA-256."""
     worlds = names() if "all" in args.scenario else tuple(map(place, args.scenario))
     if worlds:
         lessons = tuple(lesson for world in worlds for lesson in _lessons(world))
         training = replace(training, lessons=lessons)
-    if name.endswith("-egoistic"):  # the twin never weighs anybody's interest but its own
-        training = replace(training, svo=(0.0,), replay=replace(training.replay, phi=(0.0, 0.0)))
     reward = code.absolute(args.reward or training.reward, "--reward")
     metrics = tuple(code.absolute(metric, "--metric") for metric in args.metric or training.metrics)
     if reward:
@@ -104,11 +93,10 @@ def _scheduled(training: VfnTraining, args: argparse.Namespace, name: str) -> Vf
     errors = human_errors.asked(args.errors or training.errors or None)
     level = human_errors.read(errors)
     files = [*code.files_of([*metrics, reward]), *([] if level is None else [level.file])]
-    own = tuple(" ".join(item) for item in digests(files).items())
-    training = replace(training, reward=reward, metrics=metrics, errors=errors or "", code=own)
+    training = replace(training, reward=reward, metrics=metrics, errors=errors or "")
     given = {field: getattr(args, field) for field in ("iterations", "seed")}
     changes = {field: value for field, value in given.items() if value is not None}
-    return replace(training, learning=APPROACHES[name].learning, **changes)
+    return replace(training, **changes), digests(files)
 
 
 def _lessons(world: str) -> list[Lesson]:

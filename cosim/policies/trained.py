@@ -8,7 +8,15 @@ from cosim.errors import BadInput
 from cosim.files.yaml_input import dataclass_from
 from cosim.scenario.policy_name import PolicyName
 from cosim.types import ObservationConfig
-from policy.agents.approaches import APPROACHES, AgentConfig, chain_of, configure, predictor_of, shipped, vfn_of
+from policy.agents.approaches import (
+    APPROACHES,
+    AgentConfig,
+    chain_of,
+    configure,
+    predictor_of,
+    shipped,
+    vfn_of,
+)
 from policy.agents.prediction_aware import PredictionAware
 from policy.checkpoint import read_card, sha256
 from policy.networks.hpn import HpnConfig

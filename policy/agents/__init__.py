@@ -19,22 +19,20 @@ class Approach:
     predicted_maps: bool = True
     mask: Literal["gp-indirect", "hold", "none"] = "gp-indirect"
     learning: Literal["ddqn", "a2c"] = "ddqn"
-    config: Literal["compact", "maps", "rewards"] = "compact"  # of `cosim train`, for the weights that ship
 
 
 APPROACHES = {
-    "vfn-p": Approach(config="rewards"),
-    "vfn": Approach(predicted_maps=False, mask="hold", config="rewards"),
+    "vfn-p": Approach(),
+    "vfn": Approach(predicted_maps=False, mask="hold"),
     "vfn-p-demonstrated": Approach(),  # the same two, from a scripted demonstrator
     "vfn-demonstrated": Approach(predicted_maps=False, mask="hold"),
     "vfn-p-egoistic": Approach(),  # the demonstrated one's twin: trained with phi = 0
-    "safe-dqn": Approach(kinematics=False, predicted_maps=False, mask="hold", config="maps"),
-    "conv3d-dqn": Approach(kinematics=False, predicted_maps=False, mask="none", config="maps"),
-    "conv3d-a2c": Approach(
-        kinematics=False, predicted_maps=False, mask="none", learning="a2c", config="maps"
-    ),
-    "conv2d-dqn": Approach("conv2d", kinematics=False, predicted_maps=False, mask="none", config="maps"),
+    "safe-dqn": Approach(kinematics=False, predicted_maps=False, mask="hold"),
+    "conv3d-dqn": Approach(kinematics=False, predicted_maps=False, mask="none"),
+    "conv3d-a2c": Approach(kinematics=False, predicted_maps=False, mask="none", learning="a2c"),
+    "conv2d-dqn": Approach("conv2d", kinematics=False, predicted_maps=False, mask="none"),
 }
+TRAINABLE = ("vfn-p", "vfn", "safe-dqn", "conv3d-dqn", "conv3d-a2c", "conv2d-dqn")  # cosim train NAME
 
 
 def _made(module: str, kind: str, *arguments: str) -> Policy:

@@ -37,10 +37,8 @@ class Trajectory:
     unsafe: Bools  # [D+1, A] what the prioritizer masked
     action: npt.NDArray[np.int8]  # [D] carried out
     vetoed: npt.NDArray[np.int8]  # [D] the preferred action that was masked, or -1
-    wrong: Bools  # [D,A] what the demonstrator would not have done, though safe; none: no demonstration
     terms: Floats32  # [D,3] reward terms: ego, AVs, HVs (equation 6)
-    interacting: Bools  # [D] near a mission vehicle, or vetoed: drawn more often (`explore.next`: drawn)
-    yielding: Bools  # [D] the demonstrator would have yielded to a mission vehicle here
+    interacting: Bools  # [D] near a mission vehicle, or vetoed: drawn more often
     phi: float  # rad, the SVO it acted with
     ending: Ending
 
@@ -71,23 +69,13 @@ def states(chosen: list[tuple[Trajectory, int]], phi: Floats32, device: str = "c
     maps = np.empty((len(chosen), past + ahead, *first.frames.shape[1:]), first.frames.dtype)
     for row, (trajectory, t) in zip(maps, chosen, strict=True):
         row[:past], row[past:] = trajectory.maps(t)
-    return States(torch.from_numpy(maps).to(device), *states_without_maps(chosen, phi, device))
-
-
-def states_without_maps(
-    chosen: list[tuple[Trajectory, int]], phi: Floats32, device: str
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Kinematics [B,T,R,F+1], situation [B,.] and phi [B,2] of `States`; arguments as in `states`."""
-    kinematics, situation, direction = (
+    arrays = (
+        maps,
         np.stack([trajectory.kinematics[t] for trajectory, t in chosen]).astype(np.float32),
         np.stack([trajectory.situation[t] for trajectory, t in chosen]),
         np.stack([np.cos(phi), np.sin(phi)], 1).astype(np.float32),
     )
-    return (
-        torch.from_numpy(kinematics).to(device),
-        torch.from_numpy(situation).to(device),
-        torch.from_numpy(direction).to(device),
-    )
+    return States(*(torch.from_numpy(array).to(device) for array in arrays))
 
 
 def save(path: Path, trajectories: list[Trajectory]) -> None:

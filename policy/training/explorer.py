@@ -1,7 +1,7 @@
 """The agent while it learns: explores, and records the trajectories of its learning AVs."""
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,10 +13,8 @@ from cosim.rewards import RewardTerms
 from cosim.types import IS_MISSION, Decision, Floats32, History, MetaAction
 from policy.agents.approaches import AgentConfig
 from policy.agents.prediction_aware import Inputs, PredictionAware
-from policy.inputs.situation import comes_next
 from policy.inputs.tensors import States, to_numpy
 from policy.networks.vfn import VFN
-from policy.training.demonstrator import AS_GOOD, YIELD, Demonstrator
 from policy.training.experience import Ending, Trajectory
 
 STATE = ("ahead", "kinematics", "situation", "unsafe")  # fields of `Trajectory` with one value more
@@ -28,11 +26,7 @@ class ExploreConfig:
 
     learners: int = 4  # AVs that explore and are recorded; the others act with frozen weights (P, Alg. 4)
     repeat: float = 2.0  # decisions a random action is kept on average: a gap does not open in 0.4 s
-    advised: bool = True  # whether the demonstrator is asked in every state; one that is imitated is
     near: float = 60.0  # m to the mission vehicle within which a decision counts as interaction
-    # A2C: every AV of the first decision is recorded, and the first `learners` that arrive next behind a
-    # mission vehicle, within `near` of it, draw there; all others act greedily. A draw counts as interaction
-    next: bool = False
 
     def __post_init__(self) -> None:
         """Raises BadInput for a number out of range."""
@@ -43,9 +37,8 @@ class Explorer(PredictionAware):
     """`PredictionAware` whose first few AVs explore with the learner's weights.
 
     The others act greedily with `frozen` ones, so that one AV's transitions do not depend on what its
-    neighbours explore (semi-sequential training, P algorithm 4; T, section IV); with `ExploreConfig.next` all
-    AVs of the first decision act with the learner's, and few of them explore. `episode` must be called after
-    `reset`.
+    neighbours explore (semi-sequential training, P algorithm 4; T, section IV). `episode` must be called
+    after `reset`.
     """
 
     def __init__(self, name: str, config: AgentConfig, explore: ExploreConfig) -> None:
@@ -53,41 +46,26 @@ class Explorer(PredictionAware):
         self.explore = explore
         self.frozen = VFN(config.vfn).eval()
         self.frozen.load_state_dict(self.vfn.state_dict())
-        self._demonstrator = Demonstrator(knows_command=config.vfn.kinematic > 0)
 
     def episode(
-        self,
-        label: str,
-        epsilon: float,
-        rng: np.random.Generator,
-        who: np.random.Generator,
-        guided: bool = False,
-        record: bool = True,
-        keep: int = 0,
-        floor: float = 0.0,
+        self, label: str, epsilon: float, rng: np.random.Generator, record: bool = True, keep: int = 0
     ) -> None:
         """A new episode.
 
         Args:
             label: scenario, demand and seed, to find the trajectories again.
             epsilon: how much exploration, 0 to 1.
-            rng: what is tried is drawn from it.
-            who: those who learn are; it may be `rng`.
-            guided: the demonstrator drives every AV.
+            rng: what is tried, and by which AVs, is drawn from it.
             record: False: no AV learns, all drive greedily by the frozen network.
             keep: decisions that an action drawn from the preferences is kept; 0: epsilon-greedy.
-            floor: share of these draws that are even over all actions.
         """
-        self._label, self._epsilon, self._rng, self._who = label, epsilon, rng, who
-        self._guided, self._learners = guided, self.explore.learners if record else 0
-        self._keep, self._floor = keep, floor
-        self._explorers: set[str] = set()  # who has explored in this episode, with `ExploreConfig.next`
-        self._drawn: set[str] = set()  # who draws at this decision
-        self._advised = guided or (record and self.explore.advised)
-        self._demonstrator.reset(self._context)
+        self._label, self._epsilon, self._rng, self._keep = label, epsilon, rng, keep
+        self._learners = self.explore.learners if record else 0
         self.learning: dict[str, dict[str, list[Any]]] = {}  # AV -> field of `Trajectory` -> values so far
         self._repeated: dict[str, int] = {}  # random action that an AV keeps for a while
-        self._held: dict[str, tuple[MetaAction, int]] = {}  # one that is set, and for how many decisions more
+        self._held: dict[
+            str, tuple[MetaAction, int]
+        ] = {}  # one that was drawn, and for how many decisions more
         self.done: list[Trajectory] = []
 
     def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
@@ -98,14 +76,10 @@ class Explorer(PredictionAware):
         if self._learners:
             self._choose_learners(inputs)
         scene = inputs.scene
-        advice = np.zeros((len(scene.agents), len(MetaAction)), np.float32)  # nothing demonstrated
-        if self._advised:
-            advice = self._demonstrator.preferences(dict(zip(scene.agents, scene.histories, strict=True)))
-        q = advice if self._guided else self._explored(self.values(inputs), inputs)
-        decisions = self.choose(q, inputs)
+        decisions = self.choose(self._explored(self.values(inputs), scene.agents), inputs)
         for b, av in enumerate(scene.agents):
             if av in self.learning:
-                self._record(av, b, inputs, decisions[av], advice[b])
+                self._record(av, b, inputs, decisions[av])
         return decisions
 
     def perceive(self, histories: Mapping[str, History]) -> Inputs:
@@ -143,35 +117,27 @@ class Explorer(PredictionAware):
             self._close(av, "cut", again=False)
         return self.done
 
-    def hold(self, av: str, action: MetaAction, count: int) -> None:
-        """The learning AV `av` prefers `action` for its next `count` decisions."""
-        if count:
-            self._held[av] = action, count
-
     # ---- inside ----
 
     def _choose_learners(self, inputs: Inputs) -> None:
         """Those who see a mission vehicle first, then any."""
         scene = inputs.scene
         sees = [bool((h.kinematics[-1, :, IS_MISSION] * h.valid[-1] > 0.5).any()) for h in scene.histories]
-        draws = self._who.random(len(scene.agents))
+        draws = self._rng.random(len(scene.agents))
         order = sorted(range(len(scene.agents)), key=lambda b: (not sees[b], draws[b]))
-        count = len(order) if self.explore.next else self._learners
-        self.learning = {scene.agents[b]: defaultdict(list) for b in sorted(order[:count])}
+        self.learning = {scene.agents[b]: defaultdict(list) for b in sorted(order[: self._learners])}
         self._learners = 0
 
-    def _explored(self, q: Floats32, inputs: Inputs) -> Floats32:
+    def _explored(self, q: Floats32, agents: Sequence[str]) -> Floats32:
         """Random preferences in place of some learning AVs' values; the prioritizer still guards them."""
         q = q.copy()
         if self._keep:
-            self._draw(q, inputs)
+            self._draw(q, agents)
             return q
-        for b, av in enumerate(inputs.scene.agents):
+        for b, av in enumerate(agents):
             if av not in self.learning:
                 continue
             draws = self._rng.random(2)
-            if self._holds(av, q[b]):
-                continue
             if av in self._repeated and draws[0] < 1.0 / self.explore.repeat:
                 del self._repeated[av]
             # started so often that a share epsilon of the decisions is random
@@ -183,31 +149,16 @@ class Explorer(PredictionAware):
                 q[b, self._repeated[av]] = 2.0
         return q
 
-    def _draw(self, q: Floats32, inputs: Inputs) -> None:
+    def _draw(self, q: Floats32, agents: Sequence[str]) -> None:
         """Learning AVs' preferences q [B,A], replaced by such that the drawn action is preferred."""
-        c, agents = self.explore, inputs.scene.agents
         mine = [b for b, av in enumerate(agents) if av in self.learning]
         # the largest of log-preferences + Gumbel noise is a draw from their softmax
         noise = self._rng.gumbel(size=(len(mine), q.shape[1])).astype(np.float32)
-        nears = np.ones(len(agents), np.bool_)
-        if c.next:
-            nears = comes_next(to_numpy(inputs.states.situation), c.near)
-        self._drawn = set()
         for b, noises in zip(mine, noise, strict=True):
-            av = agents[b]
-            if not self._holds(av, q[b]) and nears[b] and self._may(av):
-                self._drawn.add(av)
-                if self._floor:
-                    share = np.exp(q[b] - q[b].max())
-                    q[b] = np.log((1.0 - self._floor) * share / share.sum() + self._floor / len(share))
+            if not self._holds(agents[b], q[b]):
                 q[b] += noises
-                self.hold(av, MetaAction(int(q[b].argmax())), self._keep - 1)
-
-    def _may(self, av: str) -> bool:
-        """Whether `av` explores, if it comes next: so many may in an episode."""
-        if self.explore.next and len(self._explorers) < self.explore.learners:
-            self._explorers.add(av)
-        return not self.explore.next or av in self._explorers
+                if self._keep > 1:
+                    self._held[agents[b]] = MetaAction(int(q[b].argmax())), self._keep - 1
 
     def _holds(self, av: str, q: Floats32) -> bool:
         """Whether an action is set for this decision; then q [A] prefers it."""
@@ -219,15 +170,13 @@ class Explorer(PredictionAware):
             self._held[av] = action, more - 1
         return True
 
-    def _record(self, av: str, b: int, inputs: Inputs, decision: Decision, advice: Floats32) -> None:
-        """One decision of the learning AV `av`, row `b` of the inputs; advice [A] of the demonstrator."""
+    def _record(self, av: str, b: int, inputs: Inputs, decision: Decision) -> None:
+        """One decision of the learning AV `av`, row `b` of the inputs."""
         history, states, recorded = inputs.scene.histories[b], inputs.states, self.learning[av]
         assert decision.q is not None
         free = np.zeros(len(MetaAction), np.bool_)  # without a prioritizer nothing is masked
         unsafe = free if decision.unsafe is None else decision.unsafe
         preferred = int(np.argmax(decision.q))
-        # where every action is unsafe the demonstrator knows no better either
-        best = -np.inf if unsafe.all() else advice[~unsafe].max()
         newest, maps, past = history.kinematics[-1], states.maps[b].numpy(), self.observation.frames
         mission = history.valid[-1] & (newest[:, IS_MISSION] > 0.5)
         close = mission & (np.hypot(newest[:, 0], newest[:, 1]) < self.explore.near)
@@ -239,11 +188,7 @@ class Explorer(PredictionAware):
             "unsafe": unsafe,
             "action": np.int8(decision.action),
             "vetoed": np.int8(preferred if unsafe[preferred] else -1),
-            "wrong": ~unsafe & (advice < best - AS_GOOD),
-            "yielding": np.bool_(advice.max() == YIELD),
-            "interacting": np.bool_(
-                av in self._drawn if self.explore.next else close.any() or unsafe[preferred]
-            ),
+            "interacting": np.bool_(close.any() or unsafe[preferred]),
         }
         for name, value in now.items():
             recorded[name].append(value)

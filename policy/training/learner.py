@@ -1,4 +1,4 @@
-"""What both ways of learning have: a value network, its optimiser, and steps towards demonstrations."""
+"""What both ways of learning have: a value network and its optimiser."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -9,7 +9,6 @@ import torch
 from policy.networks.seeded import seeded
 from policy.networks.vfn import VFN, VfnConfig
 from policy.training.networks import Optimized
-from policy.training.replay_buffer import Advised
 
 Metrics = dict[str, float]
 
@@ -19,7 +18,7 @@ class Learner(Optimized):
 
     Args:
         vfn: layout of the network.
-        config: optimisation; both kinds have `learning_rate`, `weight_decay`, `clip` and `imitation`.
+        config: optimisation; both kinds have `learning_rate` and `clip`.
         seed: of the first weights.
         device: of torch.
     """
@@ -29,19 +28,9 @@ class Learner(Optimized):
         self.online: VFN = seeded(lambda: VFN(vfn), seed)
         self.online.to(device=device, memory_format=self.online.layout)  # type: ignore[call-overload]
         learning = [p for p in self.online.parameters() if p.requires_grad]  # an encoder does not
-        adam = torch.optim.AdamW(learning, lr=config.learning_rate, weight_decay=config.weight_decay)
+        adam = torch.optim.AdamW(learning, lr=config.learning_rate, weight_decay=0.0)
         super().__init__({"online": self.online}, adam, config.clip)
         self.updates = 0
-        self.rate: float | None = None  # of the next updates; None: the configuration's
-
-    @property
-    def imitates(self) -> bool:
-        """Whether demonstrations are learned from."""
-        return bool(self.config.imitation > 0.0)
-
-    def imitate(self, batch: Advised) -> float:
-        """One step towards the demonstrations alone; returns how far they are followed, 0 to 1."""
-        raise NotImplementedError
 
 
 def mean_metrics(each: Sequence[Metrics]) -> Metrics:

@@ -1,4 +1,4 @@
-"""Replay buffer of whole trajectories: n-step samples, in fixed parts from rare and common moments."""
+"""Replay buffer of whole trajectories: n-step samples, a fixed share of them from interactions."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from cosim.errors import BadInput
-from cosim.types import Ints, MetaAction
+from cosim.errors import in_range
+from cosim.types import Ints
 from policy.inputs.tensors import States
-from policy.training.experience import Trajectory, states, states_without_maps
+from policy.training.experience import Trajectory, states
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,26 +19,15 @@ class ReplayConfig:
 
     capacity: int = 30_000  # decisions; P's 8,000 (Table I) are 20 episodes of 4 learners. 0.1 MB each
     batch: int = 64  # P, Table I
-    advised: int = 64  # states to imitate on; with maps `batch`, for they cost as much
     n_step: int = 8  # one step did not learn altruism (docs/guides/training.md); 1 is the papers'
     gamma: float = 0.97  # a decision of 0.4 s; P: 0.95
-    # shares of a batch, however rare such moments are (P, Alg. 4: rebalanced):
-    yielding: float = 0.25  # where the demonstrator would have yielded; one AV in ten does, for some seconds
-    correcting: float = 0.0  # where the demonstrator would not go on as commanded
-    interaction: float = 0.25  # near a mission vehicle, or vetoed
-    relabel: float = 0.5  # share of a batch that is learned for another SVO than it was driven with
-    phi: tuple[float, float] = (0.0, 90.0)  # deg, what relabelling draws from; equal bounds: one SVO only
+    # share of a batch near a mission vehicle, or vetoed, however rare that is (P, Alg. 4: rebalanced)
+    interaction: float = 0.25
+    relabel: float = 0.5  # share of a batch that is learned for another SVO, 0 to 90 deg, than was driven
 
     def __post_init__(self) -> None:
-        """Raises BadInput when the shares leave nothing to share."""
-        if min(self.rare) < 0.0 or sum(self.rare) > 1.0:
-            problem = "must be shares of a batch: none below 0, together at most 1"
-            raise BadInput(problem, field="yielding, correcting, interaction", value=self.rare)
-
-    @property
-    def rare(self) -> tuple[float, float, float]:
-        """The shares of `yielding`, `correcting` and `interaction`."""
-        return self.yielding, self.correcting, self.interaction
+        """Raises BadInput for a number out of range."""
+        in_range(self, positive="capacity batch n_step gamma", share="interaction relabel")
 
 
 class Batch(NamedTuple):
@@ -52,16 +41,7 @@ class Batch(NamedTuple):
     possible: torch.Tensor  # [B,A] bool, actions that were safe in `now`
     allowed: torch.Tensor  # [B,A] bool, actions that were safe in `later` (all, where none was)
     vetoed: torch.Tensor  # [B] the action the prioritizer refused in `now`, or -1
-    wrong: torch.Tensor  # [B,A] bool, not demonstrated in `now` (for the drive's SVO alone)
     parts: torch.Tensor  # [B,2] the same return's own part and the others', not weighed by phi
-
-
-class Advised(NamedTuple):
-    """B states with what was demonstrated there."""
-
-    now: tuple[torch.Tensor | None, torch.Tensor, torch.Tensor, torch.Tensor]  # `States`, maps or none
-    possible: torch.Tensor  # [B,A] bool, actions that were safe
-    wrong: torch.Tensor  # [B,A] bool, those of them that the demonstrator would not have taken
 
 
 class ReplayBuffer:
@@ -71,7 +51,7 @@ class ReplayBuffer:
         self.config = config
         self.trajectories: deque[Trajectory] = deque()
         self.size = 0
-        self._index: list[Ints] | None = None  # [*,2] (trajectory, t): the rare moments, then the rest
+        self._index: list[Ints] | None = None  # [*,2] (trajectory, t): the interactions, then the rest
 
     def add(self, trajectories: list[Trajectory]) -> int:
         """Store them; returns how many of the oldest were dropped."""
@@ -89,9 +69,8 @@ class ReplayBuffer:
         c = self.config
         now = self._picks(rng, c.batch)
         phi = np.array([t.phi for t, _ in now], np.float32)
-        fresh = np.radians(rng.uniform(*c.phi, len(now))).astype(np.float32)
-        relabelled = rng.random(len(now)) < c.relabel
-        phi = np.where(relabelled, fresh, phi)
+        fresh = np.radians(rng.uniform(0.0, 90.0, len(now))).astype(np.float32)
+        phi = np.where(rng.random(len(now)) < c.relabel, fresh, phi)
         weights = np.stack([np.cos(phi), np.sin(phi), np.sin(phi)], 1)  # [B,3] of the reward's terms
         later = [(trajectory, min(t + c.n_step, len(trajectory))) for trajectory, t in now]
         reward, discount = np.zeros((2, len(now)), np.float32)
@@ -110,32 +89,17 @@ class ReplayBuffer:
             ~np.stack([trajectory.unsafe[t] for trajectory, t in now]),
             safe | ~safe.any(1, keepdims=True),
             np.array([trajectory.vetoed[t] for trajectory, t in now], np.int64),
-            np.stack([trajectory.wrong[t] for trajectory, t in now]) & ~relabelled[:, None],
             parts,
         )
         tensors = (torch.from_numpy(array).to(device) for array in arrays)
         return Batch(states(now, phi, device), states(later, phi, device), *tensors)
 
-    def advised(self, rng: np.random.Generator, with_maps: bool, device: str = "cpu") -> Advised:
-        """States for learning from demonstrations alone, for the SVO they were driven with.
-
-        Raises ValueError while nothing is stored.
-        """
-        now = self._picks(rng, self.config.batch if with_maps else self.config.advised)
-        phi = np.array([t.phi for t, _ in now], np.float32)
-        inputs = states(now, phi, device) if with_maps else (None, *states_without_maps(now, phi, device))
-        possible, wrong = (
-            torch.from_numpy(np.stack(rows)).to(device)
-            for rows in ([~tr.unsafe[t] for tr, t in now], [tr.wrong[t] for tr, t in now])
-        )
-        return Advised(inputs, possible, wrong)
-
     def _picks(self, rng: np.random.Generator, count: int) -> list[tuple[Trajectory, int]]:
         """`count` places (trajectory, t), with replacement, in the configured parts."""
         if not self.size:
             raise ValueError("the replay buffer is empty")
-        rare = self.config.rare
-        shares = (*rare, 1.0 - sum(rare))
+        share = self.config.interaction
+        shares = (share, 1.0 - share)
         groups = [(p, share) for p, share in zip(self._places(), shares, strict=True) if len(p)]
         edges = np.cumsum([0.0] + [share for _, share in groups])
         counts = np.diff(np.round(count * edges / edges[-1]).astype(int)) if edges[-1] else [count]
@@ -148,18 +112,8 @@ class ReplayBuffer:
 
     def _places(self) -> list[Ints]:
         if self._index is None:
-            rows = [
-                np.stack([np.full(len(t), k), np.arange(len(t))], 1) for k, t in enumerate(self.trajectories)
-            ]
-            every, rest = np.concatenate(rows), np.ones(self.size, np.bool_)
-            wanted = self.config.correcting > 0.0
-            rare = [
-                (t.yielding, t.wrong[:, MetaAction.IDLE] & wanted, t.interacting) for t in self.trajectories
-            ]
-            self._index = []
-            for kind in zip(*rare, strict=True):
-                mine = np.concatenate(kind) & rest
-                self._index.append(every[mine])
-                rest &= ~mine
-            self._index.append(every[rest])
+            places = [(k, t) for k, one in enumerate(self.trajectories) for t in range(len(one))]
+            every = np.array(places, np.int64).reshape(-1, 2)
+            near = np.concatenate([t.interacting for t in self.trajectories])
+            self._index = [every[near], every[~near]]
         return self._index

@@ -84,16 +84,15 @@ class TrainingRun:
             k = self.iteration
             weights, frozen = self._weights(k), self._weights(k - k % c.disseminate)
             epsilon = trainer.epsilon(k)
-            drives = curriculum.drives(c, k, weights, frozen, epsilon, trainer.guided(k))
+            drives = curriculum.drives(c, k, weights, frozen, epsilon, trainer.keep)
             driving = [self._actors.submit(drive) for drive in drives]
             judged = curriculum.validation(c, weights) if curriculum.judged(c, k) else []
             judging = [self._actors.submit(drive) for drive in judged]
             losses = trainer.learn_meanwhile(k)
             drove = [f.result() for f in driving]
-            kept = trainer.keeps
-            if kept:
+            if trainer.keeps:
                 self._keep(k, drove)
-            losses |= trainer.learn_afterwards(k, [t for one in drove for t in one.trajectories], kept)
+            losses |= trainer.learn_afterwards(k, [t for one in drove for t in one.trajectories])
             record = {
                 "iteration": k,
                 "updates": trainer.learner.updates,
@@ -130,7 +129,6 @@ class TrainingRun:
         means, count = _means("valid", figures), self.config.validation
         for at, lesson in enumerate(self.config.lessons):
             name = f"valid/{Path(lesson.scenario).name}-{lesson.demand}"
-            name += f"-{lesson.preset}" if lesson.preset else ""
             means |= _means(name, figures[at * count : (at + 1) * count])
         if means["valid/reward"] > self.best:
             self.best = means["valid/reward"]

@@ -7,7 +7,6 @@ from concurrent.futures import Future
 import pytest
 
 from cosim.learning.announcement import Announced, begin
-from policy.training.a2c import A2cConfig
 from policy.training.curriculum import Drive, Drove, Lesson, VfnTraining
 from tests.learning.test_vfn_training import trajectory
 
@@ -33,7 +32,7 @@ def said(wanted: int, recorded: int = 0) -> list[str]:
 
 def test_a_training_says_what_it_does_and_where_the_curves_are(capsys: pytest.CaptureFixture[str]) -> None:
     training = VfnTraining(lessons=(Lesson("merge"), Lesson("exit")), iterations=30, episodes=2)
-    begin("vfn-p", training, training.recorded_first, "runs/mine")
+    begin("vfn-p", training, training.prefill, "runs/mine")
     text = capsys.readouterr().err
     assert "30 iterations of 2 drives, 60 in all" in text
     assert "merge (contested), exit (contested)" in text
@@ -51,10 +50,3 @@ def test_the_first_drive_says_how_long_it_takes_until_the_network_learns() -> No
 def test_a_training_that_learns_already_says_nothing() -> None:
     assert said(wanted=0) == []
     assert said(wanted=30, recorded=30) == []
-
-
-def test_a2c_records_nothing_first_but_demonstrations() -> None:
-    alone, imitating = (
-        VfnTraining(learning="a2c", a2c=A2cConfig(imitation=weight)).recorded_first for weight in (0.0, 1.0)
-    )
-    assert (alone, imitating) == (0, 2_000)

@@ -7,14 +7,11 @@ import json
 from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-import yaml
 
-from cosim.cli.main import main
 from cosim.episode import Episode
 from cosim.errors import BadInput
 from cosim.learning.rollouts import drive_episode
@@ -24,7 +21,7 @@ from cosim.seeding import generator
 from cosim.simulation.fake import FakeSimulator, FakeVehicle
 from cosim.types import SMOKE, MetaAction
 from policy.agents.approaches import AgentConfig
-from policy.inputs.situation import MEETS, SITUATION_INPUTS
+from policy.inputs.situation import SITUATION_INPUTS
 from policy.inputs.tensors import KINEMATIC_INPUTS
 from policy.networks.vfn import VfnConfig
 from policy.prediction.chain import ChainConfig
@@ -36,13 +33,11 @@ from policy.training.curriculum import (
     Drove,
     Lesson,
     VfnTraining,
-    drives,
 )
 from policy.training.ddqn import DdqnConfig, DdqnLearner
 from policy.training.experience import Trajectory
 from policy.training.explorer import ExploreConfig, Explorer
 from policy.training.replay_buffer import ReplayBuffer, ReplayConfig
-from policy.training.trainers import rate
 from policy.training.vfn import TrainingRun
 
 torch.set_num_threads(1)
@@ -78,14 +73,9 @@ def trajectory(
         vetoed=np.array(vetoed or [-1] * d, np.int8),
         terms=np.array(terms, np.float32),
         interacting=np.full(d, near),
-        yielding=np.zeros(d, np.bool_),
         phi=0.0,
-        wrong=np.zeros((d, 5), np.bool_),
         ending=ending,  # type: ignore[arg-type]
     )
-
-
-BUT_BRAKE = np.array([[True, True, True, True, False]])  # what the demonstrator would not do
 
 
 def only(config: ReplayConfig, one: Trajectory, seed: int = 0) -> tuple[ReplayBuffer, object]:
@@ -111,26 +101,20 @@ def test_an_n_step_return_is_the_discounted_sum_and_stops_at_a_crash() -> None:
 
 
 def test_relabelling_learns_for_another_orientation_than_was_driven() -> None:
-    config = ReplayConfig(batch=300, n_step=1, relabel=1.0, phi=(90.0, 90.0))
+    config = ReplayConfig(batch=300, n_step=1, relabel=1.0)
     _, batch = only(config, trajectory([1], [(1.0, 10.0, 100.0)]))
-    assert batch.reward.numpy() == pytest.approx(np.full(300, 110.0), abs=1e-3)  # the others' alone
-    assert batch.now.phi[:, 1].numpy() == pytest.approx(np.ones(300))
+    cos, sin = batch.now.phi.numpy().T
+    assert batch.reward.numpy() == pytest.approx(cos + 110.0 * sin, rel=1e-5)
+    phi = np.degrees(np.arctan2(sin, cos))
+    assert (phi.min() < 5.0, phi.max() > 85.0) == (True, True)
 
 
 def test_rare_moments_have_their_share_of_a_batch() -> None:
     far, near = trajectory([1] * 30, [(0, 0, 0)] * 30, near=False), trajectory([4], [(0, 0, 0)])
-    config = ReplayConfig(batch=100, yielding=0.25, interaction=0.5)
-    replay = ReplayBuffer(config)
+    replay = ReplayBuffer(ReplayConfig(batch=100, interaction=0.25))
     replay.add([far, near])
     actions = replay.sample(np.random.default_rng(0)).action
-    assert (actions == 4).sum() == 67, "nobody yields: the others share the batch 2 to 1"
-    replay.add([replace(trajectory([3], [(0, 0, 0)]), yielding=np.ones(1, np.bool_))])
-    actions = replay.sample(np.random.default_rng(0)).action
-    assert [(actions == a).sum() for a in (3, 4, 1)] == [25, 50, 25]
-    replay = ReplayBuffer(replace(config, correcting=0.2, interaction=0.3))
-    replay.add([far, near, replace(trajectory([0], [(0, 0, 0)], near=False), wrong=BUT_BRAKE)])
-    actions = replay.sample(np.random.default_rng(0)).action
-    assert [(actions == a).sum() for a in (0, 4, 1)] == [27, 40, 33]
+    assert [(actions == a).sum() for a in (4, 1)] == [25, 75]
 
 
 def test_the_oldest_drives_are_forgotten_first() -> None:
@@ -195,28 +179,6 @@ def test_what_the_prioritizer_masks_is_not_hoped_for() -> None:
     assert td == pytest.approx(0.5 * 1.0**2)  # goal 0.5 * 2 against q = 0; with the masked one it were 49.5
 
 
-def test_with_weight_decay_what_chance_pays_differs_less() -> None:
-    """Accelerate pays 10, all others nothing but noise: they are worth the same."""
-    rng, drives = np.random.default_rng(3), []
-    for _ in range(60):
-        action = int(rng.integers(5))
-        paid = 10.0 if action == MetaAction.ACCELERATE else float(rng.normal(0.0, 10.0))
-        drives.append(trajectory([action], [(paid, 0.0, 0.0)], ending="crashed"))
-    replay = ReplayBuffer(ReplayConfig(batch=32, n_step=1, relabel=0.0))
-    replay.add(drives)
-    spread = []
-    for decay in (0.0, 10.0):
-        learner = DdqnLearner(TINY, DdqnConfig(learning_rate=3e-3, weight_decay=decay), seed=0)
-        draws = np.random.default_rng(0)
-        for _ in range(150):
-            learner.update(replay.sample(draws))
-        with torch.no_grad():
-            q = learner.online(*experience.states([(drives[0], 0)], np.zeros(1, np.float32)))[0]
-        assert q.argmax() == MetaAction.ACCELERATE
-        spread.append(np.delete(q.numpy(), MetaAction.ACCELERATE).std())
-    assert spread[1] < 0.75 * spread[0]
-
-
 def test_a_refused_action_is_worth_a_crash() -> None:
     one = trajectory([1], [(0.0, 0.0, 0.0)], vetoed=[3])
     learner = DdqnLearner(TINY, DdqnConfig(learning_rate=1e-2), seed=1)
@@ -227,74 +189,6 @@ def test_a_refused_action_is_worth_a_crash() -> None:
         q = learner.online(*batch.now)[0]
     assert q[3].item() == pytest.approx(-0.5, abs=0.05)
     assert q[1].item() > -0.1
-
-
-def test_or_no_more_than_less_than_the_best_that_is_allowed() -> None:
-    """Both lane changes are masked; where everything is, nothing is asked."""
-    unsafe = np.zeros((3, 5), np.bool_)
-    unsafe[0, [MetaAction.LANE_LEFT, MetaAction.LANE_RIGHT]] = unsafe[1] = True
-    one = trajectory([1, 1], [(0.0, 0.0, 0.0)] * 2, unsafe=unsafe)
-    learner = DdqnLearner(TINY, DdqnConfig(learning_rate=1e-2, r_unsafe=None, margin=0.2), seed=1)
-    replay, _ = only(ReplayConfig(batch=16, n_step=1, relabel=0.0), one)
-    rng = np.random.default_rng(0)
-    for _ in range(150):
-        losses = learner.update(replay.sample(rng))
-    with torch.no_grad():
-        q = learner.online(*experience.states([(one, 0)], np.zeros(1, np.float32)))[0]
-    refused, allowed = q[unsafe[0]], q[~unsafe[0]]
-    assert losses["unsafe"] == pytest.approx(0.0, abs=0.01)
-    assert bool(((allowed.max() - refused > 0.19) & (allowed.max() - refused < 0.4)).all())
-
-
-def test_the_demonstrated_action_leads_by_the_margin_where_no_reward_speaks_for_it() -> None:
-    """An AV idled and was rewarded; the demonstrator would have braked."""
-    one = trajectory([1], [(1.0, 0.0, 0.0)], ending="crashed")
-    one = replace(one, wrong=BUT_BRAKE)
-    learner = DdqnLearner(TINY, DdqnConfig(learning_rate=1e-2, imitation=0.5, margin=0.1), seed=1)
-    replay, _ = only(ReplayConfig(batch=16, n_step=1, relabel=0.0), one)
-    rng = np.random.default_rng(0)
-    for _ in range(150):
-        learner.update(replay.sample(rng))
-    with torch.no_grad():
-        q = learner.online(*experience.states([(one, 0)], np.zeros(1, np.float32)))[0]
-    assert q.argmax() == 4
-    assert q[4].item() - q[[0, 1, 2, 3]].max().item() > 0.08
-
-
-def test_demonstrations_are_learned_without_maps_too_and_two_good_actions_are_equal() -> None:
-    one = trajectory([1], [(0.0, 0.0, 0.0)])
-    one = replace(one, wrong=np.array([[True, False, True, True, False]]))
-    config = DdqnConfig(learning_rate=1e-2, margin=0.1)
-    learner = DdqnLearner(replace(TINY, kinematic=8), config, seed=1)
-    replay, _ = only(ReplayConfig(advised=16, relabel=1.0), one)
-    rng = np.random.default_rng(0)
-    agrees = [learner.imitate(replay.advised(rng, with_maps=False)) for _ in range(100)]
-    assert agrees[-1] == 1.0
-    seen = replay.advised(rng, with_maps=False)
-    with torch.no_grad():
-        q = learner.online(*seen.now)[0]
-    assert q[[1, 4]].max() > q[[0, 2, 3]].max() + 0.08
-    assert learner.updates == 0, "what is learned from rewards alone is counted"
-
-
-def test_a_network_that_sees_maps_alone_imitates_on_them() -> None:
-    """The demonstrator brakes where the map is dark and accelerates where it is bright: all else is alike."""
-    brakes, goes = (np.array([[k != a for k in range(5)]]) for a in (4, 3))
-    dark = trajectory([1], [(0.0, 0.0, 0.0)], situation=[0, 0])
-    bright = replace(dark, frames=np.full_like(dark.frames, 255), wrong=goes)
-    replay = ReplayBuffer(ReplayConfig(advised=16))
-    replay.add([replace(dark, frames=np.zeros_like(dark.frames), wrong=brakes), bright])
-    learner = DdqnLearner(replace(TINY, kinematic=0), DdqnConfig(learning_rate=1e-2), seed=1)
-    rng = np.random.default_rng(0)
-    agrees = [learner.imitate(replay.advised(rng, with_maps=True)) for _ in range(60)]
-    assert agrees[-10:] == [1.0] * 10
-    assert learner.imitate(replay.advised(rng, with_maps=False)) < 0.9, "without them it cannot know"
-
-
-def test_advice_holds_for_the_orientation_of_the_drive_alone() -> None:
-    one = replace(trajectory([4], [(1.0, 0.0, 0.0)]), wrong=BUT_BRAKE)
-    assert (only(ReplayConfig(batch=20, relabel=0.0), one)[1].wrong.numpy() == BUT_BRAKE).all()
-    assert not only(ReplayConfig(batch=20, relabel=1.0), one)[1].wrong.any()
 
 
 def test_saved_and_loaded_a_learner_goes_on_exactly(tmp_path: Path) -> None:
@@ -367,7 +261,7 @@ def test_what_is_stored_is_what_was_seen() -> None:
 
 def test_what_is_drawn_is_kept_and_learned_from_once() -> None:
     one = agent()
-    one.explore = ExploreConfig(advised=False)
+    one.explore = ExploreConfig()
     episode = fake_episode(FakeVehicle("a", 100.0, 0, 20.0, is_av=True))
     (drove,) = drive_episode(
         episode, one, Drive(Lesson("fake"), 5, 0.7, 0.5, "", "", True, keep=4), RewardConfig()
@@ -394,17 +288,6 @@ def test_a_crashed_av_ends_its_drive_and_the_others_are_cut() -> None:
     assert ends["a"].ending == "crashed"
     assert ends["b"].ending == "cut"
     assert ends["a"].terms[-1, 0] < -3.0  # crash: -5, and what speed it had
-
-
-def test_the_demonstrator_cruises_up_to_the_limit_and_records_what_it_does() -> None:
-    episode = fake_episode(FakeVehicle("a", 100.0, 0, 15.0, is_av=True))
-    drive = Drive(Lesson("fake"), 5, 0.7, 1.0, "", "", True, guided=True)
-    (drove,) = drive_episode(episode, agent(), drive, RewardConfig()).trajectories
-    assert not drove.wrong[np.arange(len(drove)), drove.action].any()
-    assert drove.wrong.any()
-    assert set(drove.action.tolist()) == {MetaAction.ACCELERATE, MetaAction.IDLE}, "no random action"
-    limit = episode.simulator.road.lanes[0].speed_limit
-    assert episode.snapshot.speed[0] == pytest.approx(limit, abs=2.5)
 
 
 class Pretend:
@@ -462,11 +345,8 @@ def test_a_killed_run_goes_on_exactly(tmp_path: Path) -> None:
     )  # 8 drives of 12 fit in 100; what left the replay is deleted
 
 
-@pytest.mark.parametrize("imitation", [0.0, 1.0])
-def test_a_killed_a2c_run_goes_on_exactly_too(imitation: float, tmp_path: Path) -> None:
-    """With demonstrations the first two iterations are the demonstrator's: kept, and learned from once."""
-    a2c = A2cConfig(imitation=imitation)
-    config = replace(SHORT, learning="a2c", iterations=6, warm_up=2, a2c=a2c)
+def test_a_killed_a2c_run_goes_on_exactly_too(tmp_path: Path) -> None:
+    config = replace(SHORT, iterations=6)
     critic = replace(TINY, critic=True, kinematic=0)
     TrainingRun(config, critic, Pretend(), tmp_path / "whole").run()
     killed = TrainingRun(config, critic, Pretend(), tmp_path / "killed")
@@ -482,29 +362,9 @@ def test_a_killed_a2c_run_goes_on_exactly_too(imitation: float, tmp_path: Path) 
     again.run()
     assert losses(tmp_path / "killed") == losses(tmp_path / "whole")
     learned = [line for line in losses(tmp_path / "whole") if "loss/entropy" in line]
-    assert [line["iteration"] for line in learned] == list(range(2 if imitation else 0, 6))
-    assert learned[0]["replay"] == (48 if imitation else 0)
+    assert [line["iteration"] for line in learned] == list(range(6))
+    assert learned[0]["replay"] == 0
     assert learned[0]["loss/entropy"] == pytest.approx(np.log(5.0), abs=0.05)
-
-
-def test_a2c_is_demonstrated_first_and_drives_alone_afterwards(tmp_path: Path) -> None:
-    a2c = A2cConfig(learning_rate=1e-2, imitation=1.0)
-    config = replace(SHORT, learning="a2c", iterations=5, warm_up=60, a2c=a2c)
-    driven: list[Drive] = []
-
-    class Braking(Pretend):
-        def submit(self, drive: Drive) -> Future[Drove]:
-            driven.append(drive)
-            drove = super().submit(drive).result()
-            shown = [replace(t, wrong=np.repeat(BUT_BRAKE, len(t), 0)) for t in drove.trajectories]
-            future: Future[Drove] = Future()
-            future.set_result(drove._replace(trajectories=shown))
-            return future
-
-    TrainingRun(config, replace(TINY, critic=True, kinematic=0), Braking(), tmp_path).run()
-    assert [d.guided for d in driven if d.record] == [True] * 4 + [False] * 6
-    imitation = [line["loss/imitation"] for line in losses(tmp_path) if "loss/imitation" in line]
-    assert imitation[0] < 0.2, "it was imitated before the first drive of its own"
 
 
 @pytest.mark.parametrize(("normalize", "reward"), [(False, 10.0), (True, 0.01)])
@@ -527,148 +387,6 @@ def test_actor_and_critic_learn_which_action_pays(normalize: bool, reward: float
     assert chances[MetaAction.ACCELERATE] > 0.9
 
 
-@pytest.mark.parametrize(("attempts", "learns"), [(8, True), (1, False)])
-def test_attempts_in_the_same_traffic_tell_chance_from_what_one_did(attempts: int, learns: bool) -> None:
-    """Accelerating pays 1, what the traffic brings varies by 50."""
-    config = A2cConfig(learning_rate=3e-3, n_step=1, normalize=True, attempts=attempts)
-    learner = A2cLearner(replace(TINY, critic=True), config, seed=0)
-    rng = np.random.default_rng(0)
-    for k in range(40):
-        with torch.no_grad():
-            states = experience.states([(trajectory([0], [(0.0, 0.0, 0.0)]), 0)], np.zeros(1, np.float32))
-            chances = learner.online.actor_critic(*states)[0].softmax(1)[0].double().numpy()
-        drives = []
-        for luck in 50.0 * rng.standard_normal(4):
-            for action in rng.choice(5, size=8, p=chances / chances.sum()):
-                pay = luck + float(action == MetaAction.ACCELERATE)
-                one = trajectory([int(action)], [(pay, 0.0, 0.0)], ending="crashed")
-                drives.append(replace(one, episode=f"{k} {luck}"))
-        learner.learn(drives, rng)
-    assert (chances[MetaAction.ACCELERATE] > 0.9) == learns
-
-
-def test_the_actor_learns_nothing_far_from_the_mission_vehicle_if_that_weighs_nothing() -> None:
-    learner = A2cLearner(replace(TINY, critic=True), A2cConfig(n_step=1, far=0.0), seed=0)
-    policy = {}
-    for near in (False, True):
-        one = trajectory([int(MetaAction.ACCELERATE)], [(1.0, 0.0, 0.0)], ending="crashed", near=near)
-        policy[near] = learner.learn([one], np.random.default_rng(0))["policy"]
-    assert policy[False] == 0.0
-    assert policy[True] > 0.0
-
-
-def test_attempts_have_the_same_traffic_and_differ_in_what_is_tried() -> None:
-    config = replace(SHORT, learning="a2c", episodes=2, a2c=A2cConfig(attempts=3))
-    planned = drives(config, 1, "", "", 0.5, 0.0)
-    assert [d.attempt for d in planned] == [0, 1, 2] * 2
-    assert len({(d.seed, d.lesson, d.svo, d.errors) for d in planned}) == 2
-    cars = [FakeVehicle(name, at, 0, 20.0, is_av=True) for name, at in (("a", 100.0), ("b", 200.0))]
-    tried = []
-    for attempt in (0, 1):
-        one = agent()
-        one.explore = ExploreConfig(learners=1, advised=False)
-        drive = Drive(Lesson("fake"), 5, 0.7, 0.5, "", "", True, attempt=attempt, keep=4)
-        (drove,) = drive_episode(fake_episode(*cars), one, drive, RewardConfig()).trajectories
-        tried.append((drove.episode, drove.av, drove.action.tolist()))
-    assert tried[0][:2] == tried[1][:2]
-    assert tried[0][2] != tried[1][2]
-
-
-def test_who_comes_next_to_the_mission_vehicle_alone_explores() -> None:
-    """It drives on the right lane; all are recorded, and what is drawn is kept."""
-    one = agent(learners=1)
-    one.explore = ExploreConfig(learners=1, near=60.0, next=True, advised=False)
-    episode = fake_episode(
-        FakeVehicle("m", 110.0, 0, 20.0, mission=True),
-        FakeVehicle("ahead", 150.0, 1, 20.0, is_av=True),
-        FakeVehicle("next", 70.0, 1, 20.0, is_av=True),
-        FakeVehicle("later", 60.0, 1, 20.0, is_av=True),
-    )
-    with torch.no_grad():
-        one.vfn.value.bias[int(MetaAction.IDLE)] = one.frozen.value.bias[int(MetaAction.IDLE)] = 2.0
-    drive = Drive(Lesson("fake"), 5, 0.7, 1.0, "", "", True, keep=5)
-    drove = drive_episode(episode, one, drive, RewardConfig()).trajectories
-    assert {t.av for t in drove} == {"ahead", "next", "later"}
-    (explored,) = (t for t in drove if t.interacting.any())
-    assert explored.av == "next"
-    begins = np.flatnonzero(explored.interacting)
-    assert begins[0] == 0
-    assert len(begins) > 1
-    for begin in begins:
-        block = explored.action[begin : begin + 5]
-        assert (np.where(explored.vetoed[begin : begin + 5] < 0, block, block[0]) == block[0]).all()
-    one.explore = replace(one.explore, near=30.0)
-    drove = drive_episode(episode, one, drive, RewardConfig()).trajectories
-    assert not any(t.interacting[:1].any() for t in drove), "40 m behind"
-
-
-def test_a_floor_tries_what_is_not_preferred() -> None:
-    """Preferences are certain: without a floor the same is drawn for ever."""
-    drawn = {}
-    for floor in (0.0, 1.0):
-        one = agent()
-        one.explore = ExploreConfig(advised=False)
-        with torch.no_grad():
-            one.vfn.value.bias[int(MetaAction.IDLE)] = 50.0
-        drive = Drive(Lesson("fake"), 5, 0.7, 1.0, "", "", True, keep=1, floor=floor)
-        episode = fake_episode(FakeVehicle("a", 100.0, 0, 20.0, is_av=True))
-        (drove,) = drive_episode(episode, one, drive, RewardConfig()).trajectories
-        drawn[floor] = set(drove.action.tolist())
-    assert drawn[0.0] == {int(MetaAction.IDLE)}
-    assert len(drawn[1.0]) > 1
-
-
-@pytest.mark.parametrize("anchor", [0.01, 10.0])
-def test_an_anchor_holds_who_does_not_come_next_to_what_it_began_as(anchor: float) -> None:
-    """One that comes next is paid for accelerating; another one, which is not, sees nothing."""
-    config = A2cConfig(learning_rate=3e-3, n_step=1, floor=1.0, anchor=anchor, passes=2)
-    learner = A2cLearner(replace(TINY, critic=True), config, seed=0)
-    learner.remember()
-    rng = np.random.default_rng(0)
-    other = trajectory([0], [(0.0, 0.0, 0.0)], situation=[0, 0], near=False)
-
-    def chance(of: Trajectory) -> float:
-        with torch.no_grad():
-            seen = experience.states([(of, 0)], np.zeros(1, np.float32))
-            return float(learner.online.actor_critic(*seen)[0].softmax(1)[0, MetaAction.ACCELERATE])
-
-    for _ in range(40):
-        drives = [other]
-        for action in rng.integers(5, size=16):  # as a floor of 1 draws
-            pay = float(action == MetaAction.ACCELERATE)
-            nexts = trajectory(
-                [int(action)], [(10.0 * pay, 0.0, 0.0)], situation=[MEETS] * 2, ending="crashed"
-            )
-            nexts.situation[:, MEETS + 1 : MEETS + 3] = 0.1, -1.0
-            drives.append(nexts)
-        learner.learn(drives, rng)
-    assert learner.updates == 2 * 40
-    assert chance(drives[1]) > 0.9
-    assert (abs(chance(other) - 0.2) < 0.05) == (anchor > 1.0)
-
-
-def test_what_is_hardly_preferred_is_not_refused_any_further() -> None:
-    learner = A2cLearner(replace(TINY, critic=True), A2cConfig(n_step=1, floor=1.0), seed=0)
-    with torch.no_grad():
-        learner.online.value.bias[int(MetaAction.IDLE)] = 5.0
-    fast, rng = [int(MetaAction.ACCELERATE)], np.random.default_rng(0)
-    bad, good = (trajectory(fast, [(pay, 0.0, 0.0)], ending="crashed") for pay in (-1.0, 1.0))
-    assert learner.learn([bad], rng)["policy"] == 0.0
-    assert learner.learn([good], rng)["policy"] > 0.0
-    often = replace(bad, action=np.full_like(bad.action, MetaAction.IDLE))
-    assert learner.learn([often], rng)["policy"] != 0.0, "refused: it is preferred"
-
-
-def test_actor_and_critic_imitate_where_no_reward_speaks_for_it() -> None:
-    config = A2cConfig(learning_rate=1e-2, imitation=1.0)
-    learner = A2cLearner(replace(TINY, critic=True), config, seed=0)
-    one = replace(trajectory([1], [(0.0, 0.0, 0.0)]), wrong=BUT_BRAKE)
-    rng = np.random.default_rng(0)
-    losses = [learner.learn([one], rng) for _ in range(40)]
-    assert losses[0]["imitation"] == pytest.approx(np.log(5.0))
-    assert losses[-1]["imitation"] < 0.1, "the chance of braking"
-
-
 def test_another_configuration_is_not_gone_on_with(tmp_path: Path) -> None:
     TrainingRun(replace(SHORT, iterations=2), TINY, Pretend(), tmp_path).run()
     other = TrainingRun(replace(SHORT, updates=5), TINY, Pretend(), tmp_path)
@@ -676,21 +394,12 @@ def test_another_configuration_is_not_gone_on_with(tmp_path: Path) -> None:
         other.resume()
 
 
-def test_the_learning_rate_falls_over_the_last_third() -> None:
-    training = replace(SHORT, iterations=300, ddqn=replace(SHORT.ddqn, learning_rate=5e-4, last_rate=2e-4))
-    rates = [rate(training, k) for k in range(300)]
-    assert rates[:199] == [5e-4] * 199
-    assert rates[249] == pytest.approx(3.5e-4)
-    assert rates[299] == pytest.approx(2e-4)
-    assert rate(replace(training, ddqn=replace(training.ddqn, last_rate=None)), 299) == 5e-4
-
-
 def test_a_run_with_other_options_is_not_gone_on_with(tmp_path: Path) -> None:
     TrainingRun(replace(SHORT, iterations=2), TINY, Pretend(), tmp_path).run()
     state = json.loads((tmp_path / "state.json").read_text())
-    state["config"]["ddqn"]["gone"] = state["config"]["ddqn"].pop("last_rate")
+    state["config"]["ddqn"]["gone"] = state["config"]["ddqn"].pop("clip")
     (tmp_path / "state.json").write_text(json.dumps(state))
-    with pytest.raises(BadInput, match=r"ddqn\.gone, ddqn\.last_rate"):
+    with pytest.raises(BadInput, match=r"ddqn\.clip, ddqn\.gone"):
         TrainingRun(SHORT, TINY, Pretend(), tmp_path).resume()
 
 
@@ -717,24 +426,3 @@ def test_values_that_are_apart_are_weighed_by_phi() -> None:
     assert q.argmax(1).tolist() == [fast, fast, slow, slow]
     assert apart[:, 0, fast].tolist() == pytest.approx([0.2] * 4, abs=0.05)  # reward x 0.1
     assert apart[:, 1, slow].tolist() == pytest.approx([0.2] * 4, abs=0.05)
-
-
-@pytest.mark.parametrize(
-    ("given", "field"),
-    [
-        ({"explore": {"next": True}}, "explore.next"),
-        ({"training": {"a2c": {"anchor": 0.5}}}, "explore.next"),
-        ({"explore": {"next": True}, "training": {"a2c": {"anchor": 0.5}}}, "training.first"),
-        ({"training": {"a2c": {"floor": 1.5}}}, "floor"),
-        ({"explore": {"near": 0}}, "near"),
-    ],
-)
-def test_options_of_a2c_that_contradict_each_other_are_refused(
-    given: dict[str, Any], field: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file = tmp_path / "config.yaml"
-    file.write_text(yaml.safe_dump({"base": "compact", **given}))
-    out = tmp_path / "run"
-    assert main(["train", "a2c", "--scenario", "merge", "--config", str(file), "--out", str(out)]) == 2
-    assert field in capsys.readouterr().err
-    assert not out.exists()

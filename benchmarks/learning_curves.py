@@ -3,7 +3,7 @@
     python -m benchmarks.learning_curves vfn-p=runs/vfn-p-0 vfn-p=runs/vfn-p-1 twin=runs/twin-0 \\
         [--out docs/results/learning.md]
 
-RUN is a folder of `cosim train vfn|a2c`; runs of one LABEL are one agent trained from several seeds (without
+RUN is a folder of `cosim train`; runs of one LABEL are one agent trained from several seeds (without
 a label it is the folder's name). With --out a page, CSV and picture are written, else the page is printed.
 """
 
@@ -57,7 +57,7 @@ def read(text: str) -> Training:
     path = Path(folder)
     log = path / "log.jsonl"
     if not log.is_file():
-        raise BadInput("holds no log.jsonl: is it a run of `cosim train vfn|a2c`?", file=path)
+        raise BadInput("holds no log.jsonl: is it a run of `cosim train`?", file=path)
     try:
         records: list[dict[str, Any]] = [json.loads(line) for line in log.read_text().splitlines()]
         at = [float(record["iteration"]) for record in records]

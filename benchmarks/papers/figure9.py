@@ -1,18 +1,11 @@
 """P's figure 9: trained and tested among conservative, aggressive and mixed drivers.
 
-    python -m benchmarks.papers.figure9 --training           # writes the configurations, prints the commands
     python -m benchmarks.papers.figure9 [--scale 1] [--dry-run]
 
-Six networks are trained for it, with and without prediction, each by one command; what is not trained yet is
-left out and said.
+Six networks were trained for it at commit f591cb8, with and without prediction; what is missing is said.
 """
 
 from __future__ import annotations
-
-import sys
-from pathlib import Path
-
-import yaml
 
 from benchmarks.arms import differences
 from benchmarks.papers.agents import Agent
@@ -41,7 +34,6 @@ FIGURES = ("collision_rate", "av_caused_collision_rate", "dt_mean_m", "mission_s
 COMPARED = ("collision_rate", "dt_mean_m", "mission_success_rate")
 DISTANCE = Measure("dt_mean_m", "dt_mean_m", "m", "higher")
 FOLDER = "runs/figure9"
-CONTESTED, DENSE = 1.0, 2.0  # weights of the lessons: tested is how safe it drives in dense traffic
 
 
 def agent(approach: str, behavior: str) -> Agent:
@@ -58,20 +50,7 @@ def command(approach: str, behavior: str) -> str:
 
 def training() -> list[str]:
     """All commands, in order."""
-    first = "python -m benchmarks.papers.figure9 --training"
-    return [first, *(command(a, b) for b in BEHAVIORS for a in APPROACHES)]
-
-
-def write_configurations(folder: Path) -> None:
-    """The compact schedule, on the merge world alone and among one kind of drivers each."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for behavior in BEHAVIORS:
-        lessons = [
-            {"scenario": WORLD, "demand": demand, "behavior": behavior, "weight": weight}
-            for demand, weight in (("contested", CONTESTED), (DEMAND, DENSE))
-        ]
-        schedule = {"base": "compact", "training": {"lessons": lessons}}
-        (folder / f"{behavior}.yaml").write_text(yaml.safe_dump(schedule, sort_keys=False))
+    return [command(a, b) for b in BEHAVIORS for a in APPROACHES]
 
 
 def orders() -> list[Order]:
@@ -88,8 +67,7 @@ def write(results: Results, settings: Settings) -> None:
     """figure9.md, figure9.png, data/figure9.csv."""
     page = heading(JOB, results, settings, f"World `{WORLD}`, demand `{DEMAND}`, phi 45 degrees.")
     page += [
-        "Six networks, each trained by one command (killed? the same with `--resume` goes on; shorter with",
-        "`--iterations N`: how long these were trained stands above).",
+        "Six networks, each trained by one command at commit f591cb8 (how long stands above).",
         "",
         "```",
     ]
@@ -144,8 +122,4 @@ def _trained(names: dict[str, str]) -> list[str]:
 JOB = Job("figure9", "Figure 9 of P: what prediction gains among three kinds of drivers", orders, write)
 
 if __name__ == "__main__":
-    if "--training" in sys.argv:
-        write_configurations(Path(FOLDER))
-        print("\n".join(training()[1:]))
-    else:
-        JOB.main()
+    JOB.main()

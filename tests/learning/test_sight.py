@@ -25,7 +25,7 @@ from policy.networks.hpn import HpnConfig
 from policy.networks.vfn import VFN, VfnConfig
 from policy.prediction.chain import ChainConfig
 from policy.training import sight
-from policy.training.curriculum import Drive, Lesson, VfnTraining, drives, validation
+from policy.training.curriculum import Drive, Lesson, VfnTraining
 from policy.training.ddqn import DdqnConfig, DdqnLearner
 from policy.training.explorer import ExploreConfig, Explorer
 from policy.training.loop import LoopConfig
@@ -140,7 +140,7 @@ def test_latents_stand_for_their_maps() -> None:
 
 
 def test_the_encoder_learns_no_more_and_the_rest_does() -> None:
-    learner = DdqnLearner(encoded(frames=3, height=16, width=128, rows=2), DdqnConfig(imitation=0.0), seed=0)
+    learner = DdqnLearner(encoded(frames=3, height=16, width=128, rows=2), DdqnConfig(), seed=0)
     before = {k: v.clone() for k, v in learner.online.state_dict().items()}
     one = trajectory([1, 3], [(1.0, 0.0, 0.0)] * 2)
     rng = np.random.default_rng(0)
@@ -176,10 +176,10 @@ def test_an_effect_is_seen_of_what_decides_and_of_nothing_else() -> None:
 
 def explorer(learners: int = 2) -> Explorer:
     config = AgentConfig(observation=SMOKE, chain=ChainConfig(source="gp_raster"), vfn=encoded())
-    return Explorer("vfn-p", config, ExploreConfig(learners=learners, advised=False))
+    return Explorer("vfn-p", config, ExploreConfig(learners=learners))
 
 
-def test_a_drive_stores_what_the_encoder_made_of_its_maps_and_no_advice() -> None:
+def test_a_drive_stores_what_the_encoder_made_of_its_maps() -> None:
     one = explorer()
     episode = fake_episode(
         FakeVehicle("a", 100.0, 0, 20.0, is_av=True),
@@ -199,8 +199,6 @@ def test_a_drive_stores_what_the_encoder_made_of_its_maps_and_no_advice() -> Non
             with torch.inference_mode():
                 wanted = one.vfn.maps.frames(torch.from_numpy(seen[k][t.av]))[..., 0, 0].numpy()
             assert np.allclose(t.maps(k)[0], wanted, atol=2e-3)
-        assert not t.wrong.any()
-        assert not t.yielding.any()
 
 
 def test_a_network_with_an_encoder_wants_one_that_sees(tmp_path: Path) -> None:
@@ -214,13 +212,6 @@ def test_a_network_with_an_encoder_wants_one_that_sees(tmp_path: Path) -> None:
     trainer = make_trainer(replace(config, encoder=str(tmp_path / "e.safetensors")), encoded(), "cpu")
     mine = trainer.learner.online.maps.encoder.state_dict()
     assert all(torch.equal(mine[k], v) for k, v in network.encoder.state_dict().items())
-    checkpoint.save(tmp_path / "v.safetensors", {"vfn": trainer.learner.online}, {"vfn": encoded()})
-    first = replace(
-        config, encoder=str(tmp_path / "e.safetensors"), first=str(tmp_path / "v.safetensors"), seed=7
-    )
-    again = make_trainer(first, encoded(), "cpu")
-    assert torch.equal(again.learner.online.hidden.weight, trainer.learner.online.hidden.weight)
-    assert again.epsilon(0) == first.epsilon[0], "its replay buffer is filled by what it can do"
 
 
 def test_the_shipped_encoder_is_the_one_of_the_shipped_configuration() -> None:
@@ -228,19 +219,3 @@ def test_the_shipped_encoder_is_the_one_of_the_shipped_configuration() -> None:
     assert card["measured"]["R2 on tuning seeds"]["gap ahead, own lane"] > 0.9
     agent = configure("vfn-p", COMPACT, ChainConfig(), HpnConfig(), VfnConfig(extractor="frames"))
     assert sight.encoder("encoder", EncoderConfig(latent=agent.vfn.latent))
-
-
-def test_humans_err_in_a_share_of_the_drives_and_in_every_second_validation() -> None:
-    c = VfnTraining(errors="stress", erring=0.5, episodes=4, validation=4)
-    drawn = [d.errors for k in range(50) for d in drives(c, k, "", "", 0.0, 0.0)]
-    assert 70 < drawn.count("stress") < 130
-    assert [d.errors for d in validation(c, "")] == ["", "stress", "", "stress"]
-    assert {d.errors for d in drives(replace(c, erring=1.0), 0, "", "", 0.0, 0.0)} == {"stress"}
-
-
-def test_a_lesson_may_name_its_own_preset() -> None:
-    lessons = (Lesson("merge"), Lesson("merge", "dense", preset="unguarded"))
-    c = VfnTraining(lessons=lessons, validation=1, preset="lawful")
-    drawn = {(d.lesson.demand, d.preset) for k in range(20) for d in drives(c, k, "", "", 0.0, 0.0)}
-    judged = {(d.lesson.demand, d.preset) for d in validation(c, "")}
-    assert drawn == judged == {("contested", "lawful"), ("dense", "unguarded")}

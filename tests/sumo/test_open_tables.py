@@ -210,7 +210,7 @@ def test_all_of_them_together_are_trained_with(
     code = f"{own}/code.py"
     words = ["--reward", f"{code}:by_speed", "--metric", f"{code}:Frames", "--scenario", str(own / "mine")]
     assert (
-        main(["train", "vfn", "--config", "smoke", *words, "--iterations", "2", "--out", str(tmp_path)]) == 0
+        main(["train", "vfn-p", "--config", "smoke", *words, "--iterations", "2", "--out", str(tmp_path)]) == 0
     )
     log = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     assert len(log) == 2
@@ -219,7 +219,7 @@ def test_all_of_them_together_are_trained_with(
     assert json.loads((tmp_path / "best.json").read_text())["data"]["reward"] == f"{code}:by_speed"
     capsys.readouterr()
     again = ["--scenario", str(own / "mine"), "--config", "smoke", "--out", str(tmp_path), "--resume"]
-    assert main(["train", "vfn", *again, "--iterations", "3"]) == 2, "without its reward"
+    assert main(["train", "vfn-p", *again, "--iterations", "3"]) == 2, "without its reward"
     assert "was trained with another configuration" in capsys.readouterr().err
 
 
@@ -240,7 +240,7 @@ def test_what_cannot_be_loaded_is_refused_before_anything_is_made(
     own: Path, tmp_path: Path, command: str, flag: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = (
-        ["evaluate", "--duration", "4"] if command == "evaluate" else ["train", "vfn", "--config", "smoke"]
+        ["evaluate", "--duration", "4"] if command == "evaluate" else ["train", "vfn-p", "--config", "smoke"]
     )
     words += ["--scenario", "merge", flag, f"{own}/code.py:nope", "--out", str(tmp_path / "out")]
     assert main(words) == 2

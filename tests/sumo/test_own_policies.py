@@ -202,7 +202,7 @@ def test_a_device_that_is_not_there_is_refused_before_anything_is_written(
 ) -> None:
     monkeypatch.setattr("cosim.learning.train_vfn.usable", lambda device: device == "cpu")
     out = tmp_path / "out"
-    assert main(["train", "vfn", "--config", "smoke", "--device", "cuda", "--out", str(out)]) == 2
+    assert main(["train", "vfn-p", "--config", "smoke", "--device", "cuda", "--out", str(out)]) == 2
     assert "--device='cuda': torch has no such device here" in capsys.readouterr().err
     assert not out.exists()
 

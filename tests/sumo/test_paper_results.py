@@ -239,7 +239,7 @@ def test_the_course_of_training_is_drawn_where_there_is_a_log_and_missed_where_t
     text = page(small, "t_figures")
     assert "t_figure7.png" in text
     assert f"- {VFN_P}: not run yet" not in text
-    assert "- conv3d-a2c: not run yet (`cosim train a2c --policy conv3d-a2c" in text
+    assert "- conv3d-a2c: not run yet (`cosim train conv3d-a2c" in text
 
 
 def test_the_summary_says_untrained_and_not_run_yet(small: Settings, tmp_path: Path) -> None:
@@ -269,14 +269,3 @@ def test_missing_weights_are_said_in_one_line_with_the_command_that_makes_them(
     assert found.driven[0].rows == []
     assert found.absent == [f"{agent.name}: {missing(absent.agent)}"]
     assert capfd.readouterr().err.count("\n") == 1
-
-
-def test_the_training_of_figure_9_is_six_configurations_that_can_be_read(tmp_path: Path) -> None:
-    from cosim.learning.configuration import configuration
-
-    figure9.write_configurations(tmp_path)
-    for behavior in figure9.BEHAVIORS:
-        _, file = configuration(str(tmp_path / f"{behavior}.yaml"))
-        assert file.reward == configuration("compact").file.reward
-        assert {lesson.behavior for lesson in file.training.lessons} == {behavior}
-        assert {lesson.scenario for lesson in file.training.lessons} == {"merge"}

@@ -3,7 +3,7 @@
 import argparse
 
 from cosim.cli import arguments
-from policy.agents import TRAINABLE
+from cosim.policies import TRAINABLE
 
 WHAT = (*TRAINABLE, "hpn", "encoder")
 VARIANTS = ("hpn", "hpn-no-history", "hpn-plain")

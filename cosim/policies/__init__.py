@@ -18,6 +18,7 @@ class Explainer(Protocol):
 
 
 NAMES = tuple(agents.POLICIES)  # of those that ship
+TRAINABLE = agents.TRAINABLE  # those that `cosim train NAME` makes
 
 
 def check(text: str, field: str = "--policy") -> None:

@@ -209,9 +209,8 @@ def test_all_of_them_together_are_trained_with(
 ) -> None:
     code = f"{own}/code.py"
     words = ["--reward", f"{code}:by_speed", "--metric", f"{code}:Frames", "--scenario", str(own / "mine")]
-    assert (
-        main(["train", "vfn-p", "--config", "smoke", *words, "--iterations", "2", "--out", str(tmp_path)]) == 0
-    )
+    run = ["train", "vfn-p", "--config", "smoke", *words, "--out", str(tmp_path)]
+    assert main([*run, "--iterations", "2"]) == 0
     log = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     assert len(log) == 2
     assert all(entry["train/frames"] > 0 for entry in log)

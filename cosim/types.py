@@ -41,10 +41,15 @@ LANE_OFFSET = {MetaAction.LANE_LEFT: 1, MetaAction.LANE_RIGHT: -1}  # as SUMO co
 
 
 class ContinuousAction(NamedTuple):
-    """What an agent may ask of one AV in place of a meta-action, for one decision."""
+    """What an agent may ask of one AV in place of a meta-action, for one decision.
 
-    accel: float  # m/s2, within what the car can do (`cosim.control`) and, in `lawful`, what it does of it
-    lane_offset: int = 0  # +1 begins a change to the left, -1 to the right
+    Attributes:
+        accel: m/s2, within the limits of the car (`cosim.control`) and, in `lawful`, of comfort and law.
+        lane_offset: +1 begins a lane change to the left, -1 to the right, 0 none.
+    """
+
+    accel: float
+    lane_offset: int = 0
 
     @property
     def lane_change(self) -> MetaAction:
@@ -348,17 +353,29 @@ class History(NamedTuple):
 
 
 class Decision(NamedTuple):
-    """What a policy chose for one AV, with everything needed to explain it ([A] arrays may be None)."""
+    """What a policy chose for one AV, with what is needed to explain it. A = 5 meta-actions.
+
+    Attributes:
+        action: the meta-action; with `accel`, the lane change alone.
+        q: [A] action values.
+        safety_score: [A] s, weighted time to collision (P, algorithm 2).
+        unsafe: [A] whether the safety prioritizer refuses the action.
+        ttc: [A] s until first contact under the action, capped.
+        blamed: which vehicle made the preferred action unsafe, or another reason in brackets.
+        vetoed: whether the preferred action was refused.
+        fallback: whether every action was unsafe, and the highest score was taken.
+        accel: m/s2, in place of a target speed.
+    """
 
     action: MetaAction
-    q: Floats32 | None = None  # [A] action values
-    safety_score: Floats32 | None = None  # [A] s, weighted time to collision (P, algorithm 2)
-    unsafe: Bools | None = None  # [A]
-    ttc: Floats32 | None = None  # [A] s until first contact under the action, capped
-    blamed: str | None = None  # which vehicle made the preferred action unsafe, or another reason in brackets
-    vetoed: bool = False  # the preferred action was masked
-    fallback: bool = False  # every action was unsafe: the highest score was taken
-    accel: float | None = None  # m/s2, in place of a target speed: `action` says the lane change alone
+    q: Floats32 | None = None
+    safety_score: Floats32 | None = None
+    unsafe: Bools | None = None
+    ttc: Floats32 | None = None
+    blamed: str | None = None
+    vetoed: bool = False
+    fallback: bool = False
+    accel: float | None = None
 
 
 class Forecast(NamedTuple):
@@ -399,21 +416,37 @@ class Receipt(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ObservationConfig:
-    """What an AV sees. Defaults: the compact size (docs/reference/observation.md); `PAPER` is P and T's."""
+    """What an AV sees. The defaults are the compact size; `PAPER` is the papers'.
 
-    height: int = 32  # pixels across the road
-    width: int = 128  # pixels along the road
-    metres_across: float = 1.0  # m per pixel
-    metres_along: float = 2.0  # m per pixel
+    Attributes:
+        height: pixels of the map across the road.
+        width: pixels along the road.
+        metres_across: m per pixel.
+        metres_along: m per pixel.
+        channels: the map's channels, in their order.
+        frames: N, past frames of 0.2 s.
+        rows: R, the AV itself and up to 15 others.
+        row_range: m, beyond which a vehicle gets no row.
+        perception_range: m that an AV's own sensors reach.
+        share_perception: whether AVs share what they perceive (V2V).
+        maps: whether velocity maps are drawn.
+        road_version: of the road channel; 2 draws the law too (stop lines, signals, crossings).
+        signal_timing: whether an AV knows when the next signal switches.
+    """
+
+    height: int = 32
+    width: int = 128
+    metres_across: float = 1.0
+    metres_along: float = 2.0
     channels: tuple[str, ...] = ("av", "hv", "road", "mission")
-    frames: int = 10  # N
-    rows: int = 16  # R, the ego and up to 15 others
-    row_range: float = 125.0  # m, vehicles further away get no row
-    perception_range: float = 125.0  # m, what one AV's own sensors reach
-    share_perception: bool = True  # V2V: an AV also gets what the other AVs perceive
-    maps: bool = True  # False: no VelocityMaps are drawn (for policies that use none)
-    road_version: int = 1  # of the road channel: 2 draws the law too (stop lines, signals, crossings)
-    signal_timing: bool = False  # whether an AV is told when the next signal switches
+    frames: int = 10
+    rows: int = 16
+    row_range: float = 125.0
+    perception_range: float = 125.0
+    share_perception: bool = True
+    maps: bool = True
+    road_version: int = 1
+    signal_timing: bool = False
 
     def __post_init__(self) -> None:
         """Raises BadInput when a size or a range is none, or the road channel's version is unknown."""
@@ -451,18 +484,25 @@ class PolicyContext:
 
 
 class Policy(Protocol):
-    """Who commands the AVs. One object serves every AV of an episode."""
+    """What commands the AVs. One object serves every AV of an episode.
+
+    Attributes:
+        name: what rows call it.
+        observation: what it wants to see.
+        av_parameters: SUMO's parameters of AVs that get no command.
+        label: a warning that stands beside every result, for example "untrained"; or "".
+    """
 
     name: str
-    observation: ObservationConfig  # what it wants to see
-    av_parameters: Mapping[str, str]  # SUMO parameters its AVs drive with while uncommanded
-    label: str  # shown beside every result, e.g. "untrained"; "" when there is nothing to warn of
+    observation: ObservationConfig
+    av_parameters: Mapping[str, str]
+    label: str
 
     def reset(self, context: PolicyContext) -> None:
         """A new episode begins."""
 
     def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
-        """One decision per AV it wants to command; an AV left out is driven by SUMO's IDM."""
+        """One decision per AV to command; SUMO's IDM drives an AV that is left out."""
 
 
 LookAhead = Callable[[int], Sequence[Snapshot]]  # so many frames ahead (`Simulator.ahead`)

@@ -25,21 +25,26 @@ MISSION, NEAREST = "mission", "nearest"
 
 
 class SumoEnv(gymnasium.Env[Observation, Any]):
-    """One AV learns, one step is one decision (0.4 s); the reward is its SVO reward (cosim.rewards).
+    """One AV learns; a step is one decision (0.4 s); the reward is its SVO reward (`cosim.rewards`).
 
-    Who learns is settled at the end of the warm-up. `learner="mission"`: the AV that reaches the conflict
-    zone next after the mission vehicle does, so the one that would have to yield; where there is none, and
-    with `learner="nearest"`: the AV nearest upstream of the conflict zone (ties, and roads without a zone:
-    the first by id). Or the id of an AV. `reset(options={"learner": ...})` says otherwise for one episode.
-    Where no AV is on the road yet, the reset drives on until one is. The other AVs are driven by `others`
-    (a policy factory) or by SUMO's IDM.
+    `reset(seed=s)` is the episode that `cosim run --seed s` drives; without a seed, one is drawn from the
+    training seeds. `reset(options={"learner": ...})` chooses the learner of one episode. If no AV is on the
+    road after the warm-up, the reset drives on until one is. Each environment has a process of its own:
+    close it.
 
     `terminated`: the learner or the mission vehicle crashed. `truncated`: the duration is over, the learner
-    left the road, or another AV's collision ended the episode; `info["ended"]` says which.
-    `reset(seed=s)` is the very episode that `cosim run --seed s` drives; without a seed the next one is drawn
-    from the training seeds. `continuous`: an action is an acceleration in m/s2 and a lane offset
-    (`cosim.types.ContinuousAction`), the latter rounded. Each environment has a process of its own: close
-    it. `words` are `cosim.open`'s.
+    left the road, or another AV's collision ended the episode. `info["ended"]` says which.
+
+    Args:
+        config: a scenario's name or folder, a `.sumocfg`, or a `Scenario`.
+        learner: the AV that learns. "mission": the AV that would have to yield to the mission vehicle, else
+            as "nearest": the AV nearest upstream of the conflict zone. Or the id of an AV.
+        others: builds the policy of the other AVs; None: SUMO's IDM.
+        observation: what the learner sees.
+        flatten: "kinematics" or "kinematics+law" for one vector; None for a dictionary.
+        render_mode: "rgb_array" or None.
+        continuous: actions are an acceleration in m/s2 and a lane offset, which is rounded.
+        **words: as of `cosim.open`.
     """
 
     metadata = {"render_modes": [*spaces.RENDER_MODES], "render_fps": 2.5}  # noqa: RUF012 - gymnasium's own form
@@ -67,7 +72,7 @@ class SumoEnv(gymnasium.Env[Observation, Any]):
 
     @property
     def session(self) -> Session:
-        """What is underneath: snapshot, road, result."""
+        """The session below: snapshot, road, result."""
         return self._session
 
     def reset(

@@ -32,17 +32,20 @@ def parallel_env(config: str | Scenario = "merge", **words: Any) -> SumoParallel
 
 
 class SumoParallelEnv(ParallelEnv):  # type: ignore[misc]
-    """All AVs learn; one step is one decision (0.4 s); rewards are their SVO rewards (cosim.rewards).
+    """All AVs learn; a step is one decision (0.4 s); rewards are their SVO rewards (`cosim.rewards`).
 
-    `possible_agents` are slots av_0, av_1, ...: the k-th AV of the episode by departure (those that depart
-    in the same step by id) has slot k, until the episode is over; `vehicles[agent]` is its SUMO id. AVs
-    beyond the last slot are driven by SUMO. An AV joins `agents` when it has departed and leaves when it is
-    terminated (it or the mission vehicle crashed) or truncated (the duration is over, it left the road,
-    another AV's collision ended the episode). While no AV with a slot is on the road and the episode goes
-    on, it is driven on until one is.
+    Agents are slots av_0, av_1, ...: slot k belongs to the k-th AV that departs in the episode.
+    `vehicles[agent]` is its id in SUMO. An agent joins when its AV departs. It leaves when it is terminated
+    (it or the mission vehicle crashed) or truncated (the duration is over, the AV left the road, another AV's
+    collision ended the episode). While no agent is on the road, the environment drives on.
 
-    `padded`: for libraries whose agents are all there from the reset on (TorchRL, BenchMARL). An agent whose
-    AV has not departed yet observes zeros, may only idle, earns 0, and is truncated with the episode.
+    Args:
+        config: a scenario's name or folder, a `.sumocfg`, or a `Scenario`.
+        max_agents: slots; SUMO drives further AVs.
+        observation, flatten, render_mode, continuous: as of `SumoEnv`.
+        padded: all agents are there from the reset on, as TorchRL and BenchMARL need it. An agent whose AV
+            has not departed observes zeros, may only idle, and earns 0.
+        **words: as of `cosim.open`.
     """
 
     metadata = {  # noqa: RUF012 - PettingZoo's own form
@@ -80,7 +83,7 @@ class SumoParallelEnv(ParallelEnv):  # type: ignore[misc]
 
     @property
     def session(self) -> Session:
-        """What is underneath: snapshot, road, result."""
+        """The session below: snapshot, road, result."""
         return self._session
 
     def observation_space(self, agent: str) -> spaces.Space:

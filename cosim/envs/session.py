@@ -42,22 +42,30 @@ TERMINAL = ("collision", "collision of the mission vehicle")  # all else that en
 
 
 class StepResult(NamedTuple):
-    """What one `Session.act` (one decision, 0.4 s) brought; AVs are keyed by their ids.
+    """What one `Session.act` (one decision, 0.4 s) brought, by AV.
 
-    `rewards`, `terms`, `terminated` and `truncated` have every AV that was on the road before the step.
-    An AV is `terminated` when it or the mission vehicle crashed; `truncated` when the duration is over, it
-    left the road (arrived, teleported) or another AV's collision ended the episode; `ended` says which.
+    Attributes:
+        observations: what each AV on the road sees now.
+        rewards: what each AV earned that was on the road before the step; so for the next four.
+        terms: the rewards' terms.
+        terminated: whether the AV or the mission vehicle crashed.
+        truncated: whether the duration is over, the AV left the road (arrived, teleported), or another AV's
+            collision ended the episode.
+        ended: why an AV is terminated or truncated.
+        receipts: whether each command was carried out, and why not.
+        events: what happened in the step.
+        info: time and elapsed in s, steps, over.
     """
 
-    observations: dict[str, View]  # AVs on the road now
+    observations: dict[str, View]
     rewards: dict[str, float]
     terms: dict[str, RewardTerms]
     terminated: dict[str, bool]
     truncated: dict[str, bool]
     ended: dict[str, str]
-    receipts: dict[str, Receipt]  # of every command, lane changes that were blocked included
+    receipts: dict[str, Receipt]
     events: Events
-    info: dict[str, Any]  # time s, elapsed s, steps, over
+    info: dict[str, Any]
 
 
 class Caller(Protocol):

@@ -17,31 +17,48 @@ SIDES = ("left", "keep", "right")
 
 
 class View(NamedTuple):
-    """One AV at one decision: a `History` whose route is turned into arrays (m, m/s, rad, s).
+    """What one AV sees at one decision, as plain arrays (m, m/s, rad, s).
 
-    P = 11 points 0, 10, ... 100 m ahead. Sides are left, keep, right. Masks are advice, not a guard: a
-    masked lane change is answered by a receipt that says why it was not carried out.
+    Sides are left, keep, right. N frames are oldest first; R rows are vehicles; P = 11 points lie 0, 10, ...
+    100 m ahead. Masks are advice: a masked lane change is answered by a receipt that says why it was refused.
+
+    Attributes:
+        velocity_map: [N,C,H,W] pixel * 255; [N,C,0,0] without maps.
+        kinematics: [N,R,F] of `cosim.types.KINEMATIC_FEATURES`; row 0 is the AV itself.
+        valid: [N,R] whether that row was perceived at that frame.
+        ids: R names, "" for an empty row.
+        pose: [3] x m, y m, heading rad in the world.
+        target_speed: m/s, the present command (the speed while SUMO drives).
+        lane_changing: +1 / -1 while a change to the left / right is under way, else 0.
+        speed_limit: m/s.
+        to_dead_end: [3] m until the lane stops leading on; inf: it does not, 0: there is no lane.
+        conflict_distance: m to the conflict zone along the present lane; inf when none is ahead.
+        lane_exists: [3] whether there is a lane.
+        centre_lines: [3,P,2] m in the AV's frame (x ahead, y left); 0 where there is no lane.
+        action_mask: [A] False for a lane change towards no lane, or while one is under way.
+        time: s.
+        rules: the law on its own way: signals, stop lines, crossings, limits.
     """
 
-    velocity_map: Bytes  # [N,C,H,W] pixel * 255, oldest first; [N,C,0,0] without maps
-    kinematics: Floats32  # [N,R,F] see cosim.types.KINEMATIC_FEATURES; row 0 is the AV itself
-    valid: Bools  # [N,R] whether that row was perceived at that frame
-    ids: tuple[str, ...]  # R names, "" for an empty row
-    pose: Floats  # [3] x m, y m, heading rad in the world
-    target_speed: float  # m/s, the present command (the speed while SUMO drives)
-    lane_changing: int  # +1 / -1 while a change to the left / right is under way, else 0
-    speed_limit: float  # m/s
-    to_dead_end: Floats  # [3] m until the lane stops leading on; inf: it does not, 0: there is no lane
-    conflict_distance: float  # m to the conflict zone along the present lane; inf when none is ahead
-    lane_exists: Bools  # [3]
-    centre_lines: Floats32  # [3,P,2] m in the AV's frame (x ahead, y left); 0 where there is no lane
-    action_mask: Bools  # [A] False for a lane change towards no lane, or while one is under way
-    time: float  # s
-    rules: RulesAhead  # the law on its own way: signals, stop lines, crossings, limits
+    velocity_map: Bytes
+    kinematics: Floats32
+    valid: Bools
+    ids: tuple[str, ...]
+    pose: Floats
+    target_speed: float
+    lane_changing: int
+    speed_limit: float
+    to_dead_end: Floats
+    conflict_distance: float
+    lane_exists: Bools
+    centre_lines: Floats32
+    action_mask: Bools
+    time: float
+    rules: RulesAhead
 
     @property
     def ego_speed(self) -> float:
-        """m/s"""
+        """The AV's speed in m/s."""
         return float(self.kinematics[-1, 0, 2])
 
 

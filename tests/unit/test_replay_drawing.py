@@ -23,7 +23,7 @@ from cosim.recording.replay_data import ReplayData, replay_data
 from cosim.report.replay.packing import document
 from cosim.report.replay.page import page
 from cosim.report.replay.signs import LAMPS, states_at, stop_lines, zebra
-from cosim.report.replay.strip import Strip, poses_at
+from cosim.report.replay.strip import Strip, command_sign, poses_at
 from cosim.report.replay.video import CAPTION, HEIGHT, LOW, SMALL, WIDTH, animation, film, picture_at
 from cosim.report.replay.video import _Camera as Camera
 from cosim.road import Crossing, Lane, Link, RoadMap, Rule
@@ -248,6 +248,19 @@ def test_a_vehicle_is_drawn_where_it_is(replay: ReplayData) -> None:
     assert (rows.min() + rows.max()) / 2 == pytest.approx(100, abs=1.5)
     assert (columns.min() + columns.max()) / 2 == pytest.approx(320, abs=1.5)
     assert columns.max() - columns.min() == pytest.approx(5.0 * 640 / 200, abs=3)  # 5 m at 200 m a picture
+
+
+def test_only_a_change_of_lanes_has_an_arrow_and_it_points_where_the_vehicle_goes() -> None:
+    east, north, west = 0.0, math.pi / 2, math.pi
+    assert [command_sign(MetaAction.LANE_LEFT, heading) for heading in (east, north, west)] == ["↗", "↖", "↙"]
+    assert [command_sign(MetaAction.LANE_RIGHT, heading) for heading in (east, north, west)] == [
+        "↘",
+        "↗",
+        "↖",
+    ]
+    assert command_sign(MetaAction.ACCELERATE, north) == "+"
+    assert command_sign(MetaAction.DECELERATE, north) == "−"
+    assert command_sign(MetaAction.IDLE, north) == ""
 
 
 def test_the_film_has_ten_pictures_a_second_that_move(replay: ReplayData, tmp_path: Path) -> None:

@@ -29,13 +29,17 @@ HOUSING, SIGN = (32, 37, 43), (200, 30, 30)
 MISSION, AV = (184, 69, 155), (0, 114, 178)
 DRIVERS = {"conservative": (0, 158, 115), "moderate": (230, 159, 0), "aggressive": (213, 94, 0)}
 OTHER, PERSON = (125, 133, 144), (76, 52, 112)
-GLYPHS = {
-    MetaAction.LANE_LEFT: "←",
-    MetaAction.LANE_RIGHT: "→",
-    MetaAction.ACCELERATE: "↑",
-    MetaAction.DECELERATE: "↓",
-}
+SPEED = {MetaAction.ACCELERATE: "+", MetaAction.DECELERATE: "−"}
+LANE = {MetaAction.LANE_LEFT: math.pi / 4, MetaAction.LANE_RIGHT: -math.pi / 4}  # rad from the heading
+ARROWS = "→↗↑↖←↙↓↘"  # by eighths of a turn
 Colour = tuple[int, ...]
+
+
+def command_sign(action: MetaAction, heading: float) -> str:
+    """What stands beside an AV that drives towards `heading` (rad): "" where it is to go on as it does."""
+    if action in LANE:
+        return ARROWS[round((heading + LANE[action]) / (math.pi / 4)) % len(ARROWS)]
+    return SPEED.get(action, "")
 
 
 class Pose(NamedTuple):
@@ -219,10 +223,9 @@ class Strip:
             if other := others.get(d.blamed or ""):
                 ends = [self._pixel(p.x, p.y), self._pixel(other.x, other.y)]
                 self._pen.line(ends, fill=(*colour, 170), width=FINE)
-        glyph = "×" if c.blocked else GLYPHS.get(d.action)
-        if glyph:
+        if sign := "×" if c.blocked else command_sign(d.action, p.heading):
             x, y = self._pixel(p.x, p.y - p.track.width / 2 - 1.2)
-            self._text(x, y, glyph, BAD if c.blocked else AV, 15, bold=True)
+            self._text(x, y, sign, BAD if c.blocked else AV, 15, bold=True)
 
     def broken(self, p: Pose, what: str) -> None:
         """The law that it broke, beneath it."""

@@ -1,7 +1,7 @@
 // Unpacks the recording that packing.py packed: differences become typed arrays, in m, s, rad, m/s.
 
 const ACTIONS = ["lane left", "idle", "lane right", "accelerate", "decelerate"];
-const GLYPHS = ["\u2190", "\u00b7", "\u2192", "\u2191", "\u2193"];
+const LANE = [1, 0, -1, 0, 0]; // of an action: to the left, to the right
 
 function summed(steps, order = 1) {
   const values = Float64Array.from(steps);

@@ -152,21 +152,38 @@ function drawSigns(ctx, data, view, c, t) {
 }
 
 function drawScene(ctx, state) {
-  const { data, view, c, t } = state;
+  const { view, c } = state;
   view.inPixels(ctx);
   ctx.fillStyle = c.ground; ctx.fillRect(0, 0, view.width, view.height);
+  const shown = new Map();
+  view.eachRow(ctx, () => { for (const [vehicle, s] of drawRow(ctx, state)) shown.set(vehicle, s); });
+  state.shown = [...shown];
+  view.inPixels(ctx);
+  ctx.fillStyle = c.line;
+  for (let row = 1; row < view.rows; row++) {
+    const y = row * view.high;
+    ctx.fillRect(0, y - 0.5, view.width, 1);
+    ctx.textAlign = "right"; ctx.textBaseline = "bottom"; ctx.font = "11px system-ui, sans-serif";
+    halo(ctx, "goes on below \u2193", view.width - 8, y - 4, c.quiet, c); ctx.fillStyle = c.line;
+  }
+  drawScale(ctx, view, c);
+}
+
+// What one row shows of the road; returns the vehicles in it, with their states.
+function drawRow(ctx, state) {
+  const { data, view, c, t } = state;
   drawRoad(ctx, data, view, c);
   drawSigns(ctx, data, view, c, t);
   if (state.predictions) drawForecast(ctx, state, view, c, t);
-  state.shown = [];
+  const shown = [];
   for (const vehicle of data.vehicles) {
     const s = stateOf(data, vehicle, t);
-    if (s && view.sees([s.x - 8, s.y - 8, s.x + 8, s.y + 8])) state.shown.push([vehicle, s]);
+    if (s && view.sees([s.x - 8, s.y - 8, s.x + 8, s.y + 8])) shown.push([vehicle, s]);
   }
-  for (const [vehicle, s] of state.shown) drawVehicle(ctx, vehicle, s, c, view, vehicle === state.chosen, data.shapes);
+  for (const [vehicle, s] of shown) drawVehicle(ctx, vehicle, s, c, view, vehicle === state.chosen, data.shapes);
   view.inPixels(ctx);
-  for (const [vehicle, s] of state.shown) { drawChoice(ctx, state, vehicle, s); drawLaw(ctx, state, vehicle, s); drawError(ctx, state, vehicle, s); }
-  for (const [vehicle, s] of state.shown) {
+  for (const [vehicle, s] of shown) { drawChoice(ctx, state, vehicle, s); drawLaw(ctx, state, vehicle, s); drawError(ctx, state, vehicle, s); }
+  for (const [vehicle, s] of shown) {
     const named = vehicle === state.chosen || vehicle.mission || (state.labels && view.scale > 1.5);
     const error = (named || view.scale > 3.5) && erring(vehicle, t);
     if (named || error) {
@@ -177,10 +194,27 @@ function drawScene(ctx, state) {
     }
   }
   for (const crash of data.collisions) if (crash.x != null && crash.t <= t + 0.05 && crash.t > t - 4) drawCrash(ctx, view, crash, c);
-  drawScale(ctx, view, c);
+  return shown;
 }
 
-// The command on the roof, a ring where it was vetoed, and a line to whom the prioritizer blames.
+// A command as a sign of w pixels, for a vehicle that drives to the right: + and - of speed, a bent arrow to a lane.
+function drawCommand(ctx, action, w, colour, c) {
+  ctx.lineCap = ctx.lineJoin = "round";
+  const r = w / 2, up = LANE[action];
+  for (const [style, width] of [[c.halo, 5], [colour, 2]]) {
+    ctx.strokeStyle = style; ctx.lineWidth = width; ctx.beginPath();
+    if (up) {
+      ctx.moveTo(-r, up * 0.5 * r); ctx.lineTo(-0.3 * r, up * 0.5 * r); ctx.lineTo(0.6 * r, -up * 0.5 * r);
+      ctx.moveTo(0, -up * 0.75 * r); ctx.lineTo(0.75 * r, -up * 0.6 * r); ctx.lineTo(0.6 * r, up * 0.1 * r);
+    } else {
+      ctx.moveTo(-0.6 * r, 0); ctx.lineTo(0.6 * r, 0);
+      if (ACTIONS[action] === "accelerate") { ctx.moveTo(0, -0.6 * r); ctx.lineTo(0, 0.6 * r); }
+    }
+    ctx.stroke();
+  }
+}
+
+// The command beside the vehicle, a ring where it was vetoed, and a line to whom the prioritizer blames.
 function drawChoice(ctx, state, vehicle, s) {
   const { data, view, c, t } = state;
   const choice = vehicle.av ? choiceOf(data, vehicle, t) : null;
@@ -195,11 +229,13 @@ function drawChoice(ctx, state, vehicle, s) {
       ctx.setLineDash([]);
     }
   }
-  if (view.scale > 3 && choice.action !== 1) {
-    ctx.font = "bold 13px system-ui, sans-serif"; ctx.textAlign = "center"; ctx.textBaseline = "middle";
-    const glyph = choice.blocked ? "\u00d7" : GLYPHS[choice.action];
+  if (view.scale > 2.2 && choice.action !== 1) {
     const below = (Math.abs(Math.sin(s.heading)) * vehicle.length + vehicle.width) * 0.5 * view.scale + 9;
-    halo(ctx, glyph, px, py + below, choice.blocked ? c.bad : c.av, c);
+    if (choice.blocked) { caption(ctx, "\u00d7", px, py + below, c.bad, c); return; }
+    ctx.save(); ctx.translate(px, py + below);
+    if (LANE[choice.action]) ctx.rotate(-s.heading);
+    drawCommand(ctx, choice.action, 14, c.av, c);
+    ctx.restore();
   }
 }
 
@@ -284,7 +320,7 @@ function drawMap(canvas, state) {
     const [px, py] = small.toPixels(s.x, s.y), r = vehicle.mission || vehicle === state.chosen ? 3 : 1.4;
     ctx.fillStyle = colourOf(vehicle, c); ctx.beginPath(); ctx.arc(px, py, r, 0, 7); ctx.fill();
   }
-  const w = view.width / 2 / view.scale, h = view.height / 2 / view.scale;
-  const [x0, y0] = small.toPixels(view.x - w, view.y + h), [x1, y1] = small.toPixels(view.x + w, view.y - h);
+  const wide = view.width / view.scale, h = view.high / 2 / view.scale, left = view.x - (view.main + 0.5) * wide;
+  const [x0, y0] = small.toPixels(left, view.y + h), [x1, y1] = small.toPixels(left + view.rows * wide, view.y - h);
   ctx.strokeStyle = c.pick; ctx.lineWidth = 1; ctx.strokeRect(x0, y0, Math.max(x1 - x0, 3), Math.max(y1 - y0, 3));
 }

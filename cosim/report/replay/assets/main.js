@@ -2,6 +2,8 @@
 
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4, 8];
 const BESIDE = 100; // ms between two drawings of what stands beside the scene, while it plays
+const ROW = 170; // m of road from left to right, at first
+const DETAIL = 2.2; // pixels per m from which vehicles are more than boxes
 const BIN = 4; // pixels of the time line that share a bar
 const KEYS = [["space", "play, pause"], ["\u2190 \u2192", "one frame (shift: 2 s)"], ["home end", "first, last moment"],
   ["[ ]", "event before, after"], ["< >", "slower, faster"], ["+ \u2212", "zoom (or the wheel)"], ["0", "the whole net"],
@@ -16,12 +18,13 @@ function start(data, live = null) {
   const timeline = new View($$("timeline"));
   const state = {
     data, view, map, chart, t: 0, playing: false, rate: 1, chosen: null, following: false, labels: false, hidden: new Set(),
+    resting: false, // following, but the picture stands while it holds the chosen vehicle
     predictions: true, events: [], shown: [], c: null, dirty: true, live,
   };
-  let net = null, beside = 0; // ms, when what stands beside the scene was last drawn
+  let net = null, flat = null, beside = 0; // box of the road, its corridor; // ms, when what stands beside the scene was last drawn
 
   state.choose = (vehicle, follow = state.following) => {
-    state.chosen = vehicle; state.following = Boolean(vehicle) && follow;
+    state.chosen = vehicle; state.following = Boolean(vehicle) && follow; state.resting = false;
     $$("pick").value = vehicle ? vehicle.number : "";
     if ($$("mine").checked) fillEvents(state);
     touch();
@@ -52,7 +55,7 @@ function start(data, live = null) {
     const here = shown.indexOf(state.chosen);
     state.choose(shown[(here + direction + shown.length) % shown.length]);
   }
-  function follow(on) { state.following = on && Boolean(state.chosen); touch(); }
+  function follow(on) { state.following = on && Boolean(state.chosen); state.resting = false; touch(); }
   function fit() { follow(false); view.fit(net); touch(); }
 
   function resize() {
@@ -70,7 +73,8 @@ function start(data, live = null) {
     if (state.dirty) {
       state.dirty = false;
       const s = state.following && state.chosen && stateOf(data, state.chosen, state.t);
-      if (s) { view.x = s.x; view.y = s.y; }
+      if (s && !(state.resting && view.holds(s))) { view.x = s.x; view.y = s.y; state.resting = false; }
+      view.arrange(flat, net);
       drawScene(scene.getContext("2d"), state);
       if (!state.playing || now - beside > BESIDE) { // what changes slowly
         beside = now;
@@ -233,6 +237,7 @@ function start(data, live = null) {
     data = state.data = fresh;
     state.chosen = null; state.stepping = false; state.events = []; state.t = live ? data.end : 0;
     net = bounds(data.lanes.length ? data.lanes : [{ box: [0, 0, 100, 100] }]);
+    flat = corridor(data.lanes);
     $$("pick").replaceChildren();
     fillHead(data); fillFigures(data); fillKinds(state); fillEvents(state); refresh();
     const there = [...$$("pick").options].slice(1).map((option) => data.vehicles[option.value]);
@@ -246,6 +251,21 @@ function start(data, live = null) {
     refresh();
     if (state.stepping) { state.stepping = false; step(1); }
     touch();
+  }
+
+  // The first picture: a flat road in rows; else the conflict zone and the way of the chosen vehicle until its mission is fulfilled.
+  function open() {
+    const track = first && first.tracks[0];
+    if (!track) { view.fit(net); return; }
+    const s = stateOf(data, first, state.t) || { x: track.x[0], y: track.y[0] };
+    view.x = s.x; view.y = s.y; view.scale = Math.max(view.width / ROW, DETAIL);
+    if (flat || live) return;
+    const done = data.facts.metrics.find(([name]) => name === "mission_time_s"), until = (done && done[1]) ?? data.end;
+    const last = Math.min(atOrBefore(data.times, until + 3), track.last) - track.first;
+    const way = placed(track, Math.max(atOrBefore(data.times, 0) - track.first, 0), last), home = new View(scene);
+    home.resize(); home.fit(bounds([...data.zones].map((k) => data.lanes[k]).concat(way)), 1.3);
+    if (home.scale < DETAIL) return;
+    view.x = home.x; view.y = home.y; view.scale = Math.min(home.scale, (2 * view.width) / ROW); state.resting = true;
   }
 
   for (const rate of SPEEDS) $$("speed").append(new Option(`${rate} \u00d7`, rate));
@@ -263,9 +283,7 @@ function start(data, live = null) {
   const first = load(data);
   new ResizeObserver(resize).observe($$("stage"));
   resize();
-  view.scale = view.width / 170;
-  const s = first && (stateOf(data, first, state.t) || { x: first.tracks[0].x[0], y: first.tracks[0].y[0] });
-  if (s) { view.x = s.x; view.y = s.y; } else view.fit(net);
+  open();
   const asked = new URLSearchParams(location.hash.slice(1)); // replay.html#t=12.4&v=av.3&zoom=8
   if (data.byId.has(asked.get("v"))) state.choose(data.byId.get(asked.get("v")), true);
   if (asked.has("zoom")) view.scale = Number(asked.get("zoom")) || view.scale;

@@ -142,7 +142,12 @@ function fillLegend(state) {
   const first = Math.min(...data.shapes.keys()); // a car, where there is one
   const car = (colour, av) => shape(first, colour, [24, 10], av);
   if (data.vehicles.some((v) => v.mission)) entry("mission vehicle", car(c.mission));
-  if (data.vehicles.some((v) => v.av)) entry("AV (arrow: its command)", car(c.av, true));
+  if (data.vehicles.some((v) => v.av)) entry("AV", car(c.av, true));
+  if (data.vehicles.some((v) => v.choices.length)) {
+    const command = (...actions) => (ctx) => { ctx.translate(8, 8); for (const a of actions) { drawCommand(ctx, a, 14, c.av, c); ctx.translate(14, 0); } };
+    entry("its command: accelerate, decelerate", command(3, 4));
+    entry("its command: lane left, lane right", command(0, 2));
+  }
   const classes = new Set(data.vehicles.filter((v) => !v.av && !v.person).map((v) => v.driver));
   for (const name of ["conservative", "moderate", "aggressive", "as-is"]) {
     if (classes.has(name)) entry(`human, ${name}`, car(name === "as-is" ? c.asis : c[name]));
@@ -271,7 +276,7 @@ function fillHead(data) {
   const chip = (text, kind = "") => chips.append(element("span", text, `chip ${kind}`));
   const figure = (name) => (f.metrics.find(([n]) => n === name) || [])[1];
   if (f.policy_label) chip(f.policy_label, "warn");
-  chip(`seed ${f.seed}`); chip(f.preset); chip(`humans ${f.behavior}, ${f.driver_model}`); chip(`svo ${f.svo_deg}\u00b0`);
+  chip(`seed ${f.seed}`); chip(f.preset); chip(`humans ${f.behavior}, ${f.driver_model}`); chip(`SVO ${f.svo_deg}\u00b0`);
   if (f.errors) chip(`human errors ${f.errors}`);
   const crashes = figure("collisions"), among = figure("crashed") ? "" : ", none of an AV or the mission vehicle";
   const running = data.over === false; // only what has happened can be said

@@ -12,15 +12,19 @@ WORKERS ?= 2
 SAMPLE ?= 20
 PROCESSES ?= 2
 # A file's tests stay in one process, in the order of the folders: the longest files come first. A core each: no threads.
-PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(PROCESSES) --dist loadfile --no-loadscope-reorder
+PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(PROCESSES) --dist loadfile --no-loadscope-reorder --durations=40
 
-.PHONY: demo test docs quick pytest unit check kernels nets results pages results-small audit image smoke clean
+.PHONY: demo test soak docs quick pytest unit check kernels nets results pages results-small audit image smoke clean
 
 demo: $(VENV)/.installed
 	$(BIN)/cosim run merge --demand contested --policy vfn-p --beside idm --out $(RUN)
 
 test: $(VENV)/.installed-dev
 	$(MAKE) --no-print-directory -j 2 check pytest
+
+# What takes too long for `make test`: every measured page in small, a server on Ray, two on one database.
+soak: kernels
+	$(PYTEST) -m soak
 
 # Kernels first, so that the tests' processes do not compile the same ones at once.
 pytest: kernels
@@ -77,7 +81,7 @@ nets: $(VENV)/.installed-dev
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(PIP) torch
-	$(PIP) -e .
+	$(PIP) -e '.[film]'
 	$(COMPILE)
 	touch $@
 

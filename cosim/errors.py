@@ -101,6 +101,19 @@ class WeightsMismatch(BadInput):
 
 
 @contextlib.contextmanager
+def extra(name: str, *, field: str, value: object = None) -> Iterator[None]:
+    """Around imports of what the extra `name` of this distribution installs.
+
+    Raises BadInput with the command that installs it: a module is missing.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        problem = f"needs the package {error.name}: pip install 'cosim-sumo[{name}]'"
+        raise BadInput(problem, field=field, value=value) from None
+
+
+@contextlib.contextmanager
 def inside(place: str, file: object = None) -> Iterator[None]:
     """Name in a BadInput of the block the field `place` that its own field is part of, and the `file`."""
     try:

@@ -16,7 +16,7 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.exc import ArgumentError, IntegrityError, SQLAlchemyError
 
-from cosim.errors import BadInput, CosimError
+from cosim.errors import BadInput, CosimError, extra
 
 FILE = "store.sqlite"
 _NAME = sa.String(200)
@@ -204,8 +204,9 @@ def connect(url: str, tables: sa.MetaData, field: str = "--store") -> sa.Engine:
     """
     try:
         libpq = sa.engine.make_url(url).get_dialect().driver in ("psycopg", "psycopg2")
-        # a connection may have been lost meanwhile
-        engine = sa.create_engine(url, pool_pre_ping=True, connect_args=_LIBPQ if libpq else {})
+        with extra("postgresql", field=field, value=shown(url)):
+            # a connection may have been lost meanwhile
+            engine = sa.create_engine(url, pool_pre_ping=True, connect_args=_LIBPQ if libpq else {})
         if engine.dialect.name == "sqlite":
             sa.event.listen(engine, "connect", _sqlite)
         found, needed = _version(engine, tables), tables.info["version"]
@@ -218,9 +219,6 @@ def connect(url: str, tables: sa.MetaData, field: str = "--store") -> sa.Engine:
     except ArgumentError:
         masked = re.sub(r"://.*@", "://***@", url)
         raise BadInput("is no database URL", field=field, value=masked) from None
-    except ModuleNotFoundError as error:
-        problem = f"needs the package {error.name} (pip install 'cosim-sumo[postgresql]')"
-        raise BadInput(problem, field=field, value=shown(url)) from None
     except SQLAlchemyError as error:
         raise BadInput(_first_line(error), field=field, value=shown(url)) from None
     return engine

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 from cosim.cli import arguments
+from cosim.errors import extra
 from cosim.scenario.policy_name import label
 
 
@@ -49,6 +50,9 @@ def work(args: argparse.Namespace) -> int:
         name = recorded.name if other is None else f"{recorded.name}-beside-{label(other.case.policy)}"
         mp4 = recorded.folder / f"{name}.mp4"
         html = recorded.folder / f"{name}.html" if other is None else None
+    if film := mp4 or gif:
+        with extra("film", field="--mp4" if mp4 else "--gif", value=str(film)):
+            import av  # noqa: F401  # before anything is driven
     result, recording = replay.drive(recorded, scenario, check=not args.no_check)
     others = [] if other is None else [replay.drive(other, scenario, check=False)[1]]
     replay.draw([recording, *others], html, mp4, gif, args.follow)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cosim.cli import arguments
-from cosim.errors import BadInput, SimulationTimeout
+from cosim.errors import BadInput, SimulationTimeout, extra
 from cosim.files import code
 from cosim.files.xml_input import is_there
 from cosim.scenario import Scenario, chosen_preset, human_errors, place
@@ -128,6 +128,9 @@ def work(args: argparse.Namespace) -> int:
     for flag, wanted in (("--output", args.output), ("--replay", args.replay)):
         if wanted and not args.out:
             raise BadInput("needs a run folder to write into: --out DIR", field=flag)
+    if args.replay:
+        with extra("film", field="--replay"):
+            import av  # noqa: F401  # before anything is driven
     served = _served(args)
     cases = [case_of(args)]
     if args.beside is not None:

@@ -4,7 +4,7 @@ import argparse
 import sys
 
 from cosim.cli import arguments
-from cosim.errors import BadInput
+from cosim.errors import BadInput, extra
 
 
 def add(commands: arguments.SubCommands) -> None:
@@ -36,14 +36,9 @@ def add(commands: arguments.SubCommands) -> None:
 
 def work(args: argparse.Namespace) -> int:
     """Serve until it is ended. Raises BadInput before it listens."""
-    try:
-        import uvicorn  # noqa: F401
-
+    with extra("service", field="serve"):
         from cosim.service.serving import serve
         from cosim.service.settings import database
-    except ModuleNotFoundError as error:
-        problem = f"needs the package {error.name}: pip install 'cosim-sumo[service]'"
-        raise BadInput(problem, field="serve") from None
     if args.engine == "local" and args.ray_address is not None:
         raise BadInput("goes with --engine ray", field="--ray-address", value=args.ray_address)
     given = {name: getattr(args, name) for name in ("host", "port", "workers", "engine", "ray_address")}

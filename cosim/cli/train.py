@@ -3,6 +3,7 @@
 import argparse
 
 from cosim.cli import arguments
+from cosim.errors import extra
 from cosim.policies import TRAINABLE
 
 WHAT = (*TRAINABLE, "hpn", "encoder")
@@ -47,6 +48,8 @@ def add(commands: arguments.SubCommands) -> None:
 
 def work(args: argparse.Namespace) -> int:
     """Train until the last iteration."""
+    with extra("train", field="train", value=args.what):
+        import tensorboard  # noqa: F401  # before anything is driven
     if args.what == "hpn":
         from cosim.learning import train_hpn
 

@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Generator, Sequence
 from typing import Any
 
-from cosim.errors import BadInput, CosimError
+from cosim.errors import BadInput, CosimError, extra
 from cosim.workers.pool import Cancelled
 from cosim.workers.supervisor import Factory, Limits, Supervisor
 from cosim.workers.tasks import SIM_CRASH, Outcome, Task, TaskQueue
@@ -47,12 +47,8 @@ class RayEngine:
         keep: bool = False,
     ) -> None:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray sends no usage report
-        try:
+        with extra("ray", field="--engine", value="ray"):
             import ray
-        except ModuleNotFoundError:
-            raise BadInput(
-                "ray is not installed: pip install 'cosim-sumo[ray]'", field="--engine", value="ray"
-            ) from None
         self._ray: Any = ray
         self._factory = factory
         self._arguments = arguments

@@ -74,6 +74,7 @@ def test_a_database_that_goes_and_comes_back_costs_nothing(
 
 
 @needed
+@pytest.mark.soak
 def test_two_servers_on_one_database_drive_every_run_once(
     postgres: Postgres, undisturbed: dict[int, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

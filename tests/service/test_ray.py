@@ -15,6 +15,7 @@ SHORT: dict[str, Any] = {"scenario": "merge", "demand": "contested", "duration":
 FLAGS = ("--workers", "2", "--engine", "ray")
 
 
+@pytest.mark.soak
 def test_runs_on_ray_are_those_of_this_machine(server: Server, tmp_path: Path) -> None:
     pytest.importorskip("ray")
     run = server.submit(**SHORT, seeds="200000:200004")

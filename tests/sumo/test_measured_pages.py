@@ -8,8 +8,16 @@ import pytest
 
 from benchmarks import measured
 
+IN_MAKE_TEST = ("learned", "law")  # one that drives the agent, one of the lawful car
 
-@pytest.mark.parametrize("page", measured.PAGES, ids=lambda page: page.name)
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, id=page.name, marks=() if page.name in IN_MAKE_TEST else pytest.mark.soak)
+        for page in measured.PAGES
+    ],
+)
 def test_every_measured_page_is_rebuilt_and_not_measured_twice(
     page: measured.Page, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

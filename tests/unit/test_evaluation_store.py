@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import resource
+import sys
 from collections.abc import Generator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -182,17 +183,15 @@ def test_two_runs_share_a_database_and_each_sees_its_own(plan: matrix.Plan, tmp_
         assert monday.rows() == tuesday.rows() != []
 
 
-def test_a_store_that_cannot_be_is_one_sentence_without_the_password() -> None:
+def test_a_store_that_cannot_be_is_one_sentence_without_the_password(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(BadInput, match="is no database URL"):
         Store("nonsense")
     with pytest.raises(BadInput, match="unable to open database file"):
         Store("sqlite:////not/there/at/all.sqlite")
-    try:
-        import psycopg  # noqa: F401
-    except ModuleNotFoundError:
-        with pytest.raises(BadInput, match=r"pip install 'cosim-sumo\[postgresql\]'") as caught:
-            Store("postgresql+psycopg://me:secret@host/db")
-        assert "secret" not in str(caught.value)
+    monkeypatch.setitem(sys.modules, "psycopg", None)
+    with pytest.raises(BadInput, match=r"pip install 'cosim-sumo\[postgresql\]'") as caught:
+        Store("postgresql+psycopg://me:secret@host/db")
+    assert "secret" not in str(caught.value)
 
 
 def test_a_database_that_fills_up_ends_the_run_with_one_sentence(plan: matrix.Plan, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import sys
@@ -14,7 +15,14 @@ import pytest
 
 from cosim.errors import BadInput, CosimError, SimulationCrashed, SimulationError, SimulationTimeout
 from cosim.simulation.stderr import SumoStderr
+from cosim.workers import worker as worker_module
 from cosim.workers.worker import Worker
+
+
+@pytest.fixture(autouse=True)
+def spawned(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Workers start here as a user's do."""
+    monkeypatch.setattr(worker_module, "_CONTEXT", multiprocessing.get_context("spawn"))
 
 
 class Served:

@@ -121,10 +121,10 @@ def test_the_core_drives_evaluates_compares_and_replays_without_any_extra(instal
     assert {file: file.stat().st_mtime_ns for file in installed.home.rglob("*.nb[ci]")} == kernels
     assert "pip install 'cosim-sumo[film]'" in installed.command("replay", "one", code=2)
 
-    matrix = ("--scenario", "merge", "--policy", "idm", "--policy", "vfn-p", "--seeds", "0:2")
-    installed.command("evaluate", *matrix, "--duration", "2", "--workers", "2", "--out", "batch")
+    matrix = ("--scenario", "merge", "--policy", "idm", "--policy", "altruist-rule", "--seeds", "0:2")
+    installed.command("evaluate", *matrix, "--duration", "2", "--workers", "1", "--out", "batch")
     assert (installed.work / "batch" / "report.html").stat().st_size > 20_000
-    sides = ("--baseline", "idm", "--candidate", "vfn-p", "--fail-on", "collision_rate > 0")
+    sides = ("--baseline", "idm", "--candidate", "altruist-rule", "--fail-on", "collision_rate > 0")
     installed.command("compare", "batch", *sides, "--junit", "junit.xml")
     assert "<testcase" in (installed.work / "junit.xml").read_text()
 

@@ -14,7 +14,7 @@ SEEN = {
     "first_drive": (
         "mission.0 is the mission vehicle: the human driver that has to merge.",
         "With vfn-p it merged after",
-        "With idm it did not merge within 25 s.",
+        "With idm it did not merge within",
         "interventions",
         "trace hash vfn-p",
     ),

@@ -80,7 +80,7 @@ def test_a_scenario_is_started_moves_pauses_steps_and_ends(tab: Tab) -> None:
     tab.until("replay.data.over && replay.t >= 3.9")
     assert "of 1: 0.0 %" in tab.page.inner_text("#crashes")
     everybody = tab.page.inner_text("#everybody")
-    assert re.search(r"\d s delay", everybody)
+    assert re.search(r"\d s\n", everybody)
     assert re.search(r"AVs [\d.]+, humans [\d.]+ s, longest wait \d+ s, 0 arrived, [\d.]+ kg CO2", everybody)
     assert "trace " in tab.page.locator("#figures").text_content()
     assert not tab.tell("replay.playing")

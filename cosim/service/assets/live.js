@@ -26,7 +26,7 @@ const live = {
   dark: () => THEME.dark,
   darken: (on) => { THEME.dark = on; },
   keys: [["r", "this seed again", () => $("again").click()], ["e", "the next seed", () => $("next").click()],
-    ["x", "why the chosen AV chose so: what each input changes", () => $("why").click()], ["s", "another scenario", () => $("other").click()]],
+    ["x", "explain the chosen AV: what each input changes", () => $("why").click()], ["s", "another scenario", () => $("other").click()]],
 };
 
 function send(message) { if (socket && socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message)); }
@@ -143,13 +143,13 @@ function begin() {
 function fillTally() {
   const figure = (name) => (data.facts.metrics.find(([n]) => n === name) || [])[1], tally = data.facts.tally;
   const lines = (id, first, second) => $(id).replaceChildren(element("b", first), element("small", second));
-  const before = (found) => (found ? shareText(found) : "no episode is over yet");
+  const before = (found) => (found ? shareText(found) : "no episode is finished yet");
   lines("crashes", tally.crashed ? `${(100 * tally.crashed.value).toFixed(1)} %` : "\u2013", before(tally.crashed));
   lines("missions", tally.mission_success ? `${(100 * tally.mission_success.value).toFixed(1)} %` : "\u2013",
-    figure("mission_success") == null ? "none in this world" : before(tally.mission_success));
+    figure("mission_success") == null ? "none in this scenario" : before(tally.mission_success));
   lines("distance", number(figure("dt_mean_m"), 0, " m"), `AVs ${number(figure("dt_av_m"), 0)}, mission ${number(figure("dt_mission_m"), 0)} m`);
   const who = ["av", "hv"].map((kind) => number(figure(`total_delay_${kind}_s`), 1)), wait = number(figure("longest_wait_s"), 0, " s");
-  lines("everybody", number(figure("total_delay_s"), 1, " s delay"),
+  lines("everybody", number(figure("total_delay_s"), 1, " s"),
     `AVs ${who[0]}, humans ${who[1]} s, longest wait ${wait}, ${number(figure("arrivals"), 0)} arrived, ${number(figure("co2_kg"), 1, " kg CO2")}`);
   const least = tally.min_ttc_s == null ? "" : `, in all ${number(tally.min_ttc_s, 2)} s`;
   lines("ttc", figure("min_ttc_s") == null ? "> 10 s" : number(figure("min_ttc_s"), 2, " s"), `smallest in this episode${least}`);
@@ -196,9 +196,9 @@ function fillForm() {
   const form = $("scenario"), field = form.elements, worlds = catalogue.scenarios;
   choices(field.scenario, worlds.map((w) => w.name), "merge");
   choices(field.policy, catalogue.policies, "vfn-p");
-  choices(field.behavior, [["", "the world's own"], ...catalogue.behaviors]);
+  choices(field.behavior, [["", "the scenario's"], ...catalogue.behaviors]);
   choices(field.errors, [["", "none"], ...catalogue.errors]);
-  choices(field.preset, [["", "the world's own"], ...catalogue.presets]);
+  choices(field.preset, [["", "the scenario's"], ...catalogue.presets]);
   const world = () => {
     const found = worlds.find((w) => w.name === field.scenario.value);
     choices(field.demand, found.demands, "contested");

@@ -215,7 +215,7 @@ function fillForm(catalogue) {
   choices(field.scenario, catalogue.scenarios.map((w) => w.name), "merge");
   choices(field.policy, catalogue.policies);
   for (const option of field.policy.options) option.selected = ["idm", "vfn-p"].includes(option.value);
-  choices(field.behavior, [["", "the world's own"], ...catalogue.behaviors]);
+  choices(field.behavior, [["", "the scenario's"], ...catalogue.behaviors]);
   choices(field.errors, [["", "none"], ...catalogue.errors]);
   const world = () => choices(field.demand, catalogue.scenarios.find((w) => w.name === field.scenario.value).demands, "contested");
   field.scenario.onchange = world; world();
@@ -229,7 +229,7 @@ function fillForm(catalogue) {
     try { const found = await ask("/api/estimates", requestOf(form)); $("long").textContent = `${found.episodes} episodes, about ${seconds(found.estimated_s) || "?"}`; } catch (error) { $("long").textContent = ""; throw error; }
   });
   choices($("status"), [["", "any status"], ...STATUSES]);
-  choices($("world"), [["", "any world"], ...catalogue.scenarios.map((w) => w.name)]);
+  choices($("world"), [["", "any scenario"], ...catalogue.scenarios.map((w) => w.name)]);
   choices($("by"), [["", "any policy"], ...catalogue.policies]);
 }
 

@@ -29,17 +29,19 @@ NO_LOAD = {"canonical", "next", "prev", "alternate"}  # `rel` of <link>s that fe
 
 
 class Page(HTMLParser):
-    """The addresses that a page loads from and links to."""
+    """The addresses that a page loads from and links to, and the anchors that it has."""
 
     def __init__(self, file: Path) -> None:
         super().__init__()
         self.file = file
         self.loads: list[str] = []
         self.links: list[str] = []
+        self.anchors: set[str] = set()
         self.feed(file.read_text(encoding="utf-8"))
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         of = dict(attrs)
+        self.anchors.add(of.get("id") or "")
         for name, value in attrs:
             if (tag, name) in LOADS and of.get("rel") not in NO_LOAD:
                 self.loads.append(value or "")
@@ -74,6 +76,18 @@ def pages(site: Path) -> list[Page]:
 def test_every_link_and_picture_of_the_site_leads_to_a_file(pages: list[Page], site: Path) -> None:
     assert len(pages) > 40
     lost = [(str(p.file.relative_to(site)), to) for p in pages for to in p.links + p.loads if p.missing(to)]
+    assert lost == []
+
+
+def test_every_link_to_a_heading_finds_it(pages: list[Page], site: Path) -> None:
+    anchors = {p.file: p.anchors for p in pages}
+    lost = []
+    for page in pages:
+        for link in page.links:
+            to = urlsplit(link)
+            file = (page.file.parent / unquote(to.path)).resolve() if to.path else page.file
+            if not to.netloc and to.fragment and unquote(to.fragment) not in anchors.get(file, {to.fragment}):
+                lost.append((str(page.file.relative_to(site)), link))
     assert lost == []
 
 

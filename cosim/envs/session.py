@@ -177,11 +177,11 @@ def open(
 
 
 class Session(contextlib.AbstractContextManager["Session"]):
-    """One scenario in a supervised process; several sessions can be open at once. Made by `cosim.open`.
+    """One scenario in a supervised process, made by `cosim.open`. Several sessions can be open at once.
 
-    An AV without an action in `act` is driven by SUMO's IDM: also one that was commanded before, it is handed
-    back (the same rule as everywhere in cosim). When the process ends, the call that notices raises
-    SimulationCrashed; `reset` then starts a fresh process. Use it in a `with` statement, or close it.
+    SUMO's IDM drives an AV without an action, also when the AV was commanded before. When the process ends,
+    the next call raises SimulationCrashed, and `reset` starts a fresh process. Use a session in a `with`
+    statement, or close it.
     """
 
     def __init__(self, scenario: Scenario, connect: Callable[[], Caller], seed: int | None = None) -> None:
@@ -195,7 +195,14 @@ class Session(contextlib.AbstractContextManager["Session"]):
         self.over = False
 
     def reset(self, seed: int | None = None) -> dict[str, View]:
-        """Begin the episode `seed` (without one: the seed after the last) and drive its warm-up."""
+        """Begin an episode and drive its warm-up.
+
+        Args:
+            seed: of the episode; None: the seed after the last.
+
+        Returns:
+            What each AV sees, by its id.
+        """
         seed = self._next_seed if seed is None else seed
         if not 0 <= seed < 2**63:
             raise BadInput("must be a whole number from 0 on", field="seed", value=seed)
@@ -208,7 +215,7 @@ class Session(contextlib.AbstractContextManager["Session"]):
         return self.observe()
 
     def observe(self) -> dict[str, View]:
-        """What each AV on the road sees now (of those asked for in `act`); begins an episode if none has."""
+        """What each AV sees now, as far as `act` asked for it; begins an episode if none has begun."""
         if self._views is None:
             self.reset()
         assert self._views is not None
@@ -220,15 +227,16 @@ class Session(contextlib.AbstractContextManager["Session"]):
         *,
         see: Sequence[str] | None = None,
     ) -> StepResult:
-        """Carry out one action per AV for one decision (0.4 s): a meta-action, or a `ContinuousAction`
-        (acceleration in m/s2, lane offset +1, 0 or -1; a pair of numbers will do).
+        """Carry out one action per AV for one decision (0.4 s).
 
-        An AV without an action, or with None, is driven by `others`, or else by SUMO.
-        `see`: the AVs whose observation you want (all by default; fewer are faster).
+        Args:
+            actions: AV id -> a meta-action or its number, or a `ContinuousAction` or such a pair; None, or an
+                AV left out: `others` drives it, else SUMO.
+            see: the AVs whose observation is wanted; None: all. Fewer are faster.
 
         Raises:
             BadInput: an id that is not an AV on the road, something that is no action, no episode.
-            SimulationError, SimulationCrashed: SUMO failed, its process ended or hung.
+            SimulationError, SimulationCrashed: SUMO failed; its process ended or hung.
         """
         if self._views is None:
             raise BadInput("no episode has begun: call reset first")
@@ -250,7 +258,7 @@ class Session(contextlib.AbstractContextManager["Session"]):
         )
 
     def result(self, policy: str = "external") -> EpisodeResult:
-        """The metrics of the episode so far; `policy` is the name it goes by in the result."""
+        """The figures of the episode so far; `policy` is what the result calls the caller."""
         return cast(EpisodeResult, self._call("result", policy))
 
     def snapshot(self) -> Snapshot:
@@ -258,12 +266,14 @@ class Session(contextlib.AbstractContextManager["Session"]):
         return cast(Snapshot, self._call("snapshot"))
 
     def partner(self) -> str:
-        """The AV that reaches the conflict zone next after the mission vehicle does, at present speeds: the
-        one that would have to yield; "" when there is none."""
+        """The AV that would have to yield to the mission vehicle; "" when there is none.
+
+        At present speeds, it is the next AV to reach the conflict zone after the mission vehicle.
+        """
         return cast(str, self._call("partner"))
 
     def road(self) -> RoadMap:
-        """The net's lanes."""
+        """The road: lanes, links and signals."""
         return cast("RoadMap", self._call("road"))
 
     def picture(self, av: str | None = None) -> Bytes:
@@ -287,7 +297,7 @@ class Session(contextlib.AbstractContextManager["Session"]):
 
     @property
     def begun(self) -> bool:
-        """Whether an episode has."""
+        """Whether an episode has begun."""
         return self._views is not None
 
     # ---- inside ----

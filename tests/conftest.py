@@ -102,6 +102,7 @@ def start(tmp_path: Path) -> Iterator[Start]:
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     """`cosim serve` with two workers, without a token; for tests that leave it as they found it."""
     with Server(tmp_path_factory.mktemp("service") / "data", "--workers", "2") as running:
+        running.warm()
         yield running
 
 

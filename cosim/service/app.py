@@ -32,6 +32,7 @@ from cosim.service.lanes import Lane, Lanes
 from cosim.service.monitor import Figures
 from cosim.service.openapi import describe
 from cosim.service.problems import Refused
+from cosim.service.processes import Processes
 from cosim.service.readiness import Check, Readiness
 from cosim.service.replays import Replays
 from cosim.service.requests import RunRequest
@@ -54,16 +55,17 @@ results, or drive step by step in a session."""
 
 def create(settings: Settings) -> FastAPI:
     """The application. Raises BadInput: the database cannot be reached, Ray is not installed."""
-    uploads = Uploads(settings)
+    processes = Processes()
+    uploads = Uploads(settings, processes)
     jobs = Jobs(settings.jobs_url)
     if settings.database is not None:
         connect(settings.database, TABLES, "--database").dispose()  # rows of runs stand there too
-    clerks = Clerks(settings.runs, settings.database, settings.limits)
+    clerks = Clerks(settings, processes)
     runs = Runs(settings, jobs, clerks, lambda number: figures.episodes.inc(number))
     warmth = Warmth()
-    replays = Replays(settings, runs, uploads, clerks, warmth)
-    sessions = Sessions(settings, clerks, warmth, lambda seconds: figures.steps.observe(seconds))
     lanes = Lanes(settings.limits)
+    replays = Replays(settings, runs, uploads, clerks, warmth, processes, lanes.replays)
+    sessions = Sessions(settings, clerks, warmth, lambda seconds: figures.steps.observe(seconds))
     ready = Readiness({"database": jobs.problem, "disk": _disk(settings), "workers": _workers(runs, warmth)})
     pool = runs.pool
     figures = Figures(
@@ -93,7 +95,7 @@ def create(settings: Settings) -> FastAPI:
         lanes.close()
         ready.close()
         sessions.close()
-        replays.close()
+        processes.close()
         runs.close()
         jobs.close()
         log.info("ended")
@@ -123,7 +125,7 @@ def create(settings: Settings) -> FastAPI:
     _answer_problems(app, settings)
     app.include_router(_about(figures, ready, lanes.reads))
     app.include_router(runs_router(runs, replays, uploads, lanes))
-    app.include_router(uploads_router(uploads, runs, sessions, settings))
+    app.include_router(uploads_router(uploads, runs, sessions, settings, lanes))
     app.include_router(sessions_router(sessions, uploads, lanes))
     app.include_router(live_router(sessions, lanes.sessions))
     app.include_router(page_router(settings))

@@ -1,62 +1,49 @@
-"""Checks, tables and reports, in processes of their own: no request keeps the server from answering."""
+"""Plans, tables and reports, in processes of their own: no request keeps the server from answering."""
 
 from __future__ import annotations
 
 import os
 import queue
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from cosim.batch import execution, matrix, spec
 from cosim.batch.matrix import Plan
 from cosim.batch.store import Store
-from cosim.errors import BadInput, SimulationTimeout
-from cosim.policies import check
+from cosim.errors import BadInput, SimulationCrashed, SimulationTimeout
 from cosim.scenario import Scenario
 from cosim.scenario.episode_id import EpisodeId
-from cosim.scenario.vet import vetted
+from cosim.service.confined import confined_planner, room
 from cosim.service.passing import told_apart
-from cosim.service.settings import Limits
+from cosim.service.planner import Planner
+from cosim.service.processes import Processes
+from cosim.service.settings import Limits, Settings
 from cosim.workers.worker import Worker
 
 CLERKS = 2
 
 
-class Clerk:
-    """Hosted in a process whose working folder is that of the runs; the reports are imported when needed."""
+class Clerk(Planner):
+    """Hosted in a process whose working folder is that of the runs; the reports are imported when needed.
+
+    It is not confined: it reads no upload.
+    """
 
     def __init__(self, runs: str, database: str | None, limits: Limits) -> None:
+        super().__init__(limits)
         os.chdir(runs)
-        self._database, self._limits = database, limits
+        self._database = database
 
-    def spec(self, flags: Mapping[str, Any]) -> Plan:
-        """The plan of a request. Raises BadInput, as `cosim evaluate` does."""
+    def asked(self, flags: Mapping[str, Any]) -> tuple[list[EpisodeId], range]:
+        """What a request names: the case of every cell and the seeds, no file read. Raises BadInput."""
         wanted = spec.read(None, flags)
         seeds = range(*wanted.seeds)
         if (cells := wanted.episodes // len(seeds)) > self._limits.cells:
             problem = f"{cells} cells are more than {self._limits.cells}: ask for several runs"
             raise BadInput(problem, field="scenario")
-        found = matrix.plan([*matrix.cells(wanted)], seeds, check)
-        matrix.check_names(found)
-        for cell in found.cells:
-            if cell.refused:
-                raise BadInput(cell.refused, field="scenario")
-            self._check_length(cell.scenario)
-        return found
-
-    def plan(self, cases: Sequence[EpisodeId], seeds: range) -> Plan:
-        """The plan of a run that was begun."""
-        with told_apart():
-            return matrix.plan(cases, seeds, check)
-
-    def session(self, flags: Mapping[str, Any]) -> tuple[Scenario, EpisodeId]:
-        """What a session is opened on. Raises BadInput, as `cosim run` does."""
-        (case,) = matrix.cells(spec.read(None, flags))
-        check(case.policy)
-        scenario = vetted(case.scenario())
-        self._check_length(scenario)
-        return scenario, case
+        return [*matrix.cells(wanted)], seeds
 
     def finish(self, run: str, plan: Plan) -> None:
         """Write the tables, the manifest and the summary of a run."""
@@ -90,30 +77,41 @@ class Clerk:
 
         return verdict.document(compare(side(a), side(b), fail_on, across=across))
 
-    def _check_length(self, scenario: Scenario) -> None:
-        """Raises BadInput for an episode that would hold a process for ever."""
-        most = self._limits.simulated
-        if scenario.warmup + scenario.duration > most:
-            problem = f"an episode and its warm-up have at most {most:g} s"
-            raise BadInput(problem, field="duration", value=scenario.duration)
-
 
 class Clerks:
-    """`number` processes that each host a `Clerk`; `call` waits for a free one.
+    """Processes that each host a `Clerk`; whoever asks waits for a free one.
+
+    An upload is read by a confined process in place of a clerk, which is not reused.
 
     Raises BadInput: what was asked for takes longer than `limits.check` s, or what the method raises.
     """
 
-    def __init__(self, runs: Path, database: str | None, limits: Limits, number: int = CLERKS) -> None:
-        self._arguments = str(runs), database, limits
-        self._limit = limits.check
+    def __init__(self, settings: Settings, processes: Processes) -> None:
+        self._settings, self._processes = settings, processes
+        self._arguments = str(settings.runs), settings.database, settings.limits
+        self._limit = settings.limits.check
         self._free: queue.Queue[int] = queue.Queue()
-        self._workers: list[Worker | None] = [None] * number
-        for k in range(number):
+        self._workers: list[Worker | None] = [None] * CLERKS
+        for k in range(CLERKS):
             self._free.put(k)
 
+    def plan(self, flags: Mapping[str, Any], uploads: Sequence[str]) -> Plan:
+        """The plan of a new run, of the request's flags and the uploads that it names."""
+        cases, seeds = self.call("asked", flags)
+        return self._planned("plan", cases, seeds, uploads)
+
+    def plan_again(self, cases: Sequence[EpisodeId], seeds: range, uploads: Sequence[str]) -> Plan:
+        """The plan of a run that was begun."""
+        return self._planned("plan_again", cases, seeds, uploads)
+
+    def session(self, flags: Mapping[str, Any], uploads: Sequence[str]) -> tuple[Scenario, EpisodeId]:
+        """What a session is opened on."""
+        (case,), _ = self.call("asked", flags)
+        scenario: Scenario = self._read(uploads, "session", case)
+        return scenario, case
+
     def call(self, method: str, *arguments: Any) -> Any:
-        """One method of a `Clerk`."""
+        """One method of a `Clerk`, on what is no upload."""
         k = self._free.get()
         try:
             worker = self._workers[k]
@@ -122,7 +120,7 @@ class Clerks:
                 self._workers[k] = worker
             return worker.call(method, *arguments)
         except SimulationTimeout:
-            raise BadInput(f"takes more than {self._limit:g} s to work out") from None
+            raise self._late() from None
         finally:
             self._free.put(k)
 
@@ -134,3 +132,30 @@ class Clerks:
             ended = self._workers[self._free.get()]
             if ended is not None:
                 ended.close()
+
+    # ---- inside ----
+
+    def _planned(self, method: str, cases: Sequence[EpisodeId], seeds: range, uploads: Sequence[str]) -> Plan:
+        """A plan of these very cases, whatever the process that read the files says of them."""
+        found: Plan = self._read(uploads, method, cases, seeds)
+        cells = zip(found.cells, cases, strict=True)
+        return Plan(tuple(replace(cell, case=case) for cell, case in cells), seeds)
+
+    def _read(self, uploads: Sequence[str], method: str, *arguments: Any) -> Any:
+        """One method of a `Planner`, confined where there are uploads."""
+        if not uploads:
+            return self.call(method, *arguments)
+        k = self._free.get()  # no more at once than there are clerks
+        try:
+            with room(self._settings, uploads) as confined:
+                planner = confined_planner, confined
+                return self._processes.ask("cosim-planner", self._limit, planner, method, *arguments)
+        except SimulationTimeout:
+            raise self._late() from None
+        except SimulationCrashed as error:
+            raise BadInput(f"ends the process that reads it: {error}", field="scenario") from None
+        finally:
+            self._free.put(k)
+
+    def _late(self) -> BadInput:
+        return BadInput(f"takes more than {self._limit:g} s to work out")

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from cosim.envs.host import PolicyFactory, Reply
     from cosim.scenario import Scenario
     from cosim.scenario.episode_id import EpisodeId
+    from cosim.service.planner import Planner
     from cosim.service.watch import WatchedHost
     from cosim.types import ObservationConfig
     from cosim.workers.tasks import Progress
@@ -250,6 +251,16 @@ class Examiner:
         with _memory_is_limited():
             policy = make(f"upload={weights}")
         return {"approach": type(policy).__name__, "label": policy.label}
+
+
+@untrusted
+def confined_planner(room: Room) -> Planner:
+    """A `Planner` in a confined process."""
+    room.enter()
+    allow_processor_time(room.limits.check)
+    from cosim.service.planner import Planner
+
+    return Planner(room.limits)
 
 
 def session_host(

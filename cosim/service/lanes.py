@@ -6,7 +6,7 @@ import asyncio
 import functools
 import threading
 from collections.abc import Awaitable, Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import ParamSpec, TypeVar
 
 from cosim.service.clerk import CLERKS
@@ -14,6 +14,7 @@ from cosim.service.problems import Unavailable
 from cosim.service.sessions import CALLS
 from cosim.service.settings import Limits
 
+EXAMINERS = DRAWERS = 2  # processes at once
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -41,13 +42,17 @@ class Lane:
 
     async def run(self, work: Callable[[], T]) -> T:
         """What `work` returns or raises."""
+        return await asyncio.wrap_future(self.begin(work))
+
+    def begin(self, work: Callable[[], T]) -> Future[T]:
+        """What `work` will return or raise."""
         with self._lock:
             if self._taken >= self._most:
                 raise Unavailable(f"{self._most} {self._work} are asked for already: try again later")
             self._taken += 1
         future = self._threads.submit(work)
         future.add_done_callback(self._leave)  # not when its client goes away: the thread is still taken
-        return await asyncio.wrap_future(future)
+        return future
 
     def close(self) -> None:
         """What waits is not begun."""
@@ -65,6 +70,8 @@ class Lanes:
         self.reads = Lane("answers", 16, 8 * limits.waiting)
         self.checks = Lane("checks of runs", CLERKS, 4 * limits.waiting)
         self.estimates = Lane("estimates", CLERKS, limits.waiting)
+        self.uploads = Lane("uploads", EXAMINERS, limits.waiting)
+        self.replays = Lane("replays", DRAWERS, limits.waiting)
         self.tables = Lane("reports and comparisons", CLERKS, limits.waiting)
         self.sessions = Lane("sessions' answers", (CALLS + 1) * limits.sessions, limits.waiting)
 

@@ -5,13 +5,13 @@ from collections.abc import Iterator
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from cosim.errors import BadInput, CosimError, SimulationTimeout
+from cosim.errors import BadInput, CosimError, SimulationCrashed
 
 
 def may_pass(problem: BaseException) -> bool:
     """All but what is wrong with the request itself: a BadInput that no fault of the machine's led to."""
     reason = problem.__context__ if isinstance(problem, BadInput) else problem
-    return reason is problem or isinstance(reason, OSError | SQLAlchemyError | SimulationTimeout)
+    return reason is problem or isinstance(reason, OSError | SQLAlchemyError | SimulationCrashed)
 
 
 @contextlib.contextmanager

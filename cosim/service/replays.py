@@ -3,40 +3,45 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import tempfile
 import threading
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
 from cosim.errors import BadInput, CosimError, SimulationError
 from cosim.service.clerk import Clerks
 from cosim.service.confined import Drawer, room
-from cosim.service.problems import Conflict, NotFound, Unavailable
+from cosim.service.lanes import Lane
+from cosim.service.problems import Conflict, NotFound
+from cosim.service.processes import Processes
 from cosim.service.runs import SUMMARY, Runs
 from cosim.service.settings import Settings
 from cosim.service.uploads import Uploads
 from cosim.service.warm import Warmth
-from cosim.workers.worker import Worker
 
-AT_ONCE, WAITING = 2, 16  # replays that are drawn, and those and what waits for them
 HEARTBEAT = 60.0  # s
 
 
 class Replays:
-    """Draws them, two at a time; whoever asks for what is being drawn waits for the same."""
+    """Draws them in `lane`; whoever asks for what is being drawn waits for the same."""
 
     def __init__(
-        self, settings: Settings, runs: Runs, uploads: Uploads, clerks: Clerks, warmth: Warmth
+        self,
+        settings: Settings,
+        runs: Runs,
+        uploads: Uploads,
+        clerks: Clerks,
+        warmth: Warmth,
+        processes: Processes,
+        lane: Lane,
     ) -> None:
         self._settings, self._runs, self._uploads, self._clerks = settings, runs, uploads, clerks
-        self._warmth = warmth
-        self._threads = ThreadPoolExecutor(AT_ONCE, "cosim-replay")
+        self._warmth, self._processes, self._lane = warmth, processes, lane
         self._lock = threading.Lock()
         self._asked: dict[tuple[str, str], Future[Path]] = {}
-        self._workers: set[Worker] = set()
-        self._closed = False
 
     def ask(self, run: str, episode: str) -> Future[Path]:
         """The page of an episode, named by its key or seed.
@@ -58,19 +63,10 @@ class Replays:
             key = run, episode
             if key in self._asked:
                 return self._asked[key]
-            if len(self._asked) >= WAITING:
-                raise Unavailable(f"{WAITING} replays are asked for: try again later")
-            future = self._asked[key] = self._threads.submit(self._page, run, episode, job.uploads)
+            page = functools.partial(self._page, run, episode, job.uploads)
+            future = self._asked[key] = self._lane.begin(page)
         future.add_done_callback(lambda _: self._forget(key))
         return future
-
-    def close(self) -> None:
-        """End what is being drawn."""
-        with self._lock:
-            self._closed = True
-            for worker in self._workers:
-                worker.kill()
-        self._threads.shutdown(cancel_futures=True)
 
     def _forget(self, key: tuple[str, str]) -> None:
         with self._lock:
@@ -101,29 +97,23 @@ class Replays:
         """Write the page of an episode, as `Drawer.page` wants it."""
         settings = self._settings
         self._warmth.wait()
-        with room(settings, uploads, draft.parent) as confined:
-            worker = Worker(
+        with (
+            room(settings, uploads, draft.parent) as confined,
+            self._processes.host(
                 Drawer, confined, settings.limits, timeout=HEARTBEAT, start_timeout=2.0 * HEARTBEAT,
-                name="cosim-replay", wait=False,
-            )  # fmt: skip
-            with worker:
-                with self._lock:
-                    if self._closed:
-                        raise Conflict("the server ends")
-                    self._workers.add(worker)
-                try:
-                    worker.call("page", *episode, str(draft), progress=lambda *_: None)
-                except SimulationError as error:
-                    raise Conflict(f"cannot be driven again: {error}") from None
-                except BadInput:
-                    raise
-                except CosimError as error:
-                    if error.exit_code == 1:  # ReplayDiffers
-                        raise Conflict(str(error).partition(" (--no-check")[0]) from None
-                    raise
-                finally:
-                    with self._lock:
-                        self._workers.discard(worker)
+                name="cosim-replay",
+            ) as worker,
+        ):  # fmt: skip
+            try:
+                worker.call("page", *episode, str(draft), progress=lambda *_: None)
+            except SimulationError as error:
+                raise Conflict(f"cannot be driven again: {error}") from None
+            except BadInput:
+                raise
+            except CosimError as error:
+                if error.exit_code == 1:  # ReplayDiffers
+                    raise Conflict(str(error).partition(" (--no-check")[0]) from None
+                raise
 
 
 def name(episode: str) -> str:

@@ -1,25 +1,25 @@
 """The routes of uploads: send an archive, list, delete."""
 
+import functools
 import os
 import tempfile
 from enum import Enum
 from pathlib import Path as File
 from typing import Annotated, Any
 
-from anyio import CapacityLimiter, to_thread
 from fastapi import APIRouter, Path, Query, Request
 from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 
 from cosim.service.confined import KINDS, lacking
 from cosim.service.ids import PATTERN
-from cosim.service.problems import Conflict, Unavailable
+from cosim.service.lanes import Lanes
+from cosim.service.problems import Conflict
 from cosim.service.runs import Runs
 from cosim.service.sessions import Sessions
 from cosim.service.settings import Settings
 from cosim.service.uploads import Uploads
 
-EXAMINED, WAITING = 2, 16  # uploads at once, and those that wait for it
 UploadId = Annotated[str, Path(pattern=PATTERN, examples=["0c44d1e5f2ab"])]
 Kind = Enum("Kind", {name: name for name in KINDS}, type=str)  # type: ignore[misc]
 BODY = {
@@ -45,10 +45,11 @@ class UploadDocument(BaseModel):
     about: dict[str, Any]
 
 
-def uploads_router(uploads: Uploads, runs: Runs, sessions: Sessions, settings: Settings) -> APIRouter:
+def uploads_router(
+    uploads: Uploads, runs: Runs, sessions: Sessions, settings: Settings, lanes: Lanes
+) -> APIRouter:
     """All of them."""
     router = APIRouter(prefix="/api", tags=["uploads"])
-    examined = CapacityLimiter(EXAMINED)  # threads of their own: no other request waits for an upload
 
     @router.post("/uploads", status_code=201, summary="Send a scenario or weights", openapi_extra=BODY)
     async def send(
@@ -62,22 +63,23 @@ def uploads_router(uploads: Uploads, runs: Runs, sessions: Sessions, settings: S
             with os.fdopen(handle, "wb") as file:
                 async for chunk in request.stream():
                     file.write(chunk)
-            if examined.statistics().tasks_waiting >= WAITING:
-                raise Unavailable(f"{WAITING} uploads wait to be examined: try again later")
-            found = await to_thread.run_sync(uploads.add, File(path), kind.value, name, limiter=examined)
+            found = await lanes.uploads.run(functools.partial(uploads.add, File(path), kind.value, name))
         finally:
             os.unlink(path)
         return UploadDocument.model_validate(found, from_attributes=True)
 
     @router.get("/uploads", summary="Uploads, the newest first")
+    @lanes.reads
     def listing() -> list[UploadDocument]:
         return [UploadDocument.model_validate(one, from_attributes=True) for one in uploads.all()]
 
     @router.get("/uploads/{upload}", summary="One upload")
+    @lanes.reads
     def one(upload: UploadId) -> UploadDocument:
         return UploadDocument.model_validate(uploads.get(upload), from_attributes=True)
 
     @router.delete("/uploads/{upload}", status_code=204, summary="Delete an upload that no open run uses")
+    @lanes.reads
     def remove(upload: UploadId) -> None:
         uploads.get(upload)
         if used := runs.that_use(upload):

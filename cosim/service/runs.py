@@ -173,7 +173,7 @@ class Runs:
     ) -> Job:
         """Check a run and queue it. Raises BadInput, Unavailable when too many wait."""
         self._check_queue()
-        plan: Plan = self._clerks.call("spec", flags)
+        plan = self._clerks.plan(flags, uploads)
         run = new_id()
         folder = self.folder(run)
         try:
@@ -192,7 +192,7 @@ class Runs:
 
     def estimate(self, flags: dict[str, Any], uploads: Sequence[str]) -> dict[str, Any]:
         """How long a run would take on a server that does nothing else, from short episodes driven now."""
-        plan: Plan = self._clerks.call("spec", flags)
+        plan = self._clerks.plan(flags, uploads)
         workers = self.pool.workers if self.pool else self._settings.workers or cores()
         with room(self._settings, uploads) as confined:
             seconds, basis = estimate(plan, self._engine(confined, probes=True), workers)
@@ -474,7 +474,8 @@ class Runs:
         """Drive what is left of a run, write its tables and report; the faults of our own code."""
         run, folder = job.run, self.folder(job.run)
         if plan is None:
-            plan = self._clerks.call("plan", *execution.asked(folder, self._settings.database))
+            cases, seeds = execution.asked(folder, self._settings.database)
+            plan = self._clerks.plan_again(cases, seeds, job.uploads)
         (folder / OUTPUTS).mkdir(parents=True, exist_ok=True)  # it may be another server's run
         with RunFolder(str(folder), resume=True, episodes=0), self._store(run) as store:
             execution.check_same(plan, store)

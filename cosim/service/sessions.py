@@ -231,7 +231,7 @@ class Sessions:
                 raise Unavailable(f"{limits.sessions} sessions are open: close one first")
             self._opening += 1
         try:
-            scenario, case = self._clerks.call("session", flags)
+            scenario, case = self._clerks.session(flags, uploads)
             self._warmth.wait()
             found = self._begin(request, scenario, case, uploads, observation, seed, reward, idle)
             self._open[found.id] = found

@@ -8,7 +8,6 @@ import logging
 import os
 import shutil
 import stat
-import threading
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -20,8 +19,8 @@ from cosim.service.confined import Examiner, room
 from cosim.service.ids import ID, new_id
 from cosim.service.jobs import now
 from cosim.service.problems import NotFound, Unavailable
+from cosim.service.processes import Processes
 from cosim.service.settings import Limits, Settings
-from cosim.workers.worker import Worker
 
 ABOUT = ".json"  # beside the upload's folder
 log = logging.getLogger("cosim.service")
@@ -44,8 +43,8 @@ class Upload:
 class Uploads:
     """Those that the server keeps, a folder each."""
 
-    def __init__(self, settings: Settings) -> None:
-        self._settings = settings
+    def __init__(self, settings: Settings, processes: Processes) -> None:
+        self._settings, self._processes = settings, processes
         for part in settings.uploads.glob("*.part"):  # of a server that was killed
             shutil.rmtree(part, ignore_errors=True)
 
@@ -119,25 +118,14 @@ class Uploads:
         Raises BadInput, also where that process ends or hangs.
         """
         limit = self._settings.limits.check
-        late = threading.Event()
         with room(self._settings, [archive], part) as confined:
-
-            def end() -> None:
-                late.set()
-                worker.kill()
-
+            examiner, files = (Examiner, confined), (str(archive), str(part))
             try:
-                with Worker(Examiner, confined, timeout=limit, name="cosim-examiner", wait=False) as worker:
-                    clock = threading.Timer(limit, end)
-                    clock.start()
-                    try:
-                        main, about = worker.call("take", str(archive), str(part), kind)
-                        return str(main), dict(about)
-                    finally:
-                        clock.cancel()
+                main, about = self._processes.ask("cosim-examiner", limit, examiner, "take", *files, kind)
+                return str(main), dict(about)
+            except SimulationTimeout:
+                raise BadInput(f"takes more than {limit:g} s to look at", field="archive") from None
             except SimulationCrashed as error:
-                if late.is_set() or isinstance(error, SimulationTimeout):
-                    raise BadInput(f"takes more than {limit:g} s to look at", field="archive") from None
                 raise BadInput(f"ends the process that reads it: {error}", field="archive") from None
             except BadInput:
                 raise

@@ -1,7 +1,7 @@
 """A process that is not trusted with the caller's secrets, nor with the caller's pickles.
 
 It is started with few variables, no arguments of the caller's command line and no descriptors but its own;
-what it answers is read as plain data: numbers, texts, arrays, errors and frozen dataclasses of cosim's.
+what it answers is read as plain data: numbers, texts, paths, arrays, errors, cosim's frozen dataclasses.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ class _Reader(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         """As `pickle.Unpickler`."""
         package = module.partition(".")[0]
-        known = {"builtins": _PLAIN, "numpy": _ARRAYS, "cosim": {name}}
+        known = {"builtins": _PLAIN, "pathlib": {"PosixPath"}, "numpy": _ARRAYS, "cosim": {name}}
         if name in known.get(package, ()) and "." not in name:
             found = super().find_class(module, name)
             if package != "cosim" or _is_data(found) or name == "_rebuild_bad_input":

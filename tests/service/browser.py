@@ -11,6 +11,8 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
 
+from tests.service.servers import PATIENCE
+
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "google-chrome", "chromium-browser"))), None)
 needed = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed: apt-get install chromium")
 
@@ -19,7 +21,9 @@ needed = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed: 
 def launched() -> Iterator[Browser]:
     """The browser."""
     with sync_playwright() as playwright:
-        found = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        found = playwright.chromium.launch(
+            executable_path=CHROMIUM, args=["--no-sandbox"], timeout=1000 * PATIENCE
+        )
         yield found
         found.close()
 
@@ -30,6 +34,7 @@ class Tab:
     def __init__(self, browser: Browser, *, wide: int = 1280, high: int = 800, dark: bool = False) -> None:
         size: Any = {"width": wide, "height": high}
         self.context = browser.new_context(viewport=size, color_scheme="dark" if dark else "light")
+        self.context.set_default_timeout(1000 * PATIENCE)
         self.page: Page = self.context.new_page()
         self.asked: list[str] = []
         self.wrong: list[str] = []
@@ -42,9 +47,9 @@ class Tab:
         """The value of an expression in the page."""
         return self.page.evaluate(f"() => {expression}")
 
-    def until(self, expression: str, seconds: float = 120.0) -> None:
+    def until(self, expression: str) -> None:
         """Wait until it is true."""
-        deadline = time.monotonic() + seconds
+        deadline = time.monotonic() + PATIENCE
         while not self.tell(f"Boolean({expression})"):
             if time.monotonic() > deadline:
                 said = self.tell("document.body.innerText")

@@ -1,4 +1,4 @@
-"""A real PostgreSQL of its own, on a free port, that can be stopped, started and made to drop connections."""
+"""A real PostgreSQL of its own that can be stopped, started and made to drop connections."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import contextlib
 import glob
 import os
 import shutil
-import socket
 import subprocess
 import tempfile
 import time
@@ -15,12 +14,17 @@ from typing import Any
 
 import pytest
 
+from tests.service.servers import PATIENCE
+
 BINARIES = next(iter(sorted(glob.glob("/usr/lib/postgresql/*/bin"), reverse=True)), None)
 needed = pytest.mark.skipif(BINARIES is None, reason="no PostgreSQL is installed: apt-get install postgresql")
 
 
 class Postgres:
-    """A context manager; `url(role)` reaches it, as a role that is made then."""
+    """A context manager; `url(role)` reaches it, as a role that is made then.
+
+    It listens on a socket in its own folder: nobody else takes that while it is stopped, as they may a port.
+    """
 
     def __init__(self) -> None:
         # it refuses to be root's; the folder is short, as a socket's name must be, and its user's
@@ -28,33 +32,26 @@ class Postgres:
         self._folder = Path(tempfile.mkdtemp(prefix="pg"))
         if self._user:
             shutil.chown(self._folder, **self._user)
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            self._port = free.getsockname()[1]
         self._tool("initdb", "--auth=trust", "--username=owner", "--no-sync", "-D", f"{self._folder}/data")
         self.start()
 
     def start(self) -> None:
         """Begin to serve."""
-        options = f"-p {self._port} -k {self._folder} -c listen_addresses=127.0.0.1 -c fsync=off"
-        self._tool(
-            "pg_ctl", "-w", "-D", f"{self._folder}/data", "-l", f"{self._folder}/log", "-o", options, "start"
-        )
+        options = f"-k {self._folder} -c listen_addresses='' -c fsync=off"
+        self._control("-l", f"{self._folder}/log", "-o", options, "start")
 
     def stop(self) -> None:
         """End at once, connections and all."""
-        self._tool("pg_ctl", "-w", "-m", "immediate", "-D", f"{self._folder}/data", "stop")
+        self._control("-m", "immediate", "stop")
 
     def url(self, role: str) -> str:
         """The database, as SQLAlchemy names it."""
         self.sql(f"CREATE ROLE {role} SUPERUSER LOGIN")
-        return f"postgresql+psycopg://{role}@127.0.0.1:{self._port}/postgres"
+        return f"postgresql+psycopg://{role}@/postgres?host={self._folder}"
 
     def sql(self, text: str) -> str:
         """What it answers."""
-        return self._tool(
-            "psql", "-h", "127.0.0.1", "-p", str(self._port), "-U", "owner", "-d", "postgres", "-Atc", text
-        )
+        return self._tool("psql", "-h", str(self._folder), "-U", "owner", "-d", "postgres", "-Atc", text)
 
     def drop(self, role: str) -> None:
         """End the connections of a role."""
@@ -72,6 +69,9 @@ class Postgres:
     def __exit__(self, *error: object) -> None:
         self.close()
 
+    def _control(self, *arguments: str) -> None:
+        self._tool("pg_ctl", "-w", "-t", f"{PATIENCE:g}", "-D", f"{self._folder}/data", *arguments)
+
     def _tool(self, name: str, *arguments: str) -> str:
         command = [f"{BINARIES}/{name}", *arguments]
         output: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
@@ -80,9 +80,9 @@ class Postgres:
         return subprocess.run(command, check=True, cwd="/", **output, **self._user).stdout or ""
 
 
-def until(true: Any, seconds: float = 120.0) -> None:
+def until(true: Any) -> None:
     """Wait until `true()` is."""
-    deadline = time.monotonic() + seconds
+    deadline = time.monotonic() + PATIENCE
     while not true():
         assert time.monotonic() < deadline, "it never came to be"
         time.sleep(0.05)

@@ -22,6 +22,7 @@ import cosim
 from cosim.errors import BadInput, SimulationCrashed
 from cosim.service import client, uploads
 from cosim.service.confined import Room, allow_processor_time
+from cosim.service.processes import Processes
 from cosim.service.settings import DataFolder, Limits, Settings
 from cosim.service.uploads import Uploads
 from cosim.workers.worker import Worker
@@ -178,7 +179,7 @@ def test_an_upload_that_ends_or_stops_its_process_is_refused(
     sent = tmp_path / "sent.zip"
     sent.write_bytes(archive(GOOD))
     with DataFolder(str(tmp_path / "data")) as folder:
-        kept = Uploads(Settings(folder.path, limits=Limits(check=limit)))
+        kept = Uploads(Settings(folder.path, limits=Limits(check=limit)), Processes())
         with pytest.raises(BadInput, match=says):
             kept.add(sent, "scenario", "")
         assert kept.all() == []

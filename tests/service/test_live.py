@@ -17,7 +17,8 @@ from cosim.policies import make
 from cosim.service import client
 from cosim.service.live import KEPT, Viewer
 from cosim.service.watch import Scene, tally
-from tests.service.servers import Server
+from tests.service.postgres import until
+from tests.service.servers import PATIENCE, Server
 
 WORDS: dict[str, Any] = {"scenario": "merge", "demand": "contested", "duration": 4.0, "warmup": 5.0}
 SECRET = "a-secret-of-the-tests"
@@ -30,11 +31,12 @@ def opened(server: Server, **words: Any) -> str:
 
 
 def watching(server: Server, session: str, **options: Any) -> ClientConnection:
-    return connect(f"ws{server.url[4:]}/api/sessions/{session}/live", max_size=None, **options)
+    address = f"ws{server.url[4:]}/api/sessions/{session}/live"
+    return connect(address, max_size=None, open_timeout=PATIENCE, ping_timeout=PATIENCE, **options)
 
 
 def told(socket: ClientConnection) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads(socket.recv(timeout=120.0))
+    found: dict[str, Any] = json.loads(socket.recv(timeout=PATIENCE))
     return found
 
 
@@ -159,8 +161,9 @@ def test_a_program_s_session_is_watched_by_many_and_driven_by_it_alone(server: S
                 message = told(late)
                 assert message["steps"] == [b[-1]]
                 assert len([row for kind, row in message["add"] if kind == "vehicles"]) > 5
-            listed = server.http.get(f"/api/sessions/{one['id']}").json()
-            assert (listed["watched"], listed["program"]) == (2, True)
+            listed = f"/api/sessions/{one['id']}"
+            until(lambda: server.http.get(listed).json()["watched"] == 2)
+            assert server.http.get(listed).json()["program"]
             session.close()
             assert told(first) == {"ended": "closed"}
 
@@ -171,7 +174,7 @@ def test_nonsense_ends_the_connection_and_an_unknown_session_is_named(server: Se
         with watching(server, session) as socket:
             socket.send(nonsense)
             with pytest.raises(Exception, match="4400"):
-                socket.recv(timeout=20.0)
+                socket.recv(timeout=PATIENCE)
     server.http.delete(f"/api/sessions/{session}")
     with watching(server, session) as socket:
         assert told(socket) == {"ended": f"no session '{session}' is open"}

@@ -16,7 +16,7 @@ from schemathesis.specs.openapi.checks import (
     status_code_conformance,
 )
 
-from tests.service.servers import Server
+from tests.service.servers import PATIENCE, Server
 from tests.service.test_uploads import GOOD, send
 
 CHECKS = [
@@ -78,7 +78,7 @@ def test_nothing_that_the_document_allows_is_a_server_error(
                 case.query |= {"a": ids["run"], "b": ids["run"]}
             if case.path in ("/api/runs", "/api/estimates") and isinstance(case.body, dict):
                 case.body |= {"duration": 1, "warmup": 0, "seeds": "0:1", "policy": "idm"}  # a second of work
-            case.call_and_validate(checks=CHECKS, timeout=60.0)
+            case.call_and_validate(checks=CHECKS, timeout=PATIENCE)
 
         call()
 

@@ -30,9 +30,8 @@ def test_runs_on_ray_are_those_of_this_machine(server: Server, tmp_path: Path) -
     runs = {seed: cluster.submit(**SHORT, seeds=f"{seed}:{seed + 1}") for seed in undisturbed}
     cluster.wait(endless, "running")
     time.sleep(5.0)  # it is driven, or its actors start
-    began = time.monotonic()
-    assert cluster.http.post(f"/api/runs/{endless}/cancel").json()["status"] == "cancelled"
-    assert time.monotonic() - began < 10.0
+    cluster.http.post(f"/api/runs/{endless}/cancel")
+    assert cluster.wait(endless)["status"] == "cancelled"
     estimate = cluster.http.post("/api/estimates", json=SHORT).json()
     assert estimate["estimated_s"] > 0.0
     cluster.wait(runs[200000])

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from tests.service.postgres import until
 from tests.service.servers import Server
 from tests.service.test_uploads import GOOD, send
 
@@ -44,7 +45,7 @@ def test_a_replay_is_the_page_of_its_episode_and_is_kept(server: Server, finishe
     assert replay(server, finished, row["key"]).text == "kept"
     names = [entry["name"] for entry in server.http.get(f"/api/runs/{finished}/files").json()]
     assert kept.name in names
-    assert not [*(server.data / "scratch").glob("tmp*")]
+    until(lambda: not [*(server.data / "scratch").glob("tmp*")])
 
 
 def test_a_seed_names_an_episode_where_only_one_has_it(server: Server, finished: str) -> None:
@@ -74,7 +75,7 @@ def test_what_is_not_there_has_no_replay(
 
 
 def test_a_run_that_has_not_finished_has_no_replay(server: Server) -> None:
-    run = server.submit(scenario="merge", duration=3000)
+    run = server.submit(scenario="merge", duration=80_000)
     answer = replay(server, run, 200000)
     assert (answer.status_code, "has no replays" in answer.json()["problem"]) == (409, True)
     server.http.post(f"/api/runs/{run}/cancel")

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
 import signal
-import time
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from cosim.envs.session import Session
 from cosim.errors import BadInput, SimulationError
 from cosim.service import client, wire
 from cosim.types import ContinuousAction, MetaAction
+from tests.service.postgres import until
 from tests.service.servers import Server
 
 WORDS: dict[str, Any] = {"demand": "contested", "duration": 4.0, "svo": 30.0, "warmup": 5.0}
@@ -104,23 +105,26 @@ def test_a_session_of_nonsense_names_the_field(server: Server, body: dict[str, A
 
 
 def test_an_idle_session_ends_by_itself_and_a_dead_one_begins_anew(server: Server) -> None:
-    with client.open(server.url, "merge", **WORDS, idle_s=2.0) as session:
+    with client.open(server.url, "merge", **WORDS) as session:
         session.reset(1)
         os.kill(youngest_child(server.process.pid), signal.SIGKILL)
         with pytest.raises(SimulationError, match="the simulation failed"):
             session.act({})
+    before = {one["id"] for one in server.http.get("/api/sessions").json()}
     with client.open(server.url, "merge", **WORDS, idle_s=1.0) as session:
-        session.reset(1)
-        time.sleep(3.5)
+        until(lambda: {one["id"] for one in server.http.get("/api/sessions").json()} <= before)
         with pytest.raises(BadInput, match="is open"):
-            session.act({})
+            session.reset(1)
 
 
 def youngest_child(pid: int) -> int:
     """The process that it started last."""
-    tasks = Path(f"/proc/{pid}/task").iterdir()
-    found = [int(child) for task in tasks for child in (task / "children").read_text().split()]
-    return max(found, key=lambda child: int(Path(f"/proc/{child}/stat").read_text().split()[21]))
+    began = {}
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        with contextlib.suppress(OSError):  # a thread or a process that ended meanwhile
+            for child in map(int, (task / "children").read_text().split()):
+                began[child] = int(Path(f"/proc/{child}/stat").read_text().split()[21])
+    return max(began, key=lambda child: began[child])
 
 
 def test_no_server_is_one_sentence() -> None:

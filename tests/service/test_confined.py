@@ -13,18 +13,24 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import cosim
+from cosim.batch.matrix import Cell, Plan
 from cosim.errors import BadInput, SimulationCrashed
-from cosim.service import client, uploads
+from cosim.scenario import load
+from cosim.scenario.episode_id import EpisodeId
+from cosim.service import clerk, client, uploads
+from cosim.service.clerk import Clerks
 from cosim.service.confined import Room, allow_processor_time
 from cosim.service.processes import Processes
 from cosim.service.settings import DataFolder, Limits, Settings
 from cosim.service.uploads import Uploads
+from cosim.workers.untrusted import untrusted
 from cosim.workers.worker import Worker
 from tests.service.servers import Server
 from tests.service.test_live import drawn, told, watching
@@ -184,6 +190,63 @@ def test_an_upload_that_ends_or_stops_its_process_is_refused(
             kept.add(sent, "scenario", "")
         assert kept.all() == []
         assert [*(folder.path / "uploads").iterdir(), *(folder.path / "scratch").iterdir()] == []
+
+
+@untrusted
+class Planning:
+    """A planner that an upload has taken over."""
+
+    def __init__(self, room: Room) -> None:
+        room.enter()
+
+    def plan_again(self, cases: list[EpisodeId], _: range) -> Plan:
+        """Of something else, without end."""
+        other = replace(cases[0], what="/etc/passwd")
+        return Plan((Cell(other, load("merge"), {}),), range(10**15))
+
+
+@untrusted
+class Dying(Planning):
+    def plan_again(self, *_: object) -> Plan:
+        os._exit(7)
+
+
+@untrusted
+class Waiting(Planning):
+    def plan_again(self, *_: object) -> Plan:
+        signal.pause()
+        raise AssertionError
+
+
+def planned(place: Path, limit: float = 120.0) -> Plan:
+    """A plan of two seeds of a case; a check has `limit` s."""
+    with DataFolder(str(place / "data")) as folder:
+        clerks = Clerks(Settings(folder.path, limits=Limits(check=limit)), Processes())
+        try:
+            return clerks.plan_again([EpisodeId("merge", "idm", 7)], range(7, 9), ["0" * 12])
+        finally:
+            clerks.close()
+
+
+def test_a_plan_is_of_what_was_asked_for_whatever_its_process_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(clerk, "confined_planner", Planning)
+    plan = planned(tmp_path)
+    assert [cell.case.what for cell in plan.cells] == ["merge"]
+    assert plan.seeds == range(7, 9)
+
+
+@pytest.mark.parametrize(
+    ("planner", "limit", "says"),
+    [(Dying, 120.0, "ends the process that reads it"), (Waiting, 5.0, "takes more than 5 s")],
+)
+def test_an_upload_that_ends_or_stops_its_planner_is_bad_input(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, planner: type, limit: float, says: str
+) -> None:
+    monkeypatch.setattr(clerk, "confined_planner", planner)
+    with pytest.raises(BadInput, match=says):
+        planned(tmp_path, limit)
 
 
 def test_a_confined_session_is_an_unconfined_one_to_the_last_bit(server: Server, tmp_path: Path) -> None:

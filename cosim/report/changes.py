@@ -42,13 +42,14 @@ class Changes:
 
 
 def changes(figures: Mapping[str, PairedFigure]) -> Changes:
-    """Those of `IN_WORDS` that apply."""
+    """Those of `IN_WORDS` that apply; one pair cannot show that there is no difference."""
     found: dict[str, list[str]] = {GOOD: [], BAD: [], "": []}
     for name, words in IN_WORDS.items():
         if name in figures and (figure := figures[name]).n:
             how = tone(figure)
-            value = wording.interval(figure.difference, figure.measure, signed=True)
-            found[how].append(f"{words} {value}" if how else words)
+            value = wording.interval(figure.difference, figure.measure, signed=True, n=figure.n)
+            if how or figure.n >= wording.SEVERAL:
+                found[how].append(f"{words} {value}" if how else words)
     return Changes(found[GOOD], found[BAD], found[""])
 
 

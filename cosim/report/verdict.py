@@ -1,6 +1,7 @@
 """A comparison for people and machines: text for a terminal, Markdown for a pull request, JSON, JUnit."""
 
 import re
+import textwrap
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -18,6 +19,7 @@ from cosim.report.result import EVERYBODY, LAW
 
 _MARK = {PASSED: "pass", FAILED: "FAIL", SKIPPED: "n/a "}
 _EMOJI = {PASSED: "✅ pass", FAILED: "❌ **fail**", SKIPPED: "n/a"}
+COLUMNS = 100  # of a terminal
 _SHOWN = 20  # failed simulations and cells of one side that are listed by name
 _NOT_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
@@ -50,7 +52,7 @@ def text(comparison: Comparison) -> str:
     lines = [f"A  {comparison.a}", f"B  {comparison.b}", *_unfinished(comparison), ""]
     for compared in comparison.groups:
         said = (*_notes(compared), *changes(compared.figures).lines)
-        lines += [compared.group.name, *(f"  {note}" for note in said)]
+        lines += [compared.group.name, *(part for note in said for part in _wrapped(note))]
         table = [("", "A", "B", "B - A"), *(_cells(figure) for figure in _shown(comparison, compared))]
         widths = [max(len(row[k]) for row in table) for k in range(4)]
         lines += [
@@ -123,6 +125,15 @@ def junit(comparison: Comparison, path: Path) -> None:
 # ---- inside ----
 
 
+def _pairs(count: int) -> str:
+    return f"{count} pair{'s' * (count != 1)}"
+
+
+def _wrapped(note: str) -> list[str]:
+    indent = {"initial_indent": "  ", "subsequent_indent": "    "}
+    return textwrap.wrap(note, COLUMNS, break_on_hyphens=False, break_long_words=False, **indent)
+
+
 def _clean(text: str) -> str:
     """Without the characters that XML has no place for."""
     return _NOT_XML.sub("?", text)
@@ -170,27 +181,25 @@ def _cells(figure: PairedFigure) -> tuple[str, str, str, str]:
     m = figure.measure
     arrow = {"higher": " ↑", "lower": " ↓"}.get(m.better, "")
     counts = [f", {count}" if count else "" for count in figure.counts]
-    difference = wording.interval(figure.difference, m, signed=True)
-    if figure.p is not None:
+    n, named = figure.n, m.is_share  # the unit stands beside the difference, of an incidence in the name
+    difference = wording.interval(figure.difference, m, signed=True, unit=not m.per, n=n)
+    if figure.p is not None and n >= wording.SEVERAL:
         difference += f", {wording.p_value(figure.p)}"
     if figure.na:
-        difference += f", {figure.n} pairs"
-    return (
-        m.name + arrow,
-        wording.interval(figure.a, m) + counts[0],
-        wording.interval(figure.b, m) + counts[1],
-        difference,
-    )
+        difference += f", {n} pairs"
+    a, b = (wording.interval(side, m, unit=named, n=n) for side in (figure.a, figure.b))
+    return m.name + arrow, a + counts[0], b + counts[1], difference
 
 
 def _notes(compared: Compared) -> list[str]:
     """What a reader must know before the figures."""
     group = compared.group
-    notes = [f"{len(group.pairs)} pairs, A {who(group.a)}, B {who(group.b)}"]
+    one = " (one cannot tell a difference from chance)" * (len(group.pairs) == 1)
+    notes = [f"{_pairs(len(group.pairs))}{one}, A {who(group.a)}, B {who(group.b)}"]
     counted = {
-        f"{group.identical} pairs drove exactly alike (same trace hash)": group.identical,
-        f"{group.not_comparable} pairs hold an episode that says it is not comparable": group.not_comparable,
-        f"{group.mission_guessed} pairs have a guessed mission vehicle: its figures feed no gate": (
+        f"{_pairs(group.identical)} drove exactly alike (same trace hash)": group.identical,
+        f"{_pairs(group.not_comparable)} with an episode that is not comparable": group.not_comparable,
+        f"{_pairs(group.mission_guessed)} with a guessed mission vehicle: its figures feed no gate": (
             group.mission_guessed
         ),
         f"{group.unpaired[0]} episodes of A have no partner and do not count": group.unpaired[0],

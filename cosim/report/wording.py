@@ -8,6 +8,7 @@ from cosim.report.figures import Measure
 from cosim.report.statistics import Figure
 
 NA_TEXT = "NA"
+SEVERAL = 2  # episodes from which on an interval says something
 
 
 def number(
@@ -31,26 +32,34 @@ def change(value: float) -> str:
     return NA_TEXT if math.isnan(value) else f"{_digits(100.0 * value, True, 1)} %"
 
 
-def interval(figure: Figure, measure: Measure, *, signed: bool = False) -> str:
-    """`12.5 % (4.4 to 26.1)`, to two digits of the interval's width; bare where there is no interval."""
+def interval(
+    figure: Figure, measure: Measure, *, signed: bool = False, unit: bool = True, n: int = SEVERAL
+) -> str:
+    """`12.5 % (4.4 to 26.1)`, to two digits of the interval's width.
+
+    Bare where an interval would say nothing: it has no width, or fewer than `SEVERAL` episodes or pairs
+    (`n`) are behind it.
+    """
     width = (figure.high - figure.low) * (100.0 if measure.is_share else 1.0)
-    if not figure.known or not 0.0 < width < math.inf:
-        return number(figure.value, measure, signed=signed)
+    if n < SEVERAL or not figure.known or not 0.0 < width < math.inf:
+        return number(figure.value, measure, signed=signed, unit=unit)
     places = min(max(1 - math.floor(math.log10(width)), 1 if measure.is_share else 0), 4)
     value, low, high = (
-        number(x, measure, signed=signed, unit=unit, places=places)
-        for x, unit in ((figure.value, True), (figure.low, False), (figure.high, False))
+        number(x, measure, signed=signed, unit=named, places=places)
+        for x, named in ((figure.value, unit), (figure.low, False), (figure.high, False))
     )
     return f"{value} ({low} to {high})"
 
 
 def sample(counts: Mapping[str, Any]) -> str:
-    """`3/40` of a rate, `12 in 3.4 h` of an incidence, `n 40` of a mean, with the NA beside them."""
+    """`3/40` of a rate, `12 in 3.4 h` of an incidence, `n 40` of a mean where others are NA."""
     if counts.get("events") is not None:
         text = events(counts["events"], counts["exposure"], counts["per"])
         return f"{text}, {counts['na']} NA" if counts.get("na") else text
-    text = f"{counts['hits']}/{counts['n']}" if counts.get("hits") is not None else f"n {counts['n']}"
-    return f"{text}, {counts['na']} NA" if counts.get("na") else text
+    if counts.get("hits") is not None:
+        text = f"{counts['hits']}/{counts['n']}"
+        return f"{text}, {counts['na']} NA" if counts.get("na") else text
+    return f"n {counts['n']}, {counts['na']} NA" if counts.get("na") else ""
 
 
 def events(count: int, exposure: float, per: str) -> str:

@@ -203,6 +203,17 @@ def test_what_applies_to_one_side_only_is_left_out_and_counted(tmp_path: Path) -
     assert figure.difference.value == 10.0
 
 
+def test_one_pair_has_no_interval_and_shows_no_difference(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = write(tmp_path / "run", cell("idm", 1), cell("rash", 1))
+    _, out, _ = run(capsys, f"{folder}:idm", f"{folder}:rash")
+    assert "1 pair (one cannot tell a difference from chance)" in out
+    assert "no difference shown" not in out
+    assert " to " not in out.split("B - A")[1]
+    assert ", p " not in out
+
+
 # ---- near-misses ----
 
 
@@ -230,9 +241,9 @@ def test_near_misses_are_compared_per_vehicle_hour(near: Path, capsys: pytest.Ca
     code, out, _ = run(capsys, f"{near}:idm", f"{near}:rash")
     assert code == 0
     (line,) = [line for line in out.splitlines() if "near_misses_ttc_per_vehicle_hour" in line]
-    assert "6.0 per vehicle-hour (4.0 to 8.6), 30 in 5 h" in line
-    assert "8.0 per vehicle-hour (5.7 to 10.9), 40 in 5 h" in line
-    assert "+2.0 per vehicle-hour" in line
+    assert "6.0 (4.0 to 8.6), 30 in 5 h" in line
+    assert "8.0 (5.7 to 10.9), 40 in 5 h" in line
+    assert "+2.0 (" in line
     assert "near_misses_drac_per_vehicle_hour" in out
     assert "near_misses_pet" not in out  # none on either side
 
@@ -409,7 +420,7 @@ def test_pairs_that_must_not_be_compared_are_said(tmp_path: Path, capsys: pytest
     columns = {"comparable": [False, True, True]}
     folder = write(tmp_path / "run", cell("idm", 3), cell("rash", 3, columns=columns))
     _, out, _ = run(capsys, f"{folder}:idm", f"{folder}:rash")
-    assert "1 pairs hold an episode that says it is not comparable" in out
+    assert "1 pair with an episode that is not comparable" in out
 
 
 @pytest.mark.parametrize("threshold", ["mission_success_rate < -10pp", "dt_mission_m < -5%"])
@@ -424,7 +435,7 @@ def test_a_guessed_mission_vehicle_feeds_no_gate(
     assert "--mission ID" in said
     code, out, _ = run(capsys, f"{folder}:idm", f"{folder}:rash", "--fail-on", "dt_av_m < -5%")
     assert code == 0
-    assert "2 pairs have a guessed mission vehicle" in out
+    assert "2 pairs with a guessed mission vehicle" in out
 
 
 def test_a_file_that_an_earlier_version_named_without_its_folder_is_the_same_world(tmp_path: Path) -> None:

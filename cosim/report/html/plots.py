@@ -18,7 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from cosim.report import statistics
+from cosim.report import statistics, wording
 from cosim.report.html.blocks import Block, Series
 
 CRITICAL = 1.5  # s, below it a conflict is serious (cosim.metrics.time_to_collision)
@@ -104,8 +104,9 @@ def _figures(series: list[Series], name: str, title: str, label: str, note: str)
         if not f.get("n"):
             return "NA"
         value, low, high = (100 * (f["value"] if f[k] is None else f[k]) for k in ("value", "low", "high"))
-        style: Any = {"linewidth": 2.5, "alpha": 0.55, "solid_capstyle": "round"}
-        axes.plot([low, high], [place, place], color=colour, **style)
+        if f["n"] >= wording.SEVERAL:
+            style: Any = {"linewidth": 2.5, "alpha": 0.55, "solid_capstyle": "round"}
+            axes.plot([low, high], [place, place], color=colour, **style)
         axes.plot([value], [place], "o", markersize=6.5, color=colour, clip_on=False, zorder=3)
         return f"n {f['n']}" if f.get("hits") is None else f"{f['hits']}/{f['n']}"
 

@@ -190,10 +190,10 @@ def _figure(counts: dict[str, Any], measure: Measure) -> Cell:
     if not n:
         return Cell(wording.NA_TEXT, "", (f"{na} NA",) if na else ())
     value, low, high = (math.nan if counts[k] is None else counts[k] for k in ("value", "low", "high"))
-    text, bounds = _split(wording.interval(Figure(value, low, high), measure))
-    if counts.get("rule_of_three") is not None:
+    text, bounds = _split(wording.interval(Figure(value, low, high), measure, n=n))
+    if (counts.get("rule_of_three") or 1.0) < 1.0:
         bounds = f"below {100 * counts['rule_of_three']:.3g} % (3/n)"
-    elif not bounds and n > 1 and counts.get("hits") is None:
+    elif value and not bounds and n >= wording.SEVERAL and counts.get("hits") is None:
         bounds = "all alike"
     return Cell(text, repr(value), tuple(filter(None, (bounds, wording.sample(counts)))))
 
@@ -201,9 +201,10 @@ def _figure(counts: dict[str, Any], measure: Measure) -> Cell:
 def _difference(figure: PairedFigure) -> Cell:
     if not figure.n:
         return Cell(wording.NA_TEXT, "")
-    text, bounds = _split(wording.interval(figure.difference, _bare(figure.measure), signed=True))
-    p = "" if figure.p is None else wording.p_value(figure.p)
-    pairs = f"{figure.n} pairs" if figure.na else ""
+    n = figure.n
+    text, bounds = _split(wording.interval(figure.difference, _bare(figure.measure), signed=True, n=n))
+    p = "" if figure.p is None or n < wording.SEVERAL else wording.p_value(figure.p)
+    pairs = f"{n} pairs" if figure.na else ""
     small = tuple(filter(None, (bounds, ", ".join(filter(None, (p, pairs))))))
     return Cell(text, repr(figure.difference.value), small, tone(figure))
 

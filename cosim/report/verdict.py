@@ -130,8 +130,8 @@ def _pairs(count: int) -> str:
 
 
 def _wrapped(note: str) -> list[str]:
-    indent = {"initial_indent": "  ", "subsequent_indent": "    "}
-    return textwrap.wrap(note, COLUMNS, break_on_hyphens=False, break_long_words=False, **indent)
+    wrapper = textwrap.TextWrapper(COLUMNS, "  ", "    ", break_on_hyphens=False, break_long_words=False)
+    return wrapper.wrap(note)
 
 
 def _clean(text: str) -> str:

@@ -43,7 +43,8 @@ def forked_workers() -> Iterator[None]:
     """Workers fork from a process that has loaded SUMO and torch: 0.2 s of a core a start, not 0.9 to 3.
 
     Where a test changes the environment, they are spawned as a user's are; so are those of every `cosim`
-    that a test runs as a program.
+    that a test runs as a program, and those of batches, which end with the process that started them
+    (`cosim.workers.supervisor`).
     """
     spawn, fork = workers._CONTEXT, multiprocessing.get_context("forkserver")
     fork.set_forkserver_preload(
@@ -56,7 +57,8 @@ def forked_workers() -> Iterator[None]:
 
         @staticmethod
         def Process(**options: Any) -> multiprocessing.process.BaseProcess:
-            return (fork if variables() == begun_with else spawn).Process(**options)
+            alone = options["name"] == "cosim-evaluation" or variables() != begun_with
+            return (spawn if alone else fork).Process(**options)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(workers, "_CONTEXT", Context)

@@ -51,7 +51,7 @@ def add(commands: arguments.SubCommands) -> None:
     arguments.texts(compare, once)
     arguments.texts(compare, repeatable, action="append", default=[])
     compare.add_argument(
-        "--partial", action="store_true", help="judge an unfinished batch by the episodes that there are"
+        "--partial", action="store_true", help="judge an unfinished batch by its finished episodes"
     )
     arguments.add(compare, "--json")
     compare.set_defaults(work=work)

@@ -17,8 +17,8 @@ def add(commands: arguments.SubCommands) -> None:
     """Register the command and its flags."""
     metrics = commands.add_parser(
         "metrics",
-        help="time to collision, PET, DRAC, ... of existing floating-car data",
-        description="Read SUMO's fcd-output (.xml or .xml.gz, any size) and count what `cosim run` counts.",
+        help="measure time to collision, PET, DRAC, ... in existing floating-car data",
+        description="Read SUMO's fcd-output (.xml, .xml.gz, any size) and compute the figures of `cosim run`.",
     )
     metrics.add_argument("fcd", metavar="FCD", help="the file that SUMO's --fcd-output wrote")
     metrics.add_argument(
@@ -31,20 +31,20 @@ def add(commands: arguments.SubCommands) -> None:
     arguments.add(
         metrics,
         "--av-type",
-        help="measure the vehicles of this vType (cosim.: all AVs of a run of ours); default: all",
+        help="measure the vehicles of this vType (cosim.: every AV that cosim drove); default: all",
     )
     arguments.add(metrics, "--av-ids", help="measure the vehicles whose id matches")
     metrics.add_argument(
-        "--begin", type=float, default=-math.inf, metavar="S", help="leave out what is earlier"
+        "--begin", type=float, default=-math.inf, metavar="S", help="leave out frames before S"
     )
-    metrics.add_argument("--end", type=float, default=math.inf, metavar="S", help="leave out what is later")
+    metrics.add_argument("--end", type=float, default=math.inf, metavar="S", help="leave out frames after S")
     metrics.add_argument(
         "--frame", type=arguments.positive, metavar="S", help="s between frames (default: 0.2, or the file's)"
     )
     more = {
-        "--net": ("NET", "the .net.xml: bridges and lane successions"),
+        "--net": ("NET", "the .net.xml: tells bridges and lane successions"),
         "--mission": ("REGEX", "measure these too, as mission vehicles"),
-        "--conflicts": ("CSV", "write every conflict there: who, when, where, how close, of which type"),
+        "--conflicts": ("CSV", "write every conflict to this file: vehicles, time, place, distance, type"),
     }
     arguments.texts(metrics, more)
     metrics.add_argument(

@@ -14,9 +14,9 @@ def add(commands: arguments.SubCommands) -> None:
     replay = commands.add_parser(
         "replay",
         help="draw an episode of a run as an interactive page and a film",
-        description="Drive an episode once more from its manifest, check that it is the same (exit code 1 "
-        "when it is not), and draw it: an HTML file that needs no network, and an MP4. With --beside the "
-        "film shows what another policy makes of the same traffic and seed, one above the other.",
+        description="Drive an episode again from its manifest, compare the trace hash (exit code 1 if it "
+        "differs), and draw the episode: an HTML page that needs no network, and an MP4. With --beside the "
+        "film shows another policy in the same traffic, one above the other.",
     )
     replay.add_argument("run", metavar="RUN", help="folder of `cosim run --out` or of `cosim evaluate`")
     replay.add_argument(
@@ -27,12 +27,12 @@ def add(commands: arguments.SubCommands) -> None:
         {
             "--html": ("FILE", "the page (default: replay*.html in RUN)"),
             "--mp4": ("FILE", "the film (default: replay*.mp4 in RUN)"),
-            "--gif": ("FILE", "a small picture that moves, for a page or a slide"),
-            "--beside": ("POLICY", "drive it with this policy too, film both"),
-            "--follow": ("ID", "whom the film follows (default: the mission vehicle)"),
+            "--gif": ("FILE", "a small animation, for a page or a slide"),
+            "--beside": ("POLICY", "drive the same traffic with this policy too, film both"),
+            "--follow": ("ID", "the vehicle that the film follows (default: the mission vehicle)"),
         },
     )
-    replay.add_argument("--no-check", action="store_true", help="draw it even when it is another one")
+    replay.add_argument("--no-check", action="store_true", help="draw it even if the trace hash differs")
     replay.set_defaults(work=work)
 
 

@@ -12,7 +12,7 @@ def add(commands: arguments.SubCommands) -> None:
         "report",
         help="write a run's report: one HTML file",
         description="Write report.html: tables with intervals, plots, worst episodes, manifest. The file "
-        "needs no network. Of an unfinished run: of the episodes that there are.",
+        "needs no network. An unfinished run is reported as far as it is driven.",
     )
     report.add_argument("run", metavar="DIR", help="run folder of `cosim evaluate`")
     arguments.add(report, "--out", metavar="FILE", help="write it here (default: DIR/report.html)")

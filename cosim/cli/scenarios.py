@@ -1,4 +1,4 @@
-"""`cosim scenarios`: the worlds and their demands, for people and for machines."""
+"""`cosim scenarios`: the scenarios and their demands, for people and for machines."""
 
 import argparse
 import json
@@ -9,7 +9,11 @@ from cosim.cli import arguments
 
 def add(commands: arguments.SubCommands) -> None:
     """Register the command and its flags."""
-    scenarios = commands.add_parser("scenarios", help="list the worlds and their demands")
+    scenarios = commands.add_parser(
+        "scenarios",
+        help="list the scenarios and their demands",
+        description="List the scenarios that ship: demands, mission, duration, preset.",
+    )
     arguments.add(scenarios, "--json")
     scenarios.set_defaults(work=work)
 

@@ -57,7 +57,8 @@ def add(commands: arguments.SubCommands) -> None:
         "doctor",
         help="check this installation and say how to fix it",
         description="Check Python, libraries, SUMO and caches, and simulate a second. Each fault is named "
-        "with its remedy; exit code 3 if there is one. With WHAT check whether the lanes of one network are far enough apart.",
+        "with its remedy; exit code 3 if there is one. With WHAT check whether the lanes of one network "
+        "are far enough apart.",
     )
     doctor.add_argument(
         "scenario", nargs="?", metavar="WHAT", help="a scenario's name, its folder or a .sumocfg"

@@ -18,7 +18,7 @@ def add(commands: arguments.SubCommands) -> None:
     metrics = commands.add_parser(
         "metrics",
         help="measure time to collision, PET, DRAC, ... in existing floating-car data",
-        description="Read SUMO's fcd-output (.xml, .xml.gz, any size) and compute the figures of `cosim run`.",
+        description="Read SUMO's fcd-output (.xml, .xml.gz, any size), compute the figures of `cosim run`.",
     )
     metrics.add_argument("fcd", metavar="FCD", help="the file that SUMO's --fcd-output wrote")
     metrics.add_argument(

@@ -47,9 +47,7 @@ def forked_workers() -> Iterator[None]:
     (`cosim.workers.supervisor`).
     """
     spawn, fork = workers._CONTEXT, multiprocessing.get_context("forkserver")
-    fork.set_forkserver_preload(
-        ["cosim.batch.episode_runner", "cosim.simulation.sumo", "policy.agents.prediction_aware"]
-    )
+    fork.set_forkserver_preload(["tests.forked"])
     begun_with = variables()
 
     class Context:

@@ -156,15 +156,18 @@ def engine_of(args: argparse.Namespace) -> Engine:
 
 def _drive(plan: Plan, engine: Engine, store: Store, folder: Path, args: argparse.Namespace) -> int:
     found = driven("evaluate", plan, engine, store, folder)
+    report = None
     if not args.no_report:
         from cosim.report import html, run_folder  # matplotlib: a second that only a report need pay
 
-        html.write(run_folder.read(folder), None, shown=args.out)
+        report = html.write(run_folder.read(folder), None, shown=args.out)
     found.warn()
     if args.json:
         print(json.dumps(found.summary))
     else:
         print(found.text(plan, folder))
+        if report is not None:
+            print(f"  report     {report}")
     return found.exit_code
 
 

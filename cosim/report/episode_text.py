@@ -220,7 +220,8 @@ def _notes(episodes: Sequence[EpisodeResult]) -> list[str]:
             said.append(f"corrections of {_name(one)} by the car: {words}{more}")
     result = episodes[0]
     said += [f"not comparable: {reason}" for reason in result.validity]
-    said += [f"not passed on to SUMO: {option}" for option in result.manifest["options_not_passed_on"]]
+    if left_out := result.manifest["options_not_passed_on"]:
+        said.append(_list(f"not passed on to SUMO: {', '.join(left_out)}"))
     return _wrapped(said)
 
 

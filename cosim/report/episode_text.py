@@ -26,8 +26,8 @@ ALWAYS = ("collisions", "av_caused_collisions", "mission_success")  # rows that 
 _PART = re.compile(r"^av_|_av$|_hv$|^worst|^veto")  # a row's name, of a part of another: not listed as 0
 # The rows of the table, in words.
 ROWS = {
-    "mission_success": "mission vehicle succeeded",
-    "mission_time_s": "mission vehicle succeeded after",
+    "mission_success": "mission fulfilled",
+    "mission_time_s": "mission fulfilled after",
     "dt_mission_m": "distance of the mission vehicle",
     "dt_av_m": "mean distance of AVs",
     "dt_hv_m": "mean distance of humans",
@@ -270,7 +270,7 @@ def _error(collision: Collision, begun: Sequence[HumanError]) -> str:
     """The last human error with a part in a collision, in words; nothing where there is none."""
     last = max((e for e in begun if e.had_a_part(collision)), key=lambda e: e.time, default=None)
     if last is None:
-        return ", a human had erred" * collision.human_error_involved
+        return ", after a human error" * collision.human_error_involved
     return f"; {collision.time - last.time:.1f} s before: {last.who} {last.what}"
 
 

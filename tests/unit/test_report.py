@@ -102,7 +102,7 @@ def test_figures_stand_with_intervals_and_counts(full: tuple[Path, Page]) -> Non
 def test_worst_episodes_come_with_their_replay_command(full: tuple[Path, Page]) -> None:
     text = full[1].text
     key = replace(CASE, policy="vfn-p", svo_deg=90.0).key
-    assert "AV-caused collision at 12.3 s of SUMO's clock: av.1 hit hv.7, a human had erred" in text
+    assert "AV-caused collision at 12.3 s of SUMO's clock: av.1 hit hv.7, after a human error" in text
     assert f"cosim replay 'runs/my run' {key}" in text
     assert text.index("AV-caused collision at") < text.index("time to collision down to 0.90 s")
 

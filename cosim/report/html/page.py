@@ -188,7 +188,7 @@ def _rank(row: Row) -> tuple[int, float, str]:
     what = ""
     if first is not None:
         what = f" at {when:.1f} s of SUMO's clock: {first['collider']} hit {first['victim']}"
-        what += ", a human had erred" * bool(first.get("human_error_involved"))
+        what += ", after a human error" * bool(first.get("human_error_involved"))
     if row.get("av_caused_collisions"):
         return 0, when, f"AV-caused collision{what}"
     if row.get("crashed"):

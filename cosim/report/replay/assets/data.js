@@ -158,7 +158,7 @@ const EVENTS = {
 function eventsOf(data) {
   const found = data.collisions.map((c) => ({
     t: c.t, kind: "collision", who: [c.collider, c.victim],
-    text: `${c.collider} hit ${c.victim} (${c.kind}${c.av_caused ? ", AV-caused" : ""}${c.human_error ? ", a human had erred" : ""})`,
+    text: `${c.collider} hit ${c.victim} (${c.kind}${c.av_caused ? ", AV-caused" : ""}${c.human_error ? ", after a human error" : ""})`,
   }));
   for (const one of data.violations) found.push({ t: one.t, kind: "law", who: [one.vehicle.id], text: `${one.vehicle.id} ${one.text}` });
   for (const one of data.errors) { // of the warm-up none

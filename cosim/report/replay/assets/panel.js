@@ -41,7 +41,7 @@ function fillDetails(state) {
   if (last) box.append(element("p", `${corrected ? "" : "last "}corrected by the car at ${last.t.toFixed(1)} s: ${last.text}`, corrected ? "correction" : "quiet"));
   if (broken) box.append(element("p", `${broken.text} at ${broken.t.toFixed(1)} s`, "law"));
   if (choice) fillChoice(state, box, choice, corrected);
-  else box.append(element("p", "nobody commands it: SUMO's IDM drives", "quiet"));
+  else box.append(element("p", "not commanded: SUMO's IDM drives", "quiet"));
 }
 
 function fillChoice(state, box, choice, corrected) {
@@ -160,7 +160,7 @@ function fillLegend(state) {
     ctx.strokeStyle = colour; ctx.lineWidth = 2; ctx.beginPath(); ctx.arc(10, 8, 6, 0, 7); ctx.stroke();
     ctx.setLineDash([3, 2]); ctx.beginPath(); ctx.moveTo(10, 8); ctx.lineTo(29, 8); ctx.stroke();
   };
-  if (data.vehicles.some((v) => v.choices.some((k) => k.vetoed))) entry("preferred action vetoed; line to who is blamed", ring(c.warn));
+  if (data.vehicles.some((v) => v.choices.some((k) => k.vetoed))) entry("preferred action vetoed; line to the vehicle that made it unsafe", ring(c.warn));
   if (data.vehicles.some((v) => v.choices.some((k) => k.fallback))) entry("no action was safe", ring(c.bad));
   if (data.forecasts.some(Boolean)) {
     entry(`predicted path, every second \u00b1${SIGMAS} standard deviations`, (ctx) => {
@@ -168,12 +168,12 @@ function fillLegend(state) {
       ctx.globalAlpha = 0.3; ctx.beginPath(); ctx.ellipse(20, 8, 9, 5, 0, 0, 7); ctx.fill();
     });
   }
-  if (data.errors.length) entry("a human errs; line to whom it meets first", (ctx) => {
+  if (data.errors.length) entry("human error; line to the first vehicle it affects", (ctx) => {
     ctx.strokeStyle = c.error; ctx.lineWidth = 1.5; ctx.setLineDash([2, 3]); ctx.beginPath(); ctx.moveTo(10, 8); ctx.lineTo(29, 8); ctx.stroke(); ctx.setLineDash([]);
     triangle(ctx, 10, 8, 7, c);
   });
   if (data.corrections.length) {
-    entry("its car corrected the AV", (ctx) => { ctx.strokeStyle = c.correction; ctx.lineWidth = 2; ctx.strokeRect(9, 2, 12, 12); });
+    entry("corrected by its car", (ctx) => { ctx.strokeStyle = c.correction; ctx.lineWidth = 2; ctx.strokeRect(9, 2, 12, 12); });
   }
   const line = (rule, ...states) => (ctx) => {
     ctx.translate(17, 8); ctx.scale(4, 4); ctx.strokeStyle = c.dark; ctx.lineWidth = 0.2;

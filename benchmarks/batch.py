@@ -24,11 +24,10 @@ from pathlib import Path
 from cosim.batch import execution as batch
 from cosim.batch import matrix
 from cosim.batch.episode_runner import EpisodeRunner
-from cosim.batch.spec import Spec
+from cosim.batch.record import planned
 from cosim.batch.store import Store
 from cosim.workers.engines import LocalEngine
 from cosim.workers.progress import Progress
-from policy.agents import check_name
 
 GAIN = 0.6  # of the time of one worker, at most, that two may take
 OVERHEAD = 0.05  # of the serial time, at most
@@ -75,9 +74,8 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=4)
     parser.add_argument("--json", action="store_true", help="one document in the end, and nothing else")
     args = parser.parse_args()
-    seeds = (200_000, 200_000 + args.episodes)
-    spec = Spec(("merge",), seeds, demand=(("dense",),), policy=(args.policy,), duration=args.duration)
-    plan = matrix.plan(matrix.cells(spec), range(*seeds), check_name)
+    seeds = range(200_000, 200_000 + args.episodes)
+    plan = planned(seeds, scenario="merge", demand="dense", policy=args.policy, duration=args.duration)
     runs: dict[int, list[Run]] = {1: [], 2: []}
     for k in range(args.rounds):
         for workers in (1, 2) if k % 2 == 0 else (2, 1):

@@ -29,7 +29,7 @@ from benchmarks.tables import markdown_row, write_page
 from cosim.batch.episode_runner import EpisodeRunner
 from cosim.report import statistics
 from cosim.scenario import Scenario
-from cosim.scenario.episode_id import EpisodeId
+from cosim.scenario.options import EpisodeOptions
 from cosim.scenario.vet import vetted
 from cosim.types import Preset
 from cosim.workers import tasks
@@ -53,7 +53,7 @@ Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Case(EpisodeId):
+class Case(EpisodeOptions):
     """An episode whose floating-car data hold every simulation step."""
 
     def scenario(self, options: Sequence[str] = ()) -> Scenario:

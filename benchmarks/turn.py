@@ -21,7 +21,6 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -41,9 +40,9 @@ from cosim.learning.configuration import configuration
 from cosim.learning.prediction_data import spread
 from cosim.policies import make
 from cosim.report.statistics import CONFIDENCE, RESAMPLES, Figure, holm, mean, paired_mean, share, signed_rank
-from cosim.scenario.episode_id import EpisodeId
 from cosim.scenario.human_errors import NONE
 from cosim.scenario.manifest import digests
+from cosim.scenario.options import EpisodeOptions
 from cosim.scenario.policy_name import read as read_name
 from cosim.seeding import FIRST_TEST_SEED
 from cosim.types import Floats, Ints
@@ -95,7 +94,7 @@ class Parts(Earnings):
 class Earning(EpisodeRunner):
     """Hosted by an engine's worker."""
 
-    def run(self, case: EpisodeId, progress: Progress) -> Drive:  # type: ignore[override]
+    def run(self, case: EpisodeOptions, progress: Progress) -> Drive:  # type: ignore[override]
         """Drives and adds up both parts of the reward."""
         host, parts = self.open(case, ()), Parts()
         result = host.run(case.seed, progress, hooks=[parts]).document()
@@ -270,14 +269,10 @@ def main() -> None:
     policy, weights = read_name(args.policy).text, weights_of(args.policy)
     done = {k: d for k, d in read(kept).items() if d.policy != policy or d.weights == weights}
     for world in args.worlds:
-        plan = partial(
-            planned, [world], [DEMAND], [], [policy], seeds, duration=args.duration, errors=args.errors
-        )
+        what = {"scenario": world, "demand": DEMAND, "policy": policy, "svo": [*PHIS]}
+        plan = planned(seeds, **what, duration=args.duration, errors=args.errors)
         cases = [
-            case
-            for phi in PHIS
-            for _, case in plan(phi).cases()
-            if (case.policy, world, phi, case.seed) not in done
+            case for _, case in plan.cases() if (case.policy, world, case.svo_deg, case.seed) not in done
         ]
         tasks = [Task(case.key, case.cell, (case,)) for case in cases]
         for drive in spread(LocalEngine(Earning, workers=args.workers), tasks, world):

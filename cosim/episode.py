@@ -268,6 +268,7 @@ class Episode:
             validity=self._validity(metrics),
             interventions_by_reason=dict(self._interventions.most_common()),
             errors_begun=tuple(self._errors),
+            asked=self.scenario.asked.columns,
             tilt=self._tilt(),
             mission_vehicle=", ".join(self._missions) or None,
             mission_guessed=bool(self._missions) and self.scenario.mission.guessed,

@@ -176,9 +176,10 @@ def one_of(value: str, allowed: Iterable[str], field: str, file: object = None) 
     return value
 
 
-def check_pattern(pattern: str, field: str, file: object = None) -> None:
-    """Raises BadInput unless `pattern` is a regular expression."""
+def check_pattern(pattern: str, field: str, file: object = None) -> str:
+    """`pattern`; raises BadInput unless it is a regular expression."""
     try:
         re.compile(pattern)
     except re.error as error:
         raise BadInput(f"not a regular expression: {error}", file=file, field=field, value=pattern) from None
+    return pattern

@@ -562,7 +562,7 @@ class Metric:
 
 @dataclass(frozen=True)
 class Identity:
-    """What an episode is called in documents, rows, tables, recordings (`EpisodeId`: as it was asked for)."""
+    """What an episode is called in documents, rows, tables, recordings."""
 
     scenario: str
     demand: str
@@ -615,6 +615,7 @@ class EpisodeResult(Identity):
     validity: tuple[str, ...]  # reasons why the result is not comparable; empty when it is
     mission_vehicle: str | None = None  # its id (of several: joined by ", "); None: none was on the road
     mission_guessed: bool = False  # nobody named it: its figures feed no gate
+    asked: dict[str, Any] = field(default_factory=dict)  # options that the identity does not say
     interventions_by_reason: dict[str, int] = field(default_factory=dict)  # the most frequent first
     errors_begun: tuple[HumanError, ...] = ()
     tilt: dict[str, Any] = field(default_factory=dict)  # by the names of `TILT`, of tilted errors
@@ -628,6 +629,7 @@ class EpisodeResult(Identity):
         """The JSON document of `cosim run --json`: metrics by name, their units beside them, NA null."""
         return {
             **{name: getattr(self, name) for name in IDENTITY},
+            **self.asked,
             "steps": self.steps,
             **{name: getattr(self, name) for name in MISSION},
             **self.tilt,

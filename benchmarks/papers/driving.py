@@ -24,7 +24,7 @@ from cosim.batch.folder import RunFolder
 from cosim.batch.store import Store
 from cosim.report.figures import Row
 from cosim.report.run_folder import Run
-from cosim.scenario.episode_id import EpisodeId
+from cosim.scenario.options import EpisodeOptions
 from cosim.seeding import FIRST_TEST_SEED
 from cosim.types import Policy
 from cosim.workers.engines import LocalEngine
@@ -55,9 +55,9 @@ class Order:
         return self.arm or self.agent.name
 
     @property
-    def case(self) -> EpisodeId:
+    def case(self) -> EpisodeOptions:
         """Of the first seed; the policy is the agent's name."""
-        return EpisodeId(
+        return EpisodeOptions(
             what=self.scenario,
             demand=(self.demand,),
             policy=self.agent.name,
@@ -228,7 +228,7 @@ class Planned(matrix.Plan):
         """Cell -> its seeds."""
         return {cell.name: self.seeds[:n] for cell, n in zip(self.cells, self.counts, strict=True)}
 
-    def cases(self) -> Iterator[tuple[matrix.Cell, EpisodeId]]:
+    def cases(self) -> Iterator[tuple[matrix.Cell, EpisodeOptions]]:
         wanted = self.wanted
         for cell in self.cells:
             for seed in wanted[cell.name]:
@@ -273,7 +273,7 @@ class AgentRunner(EpisodeRunner):
         super().__init__()
         self._agents, self._untrained = agents, untrained
 
-    def policy(self, case: EpisodeId) -> Policy:
+    def policy(self, case: EpisodeOptions) -> Policy:
         """The agent that the case names."""
         return build(self._agents[agent_of(case.policy)], self._untrained)
 

@@ -12,7 +12,7 @@ from benchmarks.papers.driving import AgentRunner
 from cosim.recording.replay_data import ReplayData, Track
 from cosim.report.replay.strip import Strip, poses_at
 from cosim.road import Lane
-from cosim.scenario.episode_id import EpisodeId
+from cosim.scenario.options import EpisodeOptions
 from cosim.types import Floats, Kind
 from cosim.workers.tasks import Progress
 
@@ -51,7 +51,7 @@ class GuideRunner(AgentRunner):
     """Hosted by the engine: drives an episode, looks at its guide AV and takes three pictures."""
 
     def run(
-        self, case: EpisodeId, warnings: tuple[str, ...], outputs: str | None, progress: Progress
+        self, case: EpisodeOptions, warnings: tuple[str, ...], outputs: str | None, progress: Progress
     ) -> dict[str, Any]:
         """`seed`, `trace_hash`, `crashed`; `guided`: the fields of `Guided`; `pictures`: PNG files."""
         result, replay = self.open(case, warnings).run_recorded(case.seed, progress)

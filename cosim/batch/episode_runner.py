@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from cosim.host import Host, Hosts
-from cosim.scenario.episode_id import EpisodeId
+from cosim.scenario.options import EpisodeOptions
 from cosim.types import Policy
 from cosim.workers.tasks import Progress
 
@@ -15,7 +15,7 @@ class EpisodeRunner(Hosts):
     """Keeps the host of the last episode's cell."""
 
     def run(
-        self, case: EpisodeId, warnings: tuple[str, ...], outputs: str | None, progress: Progress
+        self, case: EpisodeOptions, warnings: tuple[str, ...], outputs: str | None, progress: Progress
     ) -> dict[str, Any]:
         """One episode; the document of `cosim run --json`.
 
@@ -25,11 +25,11 @@ class EpisodeRunner(Hosts):
         host = self.open(case, warnings)
         return host.run(case.seed, progress, outputs=case.outputs, folder=folder).document()
 
-    def policy(self, case: EpisodeId) -> str | Policy:
+    def policy(self, case: EpisodeOptions) -> str | Policy:
         """Who commands the AVs of `case`: a name that `--policy` knows, unless a subclass says otherwise."""
         return case.policy
 
-    def open(self, case: EpisodeId, warnings: tuple[str, ...]) -> Host:
+    def open(self, case: EpisodeOptions, warnings: tuple[str, ...]) -> Host:
         """The host of the case's cell."""
 
         def build() -> Host:

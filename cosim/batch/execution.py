@@ -10,8 +10,8 @@ from cosim.batch.matrix import Cell, Plan
 from cosim.batch.records import row
 from cosim.batch.store import FILE, Store
 from cosim.errors import BadInput, CosimError
-from cosim.scenario.episode_id import EpisodeId
 from cosim.scenario.manifest import POLICY_FILES
+from cosim.scenario.options import EpisodeOptions
 from cosim.scenario.policy_name import label
 from cosim.workers.engines import Engine
 from cosim.workers.tasks import BAD_INPUT, FAULT, Outcome, Progress
@@ -19,7 +19,7 @@ from cosim.workers.tasks import BAD_INPUT, FAULT, Outcome, Progress
 FAULTS = 10  # of our own code, before a batch stops: it is broken, not unlucky
 
 
-def asked(folder: Path, url: str | None) -> tuple[list[EpisodeId], range]:
+def asked(folder: Path, url: str | None) -> tuple[list[EpisodeOptions], range]:
     """The case of every cell and the seeds of the run in a folder, or in the database `url`.
 
     Raises BadInput when there is none.
@@ -27,7 +27,7 @@ def asked(folder: Path, url: str | None) -> tuple[list[EpisodeId], range]:
     if url is not None or (folder / FILE).is_file():
         with Store.in_folder(folder, url) as store:
             if store.spec_hash() is not None:
-                cases = [EpisodeId.read(cell["case"]) for cell in store.cells().values()]
+                cases = [EpisodeOptions.read(cell["case"]) for cell in store.cells().values()]
                 return cases, range(*store.document()["seeds"])
     raise BadInput("holds no run to resume", field="--out", value=str(folder))
 

@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from cosim.batch.spec import AXES, Spec
+from cosim.batch.spec import Spec
 from cosim.errors import BadInput
 from cosim.files import code
 from cosim.rewards import read as read_reward
-from cosim.scenario import CONFIG, Scenario, chosen_preset, sumo_outputs
-from cosim.scenario.episode_id import EpisodeId
+from cosim.scenario import CONFIG, Scenario, sumo_outputs, with_preset
 from cosim.scenario.manifest import manifest
+from cosim.scenario.options import EpisodeOptions
+from cosim.scenario.traffic import driven
 from cosim.scenario.vet import vetted
 from cosim.types import Traffic
 from cosim.workers.tasks import Task
@@ -26,7 +27,7 @@ CheckPolicy = Callable[[str], None]  # raises BadInput for a name that is none
 class Cell:
     """Cases that differ in nothing but the seed."""
 
-    case: EpisodeId  # of the first seed
+    case: EpisodeOptions  # of the first seed
     scenario: Scenario  # vetted unless `refused`
     manifest: Mapping[str, Any]  # `cosim.scenario.manifest` without the seed
     refused: str | None = None  # why SUMO must not see this net: every episode of the cell is bad_input
@@ -35,7 +36,7 @@ class Cell:
     def name(self) -> str:
         return self.case.cell
 
-    def task(self, case: EpisodeId, outputs: Path | None = None) -> Task:
+    def task(self, case: EpisodeOptions, outputs: Path | None = None) -> Task:
         """One episode of this cell, for an engine that hosts a `run(case, warnings, outputs)`.
 
         `outputs`: folder for SUMO's own outputs; None where the case wants none.
@@ -60,49 +61,34 @@ class Plan:
         text = json.dumps([sorted(cell.case.text() for cell in self.cells), self.seeds[0], self.seeds[-1]])
         return hashlib.sha256(text.encode()).hexdigest()
 
-    def cases(self) -> Iterator[tuple[Cell, EpisodeId]]:
+    def cases(self) -> Iterator[tuple[Cell, EpisodeOptions]]:
         """Every episode with its cell."""
         for cell, seed in itertools.product(self.cells, self.seeds):
             yield cell, cell.case.with_seed(seed)
 
 
-def cells(spec: Spec) -> Iterator[EpisodeId]:
+def cells(spec: Spec) -> Iterator[EpisodeOptions]:
     """The case of every cell's first seed; each once, though one policy may have one preset only.
 
     Cells with and without AVs are compared: traffic is controlled in all of them if cosim drives in one.
     """
-    found = [*dict.fromkeys(_cells(spec))]
-    if spec.traffic is None and any(case.drives for case in found):
+    found = [*dict.fromkeys(map(with_preset, spec.options()))]
+    if "traffic" not in spec.values and any(map(drives, found)):
         found = [
             case
-            if case.drives or not case.what.endswith(CONFIG)
+            if drives(case) or not case.what.endswith(CONFIG)
             else replace(case, traffic=Traffic.CONTROLLED)
             for case in found
         ]
     yield from found
 
 
-def _cells(spec: Spec) -> Iterator[EpisodeId]:
-    for values in itertools.product(*(getattr(spec, axis) for axis in AXES)):
-        named = dict(zip(AXES.values(), values, strict=True))
-        named["preset"] = chosen_preset(named["what"], named["policy"], named["preset"])
-        yield EpisodeId(
-            **named,
-            av_type=spec.av_type,
-            av_ids=spec.av_ids,
-            duration=spec.duration,
-            warmup=spec.warmup,
-            mission=spec.mission,
-            seed=spec.seeds[0],
-            outputs=spec.output,
-            metrics=spec.metric,
-            reward=spec.reward,
-            on_collision=spec.on_collision,
-            traffic=spec.traffic,
-        )
+def drives(case: EpisodeOptions) -> bool:
+    """Whether cosim may drive a vehicle where the scenario's own file does not say so."""
+    return bool(driven(case.fleet, case.behavior, case.errors))
 
 
-def plan(cases: Iterable[EpisodeId], seeds: range, check_policy: CheckPolicy) -> Plan:
+def plan(cases: Iterable[EpisodeOptions], seeds: range, check_policy: CheckPolicy) -> Plan:
     """Load and vet every cell.
 
     A net that would kill SUMO costs its own cells only: they become `refused`.
@@ -112,7 +98,7 @@ def plan(cases: Iterable[EpisodeId], seeds: range, check_policy: CheckPolicy) ->
             that is malformed or whose edges are not in the net, a vehicle type that is not there.
     """
     found = []
-    worlds: dict[EpisodeId, tuple[Scenario, Mapping[str, Any], str | None]] = {}
+    worlds: dict[EpisodeOptions, tuple[Scenario, Mapping[str, Any], str | None]] = {}
     for case in cases:
         check_policy(case.policy)
         for metric in case.metrics:
@@ -136,7 +122,7 @@ def check_names(plan: Plan) -> None:
             raise BadInput(problem, field="scenario", value=what)
 
 
-def _read(case: EpisodeId) -> tuple[Scenario, Mapping[str, Any], str | None]:
+def _read(case: EpisodeOptions) -> tuple[Scenario, Mapping[str, Any], str | None]:
     """The scenario, vetted unless its net is refused; its manifest without the seed; why it is refused."""
     scenario = case.scenario()
     sumo_outputs.check(case.outputs, scenario.options)

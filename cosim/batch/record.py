@@ -6,52 +6,25 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from cosim.batch import matrix
+from cosim.batch import matrix, spec
 from cosim.batch.episode_runner import EpisodeRunner
 from cosim.batch.matrix import Plan
-from cosim.batch.spec import Spec
 from cosim.errors import BadInput
 from cosim.policies import check
 from cosim.recording.file import write
 from cosim.recording.folder import Folder
 from cosim.recording.recorder import Recorder
-from cosim.scenario import human_errors, place
-from cosim.scenario.episode_id import EpisodeId
-from cosim.scenario.policy_name import read
+from cosim.scenario.options import EpisodeOptions
 from cosim.types import IDENTITY
 from cosim.workers.engines import LocalEngine
 from cosim.workers.progress import shown
 from cosim.workers.tasks import Progress as Heartbeat
 
 
-def planned(
-    scenarios: Sequence[str],
-    demands: Sequence[str],
-    behaviors: Sequence[str],
-    policies: Sequence[str],
-    seeds: range,
-    svo_deg: float = 45.0,
-    duration: float | None = None,
-    warmup: float | None = None,
-    mission: str | None = None,
-    on_collision: str | None = None,
-    errors: str | None = None,
-) -> Plan:
-    """Every combination; what is left out is the scenario's own. Raises BadInput."""
-    spec = Spec(
-        scenario=tuple(map(place, scenarios)),
-        demand=tuple((demand,) for demand in demands) or ((),),
-        behavior=tuple(behaviors) or (None,),
-        policy=tuple(read(policy).text for policy in policies),
-        svo=(svo_deg,),
-        seeds=(seeds.start, seeds.stop),
-        duration=duration,
-        warmup=warmup,
-        mission=mission,
-        on_collision=on_collision,
-        errors=(human_errors.asked(errors),),
-    )
-    plan = matrix.plan(dict.fromkeys(matrix.cells(spec)), seeds, check)
+def planned(seeds: range, **written: Any) -> Plan:
+    """Every combination of options, by the names and kinds of `cosim.batch.spec.read`. Raises BadInput."""
+    asked = spec.read(None, written | {spec.SEEDS: f"{seeds.start}:{seeds.stop}"})
+    plan = matrix.plan(matrix.cells(asked), seeds, check)
     for cell in plan.cells:
         if cell.refused:
             raise BadInput(cell.refused)
@@ -66,7 +39,7 @@ class RecordingRunner(EpisodeRunner):
         self._folder = Folder(Path(folder))
 
     def run(
-        self, case: EpisodeId, warnings: tuple[str, ...], outputs: str | None, progress: Heartbeat
+        self, case: EpisodeOptions, warnings: tuple[str, ...], outputs: str | None, progress: Heartbeat
     ) -> dict[str, Any]:
         """One episode and its file; the document of `cosim run --json`."""
         host, recorder = self.open(case, warnings), Recorder()

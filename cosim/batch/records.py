@@ -6,7 +6,7 @@ from dataclasses import asdict
 from typing import Any
 
 from cosim.batch.matrix import Cell
-from cosim.scenario.episode_id import EpisodeId
+from cosim.scenario.options import EpisodeOptions
 from cosim.scenario.policy_name import label
 from cosim.types import IDENTITY
 from cosim.workers.tasks import Outcome
@@ -20,10 +20,10 @@ _AS_TEXT = (
 )
 
 
-def row(cell: Cell, case: EpisodeId, outcome: Outcome) -> dict[str, Any]:
+def row(cell: Cell, case: EpisodeOptions, outcome: Outcome) -> dict[str, Any]:
     """The row of one outcome, whose value is the document of `cosim run --json`."""
     named = cell.scenario.identity(label(case.policy), None, case.svo_deg, case.seed)
-    found = {"key": case.key, "cell": cell.name, "status": outcome.status, **asdict(named)}
+    found = {"key": case.key, "cell": cell.name, "status": outcome.status, **asdict(named), **case.columns}
     if outcome.ok:
         found |= flat(outcome.value)
     return found | {"error": outcome.error, "stderr": outcome.stderr, "attempts": outcome.attempts}

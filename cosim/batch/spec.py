@@ -5,37 +5,23 @@ import itertools
 import math
 import os
 import re
-import typing
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import sumo_scenarios
-from cosim.errors import BadInput, Range, check_pattern, hint, inside, one_of
-from cosim.files import code
+from cosim.errors import BadInput, hint, inside
 from cosim.files.xml_input import is_there
-from cosim.files.yaml_input import NonNegative, Positive, check_known, document, value_of
-from cosim.scenario import BEHAVIORS, human_errors, policy_name
-from cosim.scenario.behaviors import DRIVER_MODELS
+from cosim.files.yaml_input import check_known, document, value_of
+from cosim.scenario import policy_name
+from cosim.scenario.options import FLEET, OPTIONS, EpisodeOptions, Option
 from cosim.seeding import FIRST_TEST_SEED
-from cosim.types import OnCollision, Preset, Traffic
 
 MAX_SEED = 2**62
 MAX_EPISODES = 1_000_000  # more is a slip of the keyboard: 3 GB of rows
-FLEET = ("av_type", "av_ids", "penetration")  # ways to choose the AVs: one excludes the others
-# Axes of the matrix, in the order of its cells -> the field of `EpisodeId` that each value fills.
-AXES = {
-    "scenario": "what",
-    "demand": "demand",
-    "behavior": "behavior",
-    "driver_model": "driver_model",
-    "penetration": "penetration",
-    "preset": "preset",
-    "errors": "errors",
-    "policy": "policy",
-    "svo": "svo_deg",
-}
+SEEDS = "seeds"
+FIELDS = (*OPTIONS, SEEDS)
 _GLOB = re.compile(r"[*?\[]")
 
 
@@ -43,40 +29,19 @@ _GLOB = re.compile(r"[*?\[]")
 class Spec:
     """The axes of the matrix; every combination of one value each is a cell, driven once per seed."""
 
-    scenario: tuple[str, ...]  # names of worlds, absolute paths of their folders or of .sumocfg
-    seeds: tuple[int, int] = (FIRST_TEST_SEED, FIRST_TEST_SEED + 1)  # first, and one past the last
-    demand: tuple[tuple[str, ...], ...] = ((),)  # each: names or files driven together; (): the scenario's
-    policy: tuple[str, ...] = ("idm",)  # as `cosim.scenario.policy_name` has it, files absolute
-    behavior: tuple[str | None, ...] = (None,)  # None: the scenario's default
-    driver_model: tuple[str, ...] = ("lc2013",)
-    penetration: tuple[Annotated[float, Range(0.0, high=1.0)] | None, ...] = (
-        None,
-    )  # None: the scenario's own fleet
-    svo: tuple[Annotated[float, Range(0.0, high=90.0)], ...] = (
-        45.0,
-    )  # degrees; 45 weighs oneself and the others alike
-    preset: tuple[str | None, ...] = (None,)
-    errors: tuple[str | None, ...] = (None,)  # of human drivers: levels, absolute paths; None: none
-    av_type: str | None = None
-    av_ids: str | None = None
-    duration: Positive | None = None  # s
-    warmup: NonNegative | None = None  # s
-    mission: str | None = None  # a vehicle's id or a pattern of ids, none, auto; None: the scenario's own
-    output: tuple[str, ...] = ()  # SUMO's outputs to keep, by SUMO's names
-    metric: tuple[str, ...] = ()  # measured besides, FILE.py:NAME or MODULE:NAME, files absolute
-    on_collision: str | None = None  # of `OnCollision`; None: the scenario's own
-    traffic: str | None = None  # of `Traffic`; None: as-is where cosim drives nobody in any cell
-    reward: str | None = None  # paid and reported: a name of `cosim.rewards.REWARDS`, or code likewise
+    values: Mapping[str, tuple[Any, ...]]  # field of `EpisodeOptions` -> its values; others have the default
+    seeds: tuple[int, int]  # first, and one past the last
 
     @property
     def episodes(self) -> int:
         """How many episodes the matrix has."""
         first, end = self.seeds
-        return math.prod(len(getattr(self, axis)) for axis in AXES) * (end - first)
+        return math.prod(map(len, self.values.values())) * (end - first)
 
-
-_KINDS = typing.get_type_hints(Spec, include_extras=True)
-FIELDS = tuple(_KINDS)
+    def options(self) -> Iterator[EpisodeOptions]:
+        """Of every cell's first seed."""
+        for values in itertools.product(*self.values.values()):
+            yield EpisodeOptions(**dict(zip(self.values, values, strict=True)), seed=self.seeds[0])
 
 
 def read(path: Path | None, flags: Mapping[str, Any]) -> Spec:
@@ -95,17 +60,17 @@ def read(path: Path | None, flags: Mapping[str, Any]) -> Spec:
     given = {name: flags[name] for name in FIELDS if flags.get(name) not in (None, [])}
     if given.keys() & set(FLEET):  # one way to choose the fleet replaces the others
         written = {name: value for name, value in written.items() if name not in FLEET}
-    values = {}
-    for name in FIELDS:
-        if name in given:
-            values[name] = _axis(name, given[name], Path.cwd(), None, f"--{name}")
-        elif written.get(name) is not None:
-            values[name] = _axis(name, written[name], Path(str(path)).absolute().parent, path, name)
+    folder = Path(str(path)).absolute().parent
+    asked = {name: (v, folder, path, name) for name, v in written.items() if v is not None}
+    asked |= {name: (v, Path.cwd(), None, "--" + name.replace("_", "-")) for name, v in given.items()}
+    span = asked.pop(SEEDS, None)
+    values = {o.field: _values(o, *asked[name]) for name, o in OPTIONS.items() if name in asked}
     source: object = "command line" if path is None else path
-    if "scenario" not in values:
+    if "what" not in values:
         known = ", ".join(sumo_scenarios.names())
         raise BadInput(f"name at least one: {known}, a folder or a .sumocfg", file=source, field="scenario")
-    return _checked(Spec(**values), source)
+    first = (FIRST_TEST_SEED, FIRST_TEST_SEED + 1)
+    return _checked(Spec(values, first if span is None else seeds(span[0], *span[2:])), source)
 
 
 def seeds(text: object, file: object, field: str) -> tuple[int, int]:
@@ -130,28 +95,19 @@ def seeds(text: object, file: object, field: str) -> tuple[int, int]:
 # ---- inside ----
 
 
-def _axis(name: str, value: object, folder: Path, file: object, field: str) -> Any:
-    """A field of the spec from what a file or a flag says; files are relative to `folder`."""
-    if name == "seeds":
-        return seeds(value, file, field)
+def _values(option: Option, value: object, folder: Path, file: object, field: str) -> tuple[Any, ...]:
+    """The values of one option from what a file or a flag says; files are relative to `folder`."""
+    kind: Any = tuple[option.item, ...] if option.axis or option.several else option.kind  # type: ignore[name-defined]
     with inside(field, file):
-        found = value_of(tuple[str, ...] if name == "demand" else _KINDS[name], value)
-        if found == ():
+        given = value_of(kind, value)
+        if given == ():
             raise BadInput("the list is empty")
-    if name == "policy":
-        found = [policy_name.read(item, folder, field, file).text for item in found]
-    elif name == "metric":
-        found = [code.absolute(item, field, folder=folder, file=file) for item in found]
-    elif name == "reward":
-        found = code.absolute(found, field, folder=folder, file=file)
-    elif name == "errors":
-        found = [human_errors.asked(item, folder) for item in found]
-        for item in found:
-            human_errors.read(item, field, file)
-    elif name in ("scenario", "demand"):
-        found = [point for item in found for point in _expand(item, folder, file, field, name)]
-        found = [point[0] for point in found] if name == "scenario" else found
-    return tuple(dict.fromkeys(found)) if isinstance(found, list | tuple) else found  # no file twice
+    if option.name in ("scenario", "demand"):
+        points = [point for item in given for point in _expand(item, folder, file, field, option.name)]
+        found = points if option.several else [point[0] for point in points]
+    else:
+        found = [option.read(item, folder, field, file) for item in (given if option.axis else [given])]
+    return tuple(dict.fromkeys(found))  # no file twice
 
 
 def _expand(item: str, folder: Path, file: object, field: str, kind: str) -> Iterator[tuple[str, ...]]:
@@ -185,27 +141,16 @@ def _files(name: str, folder: Path, file: object, field: str) -> tuple[str, ...]
 def _checked(spec: Spec, file: object) -> Spec:
     """What can be said without opening a scenario."""
     known = (*sumo_scenarios.names(), *sumo_scenarios.practice())
-    for name in spec.scenario:
+    for name in spec.values["what"]:
         if name not in known and not os.path.isabs(name):
             raise BadInput(f"no such scenario{hint(name, known)}", file=file, field="scenario", value=name)
-    words = (("behavior", BEHAVIORS), ("driver_model", DRIVER_MODELS), ("preset", Preset.ALL))
-    for field, allowed in words:
-        for word in filter(None, getattr(spec, field)):
-            one_of(word, allowed, field, file)
-    if spec.on_collision is not None:
-        one_of(spec.on_collision, OnCollision.ALL, "on_collision", file)
-    if spec.traffic is not None:
-        one_of(spec.traffic, Traffic.ALL, "traffic", file)
-    labels = [policy_name.label(text) for text in spec.policy]
+    labels = [policy_name.label(text) for text in spec.values.get("policy", ())]
     if twice := next((name for name in labels if labels.count(name) > 1), None):
         raise BadInput(f"two are called {twice}: label them, LABEL=...", file=file, field="policy")
-    chosen = [name for name in FLEET if getattr(spec, name) not in (None, (None,))]
-    if len(chosen) > 1:
-        raise BadInput(f"excludes {chosen[1]}: give one of them", file=file, field=chosen[0])
-    if spec.av_ids is not None:
-        check_pattern(spec.av_ids, "av_ids", file)
     if spec.episodes > MAX_EPISODES:
         problem = f"{spec.episodes} episodes are more than {MAX_EPISODES}"
         first, end = spec.seeds
-        raise BadInput(problem, file=file, field="seeds", value=f"{first}:{end}")
+        raise BadInput(problem, file=file, field=SEEDS, value=f"{first}:{end}")
+    with inside("", file):
+        next(spec.options())
     return spec

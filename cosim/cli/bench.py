@@ -60,11 +60,11 @@ def work(args: argparse.Namespace) -> int:
     where = Path(args.recordings) if args.recordings else out / "recordings"
     if not args.recordings:
         plan = planned(
-            args.scenario or sumo_scenarios.names(),
-            args.demand or DEMANDS,
-            args.behavior or [b for b in BEHAVIORS if b != AS_IS],
-            args.policy or POLICIES,
             args.seeds,
+            scenario=args.scenario or [*sumo_scenarios.names()],
+            demand=args.demand or [*DEMANDS],
+            behavior=args.behavior or [b for b in BEHAVIORS if b != AS_IS],
+            policy=args.policy or [*POLICIES],
         )
         if failed := record(where, plan, workers=args.workers, resume=True):
             print(f"cosim: {len(failed)} episodes were not recorded: {failed[0]}", file=sys.stderr)

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from cosim.cli import arguments, evaluate
 from cosim.errors import BadInput
-from cosim.scenario.episode_id import EpisodeId
+from cosim.scenario.options import EpisodeOptions
 
 FIELD = "field"  # the level of human errors that is estimated unless another one is named
 
@@ -84,7 +84,7 @@ def work(args: argparse.Namespace) -> int:
     return found.exit_code
 
 
-def _as_asked(case: EpisodeId, args: argparse.Namespace) -> EpisodeId:
+def _as_asked(case: EpisodeOptions, args: argparse.Namespace) -> EpisodeOptions:
     """With the errors of `FIELD` unless others are named, and the tilt. Raises BadInput."""
     from cosim.scenario import tilt
 

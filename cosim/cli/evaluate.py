@@ -19,7 +19,7 @@ from cosim.errors import BadInput
 if TYPE_CHECKING:
     from cosim.batch.matrix import Plan
     from cosim.batch.store import Store
-    from cosim.scenario.episode_id import EpisodeId
+    from cosim.scenario.options import EpisodeOptions
     from cosim.workers.engines import Engine
     from cosim.workers.tasks import Outcome
 
@@ -46,21 +46,15 @@ def add(commands: arguments.SubCommands) -> None:
 def add_matrix(command: argparse.ArgumentParser, errors: str = "none") -> None:
     """The flags that say what is driven, but for the seeds. `errors`: the default of that flag."""
     command.add_argument("spec", nargs="?", metavar="SPEC.yaml", help="the matrix, by the flags' names")
-    axes = command.add_argument_group("the matrix (each flag may be repeated)")
-    arguments.add(axes, "--scenario", action="append", help="a world, its folder, a .sumocfg, or a glob")
-    axes.add_argument(
-        "--demand",
-        action="append",
-        metavar="NAME|FILES",
-        help="a name, or a file or glob (.rou.xml, .trips.xml, flows, .gz); A,B is one demand of two files",
+    axes = command.add_argument_group("the matrix (flags of SPEC.yaml's lists may be repeated)")
+    arguments.options(
+        axes,
+        matrix=True,
+        scenario="a scenario, its folder, a .sumocfg, or a glob",
+        demand="a name, or a file or glob (.rou.xml, .trips.xml, flows, .gz); A,B is one demand of two files",
+        errors="of human drivers: none, field, stress, or a file (docs/explanation/driver_errors.md) "
+        f"(default: {errors})",
     )
-    arguments.add(axes, "--policy", "--behavior", "--driver-model", action="append")
-    arguments.add(axes, "--penetration", "--svo", "--preset", action="append")
-    levels = "of human drivers: none, field, stress, or a file (docs/explanation/driver_errors.md); default "
-    arguments.add(axes, "--errors", action="append", help=levels + errors)
-    arguments.add(axes, "--output", "--metric", action="append")
-    arguments.add(command, "--av-type", "--av-ids", "--duration", "--warmup", "--mission")
-    arguments.add(command, "--reward", "--on-collision", "--traffic")
 
 
 def add_work(command: argparse.ArgumentParser) -> Any:
@@ -106,7 +100,7 @@ def continued(args: argparse.Namespace) -> bool:
     return bool(args.resume) and args.spec is None and all(getattr(args, n) is None for n in spec.FIELDS)
 
 
-def asked(args: argparse.Namespace) -> tuple[list[EpisodeId], range]:
+def asked(args: argparse.Namespace) -> tuple[list[EpisodeOptions], range]:
     """The case of every cell, and the seeds. Raises BadInput."""
     from cosim.batch import execution, matrix, spec
 

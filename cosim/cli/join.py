@@ -14,8 +14,9 @@ from cosim.cli import arguments
 from cosim.cli.run import show
 from cosim.errors import BadInput
 from cosim.files import new_folder
-from cosim.scenario import Fleet, Scenario, checked_fleet, chosen_fleet, chosen_mission
-from cosim.scenario.policy_name import label, read
+from cosim.scenario import Scenario, with_options
+from cosim.scenario.options import OPTIONS, TRAFFIC, of_flags
+from cosim.scenario.policy_name import label
 
 INTERRUPTED = "interrupted"
 
@@ -29,19 +30,18 @@ def add(commands: arguments.SubCommands) -> None:
         "drive some of its vehicles as AVs, and hand them back. Ctrl-C leaves it in order.",
     )
     join.add_argument("place", metavar="HOST:PORT", type=_place, help="where it listens")
-    arguments.add(join, "--policy", default="idm")
-    arguments.add(join, "--svo", default=45.0)
-    ends = "counted s (default: until the end in SUMO's configuration, else 60)"
-    arguments.add(join, "--duration", help=ends)
-    arguments.add(join, "--warmup", help="s driven before the counted time begins (default 0)")
-    arguments.add(join, "--preset", help="safety checks on the AVs (default lawful)")
-    whom = "the mission vehicle: its id, a pattern of ids, none, or auto: guessed (default)"
-    arguments.add(join, "--mission", help=whom)
-    arguments.add(join, "--on-collision", help="of an AV or the mission vehicle (default continue)")
-    arguments.add(join, "--reward", "--out")
-    arguments.add(join.add_mutually_exclusive_group(), "--av-type", "--av-ids", "--penetration")
+    theirs = [o.name for o in OPTIONS.values() if o.scope == TRAFFIC or o.field == "outputs"]
+    arguments.options(
+        join,
+        without=theirs,
+        duration="counted s (default: until the end in SUMO's configuration, else 60)",
+        warmup="s driven before the counted time begins (default: 0)",
+        preset="safety checks on the AVs (default: lawful)",
+        mission="the mission vehicle: its id, a pattern of ids, none, or auto: guessed (default)",
+        on_collision="of an AV or the mission vehicle (default: continue)",
+    )
+    arguments.add(join, "--out")
     arguments.add(join, "--seed", help="of the draw of AVs (default: SUMO's own)")
-    arguments.add(join, "--metric", action="append", default=[])
     arguments.texts(join, {"--net": ("FILE", "its net, where SUMO's own path of it does not hold here")})
     join.add_argument(
         "--order",
@@ -69,28 +69,27 @@ def work(args: argparse.Namespace) -> int:
     from cosim.simulation.shared import theirs
     from cosim.workers.progress import Progress
 
-    policy = read(args.policy).text
-    check(policy)
-    fleet = checked_fleet(chosen_fleet(args.av_type, args.av_ids, args.penetration) or Fleet())
+    asked = of_flags({**vars(args), "scenario": "{}:{}".format(*args.place)})
+    check(asked.policy)
     with new_folder(args.out) as folder:
-        driver = make(policy)  # before SUMO has to wait for it
+        driver = make(asked.policy)  # before SUMO has to wait for it
         host_name, port = args.place
         client = Client(host_name, port, args.order, args.timeout)
         try:
             scenario, seed = theirs(client, args.net)
             host = Host(
-                _as_asked(scenario, args, fleet, client.place),
+                _warned(with_options(scenario, asked), client.place),
                 driver,
-                math.radians(args.svo),
+                math.radians(asked.svo_deg),
                 simulator=joining(client),
-                metrics=args.metric,
-                reward=args.reward,
+                metrics=asked.metrics,
+                reward=asked.reward,
             )
         except BaseException:
             client.close()
             raise
         simulator: Any = host.simulator
-        progress = Progress(f"{scenario.name} {label(policy)}", "s")
+        progress = Progress(f"{scenario.name} {label(asked.policy)}", "s")
         try:
             with _leaving(simulator):
                 drive: Any = host.run_recorded if args.replay else host.run
@@ -105,16 +104,13 @@ def work(args: argparse.Namespace) -> int:
     return 130 if simulator.leave else 0
 
 
-def _as_asked(scenario: Scenario, args: argparse.Namespace, fleet: Fleet, place: str) -> Scenario:
-    """What the SUMO at `place` simulates, with what the flags say besides."""
+def _warned(scenario: Scenario, place: str) -> Scenario:
+    """With what the SUMO at `place` does otherwise than cosim's."""
     from cosim.simulation.shared import lost
 
-    given = {name: getattr(args, name) for name in ("preset", "duration", "warmup", "on_collision")}
-    if args.mission is not None:
-        given["mission"] = chosen_mission(scenario.mission, args.mission)
-    known = {name: value for name, value in given.items() if value is not None}
-    asked = replace(scenario, fleet=fleet, **known)
-    return replace(asked, warnings=(*asked.warnings, *(f"{place}: {words}" for words in lost(asked))))
+    return replace(
+        scenario, warnings=(*scenario.warnings, *(f"{place}: {words}" for words in lost(scenario)))
+    )
 
 
 @contextmanager

@@ -17,10 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 from cosim.cli import arguments
 from cosim.errors import BadInput, SimulationTimeout, extra
-from cosim.files import code
-from cosim.files.xml_input import is_there
-from cosim.scenario import Scenario, chosen_preset, human_errors, place
-from cosim.scenario.episode_id import EpisodeId
+from cosim.scenario import Scenario, with_preset
+from cosim.scenario.options import EpisodeOptions, of_flags
 from cosim.scenario.policy_name import label, read
 from cosim.seeding import FIRST_TEST_SEED
 from cosim.types import EpisodeResult
@@ -44,18 +42,9 @@ def add(commands: arguments.SubCommands) -> None:
     run.add_argument(
         "what", metavar="WHAT", help="a scenario's name (cosim scenarios), a world's folder or any .sumocfg"
     )
-    demands = "by name (default of our worlds: dense), or route files; repeatable"
-    arguments.add(run, "--demand", action="append", default=[], help=demands)
-    arguments.add(run, "--policy", default="idm")
-    arguments.add(run, "--svo", default=45.0)
-    arguments.add(run, "--behavior", "--preset", "--duration", "--warmup", "--mission")
-    arguments.add(run, "--on-collision", "--errors", "--traffic", "--reward", "--out")
-    arguments.add(run, "--driver-model", default="lc2013", help="of the human drivers (default lc2013)")
-    arguments.add(run.add_mutually_exclusive_group(), "--av-type", "--av-ids", "--penetration")
+    arguments.options(run, without=("scenario",))
+    arguments.add(run, "--out")
     arguments.add(run, "--seed", default=FIRST_TEST_SEED, help=f"default {FIRST_TEST_SEED}")
-    outputs = "have SUMO write its NAME output (tripinfo, fcd, ssm, ...) to DIR/outputs; repeatable"
-    arguments.add(run, "--output", action="append", default=[], help=outputs)
-    arguments.add(run, "--metric", action="append", default=[])
     run.add_argument(
         "--beside",
         metavar="POLICY",
@@ -92,7 +81,7 @@ class Driver:
     def drive(
         self,
         scenario: Scenario,
-        case: EpisodeId,
+        case: EpisodeOptions,
         recorded: bool,
         folder: Path | None,
         served: tuple[int, int] | None,
@@ -168,7 +157,7 @@ def work(args: argparse.Namespace) -> int:
 def _drive(
     args: argparse.Namespace,
     worker: Worker,
-    case: EpisodeId,
+    case: EpisodeOptions,
     scenario: Scenario,
     folder: Path | None,
     served: tuple[int, int] | None,
@@ -239,14 +228,14 @@ def show(
             print(f"  watch it: cosim replay {shlex.quote(args.out)}{beside}")
 
 
-def _beside(args: argparse.Namespace) -> EpisodeId:
+def _beside(args: argparse.Namespace) -> EpisodeOptions:
     """The same episode driven by `--beside`; SUMO writes no files of it. Raises BadInput."""
     for flag, given in (("--json", args.json), ("--traci-port", args.traci_port is not None)):
         if given:
             raise BadInput(f"does not go together with {flag}", field="--beside", value=args.beside)
     read(args.beside, field="--beside")
-    case = case_of(argparse.Namespace(**vars(args) | {"policy": args.beside, "output": []}))
-    if label(case.policy) == label(read(args.policy).text):
+    case = case_of(argparse.Namespace(**vars(args) | {"policy": args.beside, "output": None}))
+    if label(case.policy) == label(case_of(args).policy):
         raise BadInput("is the policy that drives already", field="--beside", value=args.beside)
     return case
 
@@ -265,26 +254,6 @@ def _programs(count: int) -> str:
     return f"{count} TraCI program{'s' * (count > 1)}"
 
 
-def case_of(args: argparse.Namespace) -> EpisodeId:
+def case_of(args: argparse.Namespace) -> EpisodeOptions:
     """The episode that the flags describe; files by absolute path, so that it can be found again."""
-    same = ["behavior", "driver_model", "penetration", "av_type", "av_ids", "duration", "seed"]
-    same += ["warmup", "mission", "on_collision", "traffic"]
-    what, policy = place(args.what), read(args.policy).text
-    return EpisodeId(
-        what=what,
-        demand=tuple(map(_demand, args.demand)),
-        policy=policy,
-        preset=chosen_preset(what, policy, args.preset),
-        svo_deg=args.svo,
-        outputs=tuple(dict.fromkeys(args.output)),
-        metrics=tuple(code.absolute(metric, "--metric") for metric in args.metric),
-        reward=args.reward and code.absolute(args.reward, "--reward"),
-        errors=human_errors.asked(args.errors),
-        **{name: getattr(args, name) for name in same},
-    )
-
-
-def _demand(name: str) -> str:
-    """A file's absolute path; a demand's name, and whatever is wrong, as it is."""
-    is_file = ("." in name or "/" in name) and is_there(Path(name))
-    return str(Path(name).absolute()) if is_file else name
+    return with_preset(replace(of_flags({**vars(args), "scenario": args.what}), seed=args.seed))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
 import math
 import multiprocessing
 import operator
@@ -15,7 +16,8 @@ import numpy as np
 from cosim.errors import BadInput, hint
 from cosim.observation.view import Unpacker, View
 from cosim.rewards import Reward, RewardTerms, read
-from cosim.scenario import Fleet, Scenario, chosen_fleet, load
+from cosim.scenario import Fleet, Scenario, load
+from cosim.scenario.options import WORDS, EpisodeOptions
 from cosim.seeding import TRAINING_SEEDS
 from cosim.types import (
     COMPACT,
@@ -79,21 +81,7 @@ class Caller(Protocol):
 def open(
     what: str | Scenario,
     *,
-    demand: str | Sequence[str] = (),
-    behavior: str | None = None,
-    driver_model: str = "lc2013",
-    svo: float = 45.0,
-    preset: str | None = None,
     fleet: Fleet | None = None,
-    penetration: float | None = None,
-    av_type: str | None = None,
-    av_ids: str | None = None,
-    duration: float | None = None,
-    warmup: float | None = None,
-    mission: str | None = None,
-    on_collision: str | None = None,
-    errors: str | None = None,
-    traffic: str | None = None,
     options: Sequence[str] = (),
     seed: int | None = None,
     observation: ObservationConfig = COMPACT,
@@ -103,13 +91,14 @@ def open(
     simulator: SimulatorFactory | None = None,
     timeout: float = TIMEOUT,
     worker: bool = True,
+    **words: Any,
 ) -> Session:
     """Open the scenario `what`: a world's name or folder, a path to any .sumocfg, or a `Scenario`.
 
-    The same words mean the same as in `cosim run`: `penetration`, `av_type` and `av_ids` (or a `Fleet`)
-    say who is an AV, `duration` and `warmup` are in s, `mission` is a vehicle's id, a pattern, "none" or
-    "auto"; `errors` are those of human drivers; `traffic` is "as-is" or "controlled"; `svo` is in degrees
-    (it weighs the reward). A `Scenario` holds them: beside it they are refused.
+    `words` are the options of `cosim run` by their names: `demand`, `behavior`, `preset`, `duration` and
+    `warmup` in s, `svo` in degrees (it weighs the reward), ... (`cosim.scenario.options` has them all).
+    `fleet` stands for `penetration`, `av_type` and `av_ids`; `options` are SUMO's own, as typed after `--`.
+    A `Scenario` holds all but `svo`: beside it they are refused.
     `seed` is the first episode's. `reward`: a `cosim.rewards.Reward` (a `RewardConfig`, a
     function of your own), a name of `REWARDS`, FILE.py:NAME or MODULE:NAME; without it P's. `metrics`:
     classes like those of `cosim.metrics`, or FILE.py:NAME, measured besides. `others` builds a policy for
@@ -122,44 +111,28 @@ def open(
     Raises:
         BadInput: naming file (or option), field and value.
     """
-    if not 0.0 <= svo <= 90.0:
-        raise BadInput("must be an angle from 0 to 90 degrees", field="svo", value=svo)
-    scenario = what
-    if not isinstance(scenario, str):
-        given: dict[str, Any] = {
-            "demand": demand or None,
-            "behavior": behavior,
-            "preset": preset,
-            "fleet": fleet,
-        }
-        given |= {"penetration": penetration, "av_type": av_type, "av_ids": av_ids}
-        given |= {"duration": duration, "warmup": warmup, "mission": mission, "options": options or None}
-        given |= {"on_collision": on_collision, "errors": errors, "traffic": traffic}
-        for name, value in given.items():
-            if value is not None:
-                raise BadInput("is part of the Scenario that is given", field=name, value=value)
+    chosen = {} if fleet is None else fleet.words
+    if isinstance(what, str):
+        asked = EpisodeOptions.of(what, words | chosen)
+        scenario = load(asked, options=options)
     else:
-        names = (demand,) if isinstance(demand, str) else tuple(demand)
-        scenario = load(
-            scenario,
-            demand=names,
-            behavior=behavior,
-            driver_model=driver_model,
-            preset=preset,
-            fleet=chosen_fleet(av_type, av_ids, penetration, fleet),
-            duration=duration,
-            warmup=warmup,
-            mission=mission,
-            on_collision=on_collision,
-            errors=errors,
-            traffic=traffic,
-            options=options,
-        )
+        asked, scenario = EpisodeOptions.of(what.name, words), what
+        for name, value in {**words, "fleet": fleet, "options": options or None}.items():
+            if name != "svo" and value is not None:
+                raise BadInput("is part of the Scenario that is given", field=name, value=value)
     if simulator is None:
         from cosim.scenario.vet import vetted
 
         scenario = vetted(scenario)
-    arguments = (scenario, observation, math.radians(svo), reward or "p", others, simulator, tuple(metrics))
+    arguments = (
+        scenario,
+        observation,
+        math.radians(asked.svo_deg),
+        reward or "p",
+        others,
+        simulator,
+        tuple(metrics),
+    )
     # a daemonic process (gymnasium's AsyncVectorEnv, SB3's SubprocVecEnv) may have no children, but is a
     # process of its own already
     in_process = not worker or multiprocessing.current_process().daemon
@@ -174,6 +147,14 @@ def open(
             raise BadInput(problem, field="reward, metrics, others, simulator") from None
 
     return Session(scenario, connect, seed)
+
+
+_words = [
+    inspect.Parameter(o.name, inspect.Parameter.KEYWORD_ONLY, default=o.default, annotation=o.kind)
+    for o in WORDS.values()
+]
+_own = inspect.signature(open)
+setattr(open, "__signature__", _own.replace(parameters=[*[*_own.parameters.values()][:-1], *_words]))  # noqa: B010 - for help()
 
 
 class Session(contextlib.AbstractContextManager["Session"]):

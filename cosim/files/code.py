@@ -111,9 +111,9 @@ def read(
     return Code(place, member)
 
 
-def absolute(text: str, field: str, **where: Any) -> str:
+def absolute(text: str, folder: Path, field: str, file: object = None) -> str:
     """Code by its absolute path, found from anywhere; an entry of a table as it is. Raises as `read`."""
-    return read(text, field, **where).text if is_code(text) else text
+    return read(text, field, folder=folder, file=file).text if is_code(text) else text
 
 
 def files_of(texts: Iterable[object]) -> list[Path]:

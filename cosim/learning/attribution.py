@@ -18,7 +18,7 @@ from cosim.files import write_csv
 from cosim.learning.prediction_data import spread
 from cosim.policies import make
 from cosim.report.statistics import holm, mean, paired_mean, paired_share, share, signed_rank
-from cosim.scenario.episode_id import EpisodeId
+from cosim.scenario.options import EpisodeOptions
 from cosim.workers.engines import LocalEngine
 from cosim.workers.tasks import Progress, Task
 from policy.agents.oracle import Oracle
@@ -56,13 +56,13 @@ def questioned(policy: str) -> Questioned:
 class Asking(EpisodeRunner):
     """Hosted by an engine's worker: drives as `cosim run` does, and asks at every decision."""
 
-    def policy(self, case: EpisodeId) -> Questioned:
+    def policy(self, case: EpisodeOptions) -> Questioned:
         """The policy of `case`, asking itself."""
         self._agent = questioned(case.policy)
         return self._agent
 
     def run(
-        self, case: EpisodeId, warnings: tuple[str, ...], outputs: str | None, progress: Progress
+        self, case: EpisodeOptions, warnings: tuple[str, ...], outputs: str | None, progress: Progress
     ) -> dict[str, Any]:
         """One episode: the document of `cosim run --json`, and the `answers`."""
         return super().run(case, warnings, outputs, progress) | {"answers": self._agent.answers}
@@ -74,7 +74,7 @@ class Replacing(EpisodeRunner):
     _what: tuple[str, str] = NOTHING
 
     def run(  # type: ignore[override]
-        self, case: EpisodeId, warnings: tuple[str, ...], what: tuple[str, str], progress: Progress
+        self, case: EpisodeOptions, warnings: tuple[str, ...], what: tuple[str, str], progress: Progress
     ) -> dict[str, Any]:
         """One episode with `what` replaced; the document of `cosim run --json`."""
         if what != self._what:
@@ -82,7 +82,7 @@ class Replacing(EpisodeRunner):
             self._what = what
         return super().run(case, warnings, None, progress)
 
-    def policy(self, case: EpisodeId) -> PredictionAware:
+    def policy(self, case: EpisodeOptions) -> PredictionAware:
         """The policy of `case`, with that input replaced."""
         agent = questioned(case.policy)
         if self._what == ORACLE:
@@ -121,7 +121,8 @@ def attribution(
         ways = {what[0] for what in _ways(questioned(policy))}
         for name in replaced:
             one_of(name, sorted(ways), "--replace")
-    plan = planned(scenarios, [demand], [], policies, seeds, svo_deg, duration, errors=errors)
+    asked = {"scenario": scenarios, "demand": demand or None, "policy": policies, "svo": svo_deg}
+    plan = planned(seeds, **asked, duration=duration, errors=errors)
     tasks = [cell.task(case) for cell, case in plan.cases()]
     driven = spread(LocalEngine(Asking, workers=workers), tasks, "attribution")
     names = dict.fromkeys(episode["policy"] for episode in driven)

@@ -6,6 +6,7 @@ import shlex
 import sys
 from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
 
 import yaml
 
@@ -84,13 +85,13 @@ def _scheduled(training: VfnTraining, args: argparse.Namespace) -> tuple[VfnTrai
     if worlds:
         lessons = tuple(lesson for world in worlds for lesson in _lessons(world))
         training = replace(training, lessons=lessons)
-    reward = code.absolute(args.reward or training.reward, "--reward")
-    metrics = tuple(code.absolute(metric, "--metric") for metric in args.metric or training.metrics)
+    reward = code.absolute(args.reward or training.reward, Path(), "--reward")
+    metrics = tuple(code.absolute(metric, Path(), "--metric") for metric in args.metric or training.metrics)
     if reward:
         read_reward(reward)
     for metric in metrics:
         read_metric(metric)
-    errors = human_errors.asked(args.errors or training.errors or None)
+    errors = human_errors.asked(args.errors or training.errors or human_errors.NONE)
     level = human_errors.read(errors)
     files = [*code.files_of([*metrics, reward]), *([] if level is None else [level.file])]
     training = replace(training, reward=reward, metrics=metrics, errors=errors or "")

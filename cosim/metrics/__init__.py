@@ -29,6 +29,7 @@ from cosim.metrics.time_to_collision import TimeToCollision
 from cosim.metrics.total_delay import TotalDelay
 from cosim.metrics.trips import Interventions, Trips
 from cosim.metrics.waits import Waits
+from cosim.scenario.options import COLUMNS
 from cosim.types import RESERVED, Kind, Metric, Offence, Snapshot
 
 __all__ = ["METRICS", "EpisodeMetric", "MetricContext", "MetricFactory", "Metrics", "joined", "read"]
@@ -104,7 +105,7 @@ def joined(figures: Mapping[str, Metric], more: object, file: object = None) -> 
     if not isinstance(more, Mapping):
         raise BadInput("must return a mapping of names to cosim.types.Metric", file=file, field="result")
     for name, figure in more.items():
-        if name in figures or name in RESERVED:
+        if name in figures or name in {*RESERVED, *COLUMNS}:
             raise BadInput("is the name of something else in a row", file=file, field="metric", value=name)
         if not isinstance(figure, Metric) or not isinstance(figure.value, Number | None):
             problem = "must be a cosim.types.Metric of a number, true, false or None"

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cosim.report.statistics import Figure, pooled_rate
+from cosim.scenario.options import COLUMNS
 from cosim.types import RESERVED, TIMINGS, WEIGHT
 
 Row = Mapping[str, Any]  # one episode: a line of episodes.parquet, NA as None
@@ -125,7 +126,7 @@ def measures(
     incidences = {m.name: m for m in INCIDENCES.values() if {m.column, m.per, *m.more} <= kinds.keys()}
     rated = {m.column for m in rates.values() if kinds[m.column] <= {bool}}
     means = {}
-    for column in [c for c in kinds if c not in RESERVED | rated]:
+    for column in [c for c in kinds if c not in {*RESERVED, *COLUMNS, *rated}]:
         if kinds[column] == {bool}:
             name = f"{column}_rate"
             rates[name] = Measure(name, column, SHARE, better.get(column, ""), True)

@@ -17,10 +17,11 @@ from cosim.report.figures import Measure, Row, measures
 from cosim.report.summary import summarize
 from cosim.scenario import CONFIG, file_name
 from cosim.scenario.manifest import checked
+from cosim.scenario.options import COLUMNS, FLEET
 from cosim.types import OnCollision, Traffic
 from cosim.workers.tasks import OK
 
-SETTINGS = ("duration", "warmup", "mission", "on_collision", "errors_sha256", "tilt", "traffic")
+SETTINGS = (*(name for name in COLUMNS if name not in FLEET), "errors_sha256", "tilt")
 NEEDED = ("key", "cell", "status", "scenario", "demand", "policy", "seed")
 
 
@@ -56,17 +57,16 @@ class Run:
         return max((self.planned or 0) - len(self.rows), 0)
 
     def case(self, row: Row) -> dict[str, Any]:
-        """What was asked for (`EpisodeId`), without policy and seed; {} where not known."""
+        """What was asked for (`EpisodeOptions`), without policy and seed; {} where not known."""
         return {k: v for k, v in self._cell(row).get("case", {}).items() if k not in ("policy", "seed")}
 
     def settings(self, row: Row) -> dict[str, Any]:
         """What no column says of how an episode was driven (`SETTINGS`); s, and the mission as asked for."""
         driven, asked = self._cell(row).get("manifest", {}), self.case(row)
         times = driven.get("timing", {})
-        return {
+        return {name: asked.get(option.field) for name, option in COLUMNS.items()} | {
             "duration": times.get("duration_s", asked.get("duration")),
             "warmup": times.get("warmup_s", asked.get("warmup")),
-            "mission": asked.get("mission"),
             "on_collision": driven.get("on_collision", asked.get("on_collision") or OnCollision.END),
             "errors_sha256": driven.get("errors", {}).get("sha256"),
             "tilt": driven.get("tilt"),

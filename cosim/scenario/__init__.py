@@ -1,25 +1,28 @@
 """What to simulate: a world by name or by its folder, or any user's .sumocfg, read into one `Scenario`."""
 
-import math
 import os
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import sumo_scenarios
 from cosim.errors import BadInput, check_pattern, hint, one_of
 from cosim.files import yaml_input
 from cosim.files.xml_input import is_there, regular_file
 from cosim.files.yaml_input import NonNegative, Positive
-from cosim.scenario import human_errors, sumocfg
-from cosim.scenario.behaviors import AS_IS, DRIVER_MODELS, LC2013, MIXED, load_behaviors
+from cosim.scenario import human_errors, sumocfg, tilt
+from cosim.scenario.behaviors import AS_IS, LC2013, MIXED
 from cosim.scenario.human_errors import Errors
+from cosim.scenario.options import BEHAVIORS as BEHAVIORS
+from cosim.scenario.options import EpisodeOptions
+from cosim.scenario.options import Fleet as Fleet
+from cosim.scenario.options import place as place
 from cosim.scenario.tilt import Tilt
 from cosim.scenario.traffic import STEP, SUMO_STEP, Changed, check_timing, clocks, settled
 from cosim.types import Identity, OnCollision, Preset, Timing, Traffic
 
-BEHAVIORS = load_behaviors().names
 CONFIG = ".sumocfg"
 DEFINITION = "scenario.yaml"  # what makes a folder a world
 FOREIGN_DURATION = 60.0  # s, for a .sumocfg that names no end
@@ -58,37 +61,6 @@ class Zone:
 
 
 @dataclass(frozen=True, slots=True)
-class Fleet:
-    """Which vehicles are AVs: by vehicle type, by id, or a share of all (the first one given holds)."""
-
-    type: str | None = None
-    ids: str | None = None  # regular expression, full match
-    penetration: float | None = None  # 0..1, drawn per vehicle id from the seed
-
-    @property
-    def may_have_avs(self) -> bool:
-        return self.type is not None or self.ids is not None or bool(self.penetration)
-
-    def describe(self) -> str:
-        if self.type is not None:
-            return f"type {self.type}"
-        if self.ids is not None:
-            return f"ids {self.ids}"
-        return f"penetration {self.penetration:g}" if self.penetration is not None else "none"
-
-
-def chosen_fleet(
-    av_type: str | None, av_ids: str | None, penetration: float | None, fleet: Fleet | None = None
-) -> Fleet | None:
-    """The fleet that one of these asks for; None: the scenario's own. Raises BadInput where two are given."""
-    words = {"fleet": fleet, "av_type": av_type, "av_ids": av_ids, "penetration": penetration}
-    given = [name for name, value in words.items() if value is not None]
-    if len(given) > 1:
-        raise BadInput(f"excludes {given[1]}: give one of them", field=given[0], value=words[given[0]])
-    return fleet if fleet is not None or not given else Fleet(av_type, av_ids, penetration)
-
-
-@dataclass(frozen=True, slots=True)
 class Scenario:
     """Everything the simulator needs; paths are absolute."""
 
@@ -118,6 +90,7 @@ class Scenario:
     demands: Mapping[str, Path] | None = None  # name -> file, of a world
     title: str = ""
     definition: Path | None = None  # the scenario.yaml of a world
+    asked: EpisodeOptions = EpisodeOptions("")  # what a caller asked for, of which this came
     warnings: tuple[str, ...] = ()  # what `cosim.scenario.vet` found odd: reasons not to compare the result
 
     @property
@@ -156,78 +129,67 @@ class Scenario:
         return (self.config, self.net, *self.demand, *self.additional, *ours)
 
 
-def load(
-    what: str,
-    *,
-    demand: Sequence[str] = (),
-    behavior: str | None = None,
-    driver_model: str = LC2013,
-    preset: str | None = None,
-    fleet: Fleet | None = None,
-    duration: float | None = None,
-    warmup: float | None = None,
-    mission: str | None = None,
-    on_collision: str | None = None,
-    errors: str | None = None,
-    traffic: str | None = None,
-    options: Sequence[str] = (),
-) -> Scenario:
-    """The scenario `what` (a world's name or folder, a .sumocfg), with what the command line says otherwise.
+# Options that replace the scenario's field of the same name; the others have a line each in `load`.
+_READ = {"demand", "mission", "errors", "tilt", "traffic"}  # into something else
+OWN = {f.name for f in fields(Scenario)} & {f.name for f in fields(EpisodeOptions)} - _READ
 
-    `demand`: names of the world's demands or files; `options`: SUMO options as typed after `--`, which win
-    over the file's. `duration`, `warmup` in s. `mission`: a vehicle's id or a pattern of ids (full match),
-    "none" or "auto". `errors`: of human drivers, a level or a file (`cosim.scenario.human_errors`).
-    `traffic`: of `Traffic`; None: `cosim.scenario.traffic` decides. Only this file's own syntax is checked:
-    `cosim.scenario.vet` reads the rest.
+
+def load(
+    what: str | EpisodeOptions, *, fleet: Fleet | None = None, options: Sequence[str] = (), **words: Any
+) -> Scenario:
+    """The scenario of an episode as it is asked for.
+
+    `what`: a scenario's name or folder, or a .sumocfg, with `words`, options of `EpisodeOptions` by their
+    names, beside it; `fleet` stands for those that choose the AVs. `options`: SUMO options as typed after
+    `--`, which win over the file's. Only this file's own syntax is checked: `cosim.scenario.vet` reads the
+    rest.
 
     Raises:
         BadInput: names file (or option), field and value, with the nearest name where one is near.
     """
+    words |= {} if fleet is None else fleet.words
+    asked = EpisodeOptions.of(what, words) if isinstance(what, str) else what
     chosen = sumocfg.command_line(options)
-    replaced = chosen.keys() | ({"route-files"} if demand else set())
-    if sumo_scenarios.ships(what):
-        scenario = _world(sumo_scenarios.folder(what))
-    elif is_there(Path(what) / DEFINITION):
-        scenario = _world(Path(os.path.abspath(what)))
+    replaced = chosen.keys() | ({"route-files"} if asked.demand else set())
+    if sumo_scenarios.ships(asked.what):
+        scenario = _world(sumo_scenarios.folder(asked.what))
+    elif is_there(Path(asked.what) / DEFINITION):
+        scenario = _world(Path(os.path.abspath(asked.what)))
     else:
-        scenario = _foreign(what, replaced)
-    if demand:
-        scenario = _with_demand(scenario, demand)
+        scenario = _foreign(asked.what, replaced)
+    if asked.demand:
+        scenario = _with_demand(scenario, asked.demand)
     scenario = _with_sumo_options(scenario, chosen)
-    if duration is not None:
-        if not (math.isfinite(duration) and duration > 0.0):
-            raise BadInput("must be a positive number of seconds", field="--duration", value=duration)
-        scenario = replace(scenario, duration=float(duration))
-    if warmup is not None:
-        if not (math.isfinite(warmup) and warmup >= 0.0):
-            raise BadInput("must be a number of seconds from 0 on", field="--warmup", value=warmup)
-        scenario = replace(scenario, warmup=float(warmup))
-    if mission is not None:
-        scenario = replace(scenario, mission=chosen_mission(scenario.mission, mission))
-    if behavior is None:
-        behavior = _default_behavior(scenario)
     scenario = replace(
         scenario,
-        behavior=one_of(behavior, BEHAVIORS, "--behavior"),
-        driver_model=one_of(driver_model, DRIVER_MODELS, "--driver-model"),
-        preset=one_of(scenario.preset if preset is None else preset, Preset.ALL, "--preset"),
-        on_collision=one_of(on_collision or scenario.on_collision, OnCollision.ALL, "--on-collision"),
-        fleet=scenario.fleet if fleet is None else checked_fleet(fleet),
-        errors=human_errors.read(errors, world=scenario.name if scenario.ships else ""),
+        behavior=_default_behavior(scenario),
+        errors=human_errors.read(asked.errors, world=scenario.name if scenario.ships else ""),
+        tilt=None if asked.tilt is None else tilt.read(asked.tilt, "tilt"),
     )
-    return settled(scenario, chosen, traffic)
+    return settled(with_options(scenario, asked), chosen, asked.traffic)
 
 
-def chosen_preset(what: str, policy: str, preset: str | None) -> str:
-    """The preset that an episode of scenario `what` is driven in by `policy`, where `preset` is asked for.
+def with_options(scenario: Scenario, asked: EpisodeOptions) -> Scenario:
+    """`scenario` with the options that say how it is driven, not whose traffic it is. Raises BadInput."""
+    given = {name: value for name in OWN if (value := getattr(asked, name)) is not None}
+    if asked.mission is not None:
+        given["mission"] = chosen_mission(scenario.mission, asked.mission)
+    if asked.fleet is not None:
+        check_pattern(asked.fleet.ids or "", "av_ids")
+        given["fleet"] = asked.fleet
+    return replace(scenario, asked=asked, **given)
 
-    A policy of `ALWAYS` has one of its own; else it is `preset`, else that of a user's `scenario.yaml` (which
-    cannot ask for `unguarded`), else `lawful`.
+
+def with_preset(asked: EpisodeOptions) -> EpisodeOptions:
+    """`asked` with the preset that its episode is driven in, named.
+
+    A policy of `ALWAYS` has one of its own; else it is the one asked for, else that of a user's
+    `scenario.yaml` (which cannot ask for `unguarded`), else `lawful`.
     """
-    own = ALWAYS.get(policy) or preset
-    if own is None and not sumo_scenarios.ships(what) and is_there(Path(what) / DEFINITION):
-        return _world(Path(os.path.abspath(what))).preset
-    return own or Preset.LAWFUL
+    own = ALWAYS.get(asked.policy) or asked.preset
+    if own is None and not sumo_scenarios.ships(asked.what) and is_there(Path(asked.what) / DEFINITION):
+        own = _world(Path(os.path.abspath(asked.what))).preset
+    return replace(asked, preset=own or Preset.LAWFUL)
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,12 +206,6 @@ class _WorldFile:
     fleet: Fleet = Fleet()
     mission: Mission = Mission()
     conflict_zones: tuple[Zone, ...] = ()
-
-
-def place(what: str) -> str:
-    """`what` as it is found from anywhere: a folder or file by its absolute path, a world's name as it is."""
-    is_path = not sumo_scenarios.ships(what) and is_there(Path(what))
-    return os.path.abspath(what) if is_path else what
 
 
 def file_name(config: Path) -> str:
@@ -279,6 +235,7 @@ def _world(folder: Path) -> Scenario:
     demand = one_of(top.demand or next(iter(demands)), demands, "demand", file)
     one_of(top.mission.kind, MISSIONS, "mission.kind", file)
     check_pattern(top.mission.vehicles, "mission.vehicles", file)
+    check_pattern(top.fleet.ids or "", "fleet.ids", file)
     check_timing(top.timing, file, "timing.step", top.timing.step)
     preset = one_of(top.preset, Preset.ALL, "preset", file)
     return Scenario(
@@ -302,7 +259,7 @@ def _world(folder: Path) -> Scenario:
         preset=Preset.LAWFUL if preset == Preset.UNGUARDED else preset,
         mission=top.mission,
         zones=tuple(replace(z, name=z.name or f"zone{i}") for i, z in enumerate(top.conflict_zones)),
-        fleet=checked_fleet(top.fleet, file, "fleet."),
+        fleet=top.fleet,
     )
 
 
@@ -395,16 +352,6 @@ def chosen_mission(own: Mission, wanted: str) -> Mission:
         raise BadInput("name a vehicle, none or auto", field="--mission", value=wanted)
     check_pattern(wanted, "--mission")
     return replace(own, vehicles=wanted, kind=AUTO if own.kind == NONE else own.kind)
-
-
-def checked_fleet(fleet: Fleet, file: object = None, prefix: str = "--av-") -> Fleet:
-    if fleet.ids is not None:
-        check_pattern(fleet.ids, f"{prefix}ids", file)
-    share = fleet.penetration
-    if share is not None and not (isinstance(share, int | float) and 0.0 <= share <= 1.0):
-        field = "--penetration" if file is None else f"{prefix}penetration"
-        raise BadInput("must be between 0 and 1", file=file, field=field, value=share)
-    return fleet
 
 
 def _demand_name(path: Path) -> str:

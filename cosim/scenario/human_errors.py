@@ -147,13 +147,12 @@ def read(what: str | None, field: str = "--errors", file: object = None, *, worl
     return Errors(f"{path.stem}-{digest[:DIGITS]}", digest, found, path.absolute())
 
 
-def asked(what: str | None, folder: Path = Path()) -> str | None:
+def asked(what: str, folder: Path = Path(), field: str = "--errors", file: object = None) -> str | None:
     """`what` as it is found from anywhere: a level's name, the absolute path of a file relative to `folder`,
-    None for no errors. A name that is neither stays as it is."""
-    if what is None or what == NONE:
-        return None
-    file = Path(os.path.abspath(folder / what))
-    return str(file) if what not in levels() and is_there(file) else what
+    None for no errors. Raises BadInput as `read`."""
+    path = os.path.abspath(folder / what)
+    found = path if what not in (NONE, *levels()) and is_there(Path(path)) else what
+    return None if read(found, field, file) is None else found
 
 
 @lru_cache

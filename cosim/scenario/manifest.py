@@ -11,8 +11,8 @@ from typing import Any
 from cosim.errors import inside
 from cosim.files.yaml_input import mapping, value_of
 from cosim.scenario import Scenario
-from cosim.scenario.episode_id import EpisodeId
 from cosim.scenario.human_errors import Errors
+from cosim.scenario.options import EpisodeOptions
 from cosim.scenario.sumocfg import CLOCK, INPUTS, command_line, keeps
 from cosim.types import OnCollision
 
@@ -85,7 +85,7 @@ def checked(document: object, file: Path, where: str = "") -> dict[str, Any]:
     return found
 
 
-def remembered(case: EpisodeId, options: Sequence[str]) -> dict[str, Any]:
+def remembered(case: EpisodeOptions, options: Sequence[str]) -> dict[str, Any]:
     """What a manifest has to hold beside the usual so that `cosim replay` finds the episode again.
 
     Outputs are left out: a replay does not write them again.

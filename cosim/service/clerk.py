@@ -14,7 +14,7 @@ from cosim.batch.matrix import Plan
 from cosim.batch.store import Store
 from cosim.errors import BadInput, SimulationCrashed, SimulationTimeout
 from cosim.scenario import Scenario
-from cosim.scenario.episode_id import EpisodeId
+from cosim.scenario.options import EpisodeOptions
 from cosim.service.confined import confined_planner, room
 from cosim.service.passing import told_apart
 from cosim.service.planner import Planner
@@ -36,7 +36,7 @@ class Clerk(Planner):
         os.chdir(runs)
         self._database = database
 
-    def asked(self, flags: Mapping[str, Any]) -> tuple[list[EpisodeId], range]:
+    def asked(self, flags: Mapping[str, Any]) -> tuple[list[EpisodeOptions], range]:
         """What a request names: the case of every cell and the seeds, no file read. Raises BadInput."""
         wanted = spec.read(None, flags)
         seeds = range(*wanted.seeds)
@@ -59,7 +59,7 @@ class Clerk(Planner):
 
         html.write(run_folder.read(run), None, shown=run)
 
-    def recorded(self, run: str, episode: str) -> tuple[EpisodeId, Mapping[str, Any], str]:
+    def recorded(self, run: str, episode: str) -> tuple[EpisodeOptions, Mapping[str, Any], str]:
         """An episode of a run that has its tables, by its key or seed: its case, manifest and trace hash.
 
         Raises BadInput.
@@ -100,11 +100,11 @@ class Clerks:
         cases, seeds = self.call("asked", flags)
         return self._planned("plan", cases, seeds, uploads)
 
-    def plan_again(self, cases: Sequence[EpisodeId], seeds: range, uploads: Sequence[str]) -> Plan:
+    def plan_again(self, cases: Sequence[EpisodeOptions], seeds: range, uploads: Sequence[str]) -> Plan:
         """The plan of a run that was begun."""
         return self._planned("plan_again", cases, seeds, uploads)
 
-    def session(self, flags: Mapping[str, Any], uploads: Sequence[str]) -> tuple[Scenario, EpisodeId]:
+    def session(self, flags: Mapping[str, Any], uploads: Sequence[str]) -> tuple[Scenario, EpisodeOptions]:
         """What a session is opened on."""
         (case,), _ = self.call("asked", flags)
         scenario: Scenario = self._read(uploads, "session", case)
@@ -135,7 +135,9 @@ class Clerks:
 
     # ---- inside ----
 
-    def _planned(self, method: str, cases: Sequence[EpisodeId], seeds: range, uploads: Sequence[str]) -> Plan:
+    def _planned(
+        self, method: str, cases: Sequence[EpisodeOptions], seeds: range, uploads: Sequence[str]
+    ) -> Plan:
         """A plan of these very cases, whatever the process that read the files says of them."""
         found: Plan = self._read(uploads, method, cases, seeds)
         cells = zip(found.cells, cases, strict=True)

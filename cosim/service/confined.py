@@ -33,7 +33,7 @@ from cosim.workers.untrusted import untrusted
 if TYPE_CHECKING:
     from cosim.envs.host import PolicyFactory, Reply
     from cosim.scenario import Scenario
-    from cosim.scenario.episode_id import EpisodeId
+    from cosim.scenario.options import EpisodeOptions
     from cosim.service.planner import Planner
     from cosim.service.watch import WatchedHost
     from cosim.types import ObservationConfig
@@ -154,7 +154,7 @@ class ConfinedRunner:
         self._runner = EpisodeRunner()
 
     def run(
-        self, case: EpisodeId, warnings: tuple[str, ...], outputs: str | None, progress: Progress
+        self, case: EpisodeOptions, warnings: tuple[str, ...], outputs: str | None, progress: Progress
     ) -> dict[str, Any]:
         """One episode, as `EpisodeRunner.run`."""
         allow_processor_time(self._limits.cpu)
@@ -178,7 +178,12 @@ class Drawer:
         allow_processor_time(limits.cpu)
 
     def page(
-        self, case: EpisodeId, manifest: Mapping[str, Any], trace_hash: str, target: str, progress: Progress
+        self,
+        case: EpisodeOptions,
+        manifest: Mapping[str, Any],
+        trace_hash: str,
+        target: str,
+        progress: Progress,
     ) -> None:
         """Write the page of an episode of this manifest and hash. Raises BadInput, ReplayDiffers as
         `cosim replay`."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from cosim.batch.episode_runner import EpisodeRunner
-from cosim.scenario.episode_id import EpisodeId
+from cosim.scenario.options import EpisodeOptions
 from cosim.service.confined import allow_processor_time, limit_resources, session_host
 from cosim.service.settings import Limits
 from cosim.workers.tasks import Progress
@@ -24,7 +24,7 @@ class LimitedRunner(EpisodeRunner):
         self._processor_time = limits.cpu
 
     def run(
-        self, case: EpisodeId, warnings: tuple[str, ...], outputs: str | None, progress: Progress
+        self, case: EpisodeOptions, warnings: tuple[str, ...], outputs: str | None, progress: Progress
     ) -> dict[str, Any]:
         """One episode, as `EpisodeRunner.run`."""
         allow_processor_time(self._processor_time)

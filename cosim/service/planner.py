@@ -9,7 +9,7 @@ from cosim.batch.matrix import Plan
 from cosim.errors import BadInput
 from cosim.policies import check
 from cosim.scenario import Scenario
-from cosim.scenario.episode_id import EpisodeId
+from cosim.scenario.options import EpisodeOptions
 from cosim.scenario.vet import vetted
 from cosim.service.passing import told_apart
 from cosim.service.settings import Limits
@@ -21,7 +21,7 @@ class Planner:
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
 
-    def plan(self, cases: Sequence[EpisodeId], seeds: range) -> Plan:
+    def plan(self, cases: Sequence[EpisodeOptions], seeds: range) -> Plan:
         """The plan of a new run. Raises BadInput, as `cosim evaluate` does."""
         found = matrix.plan(cases, seeds, check)
         matrix.check_names(found)
@@ -31,12 +31,12 @@ class Planner:
             self._check_length(cell.scenario)
         return found
 
-    def plan_again(self, cases: Sequence[EpisodeId], seeds: range) -> Plan:
+    def plan_again(self, cases: Sequence[EpisodeOptions], seeds: range) -> Plan:
         """The plan of a run that was begun."""
         with told_apart():
             return matrix.plan(cases, seeds, check)
 
-    def session(self, case: EpisodeId) -> Scenario:
+    def session(self, case: EpisodeOptions) -> Scenario:
         """The scenario of a session. Raises BadInput, as `cosim run` does."""
         check(case.policy)
         scenario = vetted(case.scenario())

@@ -2,7 +2,6 @@
 
 import math
 import re
-import typing
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -10,42 +9,30 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictInt, WithJsonSchema, create_model
 
 import sumo_scenarios
-from cosim.batch.spec import FIELDS, Spec
+from cosim.batch.spec import SEEDS
 from cosim.errors import BadInput, hint
 from cosim.policies import NAMES as POLICIES
 from cosim.rewards import REWARDS
-from cosim.scenario import BEHAVIORS
-from cosim.scenario.behaviors import DRIVER_MODELS
+from cosim.scenario.options import MEASURED, OPTIONS, Option
 from cosim.scenario.sumo_outputs import OUTPUTS
-from cosim.types import OnCollision, Preset, Traffic
 
 UPLOAD = "upload:"  # before an upload's id, where a scenario or a policy is named
 LONGEST = 1000  # characters of a text, items of a list
 _NAME = re.compile(r"[\w+-]+(\.[\w+-]+)*", re.ASCII)
 _FILE = re.compile(r".*\.(ya?ml|json|xml|gz|py|safetensors|sumocfg)", re.IGNORECASE)
-_FREE = ("seeds", "mission", "av_type", "av_ids")  # texts that name no file whatever they hold
 _LABEL = re.compile(r"(?:([\w.+-]+)=)?upload:([0-9a-f]{12})", re.ASCII)
 Find = Callable[[str, str], Path]  # an upload's id, what it must be -> its file; raises BadInput
-_ALLOWED: dict[str, Iterable[str]] = {
+_ALLOWED: dict[str, Iterable[str]] = {  # names alone: no code is taken, and SUMO writes no other file
+    **{o.name: o.choices for o in OPTIONS.values() if o.choices},
     "reward": REWARDS,
-    "behavior": BEHAVIORS,
-    "driver_model": DRIVER_MODELS,
-    "preset": Preset.ALL,
-    "on_collision": OnCollision.ALL,
-    "traffic": Traffic.ALL,
     "output": OUTPUTS,
 }
-_ABOUT = {
-    "scenario": f"worlds by name ({', '.join(sumo_scenarios.names())}), or upload:ID",
-    "seeds": "a:b, the seeds a, a+1, ... b-1",
+_ABOUT = {  # where HTTP takes less than the command line
+    "scenario": f"scenarios by name ({', '.join(sumo_scenarios.names())}), or upload:ID",
     "demand": "by name (free, dense, contested), or files of the upload; A,B is one demand of two files",
     "policy": f"by name ({', '.join(POLICIES)}), upload:ID or LABEL=upload:ID",
-    "svo": "degrees, 0 to 90",
-    "penetration": "share of vehicles that are AVs, 0 to 1",
-    "duration": "counted s per episode",
-    "warmup": "s driven before the counted time begins",
-    "mission": "the mission vehicle: its id, a pattern of ids, none, or auto",
-    "output": "SUMO's own outputs to keep, by SUMO's names",
+    "errors": "of human drivers: none (default), field or stress",
+    "reward": "report what AVs earn by it",
     "metric": "refused: code is not taken over HTTP",
 }
 EXAMPLE: dict[str, Any] = {
@@ -58,27 +45,27 @@ EXAMPLE: dict[str, Any] = {
 }
 
 
-def _schema(name: str, kind: Any) -> dict[str, Any]:
-    """A field's JSON schema: of an axis one value or a list; `cosim.batch.spec` checks the values."""
-    kinds = typing.get_args(kind) if typing.get_origin(kind) is tuple else (kind,)
-    number = any("float" in str(k) for k in kinds)
-    one: dict[str, Any] = {"type": "number"} if number else {"type": "string", "minLength": 1}
-    if name in _ALLOWED:
-        one["enum"] = [*_ALLOWED[name]]
-    if name == "seeds":
-        return {"type": "string", "pattern": r"^[0-9]{1,19}:[0-9]{1,19}$", "examples": [EXAMPLE["seeds"]]}
-    if typing.get_origin(kind) is not tuple:
-        return {"anyOf": [one, {"type": "null"}]}
-    return {"anyOf": [one, {"type": "array", "items": one, "minItems": 1}]}
+def _schema(option: Option, several: bool) -> dict[str, Any]:
+    """JSON schema of an option, of `several` one value or a list; `cosim.batch.spec` checks the values."""
+    one: dict[str, Any] = {"type": "string", "minLength": 1} if option.range is None else {"type": "number"}
+    if option.name in _ALLOWED:
+        one["enum"] = [*_ALLOWED[option.name]]
+    other = {"type": "array", "items": one, "minItems": 1} if several else {"type": "null"}
+    return {"anyOf": [one, other]}
 
 
-_kinds = typing.get_type_hints(Spec, include_extras=True)
-_fields: dict[str, Any] = {
-    name: (
-        Annotated[Any, WithJsonSchema(_schema(name, _kinds[name]))],
-        Field(default=... if name == "scenario" else None, description=_ABOUT.get(name)),
+def _field(option: Option, schema: dict[str, Any]) -> tuple[Any, Any]:
+    about = _ABOUT.get(option.name, option.help)
+    default = ... if option.name == "scenario" else None
+    return Annotated[Any, WithJsonSchema(schema)], Field(default=default, description=about)
+
+
+_SEEDS = {"type": "string", "pattern": r"^[0-9]{1,19}:[0-9]{1,19}$", "examples": [EXAMPLE["seeds"]]}
+_fields: dict[str, Any] = {o.name: _field(o, _schema(o, o.axis or o.several)) for o in OPTIONS.values()} | {
+    SEEDS: (
+        Annotated[Any, WithJsonSchema(_SEEDS)],
+        Field(default=None, description="a:b, the seeds a, a+1, ... b-1"),
     )
-    for name in FIELDS
 }
 
 
@@ -96,10 +83,8 @@ else:
 
 
 # A session has one value of each axis; its seeds, reward and outputs are its own.
-_ONE = {
-    name: (Annotated[Any, WithJsonSchema(_schema(name, _kinds[name])["anyOf"][0])], field)
-    for name, (_, field) in _fields.items()
-    if name not in ("seeds", "reward", "output", "metric")
+_ONE: dict[str, Any] = {
+    o.name: _field(o, _schema(o, False)["anyOf"][0]) for o in OPTIONS.values() if o.scope != MEASURED
 }
 SESSION_EXAMPLE: dict[str, Any] = {"scenario": "merge", "demand": "contested", "svo": 45, "policy": "idm"}
 
@@ -175,7 +160,7 @@ def _axis(name: str, value: Any, find: Find, uploads: list[str]) -> Any:
         for item in value if isinstance(value, list) else [value]:
             if item is not None and item not in (known := [*_ALLOWED[name]]):
                 raise BadInput(f"unknown{hint(str(item), known)}", field=name, value=item)
-    if name not in _FREE and name != "demand":
+    if name not in (SEEDS, "demand") and not OPTIONS[name].free:
         for item in value if isinstance(value, list) else [value]:
             if isinstance(item, str) and not _is_name(item):
                 raise BadInput("is no name: no file or code is read", field=name, value=item)

@@ -17,7 +17,7 @@ from cosim.errors import BadInput, SimulationError
 from cosim.observation.view import Packer, View
 from cosim.policies import make
 from cosim.scenario import Scenario
-from cosim.scenario.episode_id import EpisodeId
+from cosim.scenario.options import EpisodeOptions
 from cosim.scenario.policy_name import label
 from cosim.service.clerk import Clerks
 from cosim.service.confined import confined_host, room
@@ -271,7 +271,7 @@ class Sessions:
         self,
         request: dict[str, Any],
         scenario: Scenario,
-        case: EpisodeId,
+        case: EpisodeOptions,
         uploads: Sequence[str],
         observation: ObservationConfig,
         seed: int | None,

@@ -20,6 +20,7 @@ from cosim.envs.host import Reply
 from cosim.errors import BadInput
 from cosim.observation.view import Packed
 from cosim.rewards import RewardTerms
+from cosim.scenario.options import COLUMNS
 from cosim.types import IDENTITY, Collision, Due, EpisodeResult, Events, Metric, Receipt, Snapshot
 
 MEDIA = "application/vnd.cosim.step"  # what a client accepts that wants bytes
@@ -125,6 +126,7 @@ def to_result(document: Mapping[str, Any]) -> EpisodeResult:
         validity=tuple(document["not_comparable_because"]),
         mission_vehicle=document["mission_vehicle"],
         mission_guessed=document["mission_guessed"],
+        asked={name: document[name] for name in COLUMNS if name in document},
         interventions_by_reason=document["interventions_by_reason"],
         manifest=document["manifest"],
     )

@@ -13,7 +13,7 @@ import sumo
 from conftest import Start, vehicle
 
 from cosim.host import Host
-from cosim.scenario import chosen_fleet, load
+from cosim.scenario import Fleet, load
 from cosim.types import Command, Decision, EpisodeResult, History, MetaAction, Preset
 from cosim.workers.worker import Worker
 from tests.law.drawn import build_net
@@ -148,7 +148,7 @@ def turn_after_red(folder: Path, human: float) -> Path:
 
 
 def drive(config: Path, policy: Always) -> EpisodeResult:
-    fleet = chosen_fleet(None, "av2?", None)
+    fleet = Fleet(ids="av2?")
     with Worker(Host, load(str(config), preset=Preset.LAWFUL, fleet=fleet), policy, math.pi / 4) as worker:
         result: EpisodeResult = worker.call("run", 0)
     return result

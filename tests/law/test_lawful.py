@@ -16,7 +16,7 @@ from cosim.control import COMFORT, JERK, lawful_speed, wished_accel
 from cosim.host import Host
 from cosim.road import RoadMap
 from cosim.road.rules import RulesAhead
-from cosim.scenario import chosen_fleet, load
+from cosim.scenario import load
 from cosim.scenario.human_errors import levels
 from cosim.scenario.vet import vetted
 from cosim.simulation import assistance, inside
@@ -62,7 +62,7 @@ def drive(
     seed: int = SEED,
     duration: float = 60.0,
 ) -> EpisodeResult:
-    scenario = load(str(what), preset=preset, fleet=chosen_fleet(None, None, share), duration=duration)
+    scenario = load(str(what), preset=preset, penetration=share, duration=duration)
     with Worker(Host, scenario, policy, math.pi / 4) as worker:
         result: EpisodeResult = worker.call("run", seed)
     return result

@@ -23,7 +23,7 @@ import cosim
 from cosim.batch.matrix import Cell, Plan
 from cosim.errors import BadInput, SimulationCrashed
 from cosim.scenario import load
-from cosim.scenario.episode_id import EpisodeId
+from cosim.scenario.options import EpisodeOptions
 from cosim.service import clerk, client, uploads
 from cosim.service.clerk import Clerks
 from cosim.service.confined import Room, allow_processor_time
@@ -199,7 +199,7 @@ class Planning:
     def __init__(self, room: Room) -> None:
         room.enter()
 
-    def plan_again(self, cases: list[EpisodeId], _: range) -> Plan:
+    def plan_again(self, cases: list[EpisodeOptions], _: range) -> Plan:
         """Of something else, without end."""
         other = replace(cases[0], what="/etc/passwd")
         return Plan((Cell(other, load("merge"), {}),), range(10**15))
@@ -223,7 +223,7 @@ def planned(place: Path, limit: float = 120.0) -> Plan:
     with DataFolder(str(place / "data")) as folder:
         clerks = Clerks(Settings(folder.path, limits=Limits(check=limit)), Processes())
         try:
-            return clerks.plan_again([EpisodeId("merge", "idm", 7)], range(7, 9), ["0" * 12])
+            return clerks.plan_again([EpisodeOptions("merge", "idm", 7)], range(7, 9), ["0" * 12])
         finally:
             clerks.close()
 

@@ -15,7 +15,13 @@ from cosim.workers.worker import Worker
 
 
 def test_who_is_asked_drives_the_same_episode() -> None:
-    plan = planned(["merge"], ["contested"], [], ["vfn-p-demonstrated"], range(150000, 150001), duration=3.2)
+    plan = planned(
+        range(150000, 150001),
+        scenario="merge",
+        demand="contested",
+        policy="vfn-p-demonstrated",
+        duration=3.2,
+    )
     ((_, case),) = plan.cases()
     hashes = []
     for host in (EpisodeRunner, Asking):

@@ -24,7 +24,7 @@ from cosim.metrics import MetricContext
 from cosim.metrics.context import CRITICAL
 from cosim.metrics.time_to_collision import TimeToCollision
 from cosim.recording.recorder import Recorder
-from cosim.scenario.episode_id import EpisodeId
+from cosim.scenario.options import EpisodeOptions
 from cosim.scenario.vet import vetted
 from cosim.types import Timing
 from cosim.workers.worker import Worker
@@ -258,7 +258,7 @@ class Driven:
     """Drives in a worker with an SSM device on every vehicle; near-misses by time to collision."""
 
     def __init__(self, world: str, errors: str | None) -> None:
-        case = EpisodeId(
+        case = EpisodeOptions(
             world, "idm", 0, ("dense",), warmup=0.0, duration=80.0, on_collision="continue", errors=errors
         )
         self._host = Host(vetted(case.scenario(())), "idm", 0.0)

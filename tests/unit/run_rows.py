@@ -10,7 +10,7 @@ from typing import Any
 from cosim.batch.export import export
 from cosim.batch.store import Store
 from cosim.report.summary import summarize
-from cosim.scenario.episode_id import EpisodeId
+from cosim.scenario.options import EpisodeOptions
 
 UNITS = {
     "crashed": "bool",
@@ -38,7 +38,7 @@ BETTER = {
     "veto_rate": "lower",
     "total_delay_s": "lower",
 }
-CASE = EpisodeId(
+CASE = EpisodeOptions(
     what="merge",
     demand=("contested",),
     policy="idm",
@@ -54,7 +54,7 @@ CASE = EpisodeId(
 )
 
 
-def row(case: EpisodeId, **values: Any) -> dict[str, Any]:
+def row(case: EpisodeOptions, **values: Any) -> dict[str, Any]:
     """One ok episode without a crash; `values` replace or add columns."""
     plain = {
         "key": case.key,
@@ -93,7 +93,7 @@ def row(case: EpisodeId, **values: Any) -> dict[str, Any]:
     return plain | values
 
 
-def failed(case: EpisodeId, status: str = "sim_crash") -> dict[str, Any]:
+def failed(case: EpisodeOptions, status: str = "sim_crash") -> dict[str, Any]:
     """An episode without figures, as the batch keeps it."""
     identity = list(row(case))[: list(row(case)).index("steps")]
     found = {name: value for name, value in row(case).items() if name in identity}
@@ -108,7 +108,7 @@ def cell(
     first: int = 200_000,
     columns: dict[str, Sequence[Any]] | None = None,
     **case: Any,
-) -> list[tuple[EpisodeId, dict[str, Any]]]:
+) -> list[tuple[EpisodeOptions, dict[str, Any]]]:
     """`count` episodes of one policy; `columns`: by name, one value per episode."""
     cases = [replace(CASE, policy=policy, seed=first + k, **case) for k in range(count)]
     values = columns or {}
@@ -117,7 +117,7 @@ def cell(
 
 def write(
     folder: Path,
-    *cells: list[tuple[EpisodeId, dict[str, Any]]],
+    *cells: list[tuple[EpisodeOptions, dict[str, Any]]],
     manifest: bool = True,
     planned: int | None = None,
 ) -> Path:
@@ -131,7 +131,7 @@ def write(
     return folder
 
 
-def begin(folder: Path, *cells: list[tuple[EpisodeId, dict[str, Any]]], planned: int) -> Path:
+def begin(folder: Path, *cells: list[tuple[EpisodeOptions, dict[str, Any]]], planned: int) -> Path:
     """The folder of a run that is still being driven: `planned` seeds of every cell, these rows so far."""
     folder.mkdir(parents=True)
     with Store.in_folder(folder) as store:
@@ -150,5 +150,5 @@ def _document(seeds: int) -> dict[str, Any]:
     }
 
 
-def _cells(*cells: list[tuple[EpisodeId, dict[str, Any]]]) -> dict[str, dict[str, Any]]:
+def _cells(*cells: list[tuple[EpisodeOptions, dict[str, Any]]]) -> dict[str, dict[str, Any]]:
     return {c.cell: {"case": c.document(), "manifest": {}} for one in cells for c, _ in one}

@@ -11,7 +11,7 @@ import pytest
 from cosim.batch import matrix
 from cosim.batch.spec import FIELDS, Spec, read
 from cosim.errors import BadInput
-from cosim.scenario.episode_id import EpisodeId
+from cosim.scenario.options import EpisodeOptions
 from cosim.types import Preset
 from policy.agents import check_name
 
@@ -78,8 +78,9 @@ seeds: "200000:200003"
 def test_a_flag_beside_the_file_replaces_that_line_only(tmp_path: Path) -> None:
     text = 'scenario: merge\npolicy: [idm, random]\npenetration: 0.5\nseeds: "5:9"\n'
     spec = of_file(tmp_path, text, policy=["keep-lane"], av_type="av")
-    assert (spec.scenario, spec.policy, spec.seeds) == (("merge",), ("keep-lane",), (5, 9))
-    assert (spec.av_type, spec.penetration) == ("av", (None,)), "another way to choose the fleet"
+    assert (spec.values["what"], spec.values["policy"], spec.seeds) == (("merge",), ("keep-lane",), (5, 9))
+    assert spec.values["av_type"] == ("av",)
+    assert "penetration" not in spec.values, "another way to choose the fleet"
 
 
 def test_globs_and_joined_files_are_demands_of_their_own(tmp_path: Path) -> None:
@@ -89,7 +90,7 @@ def test_globs_and_joined_files_are_demands_of_their_own(tmp_path: Path) -> None
     spec = of_file(
         tmp_path, "scenario: merge\ndemand: ['*.rou.xml', '*.gz', 'c.trips.xml,?.rou.xml', free]\n"
     )
-    names = [tuple(Path(file).name for file in point) for point in spec.demand]
+    names = [tuple(Path(file).name for file in point) for point in spec.values["demand"]]
     assert names == [
         ("a.rou.xml",),
         ("b.rou.xml",),
@@ -126,7 +127,7 @@ def test_what_two_globs_find_twice_is_driven_once(tmp_path: Path) -> None:
         ("scenario: merge\nbehavior: agressive\n", r"behavior='agressive'.*'aggressive'"),
         ("scenario: merge\npreset: none\n", r"preset='none'"),
         ("scenario: merge\nduration: 0\n", r"duration=0: must be more than 0"),
-        ("scenario: merge\nav_type: av\npenetration: 0.1\n", r"av_type: excludes penetration"),
+        ("scenario: merge\nav_type: av\npenetration: 0.1\n", r"av_type=.av.: excludes penetration"),
         ("scenario: merge\nav_ids: '['\n", r"av_ids='\[': not a regular expression"),
         ("- merge\n", r"a mapping is needed"),
         ("scenario: [merge\n", r"not YAML"),
@@ -175,13 +176,12 @@ def test_a_net_that_would_kill_sumo_costs_its_own_cells_only(tmp_path: Path) -> 
 
 def test_a_case_keeps_its_key_and_comes_back_from_its_document() -> None:
     case = next(iter(matrix.cells(of_flags(scenario=["merge"], seeds="3:9", svo=[90.0]))))
-    assert EpisodeId.read(case.document()) == case
+    assert EpisodeOptions.read(case.document()) == case
     assert case.key == f"{case.cell}-3"
     assert case.with_seed(4).cell == case.cell
     assert case.preset == Preset.LAWFUL
-    unnamed = EpisodeId.read({**case.document(), "preset": None})
+    unnamed = EpisodeOptions.read({**case.document(), "preset": None})
     assert unnamed.cell == "a6779b4d52e4", "stores and manifests of earlier runs hold this hash"
-    assert unnamed.scenario().preset == Preset.UNGUARDED, "the default of that time"
 
 
 def test_warm_up_and_mission_are_part_of_the_cell_where_they_are_given() -> None:
@@ -191,7 +191,7 @@ def test_warm_up_and_mission_are_part_of_the_cell_where_they_are_given() -> None
     )
     assert not plain.document().keys() & {"warmup", "mission"}
     assert len({plain.cell, *(case.cell for case in others)}) == 4
-    assert [EpisodeId.read(case.document()) for case in others] == others
+    assert [EpisodeOptions.read(case.document()) for case in others] == others
 
 
 def test_two_worlds_of_one_name_are_refused_by_their_places(tmp_path: Path) -> None:

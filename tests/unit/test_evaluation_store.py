@@ -18,24 +18,21 @@ from cosim.batch import execution as batch
 from cosim.batch import matrix
 from cosim.batch.export import arrow, export
 from cosim.batch.folder import RunFolder
+from cosim.batch.record import planned
 from cosim.batch.records import row
-from cosim.batch.spec import Spec
 from cosim.batch.store import Store
 from cosim.errors import BadInput, CosimError
-from cosim.scenario.episode_id import EpisodeId
-from cosim.types import Preset
+from cosim.scenario.options import EpisodeOptions
 from cosim.workers.tasks import Outcome, Task
-from policy.agents import check_name
 
 
 @pytest.fixture(scope="module")
 def plan() -> matrix.Plan:
     """Two cells of three seeds."""
-    spec = Spec(("merge",), (7, 10), policy=("random", "idm"))
-    return matrix.plan(matrix.cells(spec), range(*spec.seeds), check_name)
+    return planned(range(7, 10), scenario="merge", policy=["random", "idm"])
 
 
-def document(case: EpisodeId, cell: matrix.Cell) -> dict[str, Any]:
+def document(case: EpisodeOptions, cell: matrix.Cell) -> dict[str, Any]:
     """As `cosim run --json` has it, of an episode that was never driven."""
     return {
         "scenario": "merge",
@@ -138,22 +135,6 @@ def test_another_spec_or_another_version_of_a_file_is_refused_on_resume(
         cell = replace(plan.cells[0], manifest={**plan.cells[0].manifest, "files": files})
         with pytest.raises(BadInput, match=r"files\.merge\.sumocfg: is another one since the run began"):
             batch.check_same(replace(plan, cells=(cell, plan.cells[1])), store)
-
-
-def test_a_run_of_the_time_when_no_preset_was_named_goes_on_in_its_own(
-    plan: matrix.Plan, tmp_path: Path
-) -> None:
-    unnamed = [replace(cell.case, preset=None) for cell in plan.cells]
-    with Store.in_folder(tmp_path) as store:
-        batch.begin(matrix.plan(unnamed, plan.seeds, check_name), store, {})
-        with pytest.raises(BadInput, match="run of another spec"):
-            batch.check_same(plan, store)
-    cases, seeds = batch.asked(tmp_path, None)
-    found = matrix.plan(cases, seeds, check_name)
-    with Store.in_folder(tmp_path) as store:
-        batch.check_same(found, store)
-    assert [cell.case for cell in found.cells] == unnamed
-    assert {cell.scenario.preset for cell in found.cells} == {Preset.UNGUARDED}
 
 
 def test_a_worker_that_sees_other_versions_than_the_planner_stops_the_run(

@@ -15,9 +15,9 @@ from cosim.errors import BadInput
 from cosim.files import yaml_input
 from cosim.report.pairing import Group
 from cosim.scenario import load
-from cosim.scenario.episode_id import EpisodeId
 from cosim.scenario.human_errors import KINDS, asked, levels, read
 from cosim.scenario.manifest import manifest
+from cosim.scenario.options import EpisodeOptions
 from cosim.seeding import subseed, uniforms
 
 
@@ -102,10 +102,10 @@ def test_a_level_that_is_none_is_named_with_the_nearest() -> None:
 
 
 def test_an_episode_without_errors_is_called_as_before() -> None:
-    plain = EpisodeId("merge", "idm", 7)
+    plain = EpisodeOptions("merge", seed=7)
     assert "errors" not in plain.document()
-    assert EpisodeId("merge", "idm", 7, errors="stress").cell != plain.cell
-    assert EpisodeId.read(EpisodeId("merge", "idm", 7, errors="field").document()).errors == "field"
+    assert EpisodeOptions("merge", seed=7, errors="stress").cell != plain.cell
+    assert EpisodeOptions.read(EpisodeOptions("merge", seed=7, errors="field").document()).errors == "field"
 
 
 def test_manifest_and_identity_name_the_errors(tmp_path: Path) -> None:

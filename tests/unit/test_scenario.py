@@ -9,7 +9,8 @@ import pytest
 import sumo_scenarios
 from cosim import scenario
 from cosim.errors import BadInput
-from cosim.scenario import Fleet, Mission, chosen_preset, load, sumocfg
+from cosim.scenario import Fleet, Mission, load, sumocfg, with_preset
+from cosim.scenario.options import EpisodeOptions
 from cosim.types import Preset
 
 WORLD = """
@@ -194,6 +195,11 @@ def test_the_command_lines_fleet_and_preset_win(world: Path) -> None:  # noqa: A
     assert (s.fleet.describe(), s.preset) == ("penetration 0.2", "guarded")
 
 
+def named(what: str, **options: str) -> str | None:
+    """The preset in an episode's key."""
+    return with_preset(EpisodeOptions(what, **options)).preset
+
+
 @pytest.mark.parametrize("name", [*sumo_scenarios.names(), *sumo_scenarios.practice()])
 def test_a_copied_world_is_driven_in_the_preset_of_the_original(name: str, tmp_path: Path) -> None:
     copy = tmp_path / "mine"
@@ -203,11 +209,9 @@ def test_a_copied_world_is_driven_in_the_preset_of_the_original(name: str, tmp_p
     definition = copy / "scenario.yaml"
     definition.write_text(definition.read_text().replace(f"name: {own}", "name: mine"))
     for what in (name, str(copy)):
-        assert load(what).preset == chosen_preset(what, "idm", None) == Preset.LAWFUL
+        assert load(what).preset == named(what) == Preset.LAWFUL
         assert load(what, preset="unguarded").preset == Preset.UNGUARDED
-        assert (
-            chosen_preset(what, "idm", "unguarded") == chosen_preset(what, "keep-lane", None) == "unguarded"
-        )
+        assert named(what, preset="unguarded") == named(what, policy="keep-lane") == Preset.UNGUARDED
 
 
 @pytest.mark.parametrize(("line", "preset"), [("guarded", "guarded"), ("unguarded", "lawful")])
@@ -218,7 +222,7 @@ def test_a_world_may_ask_for_another_guard_but_not_for_none(
     shutil.copytree(world, own)
     (own / "lane.sumocfg").rename(own / "own.sumocfg")
     (own / "scenario.yaml").write_text(f"name: own\npreset: {line}\ndemand: dense\n")
-    assert load(str(own)).preset == chosen_preset(str(own), "idm", None) == preset
+    assert load(str(own)).preset == named(str(own)) == preset
 
 
 @pytest.mark.parametrize(
@@ -234,7 +238,7 @@ def test_a_world_may_ask_for_another_guard_but_not_for_none(
         ("timing: {frame: 0.25}", "timing.step", "whole number"),
         ("timing: {decison: 0.4}", "timing.decison", "'decision'"),
         ("timing: 3", "timing", "mapping"),
-        ("fleet: {penetration: 1.5}", "fleet.penetration", "between 0 and 1"),
+        ("fleet: {penetration: 1.5}", "fleet.penetration", "from 0 to 1"),
         ("fleet: {ids: '('}", "fleet.ids", "regular expression"),
         ("mission: {kind: merg}", "mission.kind", "'merge'"),
         ("mission: {goal: 3}", "mission.goal", "list"),
@@ -261,17 +265,17 @@ def test_a_wrong_field_of_scenario_yaml_is_named(world: Path, line: str, field: 
         ({"what": "lane\0"}, "scenario", "no such"),
         ({"what": "lane", "demand": ["contestd"]}, "--demand", "'contested'"),
         ({"what": "lane", "demand": ["gone.rou.xml"]}, "--demand", "no such file"),
-        ({"what": "lane", "behavior": "agressive"}, "--behavior", "'aggressive'"),
-        ({"what": "lane", "driver_model": "lc2031"}, "--driver-model", "'lc2013'"),
-        ({"what": "lane", "preset": "gaurded"}, "--preset", "'guarded'"),
-        ({"what": "lane", "duration": float("nan")}, "--duration", "positive"),
-        ({"what": "lane", "duration": -1.0}, "--duration", "positive"),
-        ({"what": "lane", "warmup": float("inf")}, "--warmup", "from 0"),
-        ({"what": "lane", "warmup": -1.0}, "--warmup", "from 0"),
+        ({"what": "lane", "behavior": "agressive"}, "behavior", "'aggressive'"),
+        ({"what": "lane", "driver_model": "lc2031"}, "driver_model", "'lc2013'"),
+        ({"what": "lane", "preset": "gaurded"}, "preset", "'guarded'"),
+        ({"what": "lane", "duration": float("nan")}, "duration", "finite"),
+        ({"what": "lane", "duration": -1.0}, "duration", "more than 0"),
+        ({"what": "lane", "warmup": float("inf")}, "warmup", "finite"),
+        ({"what": "lane", "warmup": -1.0}, "warmup", "at least 0"),
         ({"what": "lane", "mission": "["}, "--mission", "regular expression"),
         ({"what": "lane", "mission": ""}, "--mission", "name a vehicle"),
-        ({"what": "lane", "fleet": Fleet(ids="[")}, "--av-ids", "regular expression"),
-        ({"what": "lane", "fleet": Fleet(penetration=float("nan"))}, "--penetration", "between"),
+        ({"what": "lane", "fleet": Fleet(ids="[")}, "av_ids", "regular expression"),
+        ({"what": "lane", "fleet": Fleet(penetration=float("nan"))}, "penetration", "number from 0 to 1"),
         ({"what": "lane", "options": ["--seed", "3"]}, "--seed", "--seed"),
         ({"what": "lane", "options": ["--random"]}, "--random", "repeatable"),
         ({"what": "lane", "options": ["--remote-port=1"]}, "--remote-port", "itself"),

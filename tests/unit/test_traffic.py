@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from cosim.batch.matrix import cells
-from cosim.batch.spec import Spec
+from cosim.batch.spec import Spec, read
 from cosim.errors import BadInput
 from cosim.scenario import Fleet, Scenario, load
 from cosim.scenario.traffic import check, clocks
@@ -110,13 +110,16 @@ def test_cells_that_are_compared_have_the_same_traffic(config: str) -> None:
     def traffic(spec: Spec) -> list[str]:
         return [case.scenario().traffic for case in cells(spec)]
 
-    alone = Spec((config,), penetration=(0.0,))
+    def spec(what: str, *shares: float, **more: str) -> Spec:
+        return read(None, {"scenario": [what], "penetration": [*shares], **more})
+
+    alone = spec(config, 0.0)
     assert traffic(alone) == ["as-is"]
-    both = Spec((config,), penetration=(0.0, 0.2))
+    both = spec(config, 0.0, 0.2)
     assert traffic(both) == ["controlled", "controlled"]
     none, some = cells(both)
     assert none.cell != next(cells(alone)).cell, "another traffic is another cell"
-    assert some.cell == next(cells(Spec((config,), penetration=(0.2,)))).cell
-    assert traffic(replace(alone, traffic="controlled")) == ["controlled"]
-    shipped = Spec(("merge",), penetration=(0.0, 0.2))
+    assert some.cell == next(cells(spec(config, 0.2))).cell
+    assert traffic(spec(config, 0.0, traffic="controlled")) == ["controlled"]
+    shipped = spec("merge", 0.0, 0.2)
     assert ["traffic" in case.document() for case in cells(shipped)] == [False, False]

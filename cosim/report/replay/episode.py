@@ -13,8 +13,8 @@ from cosim.policies import check
 from cosim.recording.replay_data import ReplayData
 from cosim.report import run_folder
 from cosim.scenario import Scenario
-from cosim.scenario.episode_id import EpisodeId
 from cosim.scenario.manifest import CASE, OPTIONS, POLICY_FILES, TRACI, checked, manifest, named
+from cosim.scenario.options import EpisodeOptions
 from cosim.scenario.policy_name import label, read
 from cosim.scenario.sumocfg import keeps
 from cosim.scenario.vet import vetted
@@ -38,7 +38,7 @@ class ReplayDiffers(CosimError):
 class Recorded:
     """One episode as a run folder remembers it."""
 
-    case: EpisodeId
+    case: EpisodeOptions
     options: tuple[str, ...]  # SUMO's own, as typed after `--`
     manifest: Mapping[str, Any]
     trace_hash: str
@@ -72,7 +72,7 @@ def find(folder: Path, episode: str | None) -> Recorded:
     if "trace_hash" not in driven:
         raise BadInput("is missing", file=result, field="trace_hash")
     recorded = Recorded(
-        EpisodeId.read(document[CASE], file, CASE),
+        EpisodeOptions.read(document[CASE], file, CASE),
         tuple(document.get(OPTIONS, ())),
         document,
         driven["trace_hash"],
@@ -213,7 +213,7 @@ def _of_batch(folder: Path, episode: str | None) -> Recorded:
     for part in (CASE, "manifest"):
         if part not in cell:
             raise BadInput("is missing", file=file, field=f"{where}.{part}")
-    case = EpisodeId.read({**cell[CASE], "seed": row["seed"]}, file, f"{where}.{CASE}")
+    case = EpisodeOptions.read({**cell[CASE], "seed": row["seed"]}, file, f"{where}.{CASE}")
     return Recorded(case, (), cell["manifest"], row["trace_hash"], folder)
 
 

@@ -93,20 +93,27 @@ def open(
     worker: bool = True,
     **words: Any,
 ) -> Session:
-    """Open the scenario `what`: a world's name or folder, a path to any .sumocfg, or a `Scenario`.
+    """Open a scenario to drive it decision by decision.
 
-    `words` are the options of `cosim run` by their names: `demand`, `behavior`, `preset`, `duration` and
-    `warmup` in s, `svo` in degrees (it weighs the reward), ... (`cosim.scenario.options` has them all).
-    `fleet` stands for `penetration`, `av_type` and `av_ids`; `options` are SUMO's own, as typed after `--`.
-    A `Scenario` holds all but `svo`: beside it they are refused.
-    `seed` is the first episode's. `reward`: a `cosim.rewards.Reward` (a `RewardConfig`, a
-    function of your own), a name of `REWARDS`, FILE.py:NAME or MODULE:NAME; without it P's. `metrics`:
-    classes like those of `cosim.metrics`, or FILE.py:NAME, measured besides. `others` builds a policy for
-    the AVs you do not command (without it SUMO's IDM drives them). What is no text must be importable: it
-    runs in the simulation's process. `simulator` replaces SUMO, for tests (`cosim.simulation.fake`).
-    `timeout`: the longest time in s without a heartbeat before the process counts as hung. `worker=False`
-    runs the simulation in this process, for debugging: one at a time, and a crash of SUMO ends your
-    process.
+    Args:
+        what: a scenario's name or folder, a path to any .sumocfg, or a `Scenario`.
+        fleet: which vehicles are AVs, in place of `penetration`, `av_type` and `av_ids`.
+        options: SUMO's options, as typed after `--`.
+        seed: of the first episode.
+        observation: what an AV sees.
+        reward: a `cosim.rewards.Reward` (a `RewardConfig`, a function), a name of `REWARDS`, FILE.py:NAME or
+            MODULE:NAME; None: P's.
+        metrics: classes like those of `cosim.metrics`, or FILE.py:NAME, measured besides.
+        others: builds the policy of the AVs without an action; None: SUMO's IDM.
+        simulator: replaces SUMO, for tests (`cosim.simulation.fake`).
+        timeout: s without a heartbeat after which the process counts as hung.
+        worker: False runs the simulation in this process, for debugging: one at a time, and a crash of SUMO
+            ends the process.
+        **words: options of `cosim run` by their names: `demand`, `behavior`, `preset`, `duration` in s, `svo`
+            in degrees (it weighs the reward), ... (`cosim.scenario.options`). A `Scenario` holds all but
+            `svo`: beside it they are refused.
+
+    Objects are used in the simulation's process: they must be importable.
 
     Raises:
         BadInput: naming file (or option), field and value.

@@ -207,6 +207,7 @@ def driven(name: str, plan: Plan, engine: Engine, store: Store, folder: Path) ->
     title = f"{name} ({done} of {plan.episodes} done before)" if done else name
     began = time.monotonic()
     with Progress(title, "episodes") as progress:
+        progress.starting()
         faults = execution.drive(plan, store, engine, folder / "outputs", progress)
     seconds = time.monotonic() - began
     rows = store.rows()

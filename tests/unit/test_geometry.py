@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
+import numba
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
@@ -12,6 +14,7 @@ from hypothesis import strategies as st
 from cosim.geometry import (
     EVERYWHERE,
     Boxes,
+    compiled,
     conflicts,
     deceleration_to_avoid_crash,
     gap_ahead,
@@ -358,3 +361,19 @@ def test_the_smallest_encroachment_of_a_wide_crowd_is_that_of_its_worst_pair() -
     pairs = [smallest([a, b]) for a in range(n) for b in range(a)]
     assert sum(lag < 5.0 for lag in pairs) > 1
     assert smallest(list(range(n))) == min(pairs)
+
+
+def test_the_clock_of_a_drive_stands_still_while_a_kernel_is_compiled() -> None:
+    @numba.njit  # type: ignore[untyped-decorator]
+    def added(a: float, b: float) -> float:
+        return a + b
+
+    spent, drive, wall = compiled.compilation_time(), compiled.clock(), time.perf_counter()
+    added(1.0, 2.0)
+    wall, drive = time.perf_counter() - wall, compiled.clock() - drive
+    spent = compiled.compilation_time() - spent
+    assert spent > 0.5 * wall, "to add two numbers takes no time, to compile it does"
+    assert drive == pytest.approx(wall - spent, abs=1e-3)
+    before = compiled.compilation_time()
+    added(3.0, 4.0)
+    assert compiled.compilation_time() == before

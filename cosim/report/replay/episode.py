@@ -119,6 +119,7 @@ def drive(recorded: Recorded, scenario: Scenario, *, check: bool = True) -> tupl
     """
     case = recorded.case
     with Progress(f"replay {scenario.name} {label(case.policy)}", "s") as progress:
+        progress.starting()
         worker = Worker(Host, scenario, case.policy, math.radians(case.svo_deg), name="cosim-replay")
         with worker:
             return driven(recorded, worker.call, progress, check=check)

@@ -143,7 +143,9 @@ def hashes(client: httpx.Client, run: str) -> list[str]:
     """Of a run that has finished."""
     found = ended(client, run)
     assert (found["status"], found["error"]) == ("finished", None)
-    return [row["trace_hash"] for row in client.get(f"/api/runs/{run}/rows").json()["rows"]]
+    rows = client.get(f"/api/runs/{run}/rows").json()["rows"]
+    assert [row["error"] for row in rows if row["status"] != "ok"] == []
+    return [row["trace_hash"] for row in rows]
 
 
 def test_what_passes_while_a_run_is_driven_costs_it_nothing(

@@ -420,7 +420,7 @@ def test_a_simulation_that_hangs_is_killed_after_its_timeout(make: Make) -> None
     began = time.monotonic()
     with pytest.raises(SimulationCrashed, match=r"no heartbeat for 0.5 s"):
         env.step(np.int64(1))
-    assert time.monotonic() - began < 10.0
+    assert time.monotonic() - began < 30.0
     assert not Path(f"/proc/{pid}").exists()
 
 

@@ -39,7 +39,7 @@ class Served:
 
     def count(self, to: int, progress: Callable[..., None]) -> str:
         for k in range(to):
-            time.sleep(0.15)
+            time.sleep(0.6)
             progress(k, to)
         return "done"
 
@@ -116,7 +116,7 @@ def test_a_bug_says_where_it_is(worker: Worker) -> None:
 def test_progress_is_passed_on_and_counts_as_a_heartbeat() -> None:
     seen: list[tuple[int, int]] = []
     with Worker(Served, timeout=30.0) as worker:
-        worker._timeout = 0.4  # shorter than the 0.75 s the call takes in all
+        worker._timeout = 2.5  # shorter than the 3 s the call takes in all
         assert worker.call("count", 5, progress=lambda k, n: seen.append((k, n))) == "done"
     assert seen == [(k, 5) for k in range(5)]
 
@@ -164,7 +164,7 @@ def test_a_silent_process_is_killed_after_the_timeout() -> None:
     began = time.monotonic()
     with pytest.raises(SimulationCrashed, match=r"no heartbeat for 0\.3 s during 'sleep'"):
         worker.call("sleep")
-    assert time.monotonic() - began < 5.0
+    assert time.monotonic() - began < 30.0
     assert gone(pid)
 
 

@@ -1,7 +1,9 @@
 """Loaded by the process that workers of the tests fork from: what they need, and one difference."""
 
-import policy.agents.prediction_aware  # noqa: F401
+from cosim.batch import episode_runner  # noqa: F401
+from cosim.simulation import sumo  # noqa: F401
 from cosim.workers import supervisor
+from policy.agents import prediction_aware  # noqa: F401
 
 
 def end_with(parent: int) -> None:

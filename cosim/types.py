@@ -144,6 +144,15 @@ class Collision:
 
 
 @dataclass(frozen=True, slots=True)
+class Overlap:
+    """Two boxes that overlap without a collision, reported once per pair, circumstance and episode."""
+
+    time: float  # s
+    vehicles: tuple[str, str]
+    circumstance: str  # of `cosim.simulation.collisions.CIRCUMSTANCES`: what brings it about
+
+
+@dataclass(frozen=True, slots=True)
 class Entry:
     """An AV's front bumper passed a stop line in this simulation step, or the end of the place behind it at
     which the net lets it wait inside the junction."""
@@ -223,6 +232,7 @@ class Events:
     wrecked: tuple[str, ...] = ()  # crashed in an episode that goes on: they stand
     wrecks_removed: tuple[str, ...] = ()  # and were taken off the road
     errors: tuple[HumanError, ...] = ()
+    overlaps: tuple[Overlap, ...] = ()
 
     @classmethod
     def of(cls, frames: Sequence[Snapshot]) -> Events:

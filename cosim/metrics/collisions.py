@@ -10,11 +10,13 @@ class Collisions:
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._pairs: dict[frozenset[str], Collision] = {}
         self._removed = 0
+        self._uncounted: set[frozenset[str]] = set()
 
     def add(self, snapshot: Snapshot) -> None:
         for collision in snapshot.events.collisions:
             self._pairs.setdefault(frozenset((collision.collider, collision.victim)), collision)
         self._removed += len(snapshot.events.wrecks_removed)
+        self._uncounted |= {frozenset(overlap.vehicles) for overlap in snapshot.events.overlaps}
 
     def result(self) -> dict[str, Metric]:
         seen = self._pairs.values()
@@ -29,5 +31,6 @@ class Collisions:
         return {
             "crashed": Metric(any(c.crash for c in driven), "bool", "lower"),
             **{name: Metric(count, "pairs", "lower") for name, count in counts.items()},
+            "uncounted_overlaps": Metric(len(self._uncounted - self._pairs.keys()), "pairs", ""),
             "wrecks_removed": Metric(self._removed, "vehicles", "lower"),
         }

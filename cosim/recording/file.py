@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 from cosim.errors import BadInput
 from cosim.files import cannot, whole
 from cosim.recording.recorder import Knowledge, Recorder
-from cosim.types import Bytes, Collision, Entry, Events, HumanError, Intervention, Snapshot
+from cosim.types import Bytes, Collision, Entry, Events, HumanError, Intervention, Overlap, Snapshot
 
 FORMAT = "cosim-recording-1"
 # float64, so that a recording gives back exactly what was driven: histories built from it equal the policy's
@@ -30,6 +30,7 @@ HAPPENED: dict[str, Any] = {
     "entries": Entry,
     "interventions": Intervention,
     "errors": HumanError,
+    "overlaps": Overlap,
 }
 SCHEMA = pa.schema(
     [

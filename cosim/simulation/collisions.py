@@ -12,7 +12,7 @@ from cosim.simulation.commands import Commander, hand_back
 from cosim.simulation.conventions import centres
 from cosim.simulation.convert import Body
 from cosim.simulation.drivers import Drivers
-from cosim.types import INSERTION, Collision, Floats, Kind, Snapshot
+from cosim.types import INSERTION, Collision, Floats, Kind, Overlap, Snapshot
 
 SIDE_BY_SIDE = np.radians(20.0)  # lanes whose directions differ by less do not cross
 CUT_IN_WINDOW = 3.0  # s: an AV that changed lanes so shortly before it was hit from behind had cut in
@@ -24,6 +24,8 @@ DRAWN_WHOLE = 0.99  # m of a lane's shape per m of its length; nets have lanes w
 WRECK_STANDS = 5.0  # s, then it is taken off the road
 # SUMO's words for a vehicle that hits a person (MSLane::detectPedestrianJunctionCollision).
 OF_PERSONS = frozenset({"sharedLane", "crossing", "walkingarea", "junctionPedestrian"})
+# What brings an overlap about that is no collision (docs/reference/figures.md, Collisions).
+HEIGHTS, ASKEW, LANES = CIRCUMSTANCES = ("different heights", "askew", "lanes too close")
 PERSON = Body(Kind.PERSON, False, 0.0, 0.0)
 
 
@@ -32,6 +34,8 @@ class CollisionDetector:
 
     def __init__(self) -> None:
         self._seen: set[frozenset[str]] = set()
+        self._overlaps: dict[tuple[frozenset[str], str], Overlap] = {}
+        self._told = 0  # of these
         self._lanes: dict[str, int] = {}  # of every AV, in the last snapshot
         self._inserted: dict[str, float] = {}  # vehicle -> s, of the last second
         self._before: Snapshot | None = None  # the last one
@@ -91,11 +95,10 @@ class CollisionDetector:
             if snapshot.kind[i] != int(Kind.AV) and snapshot.kind[j] != int(Kind.AV):
                 continue
             names = snapshot.ids[i], snapshot.ids[j]
-            if frozenset(names) in self._seen or not road.connected(
-                int(snapshot.place[i]), int(snapshot.place[j])
-            ):
+            if frozenset(names) in self._seen:
                 continue
-            if only_a_tail(snapshot, road, i, j) or the_nets(snapshot, road, i, j):
+            if excuse := circumstance(snapshot, road, i, j):
+                self._overlaps.setdefault((frozenset(names), excuse), Overlap(snapshot.time, names, excuse))
                 continue
             self._seen.add(frozenset(names))
             pair = boxes(snapshot, np.array([i, j]))
@@ -109,6 +112,11 @@ class CollisionDetector:
             found.append(self._collision(snapshot.time, names, "overlap", "box", lane, x, y, bodies, changes))
         self._before = snapshot
         return found
+
+    def overlaps(self) -> tuple[Overlap, ...]:
+        """Those that were no collisions, since this was asked last."""
+        before, self._told = self._told, len(self._overlaps)
+        return tuple(self._overlaps.values())[before:]
 
     # ---- inside ----
 
@@ -240,6 +248,15 @@ def mover(before: Boxes, now: Boxes) -> int | None:
     )
     a, b = towards[last]
     return None if abs(a - b) < 1e-6 else int(b > a)
+
+
+def circumstance(snapshot: Snapshot, road: RoadMap, i: int, j: int) -> str:
+    """What brings the overlap of two vehicles about; "" where they have collided."""
+    if not road.connected(int(snapshot.place[i]), int(snapshot.place[j])):
+        return HEIGHTS
+    if only_a_tail(snapshot, road, i, j):
+        return ASKEW
+    return LANES if the_nets(snapshot, road, i, j) else ""
 
 
 def the_nets(snapshot: Snapshot, road: RoadMap, i: int, j: int) -> bool:

@@ -441,13 +441,18 @@ class SumoSimulator:
         wrecked: tuple[str, ...] = ()
         removed: tuple[str, ...] = ()
         extra = self._crashed(extra)
+        overlaps = self._detector.overlaps()
         if self._wrecks is not None:
             wrecked, removed = self._wrecks.take()
         errors = () if self._errors is None else self._errors.take()
-        if extra or wrecked or removed or errors:
-            found = (*snapshot.events.collisions, *extra)
+        if extra or wrecked or removed or errors or overlaps:
             events = replace(
-                snapshot.events, collisions=found, wrecked=wrecked, wrecks_removed=removed, errors=errors
+                snapshot.events,
+                collisions=(*snapshot.events.collisions, *extra),
+                wrecked=wrecked,
+                wrecks_removed=removed,
+                errors=errors,
+                overlaps=overlaps,
             )
             snapshot = replace(snapshot, events=events)
         return snapshot

@@ -18,7 +18,7 @@ from cosim.simulation import collisions
 from cosim.simulation.collisions import CUT_IN_WINDOW, CollisionDetector, mover
 from cosim.simulation.commands import Commander, Controlled
 from cosim.simulation.convert import Body
-from cosim.types import INSERTION, NO_EVENTS, Kind, Snapshot
+from cosim.types import INSERTION, NO_EVENTS, Kind, Overlap, Snapshot
 
 ROAD = straight_road(3)
 NAMES = ("av", "commanded", "hv")
@@ -206,8 +206,11 @@ SIDE: dict[str, Pose] = {"av": (50.0, 0.0, 0.0, 10.0), "hv": (51.0, 1.9, 0.0, 10
 
 def test_two_on_their_own_centre_lines_that_lie_too_close_have_not_collided() -> None:
     lanes, known = {"av": 0, "hv": 1}, bodies("av", "hv")
-    found = CollisionDetector().from_boxes(scene(1.0, SIDE, lanes), two_lanes(1.9, 1.9), known, {})
-    assert found == []
+    detector = CollisionDetector()
+    for time in (1.0, 1.2):
+        assert detector.from_boxes(scene(time, SIDE, lanes), two_lanes(1.9, 1.9), known, {}) == []
+    assert detector.overlaps() == (Overlap(1.0, ("av", "hv"), collisions.LANES),), "once, and why"
+    assert detector.overlaps() == ()
     converging = two_lanes(3.2, 0.7)
     hv: Pose = (51.0, 3.2 - 0.025 * 51.0, np.degrees(np.arctan(-0.025)), 10.0)
     here = scene(1.0, {"av": SIDE["av"], "hv": hv}, lanes)

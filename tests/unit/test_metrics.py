@@ -13,7 +13,7 @@ import pytest
 from cosim.metrics import METRICS, MetricContext, Metrics
 from cosim.metrics.post_encroachment import PostEncroachment
 from cosim.road import Lane, RoadMap
-from cosim.types import Collision, EpisodeResult, Events, Identity, Kind, Metric, Snapshot, Timing
+from cosim.types import Collision, EpisodeResult, Events, Identity, Kind, Metric, Overlap, Snapshot, Timing
 
 FRAME = 0.2  # s
 
@@ -331,11 +331,13 @@ def test_collisions_count_pairs_once_and_say_who_was_to_blame() -> None:
             crash("hv", "av", victim_is_av=True),
         )
     )
-    again = Events(collisions=(crash("x", "y"),))
+    excused = tuple(Overlap(0.8, pair, "askew") for pair in (("x", "y"), ("p", "q"), ("q", "p")))
+    again = Events(collisions=(crash("x", "y"),), overlaps=excused)
     cars = {"av": steady(0.0, 20.0, kind=Kind.AV), "hv": steady(100.0, 20.0)}
     seen = drive(cars, events={3: first, 5: again})
     assert seen["crashed"] is True
     assert seen["collisions"] == 2
+    assert seen["uncounted_overlaps"] == 1, "a pair that collides is a collision alone"
     assert seen["av_caused_collisions"] == 1
     assert seen["hv_hv_collisions"] == 1
 

@@ -97,7 +97,7 @@ def cases(
 ) -> list[Case]:
     """Every episode, `idm` first."""
     return [
-        Case(str(worlds[world]), arm, seed, penetration=share, preset=preset, errors=errors)
+        Case(str(worlds[world]), policy=arm, seed=seed, penetration=share, preset=preset, errors=errors)
         for world, share, arm, seed in itertools.product(worlds, shares, dict.fromkeys((IDM, *arms)), seeds)
     ]
 

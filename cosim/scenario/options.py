@@ -155,6 +155,7 @@ class EpisodeOptions:
         axis=True,
         reader=lambda text, folder, *_: place(text, folder),
     )
+    _: dataclasses.KW_ONLY
     demand: tuple[str, ...] = option(
         (),
         "a demand by its name, or route files driven together (default: the scenario's)",

@@ -223,7 +223,7 @@ def planned(place: Path, limit: float = 120.0) -> Plan:
     with DataFolder(str(place / "data")) as folder:
         clerks = Clerks(Settings(folder.path, limits=Limits(check=limit)), Processes())
         try:
-            return clerks.plan_again([EpisodeOptions("merge", "idm", 7)], range(7, 9), ["0" * 12])
+            return clerks.plan_again([EpisodeOptions("merge", seed=7)], range(7, 9), ["0" * 12])
         finally:
             clerks.close()
 

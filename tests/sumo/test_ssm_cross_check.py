@@ -259,7 +259,13 @@ class Driven:
 
     def __init__(self, world: str, errors: str | None) -> None:
         case = EpisodeOptions(
-            world, "idm", 0, ("dense",), warmup=0.0, duration=80.0, on_collision="continue", errors=errors
+            world,
+            demand=("dense",),
+            seed=0,
+            warmup=0.0,
+            duration=80.0,
+            on_collision="continue",
+            errors=errors,
         )
         self._host = Host(vetted(case.scenario(())), "idm", 0.0)
 

@@ -31,7 +31,7 @@ def check(text: str, field: str = "--policy") -> None:
     except BadInput as error:
         if error.field != "--policy":
             raise
-        raise BadInput(error.problem, file=error.file, field=field, value=text) from None
+        raise BadInput(error.problem, file=error.file, field=field, value=error.value) from None
 
 
 def _check(text: str) -> None:

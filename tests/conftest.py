@@ -42,20 +42,20 @@ def vehicle(name: str, kind: str, x: float, lane: int = 0, speed: float = 20.0, 
 def forked_workers() -> Iterator[None]:
     """Workers fork from a process that has loaded SUMO and torch: 0.2 s of a core a start, not 0.9 to 3.
 
-    Where a test changes the environment, they are spawned as a user's are; so are those of every `cosim`
+    Where a test changes the environment or the streams, they are spawned as a user's are; so are those of every `cosim`
     that a test runs as a program, and those of batches, which end with the process that started them
     (`cosim.workers.supervisor`).
     """
     spawn, fork = workers._CONTEXT, multiprocessing.get_context("forkserver")
     fork.set_forkserver_preload(["tests.forked"])
-    begun_with = variables()
+    begun_with = surroundings()
 
     class Context:
         Pipe = spawn.Pipe
 
         @staticmethod
         def Process(**options: Any) -> multiprocessing.process.BaseProcess:
-            alone = options["name"] == "cosim-evaluation" or variables() != begun_with
+            alone = options["name"] == "cosim-evaluation" or surroundings() != begun_with
             return (spawn if alone else fork).Process(**options)
 
     with pytest.MonkeyPatch.context() as patch:
@@ -63,9 +63,10 @@ def forked_workers() -> Iterator[None]:
         yield
 
 
-def variables() -> dict[str, str]:
-    """The environment, without what pytest itself changes in it."""
-    return {name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"}
+def surroundings() -> tuple[dict[str, str], list[int]]:
+    """The environment, without what pytest itself changes in it, and the files behind stdout and stderr."""
+    environment = {name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"}
+    return environment, [os.fstat(stream).st_ino for stream in (1, 2)]
 
 
 @pytest.fixture

@@ -179,10 +179,7 @@ def test_a_mistake_in_it_is_one_line_that_names_its_file(
     assert said in error
 
 
-def test_what_it_prints_leaves_stdout_to_the_document(
-    code: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("SPAWNED", "1")  # a forked worker has the streams that the first one had
+def test_what_it_prints_leaves_stdout_to_the_document(code: Path, capfd: pytest.CaptureFixture[str]) -> None:
     arguments = ["run", "merge", "--demand", "contested", "--duration", "1", "--json"]
     assert main([*arguments, "--policy", f"{code}:Prints"]) == 0
     out, err = capfd.readouterr()

@@ -42,9 +42,9 @@ def vehicle(name: str, kind: str, x: float, lane: int = 0, speed: float = 20.0, 
 def forked_workers() -> Iterator[None]:
     """Workers fork from a process that has loaded SUMO and torch: 0.2 s of a core a start, not 0.9 to 3.
 
-    Where a test changes the environment or the streams, they are spawned as a user's are; so are those of every `cosim`
-    that a test runs as a program, and those of batches, which end with the process that started them
-    (`cosim.workers.supervisor`).
+    Where a test changes the environment or the streams, they are spawned as a user's are; so are those of
+    every `cosim` that a test runs as a program, and those of batches, which end with the process that started
+    them (`cosim.workers.supervisor`).
     """
     spawn, fork = workers._CONTEXT, multiprocessing.get_context("forkserver")
     fork.set_forkserver_preload(["tests.forked"])

@@ -20,7 +20,7 @@ from cosim.recording.folder import Folder
 from cosim.recording.views import windows
 from cosim.types import Floats
 from cosim.workers.memory import keep_freed_memory
-from policy.predictors.gp import GaussianProcessIndirect
+from policy.prediction.gp import GaussianProcessIndirect
 
 TARGET_MS = 1.0
 MOMENTS = 20  # of a recording, at most

@@ -34,13 +34,13 @@ from cosim.scenario import Fleet, Scenario, load
 from cosim.types import COMPACT, PAPER, History, ObservationConfig
 from cosim.workers.memory import keep_freed_memory
 from cosim.workers.worker import Worker
+from policy.chain.chain import ChainConfig, predict
 from policy.inputs.scene import join
 from policy.inputs.tensors import to_batch
 from policy.networks.hpn import HPN, HpnConfig
 from policy.networks.map_branch import MapBranch, MapBranchConfig
-from policy.prediction.chain import ChainConfig, predict
+from policy.prediction.predictors import make_predictor
 from policy.prediction.traffic import TrafficConfig, predict_traffic
-from policy.predictors import make_predictor
 
 DECISION = 0.4  # s
 TARGET = 25.0  # ms, compact size, 8 AVs

@@ -20,8 +20,8 @@ from cosim.road import RoadMap
 from cosim.types import Floats
 from cosim.workers.progress import shown
 from policy.prediction.forecast import KinematicForecast
-from policy.predictors import PREDICTORS, Predictor, make_predictor
-from policy.predictors.lane import along_lanes
+from policy.prediction.lane import along_lanes
+from policy.prediction.predictors import PREDICTORS, Predictor, make_predictor
 
 EVERY = 5  # frames between two moments: 1 s
 LED = "gp-lane"  # knows the road, so it is not in the table of predictors

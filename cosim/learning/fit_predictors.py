@@ -20,9 +20,9 @@ from cosim.seeding import TRAINING_SEEDS, TUNING_SEEDS
 from cosim.workers.memory import keep_freed_memory
 from cosim.workers.progress import Progress
 from policy.checkpoint import save
-from policy.predictors import Predictor
-from policy.predictors.gp import GaussianProcessDirect, GaussianProcessIndirect
-from policy.predictors.learned import Learned, NetConfig
+from policy.prediction.gp import GaussianProcessDirect, GaussianProcessIndirect
+from policy.prediction.learned import Learned, NetConfig
+from policy.prediction.predictors import Predictor
 from policy.training.networks import use_threads
 from policy.training.predictors import (
     FitConfig,

@@ -15,10 +15,10 @@ from cosim.report import statistics
 from cosim.types import COMPACT, Floats
 from cosim.workers.engines import LocalEngine
 from cosim.workers.tasks import Task
+from policy.chain.map_error import HORIZONS, MapPredictors, frame_of, picture_error, vehicle_channels
 from policy.checkpoint import SHIPPED
 from policy.networks.hpn import HPN
-from policy.prediction.map_error import HORIZONS, MapPredictors, frame_of, picture_error, vehicle_channels
-from policy.predictors import make_predictor
+from policy.prediction.predictors import make_predictor
 from policy.training import hpn as trained
 from policy.training.networks import use_threads
 

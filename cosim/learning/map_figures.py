@@ -16,9 +16,9 @@ from cosim.recording.file import read
 from cosim.recording.folder import Folder
 from cosim.road import RoadMap
 from cosim.types import COMPACT, Bytes, Floats32
-from policy.networks.inner_features import painted
-from policy.prediction.map_error import MapPredictors, frame_of, unit_maps, vehicle_channels
-from policy.predictors import make_predictor
+from policy.chain.inner_features import painted
+from policy.chain.map_error import MapPredictors, frame_of, unit_maps, vehicle_channels
+from policy.prediction.predictors import make_predictor
 
 SHOWN = (0.2, 1.0, 2.0, 3.0, 4.0)  # s, columns of a chain's picture
 STYLE = {"hpn": "-", "hpn-no-history": "--", "hpn-plain": ":", "last-frame": "-.", "gp-raster": "-"}

@@ -22,8 +22,8 @@ from cosim.workers.engines import LocalEngine
 from cosim.workers.memory import keep_freed_memory
 from cosim.workers.progress import Progress
 from cosim.workers.tasks import Task
+from policy.prediction.predictors import make_predictor
 from policy.prediction.traffic import TrafficConfig
-from policy.predictors import make_predictor
 from policy.training import hpn
 from policy.training import loop as supervised
 from policy.training.kinematics import KinematicTask

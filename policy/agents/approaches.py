@@ -9,11 +9,11 @@ from cosim.errors import BadInput
 from cosim.files.yaml_input import dataclass_from
 from cosim.types import COMPACT, PAPER, ObservationConfig
 from policy.agents import APPROACHES as APPROACHES
+from policy.chain.chain import ChainConfig
 from policy.checkpoint import SHIPPED, read_card
 from policy.inputs.tensors import APART_OF
 from policy.networks.hpn import HpnConfig
 from policy.networks.vfn import TABLE_1, VfnConfig
-from policy.prediction.chain import ChainConfig
 from policy.prediction.traffic import TrafficConfig
 from policy.safety import SafetyConfig
 

@@ -22,6 +22,7 @@ from cosim.types import (
     Preset,
 )
 from policy.agents.approaches import AgentConfig, compact, shipped
+from policy.chain.chain import predict
 from policy.checkpoint import load
 from policy.inputs.scene import Scene, join
 from policy.inputs.tensors import States, pixels, situation_tensor, svo_tensor, to_batch, to_numpy
@@ -29,10 +30,9 @@ from policy.networks.extractors import EncodedMaps, FrameMemory
 from policy.networks.hpn import HPN
 from policy.networks.seeded import seeded
 from policy.networks.vfn import VFN, Frames
-from policy.prediction.chain import predict
 from policy.prediction.forecast import KinematicForecast
+from policy.prediction.predictors import make_predictor
 from policy.prediction.traffic import Traffic, foresee
-from policy.predictors import make_predictor
 from policy.safety import prioritize
 
 UNTRAINED = "untrained"

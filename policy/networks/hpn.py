@@ -26,7 +26,7 @@ class HpnConfig:
 
 
 class HPN(nn.Module):
-    """The branches that the configuration asks for; `policy.prediction.chain.predict` runs them (P, fig. 3).
+    """The branches that the configuration asks for; `policy.chain.chain.predict` runs them (P, fig. 3).
 
     Untrained, `rendered` and `corrected` return the maps rendered from the forecast along the lanes.
 

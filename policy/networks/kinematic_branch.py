@@ -15,8 +15,8 @@ import torch
 from torch import nn
 
 from cosim.types import Floats, Floats32, Ints
-from policy.inputs.vehicle_inputs import NEIGHBOUR_INPUTS, VehicleInputs, own_inputs
 from policy.prediction.forecast import KinematicForecast
+from policy.prediction.vehicle_inputs import NEIGHBOUR_INPUTS, VehicleInputs, own_inputs
 
 OUTPUTS = 7  # belief in the GP; ahead, left, speed, heading; sureness as the one seen, as the one who looks
 
@@ -75,7 +75,7 @@ class KinematicBranch(nn.Module):
         """What to correct of every vehicle's forecast (P, figure 3 and eq. 10).
 
         Args:
-            own: [V,own_inputs(N)] scaled (`policy.inputs.vehicle_inputs.VehicleInputs`).
+            own: [V,own_inputs(N)] scaled (`policy.prediction.vehicle_inputs.VehicleInputs`).
             near: [V,NEIGHBOURS,NEIGHBOUR_INPUTS] scaled.
 
         Returns:

@@ -1,1 +1,1 @@
-"""Where everybody will be: forecasts, traffic along the lanes, the chain of predicted observations."""
+"""Where everybody will be: kinematic predictors, and traffic along the lanes."""

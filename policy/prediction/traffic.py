@@ -10,7 +10,7 @@ from cosim.types import HEADING, LENGTH, SPEED, WIDTH, Bools, Floats, X, Y
 from policy.inputs.scene import Scene
 from policy.prediction.forecast import KinematicForecast
 from policy.prediction.motion import Rollout, fronts, pack, project_many, roll
-from policy.predictors.protocol import Predictor
+from policy.prediction.protocol import Predictor
 
 
 @dataclass(frozen=True, slots=True)

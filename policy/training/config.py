@@ -6,10 +6,10 @@ from typing import Any
 from cosim.rewards import RewardConfig
 from cosim.types import ObservationConfig
 from policy.agents.approaches import AgentConfig, configure, shipped
+from policy.chain.chain import ChainConfig
 from policy.networks.frame_encoder import EncoderConfig
 from policy.networks.hpn import HpnConfig
 from policy.networks.vfn import VfnConfig
-from policy.prediction.chain import ChainConfig
 from policy.safety import SafetyConfig
 from policy.training.curriculum import VfnTraining
 from policy.training.explorer import ExploreConfig

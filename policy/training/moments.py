@@ -9,9 +9,9 @@ import numpy as np
 from cosim.road import RoadMap
 from cosim.types import Bools, Bytes, Floats, Floats32, History, Ints, Snapshot
 from policy.inputs.scene import join
-from policy.inputs.vehicle_inputs import vehicle_inputs
+from policy.prediction.predictors import Predictor
 from policy.prediction.traffic import TrafficConfig, foresee
-from policy.predictors import Predictor
+from policy.prediction.vehicle_inputs import vehicle_inputs
 
 TURN = 2 * np.pi
 

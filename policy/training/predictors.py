@@ -18,9 +18,9 @@ from torch import nn
 from cosim.types import Bools, Floats
 from policy.networks.seeded import seeded
 from policy.prediction.gaussian_process import GaussianProcessBank, Operators, trapezoid
+from policy.prediction.gp import GaussianProcessDirect, GaussianProcessIndirect
 from policy.prediction.kernel_prior import PriorNetwork, describe
-from policy.predictors.gp import GaussianProcessDirect, GaussianProcessIndirect
-from policy.predictors.learned import KinematicNet, NetConfig, features, integrate
+from policy.prediction.learned import KinematicNet, NetConfig, features, integrate
 from policy.training.loop import Line, LoopConfig, Progress, Task, train
 
 Batch = Mapping[str, torch.Tensor]  # name -> [S,...], S the same for all

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from policy.inputs.vehicle_inputs import NEIGHBOUR_INPUTS, NEIGHBOURS, own_inputs
 from policy.networks.kinematic_branch import KinematicBranch, KinematicConfig, correct, sureness
+from policy.prediction.vehicle_inputs import NEIGHBOUR_INPUTS, NEIGHBOURS, own_inputs
 from policy.training.kinematics import KinematicTask, KinematicTraining, collate
 from policy.training.moments import Moment
 

@@ -12,11 +12,11 @@ from policy_scenes import Car, histories, straight_road
 
 from cosim.errors import BadInput
 from cosim.types import COMPACT, Snapshot
+from policy.chain.map_error import picture_error, vehicle_channels
 from policy.networks.kinematic_branch import OUTPUTS, KinematicConfig
 from policy.networks.map_branch import MapBranchConfig
-from policy.prediction.map_error import picture_error, vehicle_channels
+from policy.prediction.predictors import make_predictor
 from policy.prediction.traffic import TrafficConfig
-from policy.predictors import make_predictor
 from policy.training import hpn
 from policy.training.kinematics import KinematicTask, KinematicTraining, collate, losses
 from policy.training.loop import LoopConfig, one_cycle, train

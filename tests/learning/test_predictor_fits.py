@@ -11,8 +11,8 @@ import pytest
 import torch
 from policy_scenes import braking_cars
 
-from policy.predictors.gp import GaussianProcessIndirect
-from policy.predictors.learned import KinematicNet, NetConfig
+from policy.prediction.gp import GaussianProcessIndirect
+from policy.prediction.learned import KinematicNet, NetConfig
 from policy.training.loop import LoopConfig
 from policy.training.predictors import (
     FitConfig,

@@ -17,13 +17,13 @@ from cosim.simulation.fake import FakeVehicle
 from cosim.types import COMPACT, KINEMATIC_FEATURES, SMOKE
 from policy import checkpoint
 from policy.agents.approaches import AgentConfig, configure
+from policy.chain.chain import ChainConfig
 from policy.inputs.situation import PER_LANE, SITUATION_INPUTS
 from policy.inputs.tensors import kinematic_tensor
 from policy.networks.extractors import EncodedMaps
 from policy.networks.frame_encoder import EncoderConfig
 from policy.networks.hpn import HpnConfig
 from policy.networks.vfn import VFN, VfnConfig
-from policy.prediction.chain import ChainConfig
 from policy.training import sight
 from policy.training.curriculum import Drive, Lesson, VfnTraining
 from policy.training.ddqn import DdqnConfig, DdqnLearner

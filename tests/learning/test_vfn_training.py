@@ -21,10 +21,10 @@ from cosim.seeding import generator
 from cosim.simulation.fake import FakeSimulator, FakeVehicle
 from cosim.types import SMOKE, MetaAction
 from policy.agents.approaches import AgentConfig
+from policy.chain.chain import ChainConfig
 from policy.inputs.situation import SITUATION_INPUTS
 from policy.inputs.tensors import KINEMATIC_INPUTS
 from policy.networks.vfn import VfnConfig
-from policy.prediction.chain import ChainConfig
 from policy.safety import SafetyConfig
 from policy.training import experience
 from policy.training.a2c import A2cConfig, A2cLearner

@@ -21,11 +21,11 @@ from cosim.report import run_folder
 from cosim.scenario import load, place
 from cosim.simulation.fake import FakeSimulator, FakeVehicle
 from cosim.types import MetaAction
-from policy.predictors import make_predictor
+from policy.prediction.predictors import make_predictor
 
 CODE = """
 from cosim.types import Decision, Metric, MetaAction, ObservationConfig
-from policy.predictors.constant import ConstantSpeed
+from policy.prediction.constant import ConstantSpeed
 
 def by_speed(step):
     now = step.after

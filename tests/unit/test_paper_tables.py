@@ -18,7 +18,7 @@ from cosim.recording.replay_data import ReplayData, Track
 from cosim.report.run_folder import Run
 from cosim.road import Lane, RoadMap
 from cosim.types import Floats, Kind
-from policy.predictors import PREDICTORS
+from policy.prediction.predictors import PREDICTORS
 
 INTERVAL = 0.2  # s
 LANES = (1.6, 4.8, 8.0)  # m, the middles of the acceleration lane and of the two main lanes

@@ -11,15 +11,15 @@ from policy_scenes import LANE_WIDTH, Car, histories, straight_road
 
 from cosim.geometry.raster import rasterize_road
 from cosim.types import COMPACT, KINEMATIC_FEATURES
+from policy.chain.chain import ChainConfig, Prediction, predict, shade
 from policy.inputs.scene import Scene, join
 from policy.inputs.tensors import to_batch, unit
-from policy.inputs.vehicle_inputs import vehicle_inputs
 from policy.networks.hpn import HPN, HpnConfig
 from policy.networks.map_branch import MapBranchConfig
-from policy.prediction.chain import ChainConfig, Prediction, predict, shade
 from policy.prediction.forecast import KinematicForecast
+from policy.prediction.predictors import make_predictor
 from policy.prediction.traffic import Traffic, TrafficConfig, foresee
-from policy.predictors import make_predictor
+from policy.prediction.vehicle_inputs import vehicle_inputs
 
 ROAD = straight_road(3)
 CARS = [

@@ -11,8 +11,8 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct
 
 from policy.prediction.gaussian_process import HEADING, SPEED, BankConfig, GaussianProcessBank
+from policy.prediction.gp import GaussianProcessIndirect
 from policy.prediction.kernel_prior import KernelPrior, PriorNetwork, describe
-from policy.predictors.gp import GaussianProcessIndirect
 
 PAST = 0.2 * np.arange(-9, 1)  # s
 AHEAD = 0.2 * np.arange(1, 21)  # s

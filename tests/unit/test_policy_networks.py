@@ -13,12 +13,12 @@ from cosim.errors import BadInput
 from cosim.types import KINEMATIC_FEATURES
 from policy.inputs.situation import ASSISTED, FAR, MEETS, PER_LANE, SITUATION_INPUTS, situation
 from policy.inputs.tensors import KINEMATIC_INPUTS, apart, kinematic_tensor, svo_tensor, to_batch
-from policy.inputs.vehicle_inputs import NEIGHBOUR_INPUTS, NEIGHBOURS, own_inputs
 from policy.networks import extractors
 from policy.networks.hpn import HPN, HpnConfig
 from policy.networks.kinematic_branch import KinematicBranch, KinematicConfig, correct, sureness
 from policy.networks.map_branch import MapBranch, MapBranchConfig
 from policy.networks.vfn import VFN, Frames, VfnConfig
+from policy.prediction.vehicle_inputs import NEIGHBOUR_INPUTS, NEIGHBOURS, own_inputs
 
 
 def step(config: MapBranchConfig, batch: int = 2) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

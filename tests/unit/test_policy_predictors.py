@@ -12,12 +12,12 @@ from cosim.errors import BadInput, WeightsMismatch
 from cosim.road import Lane, RoadMap
 from policy.checkpoint import SHIPPED, save
 from policy.prediction.forecast import integrate_position, motion_of
+from policy.prediction.gp import GaussianProcessIndirect
 from policy.prediction.kernel_prior import PriorNetwork, describe
+from policy.prediction.lane import along_lanes
+from policy.prediction.learned import KinematicNet, Learned, NetConfig
 from policy.prediction.past import ORDINARY, trailing_run, whole_past
-from policy.predictors import PREDICTORS, make_predictor
-from policy.predictors.gp import GaussianProcessIndirect
-from policy.predictors.lane import along_lanes
-from policy.predictors.learned import KinematicNet, Learned, NetConfig
+from policy.prediction.predictors import PREDICTORS, make_predictor
 from policy.training.predictors import (
     in_own_frame,
 )

@@ -14,8 +14,8 @@ from cosim.road import RoadMap
 from cosim.types import Decision, MetaAction
 from policy.inputs.scene import Scene, join
 from policy.prediction import motion
+from policy.prediction.predictors import make_predictor
 from policy.prediction.traffic import Traffic, TrafficConfig, predict_traffic
-from policy.predictors import make_predictor
 from policy.safety import LANE_END, SafetyConfig, front_to_back, prioritize
 
 LEFT, IDLE, RIGHT, FASTER, SLOWER = MetaAction

@@ -14,14 +14,14 @@ from cosim.errors import BadInput, WeightsMismatch
 from cosim.geometry.raster import rasterize_road
 from cosim.road import Lane, RoadMap
 from cosim.types import COMPACT
+from policy.chain.chain import ChainConfig, Prediction, predict
+from policy.chain.map_error import MapPredictors
 from policy.checkpoint import SHIPPED
 from policy.inputs.scene import Scene, join
 from policy.inputs.tensors import to_batch
 from policy.networks.hpn import HPN
-from policy.prediction.chain import ChainConfig, Prediction, predict
-from policy.prediction.map_error import MapPredictors
+from policy.prediction.predictors import make_predictor
 from policy.prediction.traffic import TrafficConfig, foresee
-from policy.predictors import make_predictor
 from policy.training import hpn as trained
 
 ROAD = straight_road(3)

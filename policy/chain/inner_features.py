@@ -8,13 +8,13 @@ import torch
 from cosim.geometry.raster import rasterize_road
 from cosim.road import RoadMap
 from cosim.types import Floats, Floats32, History, ObservationConfig
+from policy.chain.chain import render
 from policy.inputs.scene import Scene, join, pictured
 from policy.inputs.tensors import to_batch, to_numpy, unit
-from policy.inputs.vehicle_inputs import vehicle_inputs
 from policy.networks.hpn import HPN
-from policy.prediction.chain import render
+from policy.prediction.predictors import Predictor
 from policy.prediction.traffic import TrafficConfig, foresee
-from policy.predictors import Predictor
+from policy.prediction.vehicle_inputs import vehicle_inputs
 
 PAINTED = 8  # features shown of each layer: those that differ most
 

@@ -10,12 +10,12 @@ import torch
 from cosim.geometry.raster import RoadRaster, rasterize_road
 from cosim.road import RoadMap
 from cosim.types import Bytes, Floats, Floats32, History, ObservationConfig
+from policy.chain.chain import ChainConfig, predict
 from policy.inputs.scene import join
 from policy.inputs.tensors import to_batch, to_numpy, unit
 from policy.networks.hpn import HPN
-from policy.prediction.chain import ChainConfig, predict
+from policy.prediction.predictors import Predictor
 from policy.prediction.traffic import TrafficConfig, foresee
-from policy.predictors import Predictor
 
 OCCUPIED = 0.05  # a pixel above this is occupied (figures.md: IoU)
 HORIZONS = (0.2, 0.4, 1.0, 2.0, 3.0, 4.0)  # s (observation.md, Clocks)

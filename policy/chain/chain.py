@@ -11,12 +11,12 @@ from cosim.geometry.raster import PIXEL_LOWEST, PIXEL_SPAN, PIXEL_SPEED, RoadRas
 from cosim.types import SPEED, Bools, Bytes, Floats, ObservationConfig
 from policy.inputs.scene import Scene, pictured, rows_ahead
 from policy.inputs.tensors import Batch, kinematic_tensor, unit
-from policy.inputs.vehicle_inputs import vehicle_inputs
 from policy.networks.hpn import HPN
 from policy.networks.kinematic_branch import Corrected, apply
 from policy.networks.map_branch import MapBranch
 from policy.prediction.forecast import KinematicForecast
 from policy.prediction.traffic import Traffic
+from policy.prediction.vehicle_inputs import vehicle_inputs
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,11 +5,11 @@ from functools import partial
 
 from cosim.errors import BadInput, one_of
 from cosim.files import code
+from policy.prediction.constant import ConstantAcceleration, ConstantSpeed, Hold
 from policy.prediction.forecast import KinematicForecast
-from policy.predictors.constant import ConstantAcceleration, ConstantSpeed, Hold
-from policy.predictors.gp import GaussianProcessDirect, GaussianProcessIndirect
-from policy.predictors.learned import Learned, NetConfig
-from policy.predictors.protocol import Predictor
+from policy.prediction.gp import GaussianProcessDirect, GaussianProcessIndirect
+from policy.prediction.learned import Learned, NetConfig
+from policy.prediction.protocol import Predictor
 
 PREDICTORS: dict[str, Callable[[int, float], Predictor]] = {
     "cs": ConstantSpeed,

@@ -30,11 +30,11 @@ from cosim.simulation.collisions import CollisionDetector, Wrecks
 from cosim.simulation.commands import Commander, force
 from cosim.simulation.convert import Body, SnapshotReader, read_road, struggling_lanes
 from cosim.simulation.derived_types import drivers
+from cosim.simulation.driver_errors.trials import HumanErrors
 from cosim.simulation.drivers import Drivers
 from cosim.simulation.entries import EntryWatcher
 from cosim.simulation.fleet import Fleet
 from cosim.simulation.fork import forked
-from cosim.simulation.human_errors import HumanErrors
 from cosim.simulation.stderr import SumoStderr
 from cosim.simulation.xerces import keep_initialized
 from cosim.types import (
@@ -232,7 +232,7 @@ class SumoSimulator:
     @property
     def tilted(self) -> tuple[float, dict[str, list[float]]]:
         """Of this episode's errors: log(q / p); case -> those begun near AVs, and the sum of p."""
-        return (0.0, {}) if self._errors is None else (self._errors.log_ratio, self._errors.weighed)
+        return (0.0, {}) if self._errors is None else self._errors.tilted
 
     def counts(self) -> dict[str, int]:
         """Vehicles since the start: `inserted`, and `waiting` at the last frame: due and not inserted, also

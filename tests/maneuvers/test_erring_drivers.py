@@ -290,7 +290,7 @@ def test_who_forces_its_way_in_at_a_line_enters_and_goes_through() -> None:
 
 
 def test_the_longer_one_has_waited_the_likelier_it_forces_its_way_in() -> None:
-    from cosim.simulation.human_errors import hazard
+    from cosim.simulation.driver_errors.crossing import hazard
 
     kind = ForcedEntry(rate=0.03, patience=3.0)
     assert [hazard(kind, s) for s in (1, 3, 4, 13, 60)] == pytest.approx([0.0, 0.0, 0.03, 0.3, 1.0])

@@ -36,10 +36,10 @@ from cosim.cli.arguments import seeds as seeds_of
 from cosim.episode import Episode, Step
 from cosim.files import write_csv
 from cosim.host import Earnings
-from cosim.learning.configuration import configuration
 from cosim.learning.prediction_data import spread
 from cosim.policies import make
 from cosim.report.statistics import CONFIDENCE, RESAMPLES, Figure, holm, mean, paired_mean, share, signed_rank
+from cosim.rewards import RewardConfig
 from cosim.scenario.human_errors import NONE
 from cosim.scenario.manifest import digests
 from cosim.scenario.options import EpisodeOptions
@@ -56,6 +56,8 @@ COLUMNS = (
     *("phi", "episodes", "let in", "its time, s", "of AVs, m", "of all, m"),
     *("own reward", "others' reward", "its time, p", "of AVs, p"),
 )
+# `rewards.yaml` of commit f591cb8, by which `vfn-p` learned
+REWARD = RewardConfig(eta=0.0, social=0.02, mission=200.0, perception_range=250.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +82,7 @@ class Parts(Earnings):
     """What the AVs earn themselves and by others, before it is weighed."""
 
     def __init__(self) -> None:
-        super().__init__(configuration("rewards").file.reward, 0.0)
+        super().__init__(REWARD, 0.0)
         self.own: list[float] = []
         self.others: list[float] = []
 

@@ -11,7 +11,7 @@ import numpy as np
 from cosim.control import SPEED_STEP
 from cosim.geometry.compiled import compiled
 from cosim.road import RoadMap
-from cosim.types import Bools, Floats, Floats32, History
+from cosim.types import Floats, Floats32, History
 from policy.inputs.meeting import LANE, along, meet, missions
 
 LOOK_AHEAD = np.array([20.0, 50.0, 100.0])  # m, where the candidate centre lines are sampled
@@ -40,18 +40,6 @@ def situation(histories: Sequence[History], road: RoadMap, shared: bool, assiste
     met, car = _met(histories, road, shared), [float(assisted)]
     each = [np.concatenate([_own(h), _lanes(h), m, car]) for h, m in zip(histories, met, strict=True)]
     return np.array(each, np.float32)
-
-
-def comes_next(situations: Floats32, within: float = FAR) -> Bools:
-    """[B] whether an AV arrives next behind the mission vehicle, within `within` m (200 at most).
-
-    Args:
-        situations: [B,SITUATION_INPUTS]. Without V2V nobody knows of others: all behind it come next.
-        within: m.
-    """
-    there, behind, before = situations[:, MEETS : MEETS + 3].T
-    comes: Bools = (there > 0.5) & (behind > 0.0) & (behind < min(within / FAR, 1.0)) & (before <= 0.0)
-    return comes
 
 
 def _own(history: History) -> list[float]:

@@ -28,13 +28,10 @@ class ConstantSpeed:
         return np.zeros(len(kinematics))
 
 
-class Hold:
-    """No prediction: everybody stays where they are, at the speed 0 from the next frame on."""
+class Hold(ConstantSpeed):
+    """No prediction: every vehicle stays where it is, at speed 0 from the next frame on."""
 
     name = "hold"
-
-    def __init__(self, horizon: int = 20, dt: float = 0.2) -> None:
-        self.horizon, self.dt = horizon, dt
 
     def predict(self, kinematics: Floats, valid: Bools) -> KinematicForecast:
         """See `Predictor.predict`."""

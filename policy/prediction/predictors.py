@@ -1,4 +1,4 @@
-"""Kinematic predictors: P's eight in one table, and a user's own."""
+"""Kinematic predictors by name: P's eight, none at all (`hold`), and a user's own."""
 
 from collections.abc import Callable
 from functools import partial
@@ -21,7 +21,7 @@ PREDICTORS: dict[str, Callable[[int, float], Predictor]] = {
     "gp-direct": GaussianProcessDirect,
     "gp-indirect": GaussianProcessIndirect,
 }
-MADE: dict[str, Callable[[int, float], Predictor]] = {"hold": Hold, **PREDICTORS}  # by name
+MASK_PREDICTORS: dict[str, Callable[[int, float], Predictor]] = {"hold": Hold, **PREDICTORS}
 
 
 def make_predictor(name: str, horizon: int, dt: float) -> Predictor:
@@ -30,7 +30,7 @@ def make_predictor(name: str, horizon: int, dt: float) -> Predictor:
     Raises BadInput: there is none of that name; the user's cannot be loaded or called, or lacks something.
     """
     if not code.is_code(name):
-        return MADE[one_of(name, MADE, "predictor")](horizon, dt)
+        return MASK_PREDICTORS[one_of(name, MASK_PREDICTORS, "predictor")](horizon, dt)
     own = code.read(name, "predictor")
     made: Predictor = own.make("predictor", horizon, dt)
     if (made.horizon, made.dt, isinstance(made.name, str)) != (horizon, dt, True):

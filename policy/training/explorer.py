@@ -63,9 +63,8 @@ class Explorer(PredictionAware):
         self._learners = self.explore.learners if record else 0
         self.learning: dict[str, dict[str, list[Any]]] = {}  # AV -> field of `Trajectory` -> values so far
         self._repeated: dict[str, int] = {}  # random action that an AV keeps for a while
-        self._held: dict[
-            str, tuple[MetaAction, int]
-        ] = {}  # one that was drawn, and for how many decisions more
+        # AV -> an action that was drawn, and for how many decisions more
+        self._held: dict[str, tuple[MetaAction, int]] = {}
         self.done: list[Trajectory] = []
 
     def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:

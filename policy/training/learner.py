@@ -28,7 +28,7 @@ class Learner(Optimized):
         self.online: VFN = seeded(lambda: VFN(vfn), seed)
         self.online.to(device=device, memory_format=self.online.layout)  # type: ignore[call-overload]
         learning = [p for p in self.online.parameters() if p.requires_grad]  # an encoder does not
-        adam = torch.optim.AdamW(learning, lr=config.learning_rate, weight_decay=0.0)
+        adam = torch.optim.Adam(learning, lr=config.learning_rate)
         super().__init__({"online": self.online}, adam, config.clip)
         self.updates = 0
 

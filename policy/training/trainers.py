@@ -24,7 +24,7 @@ class Trainer:
         device: of torch.
     """
 
-    keeps = True  # whether the trajectories of an iteration join the replay buffer
+    stores = True  # whether the trajectories of an iteration join the replay buffer
     keep = 0  # decisions that a drawn action is kept; 0: epsilon-greedy
 
     def __init__(self, config: VfnTraining, learner: Learner, device: str) -> None:
@@ -78,7 +78,7 @@ class OnPolicyTrainer(Trainer):
     """T's A2C: an iteration learns from its own trajectories, and no replay buffer keeps them."""
 
     learner: A2cLearner
-    keeps = False
+    stores = False
 
     @property
     def keep(self) -> int:  # type: ignore[override]

@@ -90,7 +90,7 @@ class TrainingRun:
             judging = [self._actors.submit(drive) for drive in judged]
             losses = trainer.learn_meanwhile(k)
             drove = [f.result() for f in driving]
-            if trainer.keeps:
+            if trainer.stores:
                 self._keep(k, drove)
             losses |= trainer.learn_afterwards(k, [t for one in drove for t in one.trajectories])
             record = {

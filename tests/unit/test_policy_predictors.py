@@ -51,6 +51,18 @@ def test_a_steady_car_goes_on_whatever_else_is_not_known(name: str) -> None:
     np.testing.assert_allclose(forecast.y[:2], 50.0, atol=1.0)
 
 
+def test_without_prediction_every_car_stays_where_it_is() -> None:
+    state = cars(np.full((2, 10), 12.0))
+    valid = everywhere(state)
+    valid[1, -1] = False  # left the view
+    forecast = make_predictor("hold", 20, 0.2).predict(state, valid)
+    assert forecast.valid.tolist() == [True, False]
+    assert (forecast.x[0] == 100.0).all()
+    assert (forecast.y[0] == 50.0).all()
+    assert (forecast.speed == 0.0).all()
+    assert (forecast.x[1] == 0.0).all(), "no forecast of a car that is not known now"
+
+
 @pytest.mark.parametrize("name", PREDICTORS)
 def test_a_standing_car_hardly_moves(name: str) -> None:
     state = cars(np.zeros((1, 10)), np.full((1, 10), 2.0))

@@ -23,7 +23,7 @@ APPROACH = 30.0  # m before the line within which it looks for the right of way
 SIGNAL_RANGE = 150.0  # m before the line
 FORCED_CHANGE_TIME = 4.0  # s that a forced lane change may take
 # what a person who steps out has, and what holds where its type does not say
-IGNORE = {
+STEP_OUT_PARAMETERS = {
     "jmDriveAfterRedTime": ("1000", "-1"),
     "jmIgnoreFoeProb": ("1", "0"),
     "jmIgnoreFoeSpeed": ("100", "0"),
@@ -121,10 +121,10 @@ class ForcedEntry(DriverError):
         what = _forces(self._waited[who], gap)
         if not side:
             return self.drives_on(who, now, RIGHT_OF_WAY, what, gap.whom)
-        one = self.begun(who, now, FORCED_CHANGE_TIME, what, gap.whom)
-        self.take(who, one, None)
+        under_way = self.begun(who, now, FORCED_CHANGE_TIME, what, gap.whom)
+        self.take(who, under_way, None)
         sumo.vehicle.changeLaneRelative(who, side, FORCED_CHANGE_TIME)
-        return one
+        return under_way
 
     def _at_end_of_lane(self, who: str, lane: str) -> bool:
         around = self._around
@@ -145,16 +145,16 @@ class StepOut(ErrorKind):
         """It walks, whatever comes."""
         person = who.removeprefix(PERSON)
         length = self.magnitude(self.config.duration, who, now, "duration")
-        one = self.begun(who, now, length, "walks onto the crossing without waiting", "")
+        under_way = self.begun(who, now, length, "walks onto the crossing without waiting", "")
         sumo.person.setMinGap(person, sumo.person.getMinGap(person))  # a type of its own
-        one.heeds = _crosses_by(person, {name: on for name, (on, _) in IGNORE.items()})
-        return one
+        under_way.heeds = _crosses_by(person, {name: on for name, (on, _) in STEP_OUT_PARAMETERS.items()})
+        return under_way
 
-    def end(self, who: str, one: UnderWay) -> None:
+    def end(self, who: str, under_way: UnderWay) -> None:
         """It waits as before."""
         person = who.removeprefix(PERSON)
-        if one.heeds is not None and person in sumo.person.getIDList():
-            _crosses_by(person, one.heeds)
+        if under_way.heeds is not None and person in sumo.person.getIDList():
+            _crosses_by(person, under_way.heeds)
 
 
 def hazard(config: human_errors.ForcedEntry, waited: int) -> float:
@@ -172,6 +172,6 @@ def _crosses_by(person: str, values: Mapping[str, str]) -> dict[str, str]:
     kind, before = sumo.person.getTypeID(person), {}
     for name, value in values.items():
         full = f"junctionModel.{name}"
-        before[name] = sumo.vehicletype.getParameter(kind, full) or IGNORE[name][1]
+        before[name] = sumo.vehicletype.getParameter(kind, full) or STEP_OUT_PARAMETERS[name][1]
         sumo.vehicletype.setParameter(kind, full, value)
     return before

@@ -21,11 +21,11 @@ class Inattention(DriverError):
     def begin(self, who: str, now: float, chance: Chance) -> UnderWay:
         """It holds its speed."""
         length = self.magnitude(self.config.duration, who, now, "duration")
-        one = self.begun(who, now, length, f"sees nobody for {length:.1f} s", chance.whom)
-        self.take(who, one, BLIND)
-        one.deceleration = 0.0
+        under_way = self.begun(who, now, length, f"sees nobody for {length:.1f} s", chance.whom)
+        self.take(who, under_way, BLIND)
+        under_way.deceleration = 0.0
         self.slow(who, 0.0)
-        return one
+        return under_way
 
 
 class HardBraking(DriverError):
@@ -91,12 +91,12 @@ class CutIn(DriverError):
         (asked, _, whom), side = chance.found
         back = self.changes == 2
         what = f"cuts in before {whom}, who must brake with {asked:.1f} m/s2" + ", and swerves back" * back
-        one = self.begun(who, now, self.changes * LANE_CHANGE_TIME + self._step, what, whom)
-        self.take(who, one, None)
+        under_way = self.begun(who, now, self.changes * LANE_CHANGE_TIME + self._step, what, whom)
+        self.take(who, under_way, None)
         if back:
-            one.swerves = now + LANE_CHANGE_TIME, -side
+            under_way.swerves = now + LANE_CHANGE_TIME, -side
         sumo.vehicle.changeLaneRelative(who, side, LANE_CHANGE_TIME)
-        return one
+        return under_way
 
 
 class AbortedCutIn(CutIn):
@@ -105,11 +105,11 @@ class AbortedCutIn(CutIn):
     name = "aborted_cut_in"
     changes = 2
 
-    def step(self, who: str, one: UnderWay, now: float) -> bool:
+    def step(self, who: str, under_way: UnderWay, now: float) -> bool:
         """It swerves back when it has changed."""
-        if super().step(who, one, now):
+        if super().step(who, under_way, now):
             return True
-        if one.swerves is not None and now >= one.swerves[0] - 1e-6:
-            sumo.vehicle.changeLaneRelative(who, one.swerves[1], LANE_CHANGE_TIME)
-            one.swerves = None
+        if under_way.swerves is not None and now >= under_way.swerves[0] - 1e-6:
+            sumo.vehicle.changeLaneRelative(who, under_way.swerves[1], LANE_CHANGE_TIME)
+            under_way.swerves = None
         return False

@@ -77,11 +77,11 @@ class ErrorKind:
         """It begins."""
         raise NotImplementedError
 
-    def step(self, who: str, one: UnderWay, now: float) -> bool:
+    def step(self, who: str, under_way: UnderWay, now: float) -> bool:
         """It goes on for a simulation step; whether it is over."""
-        return now >= one.error.until - 1e-6
+        return now >= under_way.error.until - 1e-6
 
-    def end(self, who: str, one: UnderWay) -> None:
+    def end(self, who: str, under_way: UnderWay) -> None:
         """Give back what was taken."""
         raise NotImplementedError
 
@@ -102,10 +102,10 @@ class ErrorKind:
 class DriverError(ErrorKind):
     """One of a driver: its vehicle is taken from the driver model as far as the error asks for it."""
 
-    def take(self, who: str, one: UnderWay, speed_mode: int | None, lane_mode: int = BLIND) -> None:
+    def take(self, who: str, under_way: UnderWay, speed_mode: int | None, lane_mode: int = BLIND) -> None:
         """Take the vehicle (`speed_mode` None: not its speed)."""
         vehicle = sumo.vehicle
-        one.modes = vehicle.getSpeedMode(who), vehicle.getLaneChangeMode(who)
+        under_way.modes = vehicle.getSpeedMode(who), vehicle.getLaneChangeMode(who)
         if speed_mode is not None:
             vehicle.setSpeedMode(who, speed_mode)
         vehicle.setLaneChangeMode(who, lane_mode)
@@ -115,36 +115,36 @@ class DriverError(ErrorKind):
         """One step slower; 0 holds the speed."""
         sumo.vehicle.setSpeed(who, max(self._around.speed_of(who) - deceleration * self._step, 0.0))
 
-    def slows(self, who: str, one: UnderWay, deceleration: float) -> UnderWay:
+    def slows(self, who: str, under_way: UnderWay, deceleration: float) -> UnderWay:
         """It slows down; it still sees its leader and the signals, and may brake harder for them."""
-        self.take(who, one, sumo.vehicle.getSpeedMode(who) & ~(MAX_ACCEL | MAX_DECEL))
-        one.deceleration = deceleration
+        self.take(who, under_way, sumo.vehicle.getSpeedMode(who) & ~(MAX_ACCEL | MAX_DECEL))
+        under_way.deceleration = deceleration
         self.slow(who, deceleration)
-        return one
+        return under_way
 
     def drives_on(self, who: str, now: float, ignored: int, what: str, near: str) -> UnderWay:
         """It heeds nothing of `ignored` until it is through the junction ahead."""
-        one = self.begun(who, now, MAX_JUNCTION_TIME, what, near)
-        self.take(who, one, sumo.vehicle.getSpeedMode(who) & ~ignored | INSIDE_JUNCTION)
-        one.leaves = sumo.vehicle.getRoadID(who)
-        return one
+        under_way = self.begun(who, now, MAX_JUNCTION_TIME, what, near)
+        self.take(who, under_way, sumo.vehicle.getSpeedMode(who) & ~ignored | INSIDE_JUNCTION)
+        under_way.leaves = sumo.vehicle.getRoadID(who)
+        return under_way
 
-    def step(self, who: str, one: UnderWay, now: float) -> bool:
+    def step(self, who: str, under_way: UnderWay, now: float) -> bool:
         """See `ErrorKind.step`."""
-        if super().step(who, one, now):
+        if super().step(who, under_way, now):
             return True
-        if one.leaves:
+        if under_way.leaves:
             edge = sumo.vehicle.getRoadID(who)
-            if bool(edge) and edge != one.leaves and edge[0] != ":":
+            if bool(edge) and edge != under_way.leaves and edge[0] != ":":
                 return True
-        if one.deceleration:
-            self.slow(who, one.deceleration)
+        if under_way.deceleration:
+            self.slow(who, under_way.deceleration)
         return False
 
-    def end(self, who: str, one: UnderWay) -> None:
+    def end(self, who: str, under_way: UnderWay) -> None:
         """See `ErrorKind.end`."""
-        if one.deceleration is not None:
+        if under_way.deceleration is not None:
             sumo.vehicle.setSpeed(who, -1.0)
-        sumo.vehicle.setSpeedMode(who, one.modes[0])
-        sumo.vehicle.setLaneChangeMode(who, one.modes[1])
+        sumo.vehicle.setSpeedMode(who, under_way.modes[0])
+        sumo.vehicle.setLaneChangeMode(who, under_way.modes[1])
         self._drivers.resume(who)

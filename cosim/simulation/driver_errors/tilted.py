@@ -1,6 +1,6 @@
 """Importance sampling of errors near AVs: raises the probability of a trial, counts what that weighs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -8,8 +8,8 @@ from cosim.scenario.tilt import Tilt, case, log_ratio
 from cosim.simulation.backend import sumo
 from cosim.types import REMEMBERED, Bools
 
-NEAR = 60.0  # m: within that of an AV errors may be tilted
-MOST = 2  # errors from raised probabilities in an episode
+TILT_RADIUS = 60.0  # m: within that of an AV errors may be tilted
+MAX_TILTED_ERRORS = 2  # errors from raised probabilities in an episode
 
 
 class Tilted:
@@ -31,20 +31,28 @@ class Tilted:
         """Whether any trial of this kind is tilted."""
         return self._tilt is not None and self._tilt.raises(kind)
 
-    def look(self, names: Sequence[str], avs: set[str], ended: Mapping[str, float], now: float) -> None:
-        """Before the trials of a second. `ended`: drivers who err or erred, and when (s) that ended (inf: not
-        yet)."""
-        if self._tilt is not None and self._begun < MOST:
-            self._near, self._during = _beside_avs(names, avs, ended, now)
+    def look(
+        self,
+        names: Sequence[str],
+        avs: set[str],
+        erring: Collection[str],
+        ended: Mapping[str, float],
+        now: float,
+    ) -> None:
+        """Before the trials of a second. `erring`: drivers who err; `ended`: when (s) earlier errors ended."""
+        if self._tilt is not None and self._begun < MAX_TILTED_ERRORS:
+            recent = {who for who, end in ended.items() if now - end <= REMEMBERED}
+            known = [name for name in names if name in erring or name in recent]
+            self._near, self._during = _beside_avs(names, avs, known)
 
     @property
     def active(self) -> bool:
         """Whether any trial of this second is weighed."""
-        return bool(self._near) and self._begun < MOST
+        return bool(self._near) and self._begun < MAX_TILTED_ERRORS
 
     def weighs(self, who: str) -> bool:
         """Whether the trials of `who` are weighed."""
-        return who in (self._near, self._during, ())[min(self._begun, MOST)]
+        return who in (self._near, self._during, ())[min(self._begun, MAX_TILTED_ERRORS)]
 
     def probability(self, who: str, kind: str, p: float, drawn: float, meets_av: bool) -> float:
         """The probability that holds for a trial that is `p` as it happens; `log_ratio` and `weighed` take it
@@ -64,19 +72,17 @@ class Tilted:
 
 
 def _beside_avs(
-    names: Sequence[str], avs: set[str], ended: Mapping[str, float], now: float
+    names: Sequence[str], avs: set[str], erring: Sequence[str]
 ) -> tuple[frozenset[str], frozenset[str]]:
-    """The vehicles within `NEAR` of an AV; and of those the ones within `NEAR` of another driver who errs,
-    or did until `REMEMBERED` s ago."""
+    """The vehicles within `TILT_RADIUS` of an AV; and of those the ones within it of another of `erring`."""
     if not (avs and names):
         return frozenset(), frozenset()
-    erring = [name for name in names if now - ended.get(name, -np.inf) <= REMEMBERED]
     places = {name: sumo.vehicle.getPosition(name) for name in (*names, *avs)}
 
     def close(to: Sequence[str]) -> Bools:
         """[n,t]"""
         here, there = (np.array([places[k] for k in group]).reshape(-1, 2) for group in (names, to))
-        return np.asarray(np.abs(here[:, None] - there).max(2) < NEAR)
+        return np.asarray(np.abs(here[:, None] - there).max(2) < TILT_RADIUS)
 
     def those(mask: Bools) -> frozenset[str]:
         return frozenset(name for name, is_so in zip(names, mask.tolist(), strict=True) if is_so)

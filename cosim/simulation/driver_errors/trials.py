@@ -102,9 +102,9 @@ class HumanErrors:
 
     def step(self, now: float) -> None:
         """After a simulation step that ended at `now` (s)."""
-        for name, (kind, one) in [*self._under_way.items()]:
+        for name, (kind, under_way) in [*self._under_way.items()]:
             try:
-                if kind.step(name, one, now):
+                if kind.step(name, under_way, now):
                     self._end(name)
             except sumo.TraCIException:  # taken off the road, neither arrived nor crashed
                 self.drop(name)
@@ -137,7 +137,7 @@ class HumanErrors:
             self.drop(name)
         self._avs &= on_road
         names = [*self._streams]
-        self._tilted.look(names, self._avs, self._ended | dict.fromkeys(self._under_way, math.inf), now)
+        self._tilted.look(names, self._avs, self._under_way, self._ended, now)
         if names and self._every_second:
             drawn = uniforms(np.array([*self._streams.values()]), second)  # [n,k]
             looked_at = drawn < self._rates
@@ -163,9 +163,9 @@ class HumanErrors:
             return
         meets_av = chance.whom in self._avs or kind.meets_anybody
         if drawn < self._tilted.probability(who, kind.name, rate, drawn, meets_av):
-            one = kind.begin(who, now, chance)
-            self._under_way[who] = kind, one
-            self._happened.append(one.error)
+            under_way = kind.begin(who, now, chance)
+            self._under_way[who] = kind, under_way
+            self._happened.append(under_way.error)
 
     def _manoeuvres(self, name: str, now: float) -> None:
         """Where it must give way, is at a signal, or its lane does not go on."""
@@ -190,13 +190,13 @@ class HumanErrors:
     # ---- inside
 
     def _forget(self, name: str) -> None:
-        for kind in self._kinds:
+        for kind in self._of_manoeuvres:
             kind.forget(name)
 
     def _end(self, name: str) -> None:
-        kind, one = self._under_way.pop(name)
+        kind, under_way = self._under_way.pop(name)
         self._ended[name] = sumo.simulation.getTime()
-        kind.end(name, one)
+        kind.end(name, under_way)
 
     def _had_a_part(self, collision: Collision) -> bool:
         now = collision.time

@@ -39,7 +39,7 @@ class Tilted:
         ended: Mapping[str, float],
         now: float,
     ) -> None:
-        """Before the trials of a second. `erring`: drivers who err; `ended`: when (s) earlier errors ended."""
+        """Before the trials of a second. `erring`: drivers who err; `ended`: s, when earlier errors ended."""
         if self._tilt is not None and self._begun < MAX_TILTED_ERRORS:
             recent = {who for who, end in ended.items() if now - end <= REMEMBERED}
             known = [name for name in names if name in erring or name in recent]

@@ -3,7 +3,7 @@
 import re
 import textwrap
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +20,31 @@ from cosim.report.result import EVERYBODY, LAW
 _MARK = {PASSED: "pass", FAILED: "FAIL", SKIPPED: "n/a "}
 _EMOJI = {PASSED: "✅ pass", FAILED: "❌ **fail**", SKIPPED: "n/a"}
 COLUMNS = 100  # of a terminal
+_INDENT, _GAP = "  ", "  "  # of a table's lines, and between its columns
 _SHOWN = 20  # failed simulations and cells of one side that are listed by name
 _NOT_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+
+
+@dataclass(frozen=True, slots=True)
+class _Cell:
+    """One cell of a table."""
+
+    value: str
+    bounds: str = ""  # `4.4 to 26.1`
+    count: str = ""  # `3/40`, or the p of a difference
+    pairs: str = ""  # `37 pairs`, where they are not all
+
+    @property
+    def line(self) -> str:
+        """`12.5 % (4.4 to 26.1), 3/40`"""
+        value = f"{self.value} ({self.bounds})" if self.bounds else self.value
+        return ", ".join(filter(None, (value, self.count, self.pairs)))
+
+    @property
+    def lines(self) -> tuple[str, str]:
+        """The value with its count, and below it the interval: narrower than `line`."""
+        first, second = (self.value, self.count), (self.bounds and f"({self.bounds})", self.pairs)
+        return ", ".join(filter(None, first)), ", ".join(filter(None, second))
 
 
 def document(comparison: Comparison) -> dict[str, Any]:
@@ -49,20 +72,18 @@ def document(comparison: Comparison) -> dict[str, Any]:
 
 def text(comparison: Comparison) -> str:
     """Tables and verdict for a terminal."""
-    lines = [f"A  {comparison.a}", f"B  {comparison.b}", *_unfinished(comparison), ""]
+    lines = [f"A  {comparison.a}", f"B  {comparison.b}"]
+    lines += [part for line in _unfinished(comparison) for part in _wrapped(line, "")]
+    lines.append("")
     for compared in comparison.groups:
-        said = (*_notes(compared), *changes(compared.figures).lines)
-        lines += [compared.group.name, *(part for note in said for part in _wrapped(note))]
-        table = [("", "A", "B", "B - A"), *(_cells(figure) for figure in _shown(comparison, compared))]
-        widths = [max(len(row[k]) for row in table) for k in range(4)]
-        lines += [
-            "  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-            for row in table
-        ]
-        mine = [check for check in comparison.checks if check.group is compared.group]
-        lines += [f"  {_MARK[check.status]}  {check.threshold.text}:  {check.finding}" for check in mine]
+        notes = (*_notes(compared), *changes(compared.figures).lines)
+        lines += [*_wrapped(compared.group.name, ""), *(part for note in notes for part in _wrapped(note))]
+        lines += _table([_cells(figure) for figure in _shown(comparison, compared)])
+        for check in comparison.checks:
+            if check.group is compared.group:
+                lines += _wrapped(f"{_MARK[check.status]}  {check.threshold.text}:  {check.finding}")
         lines.append("")
-    lines += _alone(comparison)
+    lines += [part for line in _alone(comparison) for part in _wrapped(line, "")]
     return "\n".join([*lines, comparison.verdict])
 
 
@@ -81,7 +102,8 @@ def markdown(comparison: Comparison) -> str:
         lines += ["<details>", f"<summary>{_html(compared.group.name)}</summary>", ""]
         lines += [f"{_html(note)}  " for note in (*_notes(compared), *changes(compared.figures).lines)]
         lines += ["", "| | A | B | B - A |", "|---|---|---|---|"]
-        lines += [_row([_html(cell) for cell in _cells(figure)]) for figure in _shown(comparison, compared)]
+        for figure in _shown(comparison, compared):
+            lines.append(_row([_html(cell.line) for cell in _cells(figure)]))
         lines += ["", "</details>", ""]
     lines += [f"{_html(line)}  " for line in _alone(comparison)]
     return "\n".join(lines).rstrip() + "\n"
@@ -129,9 +151,30 @@ def _pairs(count: int) -> str:
     return f"{count} pair{'s' * (count != 1)}"
 
 
-def _wrapped(note: str) -> list[str]:
-    wrapper = textwrap.TextWrapper(COLUMNS, "  ", "    ", break_on_hyphens=False, break_long_words=False)
+def _wrapped(note: str, indent: str = "  ") -> list[str]:
+    """Lines of at most `COLUMNS` columns, but for a word that is longer."""
+    wrapper = textwrap.TextWrapper(COLUMNS, indent, "    ", break_on_hyphens=False, break_long_words=False)
     return wrapper.wrap(note)
+
+
+def _table(rows: Sequence[Sequence[_Cell]]) -> list[str]:
+    """The table for a terminal: values, and below them their intervals.
+
+    A name that leaves no room for its values within `COLUMNS` has a line of its own.
+    """
+    table = [tuple(map(_Cell, ("", "A", "B", "B - A"))), *rows]
+    names = [row[0].value for row in table]
+    columns = [[part for row in table for part in row[k].lines] for k in (1, 2, 3)]
+    widths = [max(map(len, column)) for column in columns]
+    room = COLUMNS - len(_INDENT) - sum(len(_GAP) + width for width in widths)
+    first = max((len(name) for name in names if len(name) <= room), default=0)
+    lines = []
+    for name, (_, *cells) in zip(names, table, strict=True):
+        above, beside = (name, "") if len(name) > first else ("", name)
+        values, bounds = zip(*(cell.lines for cell in cells), strict=True)
+        both = ((beside, *values), ("", *bounds))
+        lines += [above, *(_GAP.join(map(str.ljust, texts, (first, *widths))) for texts in both)]
+    return [(_INDENT + line).rstrip() for line in lines if line.strip()]
 
 
 def _clean(text: str) -> str:
@@ -176,19 +219,22 @@ def _shown(comparison: Comparison, compared: Compared) -> list[PairedFigure]:
     return [compared.figures[name] for name in names if compared.figures[name].n]
 
 
-def _cells(figure: PairedFigure) -> tuple[str, str, str, str]:
-    """Name, A, B, B - A, with intervals and counts."""
+def _cells(figure: PairedFigure) -> tuple[_Cell, _Cell, _Cell, _Cell]:
+    """Name, A, B, B - A."""
     m = figure.measure
     arrow = {"higher": " ↑", "lower": " ↓"}.get(m.better, "")
-    counts = [f", {count}" if count else "" for count in figure.counts]
-    n, named = figure.n, m.is_share  # the unit stands beside the difference, of an incidence in the name
-    difference = wording.interval(figure.difference, m, signed=True, unit=not m.per, n=n)
-    if figure.p is not None and n >= wording.SEVERAL:
-        difference += f", {wording.p_value(figure.p)}"
-    if figure.na:
-        difference += f", {n} pairs"
-    a, b = (wording.interval(side, m, unit=named, n=n) for side in (figure.a, figure.b))
-    return m.name + arrow, a + counts[0], b + counts[1], difference
+    n = figure.n
+    p = "" if figure.p is None or n < wording.SEVERAL else wording.p_value(figure.p)
+    difference = wording.value_and_bounds(figure.difference, m, signed=True, unit=not m.per, n=n)
+    # The unit stands beside the difference, and beside A and B of a share; the name of an incidence has it.
+    a, b = (wording.value_and_bounds(side, m, unit=m.is_share, n=n) for side in (figure.a, figure.b))
+    counts_a, counts_b = figure.counts
+    return (
+        _Cell(m.name + arrow),
+        _Cell(*a, counts_a),
+        _Cell(*b, counts_b),
+        _Cell(*difference, p, _pairs(n) if figure.na else ""),
+    )
 
 
 def _notes(compared: Compared) -> list[str]:

@@ -35,20 +35,28 @@ def change(value: float) -> str:
 def interval(
     figure: Figure, measure: Measure, *, signed: bool = False, unit: bool = True, n: int = SEVERAL
 ) -> str:
-    """`12.5 % (4.4 to 26.1)`, to two digits of the interval's width.
+    """`12.5 % (4.4 to 26.1)`; see `value_and_bounds`."""
+    value, bounds = value_and_bounds(figure, measure, signed=signed, unit=unit, n=n)
+    return f"{value} ({bounds})" if bounds else value
 
-    Bare where an interval would say nothing: it has no width, or fewer than `SEVERAL` episodes or pairs
+
+def value_and_bounds(
+    figure: Figure, measure: Measure, *, signed: bool = False, unit: bool = True, n: int = SEVERAL
+) -> tuple[str, str]:
+    """`12.5 %` and `4.4 to 26.1`, to two digits of the interval's width.
+
+    No bounds where an interval would say nothing: it has no width, or fewer than `SEVERAL` episodes or pairs
     (`n`) are behind it.
     """
     width = (figure.high - figure.low) * (100.0 if measure.is_share else 1.0)
     if n < SEVERAL or not figure.known or not 0.0 < width < math.inf:
-        return number(figure.value, measure, signed=signed, unit=unit)
+        return number(figure.value, measure, signed=signed, unit=unit), ""
     places = min(max(1 - math.floor(math.log10(width)), 1 if measure.is_share else 0), 4)
     value, low, high = (
         number(x, measure, signed=signed, unit=named, places=places)
         for x, named in ((figure.value, unit), (figure.low, False), (figure.high, False))
     )
-    return f"{value} ({low} to {high})"
+    return value, f"{low} to {high}"
 
 
 def sample(counts: Mapping[str, Any]) -> str:

@@ -190,7 +190,7 @@ def _figure(counts: dict[str, Any], measure: Measure) -> Cell:
     if not n:
         return Cell(wording.NA_TEXT, "", (f"{na} NA",) if na else ())
     value, low, high = (math.nan if counts[k] is None else counts[k] for k in ("value", "low", "high"))
-    text, bounds = _split(wording.interval(Figure(value, low, high), measure, n=n))
+    text, bounds = wording.value_and_bounds(Figure(value, low, high), measure, n=n)
     if (counts.get("rule_of_three") or 1.0) < 1.0:
         bounds = f"below {100 * counts['rule_of_three']:.3g} % (3/n)"
     elif value and not bounds and n >= wording.SEVERAL and counts.get("hits") is None:
@@ -202,7 +202,7 @@ def _difference(figure: PairedFigure) -> Cell:
     if not figure.n:
         return Cell(wording.NA_TEXT, "")
     n = figure.n
-    text, bounds = _split(wording.interval(figure.difference, _bare(figure.measure), signed=True, n=n))
+    text, bounds = wording.value_and_bounds(figure.difference, _bare(figure.measure), signed=True, n=n)
     p = "" if figure.p is None or n < wording.SEVERAL else wording.p_value(figure.p)
     pairs = f"{n} pairs" if figure.na else ""
     small = tuple(filter(None, (bounds, ", ".join(filter(None, (p, pairs))))))
@@ -212,9 +212,3 @@ def _difference(figure: PairedFigure) -> Cell:
 def _bare(measure: Measure) -> Measure:
     """The measure as its cells write it: without the unit that `head` says."""
     return replace(measure, unit="") if measure.per else measure
-
-
-def _split(interval: str) -> tuple[str, str]:
-    """`12.5 % (4.4 to 26.1)` -> `12.5 %`, `4.4 to 26.1`"""
-    text, _, bounds = interval.partition(" (")
-    return text, bounds.rstrip(")")

@@ -1,58 +1,79 @@
-"""A card for each network that ships: what it is, learned from, measured at, and what it is not good for.
+"""The networks that ship, in two tables: what each is, learned from, measured at, and not good for.
 
     python -m benchmarks.model_cards [--out docs/reference/models.md]
 
-Made of the JSON cards beside the weights (`policy.checkpoint`), the logs of their trainings and the figures
-of docs/results/data; nothing is driven.
+Made of the JSON cards beside the weights (`policy.checkpoint`), the logs of their trainings and the pages of
+docs/results; nothing is driven.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.tables import HEADS, markdown_row, write_page
+from benchmarks.tables import markdown_row, write_page
 from cosim.errors import CosimError
 from policy.agents.approaches import APPROACHES
 from policy.checkpoint import SHIPPED, read_card
 
 Card = Mapping[str, Any]
 RESULTS = Path("docs/results")
-HEAD = 2  # lines of a table before its rows
-FIGURES = ("collision_rate", "mission_success_rate", "dt_mean_m")
-MAPS_UNUSED = (
-    "It does not use its maps, past or predicted: what a map shows changes none of its choices in the "
-    "contested merge, or hardly one (docs/results/attribution.md). A difference between `vfn-p-demonstrated` "
-    "and `vfn-demonstrated` says nothing about prediction."
+LINK = "../results"  # from the page
+HEAD = (
+    "# The networks that ship",
+    "",
+    "Made by `python -m benchmarks.model_cards`.",
+    "",
+    "Each network has a card beside its weights, `policy/weights/NAME.json`: data, whole configuration,",
+    "commands, validation figures and SHA-256. The licence is MIT, as of the code. All seeds of training",
+    "are below 100,000.",
 )
-MAPS_ONLY = "It sees nothing but maps, brakes for whatever is near, and has been trained for minutes only."
-LAWLESS = (
-    "It knows no traffic light, no speed limit of a junction's lane, no pedestrian and no bicycle; in "
-    "`unguarded` it drives through red lights."
+AGENTS = (
+    "network",
+    "chooses from",
+    "safety mask",
+    "episodes",
+    "phi, degrees",
+    "training",
+    "results",
+    "limits",
 )
-DEMONSTRATED = (
-    "It learned from a scripted demonstrator (`altruist-rule` and a cruise rule, training.md) as well "
-    "as from rewards, and chooses as that does in most states: what rewards added is not measured apart.",
-    f"The human drivers of its training never err. {LAWLESS}",
-)
-LAWFUL_ONLY = "It learned from rewards alone, in preset `lawful`: what it does in `unguarded` it never tried."
-ASSISTED = "What keeps its distance in `unguarded` are layers that this training left alone (training.md)."
-EARLIER = "**Of an earlier agent**"  # on pages that are not driven anew
-# the folder of its training's log, where that is not NAME-0
+PREDICTORS = ("network", "predicts", "data", "training", "in validation", "results", "limits")
+LIMITS = {
+    "law": "Knows no signal, no limit of a junction's lane, no pedestrian and no bicycle. In `unguarded` it "
+    "drives through red lights.",
+    "expert": "Imitated a scripted expert (`altruist-rule` and a cruise rule) beside learning from rewards, "
+    "and mostly chooses as that expert does. What rewards added is not measured. Its human drivers made no "
+    "errors.",
+    "maps unused": "Hardly uses its maps, past or predicted ([attribution](../results/attribution.md)): it "
+    "against its counterpart without predicted maps says nothing about prediction.",
+    "maps only": "Sees nothing but maps, and brakes for whatever is near.",
+    "head": "Outside `lawful` it drives with an output head that its training left unchanged.",
+    "lawful only": "Learned in preset `lawful` alone; `unguarded` is untried.",
+    "scenarios": "Learned from the shipped scenarios alone, with drivers who follow IDM and LC2013 or MOBIL "
+    "and make no errors. Its error on recorded traffic or on other roads is unknown.",
+}
+# The folder of an agent's training in docs/results/trainings, where it is not NAME-0.
 TRAINED = {"vfn-p": "assisted-0", "vfn": "assisted-0"}
-PREDICTING_LIMITS = (
-    "It learned from the five worlds alone, with drivers who follow IDM and LC2013 or MOBIL and never err; "
-    "nothing is known of its error on recorded traffic or on other roads.",
-)
+# A page with figures of a network has it in a table in this form.
+MEASURED = {
+    "table3": "| {} |",
+    "decisions": "| {} |",
+    "learned": "| {} at ",
+    "alone": "| {}-alone |",
+    "foresight": "| {} |",
+    "turn": "--policy {} ",
+    "humans": "| {} | idm |",
+    "law": "% | {} |",
+}
 
 
 def names() -> list[str]:
-    """Every network that ships, value networks first."""
+    """Every network that ships, agents first."""
     found = sorted(path.stem for path in SHIPPED.glob("*.safetensors"))
     return sorted(found, key=lambda name: (name not in APPROACHES, not name.startswith("hpn"), name))
 
@@ -60,155 +81,133 @@ def names() -> list[str]:
 def page() -> list[str]:
     """The Markdown page. Raises BadInput and WeightsMismatch where weights and card do not agree."""
     cards = {name: read_card(SHIPPED / f"{name}.safetensors") for name in names()}
-    lines = ["# The networks that ship", "", "Made by `python -m benchmarks.model_cards`.", ""]
-    lines += ["Licence: MIT, as the code. Rates and means with 95 % intervals.", ""]
-    for name, card in cards.items():
-        about = (driving if name in APPROACHES else seeing if name == "encoder" else predicting)(name, card)
-        lines += [f"## {name}", "", *about, f"- SHA-256 of `{name}.safetensors`: `{card['sha256']}`", ""]
-    return lines
+    agents = [agent(name, card) for name, card in cards.items() if name in APPROACHES]
+    others = [
+        (encoder if name == "encoder" else predictor)(name, card)
+        for name, card in cards.items()
+        if name not in APPROACHES
+    ]
+    used = {limit for row in (*agents, *others) for limit in row[-1].split("; ")}
+    return [
+        *HEAD,
+        *("", "## Agents", "", *table(AGENTS, agents)),
+        *("", "## Predictors and encoder", "", *table(PREDICTORS, others)),
+        *(
+            "",
+            "## Limits",
+            "",
+            *table(("limit", "the network"), (row for row in LIMITS.items() if row[0] in used)),
+        ),
+        "",
+    ]
 
 
-def driving(name: str, card: Card) -> Iterator[str]:
-    """The lines about a value network or a baseline of Table III."""
-    data, approach = card["data"], APPROACHES[name]
-    folder = RESULTS / "trainings" / TRAINED.get(name, f"{name}-0")
+def table(heads: Sequence[str], rows: Sequence[Sequence[str]] | Iterator[Sequence[str]]) -> Iterator[str]:
+    """The lines of a Markdown table."""
+    yield markdown_row(heads)
+    yield markdown_row(["---"] * len(heads))
+    yield from map(markdown_row, rows)
+
+
+def agent(name: str, card: Card) -> tuple[str, ...]:
+    """A value network or a baseline of P's Table III, by the heads `AGENTS`."""
+    data, folder = card["data"], RESULTS / "trainings" / TRAINED.get(name, f"{name}-0")
+    training = data["training"]
     log = [json.loads(line) for line in (folder / "log.jsonl").read_text("utf-8").splitlines()]
-    shipped = card["measured"].get("iteration")  # none: it was taught after the last one
+    shipped = card["measured"].get("iteration")  # none: it was distilled after the last one
     log = log if shipped is None else [row for row in log if row["iteration"] <= shipped]
-    training, last = data["training"], log[-1]
-    layout, rewards = card["configs"]["vfn"], name in TRAINED
-    sees = "kinematics, situation and maps" if approach.kinematics else "maps"
-    sees = sees if layout.get("others", True) else "its own speed and command, and maps"
-    if layout.get("meets", False):
-        sees = f"whether its way meets a mission vehicle's (layers of their own), {sees}"
-    if layout.get("assisted", False):
-        own = "whether its car keeps the law and its distance itself (`lawful`; layers of their own)"
-        sees = f"{own}, {sees}"
-    predicted = ", predicted maps among them" if approach.predicted_maps else ""
-    mask = "no safety prioritizer" if approach.mask == "none" else f"prioritizer on `{data['predictor']}`"
-    yield f"- Chooses an AV's meta-action from {sees}{predicted}; {layout['extractor']}, {mask}."
-    phis = ", ".join(f"{phi:g}" for phi in training["svo"])
-    yield (
-        f"- Data: {len(log) * training['episodes']} episodes of {', '.join(data['scenarios'])} up to the "
-        f"shipped iteration, seeds below 100,000, drives with phi {phis} degrees"
-        + (
-            f"; predicted maps of `hpn` (SHA-256 `{data['hpn_sha256'][:12]}`)."
-            if "hpn_sha256" in data
-            else "."
-        )
+    return (
+        f"`{name}`",
+        sees(name, card),
+        "none" if APPROACHES[name].mask == "none" else f"on `{data['predictor']}`",
+        str(len(log) * training["episodes"]),
+        ", ".join(f"{phi:g}" for phi in training["svo"]),
+        trained(card, folder, log),
+        ", ".join(pages(name)) or "none yet",
+        "; ".join(limits(name, card)),
     )
-    note = data.get("note", f"at commit f591cb8, with `{folder.as_posix()}/config.yaml`")
-    yield f"- Training: {note}."
+
+
+def sees(name: str, card: Card) -> str:
+    """What an agent chooses from, and what reads its maps."""
+    approach, layout = APPROACHES[name], card["configs"]["vfn"]
+    parts = {
+        "preset": layout.get("assisted", False),
+        "conflict with a mission vehicle": layout.get("meets", False),
+        "kinematics": approach.kinematics and layout.get("others", True),
+        "its own speed and command": approach.kinematics and not layout.get("others", True),
+        "maps": True,
+        "predicted maps": approach.predicted_maps,
+    }
+    return f"{', '.join(part for part, there in parts.items() if there)}; `{layout['extractor']}`"
+
+
+def trained(card: Card, folder: Path, log: Sequence[Mapping[str, Any]]) -> str:
+    """How the weights came about: their iteration, updates and time, or the card's own words."""
+    data, measured = card["data"], card["measured"]
+    config = f"[configuration]({LINK}/trainings/{folder.name}/config.yaml)"
+    if "agrees" in measured:
+        return f"{data['note']}; chooses as its teachers do in {measured['agrees']:.0%} of the states"
     hours = sum(row["iteration_s"] for row in log) / 3600
-    took = f"{hours:.1f} h" if hours >= 0.1 else f"{60 * hours:.0f} min"
-    own = last["updates"]  # none: its drives are all that the pupil learned from
-    made = f"after {own:,} updates and {took} by its log" if own else f"after {took} of drives"
-    if shipped is None:
-        yield (
-            f"- Shipped: what was taught, {made}; it chooses as its teachers do in "
-            f"{card['measured']['agrees']:.0%} of the states."
-        )
-    elif "validation" in card["measured"]:
-        yield (
-            f"- Shipped: iteration {shipped}, {made}; highest mean reward in {training['validation']} "
-            "validation drives a case, tuning seeds."
-        )
-    else:
-        yield f"- Shipped: iteration {shipped}, {made}, its last."
-    table = list(measured(name))
-    if len(table) > HEAD:
-        yield from ("- Measured (test seeds, preset `unguarded`):", "", *table, "")
-    else:
-        told = {"learned.md": f"| {name} at ", "alone.md": f"| {name}-alone |", "foresight.md": f"| {name} |"}
-        told |= {"turn.md": f"--policy {name} ", "humans.md": f"| {name} | idm |", "law.md": f"% | {name} |"}
-        texts = {page: (RESULTS / page).read_text(encoding="utf-8") for page in told}
-        there = [page for page, arm in told.items() if arm in texts[page] and EARLIER not in texts[page]]
-        where = "on test seeds: " + ", ".join(f"docs/results/{page}" for page in there)
-        yield f"- Measured {where if there else 'in no table yet'}."
-    if rewards and not any(lesson.get("preset") for lesson in training["lessons"]):
-        yield f"- Limit: {ASSISTED if layout.get('assisted') else LAWFUL_ONLY}"
-    limits = (LAWLESS,) if rewards else (MAPS_UNUSED if approach.kinematics else MAPS_ONLY, *DEMONSTRATED)
-    yield from (f"- Limit: {text}" for text in limits)
+    chosen = "best in validation" if "validation" in measured else "the last"
+    done = f"{log[-1]['updates']:,} updates, {hours:.1f} h"
+    return f"{config}, iteration {measured['iteration']} ({chosen}), {done}"
 
 
-def measured(name: str) -> Iterator[str]:
-    """A table of one arm's figures: docs/results' decisions and Table III."""
-    rows: dict[tuple[str, str], dict[str, str]] = {}
-    for file in ("table3", "decisions"):
-        with (RESULTS / "data" / f"{file}.csv").open(encoding="utf-8", newline="") as lines:
-            for row in csv.DictReader(lines):
-                if row["arm"] == name and not row["against"] and row["figure"] in FIGURES:
-                    rows.setdefault((row["demand"], row["scenario"]), {})[row["figure"]] = interval(row)
-    yield markdown_row(["demand", "world", *(HEADS[figure] for figure in FIGURES)])
-    yield markdown_row(["---"] * (2 + len(FIGURES)))
-    for (demand, world), found in sorted(rows.items()):
-        yield markdown_row([demand, world, *(found.get(figure, "-") for figure in FIGURES)])
+def limits(name: str, card: Card) -> Iterator[str]:
+    """Names of `LIMITS` that hold for an agent."""
+    yield "law"
+    if name not in TRAINED:
+        yield "expert"
+        yield "maps unused" if APPROACHES[name].kinematics else "maps only"
+    elif card["configs"]["vfn"].get("assisted", False):
+        yield "head"
+    elif not any(lesson.get("preset") for lesson in card["data"]["training"]["lessons"]):
+        yield "lawful only"
 
 
-def interval(row: Mapping[str, str]) -> str:
-    """One figure with its interval and its episodes, shares in percent."""
-    if not row["value"]:
-        return "-"
-    scale, unit = (100.0, " %") if row["unit"] == "share" else (1.0, f" {row['unit']}")
-    value, low, high = (f"{scale * float(row[key]):.4g}" for key in ("value", "low", "high"))
-    return f"{value}{unit} ({low} to {high}), n {row['n']}"
+def pages(name: str) -> Iterator[str]:
+    """Links to the results that have figures of an agent."""
+    for title, form in MEASURED.items():
+        if form.format(name) in (RESULTS / f"{title}.md").read_text(encoding="utf-8"):
+            yield f"[{title}]({LINK}/{title}.md)"
 
 
-def predicting(name: str, card: Card) -> Iterator[str]:
-    """The lines about a network that predicts: HPN's variants and the trajectory predictors."""
-    data = card["data"]
+def predictor(name: str, card: Card) -> tuple[str, ...]:
+    """A variant of HPN or a predictor of trajectories, by the heads `PREDICTORS`."""
+    data, measured = card["data"], card["measured"]
     if name.startswith("hpn"):
-        train, check, commands = data["train"], data["validation"], data["commands"]
-        recorded, training = commands["train recordings"], f"`{commands['train']}`"
-        with (SHIPPED / f"{name}.csv").open(encoding="utf-8", newline="") as lines:
-            steps = [row["update"] for row in csv.DictReader(lines)][-1]
-        yield "- Predicts the next velocity maps and kinematics of one AV's surroundings (hpn.md)."
-        page, unit = "docs/results/prediction_maps.md", "loss"
+        episodes, command = data["train"]["episodes"], data["commands"]["train"]
+        loss = "plain loss" if "validation_maps" in measured else "loss"  # another sum: not comparable
+        what, error = "maps and kinematics", f"{loss} {measured['validation_loss']:.3g}"
+        result = f"[prediction_maps]({LINK}/prediction_maps.md)"
     else:
-        train, check, steps = data["training"], data["validation"], data["fit"]["steps"]
-        recorded, training = (
-            train["commands"],
-            "`cosim fit-predictors --training DIR --validation DIR --out DIR`",
-        )
-        yield "- Predicts each vehicle's trajectory for 4 s (docs/explanation/prediction.md)."
-        page, unit = "docs/results/prediction.md", "m"
-    count = len(recorded)
-    then = " (`vfn` was the network of a demonstrator then)" if "--policy vfn" in recorded[0] else ""
-    yield f"- Data: {train['episodes']} episodes, recorded by {count} commands such as `{recorded[0]}`{then}."
-    yield f"- Training: {training}, {steps} updates." + (
-        f" {data['note'].capitalize()}." if "note" in data else ""
+        episodes, command = data["training"]["episodes"], "cosim fit-predictors"
+        what, error = "trajectories", f"mean error {measured['position_error_mean']:.2f} m"
+        result = f"[prediction]({LINK}/prediction.md)"
+    return f"`{name}`", f"{what}, 4 s", f"{episodes} episodes", f"`{command}`", error, result, "scenarios"
+
+
+def encoder(name: str, card: Card) -> tuple[str, ...]:
+    """The frame encoder, by the heads `PREDICTORS`."""
+    frames, r2 = card["data"]["frames"]["training"], card["measured"]["R2 on tuning seeds"]
+    shown = {"gap": "gap ahead, own lane", "speed": "speed ahead, own lane"}
+    error = "R² ahead in its lane: " + ", ".join(f"{what} {r2[key]:.2f}" for what, key in shown.items())
+    what = "what stands on a velocity map, as 128 numbers"
+    return (
+        f"`{name}`",
+        what,
+        f"{frames:,} maps",
+        "`cosim train encoder --scenario all`",
+        error,
+        "none",
+        "scenarios",
     )
-    figures = {k: v for k, v in card["measured"].items() if isinstance(v, float)}
-    text = ", ".join(f"{worded(key)} {value:g} {unit}" for key, value in figures.items())
-    yield f"- Measured on {check['episodes']} validation episodes: {text}. On test seeds: {page}."
-    yield from (f"- Limit: {text}" for text in PREDICTING_LIMITS)
-
-
-def seeing(_: str, card: Card) -> Iterator[str]:
-    """The lines about the frame encoder."""
-    data, r2 = card["data"], card["measured"]["R2 on tuning seeds"]
-    frames, sight = data["frames"], data["sight"]
-    yield "- Turns one velocity map into 128 numbers that tell what stands on it (training.md, Seeing)."
-    yield (
-        f"- Data: {frames['training']:,} frames, {sight['drives']} drives of every demand of "
-        f"{', '.join(data['scenarios'])}, seeds below 100,000; labels from the simulation."
-    )
-    yield f"- Training: `cosim train encoder --scenario all`, {sight['loop']['updates']} updates."
-    shown = ("gap ahead, own lane", "speed ahead, own lane", "mission vehicle, presence")
-    text = ", ".join(f"{key} {r2[key]:.2f}" for key in shown)
-    yield f"- Measured on {frames['validation']:,} frames of tuning seeds, R2: {text}."
-    yield "- Limit: it learned from the five worlds alone; nothing is known of its sight on other roads."
-
-
-def worded(figure: str) -> str:
-    """A figure of a JSON card in words: `position_error_0.2` is the one 0.2 s ahead."""
-    horizon = figure.removeprefix("position_error_")
-    return f"position error {horizon} s ahead" if horizon[0].isdigit() else figure.replace("_", " ")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Write the page."""
-    parser = argparse.ArgumentParser(description="Write the cards of the networks that ship.")
+    parser = argparse.ArgumentParser(description="Write the page of the networks that ship.")
     parser.add_argument("--out", type=Path, default=Path("docs/reference/models.md"), metavar="FILE")
     args = parser.parse_args(arguments)
     try:

@@ -93,7 +93,7 @@ class SimulationInUse(SimulationError):
 
 
 class SimulationEnded(SimulationError):
-    """Somebody else ended a simulation that is shared: what was driven so far counts."""
+    """Another client ended a shared simulation; what was driven until then counts."""
 
 
 class WeightsMismatch(BadInput):

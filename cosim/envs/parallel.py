@@ -27,7 +27,7 @@ Step = tuple[
 
 
 def parallel_env(config: str | Scenario = "merge", **words: Any) -> SumoParallelEnv:
-    """PettingZoo's usual entry: `words` are SumoParallelEnv's and `cosim.open`'s."""
+    """Make a `SumoParallelEnv` under PettingZoo's usual name; `words` are its own and `cosim.open`'s."""
     return SumoParallelEnv(config, **words)
 
 

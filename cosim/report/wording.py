@@ -45,18 +45,19 @@ def value_and_bounds(
 ) -> tuple[str, str]:
     """`12.5 %` and `4.4 to 26.1`, to two digits of the interval's width.
 
-    No bounds where an interval would say nothing: it has no width, or fewer than `SEVERAL` episodes or pairs
-    (`n`) are behind it.
+    No bounds where an interval would say nothing: it has no width that is shown, or fewer than `SEVERAL`
+    episodes or pairs (`n`) are behind it.
     """
     width = (figure.high - figure.low) * (100.0 if measure.is_share else 1.0)
+    bare = number(figure.value, measure, signed=signed, unit=unit)
     if n < SEVERAL or not figure.known or not 0.0 < width < math.inf:
-        return number(figure.value, measure, signed=signed, unit=unit), ""
+        return bare, ""
     places = min(max(1 - math.floor(math.log10(width)), 1 if measure.is_share else 0), 4)
     value, low, high = (
         number(x, measure, signed=signed, unit=named, places=places)
         for x, named in ((figure.value, unit), (figure.low, False), (figure.high, False))
     )
-    return value, f"{low} to {high}"
+    return (value, f"{low} to {high}") if low != high else (bare, "")
 
 
 def sample(counts: Mapping[str, Any]) -> str:

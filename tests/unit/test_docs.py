@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import inspect
+import pkgutil
 import re
 from pathlib import Path
 
 import pytest
 
+import cosim.envs
 from cosim.batch import spec
+from cosim.errors import CosimError
 from cosim.recording.file import SCHEMA
 from cosim.scenario.human_errors import KINDS
 from policy.agents import POLICIES
@@ -75,3 +79,24 @@ def test_every_name_that_a_user_may_write_or_read_stands_on_its_page(
 ) -> None:
     text = (ROOT / "docs" / page).read_text(encoding="utf-8")
     assert [name for name in names if f"`{name}`" not in text] == []
+
+
+def test_the_python_reference_lists_the_public_names_in_the_words_of_their_docstrings() -> None:
+    page = (ROOT / "docs" / "reference" / "python.md").read_text(encoding="utf-8")
+    rows = dict(re.findall(r"^\| `([\w.]+)` \| (.*) \|$", page, re.MULTILINE))
+    found = {name: pkgutil.resolve_name(name) for name in rows}
+    summaries = {name: (inspect.getdoc(of) or "").split("\n\n")[0] for name, of in found.items()}
+    assert rows == {name: " ".join(text.split()) for name, text in summaries.items()}
+    public = {getattr(module, name) for module in (cosim, cosim.envs) for name in module.__all__}
+    errors = {of for of in vars(cosim.errors).values() if inspect.isclass(of) and issubclass(of, CosimError)}
+    assert (public - {cosim.__version__}) | errors <= set(found.values())
+    in_full = set(re.findall(r"^::: ([\w.]+)$", page, re.MULTILINE))
+    parts = {name for name in rows if name.startswith("cosim.Session.")}
+    assert in_full == {f"{found[n].__module__}.{found[n].__qualname__}" for n in rows.keys() - parts}
+
+
+def test_the_glossary_is_a_line_each_in_order() -> None:
+    page = (ROOT / "docs" / "reference" / "glossary.md").read_text(encoding="utf-8")
+    terms = re.findall(r"^\| (.+?) \| .+ \|$", page, re.MULTILINE)[1:]
+    assert 40 <= len(terms) <= 60
+    assert terms == sorted(terms, key=str.lower)

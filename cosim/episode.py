@@ -153,7 +153,8 @@ class Episode:
         self._tally: dict[str, int] = dict.fromkeys(
             ("decisions", "vetoes", "fallbacks", "lane_changes", "blocked"), 0
         )
-        self._hash = hashlib.sha256()
+        sensing = self.scenario.sensing
+        self._hash = hashlib.sha256(b"" if sensing is None else sensing.digest.encode())
         context = MetricContext(
             road=self.simulator.road,
             timing=self.scenario.timing,
@@ -218,6 +219,7 @@ class Episode:
 
     def context(self, seed: int, svo: float) -> PolicyContext:
         """What a policy gets to know of the episode `seed` before it starts; `svo` (phi) in rad."""
+        sensing = self.scenario.sensing
         return PolicyContext(
             road=self.simulator.road,
             timing=Timing()
@@ -227,6 +229,8 @@ class Episode:
             svo=svo,
             rng=generator(seed, "policy"),
             preset=self.scenario.preset,
+            share_perception=sensing is None,
+            share_intentions=sensing is None or sensing.parameters.mcm,
         )
 
     @property

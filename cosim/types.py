@@ -282,6 +282,8 @@ class Snapshot:
     waiting: Mapping[str, Due] | None = None  # who is to depart and has found no room; None: not known
     # lane -> m/s where the limit is not the road's: variable speed signs, calibrators; none in recordings
     limits: Mapping[int, float] = field(default_factory=dict)
+    # AV -> what it knows of all this; None: everything (ideal sensing)
+    percepts: Mapping[str, Percept] | None = None
 
     def __post_init__(self) -> None:
         if len(self.actor) != len(self.kind):
@@ -326,6 +328,43 @@ class Snapshot:
         return tuple(self.ids[row] for row in np.flatnonzero(self.kind == Kind.AV))
 
 
+class Source(IntEnum):
+    """What an AV's newest measurement of an object comes from."""
+
+    TRUTH = 0  # ideal sensing, and the AV itself
+    SENSOR = 1  # its own sensors
+    CAM = 2  # a message of the object about itself (ETSI EN 302 637-2)
+    CPM = 3  # a message of another AV whose sensors detected it (ETSI TS 103 324)
+
+
+class Unseen(IntEnum):
+    """Why an AV's own sensors do not detect an object in a frame."""
+
+    OUT_OF_RANGE = 0  # or of the field of view
+    HIDDEN = 1  # another vehicle's body is in between
+    MISSED = 2
+
+
+@dataclass(frozen=True)
+class Percept:
+    """What one AV knows of the world at a frame (docs/reference/sensing.md).
+
+    Attributes:
+        world: the AV itself, as it is, and everybody it knows of, where it takes them to be; n in all.
+        age: [n] s since the newest measurement of each.
+        source: [n] `Source` of it.
+        unseen: vehicle or person on the road -> why the AV's own sensors do not detect it now; without those
+            out of range.
+        hears: the AVs whose intentions reach it in time for a decision (MCM).
+    """
+
+    world: Snapshot
+    age: Floats
+    source: npt.NDArray[np.int8]
+    unseen: Mapping[str, Unseen]
+    hears: frozenset[str]
+
+
 # Columns of the kinematic matrix, in the ego's frame at the newest frame of the history
 # (x ahead, y to the left), so that one history is in one fixed frame and series are smooth.
 KINEMATIC_FEATURES = ("x", "y", "speed", "heading", "length", "width", "is_av", "is_mission")
@@ -333,6 +372,8 @@ X, Y, SPEED, HEADING, LENGTH, WIDTH, IS_AV, IS_MISSION = range(len(KINEMATIC_FEA
 
 
 NO_SIGNALS: Bytes = np.zeros(0, np.uint8)
+NO_AGE: Floats = np.zeros(0)
+NO_SOURCE: npt.NDArray[np.int8] = np.zeros(0, np.int8)
 
 
 class History(NamedTuple):
@@ -355,6 +396,10 @@ class History(NamedTuple):
     time: float  # s
     rules: RulesAhead = NO_RULES  # signals, stop lines, right of way, crossings, limits on its own way
     signals: Bytes = NO_SIGNALS  # [s] `Snapshot.signals`, for drawing maps of what comes
+    age: Floats = NO_AGE  # [R] s since the newest measurement of each row's vehicle; empty: all are 0
+    source: npt.NDArray[np.int8] = NO_SOURCE  # [R] `Source` of that measurement; empty: all are the truth
+    # the AVs whose intentions reach it in time for this decision (MCM); None: all, where they are shared
+    hears: frozenset[str] | None = None
 
     @property
     def ego_speed(self) -> float:
@@ -490,7 +535,14 @@ class PolicyContext:
     svo: float  # rad, the social value orientation phi
     rng: np.random.Generator
     preset: str = Preset.UNGUARDED
+    # V2V: AVs pool what they know; not where each has a percept, which holds what messages told it
+    share_perception: bool = True
     share_intentions: bool = True  # V2V: AVs decide front to back and know the choices before theirs
+
+    @property
+    def pooled(self) -> bool:
+        """Whether AVs pool what they know."""
+        return self.share_perception and self.observation.share_perception
 
 
 class Policy(Protocol):
@@ -583,6 +635,9 @@ class Identity:
     penetration: float | None  # share of AVs, where that chooses them
     preset: str
     errors: str | None = field(default=None, kw_only=True)  # a level, or a file's stem and digest; None: none
+    sensing: str | None = field(
+        default=None, kw_only=True
+    )  # a level, a file, changed parameters; None: ideal
     svo_deg: float
     seed: int
 

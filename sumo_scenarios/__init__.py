@@ -7,6 +7,7 @@ from cosim.errors import BadInput, hint
 ROOT = Path(__file__).resolve().parent
 BEHAVIORS = ROOT / "behaviors.yaml"  # Table II and its IDM + LC2013 mapping
 ERRORS = ROOT / "errors.yaml"  # the errors of human drivers, level by level
+SENSING = ROOT / "sensing.yaml"  # what AVs measure of others, level by level
 TILTS = ROOT / "tilts.yaml"  # how much more often `cosim estimate` draws them, world by world
 TYPES = ROOT / "types.add.xml"  # the IDM + LC2013 type that vehicles of a user's file may get
 

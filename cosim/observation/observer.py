@@ -1,6 +1,6 @@
 """Turns snapshots into one History per AV: the first step of every decision."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from cosim.observation.kinematics import choose_rows, fill_rows, never_left_out,
 from cosim.observation.past import KinematicPast, MapPast
 from cosim.road import RoadMap
 from cosim.road.rules import Moment, RuleBook
-from cosim.types import KINEMATIC_FEATURES, Bools, History, Ints, Kind, ObservationConfig, Snapshot
+from cosim.types import KINEMATIC_FEATURES, Bools, History, Ints, Kind, ObservationConfig, Percept, Snapshot
 
 RouteOf = Callable[[str], tuple[str, ...]]  # AV id -> edges ahead, the present one first
 CommandOf = Callable[[str], tuple[float | None, int]]  # AV id -> target speed m/s, lane change under way
@@ -37,19 +37,29 @@ class Observer:
     def reset(self) -> None:
         """Clear the past: a new episode begins."""
         self._past = KinematicPast(self._config.frames)
+        self._pasts: dict[str, KinematicPast] = {}  # AV -> the past as it knew it
         if self._maps is not None:
             self._maps.clear()
         self._newest: Snapshot | None = None
 
     def add(self, snapshot: Snapshot) -> None:
         """Append one frame: the kinematics of all vehicles, the maps of every AV on the road."""
-        self._past.add(snapshot)
         self._newest = snapshot
         self._egos: Ints = np.flatnonzero(snapshot.kind == int(Kind.AV))
+        if snapshot.percepts is None:
+            self._past.add(snapshot)
+        else:
+            self._add_percepts(snapshot.percepts)
         if self._maps is None or self._raster is None:
             return
         block, slots = self._maps.next_frame(tuple(snapshot.ids[i] for i in self._egos))
-        draw_snapshot(block, slots, snapshot, self._egos, self._perceived(), self._raster, self._config)
+        if snapshot.percepts is None:
+            draw_snapshot(block, slots, snapshot, self._egos, self._perceived(), self._raster, self._config)
+            return
+        for name, slot in zip(snapshot.avs, slots, strict=True):
+            world = snapshot.percepts[name].world
+            here, seen = np.array([world.row[name]]), np.ones((1, world.n), np.bool_)
+            draw_snapshot(block, np.array([slot]), world, here, seen, self._raster, self._config)
 
     def histories(self, route: RouteOf, commanded: CommandOf) -> dict[str, History]:
         """One History per AV on the road, at the newest frame (AVs off every lane are left out).
@@ -58,27 +68,60 @@ class Observer:
             route: AV id -> the edges ahead of it (`Simulator.route`).
             commanded: AV id -> its target speed and lane change under way (`Simulator.commanded`).
         """
-        s, c = self._newest, self._config
+        s = self._newest
         if s is None or not len(self._egos):
             return {}
-        count, seen = len(self._egos), self._perceived()
+        if s.percepts is None:
+            return self._histories(s, self._past, self._egos, self._perceived(), route, commanded)
+        result = {}
+        for name in s.avs:
+            percept = s.percepts[name]
+            world, past = percept.world, self._pasts[name]
+            here, seen = np.array([world.row[name]]), np.ones((1, world.n), np.bool_)
+            for history in self._histories(world, past, here, seen, route, commanded).values():
+                rows = np.array([world.row.get(other, -1) for other in history.ids])
+                result[name] = history._replace(
+                    age=np.where(rows >= 0, percept.age[rows], 0.0),
+                    source=np.where(rows >= 0, percept.source[rows], 0).astype(np.int8),
+                    hears=percept.hears,
+                )
+        return result
+
+    # ---- inside ----
+
+    def _add_percepts(self, percepts: Mapping[str, Percept]) -> None:
+        self._pasts = {name: self._pasts.get(name) or KinematicPast(self._config.frames) for name in percepts}
+        for name, past in self._pasts.items():
+            past.add(percepts[name].world)
+
+    def _histories(
+        self,
+        s: Snapshot,
+        past: KinematicPast,
+        egos: Ints,  # [B]
+        seen: Bools,  # [B,n]
+        route: RouteOf,
+        commanded: CommandOf,
+    ) -> dict[str, History]:
+        """Of the AVs `egos`, who know the world `s` as far as they have `seen` it."""
+        c, count = self._config, len(egos)
         rows = np.empty((count, c.rows), np.int64)
         none = np.zeros((count, s.n), np.bool_)
-        if choose_rows(s.x, s.y, self._egos, seen, c.row_range, none, rows):
-            first = never_left_out(s, self._road.straight_on, self._egos, c.row_range)
-            choose_rows(s.x, s.y, self._egos, seen, c.row_range, first, rows)
+        if choose_rows(s.x, s.y, egos, seen, c.row_range, none, rows):
+            first = never_left_out(s, self._road.straight_on, egos, c.row_range)
+            choose_rows(s.x, s.y, egos, seen, c.row_range, first, rows)
         kinematics = np.zeros((count, c.frames, c.rows, len(KINEMATIC_FEATURES)), np.float32)
         valid = np.zeros((count, c.frames, c.rows), np.bool_)
         fixed = np.stack([s.length, s.width, s.kind == int(Kind.AV), s.mission], axis=1).astype(np.float64)
-        fill_rows(self._past.window, self._past.slots, rows, fixed, kinematics, valid)
+        fill_rows(past.window, past.slots, rows, fixed, kinematics, valid)
         lanes = np.where(rows >= 0, s.lane[rows], -1).astype(np.int32)  # [B,R]
         positions = np.where(rows >= 0, s.lane_position[rows], 0.0)  # [B,R] m
-        pose = np.stack([s.x, s.y, s.heading], axis=1)[self._egos]  # [B,3]
+        pose = np.stack([s.x, s.y, s.heading], axis=1)[egos]  # [B,3]
         no_maps = np.zeros((c.frames, len(c.channels), 0, 0), np.uint8)
         result = {}
         names = (*s.ids, "")
         now = self._moment(s, seen[0])
-        for b, e in enumerate(self._egos):
+        for b, e in enumerate(egos):
             name = s.ids[e]
             if lanes[b, 0] < 0:  # off every lane: it cannot be commanded now
                 continue

@@ -89,6 +89,8 @@ def _head(result: EpisodeResult) -> list[str]:
         begun = Counter(error.kind for error in result.errors_begun).most_common()
         kinds = ", ".join(f"{count} {kind}" for kind, count in begun) or "none"
         said.append(f"human errors {result.errors}: {kinds}")
+    if result.sensing is not None:
+        said.append(f"sensing {result.sensing}")
     title = f"{result.scenario} / {result.demand} / {result.policy}{made}, seed {result.seed}"
     return [title, *_wrapped(said)]
 

@@ -21,7 +21,7 @@ from cosim.scenario.options import COLUMNS, FLEET
 from cosim.types import OnCollision, Traffic
 from cosim.workers.tasks import OK
 
-SETTINGS = (*(name for name in COLUMNS if name not in FLEET), "errors_sha256", "tilt")
+SETTINGS = (*(name for name in COLUMNS if name not in FLEET), "errors_sha256", "sensing_sha256", "tilt")
 NEEDED = ("key", "cell", "status", "scenario", "demand", "policy", "seed")
 
 
@@ -69,6 +69,7 @@ class Run:
             "warmup": times.get("warmup_s", asked.get("warmup")),
             "on_collision": driven.get("on_collision", asked.get("on_collision") or OnCollision.END),
             "errors_sha256": driven.get("errors", {}).get("sha256"),
+            "sensing_sha256": driven.get("sensing", {}).get("sha256"),
             "tilt": driven.get("tilt"),
             "traffic": driven.get("traffic", asked.get("traffic") or Traffic.CONTROLLED),
         }

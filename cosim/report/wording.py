@@ -90,6 +90,7 @@ def group(identity: Mapping[str, Any], *, policy: bool = True) -> str:
         "behavior": "{}",
         "preset": "{}",
         "errors": "errors {}",
+        "sensing": "sensing {}",
         "svo_deg": "svo {:g}",
         "penetration": "penetration {:g}",
         "driver_model": "{}",

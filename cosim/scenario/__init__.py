@@ -12,13 +12,14 @@ from cosim.errors import BadInput, check_pattern, hint, one_of
 from cosim.files import yaml_input
 from cosim.files.xml_input import is_there, regular_file
 from cosim.files.yaml_input import NonNegative, Positive
-from cosim.scenario import human_errors, sumocfg, tilt
+from cosim.scenario import human_errors, sensing, sumocfg, tilt
 from cosim.scenario.behaviors import AS_IS, LC2013, MIXED
 from cosim.scenario.human_errors import Errors
 from cosim.scenario.options import BEHAVIORS as BEHAVIORS
 from cosim.scenario.options import EpisodeOptions
 from cosim.scenario.options import Fleet as Fleet
 from cosim.scenario.options import place as place
+from cosim.scenario.sensing import Sensing
 from cosim.scenario.tilt import Tilt
 from cosim.scenario.traffic import STEP, SUMO_STEP, Changed, check_timing, clocks, settled
 from cosim.types import Identity, OnCollision, Preset, Timing, Traffic
@@ -86,6 +87,7 @@ class Scenario:
     behavior: str = AS_IS
     driver_model: str = LC2013
     errors: Errors | None = None  # of human drivers and persons; None: nobody errs
+    sensing: Sensing | None = None  # of AVs; None: ideal
     tilt: Tilt | None = None  # of these errors; None: they are drawn as they happen
     demands: Mapping[str, Path] | None = None  # name -> file, of a world
     title: str = ""
@@ -114,6 +116,7 @@ class Scenario:
             penetration=self.fleet.penetration,
             preset=self.preset,
             errors=None if self.errors is None else self.errors.name,
+            sensing=None if self.sensing is None else self.sensing.name,
             svo_deg=svo_deg,
             seed=seed,
         )
@@ -126,11 +129,13 @@ class Scenario:
             ours.append(sumo_scenarios.BEHAVIORS)
         if self.errors is not None:
             ours.append(self.errors.file)
+        if self.sensing is not None:
+            ours.append(self.sensing.file)
         return (self.config, self.net, *self.demand, *self.additional, *ours)
 
 
 # Options that replace the scenario's field of the same name; the others have a line each in `load`.
-_READ = {"demand", "mission", "errors", "tilt", "traffic"}  # into something else
+_READ = {"demand", "mission", "errors", "sensing", "tilt", "traffic"}  # into something else
 OWN = {f.name for f in fields(Scenario)} & {f.name for f in fields(EpisodeOptions)} - _READ
 
 
@@ -164,6 +169,7 @@ def load(
         scenario,
         behavior=_default_behavior(scenario),
         errors=human_errors.read(asked.errors, world=scenario.name if scenario.ships else ""),
+        sensing=sensing.read(asked.sensing),
         tilt=None if asked.tilt is None else tilt.read(asked.tilt, "tilt"),
     )
     return settled(with_options(scenario, asked), chosen, asked.traffic)

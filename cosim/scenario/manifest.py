@@ -13,6 +13,7 @@ from cosim.files.yaml_input import mapping, value_of
 from cosim.scenario import Scenario
 from cosim.scenario.human_errors import Errors
 from cosim.scenario.options import EpisodeOptions
+from cosim.scenario.sensing import Sensing
 from cosim.scenario.sumocfg import CLOCK, INPUTS, command_line, keeps
 from cosim.types import OnCollision
 
@@ -44,6 +45,7 @@ def manifest(scenario: Scenario, seed: int) -> dict[str, Any]:
         **({} if scenario.built_in else {"traffic": scenario.traffic}),
         **({"changed_options": _changed(scenario)} if scenario.changed else {}),
         **({} if scenario.errors is None else {"errors": _errors(scenario.errors)}),
+        **({} if scenario.sensing is None else {"sensing": _sensing(scenario.sensing)}),
         **({} if scenario.tilt is None else {"tilt": scenario.tilt.text()}),
         "driver_model": scenario.driver_model,
         "behavior": scenario.behavior,
@@ -126,6 +128,10 @@ def _changed(scenario: Scenario) -> dict[str, dict[str, str]]:
 
 def _errors(errors: Errors) -> dict[str, str]:
     return {"name": errors.name, "sha256": errors.digest}
+
+
+def _sensing(sensing: Sensing) -> dict[str, str]:
+    return {"name": sensing.name, "sha256": sensing.digest}
 
 
 @lru_cache

@@ -23,6 +23,7 @@ from cosim.files import code
 from cosim.files.xml_input import is_there
 from cosim.files.yaml_input import NonNegative, Positive, check_known, dataclass_from, mapping, value_of
 from cosim.scenario import human_errors, policy_name
+from cosim.scenario import sensing as sensing_levels
 from cosim.scenario.behaviors import DRIVER_MODELS, LC2013, load_behaviors
 from cosim.seeding import FIRST_TEST_SEED
 from cosim.types import IDENTITY, OnCollision, Preset, Traffic
@@ -189,6 +190,14 @@ class EpisodeOptions:
         scope=TRAFFIC,
         axis=True,
         reader=human_errors.asked,
+    )
+    sensing: str | None = option(
+        None,
+        "of AVs: ideal (default), radar-camera, v2v, harsh, or a YAML file; single parameters behind it: "
+        "v2v,delay=0.8 (docs/reference/sensing.md)",
+        metavar="LEVEL|FILE",
+        axis=True,
+        reader=sensing_levels.asked,
     )
     policy: str = option(
         "idm",

@@ -13,6 +13,7 @@ from cosim.batch.spec import SEEDS
 from cosim.errors import BadInput, hint
 from cosim.policies import NAMES as POLICIES
 from cosim.rewards import REWARDS
+from cosim.scenario import sensing
 from cosim.scenario.options import MEASURED, OPTIONS, Option
 from cosim.scenario.sumo_outputs import OUTPUTS
 
@@ -32,6 +33,7 @@ _ABOUT = {  # where HTTP takes less than the command line
     "demand": "by name (free, dense, contested), or files of the upload; A,B is one demand of two files",
     "policy": f"by name ({', '.join(POLICIES)}), upload:ID or LABEL=upload:ID",
     "errors": "of human drivers: none (default), field or stress",
+    "sensing": "of AVs: ideal (default), radar-camera, v2v or harsh; parameters behind it: v2v,delay=0.8",
     "reward": "report what AVs earn by it",
     "metric": "refused: code is not taken over HTTP",
 }
@@ -162,7 +164,8 @@ def _axis(name: str, value: Any, find: Find, uploads: list[str]) -> Any:
                 raise BadInput(f"unknown{hint(str(item), known)}", field=name, value=item)
     if name not in (SEEDS, "demand") and not OPTIONS[name].free:
         for item in value if isinstance(value, list) else [value]:
-            if isinstance(item, str) and not _is_name(item):
+            text = sensing.base(item) if name == "sensing" and isinstance(item, str) else item
+            if isinstance(text, str) and not _is_name(text):
                 raise BadInput("is no name: no file or code is read", field=name, value=item)
     return value
 

@@ -24,6 +24,7 @@ from cosim.scenario.sumo_outputs import sumo_options
 from cosim.scenario.sumocfg import time_of
 from cosim.scenario.traffic import CHECKS_INSIDE, FORCED, USUAL, check
 from cosim.scenario.vehicle_types import VehicleTypes, vehicle_types
+from cosim.sensing.perception import Perception
 from cosim.simulation.assistance import Assistance
 from cosim.simulation.backend import sumo
 from cosim.simulation.collisions import CollisionDetector, Wrecks
@@ -137,6 +138,12 @@ class SumoSimulator:
             None
             if errors is None
             else HumanErrors(errors, self.road, self._drivers, seed, step, self._scenario.tilt)
+        )
+        sensing = self._scenario.sensing
+        self._perception = (
+            None
+            if sensing is None
+            else Perception(self.road, sensing.parameters, self._scenario.timing, seed)
         )
         self._reader.bodies_changed()
         self._entries.reset()
@@ -455,6 +462,8 @@ class SumoSimulator:
                 overlaps=overlaps,
             )
             snapshot = replace(snapshot, events=events)
+        if self._perception is not None:
+            snapshot = replace(snapshot, percepts=self._perception.perceive(snapshot))
         return snapshot
 
     def _goal(self) -> tuple[frozenset[int], frozenset[int]]:

@@ -42,7 +42,7 @@ class Oracle(PredictionAware):
 
     def foresee(self, histories: Mapping[str, History]) -> tuple[Scene, Traffic, KinematicForecast]:
         """What all AVs see together, and where the networks expect everybody in it."""
-        return self._truth(join(histories, self._context.observation.share_perception))
+        return self._truth(join(histories, self._context.pooled))
 
     def _truth(self, scene: Scene) -> tuple[Scene, Traffic, KinematicForecast]:
         c, context = self.config, self._context

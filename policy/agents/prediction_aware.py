@@ -149,7 +149,7 @@ class PredictionAware:
     def foresee(self, histories: Mapping[str, History]) -> tuple[Scene, Traffic, KinematicForecast]:
         """What all AVs see together, and where everybody in it will be."""
         c, context = self.config, self._context
-        scene = join(histories, context.observation.share_perception)
+        scene = join(histories, context.pooled)
         forecast, traffic = foresee(scene, self._predictor, context.road, c.traffic, c.safety.frames)
         self._expected = scene.vehicles, traffic, forecast
         return scene, traffic, forecast

@@ -84,7 +84,7 @@ def prioritize(
     ours = Rollout(*(array.copy() for array in traffic.rollout)) if share_intentions else traffic.rollout
     traffic = traffic._replace(rollout=ours)
     intended = np.zeros(len(scene.vehicles), np.bool_)
-    name_row = {name: k for k, name in enumerate(scene.vehicles)}
+    copies = _copies(scene)
     decisions: dict[str, Decision] = {}
     for b in front_to_back(scene, config):
         no = refused.get(scene.agents[b]) if refused else None
@@ -92,11 +92,24 @@ def prioritize(
         decision = select(q[b], evaluation, config, _ties(scene.histories[b], config))
         decisions[scene.agents[b]] = decision
         if share_intentions:
-            me = name_row[scene.agents[b]]
+            me = copies[scene.agents[b]]
             intended[me] = True
             for mine, shared in zip(ours, evaluation.futures.shared(decision.action), strict=True):
                 mine[me] = shared
     return {agent: decisions[agent] for agent in scene.agents}
+
+
+def _copies(scene: Scene) -> dict[str, list[int]]:
+    """AV -> its places among the vehicles: with pooled knowledge one, else one for each AV that hears of its
+    intentions, and its own."""
+    if scene.shared:
+        return {name: [k] for k, name in enumerate(scene.vehicles)}
+    found: dict[str, list[int]] = {name: [] for name in scene.agents}
+    for name, history, row in zip(scene.agents, scene.histories, scene.row, strict=True):
+        for other, k in zip(history.ids, row, strict=True):
+            if other in found and (other == name or history.hears is None or other in history.hears):
+                found[other].append(int(k))
+    return found
 
 
 def _ties(history: History, c: SafetyConfig) -> tuple[MetaAction, ...]:

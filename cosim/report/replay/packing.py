@@ -24,8 +24,8 @@ FORECAST_EVERY = 2  # every second predicted frame is drawn
 
 EVERYWHERE = (np.full(2, -np.inf), np.full(2, np.inf))  # the window that leaves nothing out
 FACTS = (
-    "scenario", "demand", "policy", "policy_label", "behavior", "driver_model", "preset", "errors", "svo_deg",
-    "seed", "steps", "trace_hash", "not_comparable_because", "mission_vehicle", "mission_guessed",
+    "scenario", "demand", "policy", "policy_label", "behavior", "driver_model", "preset", "errors", "sensing",
+    "svo_deg", "seed", "steps", "trace_hash", "not_comparable_because", "mission_vehicle", "mission_guessed",
 )  # fmt: skip
 
 

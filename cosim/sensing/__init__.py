@@ -1,0 +1,1 @@
+"""What each AV knows of others: sensors, messages, tracks (docs/reference/sensing.md)."""

@@ -1,0 +1,306 @@
+"""The sensors, the radio and the tracker of every AV: snapshots in, percepts out.
+
+A track is found by the vehicle's id, for own sensors too: ids follow a vehicle through the whole observation,
+and a wrong association would be an error of a kind of its own, which no parameter asks for.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from cosim.arrays import Bools, Floats, Ints
+from cosim.road import RoadMap
+from cosim.scenario.sensing import Parameters
+from cosim.seeding import subseed, uniform
+from cosim.sensing import kernels
+from cosim.sensing.kernels import (
+    B_ACCEL,
+    B_AGE,
+    B_HEADING,
+    B_LANE,
+    B_POSITION,
+    B_SOURCE,
+    B_SPEED,
+    B_TOLD,
+    B_X,
+    B_Y,
+)
+from cosim.sensing.lanes import lane_lines
+from cosim.types import Actor, Kind, Percept, Snapshot, Source, Timing, Unseen
+
+COMPENSATION = {"hold": 0, "cv": 1, "lanes": 2, "truth": 3}
+HIDING = (Actor.CAR, Actor.TRUCK, Actor.BUS, Actor.OTHER)  # nobody is behind a motorcycle or a person
+LONGEST_JITTER = 6.0  # of its mean: one message in 400 comes later, and is not looked at
+WHY = (*Unseen,)  # by the kernels' codes
+NOBODY: frozenset[str] = frozenset()
+OWN = -1.0  # in a belief's source: the AV itself
+SLOTS = 64  # objects that there is room for at first; AVs: a quarter
+
+
+class Perception:
+    """One level of sensing in one episode; `perceive` once per frame, in order.
+
+    Args:
+        road: the net.
+        parameters: the level.
+        timing: the clocks.
+        seed: the episode's, from which every draw comes.
+    """
+
+    def __init__(self, road: RoadMap, parameters: Parameters, timing: Timing, seed: int) -> None:
+        p = self._parameters = parameters
+        self._timing, self._seed = timing, seed
+        self._lanes = lane_lines(road)
+        self._noise = np.array([p.position_noise, p.speed_noise, math.radians(p.heading_noise)])
+        heading = math.radians(p.cam_heading_noise)
+        self._sender_noise = np.array([p.cam_position_noise, p.cam_speed_noise, heading])
+        self._radio = np.array([p.message_range, p.period, p.delay, p.jitter, p.loss, p.burst])
+        self._contents = np.array([p.cam, p.cpm], np.uint8)
+        self._lag = math.ceil(p.latency / timing.frame - 1e-6)
+        oldest = max(p.delay + LONGEST_JITTER * p.jitter + p.period, p.forget) if p.cam or p.cpm else 0.0
+        self._held, self._newest = 0, -1
+        self._slots = _Slots(self._lag + math.ceil(oldest / timing.frame) + 3)
+
+    def perceive(self, snapshot: Snapshot) -> Mapping[str, Percept]:
+        """What every AV of the next frame knows."""
+        p, slots, now = self._parameters, self._slots, snapshot.time
+        rows = slots.settle(snapshot, self._stream, self._is_equipped)
+        self._newest += 1
+        self._held = min(self._held + 1, len(slots.ring))
+        k = self._newest % len(slots.ring)
+        state, seen = slots.ring[k], slots.seen[k]
+        state[:] = np.nan
+        columns = snapshot.x, snapshot.y, snapshot.heading, snapshot.speed, snapshot.lane
+        state[rows] = np.stack([*columns, snapshot.lane_position], axis=1)
+        step = round(now / self._timing.frame)
+        kernels.detect(
+            *(state, slots.length, slots.width, slots.hides, slots.egos, slots.streams, step, p.range),
+            *(math.radians(p.field_of_view) / 2.0, p.line_of_sight, p.visible_share, p.miss, seen),
+        )
+        kernels.follow(
+            *(slots.ring, slots.seen, self._newest, self._held, slots.egos, slots.equipped, slots.streams),
+            *(step, now, self._timing.frame, self._lag, self._noise, self._contents, self._radio),
+            *(self._sender_noise, slots.tracks, slots.heard),
+        )
+        beliefs = np.zeros((len(slots.egos), len(slots.names), kernels.BELIEF))
+        kernels.believe(
+            *(state, slots.length, slots.egos, now, p.confirm, p.forget, COMPENSATION[p.compensation]),
+            *(*self._lanes, slots.tracks, beliefs),
+        )
+        hears = np.zeros((len(slots.egos), len(slots.egos)), np.uint8)
+        if p.mcm:
+            decision = self._timing.decision
+            kernels.intentions_heard(state, slots.egos, slots.streams, now, decision, self._radio, hears)
+        return Percepts(
+            snapshot, slots.known, dict(slots.avs), slots.egos.copy(), seen.copy(), beliefs, hears
+        )
+
+    # ---- inside ----
+
+    def _stream(self, name: str) -> int:
+        return subseed(self._seed, "sensing", name)
+
+    def _is_equipped(self, name: str) -> bool:
+        """Whether a human driver's vehicle sends CAMs."""
+        return uniform(self._seed, "equipped", name) < self._parameters.equipped
+
+
+class Known(NamedTuple):
+    """What does not change of the objects that hold a place: k of them, by name."""
+
+    names: tuple[str, ...]
+    place: Ints  # [k]
+    length: Floats  # [k] m
+    width: Floats  # [k] m
+    kind: npt.NDArray[np.int8]  # [k]
+    actor: npt.NDArray[np.int8]  # [k]
+    mission: Bools  # [k]
+
+
+class Percepts(Mapping[str, Percept]):
+    """AV -> what it knows at one frame, put together when it is asked for."""
+
+    def __init__(
+        self,
+        truth: Snapshot,
+        known: Known,
+        avs: Mapping[str, int],
+        egos: Ints,
+        seen: npt.NDArray[np.uint8],
+        beliefs: Floats,
+        hears: npt.NDArray[np.uint8],
+    ) -> None:
+        self._truth, self._known, self._avs, self._egos = truth, known, avs, egos
+        self._seen, self._beliefs, self._hears = seen, beliefs, hears
+        self._names = {a: name for name, a in avs.items()}
+        self._found: dict[str, Percept] = {}
+
+    def __getitem__(self, av: str) -> Percept:
+        if av not in self._found:
+            self._found[av] = self._percept(av, self._avs[av])
+        return self._found[av]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._avs)
+
+    def __len__(self) -> int:
+        return len(self._avs)
+
+    def _percept(self, av: str, a: int) -> Percept:
+        known, truth = self._known, self._truth
+        beliefs = self._beliefs[a]
+        beliefs[self._egos[a]] = _own(truth, truth.row[av])
+        rows = np.flatnonzero(beliefs[known.place, B_SOURCE])
+        b = beliefs[known.place[rows]].T.copy()  # [10,m]
+        b[B_SOURCE, b[B_SOURCE] < 0.0] = Source.TRUTH
+        kind, lane = known.kind[rows], b[B_LANE].astype(np.int32)
+        kind[(kind == Kind.AV) & (b[B_TOLD] == 0.0)] = Kind.HV  # it has not said what it is
+        unknown = np.full(len(rows), np.nan)
+        world = Snapshot(
+            time=truth.time,
+            ids=tuple([known.names[k] for k in rows]),
+            kind=kind,
+            mission=known.mission[rows],
+            x=b[B_X],
+            y=b[B_Y],
+            heading=b[B_HEADING],
+            speed=b[B_SPEED],
+            accel=b[B_ACCEL],
+            length=known.length[rows],
+            width=known.width[rows],
+            lane=lane,
+            lane_position=b[B_POSITION],
+            actor=known.actor[rows],
+            place=lane,
+            signals=truth.signals,
+            switches=truth.switches,
+            time_loss=unknown,
+            co2=unknown,
+            limits=truth.limits,
+        )
+        codes = self._seen[a, known.place]
+        dark = ((codes == kernels.HIDDEN) | (codes == kernels.MISSED)).nonzero()[0]
+        unseen = {known.names[k]: WHY[codes[k]] for k in dark.tolist()}
+        heard = self._hears[a].nonzero()[0]
+        hears = frozenset([self._names[k] for k in heard.tolist()]) if len(heard) else NOBODY
+        return Percept(world, b[B_AGE], b[B_SOURCE].astype(np.int8), unseen, hears)
+
+
+def _own(truth: Snapshot, row: int) -> Floats:
+    """[10] what an AV knows of itself."""
+    state = [truth.x[row], truth.y[row], truth.heading[row], truth.speed[row], truth.accel[row]]
+    return np.array([*state, truth.lane[row], truth.lane_position[row], 0.0, OWN, 1.0])
+
+
+class _Slots:
+    """Places of objects and AVs in the arrays; an object keeps its place while somebody tracks it."""
+
+    def __init__(self, frames: int) -> None:
+        self.names: list[str] = [""] * SLOTS  # "": free
+        self.place: dict[str, int] = {}
+        self.avs: dict[str, int] = {}
+        self._allocate(frames, SLOTS, SLOTS // 4)
+        self._ids: tuple[str, ...] = ()
+        self._rows: Ints = np.zeros(0, np.int64)
+        self.known = self._known()
+
+    def _allocate(self, frames: int, objects: int, avs: int) -> None:
+        self.ring = np.full((frames, objects, kernels.STATES), np.nan)
+        self.seen = np.zeros((frames, avs, objects), np.uint8)
+        self.tracks = _no_tracks(avs, objects)
+        self.heard = np.full((avs, avs), -1.0)
+        self.egos = np.full(avs, -1, np.int64)
+        self.length, self.width = np.zeros(objects), np.zeros(objects)
+        self.kind, self.actor = np.zeros(objects, np.int8), np.zeros(objects, np.int8)
+        self.mission = np.zeros(objects, np.bool_)
+        self.hides, self.equipped = np.zeros(objects, np.uint8), np.zeros(objects, np.uint8)
+        self.streams = np.zeros(objects, np.uint64)
+
+    def settle(self, s: Snapshot, stream: Callable[[str], int], is_equipped: Callable[[str], bool]) -> Ints:
+        """The places [n] of the n vehicles and persons of the next frame."""
+        if s.ids != self._ids or s.avs != tuple(self.avs):
+            self._change(s, stream, is_equipped)
+        if not np.array_equal(self.mission[self._rows], s.mission):
+            self.mission[self._rows] = s.mission
+            self.known = self._known()
+        return self._rows
+
+    def _change(self, s: Snapshot, stream: Callable[[str], int], is_equipped: Callable[[str], bool]) -> None:
+        for name in [name for name in self.avs if name not in s.row]:
+            self.egos[self.avs.pop(name)] = -1
+        for name in [name for name in self.place if name not in s.row]:
+            k = self.place[name]
+            if np.isnan(self.tracks[:, k, kernels.T_TIME]).all():
+                self.names[k] = ""
+                del self.place[name]
+        new = [name for name in s.ids if name not in self.place]
+        free = [k for k, name in enumerate(self.names) if not name]
+        while len(free) < len(new):
+            free += range(len(self.names), 2 * len(self.names))
+            self._grow(2 * len(self.names), len(self.egos))
+        for name, k in zip(new, free, strict=False):
+            self._enter(name, k, s, stream, is_equipped)
+        self._rows = np.array([self.place[name] for name in s.ids], np.int64)
+        self._ids = s.ids
+        for name in [name for name in s.avs if name not in self.avs]:
+            self._equip(name)
+        self.avs = {name: self.avs[name] for name in s.avs}
+        self.mission[self._rows] = s.mission
+        self.known = self._known()
+
+    def _known(self) -> Known:
+        names = tuple(sorted(self.place))
+        k = np.array([self.place[name] for name in names], np.int64)
+        fixed = self.length[k], self.width[k], self.kind[k], self.actor[k], self.mission[k]
+        return Known(names, k, *fixed)
+
+    def _enter(
+        self, name: str, k: int, s: Snapshot, stream: Callable[[str], int], is_equipped: Callable[[str], bool]
+    ) -> None:
+        row = s.row[name]
+        self.names[k], self.place[name] = name, k
+        self.length[k], self.width[k] = s.length[row], s.width[row]
+        self.kind[k], self.actor[k] = s.kind[row], s.actor[row]
+        self.hides[k] = s.actor[row] in HIDING
+        kind = s.kind[row]
+        self.equipped[k] = kind == Kind.AV or (kind == Kind.HV and is_equipped(name))
+        self.streams[k] = stream(name)
+        self.ring[:, k] = np.nan
+        self.seen[:, :, k] = 0
+        self.tracks[:, k] = _no_tracks(1, 1)[0, 0]
+
+    def _equip(self, name: str) -> None:
+        """A vehicle is an AV from now on."""
+        free = np.flatnonzero(self.egos < 0)
+        if not len(free):
+            free = np.array([len(self.egos)])
+            self._grow(len(self.names), 2 * len(self.egos))
+        a, k = int(free[0]), self.place[name]
+        self.avs[name], self.egos[a] = a, k
+        self.kind[k], self.equipped[k] = Kind.AV, 1
+        self.tracks[a] = _no_tracks(1, len(self.names))[0]
+        self.seen[:, a] = 0
+        self.heard[a], self.heard[:, a] = -1.0, -1.0
+
+    def _grow(self, objects: int, avs: int) -> None:
+        before = dict(vars(self))
+        n, b = len(self.names), len(self.egos)
+        self._allocate(len(self.ring), objects, avs)
+        self.names += [""] * (objects - n)
+        for name in ("length", "width", "kind", "actor", "mission", "hides", "equipped", "streams"):
+            getattr(self, name)[:n] = before[name]
+        self.ring[:, :n] = before["ring"]
+        self.seen[:, :b, :n] = before["seen"]
+        self.tracks[:b, :n] = before["tracks"]
+        self.heard[:b, :b] = before["heard"]
+        self.egos[:b] = before["egos"]
+
+
+def _no_tracks(avs: int, objects: int) -> Floats:
+    """[A,S,18]"""
+    tracks = np.full((avs, objects, kernels.TRACK), np.nan)
+    tracks[..., kernels.T_CAM], tracks[..., kernels.T_TOLD] = -1.0, 0.0
+    return tracks

@@ -1,0 +1,57 @@
+"""Sensing levels in SUMO: one flag changes what AVs know, and nothing of what is measured."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+
+from cosim.errors import BadInput
+from cosim.host import Host
+from cosim.scenario import load
+from cosim.service.requests import RunRequest, flags
+from cosim.types import EpisodeResult, Preset, Snapshot
+
+FLEET: dict[str, Any] = {"demand": "contested", "penetration": 0.4, "duration": 3.0}
+
+
+def driven(
+    sensing: str | None, policy: str = "altruist-rule", **words: Any
+) -> tuple[EpisodeResult, Snapshot]:
+    """One short episode on the merge, and its last snapshot."""
+    scenario = load("merge", sensing=sensing, **({"preset": Preset.UNGUARDED} | FLEET | words))
+    host = Host(scenario, policy, math.radians(45.0))
+    try:
+        return host.run(7), host.episode.snapshot
+    finally:
+        host.close()
+
+
+def test_a_level_is_named_repeats_itself_and_changes_what_avs_know() -> None:
+    ideal, _ = driven(None)
+    named, snapshot = driven("ideal")
+    assert (named.trace_hash, named.sensing, snapshot.percepts) == (ideal.trace_hash, None, None)
+    late, snapshot = driven("v2v,delay=0.8")
+    again, _ = driven("v2v,delay=0.8")
+    assert late.trace_hash == again.trace_hash != ideal.trace_hash
+    assert late.document()["sensing"] == "v2v,delay=0.8"
+    assert snapshot.percepts is not None
+    assert set(snapshot.percepts) == set(snapshot.avs)
+    for av, percept in snapshot.percepts.items():
+        assert av in percept.world.ids
+        assert percept.world.ids == tuple(sorted(percept.world.ids))
+        assert percept.age.max() <= 0.8 + 1.0 + 0.3
+
+
+def test_where_nobody_decides_by_it_sensing_changes_nothing_but_the_hash() -> None:
+    places = [driven(level, "keep-lane")[1] for level in (None, "harsh")]
+    assert places[0].ids == places[1].ids
+    assert places[0].x.tolist() == places[1].x.tolist()
+
+
+def test_http_takes_levels_and_parameters_but_no_file() -> None:
+    given, _ = flags(RunRequest(scenario="merge", sensing=["v2v", "v2v,delay=0.8"]), None)  # type: ignore[arg-type, call-arg]
+    assert given["sensing"] == ["v2v", "v2v,delay=0.8"]
+    with pytest.raises(BadInput, match="no file or code is read"):
+        flags(RunRequest(scenario="merge", sensing="/etc/x.yaml,delay=1"), None)  # type: ignore[arg-type, call-arg]

@@ -54,8 +54,8 @@ def dataclass_from(cls: type[Config], values: object, file: Path | None, where: 
     """An instance of `cls` from a mapping as YAML gives it; absent and empty fields keep their defaults.
 
     Fields may be int, float, bool, str, Literal, IntEnum, X | None, tuples (one value stands for a list of
-    one), mappings and further dataclasses of these; `Annotated[float, Range(...)]` has bounds. `where`: the
-    mapping's own name in the file.
+    one), mappings and further dataclasses of these; `Annotated[float, Range(...)]` has bounds, `Any` is as it
+    stands. `where`: the mapping's own name in the file.
 
     Raises:
         BadInput: an unknown field (with the nearest name), a value of the wrong type, or what the
@@ -72,6 +72,8 @@ def value_of(kind: Any, value: object) -> Any:
         BadInput: of another type or out of bounds; the field is named only where it is below `value`.
     """
     origin, arguments = get_origin(kind), get_args(kind)
+    if kind is Any:
+        return value
     if origin in (Union, types.UnionType):
         kind = next(a for a in arguments if a is not type(None))
         return None if value is None else value_of(kind, value)

@@ -197,6 +197,17 @@ def holm(p: Sequence[float]) -> list[float]:
     return [float(x) for x in out]
 
 
+def power(effect: float, difference: Figure, tests: int = 1) -> float:
+    """The chance that a true difference of `effect` would have been found, with the error of `difference`.
+
+    Normal, from the width of its interval; `tests`: so many are corrected together (the first step of
+    `holm`). nan where there is no interval.
+    """
+    error = (difference.high - difference.low) / (2.0 * Z)
+    needed = float(stats.norm.isf((1.0 - CONFIDENCE) / 2.0 / tests))
+    return 1.0 if error == 0.0 else float(stats.norm.cdf(abs(effect) / error - needed))
+
+
 def paired_mean(before: Sequence[float] | Array, after: Sequence[float] | Array, seed: int = 0) -> Figure:
     """Mean of the differences after - before, BCa bootstrap over pairs; pairs with a nan are left out."""
     difference = np.asarray(after, np.float64) - np.asarray(before, np.float64)

@@ -14,8 +14,8 @@ MEASURE_PARTS = {"benchmarks/loop.py", "benchmarks/decision_cost.py"}
 
 
 def calls() -> Iterator[tuple[str, str]]:
-    """(file, what is called) of every call in the packages, the benchmarks and the examples."""
-    for package in ("cosim", "policy", "sumo_scenarios", "benchmarks", "examples"):
+    """(file, what is called) of every call in the packages, the claims, the benchmarks and the examples."""
+    for package in ("cosim", "policy", "sumo_scenarios", "research", "benchmarks", "examples"):
         for file in sorted((ROOT / package).rglob("*.py")):
             for node in ast.walk(ast.parse(file.read_text())):
                 if isinstance(node, ast.Call):

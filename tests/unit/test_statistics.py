@@ -21,6 +21,7 @@ from cosim.report.statistics import (
     paired_rate_change,
     paired_share,
     pooled_rate,
+    power,
     quantile,
     rate,
     rule_of_three,
@@ -84,6 +85,16 @@ def test_ranks_of_differences_by_wilcoxon_and_many_tests_by_holm() -> None:
     assert signed_rank([1.0, 2.0, math.nan], [1.0, 2.0, 5.0]) == 1.0
     assert holm([0.04, 0.01, 0.03]) == pytest.approx([0.06, 0.03, 0.06])
     assert holm([0.9, 0.8]) == [1.0, 1.0]
+
+
+def test_the_power_of_a_test_follows_from_the_width_of_the_interval() -> None:
+    """An effect of 2.8 standard errors is found with 80 %; without error always."""
+    one = Figure(0.3, 0.3 - Z, 0.3 + Z)  # a standard error of 1
+    assert power(2.8, one) == pytest.approx(0.80, abs=2e-3)
+    assert power(-2.8, one) == power(2.8, one)
+    assert power(2.8, one, tests=20) == pytest.approx(0.41, abs=0.01)
+    assert power(1.0, Figure(0.0, 0.0, 0.0)) == 1.0
+    assert math.isnan(power(1.0, Figure(0.0, math.nan, math.nan)))
 
 
 def test_interval_of_paired_shares_is_symmetric_and_stays_within_one() -> None:

@@ -1,0 +1,142 @@
+"""`python -m research`: claims are listed, driven, written as pages, kept, checked."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import sumo_scenarios
+from cosim.batch import spec
+from cosim.errors import CosimError
+from research import audit, drive, evaluate, index, kept, page, schema
+from research.drive import Settings
+from research.schema import Claim
+
+SAMPLE = 20  # episodes that `audit` drives anew
+STALE, INTERRUPTED = 1, 130  # exit codes
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """0, or what went wrong: 1 a page is stale or an episode differs, 2 a claim is wrong, 130 interrupted."""
+    args = _parser().parse_args(arguments)
+    try:
+        claims = [*schema.chosen(args.names, args.claims)]
+        work: Callable[[list[Claim], Settings, argparse.Namespace], int] = args.work
+        return work(claims, _settings(args), args)
+    except CosimError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print("interrupted: the same command goes on", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _list(claims: list[Claim], settings: Settings, args: argparse.Namespace) -> int:
+    """A line for every claim: episodes driven and wanted, and the CPU hours left."""
+    found = drive.held(claims, settings)
+    for claim in claims:
+        arms = found.arms[claim.name].values()
+        wanted, there = sum(len(arm.seeds) for arm in arms), sum(len(arm.rows) for arm in arms)
+        times = [row["total_s"] for arm in arms for row in arm.rows if row.get("total_s")]
+        left = (wanted - there) * sum(times) / len(times) / 3600.0 if times else None
+        cost = "" if left is None else f", {left:.1f} CPU hours left"
+        print(f"{claim.name:14} {there:6} of {wanted:6} episodes{cost}  {index.answer(claim, args.out)}")
+    return 0
+
+
+def _drive(claims: list[Claim], settings: Settings, _: argparse.Namespace) -> int:
+    """Drive what is missing."""
+    found = drive.drive(claims, settings)
+    lacking = [c.name for c in claims if not all(a.complete for a in found.arms[c.name].values())]
+    if lacking:
+        print(f"research: episodes are missing of {', '.join(lacking)}", file=sys.stderr)
+    return 0
+
+
+def _page(claims: list[Claim], settings: Settings, args: argparse.Namespace) -> int:
+    """Write the pages of the claims whose episodes are all there, and the index."""
+    found = drive.held(claims, settings)
+    for claim in claims:
+        arms = found.arms[claim.name]
+        lacking = sum(len(arm.seeds) - len(arm.rows) for arm in arms.values())
+        if lacking or not arms:
+            print(f"{claim.name}: left as it is: {lacking} episodes are not driven", file=sys.stderr)
+            continue
+        print(page.write(evaluate.evaluate(claim, arms, found.notes), settings, args.out))
+    print(index.write([*schema.chosen([], args.claims)], args.out))
+    return 0
+
+
+def _check(claims: list[Claim], settings: Settings, args: argparse.Namespace) -> int:
+    """Whether every page is of the weights and definitions that are here."""
+    work = drive.planned(claims, settings)
+    lines = [line for claim in claims for line in index.stale(claim, work, args.out)]
+    print(
+        *lines, f"{len(lines)} differences: `drive` and `page` make the pages anew" if lines else "", sep="\n"
+    )
+    return STALE if lines else 0
+
+
+def _keep(claims: list[Claim], settings: Settings, _: argparse.Namespace) -> int:
+    """Keep the episodes of the claims in the repository."""
+    work = drive.planned(claims, settings)
+    folder = settings.kept or kept.FOLDER
+    with drive.opened(work, settings) as store:
+        print(f"{kept.keep(store, work.wanted, folder)} episodes in {folder}")
+    return 0
+
+
+def _audit(claims: list[Claim], settings: Settings, args: argparse.Namespace) -> int:
+    """Drive some of the kept episodes anew: are they the same in every figure and the trace hash?"""
+    found = audit.audit(drive.planned(claims, settings), settings, args.sample, args.pick)
+    print(*found.differing, sep="\n", end="\n" if found.differing else "")
+    wrong = len({line.split(":")[0] for line in found.differing})
+    print(f"{found.driven - wrong} of {found.driven} driven anew are the same in every figure and trace hash")
+    print(f"{found.kept} are kept; of other weights, files or versions than here: {found.unknown}")
+    return STALE if found.differing else 0
+
+
+COMMANDS = {"list": _list, "drive": _drive, "page": _page, "check": _check, "keep": _keep, "audit": _audit}
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m research", description=__doc__)
+    commands = parser.add_subparsers(required=True, metavar="|".join(COMMANDS))
+    default = Settings()
+    for name, work in COMMANDS.items():
+        command = commands.add_parser(name, help=work.__doc__, description=work.__doc__)
+        command.set_defaults(work=work)
+        add = command.add_argument
+        add("names", nargs="*", metavar="NAME", help="claims (default: all)")
+        add("--claims", type=Path, default=schema.FOLDER, metavar="DIR", help="folder of their files")
+        add("--workers", type=int, default=default.workers, metavar="N")
+        add("--engine", choices=("local", "ray"), default=default.engine)
+        add("--scale", type=float, default=default.scale, metavar="X", help="of the numbers of episodes")
+        add("--seeds", metavar="A:B", help="in place of every claim's own")
+        add("--scenario", action="append", default=[], choices=sumo_scenarios.names())
+        add("--duration", type=float, metavar="S", help="of an episode (default: the scenario's)")
+        add("--untrained", action="store_true", help="networks with initial weights may drive, labelled so")
+        add("--runs", type=Path, default=default.runs, metavar="DIR", help="where the episodes are stored")
+        add("--out", type=Path, default=page.OUT, metavar="DIR", help="folder of pages")
+        add("--kept", type=Path, default=default.kept, metavar="DIR", help="episodes that need not be driven")
+        add("--anew", action="store_true", help="drive the kept episodes too")
+        if work is _audit:
+            add("--sample", type=int, default=SAMPLE, metavar="N", help=f"episodes (default {SAMPLE})")
+            add("--pick", type=int, default=0, metavar="SEED", help="which ones")
+    return parser
+
+
+def _settings(args: argparse.Namespace) -> Settings:
+    return Settings(
+        runs=args.runs,
+        workers=args.workers,
+        engine=args.engine,
+        kept=None if args.anew else args.kept,
+        scale=args.scale,
+        seeds=None if args.seeds is None else range(*spec.seeds(args.seeds, None, "--seeds")),
+        scenarios=tuple(args.scenario),
+        duration=args.duration,
+        untrained=args.untrained,
+    )

@@ -1,0 +1,251 @@
+"""Drives what the claims need, each episode once for all of them, into one store: killed, the same goes on.
+
+An episode counts only for what drove it: its options, the files of the policy and of the scenario by their
+hash, and the versions of the packages. All four stand in the name of its cell: new weights are driven anew,
+and what is there stays.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from cosim.batch import execution, matrix
+from cosim.batch.episode_runner import EpisodeRunner
+from cosim.batch.folder import RunFolder
+from cosim.batch.store import Store
+from cosim.files import code
+from cosim.policies import check, make
+from cosim.report.figures import Row
+from cosim.scenario.manifest import POLICY_FILES, digests
+from cosim.scenario.options import EpisodeOptions
+from cosim.scenario.policy_name import WEIGHTS
+from cosim.workers.engines import Engine, LocalEngine
+from cosim.workers.progress import Progress
+from research import kept
+from research.schema import Claim, Condition
+
+MARK = "#"  # between a policy's name and the hash of what makes the episode
+LEAST = 2  # episodes, however small the scale
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How much is driven, by whom, and where it lies. Defaults: all, as the pages need it."""
+
+    runs: Path = Path("runs/research")
+    workers: int = 2
+    engine: str = "local"  # or "ray"
+    kept: Path | None = kept.FOLDER  # episodes that need not be driven; None: every one is
+    scale: float = 1.0  # of the numbers of episodes
+    seeds: range | None = None  # in place of every claim's own
+    scenarios: tuple[str, ...] = ()  # (): all of a claim
+    duration: float | None = None  # s; None: the scenario's own
+    untrained: bool = False  # value networks with initial weights may drive
+
+    def seeds_of(self, claim: Claim, scenario: str) -> range:
+        """The seeds of every arm in a scenario, fewer at a small scale."""
+        seeds = claim.seeds_of(scenario) if self.seeds is None else self.seeds
+        return seeds[: max(round(len(seeds) * self.scale), LEAST)]
+
+    def conditions(self, claim: Claim) -> list[Condition]:
+        """Those of the scenarios that are wanted."""
+        return [c for c in claim.conditions if not self.scenarios or c.scenario in self.scenarios]
+
+
+@dataclass(frozen=True)
+class Arm:
+    """One arm in one condition: what drives it, and the episodes that there are."""
+
+    cell: matrix.Cell
+    seeds: range
+    weights: str  # first digits of the SHA-256 of its network, or of its code; "": a script that ships
+    definitions: str  # the same of the policy's and the scenario's files and options
+    label: str  # "untrained value network", or ""
+    rows: tuple[Row, ...] = ()  # by seed, of any status
+
+    @property
+    def complete(self) -> bool:
+        """Whether every episode was driven."""
+        return len(self.rows) == len(self.seeds)
+
+
+Arms = Mapping[tuple[Condition, str], Arm]  # of one claim
+
+
+@dataclass(frozen=True)
+class Work(matrix.Plan):
+    """A plan whose cells have seeds of their own."""
+
+    wanted: Mapping[str, frozenset[int]]  # cell -> seeds
+    arms: Mapping[str, Arms]  # claim -> its arms, without rows
+
+    @property
+    def episodes(self) -> int:
+        return sum(map(len, self.wanted.values()))
+
+    def cases(self) -> Iterator[tuple[matrix.Cell, EpisodeOptions]]:
+        for cell in self.cells:
+            for seed in sorted(self.wanted[cell.name]):
+                yield cell, cell.case.with_seed(seed)
+
+
+@dataclass(frozen=True)
+class Driven:
+    """What the store holds of the claims."""
+
+    arms: Mapping[str, Arms]  # claim -> its arms
+    notes: Mapping[str, Mapping[str, str]]  # `units` and `better` of the figures
+
+
+def planned(claims: Sequence[Claim], settings: Settings) -> Work:
+    """Every cell that the claims need, once.
+
+    Raises BadInput: a scenario, demand or policy is wrong.
+    """
+    asked = {
+        (claim.name, condition, arm): replace(claim.cases[condition, arm], duration=settings.duration)
+        for claim in claims
+        for condition in settings.conditions(claim)
+        for arm in claim.every_arm
+    }
+    plan = matrix.plan(asked.values(), range(1), check)
+    by_name = {claim.name: claim for claim in claims}
+    cells: dict[str, matrix.Cell] = {}
+    wanted: dict[str, frozenset[int]] = {}
+    arms: dict[str, dict[tuple[Condition, str], Arm]] = {name: {} for name in by_name}
+    for (name, condition, arm), plain in zip(asked, plan.cells, strict=True):
+        found = _arm(plain, settings.seeds_of(by_name[name], condition.scenario))
+        arms[name][condition, arm] = found
+        if found.label and not settings.untrained:
+            continue
+        cells.setdefault(found.cell.name, found.cell)
+        wanted[found.cell.name] = wanted.get(found.cell.name, frozenset()) | {*found.seeds}
+    return Work(tuple(cells.values()), range(1), wanted, arms)
+
+
+def drive(claims: Sequence[Claim], settings: Settings) -> Driven:
+    """Drive what the store does not hold yet. What has no trained weights is left out and named on stderr.
+
+    Raises BadInput (nothing is driven then) and CosimError as `cosim evaluate` does.
+    """
+    work = planned(claims, settings)
+    for label in sorted({f"{policy(a.cell)}: {a.label}" for a in _every(work) if a.label}):
+        print(f"research: {label}{'' if settings.untrained else ', not driven'}", file=sys.stderr)
+    with opened(work, settings) as store:
+        with Progress("research", "episodes") as progress:
+            faults = execution.drive(work, store, engine(settings), settings.runs / "outputs", progress)
+        for fault in faults:
+            print(f"research: {fault.key}: our own code failed, no row: {fault.stderr}", file=sys.stderr)
+        return _found(work, store)
+
+
+def held(claims: Sequence[Claim], settings: Settings) -> Driven:
+    """What there is of the claims; nothing is driven. Raises BadInput as `drive`."""
+    work = planned(claims, settings)
+    with opened(work, settings) as store:
+        return _found(work, store)
+
+
+@contextmanager
+def opened(work: Work, settings: Settings) -> Iterator[Store]:
+    """The store, which knows the cells of `work` and holds what is kept of it. One process at a time."""
+    with (
+        RunFolder(str(settings.runs), resume=True, episodes=work.episodes) as folder,
+        Store.in_folder(folder.path) as store,
+    ):
+        if store.spec_hash() is None:
+            store.begin("research", {"units": {}, "better": {}}, [])
+        known = store.cells()
+        store.extend(
+            [{"cell": c.name, "case": c.case.document(), "manifest": dict(c.manifest)} for c in work.cells]
+        )
+        for cell in work.cells:  # another Python drives on
+            if cell.name in known and known[cell.name]["manifest"]["versions"] != cell.manifest["versions"]:
+                store.set_manifest(cell.name, known[cell.name]["manifest"] | cell.manifest)
+        if taken := kept.take(store, work.wanted, settings.kept):
+            print(f"research: {taken} episodes taken from {settings.kept}", file=sys.stderr, flush=True)
+        yield store
+
+
+def engine(settings: Settings) -> Engine:
+    """Who spreads the episodes over processes or machines. Raises BadInput: ray is not installed."""
+    if settings.engine == "local":
+        return LocalEngine(Runner, workers=settings.workers)
+    from cosim.workers.ray_engine import RayEngine
+
+    return RayEngine(Runner, workers=settings.workers)
+
+
+class Runner(EpisodeRunner):
+    """Hosted by the engine: as `cosim evaluate` drives, for policies whose name has a mark."""
+
+    def policy(self, case: EpisodeOptions) -> str:
+        """The name that `--policy` knows."""
+        return unmarked(case.policy)
+
+
+def unmarked(text: str) -> str:
+    """The policy's name without its mark."""
+    return text.rpartition(MARK)[0]
+
+
+def policy(cell: matrix.Cell) -> str:
+    """Who drives the cell, by the name that `--policy` knows."""
+    return unmarked(cell.case.policy)
+
+
+# ---- inside ----
+
+
+@cache
+def _made_of(name: str) -> tuple[tuple[Path, ...], str]:
+    """The files that decide how a policy drives, and what is to be warned of."""
+    made = make(name)
+    return tuple(getattr(made, "files", ())), str(getattr(made, "label", ""))
+
+
+def _arm(plain: matrix.Cell, seeds: range) -> Arm:
+    """The cell with the mark of what drives it."""
+    paths, label = _made_of(plain.case.policy)
+    files = digests([*paths, *code.files_of([*plain.case.metrics, plain.case.reward])])
+    about = {**plain.manifest, POLICY_FILES: files}
+    versions = kept.packages(about["versions"])
+    defined = _short({name: part for name, part in about.items() if name != "versions"})
+    case = replace(plain.case, policy=f"{plain.case.policy}{MARK}{_short([defined, versions])}")
+    cell = replace(plain, case=case, manifest=about)
+    weights = [digest for name, digest in files.items() if name.endswith(WEIGHTS)] or [*files.values(), ""]
+    return Arm(cell, seeds, weights[0][:12], defined, label)
+
+
+def _short(document: Any) -> str:
+    return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def _every(work: Work) -> Iterator[Arm]:
+    for arms in work.arms.values():
+        yield from arms.values()
+
+
+def _found(work: Work, store: Store) -> Driven:
+    """The arms with their rows."""
+    rows: dict[str, dict[int, Row]] = {}
+    for row in store.rows():
+        rows.setdefault(row["cell"], {})[row["seed"]] = row
+    filled = {
+        name: {key: replace(arm, rows=_rows(arm, rows.get(arm.cell.name, {}))) for key, arm in arms.items()}
+        for name, arms in work.arms.items()
+    }
+    document = store.document()
+    return Driven(filled, {name: document[name] for name in ("units", "better")})
+
+
+def _rows(arm: Arm, by_seed: Mapping[int, Row]) -> tuple[Row, ...]:
+    return tuple(by_seed[seed] for seed in arm.seeds if seed in by_seed)

@@ -1,0 +1,234 @@
+"""What the episodes say of a claim: every figure with its interval, every pair tested, and one verdict.
+
+The statistics are those of `cosim compare`. Tests are corrected together, by Holm's method.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from cosim.errors import BadInput, hint
+from cosim.report.compare import PairedFigure, paired
+from cosim.report.figures import Measure, Row, measures
+from cosim.report.statistics import NA, Figure, holm, mean, power, share, signed_rank
+from cosim.workers.tasks import OK
+from research.drive import Arm, Arms, policy
+from research.schema import Claim, Condition
+
+SIGNIFICANT = 0.05  # of a p that is corrected for all tests of the claim
+Verdict = Literal["yes", "no", "not resolved"]
+
+
+class Line(NamedTuple):
+    """One figure, a line of the CSV. Shares and their differences are fractions."""
+
+    scenario: str
+    condition: str  # values of the matrix
+    arm: str
+    against: str  # the arm it is a paired difference to; "" for a figure of its own
+    figure: str
+    unit: str
+    value: float
+    low: float
+    high: float
+    n: int  # episodes, or pairs
+    na: int
+    p: float | None = None  # of the claim's test, and corrected for all of them
+    p_holm: float | None = None
+    preset: str = ""
+    errors: str = ""
+    drivers: str = ""
+    policy: str = ""
+    weights: str = ""
+    definitions: str = ""
+
+
+class Traffic(NamedTuple):
+    """What a row of a page says beside its figures."""
+
+    preset: str
+    errors: str  # of the human drivers
+    drivers: str  # the human drivers' behavior
+
+
+@dataclass(frozen=True)
+class Tested:
+    """The claim in one condition, against one arm."""
+
+    condition: Condition
+    against: str
+    found: PairedFigure  # difference: the claim's arm less `against`
+    p: float
+    p_holm: float
+    power: float  # to find the smallest effect of interest
+    verdict: Verdict
+
+
+@dataclass(frozen=True)
+class Found:
+    """All that a page says of a claim."""
+
+    claim: Claim
+    arms: Arms
+    measures: Mapping[str, Measure]
+    tested: tuple[Tested, ...]
+
+    @property
+    def verdict(self) -> Verdict:
+        """Of the claim: it holds everywhere, or somewhere, as the claim says."""
+        verdicts = {one.verdict for one in self.tested}
+        decisive: Verdict = "no" if self.claim.holds == "everywhere" else "yes"
+        other: Verdict = "yes" if decisive == "no" else "no"
+        if decisive in verdicts:
+            return decisive
+        return other if verdicts == {other} else "not resolved"
+
+    @property
+    def overall(self) -> dict[str, PairedFigure]:
+        """Against each arm: the primary figure over the pairs of all conditions."""
+        claim, primary = self.claim, self.measures[self.claim.primary.metric]
+        conditions = list(dict.fromkeys(condition for condition, _ in self.arms))
+        return {
+            against: paired(
+                primary,
+                [
+                    p
+                    for c in conditions
+                    for p in pairs(self.arms[c, against], self.arms[c, claim.compare.arm])
+                ],
+            )
+            for against in claim.compare.against
+        }
+
+    def figure(self, condition: Condition, arm: str, metric: str) -> Figure:
+        """One arm's figure in one condition; NA where it applies to no episode."""
+        return figure(self.measures[metric], self.arms[condition, arm].rows)
+
+    def difference(self, condition: Condition, against: str, metric: str) -> PairedFigure:
+        """The claim's arm less another one, on equal seeds."""
+        both = (self.arms[condition, arm] for arm in (against, self.claim.compare.arm))
+        return paired(self.measures[metric], pairs(*both))
+
+    def lines(self) -> Iterator[Line]:
+        """Every figure of every arm, then every difference."""
+        for (condition, name), arm in self.arms.items():
+            for metric in self.claim.metrics:
+                measure = self.measures[metric]
+                n = len(_known(measure, arm.rows))
+                counts = (n, len(_ok(arm.rows)) - n)
+                yield _line(
+                    condition, arm, (name, "", metric, measure.unit), figure(measure, arm.rows), counts
+                )
+        for one in self.tested:
+            arm = self.arms[one.condition, self.claim.compare.arm]
+            for metric in self.claim.metrics:
+                found = self.difference(one.condition, one.against, metric)
+                what = (self.claim.compare.arm, one.against, metric, found.measure.unit)
+                line = _line(one.condition, arm, what, found.difference, (found.n, found.na))
+                tested = metric == self.claim.primary.metric
+                yield line._replace(p=one.p, p_holm=one.p_holm) if tested else line
+
+
+def evaluate(claim: Claim, arms: Arms, notes: Mapping[str, Mapping[str, str]]) -> Found:
+    """Test the claim on these episodes.
+
+    Raises BadInput: a metric that the episodes do not have, or a test that is not one of its kind.
+    """
+    rows = [row for arm in arms.values() for row in arm.rows]
+    known = measures(rows, notes.get("units"), notes.get("better"))
+    for metric in claim.metrics:
+        if metric not in known:
+            raise BadInput(
+                f"no such figure{hint(metric, known)}", file=claim.name, field="metric", value=metric
+            )
+    primary = known[claim.primary.metric]
+    if (claim.test == "mcnemar") != primary.is_rate:
+        problem = f"{primary.name} is {'a' if primary.is_rate else 'no'} share of episodes"
+        raise BadInput(problem, file=claim.name, field="test", value=claim.test)
+    conditions = dict.fromkeys(condition for condition, _ in arms)
+    compared = [
+        (condition, against, pairs(arms[condition, against], arms[condition, claim.compare.arm]))
+        for condition in conditions
+        for against in claim.compare.against
+    ]
+    found = [paired(primary, both) for _, _, both in compared]
+    each = [_p(claim, primary, one, both) for one, (_, _, both) in zip(found, compared, strict=True)]
+    together = holm(each)
+    tested = [
+        Tested(
+            *(condition, against, one, p, corrected),
+            power(claim.power.smallest, one.difference, len(found)),
+            _verdict(claim, one.difference, corrected),
+        )
+        for (condition, against, _), one, p, corrected in zip(compared, found, each, together, strict=True)
+    ]
+    return Found(claim, arms, known, tuple(tested))
+
+
+def pairs(before: Arm, after: Arm) -> list[tuple[Row, Row]]:
+    """The episodes of both on equal seeds that both drove to the end."""
+    first = {row["seed"]: row for row in _ok(before.rows)}
+    return [(first[row["seed"]], row) for row in _ok(after.rows) if row["seed"] in first]
+
+
+def figure(measure: Measure, rows: Sequence[Row]) -> Figure:
+    """A measure over the episodes that came through."""
+    if measure.per:
+        return measure.figure(_ok(rows))
+    values = _known(measure, rows)
+    if not values:
+        return NA
+    return share(int(sum(values)), len(values)) if measure.is_rate else mean(values)
+
+
+def traffic_of(arm: Arm) -> Traffic:
+    """What the episodes of an arm say of their traffic."""
+    row = arm.rows[0]
+    return Traffic(str(row["preset"]), str(row.get("errors") or "none"), str(row["behavior"]))
+
+
+# ---- inside ----
+
+
+def _line(
+    condition: Condition, arm: Arm, what: tuple[str, str, str, str], shown: Figure, counts: tuple[int, int]
+) -> Line:
+    """A figure of `arm`, or a difference of it: `what` is arm, against, figure and unit."""
+    here = traffic_of(arm)
+    return Line(
+        *(condition.scenario, condition.text, *what),
+        *(shown.value, shown.low, shown.high, *counts),
+        *(None, None, here.preset, here.errors, here.drivers),
+        *(policy(arm.cell), arm.weights, arm.definitions),
+    )
+
+
+def _ok(rows: Sequence[Row]) -> list[Row]:
+    return [row for row in rows if row["status"] == OK]
+
+
+def _known(measure: Measure, rows: Sequence[Row]) -> list[float]:
+    return [value for value in measure.values(_ok(rows)) if not math.isnan(value)]
+
+
+def _p(claim: Claim, measure: Measure, found: PairedFigure, both: Sequence[tuple[Row, Row]]) -> float:
+    if claim.test == "mcnemar":
+        return 1.0 if found.p is None else found.p
+    before, after = (np.array(measure.values([pair[k] for pair in both])) for k in (0, 1))
+    return signed_rank(before, after)
+
+
+def _verdict(claim: Claim, difference: Figure, p: float) -> Verdict:
+    """Yes: a difference the claimed way beyond chance. No: none as large as the smallest of interest."""
+    if not difference.known:
+        return "not resolved"
+    sign = claim.primary.sign
+    if p < SIGNIFICANT and sign * difference.value > 0.0:
+        return "yes"
+    largest = max(sign * difference.low, sign * difference.high)
+    return "no" if largest < claim.power.smallest else "not resolved"

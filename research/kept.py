@@ -1,0 +1,94 @@
+"""The episodes that come with the repository: what a page needs and was driven already is taken from here.
+
+An exported run like any other (`episodes.parquet`, `manifest.json`; `cosim.report.run_folder` reads it),
+but for what belongs to the machine that drove it. A row is taken only for the very cell it was driven for.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Container, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet
+
+from cosim.batch.export import arrow
+from cosim.batch.store import Store
+from cosim.files import whole
+from cosim.report.figures import Row
+from cosim.report.run_folder import Run, read
+from cosim.workers.tasks import OK
+
+FOLDER = Path("docs/results/episodes")
+ROWS, MANIFEST = "episodes.parquet", "manifest.json"
+LEVEL = 19  # of zstd: written seldom
+OF_THE_MACHINE = ("timings", "stderr", "attempts")  # and every timing: not the same again
+
+
+def episodes(folder: Path | None) -> Run:
+    """What is kept; no rows where nothing is. Raises BadInput when the files are not ours."""
+    if folder is None or not (folder / ROWS).is_file():
+        return Run(Path(), [])
+    return _read(folder, (folder / ROWS).stat().st_mtime_ns)
+
+
+def take(store: Store, wanted: Mapping[str, Container[int]], folder: Path | None) -> int:
+    """Put into the store what it lacks of the `wanted` seeds (by cell) and is kept; how many were taken.
+
+    The store knows these cells.
+    """
+    found, known = episodes(folder), store.keys()
+    rows = [
+        row for row in found.rows if row["seed"] in wanted.get(row["cell"], ()) and row["key"] not in known
+    ]
+    if rows:
+        store.add(rows)
+        document = store.document()
+        for name in ("units", "better"):
+            store.note(name, {**found.manifest[name], **document[name]})
+    return len(rows)
+
+
+def keep(store: Store, wanted: Mapping[str, Container[int]], folder: Path) -> int:
+    """Write what the store holds of the wanted episodes and came through; how many.
+
+    What was kept and is not wanted any more goes; `opened` has put the rest into the store.
+    """
+    rows = [row for row in store.rows() if row["status"] == OK and row["seed"] in wanted.get(row["cell"], ())]
+    present, cells, document = {row["cell"] for row in rows}, store.cells(), store.document()
+    manifest = {
+        "versions": next((about["manifest"]["versions"] for about in cells.values()), {}),
+        **{name: document[name] for name in ("units", "better")},
+        "cells": {cell: about for cell, about in cells.items() if cell in present},
+    }
+    if rows:
+        write(rows, manifest, folder)
+    return len(rows)
+
+
+def write(rows: Sequence[Row], manifest: Mapping[str, Any], folder: Path) -> None:
+    """The rows, by cell and seed, with the manifest; each file whole or not at all."""
+    folder.mkdir(parents=True, exist_ok=True)
+    place = {name: k for k, name in enumerate(manifest["cells"])}
+    table = arrow([plain(row) for row in sorted(rows, key=lambda r: (place[r["cell"]], r["seed"]))])
+    with whole(folder / ROWS) as rows_draft, whole(folder / MANIFEST) as draft:
+        pyarrow.parquet.write_table(table, rows_draft, compression="zstd", compression_level=LEVEL)
+        draft.write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
+
+
+def plain(row: Row) -> dict[str, Any]:
+    """The row without what belongs to the machine that drove it: equal whenever it is driven anew."""
+    timings = json.loads(row.get("timings") or "{}")
+    return {name: value for name, value in row.items() if name not in (*OF_THE_MACHINE, *timings)}
+
+
+def packages(versions: Mapping[str, str | None]) -> dict[str, str]:
+    """The versions that decide how an episode is driven: not Python's own, and no local label (`+cpu`)."""
+    return {name: (version or "").partition("+")[0] for name, version in versions.items() if name != "python"}
+
+
+@cache
+def _read(folder: Path, modified: int) -> Run:  # noqa: ARG001 - a changed file is read anew
+    return read(folder)

@@ -1,0 +1,202 @@
+"""A claim's page on one screen, its picture and its CSV."""
+
+from __future__ import annotations
+
+import csv
+import math
+import textwrap
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from cosim.files import whole
+from cosim.report import wording
+from cosim.report.compare import PairedFigure
+from cosim.report.figures import Measure
+from cosim.workers.tasks import OK
+from research import picture
+from research.drive import Settings
+from research.evaluate import Found, Line, traffic_of
+from research.schema import Condition
+
+OUT = Path("docs/results")
+WIDTH = 100  # columns of prose
+TESTS = {"mcnemar": "McNemar's exact test", "signed_rank": "Wilcoxon's signed ranks"}
+WORDS = {"yes": "Yes.", "no": "No.", "not resolved": "Not resolved."}
+
+
+def write(found: Found, settings: Settings, out: Path) -> Path:
+    """NAME.md, NAME.svg and data/NAME.csv; returns the page."""
+    name = found.claim.name
+    picture.draw(found, out / f"{name}.svg")
+    write_csv(out / "data" / f"{name}.csv", found.lines())
+    path = out / f"{name}.md"
+    with whole(path) as draft:
+        draft.write_text("\n".join(lines(found, settings)), encoding="utf-8")
+    return path
+
+
+def lines(found: Found, settings: Settings) -> list[str]:
+    """The page: verdict, table, picture, conditions, tests, power, command."""
+    claim, about = found.claim, (conditions(found, settings), tests(found), powered(found))
+    command = (
+        f"Made by `python -m research page {claim.name}{flags(settings)}` from "
+        f"`research/claims/{claim.name}.yaml` ({claim.digest}); figures in `data/{claim.name}.csv`."
+    )
+    return [
+        *(f"# {claim.sentence}", "", *wrapped(verdict(found)), ""),
+        *(*table(found), "", f"![{claim.name}]({claim.name}.svg)", ""),
+        *(line for text in filter(None, (claim.note, *about, command)) for line in (*wrapped(text), "")),
+    ]
+
+
+def wrapped(text: str) -> list[str]:
+    """Lines of prose."""
+    return textwrap.wrap(text, WIDTH, break_long_words=False, break_on_hyphens=False)
+
+
+def verdict(found: Found) -> str:
+    """`**No.** ...`: the answer, the effect with its interval, and in how many comparisons."""
+    claim = found.claim
+    effects = [
+        f"less `{against}` {_difference(one)}, {one.n} pairs" for against, one in found.overall.items()
+    ]
+    counts = {word: sum(t.verdict == word for t in found.tested) for word in WORDS}
+    parts = [f"{n} {word}" for word, n in counts.items() if n]
+    return (
+        f"**{WORDS[found.verdict]}** {claim.source}. `{claim.primary.metric}` of `{claim.compare.arm}`: "
+        f"{'; '.join(effects)}. By condition: {', '.join(parts)}."
+    )
+
+
+def table(found: Found) -> list[str]:
+    """A row for every arm and difference, a column for every scenario; block by block of the matrix."""
+    claim = found.claim
+    primary = found.measures[claim.primary.metric]
+    scenarios = list(dict.fromkeys(condition.scenario for condition, _ in found.arms))
+    heads = [_headed(primary, "%"), "n", "preset", "errors", "drivers", "weights", *scenarios]
+    rows = [heads, ["---"] * len(heads)]
+    for values in dict.fromkeys(condition.values for condition, _ in found.arms):
+        here = [Condition(scenario, values) for scenario in scenarios]
+        if text := here[0].text:
+            rows.append([f"**{text}**", *[""] * (len(heads) - 1)])
+        for arm in claim.every_arm:
+            figures = (_own(found, condition, arm) for condition in here)
+            rows.append([_named(found, here[0], arm), *_about(found, here, arm), *figures])
+        rows += _differences(found, here)
+    return [f"| {' | '.join(row)} |" for row in rows]
+
+
+def conditions(found: Found, settings: Settings) -> str:
+    """Seeds, the paper's figures, and what is cut or lost."""
+    first = min(arm.seeds.start for arm in found.arms.values())
+    failed = sum(row["status"] != OK for arm in found.arms.values() for row in arm.rows)
+    parts = [f"All arms drive equal seeds from {first} on."]
+    if found.claim.published:
+        parts.append("Brackets and crosses are the paper's figures.")
+    if settings.duration is not None:
+        parts.append(f"**Episodes are cut to {settings.duration:g} s.**")
+    if failed:
+        parts.append(f"{failed} episodes failed and are left out.")
+    return " ".join(parts)
+
+
+def tests(found: Found) -> str:
+    """How it was tested."""
+    claim = found.claim
+    smallest = wording.number(claim.power.smallest, found.measures[claim.primary.metric], signed=True).lstrip(
+        "+"
+    )
+    return (
+        f"Intervals are of 95 %. p is of {TESTS[claim.test]}, corrected by Holm's method "
+        f"(tests: {len(found.tested)}). "
+        f"A condition says yes where p is below 0.05 and the figure {claim.primary.direction}, as claimed. "
+        f"It says no where the interval holds no effect of {smallest} or more that way. "
+        f"The claim must hold {claim.holds}."
+    )
+
+
+def powered(found: Found) -> str:
+    """The power that the tests had."""
+    known = [t.power for t in found.tested if not math.isnan(t.power)]
+    span = _span(round(100 * x) for x in known) if known else "unknown"
+    pairs = _span(t.found.n for t in found.tested)
+    planned = f"{pairs} pairs a test, planned {found.claim.power.pairs}"
+    return f"Power to find the smallest effect of interest: {span} % ({planned})."
+
+
+def flags(settings: Settings) -> str:
+    """As they were typed, where they decide what the page shows."""
+    default = Settings()
+    words = [] if settings.scale == default.scale else [f"--scale {settings.scale:g}"]
+    words += [f"--seeds {s.start}:{s.stop}" for s in [settings.seeds] if s is not None]
+    words += [f"--scenario {name}" for name in settings.scenarios]
+    words += [] if settings.duration is None else [f"--duration {settings.duration:g}"]
+    words += ["--untrained"] if settings.untrained else []
+    return " ".join(["", *words])
+
+
+def write_csv(path: Path, found: Iterable[Line]) -> None:
+    """NA is empty."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with whole(path) as draft, draft.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(Line._fields)
+        writer.writerows([_plain(value) for value in line] for line in found)
+
+
+# ---- inside ----
+
+
+def _named(found: Found, condition: Condition, name: str) -> str:
+    label = found.arms[condition, name].label
+    return f"`{name}`" + (f" ({label})" if label else "")
+
+
+def _about(found: Found, here: Sequence[Condition], name: str) -> list[str]:
+    arm = found.arms[here[0], name]
+    count = _span(len(found.arms[c, name].rows) for c in here)
+    return [count, *traffic_of(arm), arm.weights or "-"]
+
+
+def _own(found: Found, condition: Condition, name: str) -> str:
+    """`2.3 % (1.1 to 4.7)`, and the paper's figure in brackets."""
+    measure = found.measures[found.claim.primary.metric]
+    text = wording.interval(found.figure(condition, name, measure.name), measure, unit=False)
+    published = found.claim.published.get(condition.scenario, {}).get(name)
+    return text if published is None else f"{text} [{published:g}]"
+
+
+def _differences(found: Found, here: Sequence[Condition]) -> Iterator[list[str]]:
+    """Rows of the primary figure against each arm, and of the secondary ones against the first."""
+    claim = found.claim
+    _, *about = _about(found, here, claim.compare.arm)
+    for against in claim.compare.against:
+        tested = [t for c in here for t in found.tested if (t.condition, t.against) == (c, against)]
+        texts = [f"{_difference(t.found, False)}, {wording.p_value(t.p_holm)}: {t.verdict}" for t in tested]
+        yield [f"less `{against}`", _span(t.found.n for t in tested), *about, *texts]
+    first = claim.compare.against[0]
+    for metric in claim.secondary:
+        pairs = [found.difference(condition, first, metric) for condition in here]
+        name = f"{_headed(found.measures[metric], 'pp')}, less `{first}`"
+        yield [name, _span(p.n for p in pairs), *about, *(_difference(p, False) for p in pairs)]
+
+
+def _difference(one: PairedFigure, unit: bool = True) -> str:
+    return wording.interval(one.difference, one.measure, signed=True, unit=unit)
+
+
+def _headed(measure: Measure, share: str) -> str:
+    unit = share if measure.is_share else measure.unit
+    return f"{measure.name}, {unit}" if unit else measure.name
+
+
+def _span(counts: Iterable[int]) -> str:
+    low, high = min(known := [*counts]), max(known)
+    return str(low) if low == high else f"{low} to {high}"
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, float):
+        return "" if math.isnan(value) else f"{value:.6g}"
+    return "" if value is None else value

@@ -1,0 +1,105 @@
+"""What made-up episodes with known answers say of a claim."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cosim.errors import BadInput
+from cosim.report.statistics import mcnemar
+from research.evaluate import Found, evaluate
+from tests.research.claims import arms, claim, rows
+
+NOTES = {"units": {"dt_mean_m": "m"}, "better": {"dt_mean_m": "higher"}}
+
+
+def found(folder: Path, merge: Any, exit: Any, **changes: Any) -> Found:
+    """The claim on the episodes of (rule, idm) in both scenarios."""
+    of = {
+        **{("merge", name): mine for name, mine in zip(("rule", "idm"), merge, strict=True)},
+        **{("exit", name): mine for name, mine in zip(("rule", "idm"), exit, strict=True)},
+        **{(scenario, "lane"): rows(range(40), 40) for scenario in ("merge", "exit")},
+    }
+    return evaluate(claim(folder, **changes), arms(of), NOTES)
+
+
+SAVES = (rows([], 400), rows(range(100), 400))  # 25 points fewer
+EQUAL = (rows([1], 400), rows([2], 400))
+FEW = (rows([], 20), rows([1, 2, 3], 20))
+
+
+def test_a_claim_that_holds_in_every_condition_is_yes_with_its_effect(tmp_path: Path) -> None:
+    one = found(tmp_path, SAVES, SAVES)
+    assert one.verdict == "yes"
+    assert [t.verdict for t in one.tested] == ["yes", "yes"]
+    overall = one.overall["idm"]
+    assert overall.n == 800
+    assert overall.difference.value == pytest.approx(-0.25)
+    assert overall.difference.high < -0.2
+
+
+def test_one_condition_without_an_effect_of_interest_makes_it_no(tmp_path: Path) -> None:
+    one = found(tmp_path, SAVES, EQUAL)
+    assert [t.verdict for t in one.tested] == ["yes", "no"]
+    assert one.verdict == "no"
+    assert found(tmp_path, SAVES, EQUAL, holds="somewhere").verdict == "yes"
+
+
+def test_too_few_episodes_resolve_nothing_and_say_which_power_they_had(tmp_path: Path) -> None:
+    one = found(tmp_path, SAVES, FEW)
+    assert [t.verdict for t in one.tested] == ["yes", "not resolved"]
+    assert one.verdict == "not resolved"
+    assert one.tested[1].power < 0.3
+    assert one.tested[0].power > 0.95
+
+
+def test_an_effect_the_other_way_is_no(tmp_path: Path) -> None:
+    other = (SAVES[1], SAVES[0])
+    assert found(tmp_path, other, other).verdict == "no"
+
+
+def test_tests_are_corrected_together(tmp_path: Path) -> None:
+    five, six = (rows([], 400), rows(range(5), 400)), (rows([], 400), rows(range(6), 400))
+    one = found(tmp_path, five, six)
+    assert [t.p for t in one.tested] == [mcnemar(5, 0), mcnemar(6, 0)] == [0.0625, 0.03125]
+    assert [t.p_holm for t in one.tested] == [0.0625, 0.0625]
+
+
+def test_a_mean_is_tested_by_signed_ranks(tmp_path: Path) -> None:
+    farther = (rows([], 40, 110.0), rows([], 40, 100.0))
+    changes = {
+        "primary": {"metric": "dt_mean_m", "direction": "higher"},
+        "test": "signed_rank",
+        "power": {"smallest": 5.0, "pairs": 40},
+    }
+    one = found(tmp_path, farther, farther, **changes)
+    assert one.verdict == "yes"
+    assert one.overall["idm"].difference.value == pytest.approx(10.0)
+    with pytest.raises(BadInput, match="test='mcnemar': dt_mean_m is no share of episodes"):
+        found(tmp_path, farther, farther, **{**changes, "test": "mcnemar"})
+
+
+def test_a_figure_that_the_episodes_do_not_have_is_named(tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match="metric='dt_mean': no such figure, did you mean 'dt_mean_m'"):
+        found(tmp_path, SAVES, SAVES, secondary=["dt_mean"])
+
+
+def test_only_seeds_that_both_drove_to_the_end_are_pairs(tmp_path: Path) -> None:
+    failed = tuple({**row, "status": "timeout"} if row["seed"] < 3 else row for row in SAVES[0])
+    one = found(tmp_path, (failed, SAVES[1]), SAVES)
+    assert [t.found.n for t in one.tested] == [397, 400]
+
+
+def test_every_line_says_what_it_is_of_and_floors_are_not_tested(tmp_path: Path) -> None:
+    lines = [*found(tmp_path, SAVES, EQUAL).lines()]
+    own = [line for line in lines if not line.against]
+    assert {line.arm for line in own} == {"rule", "idm", "lane"}
+    assert {(line.arm, line.against) for line in lines if line.against} == {("rule", "idm")}
+    assert {line.weights for line in own if line.arm == "rule"} == {"0123456789ab"}
+    assert {(line.preset, line.errors, line.drivers) for line in lines} == {("unguarded", "none", "mixed")}
+    crashes = next(line for line in own if (line.scenario, line.arm) == ("merge", "idm"))
+    assert (crashes.figure, crashes.value, crashes.n, crashes.na) == ("collision_rate", 0.25, 400, 0)
+    tested = [line for line in lines if line.p_holm is not None]
+    assert [line.figure for line in tested] == ["collision_rate"] * 2

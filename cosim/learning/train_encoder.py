@@ -4,7 +4,7 @@ import argparse
 import math
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -122,11 +122,12 @@ def gather(
 
 def train(args: argparse.Namespace) -> int:
     """`cosim train encoder`. Raises BadInput for whatever is wrong before anything is driven."""
-    for flag in ("policy", "iterations", "reward", "errors"):
+    for flag in ("iterations", "reward", "metric", "errors"):
         if getattr(args, flag):
             raise BadInput("is not for the encoder", field=f"--{flag}", value=getattr(args, flag))
     file = configuration(args.config).file
-    training, agent = file.sight, agent_config("vfn-p", file)
+    seed = file.sight.seed if args.seed is None else args.seed
+    training, agent = replace(file.sight, seed=seed), agent_config("vfn-p", file)
     worlds = [place(w) for w in args.scenario if w != "all"] or list(names())
     announce(
         f"train encoder: {training.loop.updates:,} updates on drives in {', '.join(worlds)}",

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from cosim.errors import BadInput
 from cosim.files.yaml_input import dataclass_from
@@ -16,6 +16,9 @@ from policy.networks.hpn import HpnConfig
 from policy.networks.vfn import TABLE_1, VfnConfig
 from policy.prediction.traffic import TrafficConfig
 from policy.safety import SafetyConfig
+
+# what stands for convolutions where a frozen encoder reads each frame: Conv3D sees time, Conv2D the present
+ENCODED: Mapping[str, Literal["frames", "frame"]] = {"conv3d": "frames", "conv2d": "frame"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,9 +70,9 @@ def configure(
     if name not in APPROACHES:
         raise BadInput(f"no such approach ({', '.join(APPROACHES)})", field="policy", value=name)
     approach = APPROACHES[name]
-    encoded = vfn.extractor == "frames"
+    encoded = vfn.encoded
     if (encoded or not approach.kinematics) and observation.channels != APART_OF:
-        how = "with extractor frames reads" if encoded else "sees maps alone and reads"
+        how = "with an encoder reads" if encoded else "sees maps alone and reads"
         problem = f"{name} {how} the channels {', '.join(APART_OF)}"
         raise BadInput(problem, field="observation.channels", value=", ".join(observation.channels))
     return AgentConfig(
@@ -86,7 +89,7 @@ def configure(
             channels=len(observation.channels),
             frames=observation.frames + (chain.hypotheses if approach.predicted_maps else 0),
             rows=observation.rows,
-            extractor="frames" if encoded else approach.extractor,
+            extractor=ENCODED[approach.extractor] if encoded else approach.extractor,
             kinematic=vfn.kinematic if approach.kinematics else 0,
             dueling=vfn.dueling and approach.learning != "a2c",
             parts=1 if approach.learning == "a2c" else vfn.parts,

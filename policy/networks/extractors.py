@@ -79,7 +79,7 @@ class Conv3dMaps(nn.Module):
 
 
 class EncodedMaps(nn.Module):
-    """Every frame through an encoder that was taught to see and learns no more here: maps -> latents.
+    """The last `frames` frames, each through a frozen encoder that was trained before: maps -> latents.
 
     `maps` may be latents already [B,T,L]: what never changes is not worked out again.
     """
@@ -87,13 +87,14 @@ class EncodedMaps(nn.Module):
     def __init__(self, frames: int, config: EncoderConfig) -> None:
         super().__init__()
         self.encoder = FrameEncoder(config).requires_grad_(False)
-        self.flat = frames * config.latent
+        self.count, self.flat = frames, frames * config.latent
 
     def forward(self, maps: torch.Tensor) -> torch.Tensor:
         """Maps [B,T,C,H,W] as bytes, or latents [B,T,L], -> [B,flat]."""
+        seen = maps[:, -self.count :]
         if maps.dim() == 3:
-            return maps.flatten(1).to(torch.float32)
-        return self.frames(maps.flatten(0, 1)).view(len(maps), -1)
+            return seen.flatten(1).to(torch.float32)
+        return self.frames(seen.flatten(0, 1)).view(len(maps), -1)
 
     @property
     def blank(self) -> torch.Tensor:
@@ -109,7 +110,7 @@ class EncodedMaps(nn.Module):
 
     def stacked(self, frames: torch.Tensor) -> torch.Tensor:
         """[B,T,L,1,1] -> [B,flat]."""
-        return frames.flatten(1)
+        return frames[:, -self.count :].flatten(1)
 
 
 AT_ONCE = 256  # frames: all of a city's AVs would take a gigabyte

@@ -43,8 +43,9 @@ class VfnConfig:
     others: bool = True  # False: they are seen in maps alone, beside the ego's own speed and command
     meets: bool = False  # behind the maps, layers of their own for AVs whose way meets a mission vehicle's
     assisted: bool = False  # and for those whose car keeps the law and its distance itself (`lawful`)
-    extractor: Literal["conv3d", "conv2d", "frames"] = "conv3d"  # frames: each by a trained `FrameEncoder`
-    latent: int = 128  # numbers a frame becomes (extractor `frames`)
+    # the last two: all frames, or the present one alone, each by a frozen `FrameEncoder`
+    extractor: Literal["conv3d", "conv2d", "frames", "frame"] = "conv3d"
+    latent: int = 128  # numbers that a frame becomes (with an encoder)
     dueling: bool = True  # q = state value + advantage: how good the moment is drowns what an action changes
     parts: int = 1  # 2: what an action brings oneself and what it brings the others are valued apart
     most: float = 90.0  # deg: who drives by a larger phi is driven by this one
@@ -58,6 +59,11 @@ class VfnConfig:
                 raise BadInput("is for networks that value actions", field=f"vfn.{field}", value=value)
         if not 45.0 <= self.most <= 90.0:
             raise BadInput("must be an angle from 45 to 90 degrees", field="vfn.most", value=self.most)
+
+    @property
+    def encoded(self) -> bool:
+        """Whether a frozen encoder, trained before, reads the maps."""
+        return self.extractor in ("frames", "frame")
 
 
 TABLE_1 = VfnConfig(features=(32, 64, 64), hidden=512, strides="literal", dueling=False)
@@ -110,8 +116,9 @@ class VFN(nn.Module):
         rows = c.kinematic if c.others else 0
         channels, read = (c.channels, unit) if rows else (APART, apart)
         shape = c.frames, channels, c.height, c.width
-        if c.extractor == "frames":
-            self.maps: Any = EncodedMaps(c.frames, EncoderConfig(c.height, c.width, latent=c.latent))
+        if c.encoded:
+            count = c.frames if c.extractor == "frames" else 1
+            self.maps: Any = EncodedMaps(count, EncoderConfig(c.height, c.width, latent=c.latent))
         elif c.extractor == "conv2d":
             self.maps = Conv2dMaps(*shape, c.features, read)
         else:

@@ -222,6 +222,21 @@ def test_all_of_them_together_are_trained_with(
     assert "was trained with another configuration" in capsys.readouterr().err
 
 
+def test_an_encoder_is_trained_on_one_s_own_roads(
+    own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = ["train", "encoder", "--config", "smoke", "--scenario", str(own / "mine"), "--out", str(tmp_path)]
+    assert main([*run, "--seed", "3"]) == 0
+    card = json.loads((tmp_path / "encoder.json").read_text())
+    assert card["data"]["sight"]["seed"] == 3
+    assert card["data"]["frames"]["training"] > card["data"]["frames"]["validation"] // 2 > 0
+    log = (tmp_path / "log.csv").read_text().splitlines()
+    assert len(log) == 3, "a head, and two lines of two updates"
+    capsys.readouterr()
+    assert main([*run, "--errors", "stress"]) == 2
+    assert "is not for the encoder" in capsys.readouterr().err
+
+
 def test_a_predictor_is_measured_where_one_s_own_policy_drives(own: Path, tmp_path: Path) -> None:
     code = f"{own}/code.py"
     words = ["--scenario", str(own / "mine"), "--demand", "free", "--behavior", "mixed", "--no-maps"]

@@ -11,12 +11,14 @@ import torch
 from policy_scenes import Car, histories, straight_road
 
 from cosim.errors import BadInput
+from cosim.learning.configuration import configuration
 from cosim.types import COMPACT, PAPER, SMOKE, Decision, MetaAction, PolicyContext, Timing
-from policy.agents import APPROACHES
+from policy.agents import APPROACHES, TRAINABLE
 from policy.agents.approaches import AgentConfig, compact, paper
 from policy.agents.prediction_aware import PredictionAware
 from policy.networks.hpn import HpnConfig
 from policy.networks.vfn import VfnConfig
+from policy.training.config import agent_config
 
 ROAD = straight_road(3)
 CARS = [
@@ -132,6 +134,13 @@ def test_every_approach_is_a_policy_and_sees_what_table_iii_says() -> None:
         assert config.vfn.frames == (14 if name.startswith("vfn-p") else 10)
         assert bool(config.vfn.kinematic) == name.startswith("vfn")
         assert config.mask == name.startswith(("vfn", "safe"))
+
+
+def test_a_frozen_encoder_stands_for_the_convolutions_of_all_six() -> None:
+    sizes = configuration("papers").file
+    layouts = {name: agent_config(name, sizes).vfn for name in TRAINABLE}
+    assert all(layout.encoded for layout in layouts.values())
+    assert [name for name, layout in layouts.items() if layout.extractor == "frame"] == ["conv2d-dqn"]
 
 
 def test_what_learned_from_rewards_alone_sees_others_in_its_maps_alone() -> None:

@@ -327,6 +327,19 @@ def test_frames_remembered_from_the_last_decision_give_the_same_values_to_the_bi
         assert convolved == (14, 6 + 14, 6 + 6 + 14, 14 + 14)[number]
 
 
+def test_in_place_of_conv2d_the_encoder_sees_the_present_frame_alone() -> None:
+    torch.manual_seed(0)
+    network = VFN(VfnConfig(extractor="frame", frames=10)).eval()
+    maps = torch.randint(0, 256, (2, 10, 4, 32, 128), dtype=torch.uint8)
+    assert network.maps.flat == VfnConfig().latent
+    with torch.inference_mode():
+        present = network.maps(maps)
+        maps[:, :-1] = 0
+        assert torch.equal(network.maps(maps), present)
+        maps[:, -1] = 0
+        assert not torch.equal(network.maps(maps), present)
+
+
 @pytest.mark.parametrize("extractor", ["conv3d", "frames"])
 def test_a_citys_frames_are_read_in_parts_to_the_bit(
     extractor: Literal["conv3d", "frames"], monkeypatch: pytest.MonkeyPatch

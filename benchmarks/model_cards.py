@@ -198,7 +198,7 @@ def encoder(name: str, card: Card) -> tuple[str, ...]:
         f"`{name}`",
         what,
         f"{frames:,} maps",
-        "`cosim train encoder --scenario all`",
+        "`cosim train encoder`",
         error,
         "none",
         "scenarios",

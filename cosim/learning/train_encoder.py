@@ -28,8 +28,9 @@ from policy.agents.prediction_aware import PredictionAware
 from policy.training import loop as supervised
 from policy.training import sight
 from policy.training.config import agent_config, encoder_of
+from policy.training.loop import LoopConfig
 from policy.training.networks import use_threads
-from policy.training.sight import Seen, SightTask, SightTraining
+from policy.training.sight import AVS, ERRORS, EVERY, Seen, SightTask
 from sumo_scenarios import names
 
 HELD = 6.0  # decisions for which a random action is held on average
@@ -40,12 +41,10 @@ class Watcher(PredictionAware):
 
     Args:
         agent: sizes, chain and prioritizer.
-        training: how often it looks, at how many AVs.
     """
 
-    def __init__(self, agent: AgentConfig, training: SightTraining) -> None:
+    def __init__(self, agent: AgentConfig) -> None:
         super().__init__("vfn-p", agent)
-        self._training = training
 
     def watch(self, world: int, seed: int, acts: bool) -> None:
         """A new drive in the scenario number `world`; `acts`: the AVs are driven at random."""
@@ -64,7 +63,7 @@ class Watcher(PredictionAware):
         self._count += 1
         if not histories:
             return {}
-        if self._count % self._training.every == 0:
+        if self._count % EVERY == 0:
             self._look(histories)
         return {av: Decision(self._held.get(av, MetaAction.IDLE)) for av in histories} if self._acts else {}
 
@@ -73,9 +72,9 @@ class Watcher(PredictionAware):
         agents, actions = inputs.scene.agents, len(MetaAction)
         decided = self.choose(self._rng.random((len(agents), actions)).astype(np.float32), inputs)
         for av in agents:
-            if av not in self._held or self._rng.random() < self._training.every / HELD:
+            if av not in self._held or self._rng.random() < EVERY / HELD:
                 self._held[av] = decided[av].action
-        rows = self._rng.permutation(len(agents))[: self._training.avs]
+        rows = self._rng.permutation(len(agents))[:AVS]
         past, states = self.observation.frames, inputs.states
         maps, kinematics, situation = (part.numpy()[rows] for part in states[:3])
         ttc = np.array([decided[agents[row]].ttc for row in rows], np.float32)
@@ -86,9 +85,9 @@ class Watcher(PredictionAware):
 class Watching(Hosts):
     """Runs in a worker: one drive, and what was seen in it."""
 
-    def __init__(self, agent: AgentConfig, training: SightTraining) -> None:
+    def __init__(self, agent: AgentConfig) -> None:
         super().__init__()
-        self._watcher = Watcher(agent, training)
+        self._watcher = Watcher(agent)
 
     def run(
         self, world: str, index: int, demand: str, seed: int, errors: str, progress: Any = None
@@ -104,19 +103,17 @@ class Watching(Hosts):
         return self._watcher.parts
 
 
-def gather(
-    agent: AgentConfig, training: SightTraining, worlds: Sequence[str], seeds: range, workers: int, title: str
-) -> Seen:
+def gather(agent: AgentConfig, worlds: Sequence[str], seeds: range, workers: int, title: str) -> Seen:
     """What is seen in drives with `seeds` of every demand of `worlds`; humans err in every second one."""
     tasks = [
         Task(f"{world}/{demand}/{seed}", f"{world}/{demand}/{errors}", (world, index, demand, seed, errors))
         for index, world in enumerate(worlds)
         for demand in load(world).demands or {}
-        for errors in dict.fromkeys(("", training.errors))
+        for errors in ("", ERRORS)
         for seed in seeds
-        if not training.errors or (seed % 2 == 1) == bool(errors)
+        if (seed % 2 == 1) == bool(errors)
     ]
-    each = spread(LocalEngine(Watching, (agent, training), workers=workers), tasks, title)
+    each = spread(LocalEngine(Watching, (agent,), workers=workers), tasks, title)
     return sight.joined([part for parts in each for part in parts])
 
 
@@ -130,7 +127,7 @@ def train(args: argparse.Namespace) -> int:
     training, agent = replace(file.sight, seed=seed), agent_config("vfn-p", file)
     worlds = [place(w) for w in args.scenario if w != "all"] or list(names())
     announce(
-        f"train encoder: {training.loop.updates:,} updates on drives in {', '.join(worlds)}",
+        f"train encoder: {training.updates:,} updates on drives in {', '.join(worlds)}",
         {
             "learning begins": f"when {training.drives} drives of each demand are seen, and "
             f"{training.validation} for validation",
@@ -140,10 +137,8 @@ def train(args: argparse.Namespace) -> int:
     with working_in(args.out) as folder:
         keep_freed_memory()
         use_threads(args.threads)
-        seen = gather(agent, training, worlds, TRAINING_SEEDS[: training.drives], args.workers, "learns from")
-        checked = gather(
-            agent, training, worlds, TUNING_SEEDS[: training.validation], args.workers, "checks on"
-        )
+        seen = gather(agent, worlds, TRAINING_SEEDS[: training.drives], args.workers, "learns from")
+        checked = gather(agent, worlds, TUNING_SEEDS[: training.validation], args.workers, "checks on")
         encoder = encoder_of(file)
         task = SightTask(encoder, training, seen, checked, args.device)
         about = {
@@ -154,7 +149,12 @@ def train(args: argparse.Namespace) -> int:
         layout = {"encoder": asdict(encoder), **about}
         with Progress("train encoder", "updates") as progress:
             log = supervised.train(
-                task, training.loop, folder, layout=layout, resume=args.resume, progress=progress
+                task,
+                LoopConfig.of(training.updates),
+                folder,
+                layout=layout,
+                resume=args.resume,
+                progress=progress,
             )
         weights = folder / "encoder.safetensors"
         explained = sight.explained(checked.readings, sight.read_all(task.network, checked.maps, args.device))
@@ -163,6 +163,6 @@ def train(args: argparse.Namespace) -> int:
         supervised.write_log(weights.with_suffix(".csv"), log)
         for name, value in explained.items():
             print(f"  {value:6.2f}  {name}")
-        print(f"encoder: {training.loop.updates} updates on {len(seen.maps):,} frames")
+        print(f"encoder: {training.updates} updates on {len(seen.maps):,} frames")
         print(f"  {weights}")
         return 0

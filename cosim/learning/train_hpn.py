@@ -6,7 +6,7 @@ import json
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +26,6 @@ from policy.prediction.predictors import make_predictor
 from policy.prediction.traffic import TrafficConfig
 from policy.training import hpn
 from policy.training import loop as supervised
-from policy.training.kinematics import KinematicTask
-from policy.training.map_branch import MapTask
 from policy.training.moments import MapSample, Moment, map_sample, moment
 from policy.training.networks import use_threads
 
@@ -37,7 +35,7 @@ def train(args: argparse.Namespace) -> int:
     file = configuration(args.config).file
     name, training = args.variant, file.prediction
     if args.seed is not None:
-        training = hpn.seeded(training, args.seed)
+        training = replace(training, seed=args.seed)
     if not args.recordings or not args.validation:
         raise BadInput(
             "recordings to train and to validate on are needed", field="--recordings, --validation"
@@ -47,7 +45,7 @@ def train(args: argparse.Namespace) -> int:
         "validation": _checked(args.validation, TUNING_SEEDS, "--validation"),
     }
     variant = hpn.VARIANTS[name]
-    loop = training.map_loop if variant.maps == "plain" else training.loop
+    loop = training.loop(variant)
     announce(
         f"train {name}: {loop.updates:,} updates on {len(found['train']):,} recorded episodes",
         {
@@ -61,12 +59,7 @@ def train(args: argparse.Namespace) -> int:
         use_threads(args.threads)
         data = {part: _manifest(keys) for part, keys in found.items()}
         examples = {part: _gather(keys, name, training, args.workers, part) for part, keys in found.items()}
-        task: KinematicTask | MapTask
-        sets = examples["train"], examples["validation"]
-        if variant.maps == "plain":
-            task = MapTask(variant.map_branch, training.maps, loop.updates, *sets, args.device)
-        else:
-            task = KinematicTask(variant.kinematic, training.kinematics, loop.updates, *sets, args.device)
+        task = hpn.make_task(variant, training, examples["train"], examples["validation"], args.device)
         layout = {"hpn": asdict(variant), "training": asdict(training), "data": data}
         with Progress(f"train {name}", "updates") as progress:
             log = supervised.train(task, loop, folder, layout=layout, resume=args.resume, progress=progress)
@@ -163,8 +156,8 @@ def _manifest(keys: Sequence[tuple[Path, str]]) -> dict[str, Any]:
 
 def check(args: argparse.Namespace) -> None:
     """Refuse flags that say nothing to an HPN. Raises BadInput."""
-    for flag in ("policy", "iterations"):
-        if getattr(args, flag) is not None:
+    for flag in ("iterations", "reward", "metric", "errors"):
+        if getattr(args, flag):
             raise BadInput("is not for hpn", field=f"--{flag}", value=getattr(args, flag))
     if args.scenario:
         print("cosim: --scenario is not for hpn: the recordings say which worlds", file=sys.stderr)

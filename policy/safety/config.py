@@ -9,11 +9,21 @@ from cosim.types import MetaAction
 
 
 @dataclass(frozen=True, slots=True)
-class SafetyConfig:
-    """Thresholds (docs/reference/paper_map.md) and the driving limits behind them."""
+class Thresholds:
+    """When an action is unsafe (docs/reference/paper_map.md)."""
 
     safe_th: float = 3.0  # s, P: safe_th
     critical_th: float = 1.5  # s, P: critical_th
+
+    def __post_init__(self) -> None:
+        """Raises BadInput for a number out of range."""
+        in_range(self, not_negative="safe_th critical_th")
+
+
+@dataclass(frozen=True, slots=True)
+class SafetyConfig(Thresholds):
+    """Thresholds, and the driving limits behind them."""
+
     decay: float = 0.5  # 1/s, lambda of the weights
     cap: float = 10.0  # s, time to collision counts no further
     horizon: float = 4.0  # s, P, Table I
@@ -49,11 +59,12 @@ class SafetyConfig:
 
     def __post_init__(self) -> None:
         """Raises BadInput for a number out of range."""
+        Thresholds.__post_init__(self)
         lengths = "margin_length margin_width reach reaction brake_after standstill_gap follower_reaction"
         in_range(
             self,
             positive="cap horizon dt leader_brake follower_brake straddle lane_half same_way",
-            not_negative=f"safe_th critical_th decay {lengths} follower_gap lane_change_speed resume_below",
+            not_negative=f"decay {lengths} follower_gap lane_change_speed resume_below",
         )
 
     @property

@@ -10,7 +10,7 @@ from policy.chain.chain import ChainConfig
 from policy.networks.frame_encoder import EncoderConfig
 from policy.networks.hpn import HpnConfig
 from policy.networks.vfn import VfnConfig
-from policy.safety import SafetyConfig
+from policy.safety import SafetyConfig, Thresholds
 from policy.training.curriculum import VfnTraining
 from policy.training.explorer import ExploreConfig
 from policy.training.hpn import HpnTraining
@@ -24,7 +24,7 @@ class TrainingFile:
     observation: ObservationConfig = field(default_factory=ObservationConfig)
     chain: ChainConfig = field(default_factory=ChainConfig)
     vfn: VfnConfig = field(default_factory=VfnConfig)
-    safety: SafetyConfig = field(default_factory=SafetyConfig)
+    safety: Thresholds = field(default_factory=Thresholds)
     reward: RewardConfig = field(default_factory=RewardConfig)
     explore: ExploreConfig = field(default_factory=ExploreConfig)
     training: VfnTraining = field(default_factory=VfnTraining)
@@ -35,7 +35,7 @@ class TrainingFile:
 def agent_config(name: str, file: TrainingFile) -> AgentConfig:
     """The approach `name` at the sizes of `file`: its value network untrained, its HPN the shipped one."""
     config = configure(name, file.observation, file.chain, HpnConfig(), file.vfn)
-    return replace(config, safety=file.safety, hpn_weights=shipped("hpn"))
+    return replace(config, safety=SafetyConfig(**asdict(file.safety)), hpn_weights=shipped("hpn"))
 
 
 def encoder_of(file: TrainingFile) -> EncoderConfig:

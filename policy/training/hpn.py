@@ -1,7 +1,7 @@
 """The three HPNs that are trained and compared, and how: the shipped one, and two ablations of it."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,22 +25,29 @@ class HpnTraining:
     """One training run. Defaults: what trains on a CPU core in an hour."""
 
     stride: int = 4  # decisions between two moments of an episode: neighbours are nearly the same
-    map_stride: int = 20  # the same for `hpn-plain`, whose samples are whole maps
-    loop: LoopConfig = field(default_factory=lambda: LoopConfig(updates=6000))
-    map_loop: LoopConfig = field(  # an update costs four times as much, and the loss is flat long before
-        default_factory=lambda: LoopConfig(updates=2000, log_every=25, validate_every=100)
-    )
-    kinematics: KinematicTraining = field(default_factory=KinematicTraining)
-    maps: MapTraining = field(default_factory=MapTraining)
+    updates: int = 6000
+    batch: int = 16  # moments an update: about 600 vehicles
+    # the same for `hpn-plain`, whose samples are whole maps: four times the cost, and the loss is flat early
+    map_stride: int = 20
+    map_updates: int = 2000
+    map_batch: int = 16  # AVs
+    seed: int = 0
+
+    def loop(self, variant: HpnConfig) -> LoopConfig:
+        """How long a variant is trained."""
+        return LoopConfig.of(self.map_updates if variant.maps == "plain" else self.updates)
 
 
-def seeded(training: HpnTraining, seed: int) -> HpnTraining:
-    """The same run with other draws."""
-    return replace(
-        training,
-        kinematics=replace(training.kinematics, seed=seed),
-        maps=replace(training.maps, seed=seed),
-    )
+def make_task(
+    variant: HpnConfig, training: HpnTraining, train: Sequence[Any], validation: Sequence[Any], device: str
+) -> KinematicTask | MapTask:
+    """The training of a variant's branch on its examples (`policy.training.moments`)."""
+    sets, updates = (train, validation), training.loop(variant).updates
+    if variant.maps == "plain":
+        maps = MapTraining(batch=training.map_batch, seed=training.seed)
+        return MapTask(variant.map_branch, maps, updates, *sets, device)
+    kinematics = KinematicTraining(batch=training.batch, seed=training.seed)
+    return KinematicTask(variant.kinematic, kinematics, updates, *sets, device)
 
 
 def assemble(name: str, task: KinematicTask | MapTask) -> HPN:

@@ -39,6 +39,11 @@ class LoopConfig:
     validate_every: int = 500  # updates
     save_every: float = 30.0  # s between checkpoints: what a kill may cost
 
+    @classmethod
+    def of(cls, updates: int) -> "LoopConfig":
+        """So many updates: 40 lines of the log, 8 validations."""
+        return cls(updates, math.ceil(updates / 40), math.ceil(updates / 8))
+
 
 class Task(Optimized):
     """One network that learns from examples; a kind of training says what its batches and losses are.

@@ -6,7 +6,7 @@ ones too, the kinematic rows say who is ahead and behind in the AV's own frame.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,8 +22,12 @@ from policy.inputs.situation import OWN, PER_LANE
 from policy.inputs.tensors import KINEMATIC_SCALE, apart, to_numpy
 from policy.networks.frame_encoder import EncoderConfig, Sight
 from policy.networks.seeded import first_weights
-from policy.training.loop import LoopConfig, Task, one_cycle
+from policy.training.loop import Task, one_cycle
 
+EVERY = 3  # decisions between two moments of a drive: neighbours are nearly the same
+AVS = 4  # that look, at each of them
+ERRORS = "stress"  # of the human drivers in every second drive
+RATE = 1e-3  # Adam, one cycle
 LANE, HALF = 3.2, 1.6  # m between centre lines, and from one to its lane's edge
 AHEAD = 100.0  # m, further away all gaps are alike
 ALONG, ACROSS, BRISK = 125.0, 16.0, 15.0  # m, m and m/s: scales of the mission vehicle's place and speed
@@ -65,15 +69,9 @@ class SightTraining:
 
     drives: int = 20  # of every world and demand
     validation: int = 4  # the same, on tuning seeds
-    every: int = 3  # decisions between two moments of a drive: neighbours are nearly the same
-    avs: int = 4  # at each of them
-    errors: str = "stress"  # of the human drivers in every second drive
+    updates: int = 8000
     batch: int = 128  # frames
-    rate: float = 1e-3
     seed: int = 0
-    loop: LoopConfig = field(
-        default_factory=lambda: LoopConfig(updates=8000, log_every=200, validate_every=1000)
-    )
 
 
 def bands(kinematics: Floats) -> Floats:
@@ -165,9 +163,9 @@ class SightTask(Task):
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         spread = np.ma.masked_invalid(train.readings).std(0).filled(0.0)
         self._weight = torch.from_numpy(1.0 / np.maximum(spread, 0.05) ** 2).to(device, torch.float32)
-        adam = torch.optim.Adam(self.network.parameters(), lr=training.rate)
+        adam = torch.optim.Adam(self.network.parameters(), lr=RATE)
         blocks = [validation.at(slice(k, k + 256)) for k in range(0, len(validation.maps), 256)]
-        schedule = partial(one_cycle, updates=training.loop.updates, rate=training.rate)
+        schedule = partial(one_cycle, updates=training.updates, rate=RATE)
         super().__init__(self.network, adam, schedule, [(b, len(b.maps)) for b in blocks], 1.0)
 
     def batch(self, number: int) -> Seen:

@@ -28,7 +28,6 @@ from policy.training import sight
 from policy.training.curriculum import Drive, Lesson, VfnTraining
 from policy.training.ddqn import DdqnConfig, DdqnLearner
 from policy.training.explorer import ExploreConfig, Explorer
-from policy.training.loop import LoopConfig
 from policy.training.replay_buffer import ReplayBuffer, ReplayConfig
 from policy.training.sight import AHEAD, ALONG, BRISK, READINGS, Seen, SightTask, SightTraining
 from policy.training.trainers import make_trainer
@@ -93,7 +92,10 @@ def test_the_lanes_are_those_of_the_situation() -> None:
     assert read(found, "existence, left lane") == 0.0
 
 
-def test_it_learns_to_read_a_gap_off_the_map_and_nothing_off_an_empty_one(tmp_path: Path) -> None:
+def test_it_learns_to_read_a_gap_off_the_map_and_nothing_off_an_empty_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sight, "RATE", 3e-3)
     rng = np.random.default_rng(0)
 
     def drawn(count: int) -> Seen:
@@ -104,7 +106,7 @@ def test_it_learns_to_read_a_gap_off_the_map_and_nothing_off_an_empty_one(tmp_pa
         wanted[:, READINGS.index("gap ahead, own band")] = gaps / 60
         return Seen(maps, wanted.astype(np.float32), np.zeros(count, np.int64))
 
-    config = SightTraining(batch=64, rate=3e-3, loop=LoopConfig(updates=250))
+    config = SightTraining(batch=64, updates=250)
     task = SightTask(SMALL, config, drawn(600), drawn(100))
     for number in range(250):
         task.update(number)

@@ -231,7 +231,7 @@ def test_an_encoder_is_trained_on_one_s_own_roads(
     assert card["data"]["sight"]["seed"] == 3
     assert card["data"]["frames"]["training"] > card["data"]["frames"]["validation"] // 2 > 0
     log = (tmp_path / "log.csv").read_text().splitlines()
-    assert len(log) == 3, "a head, and two lines of two updates"
+    assert len(log) == 5, "a head, and a line of each update"
     capsys.readouterr()
     assert main([*run, "--errors", "stress"]) == 2
     assert "is not for the encoder" in capsys.readouterr().err

@@ -24,6 +24,7 @@ from policy import checkpoint
 from policy.agents.approaches import APPROACHES, compact
 from policy.checkpoint import SHIPPED
 from policy.networks.vfn import VFN
+from policy.safety import Thresholds
 from policy.training.config import agent_config, described
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -116,7 +117,7 @@ def test_the_card_of_what_ships_says_all_of_its_agent(name: str) -> None:
 
 def test_the_card_of_ones_own_training_says_its_sizes_and_thresholds(tmp_path: Path) -> None:
     file = configuration("smoke").file
-    file = replace(file, safety=replace(file.safety, safe_th=2.5, ties=file.safety.ties[::-1]))
+    file = replace(file, safety=Thresholds(safe_th=2.5))
     wanted = agent_config("vfn", file)
     about = described("vfn", wanted, file)
     weights = tmp_path / "best.safetensors"

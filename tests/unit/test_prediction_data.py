@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cosim.cli.main import main
 from cosim.episode import Episode, run_episode
 from cosim.errors import BadInput
 from cosim.files import write_csv
@@ -124,7 +125,9 @@ def arguments(folder: Path, **changes: object) -> argparse.Namespace:
         "threads": 1,
         "device": "cpu",
         "resume": False,
-        "policy": None,
+        "reward": None,
+        "metric": [],
+        "errors": None,
         "iterations": None,
         "scenario": [],
     }
@@ -139,8 +142,16 @@ def test_training_refuses_recordings_of_the_wrong_seeds_before_it_reads_one(fold
     with pytest.raises(BadInput, match="not a folder of recordings"):
         train_hpn.train(arguments(folder, recordings=[str(folder / "roads")]))
     assert not (folder / "run").exists(), "nothing is left behind"
-    with pytest.raises(BadInput, match="is not for hpn"):
-        train_hpn.check(arguments(folder, policy="vfn-p"))
+
+
+def test_the_command_line_trains_no_hpn_on_recordings_of_the_wrong_seeds(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--recordings", str(folder), "--validation", str(folder), "--out", str(folder / "run")]
+    assert main(["train", "hpn", *words]) == 2
+    assert "seeds 100000 to 199999 are for this, not 7 (" in capsys.readouterr().err
+    assert main(["train", "hpn", *words, "--errors", "stress"]) == 2
+    assert "--errors='stress': is not for hpn" in capsys.readouterr().err
 
 
 def test_examples_of_both_kinds_come_from_a_recording(folder: Path) -> None:

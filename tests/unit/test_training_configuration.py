@@ -54,7 +54,7 @@ def test_a_file_changes_only_what_it_says_of_its_base(tmp_path: Path) -> None:
         ),
         ("training: {ddqn: {learning_rate: -1}}", "training.ddqn.learning_rate=-1.0: must be above 0"),
         ("observation: {height: -3}", "observation.height=-3: must be above 0"),
-        ("safety: {brake_after: -3}", "safety.brake_after=-3.0: must be 0 or more"),
+        ("safety: {critical_th: -3}", "safety.critical_th=-3.0: must be 0 or more"),
         ("svo: 1\nsvo: 2", "mine.yaml: line=2: not YAML: 'svo' is twice in this mapping"),
         ("base: papers\ntraining: 3", "mine.yaml: training=3: a mapping is needed"),
     ],
@@ -68,7 +68,7 @@ def test_a_wrong_base_is_named_with_its_file(tmp_path: Path, text: str, said: st
 
 
 def test_a_network_of_maps_alone_refuses_channels_that_it_cannot_read(tmp_path: Path) -> None:
-    text = "base: papers\nobservation: {channels: [av, hv, road]}"
+    text = "base: papers\nvfn: {extractor: conv3d}\nobservation: {channels: [av, hv, road]}"
     file = configuration(written(tmp_path, "mine", text)).file
     assert agent_config("vfn-p", file).vfn.channels == 3
     with pytest.raises(BadInput, match=r"observation\.channels='av, hv, road': conv2d-dqn sees maps alone"):

@@ -28,7 +28,8 @@ from cosim.report.statistics import (
 )
 from cosim.report.thresholds import CHANGE, DIFFERENCE, Threshold, parse
 
-OF_THE_MISSION = frozenset({"mission_success", "mission_failed_at_end", "mission_time_s", "dt_mission_m"})
+# Figures of the mission vehicle.
+MISSION_COLUMNS = frozenset({"mission_success", "mission_failed_at_end", "mission_time_s", "dt_mission_m"})
 PASSED, FAILED, SKIPPED = "passed", "failed", "skipped"
 
 
@@ -40,16 +41,16 @@ class PairedFigure:
     a: Figure
     b: Figure
     difference: Figure  # b - a
-    n: int  # pairs it is from
+    n: int  # pairs in which it applies to both sides
     na: int  # pairs in which it is NA on either side
-    na_on_both: int  # of these
-    hits: tuple[int, int] | None = None  # episodes of A and of B in which it happened, of a rate
-    tallies: tuple[tuple[int, float], ...] = ()  # of A and of B: events and exposure, of an incidence
-    p: float | None = None  # exact McNemar, of a rate
+    na_on_both: int  # pairs in which it is NA on both sides
+    hits: tuple[int, int] | None = None  # of a rate: episodes of A and of B in which it happened
+    tallies: tuple[tuple[int, float], ...] = ()  # of an incidence: events and exposure of A, of B
+    p: float | None = None  # of a rate: exact McNemar
 
     def document(self) -> dict[str, Any]:
         """Plain JSON values."""
-        found = {
+        document = {
             "a": self.a.document(),
             "b": self.b.document(),
             "difference": self.difference.document(),
@@ -59,14 +60,14 @@ class PairedFigure:
             "better": self.measure.better,
         }
         if self.hits is not None:
-            found |= {"hits_a": self.hits[0], "hits_b": self.hits[1], "p": self.p}
+            document |= {"hits_a": self.hits[0], "hits_b": self.hits[1], "p": self.p}
         for side, (events, exposure) in zip("ab", self.tallies, strict=False):
-            found |= {f"events_{side}": events, f"exposure_{side}": exposure}
-        return found
+            document |= {f"events_{side}": events, f"exposure_{side}": exposure}
+        return document
 
     @property
     def counts(self) -> tuple[str, str]:
-        """What stands beside A and B: `3/40`, `12 in 3.4 h`, or nothing."""
+        """The counts behind A and B: `3/40` of a rate, `12 in 3.4 h` of an incidence, "" of a mean."""
         if self.tallies:
             a, b = (wording.events(*tally, self.measure.per) for tally in self.tallies)
             return a, b
@@ -80,12 +81,12 @@ class Check:
     threshold: Threshold
     group: Group
     status: str  # PASSED, FAILED or SKIPPED
-    finding: str  # what the threshold was held against
-    figures: str = ""  # A, B and the difference, for who sees no table beside it
+    finding: str  # the figure that decided, in words
+    figures: str = ""  # A, B and the difference, for output without a table
 
 
 class PairedFigures(Mapping[str, PairedFigure]):
-    """Every measure of a group by name, each bootstrapped when it is first asked for."""
+    """Every measure of a group by name, each bootstrapped at its first access."""
 
     def __init__(self, known: Mapping[str, Measure], pairs: Sequence[tuple[Row, Row]], seed: int) -> None:
         self._known = known
@@ -118,12 +119,12 @@ class Comparison:
     b: str
     groups: list[Compared]
     checks: list[Check]
-    alone: tuple[list[str], list[str]]  # cells that only A, only B has
-    unfinished: tuple[str, ...] = ()  # `37 of 80 episodes of DIR are driven`, of each run that lacks some
-    partial: bool = False  # thresholds are held against an unfinished run all the same
+    unmatched: tuple[list[str], list[str]]  # cells that only A, only B has
+    unfinished: tuple[str, ...] = ()  # a line for each unfinished run: `37 of 80 episodes of DIR are driven`
+    partial: bool = False  # whether thresholds judge unfinished runs
 
     @property
-    def open(self) -> bool:
+    def undecided(self) -> bool:
         """Whether thresholds are given that only finished runs can pass or fail."""
         return bool(self.unfinished and self.checks) and not self.partial
 
@@ -131,16 +132,16 @@ class Comparison:
     def exit_code(self) -> int:
         """0 passed, 1 a threshold failed, 2 input refused or unfinished, 3 simulations failed among the
         compared."""
-        return self._judged[0]
+        return self._outcome[0]
 
     @property
     def verdict(self) -> str:
-        """The same in words."""
-        return self._judged[1]
+        """The exit code in words."""
+        return self._outcome[1]
 
     @property
-    def _judged(self) -> tuple[int, str]:
-        if self.open:
+    def _outcome(self) -> tuple[int, str]:
+        if self.undecided:
             return 2, "no verdict: the batch is unfinished (--partial judges the episodes that there are)"
         if refused := sum(len(g.group.refused) for g in self.groups):
             return 2, f"no verdict: {refused} compared episodes had bad input"
@@ -151,8 +152,8 @@ class Comparison:
             return 1, f"failed: {count[FAILED]} of {len(self.checks)} checks"
         passed = f"passed: {count[PASSED]} of {len(self.checks)} checks" if count else ""
         skipped = f", {count[SKIPPED]} do not apply" if count[SKIPPED] else ""
-        part = ", on a part of the episodes" if count and self.unfinished else ""
-        return 0, passed + skipped + part or "compared, no threshold was given"
+        extent = ", on a part of the episodes" if count and self.unfinished else ""
+        return 0, passed + skipped + extent or "compared, no threshold was given"
 
 
 def compare(
@@ -164,10 +165,15 @@ def compare(
     partial: bool = False,
     seed: int = 0,
 ) -> Comparison:
-    """Pair the episodes and hold every threshold against every group.
+    """Pair the episodes and test every threshold in every group.
 
-    `across`: what A and B may differ in, e.g. ("svo_deg",). `partial`: thresholds judge unfinished runs by
-    what there is of them. `seed` fixes the bootstrap.
+    Args:
+        a: the baseline.
+        b: the candidate.
+        fail_on: thresholds (`cosim.report.thresholds`).
+        across: what A and B may differ in, e.g. ("svo_deg",).
+        partial: whether thresholds judge unfinished runs by their finished episodes.
+        seed: fixes the bootstrap.
 
     Raises:
         BadInput: see `pair`; a threshold that cannot be read, that applies to no group, or that is on a
@@ -175,45 +181,45 @@ def compare(
     """
     known = {**b.run.measures, **a.run.measures}
     thresholds = [parse(text, known) for text in fail_on]
-    found, alone = pair(a, b, across)
-    guessed = sum(group.mission_guessed for group in found)
+    paired_groups, unmatched = pair(a, b, across)
+    guessed = sum(group.mission_guessed for group in paired_groups)
     for threshold in thresholds:
-        if guessed and threshold.measure.column in OF_THE_MISSION:
+        if guessed and threshold.measure.column in MISSION_COLUMNS:
             problem = (
                 f"the mission vehicle of {guessed} pairs was guessed, and a guess feeds no gate: drive both "
                 "with --mission ID, or leave this threshold out"
             )
             raise BadInput(problem, field="--fail-on", value=threshold.text)
-    groups = [Compared(group, PairedFigures(known, group.pairs, seed), seed) for group in found]
+    groups = [Compared(group, PairedFigures(known, group.pairs, seed), seed) for group in paired_groups]
     checks = [Check(t, compared.group, *_judge(t, compared)) for compared in groups for t in thresholds]
     for threshold in thresholds:
         if all(check.status == SKIPPED for check in checks if check.threshold is threshold):
             problem = f"{threshold.measure.name} is NA in every compared episode"
             raise BadInput(problem, field="--fail-on", value=threshold.text)
-    runs = [one.run for one in (a, b) if one.run.missing]
+    runs = [side.run for side in (a, b) if side.run.missing]
     unfinished = dict.fromkeys(f"{len(r.rows)} of {r.planned} episodes of {r.path} are driven" for r in runs)
-    return Comparison(title(a), title(b), groups, checks, alone, tuple(unfinished), partial)
+    return Comparison(title(a), title(b), groups, checks, unmatched, tuple(unfinished), partial)
 
 
 def paired(measure: Measure, pairs: Sequence[tuple[Row, Row]], seed: int = 0) -> PairedFigure:
-    """One measure over the pairs; those in which it is NA on either side are left out, and counted."""
+    """One measure over the pairs; pairs in which it is NA on either side are left out, and counted."""
     values = np.array([measure.values([pair[k] for pair in pairs]) for k in (0, 1)])  # [2,pairs]
     missing = np.isnan(values)
     x, y = values[:, ~missing.any(0)]
-    n, na, neither = len(x), len(pairs) - len(x), int(missing.all(0).sum())
+    n, na, na_on_both = len(x), len(pairs) - len(x), int(missing.all(0).sum())
     if measure.per:
         before, after = (measure.tally([pair[k] for pair in pairs])[:, ~missing.any(0)] for k in (0, 1))
         rates = pooled_rate(*before), pooled_rate(*after), paired_rate(before, after)
         tallies = tuple((int(k.sum()), measure.scale * float(t.sum())) for k, t, _ in (before, after))
-        return PairedFigure(measure, *rates, n, na, neither, tallies=tallies)
+        return PairedFigure(measure, *rates, n, na, na_on_both, tallies=tallies)
     if not measure.is_rate:
         difference = paired_mean(x, y, seed)
-        return PairedFigure(measure, mean(x, seed), mean(y, seed), difference, n, na, neither)
-    was, now = x > 0, y > 0
-    hits = (int(was.sum()), int(now.sum()))
-    difference = paired_share(was, now)
-    p = mcnemar(*discordant(was, now)) if n else None
-    return PairedFigure(measure, share(hits[0], n), share(hits[1], n), difference, n, na, neither, hits, p=p)
+        return PairedFigure(measure, mean(x, seed), mean(y, seed), difference, n, na, na_on_both)
+    in_a, in_b = x > 0, y > 0
+    hits = (int(in_a.sum()), int(in_b.sum()))
+    shares = share(hits[0], n), share(hits[1], n), paired_share(in_a, in_b)
+    p = mcnemar(*discordant(in_a, in_b)) if n else None
+    return PairedFigure(measure, *shares, n, na, na_on_both, hits, p=p)
 
 
 # ---- inside ----
@@ -222,61 +228,63 @@ def paired(measure: Measure, pairs: Sequence[tuple[Row, Row]], seed: int = 0) ->
 def _judge(threshold: Threshold, compared: Compared) -> tuple[str, str, str]:
     """Status, finding and figures of one threshold in one group."""
     measure, pairs = threshold.measure, compared.group.pairs
-    found = compared.figures[measure.name]
+    in_pairs = compared.figures[measure.name]
     if not pairs:
         return FAILED, "no pair of episodes finished on both sides", ""
-    if found.na_on_both == len(pairs):
+    if in_pairs.na_on_both == len(pairs):
         return SKIPPED, f"{measure.name} is NA in all {len(pairs)} pairs", ""
     rows = [[both[k] for both in pairs] for k in (0, 1)]
-    count = f"{found.n} pairs" + (f", NA in {found.na} more" if found.na else "")
+    count = f"{in_pairs.n} pairs" + (f", NA in {in_pairs.na} more" if in_pairs.na else "")
     if threshold.kind == CHANGE:
         figure, what = _change(measure, rows, compared.seed), "B / A - 1"
-        shown = [wording.change(v) for v in (threshold.of(figure), figure.value, figure.low, figure.high)]
-        whole = f"{shown[1]} ({shown[2]} to {shown[3]})"
+        judged, value, low, high = map(
+            wording.change, (threshold.of(figure), figure.value, figure.low, figure.high)
+        )
+        shown = f"{value} ({low} to {high})"
     elif threshold.kind == DIFFERENCE:
-        figure, what = found.difference, "B - A"
-        shown = [wording.number(threshold.of(figure), measure, signed=True)]
-        whole = wording.interval(figure, measure, signed=True)
-    else:  # of B alone: pairs in which only A is NA count too
-        figure, count = _alone(measure, rows[1], compared.seed)
+        figure, what = in_pairs.difference, "B - A"
+        judged = wording.number(threshold.of(figure), measure, signed=True)
+        shown = wording.interval(figure, measure, signed=True)
+    else:  # of B: pairs in which only A is NA count too
+        figure, count = _of_candidate(measure, rows[1], compared.seed)
         what = "B"
-        shown = [wording.number(threshold.of(figure), measure)]
-        whole = wording.interval(figure, measure)
-    finding = f"{what} is {whole}, {count}"
+        judged = wording.number(threshold.of(figure), measure)
+        shown = wording.interval(figure, measure)
+    finding = f"{what} is {shown}, {count}"
     if threshold.bound != "value":
-        finding = f"{threshold.bound} bound is {shown[0]}: {finding}"
-    return FAILED if threshold.fails(threshold.of(figure)) else PASSED, finding, _figures(found)
+        finding = f"{threshold.bound} bound is {judged}: {finding}"
+    return FAILED if threshold.fails(threshold.of(figure)) else PASSED, finding, _in_words(in_pairs)
 
 
 def _change(measure: Measure, rows: Sequence[Sequence[Row]], seed: int) -> Figure:
-    """B / A - 1 over the pairs in which both are known."""
+    """B / A - 1 over the pairs in which A and B are known."""
     if not measure.per:
         return paired_change(measure.values(rows[0]), measure.values(rows[1]), seed)
-    before, after = (measure.tally(mine) for mine in rows)
+    before, after = (measure.tally(of_side) for of_side in rows)
     known = ~np.isnan([*before, *after]).any(0)
     return paired_rate_change(before[:, known], after[:, known])
 
 
-def _alone(measure: Measure, rows: Sequence[Row], seed: int) -> tuple[Figure, str]:
-    """The figure of one side over all its episodes, and what it is from."""
+def _of_candidate(measure: Measure, rows: Sequence[Row], seed: int) -> tuple[Figure, str]:
+    """The figure of B over all its episodes, and the count behind it."""
     y = [value for value in measure.values(rows) if not math.isnan(value)]
     if measure.per:
         tally = measure.tally(rows)
         events, exposure, weight = tally[:, ~np.isnan(tally).any(0)]
-        said = wording.events(int(events.sum()), measure.scale * float(exposure.sum()), measure.per)
-        return pooled_rate(events, exposure, weight), f"{said} of {len(y)} episodes"
+        count = wording.events(int(events.sum()), measure.scale * float(exposure.sum()), measure.per)
+        return pooled_rate(events, exposure, weight), f"{count} of {len(y)} episodes"
     if measure.is_rate:
         return share(int(sum(y)), len(y)), f"{int(sum(y))} of {len(y)} episodes"
     return mean(y, seed), f"{len(y)} episodes"
 
 
-def _figures(found: PairedFigure) -> str:
+def _in_words(figure: PairedFigure) -> str:
     """`A 2.5 % (0.4 to 12.9) = 1/40, B ..., B - A ..., p 1`"""
-    m = found.measure
-    counts = [f" = {count}" if count else "" for count in found.counts]
+    m = figure.measure
+    counts = [f" = {count}" if count else "" for count in figure.counts]
     parts = [
-        f"A {wording.interval(found.a, m)}{counts[0]}",
-        f"B {wording.interval(found.b, m)}{counts[1]}",
-        f"B - A {wording.interval(found.difference, m, signed=True)}",
+        f"A {wording.interval(figure.a, m)}{counts[0]}",
+        f"B {wording.interval(figure.b, m)}{counts[1]}",
+        f"B - A {wording.interval(figure.difference, m, signed=True)}",
     ]
-    return ", ".join(parts if found.p is None else [*parts, wording.p_value(found.p)])
+    return ", ".join(parts if figure.p is None else [*parts, wording.p_value(figure.p)])

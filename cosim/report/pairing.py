@@ -25,7 +25,7 @@ ACROSS = tuple(name for name in PAIR if name not in ("scenario", "demand"))  # w
 
 @dataclass(frozen=True, slots=True)
 class Side:
-    """One of the two: a run, or one policy of it."""
+    """A or B of a comparison: a run, or one policy of it."""
 
     run: Run
     policy: str | None = None
@@ -36,17 +36,17 @@ class Group:
     """The pairs of one cell."""
 
     identity: dict[str, Any]  # by the names of `PAIR`
-    a: dict[str, Any]  # who drove: policy, policy_label, and whatever A and B differ in
+    a: dict[str, Any]  # the driver: policy, policy_label, and the options in which A and B differ
     b: dict[str, Any]
     pairs: list[tuple[Row, Row]]  # both ok, by seed
-    failed: list[Row]  # sim_crash and timeout among the pairs
-    refused: list[Row]  # bad_input among the pairs
+    failed: list[Row]  # paired episodes of status sim_crash or timeout
+    refused: list[Row]  # paired episodes of status bad_input
     unpaired: tuple[int, int]  # episodes of A and of B without a partner
 
     @property
     def name(self) -> str:
         """`merge / contested / ... / lc2013: idm -> altruist-rule`"""
-        return f"{wording.group(self.identity)}: {who(self.a)} -> {who(self.b)}"
+        return f"{wording.group(self.identity)}: {driver(self.a)} -> {driver(self.b)}"
 
     @property
     def not_comparable(self) -> int:
@@ -60,7 +60,7 @@ class Group:
 
     @property
     def errors_begun(self) -> tuple[int, int, int]:
-        """See the function of that name."""
+        """Human errors in A, in B and in both (`errors_begun`)."""
         return errors_begun(self.pairs)
 
     @property
@@ -70,7 +70,7 @@ class Group:
 
 
 def errors_begun(pairs: Iterable[tuple[Row, Row]]) -> tuple[int, int, int]:
-    """Human errors that began in A's episodes, in B's, and of both the same: kind, who and second."""
+    """Human errors that began in A's episodes, in B's, and in both: of equal kind, vehicle and second."""
     begun = [[Counter(map(tuple, _errors(row))) for row in pair] for pair in pairs]
     return (
         sum(a.total() for a, _ in begun),
@@ -80,7 +80,7 @@ def errors_begun(pairs: Iterable[tuple[Row, Row]]) -> tuple[int, int, int]:
 
 
 def side(text: str) -> Side:
-    """`DIR` or `DIR:POLICY`; of an unfinished run the episodes that there are.
+    """Read `DIR` or `DIR:POLICY`; of an unfinished run the episodes that are driven.
 
     Raises:
         BadInput: no such run, or no such policy in it.
@@ -92,46 +92,46 @@ def side(text: str) -> Side:
 
 
 def chosen(run: Run, policy: str) -> Side:
-    """One policy of a run. Raises BadInput when it is not in it."""
+    """One policy of a run. Raises BadInput when the run has no episode of it."""
     if policy not in run.policies:
         near = hint(policy, run.policies)
         raise BadInput(f"no episode of this policy in {run.path}{near}", field="policy", value=policy)
     return Side(run, policy)
 
 
-def title(one: Side) -> str:
+def title(side: Side) -> str:
     """`DIR` or `DIR:POLICY`."""
-    return str(one.run.path) if one.policy is None else f"{one.run.path}:{one.policy}"
+    return str(side.run.path) if side.policy is None else f"{side.run.path}:{side.policy}"
 
 
-def who(one: Mapping[str, Any]) -> str:
-    """`vfn-p (untrained) svo_deg=45.0`"""
-    label = f" ({one['policy_label']})" if one["policy_label"] else ""
-    others = [f" {k}={v}" for k, v in one.items() if k not in ("policy", "policy_label")]
-    return str(one["policy"]) + label + "".join(others)
+def driver(identity: Mapping[str, Any]) -> str:
+    """`vfn-p (untrained) svo_deg=45.0`, of `Group.a` or `Group.b`."""
+    label = f" ({identity['policy_label']})" if identity["policy_label"] else ""
+    options = [f" {k}={v}" for k, v in identity.items() if k not in ("policy", "policy_label")]
+    return str(identity["policy"]) + label + "".join(options)
 
 
 def pair(a: Side, b: Side, across: Sequence[str] = ()) -> tuple[list[Group], tuple[list[str], list[str]]]:
-    """Groups of pairs in A's order, and the names of the cells that only one side has.
+    """Groups of pairs in A's order, and the names of the cells that only A, only B has.
 
     `across`: names of `ACROSS` in which A and B may differ.
 
     Raises:
-        BadInput: nothing to pair, no seed in common, a side's policy is not clear, two cells that would be
-            the same partner.
+        BadInput: nothing to pair, no seed in common, a side with several policies against one with one, two
+            cells with the same key.
     """
     for name in across:
         if name not in ACROSS:
             raise BadInput(f"cannot be compared across{hint(name, ACROSS)}", field="--across", value=name)
-    by_policy = _clear_policies(a, b)
+    by_policy = _paired_by_policy(a, b)
     if by_policy and not set(a.run.policies) & set(b.run.policies):
         problem = f"no policy in common: A has {_words(a.run.policies)}, B has {_words(b.run.policies)}"
         raise BadInput(problem + "; choose with DIR:POLICY")
     fields = tuple(name for name in PAIR if name not in across) + ("policy",) * by_policy
     same_folder = a.run.path.resolve() == b.run.path.resolve()
-    known = not same_folder and all(one.run.manifest.get("cells") for one in (a, b))
-    settings = SETTINGS if known else ()
-    all_a, all_b = (_cells(one, fields, across, same_folder, settings) for one in (a, b))
+    settings_known = not same_folder and all(side.run.manifest.get("cells") for side in (a, b))
+    settings = SETTINGS if settings_known else ()
+    all_a, all_b = (_cells(side, fields, across, same_folder, settings) for side in (a, b))
     groups = []
     for key, cells_a in all_a.items():
         for rows_a, rows_b in itertools.product(cells_a.values(), all_b.get(key, {}).values()):
@@ -142,11 +142,11 @@ def pair(a: Side, b: Side, across: Sequence[str] = ()) -> tuple[list[Group], tup
     only_a, only_b = (
         [
             _name(next(iter(rows.values())))
-            for key, cells in mine.items()
+            for key, cells in of_side.items()
             for rows in cells.values()
-            if key not in others
+            if key not in of_other
         ]
-        for mine, others in ((all_a, all_b), (all_b, all_a))
+        for of_side, of_other in ((all_a, all_b), (all_b, all_a))
     )
     return groups, (only_a, only_b)
 
@@ -156,28 +156,31 @@ def pair(a: Side, b: Side, across: Sequence[str] = ()) -> tuple[list[Group], tup
 
 def _errors(row: Row) -> list[list[Any]]:
     """`human_error_list` of an episode; [] where it has none."""
-    found = row.get("human_error_list") or []
-    return list(json.loads(found) if isinstance(found, str) else found)
+    errors = row.get("human_error_list") or []
+    return list(json.loads(errors) if isinstance(errors, str) else errors)
 
 
 _Key = tuple[Any, ...]
 
 
-def _clear_policies(a: Side, b: Side) -> bool:
-    """Whether each policy is paired with itself; otherwise each side is of one policy."""
-    several = [one.policy is None and len(one.run.policies) > 1 for one in (a, b)]
+def _paired_by_policy(a: Side, b: Side) -> bool:
+    """Whether each policy is paired with itself; otherwise each side has one policy.
+
+    Raises BadInput when one side has several policies, and the other has one.
+    """
+    several = [side.policy is None and len(side.run.policies) > 1 for side in (a, b)]
     if all(several) or not any(several):
         return all(several)
-    name, one = ("A", a) if several[0] else ("B", b)
-    problem = f"{name} holds several policies, choose one with DIR:POLICY: {_words(one.run.policies)}"
-    raise BadInput(problem, value=str(one.run.path))
+    name, side = ("A", a) if several[0] else ("B", b)
+    problem = f"{name} holds several policies, choose one with DIR:POLICY: {_words(side.run.policies)}"
+    raise BadInput(problem, value=str(side.run.path))
 
 
 _Cells = dict[_Key, dict[_Key, dict[int, Row]]]
 
 
 def _cells(
-    one: Side,
+    side: Side,
     fields: tuple[str, ...],
     across: Sequence[str],
     same_folder: bool,
@@ -185,23 +188,25 @@ def _cells(
 ) -> _Cells:
     """Rows by pairing key (`fields`, then `settings`), then by the values of `across`, then by seed.
 
-    Raises BadInput when two rows would be one.
+    Raises BadInput when two rows have the same key.
     """
-    found: _Cells = {}
-    for row in one.run.rows:
-        if one.policy is not None and row["policy"] != one.policy:
+    cells: _Cells = {}
+    for row in side.run.rows:
+        if side.policy is not None and row["policy"] != side.policy:
             continue
-        driven = one.run.settings(row) if settings else {}
+        driven = side.run.settings(row) if settings else {}
         key: _Key = (*(row.get(name) for name in fields), *(driven[name] for name in settings))
-        if same_folder:  # then files are distinguished even where their names are equal
-            case = {k: v for k, v in one.run.case(row).items() if k not in (*across, "outputs")}
+        if (
+            same_folder
+        ):  # one run may hold different files of equal names: what was asked for tells them apart
+            case = {k: v for k, v in side.run.case(row).items() if k not in (*across, "outputs")}
             key += (json.dumps(case, sort_keys=True),)
-        rows = found.setdefault(key, {}).setdefault(tuple(row.get(name) for name in across), {})
+        rows = cells.setdefault(key, {}).setdefault(tuple(row.get(name) for name in across), {})
         twin = rows.setdefault(row["seed"], row)
         if twin is not row:
             problem = f"two cells would be one, {twin['cell']} and {row['cell']}: both are {_name(row)}"
-            raise BadInput(f"{problem} with seed {row['seed']}", file=one.run.path)
-    return found
+            raise BadInput(f"{problem} with seed {row['seed']}", file=side.run.path)
+    return cells
 
 
 def _group(pairs: list[tuple[Row, Row]], fields: tuple[str, ...], episodes: tuple[int, int]) -> Group:
@@ -215,14 +220,14 @@ def _group(pairs: list[tuple[Row, Row]], fields: tuple[str, ...], episodes: tupl
         }
         for k, row in enumerate(pairs[0])
     ]
-    wrong = [row for pair in pairs for row in pair if row["status"] != OK]
+    without_figures = [row for pair in pairs for row in pair if row["status"] != OK]
     return Group(
         identity={n: first.get(n) for n in PAIR if n not in differing},
         a=drivers[0],
         b=drivers[1],
         pairs=[(x, y) for x, y in pairs if x["status"] == OK and y["status"] == OK],
-        failed=[row for row in wrong if row["status"] != BAD_INPUT],
-        refused=[row for row in wrong if row["status"] == BAD_INPUT],
+        failed=[row for row in without_figures if row["status"] != BAD_INPUT],
+        refused=[row for row in without_figures if row["status"] == BAD_INPUT],
         unpaired=(episodes[0] - len(pairs), episodes[1] - len(pairs)),
     )
 

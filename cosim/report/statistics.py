@@ -17,10 +17,11 @@ from scipy.optimize import brentq
 CONFIDENCE = 0.95
 Z = float(stats.norm.ppf(0.5 + CONFIDENCE / 2.0))
 RESAMPLES = 2000  # the bounds of a mean then wander by some 2 % of the interval's width from seed to seed
-FEW = 3.0  # effective events, from which on their weights tell what another one may weigh
-# effective events of two rates, and effective samples that have any: their difference is about normal
-MANY = 20.0, 10.0
-BATCH = 2_000_000  # resampled values held at once: 16 MB
+FEW_EVENTS = 3.0  # effective events, from which on their largest weight bounds that of another one
+# Effective events of two rates, and effective samples with an event, from which on the difference of the
+# rates is about normal.
+NORMAL_EVENTS, NORMAL_SAMPLES = 20.0, 10.0
+MAX_RESAMPLED_VALUES = 2_000_000  # held at once: 16 MB
 
 Array = npt.NDArray[np.float64]
 Bools = Sequence[bool] | npt.NDArray[np.bool_]
@@ -94,14 +95,14 @@ def pooled_rate(
     that of the ratio, sum(w^2 (y - R k)^2), and at least the Poisson variance sum(w^2 y): events of one
     episode come together. The upper bound allows for one more event (or as many as come together), of the
     largest weight of the events seen; of the largest weight of all samples where the events seen are
-    effectively fewer than `FEW`. With equal weights and no more scatter than Poisson counts have it is
+    effectively fewer than `FEW_EVENTS`. With equal weights and no more scatter than Poisson counts have it is
     the exact interval of `rate`.
 
     Args:
         counts: [n] y, events of each sample.
         exposures: [n] k, what they are divided by.
         weights: [n] w, positive likelihood ratios; None: all alike.
-        times: the interval that so many times as many samples would have, if they were like these.
+        times: gives the interval of this many times as many samples, if they were like these.
     """
     y, k = np.asarray(counts, np.float64), np.asarray(exposures, np.float64)
     w = np.ones(len(y)) if weights is None else np.asarray(weights, np.float64)
@@ -115,7 +116,7 @@ def pooled_rate(
     poisson = times * float((w**2 * y).sum())
     variance = max(scatter, poisson)
     seen = w[y > 0.0]
-    largest = float(seen.max() if times * effective(seen) >= FEW else w.max()) * variance / poisson
+    largest = float(seen.max() if times * effective(seen) >= FEW_EVENTS else w.max()) * variance / poisson
 
     def bound(p: float, mean: float, spread: float) -> float:
         """The p-quantile of the gamma distribution of this mean and variance."""
@@ -126,7 +127,8 @@ def pooled_rate(
 
 
 def effective(weights: Sequence[float] | Array) -> float:
-    """How many equal weights tell as much: (sum w)^2 / sum w^2 (Kish 1965); 0 of none."""
+    """The effective sample size: how many equal weights tell as much, (sum w)^2 / sum w^2 (Kish 1965); 0 of
+    none."""
     w = np.asarray(weights, np.float64)
     total = float((w**2).sum())
     return float(w.sum()) ** 2 / total if total > 0.0 else 0.0
@@ -180,7 +182,8 @@ def mcnemar(lost: int, gained: int) -> float:
 
 
 def signed_rank(before: Sequence[float] | Array, after: Sequence[float] | Array) -> float:
-    """Two-sided p of "pairs change either way alike" (Wilcoxon 1945, ties by Pratt); 1 when none changes.
+    """Two-sided p of "pairs change equally in both directions" (Wilcoxon 1945, ties by Pratt); 1 when none
+    changes.
 
     Pairs with a nan are left out.
     """
@@ -231,19 +234,21 @@ def paired_rate(before: Array, after: Array) -> Figure:
     """Difference of two pooled rates, after - before.
 
     Each [3,n]: events, exposure and weight of every pair (or [2,n], all alike), as for `pooled_rate`. With
-    effectively `MANY` events or more its error is that of what single pairs contribute (delta method). With
-    fewer the bounds are recovered from those of the two rates and the correlation of the contributions
+    effectively `NORMAL_EVENTS` or more its error is that of what single pairs contribute (delta method).
+    With fewer the bounds are recovered from those of the two rates and the correlation of the contributions
     (MOVER, Zou and Donner, Statistics in Medicine 27 (2008) 1693-1702).
     """
     a, b = pooled_rate(*before), pooled_rate(*after)
     if not (a.known and b.known):
         return NA
-    return _recovered(a, b, _contributions(before, a), _contributions(after, b), _many(before, after))
+    return _difference(a, b, _contributions(before, a), _contributions(after, b), _normal(before, after))
 
 
 def paired_rate_change(before: Array, after: Array) -> Figure:
-    """Relative change of a pooled rate over pairs [3,n], likewise from logarithms; infinite and unbounded as
-    `paired_change`, and without bounds where there is no event after."""
+    """Relative change of a pooled rate over pairs [3,n], as `paired_rate` of the logarithms.
+
+    Infinite and without bounds as `paired_change`; without bounds too where there is no event after.
+    """
     a, b = pooled_rate(*before), pooled_rate(*after)
     if not (a.known and b.known):
         return NA
@@ -252,7 +257,7 @@ def paired_rate_change(before: Array, after: Array) -> Figure:
         return Figure(change, math.nan, math.nan)
     log_a, log_b = (Figure(*map(math.log, (f.value, f.low, f.high))) for f in (a, b))
     parts = _contributions(before, a) / a.value, _contributions(after, b) / b.value
-    found = _recovered(log_a, log_b, *parts, _many(before, after))
+    found = _difference(log_a, log_b, *parts, _normal(before, after))
     return Figure(*map(math.expm1, (found.value, found.low, found.high)))
 
 
@@ -263,11 +268,14 @@ def _weights(tally: Array) -> Array:
     return tally[2] if len(tally) > 2 else np.ones(tally.shape[1])
 
 
-def _many(before: Array, after: Array) -> bool:
-    """Whether there are `MANY` of both: the events of one sample come together."""
+def _normal(before: Array, after: Array) -> bool:
+    """Whether the difference of the two rates is about normal.
+
+    Samples with an event are asked for besides events, since the events of one sample come together.
+    """
     y, w = (np.concatenate(both) for both in ((before[0], after[0]), (_weights(before), _weights(after))))
-    events, samples = MANY
-    return effective(w * y) >= samples and float((w * y).sum()) ** 2 >= events * float((w**2 * y).sum())
+    enough_events = float((w * y).sum()) ** 2 >= NORMAL_EVENTS * float((w**2 * y).sum())
+    return enough_events and effective(w * y) >= NORMAL_SAMPLES
 
 
 def _contributions(tally: Array, rate: Figure) -> Array:
@@ -276,16 +284,16 @@ def _contributions(tally: Array, rate: Figure) -> Array:
     return np.asarray(w * (tally[0] - rate.value * tally[1]) / (w * tally[1]).sum())
 
 
-def _recovered(a: Figure, b: Figure, part_a: Array, part_b: Array, many: bool) -> Figure:
-    """b - a, to whose errors pairs contribute `part_a` and `part_b`."""
+def _difference(a: Figure, b: Figure, part_a: Array, part_b: Array, normal: bool) -> Figure:
+    """b - a with its bounds, from what each pair contributes to the errors of a and b ([n] each)."""
     value = b.value - a.value
-    if many:
+    if normal:
         reach = Z * float(np.linalg.norm(part_b - part_a)) * math.sqrt(len(part_a) / (len(part_a) - 1))
         return Figure(value, value - reach, value + reach)
     scatter = np.ptp(part_a) > 0.0 and np.ptp(part_b) > 0.0
-    alike = float(np.corrcoef(part_a, part_b)[0, 1]) if scatter else 0.0
+    correlation = float(np.corrcoef(part_a, part_b)[0, 1]) if scatter else 0.0
     sides = (b.value - b.low, a.high - a.value), (b.high - b.value, a.value - a.low)
-    down, up = (math.sqrt(max(p**2 + q**2 - 2.0 * alike * p * q, 0.0)) for p, q in sides)
+    down, up = (math.sqrt(max(p**2 + q**2 - 2.0 * correlation * p * q, 0.0)) for p, q in sides)
     return Figure(value, value - down, value + up)
 
 
@@ -315,7 +323,7 @@ def _bootstrap(samples: tuple[Array, ...], statistic: Callable[..., Any], seed: 
             paired=True,
             vectorized=True,
             n_resamples=RESAMPLES,
-            batch=max(1, BATCH // count),
+            batch=max(1, MAX_RESAMPLED_VALUES // count),
             confidence_level=CONFIDENCE,
             method="BCa",
             rng=np.random.default_rng(seed),
@@ -330,7 +338,7 @@ def _bootstrap(samples: tuple[Array, ...], statistic: Callable[..., Any], seed: 
 
 
 def _tango(gained: int, lost: int, count: int) -> Figure:
-    """Score interval of (gained - lost) / count: the differences d that a score test does not refuse.
+    """Score interval of (gained - lost) / count: the differences d that a score test does not reject.
 
     Tango, Statistics in Medicine 17 (1998) 891-908, equation (10) for the variance under d.
     """

@@ -14,15 +14,15 @@ from cosim.report import wording
 from cosim.report.changes import changes
 from cosim.report.compare import FAILED, PASSED, SKIPPED, Compared, Comparison, PairedFigure
 from cosim.report.figures import HEADLINE, INCIDENCES, Row
-from cosim.report.pairing import who
+from cosim.report.pairing import driver
 from cosim.report.result import EVERYBODY, LAW
 
 _MARK = {PASSED: "pass", FAILED: "FAIL", SKIPPED: "n/a "}
 _EMOJI = {PASSED: "✅ pass", FAILED: "❌ **fail**", SKIPPED: "n/a"}
 COLUMNS = 100  # of a terminal
 _INDENT, _GAP = "  ", "  "  # of a table's lines, and between its columns
-_SHOWN = 20  # failed simulations and cells of one side that are listed by name
-_NOT_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+_MAX_LISTED = 20  # failed simulations, and unmatched cells of one side, that are listed by name
+_FORBIDDEN_IN_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,8 +65,8 @@ def document(comparison: Comparison) -> dict[str, Any]:
             for check in comparison.checks
         ],
         "groups": [_group_document(compared) for compared in comparison.groups],
-        "only_in_a": comparison.alone[0],
-        "only_in_b": comparison.alone[1],
+        "only_in_a": comparison.unmatched[0],
+        "only_in_b": comparison.unmatched[1],
     }
 
 
@@ -83,7 +83,7 @@ def text(comparison: Comparison) -> str:
             if check.group is compared.group:
                 lines += _wrapped(f"{_MARK[check.status]}  {check.threshold.text}:  {check.finding}")
         lines.append("")
-    lines += [part for line in _alone(comparison) for part in _wrapped(line, "")]
+    lines += [part for line in _unmatched(comparison) for part in _wrapped(line, "")]
     return "\n".join([*lines, comparison.verdict])
 
 
@@ -105,14 +105,16 @@ def markdown(comparison: Comparison) -> str:
         for figure in _shown(comparison, compared):
             lines.append(_row([_html(cell.line) for cell in _cells(figure)]))
         lines += ["", "</details>", ""]
-    lines += [f"{_html(line)}  " for line in _alone(comparison)]
+    lines += [f"{_html(line)}  " for line in _unmatched(comparison)]
     return "\n".join(lines).rstrip() + "\n"
 
 
 def junit(comparison: Comparison, path: Path) -> None:
-    """Write the file that every CI server reads, whole or not at all: a test case per threshold and group,
-    one per group with simulations that gave no figures, and one where the batch is unfinished. Raises
-    OSError."""
+    """Write the file that every CI server reads, whole or not at all.
+
+    It has a test case per threshold and group, one per group with simulations that gave no figures, and one
+    if the batch is unfinished. Raises OSError.
+    """
     suite = TestSuite("cosim compare")
     for name, value in (("a", comparison.a), ("b", comparison.b), ("verdict", comparison.verdict)):
         suite.add_property(name, _clean(value))
@@ -126,7 +128,7 @@ def junit(comparison: Comparison, path: Path) -> None:
         else:
             case.system_out = message
         suite.add_testcase(case)
-    if comparison.open:
+    if comparison.undecided:
         case = TestCase("every episode was driven", classname="cosim compare")
         case.result = [Error(_clean("; ".join(comparison.unfinished)), "unfinished")]
         suite.add_testcase(case)
@@ -178,8 +180,8 @@ def _table(rows: Sequence[Sequence[_Cell]]) -> list[str]:
 
 
 def _clean(text: str) -> str:
-    """Without the characters that XML has no place for."""
-    return _NOT_XML.sub("?", text)
+    """The text without the characters that XML forbids."""
+    return _FORBIDDEN_IN_XML.sub("?", text)
 
 
 def _reason(row: Row) -> str:
@@ -208,15 +210,13 @@ def _group_document(compared: Compared) -> dict[str, Any]:
 
 
 def _shown(comparison: Comparison, compared: Compared) -> list[PairedFigure]:
-    """Headline figures, those of everybody, of the law and of near-misses that are not 0, and those a
-    threshold asks for, where they apply."""
-    asked = [check.threshold.measure.name for check in comparison.checks]
-    every = dict.fromkeys((*HEADLINE, *EVERYBODY, *INCIDENCES, *LAW, *asked))
-    names = [name for name in every if name in compared.figures]
-    rare = {*EVERYBODY, *INCIDENCES, *LAW} - {*asked}
-    happened = {n for n in rare if (f := compared.figures.get(n)) and (f.a.value or f.b.value)}
-    names = [name for name in names if name not in rare or name in happened]
-    return [compared.figures[name] for name in names if compared.figures[name].n]
+    """Figures of the table, where they apply: the headline's and those of thresholds; of all vehicles, of the
+    law and of near-misses only those that are not 0."""
+    gated = [check.threshold.measure.name for check in comparison.checks]
+    always = {*HEADLINE, *gated}
+    names = dict.fromkeys((*HEADLINE, *EVERYBODY, *INCIDENCES, *LAW, *gated))
+    figures = [compared.figures[name] for name in names if name in compared.figures]
+    return [f for f in figures if f.n and (f.measure.name in always or f.a.value or f.b.value)]
 
 
 def _cells(figure: PairedFigure) -> tuple[_Cell, _Cell, _Cell, _Cell]:
@@ -238,10 +238,10 @@ def _cells(figure: PairedFigure) -> tuple[_Cell, _Cell, _Cell, _Cell]:
 
 
 def _notes(compared: Compared) -> list[str]:
-    """What a reader must know before the figures."""
+    """Lines above a group's table: how many pairs, who drove, and what limits the comparison."""
     group = compared.group
-    one = " (one cannot tell a difference from chance)" * (len(group.pairs) == 1)
-    notes = [f"{_pairs(len(group.pairs))}{one}, A {who(group.a)}, B {who(group.b)}"]
+    caution = " (one cannot tell a difference from chance)" * (len(group.pairs) == 1)
+    notes = [f"{_pairs(len(group.pairs))}{caution}, A {driver(group.a)}, B {driver(group.b)}"]
     counted = {
         f"{_pairs(group.identical)} drove exactly alike (same trace hash)": group.identical,
         f"{_pairs(group.not_comparable)} with an episode that is not comparable": group.not_comparable,
@@ -256,23 +256,23 @@ def _notes(compared: Compared) -> list[str]:
     if either := begun_a + begun_b - both:
         words = f"human errors: {begun_a} in A, {begun_b} in B"
         notes.append(f"{words}; {100 * both / either:.0f} % of all began in both, in the same second")
-    for row in [*group.failed, *group.refused][:_SHOWN]:
+    for row in [*group.failed, *group.refused][:_MAX_LISTED]:
         notes.append(f"{row['status']} {row['key']} ({row['policy']}, seed {row['seed']}): {_reason(row)}")
-    hidden = len(group.failed) + len(group.refused) - _SHOWN
+    hidden = len(group.failed) + len(group.refused) - _MAX_LISTED
     return [*notes, f"and {hidden} more"] if hidden > 0 else notes
 
 
 def _unfinished(comparison: Comparison) -> list[str]:
-    """What a reader must know first: of how much of the batch all of this is."""
+    """How much of the batch is driven, where not all of it is."""
     pairs = sum(len(compared.group.pairs) for compared in comparison.groups)
     return [f"unfinished: {'; '.join(comparison.unfinished)}, {pairs} pairs"] if comparison.unfinished else []
 
 
-def _alone(comparison: Comparison) -> list[str]:
+def _unmatched(comparison: Comparison) -> list[str]:
     return [
-        f"only in {side}, not compared: {'; '.join(names[:_SHOWN])}"
-        + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")
-        for side, names in zip("AB", comparison.alone, strict=True)
+        f"only in {side}, not compared: {'; '.join(names[:_MAX_LISTED])}"
+        + (f" and {len(names) - _MAX_LISTED} more" if len(names) > _MAX_LISTED else "")
+        for side, names in zip("AB", comparison.unmatched, strict=True)
         if names
     ]
 

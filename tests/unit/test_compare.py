@@ -135,8 +135,8 @@ def test_two_runs_of_several_policies_are_compared_policy_by_policy(tmp_path: Pa
         ("idm", "idm"),
         ("rash", "rash"),
     ]
-    assert len(found.alone[1]) == 1
-    assert "new" in found.alone[1][0]
+    assert len(found.unmatched[1]) == 1
+    assert "new" in found.unmatched[1][0]
 
 
 def test_demands_of_one_name_in_two_folders_are_not_mixed_up(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""What differences on equal seeds say of the figures that a verdict names: better, worse, or chance."""
+"""Which figures of B are better than those of A on equal seeds, which are worse, which show no difference."""
 
 import math
 from collections.abc import Mapping
@@ -9,7 +9,8 @@ from cosim.report.compare import PairedFigure
 from cosim.report.statistics import CONFIDENCE
 
 GOOD, BAD = "good", "bad"
-IN_WORDS = {
+# The measures that are judged, in words.
+MEASURES = {
     "collision_rate": "collisions",
     "av_caused_collision_rate": "AV-caused collisions",
     "mission_success_rate": "mission success",
@@ -28,36 +29,36 @@ IN_WORDS = {
 
 @dataclass(frozen=True, slots=True)
 class Changes:
-    """Of B against A, in words: what got better and worse, with interval, and what shows no difference."""
+    """Figures of B against A, in words: the better and worse ones with their intervals, and the others."""
 
     better: list[str]
     worse: list[str]
-    alike: list[str]
+    alike: list[str]  # no difference is shown
 
     @property
     def lines(self) -> list[str]:
-        """`better: ...`, `worse: ...`, `no difference shown: ...`; those that say something."""
-        said = {"better": self.better, "worse": self.worse, "no difference shown": self.alike}
-        return [f"{name}: {', '.join(found)}" for name, found in said.items() if found]
+        """`better: ...`, `worse: ...`, `no difference shown: ...`; those that are not empty."""
+        kinds = {"better": self.better, "worse": self.worse, "no difference shown": self.alike}
+        return [f"{name}: {', '.join(figures)}" for name, figures in kinds.items() if figures]
 
 
 def changes(figures: Mapping[str, PairedFigure]) -> Changes:
-    """Those of `IN_WORDS` that apply; one pair cannot show that there is no difference."""
-    found: dict[str, list[str]] = {GOOD: [], BAD: [], "": []}
-    for name, words in IN_WORDS.items():
+    """Those of `MEASURES` that apply; one pair cannot show that there is no difference."""
+    by_tone: dict[str, list[str]] = {GOOD: [], BAD: [], "": []}
+    for name, words in MEASURES.items():
         if name in figures and (figure := figures[name]).n:
             how = tone(figure)
             value = wording.interval(figure.difference, figure.measure, signed=True, n=figure.n)
             if how or figure.n >= wording.SEVERAL:
-                found[how].append(f"{words} {value}" if how else words)
-    return Changes(found[GOOD], found[BAD], found[""])
+                by_tone[how].append(f"{words} {value}" if how else words)
+    return Changes(by_tone[GOOD], by_tone[BAD], by_tone[""])
 
 
 def tone(figure: PairedFigure) -> str:
-    """Whether a difference is good or bad news; "" where chance may have made it.
+    """Whether a difference is good or bad; "" where chance can explain it.
 
-    That is where its interval holds 0, or, of a rate, McNemar's exact p is 5 % or more: with a handful of
-    crashes Tango's interval can leave 0 out where the exact test does not agree.
+    Chance can if the interval contains 0, or if McNemar's exact p of a rate is 5 % or more: with a handful of
+    crashes Tango's interval can exclude 0 where the exact test does not.
     """
     d = figure.difference
     chance = math.isnan(d.low) or d.low <= 0.0 <= d.high

@@ -14,22 +14,25 @@ from cosim.types import RESERVED, TIMINGS, WEIGHT
 
 Row = Mapping[str, Any]  # one episode: a line of episodes.parquet, NA as None
 
-SHARE = "share"  # unit of what is shown in per cent and compared in percentage points
+SHARE = "share"  # unit of figures that are shown in per cent, and compared in percentage points
 
 
 @dataclass(frozen=True, slots=True)
 class Measure:
-    """A figure by name: the share of episodes in which `column` is true or above 0, the column's mean, or its
-    sum over that of the column `per`."""
+    """A figure by name, of one of three kinds.
+
+    A rate is the share of episodes in which `column` is true or above 0. An incidence is the column's sum
+    over the sum of the column `per`. Any other measure is the column's mean.
+    """
 
     name: str
     column: str
     unit: str  # SHARE for a rate, "" where the run does not say
     better: str  # "higher", "lower" or ""
     is_rate: bool = False
-    per: str = ""  # the column of the exposure that events are counted in
-    scale: float = 1.0  # of the exposure: how much of it is one of the unit
-    more: tuple[str, ...] = ()  # columns whose events count too
+    per: str = ""  # of an incidence: the column of its exposure
+    scale: float = 1.0  # exposure in one unit: 1e6 km of "per million km"
+    more: tuple[str, ...] = ()  # further columns whose events count
 
     @property
     def is_share(self) -> bool:
@@ -50,7 +53,7 @@ class Measure:
         return np.array([events, exposure, weights(rows)])
 
     def figure(self, rows: Sequence[Row]) -> Figure:
-        """Of events per exposure: their weighted quotient over the rows in which neither is NA."""
+        """The weighted rate of an incidence over the rows in which neither events nor exposure are NA."""
         tally = self.tally(rows)
         return pooled_rate(*tally[:, ~np.isnan(tally).any(0)])
 
@@ -64,7 +67,7 @@ def _column(rows: Sequence[Row], name: str) -> list[float]:
     return [math.nan if row.get(name) is None else float(row[name]) for row in rows]
 
 
-# Shares of episodes, by the name that thresholds and tables use.
+# Shares of episodes, by the names that thresholds and tables use.
 RATES: dict[str, Measure] = {
     name: Measure(name, column, SHARE, better, True)
     for name, column, better in (
@@ -77,7 +80,7 @@ RATES: dict[str, Measure] = {
 }
 
 CRASHES = "crash_rate_per_million_km"
-# Events per distance and per vehicle time: all of them over all of it (figures.md, Near-misses).
+# Events per distance, pooled over all episodes (figures.md, Rates over many episodes).
 CRASH_RATES: dict[str, Measure] = {
     name: Measure(name, column, f"per million {km}", "lower", per=per, scale=1e6, more=more)
     for name, column, more, km, per in (
@@ -86,11 +89,12 @@ CRASH_RATES: dict[str, Measure] = {
         (f"all_{CRASHES}", "av_involved_collisions", ("hv_hv_collisions",), "vehicle-km", "vehicle_km"),
     )
 }
+# Events per vehicle time, pooled over all episodes (figures.md, Near-misses).
 NEAR_MISS_RATES: dict[str, Measure] = {
-    name: Measure(name, f"{who}near_misses_{kind}", f"per {hour}", "lower", per=hours)
-    for who, hour, hours in (("av_", "AV-hour", "av_hours"), ("", "vehicle-hour", "vehicle_hours"))
+    name: Measure(name, f"{prefix}near_misses_{kind}", f"per {hour}", "lower", per=hours)
+    for prefix, hour, hours in (("av_", "AV-hour", "av_hours"), ("", "vehicle-hour", "vehicle_hours"))
     for kind in ("ttc", "drac", "pet")
-    for name in (f"{who}near_misses_{kind}_per_{hour.lower().replace('-', '_')}",)
+    for name in (f"{prefix}near_misses_{kind}_per_{hour.lower().replace('-', '_')}",)
 }
 INCIDENCES = CRASH_RATES | NEAR_MISS_RATES
 
@@ -111,11 +115,11 @@ HEADLINE = (
 def measures(
     rows: Sequence[Row], units: Mapping[str, str] | None = None, better: Mapping[str, str] | None = None
 ) -> dict[str, Measure]:
-    """Every figure these rows hold, by name: rates, then events per exposure, then means, then timings.
+    """Every figure these rows hold, by name: rates, then incidences, then means, then timings.
 
-    `units` and `better` say by column what `cosim run --json` says of its metrics. Columns of yes and no
-    give rates, of numbers means; so a metric that is new has its figure without being listed here. Of tilted
-    episodes (estimate.md) only events per exposure and timings: what is not weighed is of no traffic.
+    `units` and `better` are by column, as `cosim run --json` gives them with its metrics. Columns of yes and
+    no are rates, columns of numbers means, so a new metric needs no entry here. Tilted episodes (estimate.md)
+    have only incidences and timings: unweighted figures of them describe no real traffic.
     """
     units, better = units or {}, better or {}
     kinds: dict[str, set[type]] = {}  # of the values that are not NA

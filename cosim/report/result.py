@@ -7,7 +7,7 @@ from pathlib import Path
 from cosim.files import cannot, whole
 from cosim.types import EpisodeResult, Metric
 
-# What happened to all vehicles that wanted to depart (figures.md, Everybody), in words.
+# Figures of all vehicles that were due to depart (figures.md, Everybody), in words.
 EVERYBODY = {
     "total_delay_s": "delay of all",
     "total_delay_av_s": "delay of AVs",
@@ -22,7 +22,7 @@ EVERYBODY = {
     "co2_kg": "CO2",
     "co2_kg_per_vehicle_km": "CO2 per vehicle-km",
 }
-# What an AV must not do (figures.md, The law), in words; in red when it is not 0.
+# Violations by AVs (figures.md, The law), in words; shown in red when not 0.
 LAW = {
     "red_light_violations": "red lights",
     "stop_sign_violations": "stop signs",
@@ -33,22 +33,21 @@ LAW = {
     "speeding_share": "speeding",
     "worst_speeding_mps": "worst speeding",
 }
-# Near-misses (figures.md), by the end of their columns' names.
+# Measures of near-misses (figures.md), by the suffix of their columns.
 NEAR_MISSES = {"ttc": "TTC < 1.5 s", "drac": "DRAC > 3.35 m/s2", "pet": "PET < 1 s"}
 
 
 def write_folder(folder: Path, result: EpisodeResult, text: str, outputs: Sequence[str] = ()) -> None:
-    """`result.json`, `manifest.json` and `metrics.txt` (`text`); each appears whole or not at all.
+    """Write `result.json`, `manifest.json` and `metrics.txt` (`text`); each appears whole or not at all.
 
-    Films, pages and SUMO's outputs of an earlier run in this folder go, but for `outputs`, this run's own.
-
-    Raises BadInput when it cannot be written.
+    Films, pages and SUMO outputs of an earlier run in the folder are deleted, except `outputs`, those of this
+    run. Raises BadInput when the folder cannot be written.
     """
-    everything = result.document()
+    document = result.document()
     texts = {
-        "manifest.json": json.dumps(everything["manifest"], indent=2),
+        "manifest.json": json.dumps(document["manifest"], indent=2),
         "metrics.txt": text,
-        "result.json": json.dumps(everything, indent=2),
+        "result.json": json.dumps(document, indent=2),
     }
     old = [*folder.glob("replay*.html"), *folder.glob("replay*.mp4"), *folder.glob("replay*.gif")]
     old += [file for file in (folder / "outputs").glob("*.xml") if file.stem not in outputs]
@@ -61,7 +60,7 @@ def write_folder(folder: Path, result: EpisodeResult, text: str, outputs: Sequen
 
 
 def figure(metric: Metric) -> str:
-    """One figure with its unit, as people read it; NA is said."""
+    """One figure with its unit, for people: `12.5 m`, `yes`, `NA`."""
     value = metric.value
     if value is None:
         return "NA"

@@ -1,4 +1,4 @@
-"""The figures of a run, cell by cell, with intervals and counts: what summary.json holds."""
+"""The figures of a run, cell by cell, with intervals and counts: the content of summary.json."""
 
 import json
 import math
@@ -14,7 +14,7 @@ from cosim.report.statistics import CONFIDENCE, mean, pooled_rate, rule_of_three
 from cosim.types import IDENTITY, TIMINGS
 from cosim.workers.tasks import OK, STATUSES
 
-# What must be equal for episodes to be counted together; rows of different cells never are.
+# Columns that must be equal for episodes to be counted together. Rows of different cells never are.
 GROUP = tuple(name for name in IDENTITY if name not in ("policy_label", "seed"))
 
 
@@ -25,10 +25,11 @@ def summarize(
     *,
     seed: int = 0,
 ) -> dict[str, Any]:
-    """Plain JSON values: counts of the whole, and one entry per group with its rates, means and timings.
+    """Plain JSON values: counts of the run, and one entry per group with its rates, means and timings.
 
-    Only episodes of status ok enter a figure; `status` says how many there are of each. Every figure has its
-    `n` beside it and its `na`: ok episodes in which it does not apply. `seed` fixes the bootstrap.
+    Only episodes of status ok enter a figure; `status` counts the episodes by status. Every figure has `n`,
+    the episodes that it is from, and `na`, the ok episodes in which it does not apply. `seed` fixes the
+    bootstrap.
     """
     known = measures(rows, units, better)
     return {
@@ -43,7 +44,7 @@ def summarize(
 
 
 def groups(rows: Sequence[Row]) -> list[tuple[dict[str, Any], list[Row]]]:
-    """The rows by scenario x demand x policy x ... (`GROUP`) and cell, in the order they come."""
+    """The rows by scenario x demand x policy x ... (`GROUP`) and cell, in the order of the rows."""
     found: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
         found.setdefault((*(row.get(name) for name in GROUP), row.get("cell")), []).append(row)
@@ -77,7 +78,7 @@ def group_figures(rows: Sequence[Row], known: Mapping[str, Measure], seed: int =
 
 
 def rate_document(measure: Measure, rows: Sequence[Row]) -> dict[str, Any]:
-    """Share of the rows with Wilson's interval; `rule_of_three` where it was never seen."""
+    """Share of the rows with Wilson's interval; `rule_of_three` where no row is a hit."""
     values = [v for v in measure.values(rows) if not math.isnan(v)]
     hits = int(sum(values))
     never = bool(values) and hits == 0
@@ -126,23 +127,23 @@ def status_counts(rows: Sequence[Row]) -> dict[str, int]:
 
 
 def not_comparable(row: Row) -> bool:
-    """Whether an episode says of itself that it must not be compared (`EpisodeResult.validity`)."""
+    """Whether an episode is marked as not comparable (`EpisodeResult.validity`)."""
     return row.get("status", OK) == OK and row.get("comparable") is False
 
 
 def mission_guessed(row: Row) -> bool:
-    """Whether nobody named the episode's mission vehicle."""
+    """Whether the episode's mission vehicle was guessed, since neither scenario nor caller named it."""
     return bool(row.get("mission_guessed"))
 
 
 def reasons(rows: Sequence[Row]) -> dict[str, int]:
-    """Why episodes are not comparable and how many say so; numbers in a reason become "n"."""
-    found: Counter[str] = Counter()
+    """Why episodes are not comparable, with the number of episodes; numbers in a reason become "n"."""
+    counts: Counter[str] = Counter()
     for row in rows:
-        said = row.get("not_comparable_because") or []
-        for reason in json.loads(said) if isinstance(said, str) else said:
-            found[re.sub(r"(?<![\w.])\d+(\.\d+)?", "n", reason)] += 1
-    return dict(found.most_common())
+        listed = row.get("not_comparable_because") or []
+        for reason in json.loads(listed) if isinstance(listed, str) else listed:
+            counts[re.sub(r"(?<![\w.])\d+(\.\d+)?", "n", reason)] += 1
+    return dict(counts.most_common())
 
 
 def _label(rows: Sequence[Row]) -> str:

@@ -25,12 +25,12 @@ _FORM = re.compile(
         \s*(?P<unit>\S.*?)?\s*""",
     re.VERBOSE,
 )
-_SLACK = 1e-12  # 1 of 200 is not more than 0.5 %, whatever float arithmetic makes of it
+_SLACK = 1e-12  # for rounding: 1 of 200 is not more than 0.5 %
 
 
 @dataclass(frozen=True, slots=True)
 class Threshold:
-    """One `--fail-on`: fails when the figure is beyond `limit` in the direction of `sense`."""
+    """One `--fail-on`: fails if the figure is beyond `limit` in the direction of `sense`."""
 
     text: str  # as the user typed it
     measure: Measure
@@ -40,41 +40,41 @@ class Threshold:
     kind: str  # DIFFERENCE, CHANGE or ABSOLUTE
 
     def of(self, figure: Figure) -> float:
-        """The number that is held against the limit; nan where there is none."""
+        """The value or bound of a figure that is compared with the limit; nan where there is none."""
         return {"value": figure.value, "upper": figure.high, "lower": figure.low}[self.bound]
 
     def fails(self, number: float) -> bool:
-        """Whether it is beyond the limit. NA, or no such bound, fails: it proves nothing."""
+        """Whether a number is beyond the limit. nan (NA, or no such bound) fails: it proves nothing."""
         slack = _SLACK * max(1.0, abs(self.limit))
         return not (number <= self.limit + slack if self.sense == ">" else number >= self.limit - slack)
 
 
 def parse(text: str, known: Mapping[str, Measure]) -> Threshold:
-    """Read one threshold; `known`: the figures that the runs hold.
+    """Read one threshold; `known`: the figures of the runs, by name.
 
     Raises:
-        BadInput: not of that form, an unknown metric (with the nearest name), a unit that is not its own.
+        BadInput: another form, an unknown metric (with the nearest name), a unit of another kind.
     """
-    found = _FORM.fullmatch(text)
-    if found is None:
+    parts = _FORM.fullmatch(text)
+    if parts is None:
         problem = "write METRIC[.upper|.lower] > or < [+|-]NUMBER[UNIT], as in 'collision_rate > +0.5pp'"
         raise _wrong(problem, text)
     names = {**{m.column: m for m in known.values() if m.is_rate}, **known}  # `crashed` is `collision_rate`
-    measure = names.get(found["metric"])
+    measure = names.get(parts["metric"])
     if measure is None:
-        near = hint(found["metric"], known) or f", there are: {', '.join(known)}"
-        raise _wrong(f"unknown metric {found['metric']!r}{near}", text)
-    bound = found["bound"] or "value"
+        near = hint(parts["metric"], known) or f", there are: {', '.join(known)}"
+        raise _wrong(f"unknown metric {parts['metric']!r}{near}", text)
+    bound = parts["bound"] or "value"
     if bound not in ("value", "upper", "lower"):
         raise _wrong(f"unknown bound .{bound}: there are .upper and .lower", text)
-    number = float(found["number"])
-    kind, scale = _unit(measure, found["sign"], number, found["unit"], text)
-    limit = scale * number * (-1.0 if found["sign"] == "-" else 1.0)
-    return Threshold(" ".join(text.split()), measure, bound, found["sense"], limit, kind)
+    number = float(parts["number"])
+    kind, scale = _unit(measure, parts["sign"], number, parts["unit"], text)
+    limit = scale * number * (-1.0 if parts["sign"] == "-" else 1.0)
+    return Threshold(" ".join(text.split()), measure, bound, parts["sense"], limit, kind)
 
 
 def _unit(measure: Measure, sign: str, number: float, unit: str | None, text: str) -> tuple[str, float]:
-    """What is bounded, and what one of the unit is in the metric's own."""
+    """The threshold's kind, and its unit in the metric's own unit."""
     kind = DIFFERENCE if sign else ABSOLUTE
     if unit is None and measure.is_share and number != 0.0:
         raise _wrong(f"{measure.name} is a share: write {'pp' if sign else '%'} behind the number", text)

@@ -1,4 +1,4 @@
-"""How figures are spelled for people: per cent and percentage points, units, intervals, NA."""
+"""How figures are written for people: per cent and percentage points, units, intervals, NA."""
 
 import math
 from collections.abc import Mapping
@@ -8,7 +8,7 @@ from cosim.report.figures import Measure
 from cosim.report.statistics import Figure
 
 NA_TEXT = "NA"
-SEVERAL = 2  # episodes from which on an interval says something
+SEVERAL = 2  # episodes or pairs from which on an interval is shown
 
 
 def number(
@@ -61,7 +61,7 @@ def value_and_bounds(
 
 
 def sample(counts: Mapping[str, Any]) -> str:
-    """`3/40` of a rate, `12 in 3.4 h` of an incidence, `n 40` of a mean where others are NA."""
+    """`3/40` of a rate, `12 in 3.4 h` of an incidence; `n 40, 2 NA` of a mean with episodes that are NA."""
     if counts.get("events") is not None:
         text = events(counts["events"], counts["exposure"], counts["per"])
         return f"{text}, {counts['na']} NA" if counts.get("na") else text
@@ -100,7 +100,7 @@ def group(identity: Mapping[str, Any], *, policy: bool = True) -> str:
 
 
 def _digits(value: float, signed: bool, places: int | None = None) -> str:
-    """Never an exponent below a million, never a minus before a zero."""
+    """The number without an exponent below a million, and without a sign before a zero."""
     sign = "+" if signed else ""
     size = abs(value)
     if math.isinf(value) or size >= 1e6:

@@ -172,6 +172,8 @@ def test_as_many_episodes_as_are_said_to_be_needed_make_the_interval_as_wide(spr
     many = round(crash_rate.needed(few) / 50.0) * 50
     found = crash.figure(drawn(many))
     assert many > 150
-    assert (found.high - found.low) / 2.0 == pytest.approx(crash_rate.HALF * found.value, rel=0.08)
+    assert (found.high - found.low) / 2.0 == pytest.approx(
+        crash_rate.USEFUL_HALF_WIDTH * found.value, rel=0.08
+    )
     assert crash_rate.needed(drawn(many)) == pytest.approx(many, rel=0.2)
     assert math.isinf(crash_rate.needed([row | {"av_involved_collisions": 0.0} for row in few]))

@@ -1,4 +1,4 @@
-"""What `cosim evaluate` leaves in a run folder, written and read back: rows, manifest, summary."""
+"""The run folder of `cosim evaluate`, written and read back: rows, manifest, summary."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,12 +15,12 @@ from cosim.errors import BadInput
 from cosim.files import read_json
 from cosim.report.figures import Measure, Row, measures
 from cosim.report.summary import summarize
-from cosim.scenario import CONFIG, file_name
 from cosim.scenario.manifest import checked
 from cosim.scenario.options import COLUMNS, FLEET
 from cosim.types import OnCollision, Traffic
 from cosim.workers.tasks import OK
 
+# Options that pairs must agree in and that are no columns of a row: those asked for, and hashes.
 SETTINGS = (*(name for name in COLUMNS if name not in FLEET), "errors_sha256", "sensing_sha256", "tilt")
 NEEDED = ("key", "cell", "status", "scenario", "demand", "policy", "seed")
 
@@ -45,7 +45,7 @@ class Run:
 
     @property
     def planned(self) -> int | None:
-        """How many episodes the run is to have; None where it does not say."""
+        """How many episodes the run is to have; None where the manifest does not say."""
         seeds, cells = self.manifest.get("seeds"), self.manifest.get("cells")
         if not (isinstance(seeds, list) and len(seeds) == 2 and cells):
             return None
@@ -53,15 +53,15 @@ class Run:
 
     @property
     def missing(self) -> int:
-        """How many of these have no row."""
+        """How many planned episodes have no row."""
         return max((self.planned or 0) - len(self.rows), 0)
 
     def case(self, row: Row) -> dict[str, Any]:
-        """What was asked for (`EpisodeOptions`), without policy and seed; {} where not known."""
+        """The options asked for (`EpisodeOptions`), without policy and seed; {} where not known."""
         return {k: v for k, v in self._cell(row).get("case", {}).items() if k not in ("policy", "seed")}
 
     def settings(self, row: Row) -> dict[str, Any]:
-        """What no column says of how an episode was driven (`SETTINGS`); s, and the mission as asked for."""
+        """Options of an episode that no column of its row has (`SETTINGS`); times in s."""
         driven, asked = self._cell(row).get("manifest", {}), self.case(row)
         times = driven.get("timing", {})
         return {name: asked.get(option.field) for name, option in COLUMNS.items()} | {
@@ -75,12 +75,12 @@ class Run:
         }
 
     def _cell(self, row: Row) -> Mapping[str, Any]:
-        found: Mapping[str, Any] = self.manifest.get("cells", {}).get(row["cell"], {})
-        return found
+        cell: Mapping[str, Any] = self.manifest.get("cells", {}).get(row["cell"], {})
+        return cell
 
 
 def export(folder: Path, rows: Sequence[Row], manifest: Mapping[str, Any], planned: int) -> dict[str, Any]:
-    """Write the rows, the manifest and their summary, which is returned; `planned`: episodes of the run.
+    """Write rows, manifest and summary, and return the summary; `planned`: episodes of the run.
 
     Raises CosimError as `cosim.batch.export`.
     """
@@ -90,10 +90,14 @@ def export(folder: Path, rows: Sequence[Row], manifest: Mapping[str, Any], plann
 
 
 def read(path: str | Path, *, unfinished: bool = False) -> Run:
-    """The run in the folder `path`; `unfinished`: also one that goes on or was stopped, as far as it is.
+    """The run in the folder `path`.
+
+    Args:
+        path: the run folder.
+        unfinished: whether a run may be read that continues or was interrupted, as far as it is driven.
 
     Raises:
-        BadInput: no such folder, no `episodes.parquet` in it, or one that is not ours; no episode yet.
+        BadInput: no such folder, no `episodes.parquet` in it, or another program's; no episode yet.
     """
     folder = Path(path)
     if not folder.is_dir():
@@ -114,29 +118,19 @@ def read(path: str | Path, *, unfinished: bool = False) -> Run:
             raise BadInput("has no such column: is it a run of `cosim evaluate`?", file=file, field=name)
     file = folder / "manifest.json"
     manifest = checked(read_json(file), file) if file.is_file() else {}
-    return Run(folder, _named_alike(rows, manifest.get("cells", {})), manifest)
+    return Run(folder, _with_policy_names(rows), manifest)
 
 
 def _so_far(folder: Path) -> Run:
-    """What the store of an unfinished run holds, as it will be read when the run has ended."""
+    """The episodes in the store of an unfinished run, in the form of a finished one."""
     with Store.in_folder(folder) as store:
         if not (rows := store.rows()):
             raise BadInput("has no episode yet", file=folder)
         manifest = {**store.document(), "cells": store.cells()}
-    return Run(folder, _named_alike(files.arrow(rows).to_pylist(), manifest["cells"]), manifest)
+    return Run(folder, _with_policy_names(files.arrow(rows).to_pylist()), manifest)
 
 
-def _named_alike(rows: list[dict[str, Any]], cells: Mapping[str, Any]) -> list[Row]:
-    """Episodes that failed have the policy's name as typed; give them the one that it gives itself. Earlier
-    runs named a .sumocfg without its folder; give it the name that it has now."""
+def _with_policy_names(rows: list[dict[str, Any]]) -> list[Row]:
+    """The rows with the name that a policy gives itself: rows of failed episodes have it as typed."""
     names = {row["cell"]: row["policy"] for row in rows if row["status"] == OK}
-    configs = {cell: str(about.get("case", {}).get("what", "")) for cell, about in cells.items()}
-    worlds = {cell: file_name(Path(what)) for cell, what in configs.items() if what.endswith(CONFIG)}
-    return [
-        {
-            **row,
-            "policy": names.get(row["cell"], row["policy"]),
-            "scenario": worlds.get(row["cell"], row["scenario"]),
-        }
-        for row in rows
-    ]
+    return [{**row, "policy": names.get(row["cell"], row["policy"])} for row in rows]

@@ -457,16 +457,6 @@ def test_a_guessed_mission_vehicle_feeds_no_gate(
     assert "2 pairs with a guessed mission vehicle" in out
 
 
-def test_a_file_that_an_earlier_version_named_without_its_folder_is_the_same_world(tmp_path: Path) -> None:
-    before = {"scenario": ["run"] * 3}
-    one = write(tmp_path / "a", cell("idm", 3, what="/x/city/run.sumocfg", columns=before))
-    two = write(
-        tmp_path / "b", cell("idm", 3, what="/y/city/run.sumocfg", columns={"scenario": ["city/run"] * 3})
-    )
-    found = compare(side(str(one)), side(str(two)))
-    assert [len(compared.group.pairs) for compared in found.groups] == [3]
-
-
 # ---- files ----
 
 

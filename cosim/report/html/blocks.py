@@ -1,6 +1,6 @@
-"""The rows of a run as the report shows them: blocks of equal traffic, and in each the series that drove it.
+"""The rows of a run as the report shows them: blocks of equal traffic, each with a series per policy.
 
-Only figures of one block stand side by side: its series met the same traffic on the same seeds.
+Only figures of one block stand side by side: its series drove the same traffic on the same seeds.
 """
 
 import json
@@ -15,7 +15,7 @@ from cosim.report.run_folder import Run
 from cosim.report.summary import GROUP, group_figures, groups
 from cosim.workers.tasks import OK
 
-EGOISTIC = "idm"  # the baseline of the papers: AVs that nobody commands
+BASELINE = "idm"  # of the papers: AVs without commands
 TRAFFIC = tuple(name for name in GROUP if name not in ("policy", "svo_deg"))
 
 
@@ -26,8 +26,8 @@ class Series:
     identity: dict[str, Any]  # by the names of `GROUP`, and cell, policy_label
     rows: list[Row]
     known: dict[str, Measure]
-    label: str  # tells it apart within its block
-    colour: int  # the policy's place in the run
+    label: str  # distinct within the block
+    colour: int  # the policy's index in the run
 
     @cached_property
     def ok(self) -> list[Row]:
@@ -41,8 +41,7 @@ class Series:
 
     def counts(self, name: str) -> dict[str, Any]:
         """Value, interval and counts of one measure; {} where the run does not have it."""
-        found = self.figures
-        kinds = (found[kind] for kind in ("rates", "incidences", "means", "timings"))
+        kinds = (self.figures[kind] for kind in ("rates", "incidences", "means", "timings"))
         return next((kind[name] for kind in kinds if name in kind), {})
 
     def values(self, name: str) -> list[float]:
@@ -62,37 +61,36 @@ class Difference:
 
 @dataclass(frozen=True)
 class Block:
-    """Series that met the same traffic."""
+    """Series that drove the same traffic."""
 
     identity: dict[str, Any]  # by the names of `TRAFFIC`
     series: list[Series]
 
     def differences(self, names: Iterable[str]) -> list[Difference]:
-        """Every other series against the baseline: `idm` where it is there, else the first one."""
+        """Every other series against the baseline: `idm`, if possible at its SVO, else the first series."""
         names = tuple(names)
-        egoists = [s for s in self.series if s.identity["policy"] == EGOISTIC]
-        found = []
+        baselines = [s for s in self.series if s.identity["policy"] == BASELINE]
+        differences = []
         for series in self.series:
-            alike = [s for s in egoists if s.identity["svo_deg"] == series.identity["svo_deg"]]
-            baseline = [*alike, *egoists, *self.series][0]
-            if series is baseline or series in egoists:
+            same_svo = [s for s in baselines if s.identity["svo_deg"] == series.identity["svo_deg"]]
+            baseline = [*same_svo, *baselines, *self.series][0]
+            if series is baseline or series in baselines:
                 continue
             before = {row["seed"]: row for row in baseline.ok}
             if pairs := [(before[row["seed"]], row) for row in series.ok if row["seed"] in before]:
                 figures = {n: paired(series.known[n], pairs) for n in names if n in series.known}
-                found.append(Difference(series, baseline, figures, len(pairs)))
-        return found
+                differences.append(Difference(series, baseline, figures, len(pairs)))
+        return differences
 
 
 def blocks(run: Run) -> list[Block]:
-    """The run's cells by traffic, in the order they come."""
-    found: dict[str, list[tuple[dict[str, Any], list[Row]]]] = {}
+    """The run's cells by traffic, in the order of the rows."""
+    by_traffic: dict[str, list[tuple[dict[str, Any], list[Row]]]] = {}
     for identity, rows in groups(run.rows):
         case = {k: v for k, v in run.case(rows[0]).items() if k not in ("svo_deg", "outputs")}
         traffic = [identity[name] for name in TRAFFIC]
-        found.setdefault(json.dumps([traffic, case], sort_keys=True, default=str), []).append(
-            (identity, rows)
-        )
+        key = json.dumps([traffic, case], sort_keys=True, default=str)
+        by_traffic.setdefault(key, []).append((identity, rows))
     colours = {policy: k for k, policy in enumerate(run.policies)}
     return [
         Block(
@@ -102,12 +100,12 @@ def blocks(run: Run) -> list[Block]:
                 for (identity, rows), label in zip(members, _labels([i for i, _ in members]), strict=True)
             ],
         )
-        for members in found.values()
+        for members in by_traffic.values()
     ]
 
 
 def _labels(identities: list[dict[str, Any]]) -> list[str]:
-    """The policy, its SVO where several are there, its cell where even that is not enough."""
+    """The policy; with its SVO if the block has several; with its cell if labels would still be equal."""
     several = len({identity["svo_deg"] for identity in identities}) > 1
     labels = [
         f"{i['policy']} {i['svo_deg']:g}°" if several and i["svo_deg"] is not None else str(i["policy"])

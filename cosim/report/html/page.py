@@ -1,4 +1,4 @@
-"""Puts the report together: verdict, tables, plots, worst episodes, failures, manifest -> one HTML text."""
+"""The report as one HTML text: verdict, tables, plots, worst episodes, failures, manifest."""
 
 import json
 import math
@@ -23,18 +23,18 @@ from cosim.scenario.traffic import in_words
 from cosim.workers.tasks import OK
 
 FILE = "report.html"
-PLOTTED = 12  # blocks that get plots: a page of more cannot be read, and each takes a second to draw
-FINDINGS = 8  # before the fold
-WORST, FAILURES = 12, 50  # listed by name
-MANIFEST = 200_000  # characters of it on the page
-COMPARED = tuple(name for name in HEADLINE if name != "veto_rate")  # of each block against its baseline
-OF_ALL = tuple(name for name in EVERYBODY if name != "co2_kg")  # which stands per km too
+MAX_PLOTTED_BLOCKS = 12  # more are hard to read, and drawing one takes a second
+FINDINGS_SHOWN = 8  # without unfolding
+MAX_WORST, MAX_FAILURES = 12, 50  # episodes listed by name
+MAX_MANIFEST_CHARACTERS = 200_000
+COMPARED_FIGURES = tuple(name for name in HEADLINE if name != "veto_rate")  # with the baseline of each block
+FIGURES_OF_ALL = tuple(name for name in EVERYBODY if name != "co2_kg")  # CO2 per km is there
 
 
 def write(run: Run, path: Path | None = None, shown: str | None = None) -> Path:
     """Write the report, by default `report.html` in the run's folder; whole or not at all.
 
-    `shown`: the folder as commands on the page shall name it.
+    `shown`: the run's folder in the commands on the page.
 
     Raises:
         BadInput: it cannot be written there.
@@ -55,28 +55,28 @@ def html(run: Run, shown: str | None = None) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    found = blocks(run)
-    differences, everybody, crashes, closer = (
-        [block.differences(which) for block in found]
-        for which in (COMPARED, OF_ALL, CRASH_RATES, NEAR_MISS_RATES)
+    all_blocks = blocks(run)
+    differences, everybody, crashes, near_misses = (
+        [block.differences(which) for block in all_blocks]
+        for which in (COMPARED_FIGURES, FIGURES_OF_ALL, CRASH_RATES, NEAR_MISS_RATES)
     )
     folder = str(run.path) if shown is None else shown
-    wrong = [row for row in run.rows if row["status"] != OK]
+    failures = [row for row in run.rows if row["status"] != OK]
     return environment.get_template("page.html").render(
         name=run.path.resolve().name,
-        verdict=_verdict(run, found),
-        findings=_findings(found, differences, everybody),
-        shown=FINDINGS,
-        figures=tables.figures(found, run.measures) if found else None,
-        everybody=tables.chosen(found, run.measures, OF_ALL),
-        law=tables.law(found, run.measures),
-        crashes=tables.chosen(found, run.measures, CRASH_RATES),
-        near_misses=tables.chosen(found, run.measures, NEAR_MISS_RATES),
+        verdict=_verdict(run, all_blocks),
+        findings=_findings(all_blocks, differences, everybody),
+        shown=FINDINGS_SHOWN,
+        figures=tables.figures(all_blocks, run.measures) if all_blocks else None,
+        everybody=tables.chosen(all_blocks, run.measures, FIGURES_OF_ALL),
+        law=tables.law(all_blocks, run.measures),
+        crashes=tables.chosen(all_blocks, run.measures, CRASH_RATES),
+        near_misses=tables.chosen(all_blocks, run.measures, NEAR_MISS_RATES),
         sections=[
-            _section(b, differences[k], everybody[k], crashes[k], closer[k], k < PLOTTED)
-            for k, b in enumerate(found)
+            _section(b, differences[k], everybody[k], crashes[k], near_misses[k], k < MAX_PLOTTED_BLOCKS)
+            for k, b in enumerate(all_blocks)
         ],
-        plotted=PLOTTED,
+        plotted=MAX_PLOTTED_BLOCKS,
         worst=[
             {
                 "why": why,
@@ -86,10 +86,11 @@ def html(run: Run, shown: str | None = None) -> str:
             }
             for why, row in _worst(run.rows)
         ],
-        wrong=[
-            {"row": row, "group": wording.group(row), "line": _last_line(row)} for row in wrong[:FAILURES]
+        failures=[
+            {"row": row, "group": wording.group(row), "line": _last_line(row)}
+            for row in failures[:MAX_FAILURES]
         ],
-        more_wrong=max(len(wrong) - FAILURES, 0),
+        more_failures=max(len(failures) - MAX_FAILURES, 0),
         reasons=reasons([row for row in run.rows if not_comparable(row)]),
         traffic=_traffic(run),
         manifest=_manifest(run),
@@ -99,12 +100,12 @@ def html(run: Run, shown: str | None = None) -> str:
 # ---- inside ----
 
 
-def _verdict(run: Run, found: Sequence[Block]) -> dict[str, Any]:
-    """What can be said of the run as a whole: whether all was driven, and whether it may be compared."""
+def _verdict(run: Run, all_blocks: Sequence[Block]) -> dict[str, Any]:
+    """The run as a whole: whether every episode was driven, and whether episodes may be compared."""
     status = {name: count for name, count in status_counts(run.rows).items() if count}
     total, ok = len(run.rows), status.get(OK, 0)
     missing = run.missing
-    odd = sum(not_comparable(row) for row in run.rows)
+    unfit = sum(not_comparable(row) for row in run.rows)
     if missing:
         words = (
             f"{missing} of {_count(total + missing, 'episode')} not driven: `cosim evaluate --resume` goes on"
@@ -117,37 +118,37 @@ def _verdict(run: Run, found: Sequence[Block]) -> dict[str, Any]:
         words = f"{total - ok} of {_count(total, 'episode')} gave no figures"
     else:
         words = f"All {_count(total, 'episode')} finished" if total > 1 else "Finished"
-    cells = sum(len(block.series) for block in found)
+    cells = sum(len(block.series) for block in all_blocks)
     return {
         "words": words,
-        "tone": "bad" if not ok else "warn" if ok < total or odd or missing else "good",
+        "tone": "bad" if not ok else "warn" if ok < total or unfit or missing else "good",
         "status": status,
         "episodes": _count(total, "episode"),
         "cells": _count(cells, "cell"),
-        "not_comparable": odd,
+        "not_comparable": unfit,
         "guessed": sum(mission_guessed(row) for row in run.rows),
     }
 
 
 def _findings(
-    found: Sequence[Block],
+    all_blocks: Sequence[Block],
     differences: Sequence[list[Difference]],
     everybody: Sequence[list[Difference]],
 ) -> list[dict[str, Any]]:
-    """Per block and series: what is better and worse than the baseline beyond chance, and what is not."""
-    lines = []
-    for block, mine, everybodys in zip(found, differences, everybody, strict=True):
-        for difference, others in zip(mine, everybodys, strict=True):
-            lines.append(
+    """Per block and series: figures better or worse than the baseline's beyond chance, and the others."""
+    findings = []
+    for block, headline, of_all in zip(all_blocks, differences, everybody, strict=True):
+        for difference, of_all_vehicles in zip(headline, of_all, strict=True):
+            findings.append(
                 {
                     "block": wording.group(block.identity),
                     "series": difference.series.label,
                     "baseline": difference.baseline.label,
                     "pairs": difference.pairs,
-                    "changes": changes(difference.figures | others.figures),
+                    "changes": changes(difference.figures | of_all_vehicles.figures),
                 }
             )
-    return lines
+    return findings
 
 
 def _section(
@@ -155,7 +156,7 @@ def _section(
     differences: list[Difference],
     everybody: list[Difference],
     crashes: list[Difference],
-    closer: list[Difference],
+    near_misses: list[Difference],
     draw: bool,
 ) -> dict[str, Any]:
     return {
@@ -164,26 +165,26 @@ def _section(
         "drawn": draw,
         "ok": sum(len(s.ok) for s in block.series),
         "differences": tables.differences(differences),
-        "everybody": tables.differences([d for d in everybody if any(f.n for f in d.figures.values())]),
-        "crashes": tables.differences([d for d in crashes if any(f.n for f in d.figures.values())]),
-        "near_misses": tables.differences([d for d in closer if any(f.n for f in d.figures.values())]),
+        "everybody": tables.differences(everybody),
+        "crashes": tables.differences(crashes),
+        "near_misses": tables.differences(near_misses),
         "everything": tables.everything(block),
     }
 
 
 def _worst(rows: Sequence[Row]) -> list[tuple[str, Row]]:
-    """What was bad about an episode, and the episode: AV-caused crashes, other crashes, then the narrowest
-    escapes; crashes of one kind by the time they happened at."""
-    found = [(*_rank(row), str(row["key"]), row) for row in rows if row["status"] == OK]
-    bad = sorted((f for f in found if f[2]), key=lambda f: (f[0], f[1], f[3]))
-    return [(why, row) for _, _, why, _, row in bad[:WORST]]
+    """The worst episodes, each with its reason: AV-caused collisions, other collisions (both by time), then
+    the smallest times to collision."""
+    ranked = [(*_rank(row), str(row["key"]), row) for row in rows if row["status"] == OK]
+    bad = sorted((rank for rank in ranked if rank[2]), key=lambda rank: (rank[0], rank[1], rank[3]))
+    return [(why, row) for _, _, why, _, row in bad[:MAX_WORST]]
 
 
 def _rank(row: Row) -> tuple[int, float, str]:
-    """Class, order within it, why; "" where nothing is bad enough."""
+    """Class, order within the class, and reason; the reason is "" where nothing is bad enough."""
     text = row.get("collision_list")
-    found = json.loads(text) if isinstance(text, str) else (text or [])
-    first = min(found, key=lambda c: (not c.get("av_caused"), c.get("time") or 0.0), default=None)
+    collisions = json.loads(text) if isinstance(text, str) else (text or [])
+    first = min(collisions, key=lambda c: (not c.get("av_caused"), c.get("time") or 0.0), default=None)
     when = 0.0 if first is None else float(first.get("time") or 0.0)
     what = ""
     if first is not None:
@@ -198,13 +199,13 @@ def _rank(row: Row) -> tuple[int, float, str]:
 
 
 def _last_line(row: Row) -> str:
-    """Of an episode without figures: the last thing its simulation said, else our own words."""
+    """The last line that the simulation of a failed episode wrote, else cosim's own error."""
     lines = [line.strip() for line in str(row.get("stderr") or "").splitlines() if line.strip()]
     return lines[-1] if lines else str(row.get("error") or "no reason given")
 
 
 def _traffic(run: Run) -> dict[str, str]:
-    """A user's file -> whose options drove its traffic."""
+    """A user's file -> the SUMO options that its traffic was driven with, in words."""
     cells = run.manifest.get("cells", {})
     about = {row["scenario"]: cells.get(row["cell"], {}).get("manifest", {}) for row in run.rows}
     return {name: words for name, driven in about.items() if (words := in_words(driven))}
@@ -218,8 +219,8 @@ def _manifest(run: Run) -> dict[str, Any]:
         "began": run.manifest.get("began"),
         "seeds": f"{seeds[0]} to {seeds[1] - 1}" if isinstance(seeds, list) and len(seeds) == 2 else None,
         "versions": run.manifest.get("versions") or {},
-        "text": text[:MANIFEST] if run.manifest else "",
-        "cut": len(text) > MANIFEST,
+        "text": text[:MAX_MANIFEST_CHARACTERS] if run.manifest else "",
+        "cut": len(text) > MAX_MANIFEST_CHARACTERS,
     }
 
 

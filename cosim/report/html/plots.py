@@ -1,6 +1,6 @@
-"""The plots of the report, one row per series each: rates, distances, times to collision, Pareto, vetoes.
+"""The plots of the report, with one row per series: rates, distances, times to collision, Pareto, vetoes.
 
-matplotlib's SVG made fit for a page: colours of the page's theme, its fonts, ids that do not clash.
+matplotlib's SVG is adapted to the page: colours of the page's theme, its fonts, unique ids.
 """
 
 import hashlib
@@ -21,12 +21,12 @@ from matplotlib.ticker import MaxNLocator
 from cosim.report import statistics, wording
 from cosim.report.html.blocks import Block, Series
 
-CRITICAL = 1.5  # s, below it a conflict is serious (cosim.metrics.time_to_collision)
-HORIZON = 10.0  # s, times to collision beyond it are NA
-BIN = 0.5  # s
-WIDTH = 5.6  # inches; 1 in the drawing is 72 px on the page, so a phone shows its letters almost full size
+CRITICAL_TTC = 1.5  # s; a shorter one is a serious conflict (cosim.metrics.time_to_collision)
+TTC_HORIZON = 10.0  # s; a longer one is NA
+BIN_S = 0.5
+WIDTH_INCHES = 5.6  # an inch is 72 px on the page, so a phone shows letters almost full size
 
-# matplotlib wants colours, the page has variables that differ in light and dark: these stand in for them.
+# Stand-ins for the page's variables, which differ in light and dark: matplotlib needs fixed colours.
 INK, FAINT, GRID = "#010101", "#020202", "#030303"
 SERIES = tuple(f"#0400{k:02x}" for k in range(1, 9))
 _THEME = {
@@ -62,7 +62,7 @@ _STYLE: Any = {
 
 @dataclass(frozen=True, slots=True)
 class Plot:
-    """A drawing with what it shows."""
+    """A drawing with its title."""
 
     title: str
     svg: Markup
@@ -70,7 +70,7 @@ class Plot:
 
 
 def plots(block: Block) -> list[Plot]:
-    """Every plot that has something to show."""
+    """The plots of a block that have data."""
     series = [s for s in block.series if s.ok]
     share = ("% of episodes", "Point: share; bar: Wilson's 95 % interval; beside it the counts.")
     mean = ("% of decisions", "Point: mean over episodes; bar: bootstrap 95 % interval.")
@@ -95,12 +95,12 @@ def plots(block: Block) -> list[Plot]:
 
 def _figures(series: list[Series], name: str, title: str, label: str, note: str) -> Plot | None:
     """Shares or means of shares, in per cent with their intervals."""
-    found = {id(s): s.counts(name) for s in series}
-    if not any(f.get("n") for f in found.values()):
+    figures = {id(s): s.counts(name) for s in series}
+    if not any(f.get("n") for f in figures.values()):
         return None
 
     def draw(axes: Axes, place: float, one: Series) -> str:
-        f, colour = found[id(one)], _colour(one)
+        f, colour = figures[id(one)], _colour(one)
         if not f.get("n"):
             return "NA"
         value, low, high = (100 * (f["value"] if f[k] is None else f[k]) for k in ("value", "low", "high"))
@@ -138,7 +138,7 @@ def _times(series: list[Series]) -> Plot | None:
     name, title = "min_ttc_s", "Smallest time to collision in each episode"
     if not any(s.values(name) for s in series):
         return None
-    edges = np.arange(0.0, HORIZON + BIN / 2, BIN)  # [k+1] s
+    edges = np.arange(0.0, TTC_HORIZON + BIN_S / 2, BIN_S)  # [k+1] s
     shares = {
         id(s): np.histogram([v for v in s.values(name) if not math.isnan(v)], edges)[0] / len(s.ok)
         for s in series
@@ -147,19 +147,21 @@ def _times(series: list[Series]) -> Plot | None:
 
     def draw(axes: Axes, place: float, one: Series) -> str:
         heights = -0.8 * shares[id(one)] / tallest  # rows are counted downwards
-        axes.bar(edges[:-1], heights, 0.92 * BIN, place + 0.4, align="edge", color=_colour(one))
+        axes.bar(edges[:-1], heights, 0.92 * BIN_S, place + 0.4, align="edge", color=_colour(one))
         missing = sum(math.isnan(v) for v in one.values(name))
         return f"n {len(one.ok) - missing}" + (f", {missing} none" if missing else "")
 
-    note = f"Share of episodes; line: {CRITICAL:g} s, critical; none: nobody came within {HORIZON:g} s."
-    return Plot(title, _rows(series, title, "s", draw, limits=(0.0, HORIZON), mark=CRITICAL), note)
+    note = (
+        f"Share of episodes; line: {CRITICAL_TTC:g} s, critical; none: no vehicle within {TTC_HORIZON:g} s."
+    )
+    return Plot(title, _rows(series, title, "s", draw, limits=(0.0, TTC_HORIZON), mark=CRITICAL_TTC), note)
 
 
 def _pareto(series: list[Series]) -> Plot | None:
-    """What the AVs give and what the others get; an SVO sweep is a line."""
+    """Distance of AVs against that of the mission vehicle, or of human drivers; an SVO sweep is a line."""
     others = {"dt_mission_m": "mission vehicle", "dt_hv_m": "human drivers"}
     name = next((n for n in others if any(s.counts(n).get("n") for s in series)), "dt_hv_m")
-    who = others[name]
+    beneficiary = others[name]
     points = [(s, statistics.mean(s.values("dt_av_m")), statistics.mean(s.values(name))) for s in series]
     points = [(s, x, y) for s, x, y in points if x.known and y.known]
     if len(points) < 2:
@@ -167,20 +169,20 @@ def _pareto(series: list[Series]) -> Plot | None:
     figure, axes = _canvas(7.0)
     axes.grid(axis="y")
     for policy in dict.fromkeys(s.identity["policy"] for s, _, _ in points):
-        mine = [p for p in points if p[0].identity["policy"] == policy]
-        mine.sort(key=lambda p: p[0].identity["svo_deg"] or 0.0)
-        colour = _colour(mine[0][0])
-        axes.plot([x.value for _, x, _ in mine], [y.value for _, _, y in mine], color=colour, linewidth=1.0)
-        for _, x, y in mine:
+        sweep = [p for p in points if p[0].identity["policy"] == policy]
+        sweep.sort(key=lambda p: p[0].identity["svo_deg"] or 0.0)
+        colour = _colour(sweep[0][0])
+        axes.plot([x.value for _, x, _ in sweep], [y.value for _, _, y in sweep], color=colour, linewidth=1.0)
+        for _, x, y in sweep:
             axes.plot((x.low, x.high), (y.value, y.value), color=colour, linewidth=1.6, alpha=0.5)
             axes.plot((x.value, x.value), (y.low, y.high), color=colour, linewidth=1.6, alpha=0.5)
             axes.plot([x.value], [y.value], "o", markersize=6, color=colour)
     axes.set_xlabel("mean distance of the AVs, m")
-    axes.set_ylabel(f"mean distance of the {who}, m")
+    axes.set_ylabel(f"mean distance of the {beneficiary}, m")
     axes.tick_params(axis="y", colors=FAINT, labelsize=8.5)
     axes.margins(0.15)
     _name_points(axes, [(one.label, x.value, y.value) for one, x, y in points])
-    title = f"What AVs give, what the {who} get" + ("s" if who.endswith("vehicle") else "")
+    title = f"What AVs give, what the {beneficiary} get" + ("s" if beneficiary.endswith("vehicle") else "")
     return Plot(title, _render(figure, title), "Up and to the right is better for all; bars: 95 % intervals.")
 
 
@@ -196,7 +198,7 @@ def _rows(
     limits: tuple[float | None, float | None] = (None, None),
     mark: float | None = None,
 ) -> Markup:
-    """A drawing with a row per series, first on top; `draw` returns what stands at the row's right end."""
+    """A drawing with a row per series, the first on top; `draw` returns the text at the row's right end."""
     figure, axes = _canvas(len(series))
     if mark is not None:
         axes.axvline(mark, color=FAINT, linewidth=1.0, linestyle=(0, (4, 3)))
@@ -217,7 +219,7 @@ def _rows(
 
 
 def _name_points(axes: Axes, points: list[tuple[str, float, float]]) -> None:
-    """Write each name beside its point; below it where another one stands above already."""
+    """Write each name beside its point, at another corner where earlier names are close."""
     (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
     taken: list[tuple[float, float]] = []  # shares of the drawing's width and height
     for label, x, y in sorted(points, key=lambda p: p[1]):
@@ -236,7 +238,7 @@ def _colour(one: Series) -> str:
 
 def _canvas(rows: float) -> tuple[Figure, Axes]:
     """An empty drawing with room for `rows` rows of a series each."""
-    figure = Figure(figsize=(WIDTH, 0.55 + 0.36 * rows), layout="constrained")
+    figure = Figure(figsize=(WIDTH_INCHES, 0.55 + 0.36 * rows), layout="constrained")
     return figure, figure.add_subplot()
 
 

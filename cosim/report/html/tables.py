@@ -1,4 +1,4 @@
-"""The tables of the report, as plain cells: what is written, what it is sorted by, what is said beside it."""
+"""The tables of the report, as plain cells: text, sort key, and small lines with interval and counts."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -51,7 +51,7 @@ class Cell:
     """One cell of a table."""
 
     text: str
-    sort: str  # what its column is sorted by
+    sort: str  # the key by which the column is sorted
     small: tuple[str, ...] = ()  # interval and counts, a line each
     tone: str = ""  # "good", "bad", "warn" or ""
 
@@ -82,7 +82,7 @@ def figures(blocks: Sequence[Block], known: dict[str, Measure]) -> Table:
 
 
 def law(blocks: Sequence[Block], known: dict[str, Measure]) -> Table | None:
-    """One row per cell with what its AVs did against the law, red where it is not 0; None without any."""
+    """One row per cell with the violations by its AVs, red where not 0; None where no episode counts any."""
     series, varying = _series(blocks)
     names = [n for n in LAW if any(s.counts(n).get("n") for s in series)]
     if not names:
@@ -91,7 +91,7 @@ def law(blocks: Sequence[Block], known: dict[str, Measure]) -> Table | None:
     rows = [
         [
             _named(s, varying),
-            *(_against(_figure(s.counts(n), known[n]), s.counts(n)) for n in names),
+            *(_red_unless_0(_figure(s.counts(n), known[n]), s.counts(n)) for n in names),
             *(_figure(s.counts(n), known[n]) for n in more),
         ]
         for s in series
@@ -100,7 +100,7 @@ def law(blocks: Sequence[Block], known: dict[str, Measure]) -> Table | None:
 
 
 def chosen(blocks: Sequence[Block], known: dict[str, Measure], which: Iterable[str]) -> Table | None:
-    """One row per cell with the figures `which`; None where no episode has one of them."""
+    """One row per cell with the figures `which`; None where no episode has any of them."""
     series, varying = _series(blocks)
     names = [n for n in which if any(s.counts(n).get("n") for s in series)]
     if not names:
@@ -109,8 +109,9 @@ def chosen(blocks: Sequence[Block], known: dict[str, Measure], which: Iterable[s
     return Table(["policy", *(head(known[n]) for n in names)], rows, [])
 
 
-def differences(found: Sequence[Difference]) -> Table | None:
-    """Every series of a block against its baseline, pair by pair; None where there is no pair."""
+def differences(against_baseline: Iterable[Difference]) -> Table | None:
+    """Series of a block against its baseline, pair by pair, where any figure applies; None without any."""
+    found = [d for d in against_baseline if any(f.n for f in d.figures.values())]
     measures = found[0].figures if found else {}
     shown = [n for n in measures if any(d.figures[n].n for d in found)]
     if not shown:
@@ -149,17 +150,17 @@ def head(measure: Measure) -> str:
 
 
 def _series(blocks: Sequence[Block]) -> tuple[list[Series], list[str]]:
-    """All of them, and what of `GROUP` tells them apart."""
+    """The series of all blocks, and the columns of `GROUP` in which they differ."""
     series = [s for block in blocks for s in block.series]
     return series, [n for n in GROUP if len({s.identity[n] for s in series}) > 1]
 
 
-def _against(cell: Cell, counts: dict[str, Any]) -> Cell:
+def _red_unless_0(cell: Cell, counts: dict[str, Any]) -> Cell:
     return replace(cell, tone="bad") if counts.get("value") else cell
 
 
 def _named(series: Series, varying: Sequence[str]) -> Cell:
-    """Policy and SVO above, below it whatever else tells the cell apart: one column, so that it can stick."""
+    """Policy and SVO, and below them what else distinguishes the cell: one column, which stays in view."""
     identity = series.identity
     text = str(identity["policy"])
     if "svo_deg" in varying and identity["svo_deg"] is not None:
@@ -177,15 +178,15 @@ def _plain(value: Any) -> str:
 def _episodes(series: Series) -> Cell:
     ok, total = len(series.ok), len(series.rows)
     others = [f"{count} {name}" for name, count in series.figures["status"].items() if count and name != "ok"]
-    odd = series.figures["not_comparable"]
-    small = (*others, *([f"{odd} not comparable"] if odd else []))
+    unfit = series.figures["not_comparable"]
+    small = (*others, *([f"{unfit} not comparable"] if unfit else []))
     text = str(ok) if ok == total else f"{ok} of {total}"
-    return Cell(text, str(ok), small, "bad" if ok < total else "warn" if odd else "")
+    return Cell(text, str(ok), small, "bad" if ok < total else "warn" if unfit else "")
 
 
 def _figure(counts: dict[str, Any], measure: Measure) -> Cell:
-    """Value above, interval and counts below."""
-    measure = _bare(measure)
+    """The value, and below it interval and counts."""
+    measure = _without_unit(measure)
     n, na = counts.get("n", 0), counts.get("na", 0)
     if not n:
         return Cell(wording.NA_TEXT, "", (f"{na} NA",) if na else ())
@@ -194,7 +195,7 @@ def _figure(counts: dict[str, Any], measure: Measure) -> Cell:
     if (counts.get("rule_of_three") or 1.0) < 1.0:
         bounds = f"below {100 * counts['rule_of_three']:.3g} % (3/n)"
     elif value and not bounds and n >= wording.SEVERAL and counts.get("hits") is None:
-        bounds = "all alike"
+        bounds = "all equal"
     return Cell(text, repr(value), tuple(filter(None, (bounds, wording.sample(counts)))))
 
 
@@ -202,13 +203,15 @@ def _difference(figure: PairedFigure) -> Cell:
     if not figure.n:
         return Cell(wording.NA_TEXT, "")
     n = figure.n
-    text, bounds = wording.value_and_bounds(figure.difference, _bare(figure.measure), signed=True, n=n)
+    text, bounds = wording.value_and_bounds(
+        figure.difference, _without_unit(figure.measure), signed=True, n=n
+    )
     p = "" if figure.p is None or n < wording.SEVERAL else wording.p_value(figure.p)
     pairs = f"{n} pairs" if figure.na else ""
     small = tuple(filter(None, (bounds, ", ".join(filter(None, (p, pairs))))))
     return Cell(text, repr(figure.difference.value), small, tone(figure))
 
 
-def _bare(measure: Measure) -> Measure:
-    """The measure as its cells write it: without the unit that `head` says."""
+def _without_unit(measure: Measure) -> Measure:
+    """The measure as cells write it: the unit of an incidence stands in the head of the column."""
     return replace(measure, unit="") if measure.per else measure

@@ -194,7 +194,7 @@ def _figure(counts: dict[str, Any], measure: Measure) -> Cell:
     text, bounds = wording.value_and_bounds(Figure(value, low, high), measure, n=n)
     if (counts.get("rule_of_three") or 1.0) < 1.0:
         bounds = f"below {100 * counts['rule_of_three']:.3g} % (3/n)"
-    elif value and not bounds and n >= wording.SEVERAL and counts.get("hits") is None:
+    elif value and low == high and n >= wording.SEVERAL and counts.get("hits") is None:
         bounds = "all equal"
     return Cell(text, repr(value), tuple(filter(None, (bounds, wording.sample(counts)))))
 

@@ -117,8 +117,8 @@ def training(config: str, lesson: Lesson, episodes: int) -> dict[str, float]:
     """
     file = configuration(config).file
     agent = agent_config(POLICY, file)
-    learner = DdqnLearner(agent.vfn, file.training.ddqn, seed=0)
-    replay = ReplayBuffer(file.training.replay)
+    learner = DdqnLearner(agent.vfn, file.training.ddqn_config, seed=0)
+    replay = ReplayBuffer(file.training.replay_config)
     with Rollouts(1, POLICY, agent, file.explore, file.reward) as actors:
 
         def drive(seed: int) -> Any:
@@ -143,7 +143,7 @@ def training(config: str, lesson: Lesson, episodes: int) -> dict[str, float]:
     return {
         "joint decisions/s": steps / elapsed,
         "updates/s": updates / elapsed,
-        "batch": float(file.training.replay.batch),
+        "batch": float(file.training.batch),
         "episodes/h": 3600.0 * episodes / elapsed,
         "episodes of a whole training": float(whole),
         "hours of a whole training, at this rate": whole * elapsed / (3600.0 * episodes),

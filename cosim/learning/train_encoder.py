@@ -4,7 +4,7 @@ import argparse
 import math
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -123,8 +123,7 @@ def train(args: argparse.Namespace) -> int:
         if getattr(args, flag):
             raise BadInput("is not for the encoder", field=f"--{flag}", value=getattr(args, flag))
     file = configuration(args.config).file
-    seed = file.sight.seed if args.seed is None else args.seed
-    training, agent = replace(file.sight, seed=seed), agent_config("vfn-p", file)
+    training, seed, agent = file.sight, args.seed or 0, agent_config("vfn-p", file)
     worlds = [place(w) for w in args.scenario if w != "all"] or list(names())
     announce(
         f"train encoder: {training.updates:,} updates on drives in {', '.join(worlds)}",
@@ -140,11 +139,12 @@ def train(args: argparse.Namespace) -> int:
         seen = gather(agent, worlds, TRAINING_SEEDS[: training.drives], args.workers, "learns from")
         checked = gather(agent, worlds, TUNING_SEEDS[: training.validation], args.workers, "checks on")
         encoder = encoder_of(file)
-        task = SightTask(encoder, training, seen, checked, args.device)
+        task = SightTask(encoder, training.updates, seed, seen, checked, args.device)
         about = {
             "scenarios": worlds,
             "frames": {"training": len(seen.maps), "validation": len(checked.maps)},
             "sight": asdict(training),
+            "seed": seed,
         }
         layout = {"encoder": asdict(encoder), **about}
         with Progress("train encoder", "updates") as progress:

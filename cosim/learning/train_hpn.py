@@ -6,7 +6,7 @@ import json
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -33,9 +33,7 @@ from policy.training.networks import use_threads
 def train(args: argparse.Namespace) -> int:
     """`cosim train hpn`. Raises BadInput for whatever is wrong before anything is computed."""
     file = configuration(args.config).file
-    name, training = args.variant, file.prediction
-    if args.seed is not None:
-        training = replace(training, seed=args.seed)
+    name, training, seed = args.variant, file.prediction, args.seed or 0
     if not args.recordings or not args.validation:
         raise BadInput(
             "recordings to train and to validate on are needed", field="--recordings, --validation"
@@ -59,8 +57,8 @@ def train(args: argparse.Namespace) -> int:
         use_threads(args.threads)
         data = {part: _manifest(keys) for part, keys in found.items()}
         examples = {part: _gather(keys, name, training, args.workers, part) for part, keys in found.items()}
-        task = hpn.make_task(variant, training, examples["train"], examples["validation"], args.device)
-        layout = {"hpn": asdict(variant), "training": asdict(training), "data": data}
+        task = hpn.make_task(variant, training, seed, examples["train"], examples["validation"], args.device)
+        layout = {"hpn": asdict(variant), "training": asdict(training), "seed": seed, "data": data}
         with Progress(f"train {name}", "updates") as progress:
             log = supervised.train(task, loop, folder, layout=layout, resume=args.resume, progress=progress)
         file_name = folder / f"{name}.safetensors"

@@ -40,7 +40,8 @@ def train(args: argparse.Namespace) -> int:
     agent = agent_config(name, file)
     if not usable(args.device):
         raise BadInput("torch has no such device here", field="--device", value=args.device)
-    training, own = _scheduled(file.training, args)
+    training = _scheduled(file.training, args)
+    reward, metrics, own = _users(training, args)
     for lesson in training.lessons:
         load(lesson.scenario, demand=[lesson.demand], behavior=lesson.behavior)
     with working_in(args.out) as folder:
@@ -49,16 +50,14 @@ def train(args: argparse.Namespace) -> int:
         about = described(name, agent, file)
         about["scenarios"] = sorted({lesson.scenario for lesson in training.lessons})
         about |= {"code": own} if own else {}
-        if training.reward:
-            about["reward"] = training.reward
+        about |= {"reward": reward} if reward else {}
+        about |= {"metrics": list(metrics)} if metrics else {}
         if agent.predicted_maps and agent.chain.source == "hpn" and agent.hpn_weights is not None:
             about["hpn_sha256"] = sha256(agent.hpn_weights)
         keep_freed_memory()
         use_threads(args.threads)  # more threads than cores stall each other (docs/guides/training.md)
         writer = tensorboard(folder)
-        rollouts = Rollouts(
-            args.workers, name, agent, file.explore, training.reward or file.reward, training.metrics
-        )
+        rollouts = Rollouts(args.workers, name, agent, file.explore, reward or file.reward, metrics)
         wanted = 0 if agent.vfn.critic else training.prefill  # decisions before the first update
         begin(name, training, wanted, shlex.quote(args.out))
         with closing(writer), Progress(f"train {name}", "iterations") as progress, rollouts as actors:
@@ -79,25 +78,29 @@ def train(args: argparse.Namespace) -> int:
         return 0
 
 
-def _scheduled(training: VfnTraining, args: argparse.Namespace) -> tuple[VfnTraining, dict[str, str]]:
-    """The file's schedule with what the command line says otherwise; the user's files and their SHA-256."""
+def _scheduled(training: VfnTraining, args: argparse.Namespace) -> VfnTraining:
+    """The file's schedule with what the command line says otherwise."""
     worlds = names() if "all" in args.scenario else tuple(map(place, args.scenario))
     if worlds:
         lessons = tuple(lesson for world in worlds for lesson in _lessons(world))
         training = replace(training, lessons=lessons)
-    reward = code.absolute(args.reward or training.reward, Path(), "--reward")
-    metrics = tuple(code.absolute(metric, Path(), "--metric") for metric in args.metric or training.metrics)
+    errors = human_errors.asked(args.errors or training.errors or human_errors.NONE)
+    given = {field: getattr(args, field) for field in ("iterations", "seed")}
+    changes = {field: value for field, value in given.items() if value is not None}
+    return replace(training, errors=errors or "", **changes)
+
+
+def _users(training: VfnTraining, args: argparse.Namespace) -> tuple[str, tuple[str, ...], dict[str, str]]:
+    """A user's own reward and metrics, checked; the user's files and their SHA-256."""
+    reward = code.absolute(args.reward, Path(), "--reward") if args.reward else ""
+    metrics = tuple(code.absolute(metric, Path(), "--metric") for metric in args.metric)
     if reward:
         read_reward(reward)
     for metric in metrics:
         read_metric(metric)
-    errors = human_errors.asked(args.errors or training.errors or human_errors.NONE)
-    level = human_errors.read(errors)
+    level = human_errors.read(training.errors or None)
     files = [*code.files_of([*metrics, reward]), *([] if level is None else [level.file])]
-    training = replace(training, reward=reward, metrics=metrics, errors=errors or "")
-    given = {field: getattr(args, field) for field in ("iterations", "seed")}
-    changes = {field: value for field, value in given.items() if value is not None}
-    return replace(training, **changes), digests(files)
+    return reward, metrics, digests(files)
 
 
 def _lessons(world: str) -> list[Lesson]:

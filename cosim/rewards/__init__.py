@@ -27,13 +27,11 @@ class RewardConfig:
 
     variant: str = "p"  # of `cosim.rewards.REWARDS`; "p": decays with distance; "t": r_i pays for maneuvers
     crash: float = -5.0  # for a vehicle that crashed in this decision; -5 in code of the same authors
-    speed: float = 1.0  # times speed / reference_speed at the decision's end; 1 in the same code
-    distance: float = 1.0  # times distance / (reference_speed * duration); as much as speed: P names both
+    speed: float = 1.0  # times speed / `REFERENCE_SPEED` at the decision's end; 1 in the same code
+    distance: float = 1.0  # times distance / (`REFERENCE_SPEED` * duration); as much as speed: P names both
     lane_change: float = -0.3  # variant t, r_i only, for commanding one; 0.3 in the same code
     acceleration: float = -0.1  # variant t, r_i only, for Accelerate and Decelerate; less than a lane change
-    reference_speed: float = 30.0  # m/s, where speed and distance saturate: AVs drive 25-30 m/s in the papers
     eta: float = 1.0  # exponent of the distance decay (P, eq. (6)); not stated there: 1
-    nearest: float = 5.0  # m, distances below it count as this: a vehicle's length, so that none dominates
     mission: float = 20.0  # a mission vehicle's utility counts as this many bystanders': altruism was
     # learned with 20 and not with 1, where its gain drowns among those who merely drive by
     social: float = 1.0  # of every other's utility against the own: with eta = 0 twenty add up undiminished
@@ -41,9 +39,8 @@ class RewardConfig:
 
     def __post_init__(self) -> None:
         one_of(self.variant, REWARDS, "variant")
-        for name in ("reference_speed", "nearest", "perception_range"):
-            if not 0.0 < getattr(self, name) < np.inf:
-                raise BadInput("must be a positive number", field=name, value=getattr(self, name))
+        if not 0.0 < self.perception_range < np.inf:
+            raise BadInput("must be a positive number", field="perception_range", value=self.perception_range)
         for name in ("crash", "speed", "distance", "lane_change", "acceleration", "eta", "mission", "social"):
             if not np.isfinite(getattr(self, name)):
                 raise BadInput("must be a finite number", field=name, value=getattr(self, name))

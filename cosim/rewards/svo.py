@@ -12,6 +12,8 @@ from cosim.types import Floats, Kind, MetaAction, Snapshot
 if TYPE_CHECKING:
     from cosim.rewards import RewardConfig
 
+REFERENCE_SPEED = 30.0  # m/s, where speed and distance saturate: AVs drive 25-30 m/s in the papers
+NEAREST = 5.0  # m, distances below it count as this: a vehicle's length, so that no neighbour dominates
 _LANE_CHANGES = (MetaAction.LANE_LEFT, MetaAction.LANE_RIGHT)
 _SPEED_CHANGES = (MetaAction.ACCELERATE, MetaAction.DECELERATE)
 
@@ -55,7 +57,7 @@ class RewardP:
 
     def decay(self, distance: Floats) -> Floats:
         """[a,n] what a neighbour `distance` [a,n] m away counts."""
-        return np.asarray(np.maximum(distance, self.config.nearest) ** -self.config.eta)
+        return np.asarray(np.maximum(distance, NEAREST) ** -self.config.eta)
 
     def maneuver(self, action: MetaAction | None) -> float:
         """What commanding `action` adds to r_i."""
@@ -82,11 +84,11 @@ def vehicle_utility(before: Snapshot, after: Snapshot, crashed: set[str], config
     """
     then = np.array([before.row.get(name, -1) for name in after.ids], dtype=np.int64)  # [n]
     old = then >= 0
-    # the mean speed of the decision over the reference speed: distance / (reference_speed * duration)
+    # the mean speed of the decision over the reference speed: distance / (REFERENCE_SPEED * duration)
     mean = np.zeros(after.n)  # [n] m/s
     mean[old] = 0.5 * (before.speed[then[old]] + after.speed[old])
-    speed = np.where(old, np.clip(after.speed / config.reference_speed, 0.0, 1.0), 0.0)
-    travelled = np.clip(mean / config.reference_speed, 0.0, 1.0)
+    speed = np.where(old, np.clip(after.speed / REFERENCE_SPEED, 0.0, 1.0), 0.0)
+    travelled = np.clip(mean / REFERENCE_SPEED, 0.0, 1.0)
     crash = np.array([name in crashed for name in after.ids], dtype=np.float64)  # [n]
     return np.asarray(config.crash * crash + config.speed * speed + config.distance * travelled)
 

@@ -20,12 +20,18 @@ from policy.prediction.vehicle_inputs import vehicle_inputs
 
 
 @dataclass(frozen=True, slots=True)
-class ChainConfig:
+class Hypotheses:
+    """What a training chooses of the prediction chain."""
+
+    every: int = 5  # the VFN takes every fifth frame, M = 4; paper: 1, M = 20
+    source: Literal["hpn", "gp_raster"] = "hpn"  # gp_raster: maps rendered from the forecast as it is
+
+
+@dataclass(frozen=True, slots=True)
+class ChainConfig(Hypotheses):
     """How the next seconds are predicted (observation.md, Clocks)."""
 
     horizon: int = 20  # frames of 0.2 s: 4 s (P, Table I)
-    every: int = 5  # the VFN takes every fifth frame, M = 4; paper: 1, M = 20
-    source: Literal["hpn", "gp_raster"] = "hpn"  # gp_raster: maps rendered from the forecast as it is
     shade: bool = True  # vehicles are drawn the darker the less sure their places are (`shade`)
 
     def __post_init__(self) -> None:

@@ -25,29 +25,41 @@ PICKED_BY = {"met": MEETS, "assisted": ASSISTED}
 
 
 @dataclass(frozen=True, slots=True)
-class VfnConfig:
-    """Layout of the network. Defaults: compact size with 10 past and 4 predicted frames, at half of T's
-    widths: a third of the arithmetic, so that it trains on two cores. `TABLE_1` is T's."""
+class Layout:
+    """What a training chooses of the network. Defaults: half of T's widths, a third of the arithmetic, to
+    train on two cores. `TABLE_1` is T's."""
+
+    # the last two: all frames, or the present one alone, each by a frozen `FrameEncoder`
+    extractor: Literal["conv3d", "conv2d", "frames", "frame"] = "conv3d"
+    strides: Strides = "temporal"
+    features: tuple[int, int, int] = (16, 32, 32)  # T, Table 1: 32, 64, 64
+    hidden: int = 256  # T, Table 1: 512
+    joined: int = 256  # T, Table 1
+    dueling: bool = True  # q = state value + advantage: how good the moment is drowns what an action changes
+    parts: int = 1  # 2: what an action brings oneself and what it brings the others are valued apart
+
+    @property
+    def encoded(self) -> bool:
+        """Whether a frozen encoder, trained before, reads the maps."""
+        return self.extractor in ("frames", "frame")
+
+
+@dataclass(frozen=True, slots=True)
+class VfnConfig(Layout):
+    """The whole layout: the inputs follow from the approach and the observation (`policy.agents.approaches`).
+    Defaults: compact maps, 10 past and 4 predicted frames."""
 
     height: int = 32
     width: int = 128
     channels: int = 4
     frames: int = 14  # N, or N + M with predicted maps
     rows: int = 16
-    strides: Strides = "temporal"
-    features: tuple[int, int, int] = (16, 32, 32)  # T, Table 1: 32, 64, 64
-    hidden: int = 256  # T, Table 1: 512
-    joined: int = 256  # T, Table 1
     kinematic: int = 64  # features of a vehicle; 0: maps and phi are all the network sees, read by `apart`
     situation: int = 64  # width of the branch of what the ego knows besides; goes with `kinematic`
     others: bool = True  # False: they are seen in maps alone, beside the ego's own speed and command
     meets: bool = False  # behind the maps, layers of their own for AVs whose way meets a mission vehicle's
     assisted: bool = False  # and for those whose car keeps the law and its distance itself (`lawful`)
-    # the last two: all frames, or the present one alone, each by a frozen `FrameEncoder`
-    extractor: Literal["conv3d", "conv2d", "frames", "frame"] = "conv3d"
     latent: int = 128  # numbers that a frame becomes (with an encoder)
-    dueling: bool = True  # q = state value + advantage: how good the moment is drowns what an action changes
-    parts: int = 1  # 2: what an action brings oneself and what it brings the others are valued apart
     most: float = 90.0  # deg: who drives by a larger phi is driven by this one
     critic: bool = False  # True: action preferences and a state value (A2C), not action values
 
@@ -59,11 +71,6 @@ class VfnConfig:
                 raise BadInput("is for networks that value actions", field=f"vfn.{field}", value=value)
         if not 45.0 <= self.most <= 90.0:
             raise BadInput("must be an angle from 45 to 90 degrees", field="vfn.most", value=self.most)
-
-    @property
-    def encoded(self) -> bool:
-        """Whether a frozen encoder, trained before, reads the maps."""
-        return self.extractor in ("frames", "frame")
 
 
 TABLE_1 = VfnConfig(features=(32, 64, 64), hidden=512, strides="literal", dueling=False)

@@ -1,29 +1,31 @@
 """One training run as one document: sizes, reward, exploration and schedule (policy/configs/*.yaml)."""
 
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 from cosim.rewards import RewardConfig
-from cosim.types import ObservationConfig
+from cosim.types import COMPACT, PAPER, SMOKE
 from policy.agents.approaches import AgentConfig, configure, shipped
-from policy.chain.chain import ChainConfig
+from policy.chain.chain import ChainConfig, Hypotheses
 from policy.networks.frame_encoder import EncoderConfig
 from policy.networks.hpn import HpnConfig
-from policy.networks.vfn import VfnConfig
+from policy.networks.vfn import Layout, VfnConfig
 from policy.safety import SafetyConfig, Thresholds
 from policy.training.curriculum import VfnTraining
 from policy.training.explorer import ExploreConfig
 from policy.training.hpn import HpnTraining
 from policy.training.sight import SightTraining
 
+SIZES = {"compact": COMPACT, "paper": PAPER, "smoke": SMOKE}  # of the maps
+
 
 @dataclass(frozen=True, slots=True)
 class TrainingFile:
     """The sections of a configuration file; whatever it leaves out keeps the compact default."""
 
-    observation: ObservationConfig = field(default_factory=ObservationConfig)
-    chain: ChainConfig = field(default_factory=ChainConfig)
-    vfn: VfnConfig = field(default_factory=VfnConfig)
+    observation: Literal["compact", "paper", "smoke"] = "compact"  # `SIZES`
+    chain: Hypotheses = field(default_factory=Hypotheses)
+    vfn: Layout = field(default_factory=Layout)
     safety: Thresholds = field(default_factory=Thresholds)
     reward: RewardConfig = field(default_factory=RewardConfig)
     explore: ExploreConfig = field(default_factory=ExploreConfig)
@@ -34,14 +36,15 @@ class TrainingFile:
 
 def agent_config(name: str, file: TrainingFile) -> AgentConfig:
     """The approach `name` at the sizes of `file`: its value network untrained, its HPN the shipped one."""
-    config = configure(name, file.observation, file.chain, HpnConfig(), file.vfn)
+    seen, layout = SIZES[file.observation], VfnConfig(**asdict(file.vfn))
+    config = configure(name, seen, ChainConfig(**asdict(file.chain)), HpnConfig(), layout)
     return replace(config, safety=SafetyConfig(**asdict(file.safety)), hpn_weights=shipped("hpn"))
 
 
 def encoder_of(file: TrainingFile) -> EncoderConfig:
     """The frame encoder for the maps of `file`, with as many numbers a frame as its value network takes."""
-    seen = file.observation
-    return EncoderConfig(seen.height, seen.width, latent=file.vfn.latent)
+    seen = SIZES[file.observation]
+    return EncoderConfig(seen.height, seen.width)
 
 
 def described(name: str, agent: AgentConfig, file: TrainingFile) -> dict[str, Any]:

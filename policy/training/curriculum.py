@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -29,8 +29,18 @@ class Lesson:
 
 
 @dataclass(frozen=True, slots=True)
+class OnPolicy:
+    """What A2C has besides. T gives none of these."""
+
+    keep: int = 1  # decisions that what is drawn is kept: no gap opens within one of 0.4 s
+    n_step: int = 8  # decisions of a return; 1 is the papers'
+    passes: int = 1  # over what an iteration drove; 1 is A2C
+    entropy: float = 0.01  # weight: it keeps the policy from closing up early
+
+
+@dataclass(frozen=True, slots=True)
 class VfnTraining:
-    """One training run. Defaults: what trains on two CPU cores (docs/guides/training.md)."""
+    """One training run. Defaults: P's Table I where it has them, else what trains on two CPU cores."""
 
     lessons: tuple[Lesson, ...] = (Lesson("merge"),)
     iterations: int = 400
@@ -45,14 +55,20 @@ class VfnTraining:
     validate_every: int = 20  # iterations; the last one is validated too
     validation: int = 4  # episodes of every lesson, greedy, on tuning seeds
     save_every: int = 5  # iterations
-    reward: str = ""  # a user's, FILE.py:NAME, or one of `cosim.rewards.REWARDS`; "": the file's section
-    metrics: tuple[str, ...] = ()  # a user's, FILE.py:NAME: logged besides
     errors: str = ""  # of the human drivers: a level or a user's file; "": none
     preset: str = Preset.UNGUARDED  # what the car does by itself (docs/reference/presets.md)
     encoder: str = ""  # weights of `cosim train encoder`, for extractor `frames`: encoder, or a file
-    replay: ReplayConfig = field(default_factory=ReplayConfig)
-    ddqn: DdqnConfig = field(default_factory=DdqnConfig)
-    a2c: A2cConfig = field(default_factory=A2cConfig)
+    learning_rate: float = 5e-4  # P, Table I
+    gamma: float = 0.97  # a decision of 0.4 s; P: 0.95
+    batch: int = 64  # P, Table I
+    # DDQN
+    n_step: int = 8  # decisions of a return; 1 is P's
+    target_every: int = 300  # P, Table I
+    refused: float = 1.0  # weight of the loss that makes refused actions worth a crash (P, algorithm 4)
+    capacity: int = 30_000  # decisions in the replay buffer; P's 8,000 are 20 episodes of 4 learners
+    interaction: float = 0.25  # share of a batch near a mission vehicle, or vetoed (P, algorithm 4)
+    relabel: float = 0.5  # share of a batch that is learned for another SVO than was driven
+    a2c: OnPolicy = field(default_factory=OnPolicy)
 
     def __post_init__(self) -> None:
         """Raises BadInput: a number is out of range, or the replay buffer never holds what is waited for."""
@@ -61,9 +77,29 @@ class VfnTraining:
             positive="iterations episodes updates epsilon_iterations disseminate validate_every save_every",
             not_negative="prefill validation",
         )
-        if self.prefill > WAITS * self.replay.capacity:
+        _ = self.replay_config, self.ddqn_config, self.a2c_config  # each checks its numbers
+        if self.prefill > WAITS * self.capacity:
             problem = f"nothing is learned before {self.prefill} decisions are kept"
-            raise BadInput(problem, field="training.replay.capacity", value=self.replay.capacity)
+            raise BadInput(problem, field="training.capacity", value=self.capacity)
+
+    @property
+    def replay_config(self) -> ReplayConfig:
+        """Of the replay buffer."""
+        kept = self.capacity, self.batch, self.n_step, self.gamma, self.interaction, self.relabel
+        return ReplayConfig(*kept)
+
+    @property
+    def ddqn_config(self) -> DdqnConfig:
+        """Of the DDQN learner."""
+        rate, every, refused = self.learning_rate, self.target_every, self.refused
+        return DdqnConfig(learning_rate=rate, target_every=every, refused=refused)
+
+    @property
+    def a2c_config(self) -> A2cConfig:
+        """Of the A2C learner."""
+        own = asdict(self.a2c)
+        rate, gamma, batch = self.learning_rate, self.gamma, self.batch
+        return A2cConfig(learning_rate=rate, gamma=gamma, batch=batch, normalize=True, **own)
 
 
 class Drive(NamedTuple):

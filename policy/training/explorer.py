@@ -20,17 +20,19 @@ from policy.training.experience import Ending, Trajectory
 STATE = ("ahead", "kinematics", "situation", "unsafe")  # fields of `Trajectory` with one value more
 
 
+NEAR = 60.0  # m to the mission vehicle within which a decision counts as interaction
+
+
 @dataclass(frozen=True, slots=True)
 class ExploreConfig:
     """Who learns in an episode, and how it explores."""
 
     learners: int = 4  # AVs that explore and are recorded; the others act with frozen weights (P, Alg. 4)
     repeat: float = 2.0  # decisions a random action is kept on average: a gap does not open in 0.4 s
-    near: float = 60.0  # m to the mission vehicle within which a decision counts as interaction
 
     def __post_init__(self) -> None:
         """Raises BadInput for a number out of range."""
-        in_range(self, positive="learners repeat near")
+        in_range(self, positive="learners repeat")
 
 
 class Explorer(PredictionAware):
@@ -178,7 +180,7 @@ class Explorer(PredictionAware):
         preferred = int(np.argmax(decision.q))
         newest, maps, past = history.kinematics[-1], states.maps[b].numpy(), self.observation.frames
         mission = history.valid[-1] & (newest[:, IS_MISSION] > 0.5)
-        close = mission & (np.hypot(newest[:, 0], newest[:, 1]) < self.explore.near)
+        close = mission & (np.hypot(newest[:, 0], newest[:, 1]) < NEAR)
         now = {
             "frames": maps[past - self._stride if recorded["frames"] else 0 : past].copy(),
             "ahead": maps[past:].copy(),

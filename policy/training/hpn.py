@@ -27,26 +27,31 @@ class HpnTraining:
     stride: int = 4  # decisions between two moments of an episode: neighbours are nearly the same
     updates: int = 6000
     batch: int = 16  # moments an update: about 600 vehicles
-    # the same for `hpn-plain`, whose samples are whole maps: four times the cost, and the loss is flat early
-    map_stride: int = 20
-    map_updates: int = 2000
-    map_batch: int = 16  # AVs
-    seed: int = 0
+
+    @property
+    def map_stride(self) -> int:
+        """The stride for `hpn-plain`, whose samples are whole maps."""
+        return 5 * self.stride
 
     def loop(self, variant: HpnConfig) -> LoopConfig:
-        """How long a variant is trained."""
-        return LoopConfig.of(self.map_updates if variant.maps == "plain" else self.updates)
+        """How long a variant is trained; an update of `hpn-plain` costs four times as much."""
+        return LoopConfig.of(-(-self.updates // 3) if variant.maps == "plain" else self.updates)
 
 
 def make_task(
-    variant: HpnConfig, training: HpnTraining, train: Sequence[Any], validation: Sequence[Any], device: str
+    variant: HpnConfig,
+    training: HpnTraining,
+    seed: int,
+    train: Sequence[Any],
+    validation: Sequence[Any],
+    device: str,
 ) -> KinematicTask | MapTask:
     """The training of a variant's branch on its examples (`policy.training.moments`)."""
     sets, updates = (train, validation), training.loop(variant).updates
     if variant.maps == "plain":
-        maps = MapTraining(batch=training.map_batch, seed=training.seed)
+        maps = MapTraining(batch=training.batch, seed=seed)
         return MapTask(variant.map_branch, maps, updates, *sets, device)
-    kinematics = KinematicTraining(batch=training.batch, seed=training.seed)
+    kinematics = KinematicTraining(batch=training.batch, seed=seed)
     return KinematicTask(variant.kinematic, kinematics, updates, *sets, device)
 
 

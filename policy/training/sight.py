@@ -27,7 +27,7 @@ from policy.training.loop import Task, one_cycle
 EVERY = 3  # decisions between two moments of a drive: neighbours are nearly the same
 AVS = 4  # that look, at each of them
 ERRORS = "stress"  # of the human drivers in every second drive
-RATE = 1e-3  # Adam, one cycle
+RATE, BATCH = 1e-3, 128  # Adam, one cycle; frames an update
 LANE, HALF = 3.2, 1.6  # m between centre lines, and from one to its lane's edge
 AHEAD = 100.0  # m, further away all gaps are alike
 ALONG, ACROSS, BRISK = 125.0, 16.0, 15.0  # m, m and m/s: scales of the mission vehicle's place and speed
@@ -70,8 +70,6 @@ class SightTraining:
     drives: int = 20  # of every world and demand
     validation: int = 4  # the same, on tuning seeds
     updates: int = 8000
-    batch: int = 128  # frames
-    seed: int = 0
 
 
 def bands(kinematics: Floats) -> Floats:
@@ -143,7 +141,8 @@ class SightTask(Task):
 
     Args:
         config: layout of the encoder.
-        training: batch size, learning rate, seed.
+        updates: how many there will be; the learning rate's cycle ends with the last.
+        seed: of first weights and batches.
         train, validation: frames.
         device: of torch.
     """
@@ -153,25 +152,25 @@ class SightTask(Task):
     def __init__(
         self,
         config: EncoderConfig,
-        training: SightTraining,
+        updates: int,
+        seed: int,
         train: Seen,
         validation: Seen,
         device: str = "cpu",
     ) -> None:
-        self._training, self._train, self._device = training, train, device
-        self.network = first_weights(lambda: Sight(config, len(READINGS)), training.seed).to(device)
+        self._seed, self._train, self._device = seed, train, device
+        self.network = first_weights(lambda: Sight(config, len(READINGS)), seed).to(device)
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         spread = np.ma.masked_invalid(train.readings).std(0).filled(0.0)
         self._weight = torch.from_numpy(1.0 / np.maximum(spread, 0.05) ** 2).to(device, torch.float32)
         adam = torch.optim.Adam(self.network.parameters(), lr=RATE)
         blocks = [validation.at(slice(k, k + 256)) for k in range(0, len(validation.maps), 256)]
-        schedule = partial(one_cycle, updates=training.updates, rate=RATE)
+        schedule = partial(one_cycle, updates=updates, rate=RATE)
         super().__init__(self.network, adam, schedule, [(b, len(b.maps)) for b in blocks], 1.0)
 
     def batch(self, number: int) -> Seen:
         """See `Task.batch`."""
-        t = self._training
-        rows = generator(t.seed, "batch", str(number)).integers(len(self._train.maps), size=t.batch)
+        rows = generator(self._seed, "batch", str(number)).integers(len(self._train.maps), size=BATCH)
         return self._train.at(rows)
 
     def losses(self, batch: Seen) -> dict[str, torch.Tensor]:

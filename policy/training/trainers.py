@@ -29,7 +29,7 @@ class Trainer:
 
     def __init__(self, config: VfnTraining, learner: Learner, device: str) -> None:
         self.config, self.learner, self.device = config, learner, device
-        self.replay = ReplayBuffer(config.replay)
+        self.replay = ReplayBuffer(config.replay_config)
 
     def epsilon(self, k: int) -> float:
         """Share of random actions."""
@@ -99,9 +99,9 @@ def make_trainer(config: VfnTraining, vfn: VfnConfig, device: str) -> Trainer:
     seed = subseed(config.seed, "network") % 2**31
     trainer: Trainer
     if vfn.critic:
-        trainer = OnPolicyTrainer(config, A2cLearner(vfn, config.a2c, seed, device), device)
+        trainer = OnPolicyTrainer(config, A2cLearner(vfn, config.a2c_config, seed, device), device)
     else:
-        trainer = OffPolicyTrainer(config, DdqnLearner(vfn, config.ddqn, seed, device), device)
+        trainer = OffPolicyTrainer(config, DdqnLearner(vfn, config.ddqn_config, seed, device), device)
     online = trainer.learner.online
     if isinstance(online.maps, EncodedMaps):
         if not config.encoder:

@@ -29,7 +29,7 @@ from policy.training.curriculum import Drive, Lesson, VfnTraining
 from policy.training.ddqn import DdqnConfig, DdqnLearner
 from policy.training.explorer import ExploreConfig, Explorer
 from policy.training.replay_buffer import ReplayBuffer, ReplayConfig
-from policy.training.sight import AHEAD, ALONG, BRISK, READINGS, Seen, SightTask, SightTraining
+from policy.training.sight import AHEAD, ALONG, BRISK, READINGS, Seen, SightTask
 from policy.training.trainers import make_trainer
 from tests.learning.test_vfn_training import TINY, fake_episode, trajectory
 
@@ -106,8 +106,7 @@ def test_it_learns_to_read_a_gap_off_the_map_and_nothing_off_an_empty_one(
         wanted[:, READINGS.index("gap ahead, own band")] = gaps / 60
         return Seen(maps, wanted.astype(np.float32), np.zeros(count, np.int64))
 
-    config = SightTraining(batch=64, updates=250)
-    task = SightTask(SMALL, config, drawn(600), drawn(100))
+    task = SightTask(SMALL, 250, 0, drawn(600), drawn(100))
     for number in range(250):
         task.update(number)
     unseen = drawn(200)

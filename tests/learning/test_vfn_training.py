@@ -313,8 +313,9 @@ SHORT = VfnTraining(
     validation=2,
     save_every=2,
     disseminate=3,
-    replay=ReplayConfig(batch=8, capacity=100),
-    ddqn=DdqnConfig(target_every=4),
+    batch=8,
+    capacity=100,
+    target_every=4,
 )
 
 
@@ -397,9 +398,9 @@ def test_another_configuration_is_not_gone_on_with(tmp_path: Path) -> None:
 def test_a_run_with_other_options_is_not_gone_on_with(tmp_path: Path) -> None:
     TrainingRun(replace(SHORT, iterations=2), TINY, Pretend(), tmp_path).run()
     state = json.loads((tmp_path / "state.json").read_text())
-    state["config"]["ddqn"]["gone"] = state["config"]["ddqn"].pop("clip")
+    state["config"]["a2c"]["gone"] = state["config"]["a2c"].pop("keep")
     (tmp_path / "state.json").write_text(json.dumps(state))
-    with pytest.raises(BadInput, match=r"ddqn\.clip, ddqn\.gone"):
+    with pytest.raises(BadInput, match=r"a2c\.gone, a2c\.keep"):
         TrainingRun(SHORT, TINY, Pretend(), tmp_path).resume()
 
 

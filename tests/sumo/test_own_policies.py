@@ -19,7 +19,7 @@ from cosim.errors import BadInput
 from cosim.learning.configuration import configuration
 from cosim.policies import check, make
 from cosim.policies.trained import config
-from cosim.types import COMPACT
+from cosim.types import COMPACT, SMOKE
 from policy import checkpoint
 from policy.agents.approaches import APPROACHES, compact
 from policy.checkpoint import SHIPPED
@@ -30,7 +30,7 @@ from policy.training.config import agent_config, described
 EXAMPLES = Path(__file__).parents[2] / "examples"
 SEED = "200061"
 CODE = """
-from cosim.types import COMPACT, Decision, MetaAction, ObservationConfig
+from cosim.types import COMPACT, SMOKE, Decision, MetaAction, ObservationConfig
 
 class Holds:
     observation = ObservationConfig(maps=False)
@@ -123,7 +123,7 @@ def test_the_card_of_ones_own_training_says_its_sizes_and_thresholds(tmp_path: P
     weights = tmp_path / "best.safetensors"
     checkpoint.save(weights, {"vfn": VFN(wanted.vfn)}, {"vfn": wanted.vfn}, {}, about)
     assert config(weights) == replace(wanted, vfn_weights=weights)
-    assert make(f"{tmp_path}/").observation == file.observation != COMPACT
+    assert make(f"{tmp_path}/").observation == SMOKE != COMPACT
     checkpoint.save(
         weights, {"vfn": VFN(wanted.vfn)}, {"vfn": wanted.vfn}, {}, about | {"hpn_sha256": "0" * 64}
     )

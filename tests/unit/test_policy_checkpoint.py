@@ -17,7 +17,7 @@ from policy.agents.prediction_aware import PredictionAware
 from policy.checkpoint import load, read_card, save, sha256
 from policy.networks.vfn import VFN, VfnConfig
 
-CONFIG = VfnConfig(16, 128, frames=10)
+CONFIG = VfnConfig(height=16, frames=10)
 
 
 @pytest.fixture
@@ -49,7 +49,7 @@ def test_what_was_saved_is_loaded_bit_by_bit_with_its_card(saved: Path) -> None:
 
 
 def test_another_layout_is_refused_by_the_field_that_differs(saved: Path) -> None:
-    other = VfnConfig(32, 128, frames=10)
+    other = VfnConfig(frames=10)
     with pytest.raises(WeightsMismatch, match=r"configs\.vfn.*differs in height"):
         load(saved, {"vfn": VFN(other)}, {"vfn": other})
 

@@ -155,7 +155,7 @@ def test_the_command_line_trains_no_hpn_on_recordings_of_the_wrong_seeds(
 
 
 def test_examples_of_both_kinds_come_from_a_recording(folder: Path) -> None:
-    training = trained.HpnTraining(stride=3, map_stride=3)
+    training = trained.HpnTraining(stride=1)  # whole maps: every fifth decision
     moments = train_hpn.Gatherer("hpn", training).run(str(folder), "cell-7")
     blind = train_hpn.Gatherer("hpn-no-history", training).run(str(folder), "cell-7")
     samples = train_hpn.Gatherer("hpn-plain", training).run(str(folder), "cell-7")

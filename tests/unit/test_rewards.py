@@ -155,7 +155,7 @@ def test_distance_counts_what_was_driven_and_speed_what_is_driven_now() -> None:
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("variant", "q"), ("nearest", 0.0), ("crash", float("nan")), ("reference_speed", -1.0)],
+    [("variant", "q"), ("perception_range", 0.0), ("crash", float("nan"))],
 )
 def test_a_wrong_weight_is_refused_by_name(field: str, value: object) -> None:
     with pytest.raises(BadInput, match=field):

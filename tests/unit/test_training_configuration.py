@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import typing
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +12,12 @@ import yaml
 
 from cosim.errors import BadInput
 from cosim.learning.configuration import configuration
-from policy.training.config import TrainingFile, agent_config
+from cosim.types import COMPACT
+from policy.agents.approaches import configure
+from policy.chain.chain import ChainConfig
+from policy.networks.hpn import HpnConfig
+from policy.networks.vfn import VfnConfig
+from policy.training.config import TrainingFile
 
 
 def written(folder: Path, name: str, text: str) -> str:
@@ -27,14 +34,12 @@ def test_what_ships_can_be_read_and_written_whole(name: str, tmp_path: Path) -> 
 
 
 def test_a_file_changes_only_what_it_says_of_its_base(tmp_path: Path) -> None:
-    written(tmp_path, "mine", "base: papers\nexplore: {learners: 7}\ntraining: {replay: {batch: 16}}")
+    written(tmp_path, "mine", "base: papers\nexplore: {learners: 7}\ntraining: {batch: 16}")
     found = configuration(
         written(tmp_path, "again", "base: mine.yaml\ntraining: {iterations: 9, svo: [45]}")
     ).file
     papers = configuration("papers").file
-    training = replace(
-        papers.training, iterations=9, svo=(45.0,), replay=replace(papers.training.replay, batch=16)
-    )
+    training = replace(papers.training, iterations=9, svo=(45.0,), batch=16)
     assert found == replace(papers, explore=replace(papers.explore, learners=7), training=training)
 
 
@@ -49,11 +54,14 @@ def test_a_file_changes_only_what_it_says_of_its_base(tmp_path: Path) -> None:
         ("base: other.yaml", "other.yaml: base='mine.yaml': is its own base"),
         ("base: broken.yaml", "broken.yaml: training.iteration=3: unknown field"),
         (
-            "base: papers\ntraining: {replay: {interaction: 1.9}}",
+            "base: papers\ntraining: {interaction: 1.9}",
             "interaction=1.9: must be a share",
         ),
-        ("training: {ddqn: {learning_rate: -1}}", "training.ddqn.learning_rate=-1.0: must be above 0"),
-        ("observation: {height: -3}", "observation.height=-3: must be above 0"),
+        ("training: {learning_rate: -1}", "training.learning_rate=-1.0: must be above 0"),
+        (
+            "observation: compct",
+            "observation='compct': must be one of compact, paper, smoke, did you mean 'compact'",
+        ),
         ("safety: {critical_th: -3}", "safety.critical_th=-3.0: must be 0 or more"),
         ("svo: 1\nsvo: 2", "mine.yaml: line=2: not YAML: 'svo' is twice in this mapping"),
         ("base: papers\ntraining: 3", "mine.yaml: training=3: a mapping is needed"),
@@ -67,9 +75,19 @@ def test_a_wrong_base_is_named_with_its_file(tmp_path: Path, text: str, said: st
     assert said in str(refused.value)
 
 
-def test_a_network_of_maps_alone_refuses_channels_that_it_cannot_read(tmp_path: Path) -> None:
-    text = "base: papers\nvfn: {extractor: conv3d}\nobservation: {channels: [av, hv, road]}"
-    file = configuration(written(tmp_path, "mine", text)).file
-    assert agent_config("vfn-p", file).vfn.channels == 3
+def test_a_network_of_maps_alone_refuses_channels_that_it_cannot_read() -> None:
+    seen, sizes = replace(COMPACT, channels=("av", "hv", "road")), (ChainConfig(), HpnConfig(), VfnConfig())
+    assert configure("vfn-p", seen, *sizes).vfn.channels == 3
     with pytest.raises(BadInput, match=r"observation\.channels='av, hv, road': conv2d-dqn sees maps alone"):
-        agent_config("conv2d-dqn", file)
+        configure("conv2d-dqn", seen, *sizes)
+
+
+def test_a_training_has_at_most_sixty_fields() -> None:
+    def count(kind: type) -> int:
+        kinds = typing.get_type_hints(kind)
+        return sum(
+            count(kinds[field.name]) if dataclasses.is_dataclass(kinds[field.name]) else 1
+            for field in dataclasses.fields(kind)  # type: ignore[arg-type]
+        )
+
+    assert 50 < count(TrainingFile) <= 60

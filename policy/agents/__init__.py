@@ -46,6 +46,7 @@ POLICIES: dict[str, Callable[[], Policy]] = {
     **{f"idm-{gap}": partial(_made, "idm", "IdmHeadway", gap) for gap in ("1.5", "2.2")},  # s of headway
     "idm-courteous": partial(_made, "idm", "IdmCourteous"),
     "keep-lane": partial(_made, "keep_lane", "KeepLane"),
+    "car-alone": partial(_made, "car_alone", "CarAlone"),
     "random": partial(_made, "random", "Random"),
     "altruist-rule": partial(_made, "altruist_rule", "AltruistRule"),
     **{name: partial(_made, "prediction_aware", "PredictionAware", name) for name in APPROACHES},

@@ -51,28 +51,36 @@ docs: $(VENV)/.installed-dev
 	PYTHONPATH=. $(BIN)/zensical build --strict --clean
 
 # Every table and figure of docs/results/: first what is measured (costs, predictions; better on an idle
-# machine), then what is driven. The same command continues after an interruption. SCALE=0.1: a tenth of the episodes. Those in
-# docs/results/episodes/ need not be driven; ANEW=1 drives them all the same, `make audit` a few of them.
-# What has no trained weights is left out and named; `python -m benchmarks.papers --dry-run` lists what is
-# still to be driven, and its CPU hours.
+# machine), then what claims need driven (research/claims). The same command continues after an interruption.
+# SCALE=0.1: a tenth of the episodes. Those in docs/results/episodes/ need not be driven; ANEW=1 drives them all
+# the same, `make audit` a few of them. What has no trained weights is left out and named; `python -m research list`
+# says what is still to be driven, and its CPU hours.
+CLAIMS = --scale $(SCALE) --workers $(WORKERS) $(if $(ANEW),--anew)
 results: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.measured
-	$(BIN)/python -m benchmarks.papers --scale $(SCALE) --workers $(WORKERS) $(if $(ANEW),--anew)
+	$(BIN)/python -m benchmarks.learning
+	$(BIN)/python -m research drive $(CLAIMS)
+	$(BIN)/python -m research.figure8 $(CLAIMS)
+	$(BIN)/python -m research page $(CLAIMS)
 
-# The pages of the episodes that are there (docs/results/episodes/, runs/results): minutes, nothing is driven.
+# The pages of the episodes that are there (docs/results/episodes/, runs/research): minutes, nothing is driven.
 pages: $(VENV)/.installed-dev
-	$(BIN)/python -m benchmarks.papers --held
+	$(BIN)/python -m research page
 
-# Some of the shipped episodes driven anew: are they the same in every figure and the trace hash?
+# Some of the kept episodes driven anew: are they the same in every figure and the trace hash?
 audit: $(VENV)/.installed-dev
-	$(BIN)/python -m benchmarks.papers.episodes check --sample $(SAMPLE) --workers $(WORKERS)
+	$(BIN)/python -m research audit --sample $(SAMPLE) --workers $(WORKERS)
 	$(BIN)/python -m benchmarks.rows check --sample $(SAMPLE)
 
-# The same in small: one world, two episodes each, two seconds long, untrained networks. Shows that all works.
+# The same in small: one scenario, two episodes each on validation seeds, two seconds long. Shows that all works.
+SMALL = --seeds 150000:150002 --scenario merge --duration 2 --untrained --workers $(WORKERS) \
+    --runs runs/results-small/research --out runs/results-small/pages
 results-small: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.measured --small --runs runs/results-small/measured --out runs/results-small/pages
-	$(BIN)/python -m benchmarks.papers --scale 0.001 --scenario merge --duration 2 --untrained \
-	    --workers $(WORKERS) --runs runs/results-small --out runs/results-small/pages
+	$(BIN)/python -m benchmarks.learning --out runs/results-small/pages
+	$(BIN)/python -m research drive $(SMALL)
+	$(BIN)/python -m research.figure8 $(SMALL)
+	$(BIN)/python -m research page $(SMALL)
 
 # Rebuild every world's net from its plain XML sources.
 nets: $(VENV)/.installed-dev

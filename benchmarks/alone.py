@@ -18,7 +18,6 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.learned import asked, drivers, driving, options, share
-from benchmarks.papers.agents import Agent, build
 from benchmarks.tables import markdown_row, write_page
 from cosim.cli.main import main as cosim
 from cosim.learning.attribution import questioned
@@ -27,6 +26,7 @@ from cosim.report import run_folder, statistics
 from cosim.report.figures import Row
 from cosim.types import Policy
 from cosim.workers.tasks import OK
+from policy.agents.approaches import compact
 from policy.agents.prediction_aware import PredictionAware
 from policy.attribution import PRESENT, Replaced
 from sumo_scenarios import names
@@ -45,6 +45,11 @@ COLUMNS = (
 )  # fmt: skip
 
 
+def unmasked(approach: str) -> Policy:
+    """A shipped approach whose best valued action is carried out."""
+    return PredictionAware(f"{approach} alone", replace(compact(approach), mask=False))
+
+
 def given() -> Policy:
     """The network of `--weights` without the mask."""
     return PredictionAware("given alone", replace(config(Path(os.environ[WEIGHTS])), mask=False))
@@ -52,7 +57,7 @@ def given() -> Policy:
 
 def vfn_p() -> Policy:
     """`vfn-p` without the mask."""
-    return build(Agent("vfn-p alone", "vfn-p", mask="none"))
+    return unmasked("vfn-p")
 
 
 def vfn_p_present() -> Policy:
@@ -63,22 +68,22 @@ def vfn_p_present() -> Policy:
 
 def conv3d_dqn() -> Policy:
     """`conv3d-dqn`: it never has a mask."""
-    return build(Agent("conv3d-dqn alone", "conv3d-dqn"))
+    return unmasked("conv3d-dqn")
 
 
 def conv3d_a2c() -> Policy:
     """`conv3d-a2c`: it never has a mask."""
-    return build(Agent("conv3d-a2c alone", "conv3d-a2c"))
+    return unmasked("conv3d-a2c")
 
 
 def vfn() -> Policy:
     """`vfn` without the mask."""
-    return build(Agent("vfn alone", "vfn", mask="none"))
+    return unmasked("vfn")
 
 
 def vfn_p_demonstrated() -> Policy:
     """`vfn-p-demonstrated` without the mask."""
-    return build(Agent("vfn-p-demonstrated alone", "vfn-p-demonstrated", mask="none"))
+    return unmasked("vfn-p-demonstrated")
 
 
 def table(rows: Sequence[Row]) -> list[str]:

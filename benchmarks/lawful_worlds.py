@@ -3,12 +3,11 @@
     python -m benchmarks.lawful_worlds [--policies vfn-p ...] [--episodes 100] [--worlds merge ...]
         [--runs runs/lawful] [--workers 2] [--out PAGE]
 
-The policies drive `dense` from test seed 200,000 on; the same command goes on where it stopped. Episodes in
-`unguarded` that ship (docs/results/episodes) are not driven again. What the way that `lawful` is shorter
-comes from is taken away: the same networks in `unguarded` no faster than the limit (`WithinLimit`), and in
-`lawful` in cars that keep no longer headway before humans (`ShortHeadway`). How far anybody gets who keeps to
-the limit: `Hurries` and `HurriesCloser`, whom nothing but the limit and the leader holds back. Writes
-docs/results/lawful_worlds.md.
+The policies drive `dense` from test seed 200,000 on; the same command goes on where it stopped. What the way
+that `lawful` is shorter comes from is taken away: the same networks in `unguarded` no faster than the limit
+(`WithinLimit`), and in `lawful` in cars that keep no longer headway before humans (`ShortHeadway`). How far
+anybody gets who keeps to the limit: `Hurries` and `HurriesCloser`, whom nothing but the limit and the leader
+holds back. Writes docs/results/lawful_worlds.md.
 """
 
 import argparse
@@ -33,7 +32,6 @@ from policy import agents
 from policy.agents.idm import ACCEL, Idm
 
 PAGE = Path("docs/results/lawful_worlds.md")
-SHIPPED = Path("docs/results/episodes")
 IDM = "idm"
 WITHIN = "within-limit"  # `WithinLimit`, in `unguarded`
 SHORT = "short-headway"  # `ShortHeadway`, in `lawful`
@@ -206,9 +204,6 @@ def driven(policy: str, preset: str, args: argparse.Namespace) -> dict[str, dict
     """World -> seed -> row; what is missing is driven."""
     episodes = min(args.episodes, args.changed) if policy == SHORT else args.episodes
     seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + episodes)
-    shipped = {} if args.duration else by_seed(SHIPPED, policy, preset)
-    if all(shipped.get(world, {}).keys() >= set(seeds) for world in args.worlds):
-        return {world: {seed: shipped[world][seed] for seed in seeds} for world in args.worlds}
     out = args.runs / f"{policy}-{preset}"
     own = OURS.get(policy)
     named = f"{policy}=benchmarks.lawful_worlds:{own.__name__}" if own else policy

@@ -22,13 +22,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Picture
 
-from benchmarks.tables import DPI, markdown_row, write_page
+from benchmarks.tables import markdown_row, write_page
 from cosim.errors import BadInput, CosimError
 from cosim.types import Floats
 
 COURSES = {"crashed": "crashed, %", "mission_success": "missions fulfilled, %", "dt_mean_m": "distance, m"}
 PERCENT = ("crashed", "mission_success")
 PARTS = {"train": "training drives", "valid": "validation, greedy"}
+DPI = 110
 WINDOW = 20  # iterations a point of the training drives is the mean of
 
 

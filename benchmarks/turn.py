@@ -26,8 +26,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure as Picture
 
-from benchmarks.papers.pages import drawing, save_picture
 from benchmarks.tables import markdown_row, write_page
 from benchmarks.worlds import WITH_MISSION
 from cosim.batch.episode_runner import EpisodeRunner
@@ -48,6 +48,7 @@ from cosim.seeding import FIRST_TEST_SEED
 from cosim.types import Floats, Ints
 from cosim.workers.engines import LocalEngine
 from cosim.workers.tasks import Progress, Task
+from research.picture import save
 
 RESULTS = Path("docs/results")
 DEMAND = "contested"
@@ -209,7 +210,7 @@ def verdict(drives: Sequence[Drive]) -> str:
 
 def picture(drives: Mapping[str, Sequence[Drive]], path: Path) -> str:
     """A panel per world: share let in and the AVs' distance over phi, and the break-even (Markdown)."""
-    drawn = drawing(3.2 * len(drives), 3.0)
+    drawn = Picture(figsize=(3.2 * len(drives), 3.0), layout="constrained")
     panels = drawn.subplots(1, len(drives), squeeze=False, sharey=True)[0]
     for axes, (world, mine) in zip(panels, drives.items(), strict=True):
         served, av = columns(mine, "served"), columns(mine, "av_m")
@@ -224,7 +225,8 @@ def picture(drives: Mapping[str, Sequence[Drive]], path: Path) -> str:
         axes.set(title=world, xlabel="phi, degrees", ylim=(-0.05, 1.1), xticks=PHIS)
         axes.grid(alpha=0.3)
     panels[0].legend(fontsize="x-small")
-    return save_picture(drawn, path)
+    save(drawn, path)
+    return f"![{path.stem}]({path.name})"
 
 
 def read(path: Path) -> dict[tuple[str, str, float, int], Drive]:

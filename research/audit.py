@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from cosim.batch.records import row as row_of
-from cosim.errors import BadInput
 from cosim.report.figures import Row
 from cosim.workers.progress import Progress
 from cosim.workers.tasks import OK
@@ -29,16 +28,9 @@ class Audited:
 
 
 def audit(work: Work, settings: Settings, sample: int, pick: int = 0) -> Audited:
-    """Drive `sample` of the kept episodes, picked by `pick`, and compare every column.
-
-    Raises BadInput: nothing is kept of what the claims drive here.
-    """
+    """Drive `sample` of the kept episodes, picked by `pick`, and compare every column."""
     rows = kept.episodes(settings.kept).rows
     mine = [row for row in rows if row["cell"] in work.wanted]
-    if not mine:
-        raise BadInput(
-            "holds no episode of the claims, weights and files that are here", value=str(settings.kept)
-        )
     picked = random.Random(pick).sample(mine, min(sample, len(mine)))
     picked.sort(key=lambda row: row["key"])  # a cell's episodes one after the other
     anew = _driven(picked, work, settings)

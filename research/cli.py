@@ -24,7 +24,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         claims = [*schema.chosen(args.names, args.claims)]
         work: Callable[[list[Claim], Settings, argparse.Namespace], int] = args.work
-        return work(claims, _settings(args), args)
+        return work(claims, settings_of(args), args)
     except CosimError as error:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code
@@ -101,34 +101,24 @@ def _audit(claims: list[Claim], settings: Settings, args: argparse.Namespace) ->
 COMMANDS = {"list": _list, "drive": _drive, "page": _page, "check": _check, "keep": _keep, "audit": _audit}
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m research", description=__doc__)
-    commands = parser.add_subparsers(required=True, metavar="|".join(COMMANDS))
-    default = Settings()
-    for name, work in COMMANDS.items():
-        command = commands.add_parser(name, help=work.__doc__, description=work.__doc__)
-        command.set_defaults(work=work)
-        add = command.add_argument
-        add("names", nargs="*", metavar="NAME", help="claims (default: all)")
-        add("--claims", type=Path, default=schema.FOLDER, metavar="DIR", help="folder of their files")
-        add("--workers", type=int, default=default.workers, metavar="N")
-        add("--engine", choices=("local", "ray"), default=default.engine)
-        add("--scale", type=float, default=default.scale, metavar="X", help="of the numbers of episodes")
-        add("--seeds", metavar="A:B", help="in place of every claim's own")
-        add("--scenario", action="append", default=[], choices=sumo_scenarios.names())
-        add("--duration", type=float, metavar="S", help="of an episode (default: the scenario's)")
-        add("--untrained", action="store_true", help="networks with initial weights may drive, labelled so")
-        add("--runs", type=Path, default=default.runs, metavar="DIR", help="where the episodes are stored")
-        add("--out", type=Path, default=page.OUT, metavar="DIR", help="folder of pages")
-        add("--kept", type=Path, default=default.kept, metavar="DIR", help="episodes that need not be driven")
-        add("--anew", action="store_true", help="drive the kept episodes too")
-        if work is _audit:
-            add("--sample", type=int, default=SAMPLE, metavar="N", help=f"episodes (default {SAMPLE})")
-            add("--pick", type=int, default=0, metavar="SEED", help="which ones")
-    return parser
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Flags that say how much is driven, by whom, and where it lies."""
+    add, default = parser.add_argument, Settings()
+    add("--workers", type=int, default=default.workers, metavar="N")
+    add("--engine", choices=("local", "ray"), default=default.engine)
+    add("--scale", type=float, default=default.scale, metavar="X", help="of the numbers of episodes")
+    add("--seeds", metavar="A:B", help="in place of every claim's own")
+    add("--scenario", action="append", default=[], choices=sumo_scenarios.names())
+    add("--duration", type=float, metavar="S", help="of an episode (default: the scenario's)")
+    add("--untrained", action="store_true", help="networks with initial weights may drive, labelled so")
+    add("--runs", type=Path, default=default.runs, metavar="DIR", help="where the episodes are stored")
+    add("--out", type=Path, default=page.OUT, metavar="DIR", help="folder of pages")
+    add("--kept", type=Path, default=default.kept, metavar="DIR", help="episodes that need not be driven")
+    add("--anew", action="store_true", help="drive the kept episodes too")
 
 
-def _settings(args: argparse.Namespace) -> Settings:
+def settings_of(args: argparse.Namespace) -> Settings:
+    """The settings as typed. Raises BadInput for seeds that are none."""
     return Settings(
         runs=args.runs,
         workers=args.workers,
@@ -140,3 +130,19 @@ def _settings(args: argparse.Namespace) -> Settings:
         duration=args.duration,
         untrained=args.untrained,
     )
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m research", description=__doc__)
+    commands = parser.add_subparsers(required=True, metavar="|".join(COMMANDS))
+    for name, work in COMMANDS.items():
+        command = commands.add_parser(name, help=work.__doc__, description=work.__doc__)
+        command.set_defaults(work=work)
+        command.add_argument("names", nargs="*", metavar="NAME", help="claims (default: all)")
+        command.add_argument("--claims", type=Path, default=schema.FOLDER, metavar="DIR", help="their folder")
+        add_flags(command)
+        if work is _audit:
+            about = f"episodes (default {SAMPLE})"
+            command.add_argument("--sample", type=int, default=SAMPLE, metavar="N", help=about)
+            command.add_argument("--pick", type=int, default=0, metavar="SEED", help="which ones")
+    return parser

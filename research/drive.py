@@ -32,7 +32,6 @@ from cosim.workers.progress import Progress
 from research import kept
 from research.schema import Claim, Condition
 
-MARK = "#"  # between a policy's name and the hash of what makes the episode
 LEAST = 2  # episodes, however small the scale
 
 
@@ -189,17 +188,12 @@ class Runner(EpisodeRunner):
 
     def policy(self, case: EpisodeOptions) -> str:
         """The name that `--policy` knows."""
-        return unmarked(case.policy)
-
-
-def unmarked(text: str) -> str:
-    """The policy's name without its mark."""
-    return text.rpartition(MARK)[0]
+        return kept.unmarked(case.policy)
 
 
 def policy(cell: matrix.Cell) -> str:
     """Who drives the cell, by the name that `--policy` knows."""
-    return unmarked(cell.case.policy)
+    return kept.unmarked(cell.case.policy)
 
 
 # ---- inside ----
@@ -219,7 +213,7 @@ def _arm(plain: matrix.Cell, seeds: range) -> Arm:
     about = {**plain.manifest, POLICY_FILES: files}
     versions = kept.packages(about["versions"])
     defined = _short({name: part for name, part in about.items() if name != "versions"})
-    case = replace(plain.case, policy=f"{plain.case.policy}{MARK}{_short([defined, versions])}")
+    case = replace(plain.case, policy=f"{plain.case.policy}{kept.MARK}{_short([defined, versions])}")
     cell = replace(plain, case=case, manifest=about)
     weights = [digest for name, digest in files.items() if name.endswith(WEIGHTS)] or [*files.values(), ""]
     return Arm(cell, seeds, weights[0][:12], defined, label)

@@ -24,6 +24,7 @@ from cosim.workers.tasks import OK
 FOLDER = Path("docs/results/episodes")
 ROWS, MANIFEST = "episodes.parquet", "manifest.json"
 LEVEL = 19  # of zstd: written seldom
+MARK = "#"  # between a policy's name and the hash of what makes the episode
 OF_THE_MACHINE = ("timings", "stderr", "attempts")  # and every timing: not the same again
 
 
@@ -61,7 +62,7 @@ def keep(store: Store, wanted: Mapping[str, Container[int]], folder: Path) -> in
     manifest = {
         "versions": next((about["manifest"]["versions"] for about in cells.values()), {}),
         **{name: document[name] for name in ("units", "better")},
-        "cells": {cell: about for cell, about in cells.items() if cell in present},
+        "cells": {cell: _replayable(about) for cell, about in cells.items() if cell in present},
     }
     if rows:
         write(rows, manifest, folder)
@@ -87,6 +88,17 @@ def plain(row: Row) -> dict[str, Any]:
 def packages(versions: Mapping[str, str | None]) -> dict[str, str]:
     """The versions that decide how an episode is driven: not Python's own, and no local label (`+cpu`)."""
     return {name: (version or "").partition("+")[0] for name, version in versions.items() if name != "python"}
+
+
+def unmarked(text: str) -> str:
+    """The name that `--policy` knows, of the policy of a cell."""
+    return text.partition(MARK)[0]
+
+
+def _replayable(cell: Mapping[str, Any]) -> dict[str, Any]:
+    """A cell as `cosim replay` drives it."""
+    case = cell["case"]
+    return {**cell, "case": {**case, "policy": unmarked(case["policy"])}}
 
 
 @cache

@@ -150,7 +150,7 @@ def write_csv(path: Path, found: Iterable[Line]) -> None:
 
 def _named(found: Found, condition: Condition, name: str) -> str:
     label = found.arms[condition, name].label
-    return f"`{name}`" + (f" ({label})" if label else "")
+    return f"{name} ({label})" if label else name
 
 
 def _about(found: Found, here: Sequence[Condition], name: str) -> list[str]:
@@ -174,11 +174,11 @@ def _differences(found: Found, here: Sequence[Condition]) -> Iterator[list[str]]
     for against in claim.compare.against:
         tested = [t for c in here for t in found.tested if (t.condition, t.against) == (c, against)]
         texts = [f"{_difference(t.found, False)}, {wording.p_value(t.p_holm)}: {t.verdict}" for t in tested]
-        yield [f"less `{against}`", _span(t.found.n for t in tested), *about, *texts]
+        yield [f"less {against}", _span(t.found.n for t in tested), *about, *texts]
     first = claim.compare.against[0]
     for metric in claim.secondary:
         pairs = [found.difference(condition, first, metric) for condition in here]
-        name = f"{_headed(found.measures[metric], 'pp')}, less `{first}`"
+        name = f"{_headed(found.measures[metric], 'pp')}, less {first}"
         yield [name, _span(p.n for p in pairs), *about, *(_difference(p, False) for p in pairs)]
 
 

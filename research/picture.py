@@ -20,8 +20,12 @@ STYLE: Any = {"svg.fonttype": "none", "svg.hashsalt": "cosim", "font.size": 9.0}
 
 
 def draw(found: Found, path: Path) -> None:
-    """Write the picture as SVG."""
-    picture = _front(found) if found.claim.front else _points(found)
+    """Write the picture of a claim."""
+    save(_front(found) if found.claim.front else _points(found), path)
+
+
+def save(picture: Picture, path: Path) -> None:
+    """Write it as SVG, the same for the same figures."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with rc_context(STYLE):
         picture.savefig(path, metadata={"Date": None, "Creator": None})

@@ -1,38 +1,44 @@
-"""Policies that claims alone compare: a shipped one with fewer senses (`LABEL=research.policies:NAME`)."""
+"""Policies that claims alone compare (`LABEL=research.policies:NAME`): the mask without a network."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
-from cosim.types import PolicyContext
-from policy.agents.approaches import compact
-from policy.agents.prediction_aware import PredictionAware
+import numpy as np
 
-SHORT_RANGE = 25.0  # m
-
-
-class Alone(PredictionAware):
-    """An approach whose AVs share neither what they perceive nor what they intend."""
-
-    def __init__(self, approach: str, perception_range: float | None = None) -> None:
-        config = compact(approach)
-        seen = replace(
-            config.observation,
-            share_perception=False,
-            perception_range=perception_range or config.observation.perception_range,
-        )
-        super().__init__(approach, replace(config, observation=seen))
-
-    def reset(self, context: PolicyContext) -> None:
-        """A new episode, in which no intention is shared."""
-        super().reset(replace(context, share_intentions=False))
+from cosim.types import Floats32, History, MetaAction
+from policy.agents.approaches import AgentConfig, compact
+from policy.agents.prediction_aware import Inputs, PredictionAware
+from policy.inputs.tensors import States, svo_tensor
 
 
-def without_v2v() -> Alone:
-    """`vfn-p` without V2V."""
-    return Alone("vfn-p")
+class MaskOnly(PredictionAware):
+    """All actions are worth the same: an AV keeps lane and speed while that is safe, and picks up speed when
+    it has become slow (the prioritizer's order of equal values). Without a mask this is `keep-lane`.
+
+    No network is asked, no map drawn.
+    """
+
+    def __init__(self, name: str, config: AgentConfig) -> None:
+        super().__init__(name, replace(config, predicted_maps=False, vfn_weights=None))
+        self.observation = replace(config.observation, maps=False)
+        self.label = ""
+
+    def perceive(self, histories: Mapping[str, History]) -> Inputs:
+        """What the prioritizer needs."""
+        scene, traffic, _ = self.foresee(histories)
+        none = svo_tensor(0.0, 0)
+        return Inputs(scene, States(none, none, none, none), traffic)
+
+    def values(self, inputs: Inputs) -> Floats32:
+        """All alike."""
+        q = np.zeros((len(inputs.scene.agents), len(MetaAction)), np.float32)
+        if not self.config.mask:
+            q[:, MetaAction.IDLE] = 1.0
+        return q
 
 
-def alone_25_m() -> Alone:
-    """`vfn-p` without V2V, which perceives 25 m."""
-    return Alone("vfn-p", SHORT_RANGE)
+def cruise() -> MaskOnly:
+    """Keeps lane and speed behind the mask of `vfn-p`."""
+    return MaskOnly("cruise", compact("vfn-p"))

@@ -32,9 +32,9 @@ def test_a_shipped_claim_names_figures_that_there_are_and_drives_unguarded(one: 
     assert {case.preset for case in one.cases.values()} == {"unguarded"}
 
 
-def test_table_3_drives_six_approaches_and_four_floors_in_both_cells_and_demands() -> None:
+def test_table_3_drives_six_approaches_and_five_floors_in_both_cells_and_demands() -> None:
     (one,) = schema.chosen(["table3"])
-    assert len(one.cases) == 5 * 2 * 2 * 10
+    assert len(one.cases) == 5 * 2 * 2 * 11
     assert {case.errors for case in one.cases.values()} == {None, "stress"}
     assert {case.demand for case in one.cases.values()} == {("dense",), ("contested",)}
     assert {case.behavior for case in one.cases.values()} == {"mixed"}

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.papers.driving import AgentRunner
 from cosim.recording.replay_data import ReplayData, Track
 from cosim.report.replay.strip import Strip, poses_at
 from cosim.road import Lane
 from cosim.scenario.options import EpisodeOptions
 from cosim.types import Floats, Kind
 from cosim.workers.tasks import Progress
+from research.drive import Runner
 
 SLOWS, YIELDS, OVERTAKES, OTHER, NONE = KINDS = (
     "slows down in its lane",
@@ -24,10 +24,7 @@ SLOWS, YIELDS, OVERTAKES, OTHER, NONE = KINDS = (
     "no AV at the merging point",
 )
 BEFORE = 15.0  # s before the merge in which room is made
-NEAR = (
-    -125.0,
-    20.0,
-)  # m along the road from the merging vehicle: who perceives it, and who is just beside it
+NEAR = (-125.0, 20.0)  # m along the road from the merging vehicle: AVs that perceive it or drive beside it
 SLOWER = 2.0  # m/s that it lost: it made room
 LANE = 3.2  # m, a lane's width; half of it to either side is in a lane
 WIDTH, HEIGHT = 760, 120  # pixels of a snapshot
@@ -47,7 +44,7 @@ class Guided:
     mission_speed: tuple[float | None, ...] = ()
 
 
-class GuideRunner(AgentRunner):
+class GuideRunner(Runner):
     """Hosted by the engine: drives an episode, looks at its guide AV and takes three pictures."""
 
     def run(
@@ -61,7 +58,7 @@ class GuideRunner(AgentRunner):
 
 
 def guided(r: ReplayData) -> Guided:
-    """Who made room, and how."""
+    """Which AV made room, and how."""
     mission = next((t for t in r.tracks if t.mission), None)
     at = None if mission is None else _merge(r, mission)
     if mission is None or at is None:

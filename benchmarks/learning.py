@@ -1,0 +1,65 @@
+"""How the shipped approaches learned: crashes, missions and distance over training. Drives nothing.
+
+    python -m benchmarks.learning [--training vfn-p=runs/vfn-p-0] [--out docs/results]
+
+Drawn from runs/POLICY, runs/POLICY-0, -1, ... or, where there are none, from the logs of the trainings that
+made the shipped weights (docs/results/trainings). Other runs: `python -m benchmarks.learning_curves`.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from benchmarks import learning_curves
+from benchmarks.tables import write_page
+from policy.agents import APPROACHES
+
+NAME = "learning"
+TRAININGS = Path("docs/results/trainings")  # logs of the trainings that made the shipped weights
+
+
+def write(out: Path, given: Mapping[str, Sequence[Path]]) -> None:
+    """learning.md, learning.png, data/learning.csv; nothing where no training is known of.
+
+    `given`: policy -> runs of `cosim train`, in place of those that are found.
+    """
+    runs = [
+        learning_curves.read(f"{name}={run}") for name in APPROACHES for run in given.get(name, found(name))
+    ]
+    if not runs:
+        return
+    data = out / "data"
+    data.mkdir(parents=True, exist_ok=True)
+    learning_curves.draw(out / f"{NAME}.png", runs)
+    learning_curves.write_csv(data / f"{NAME}.csv", runs)
+    text = learning_curves.page(runs, f"python -m benchmarks.{NAME}", f"{NAME}.png")
+    write_page(out / f"{NAME}.md", text)
+    print(out / f"{NAME}.md")
+
+
+def found(policy: str) -> list[Path]:
+    """The runs of `cosim train` that are known of a policy."""
+    for root in (Path("runs"), TRAININGS):
+        places = [root / policy, *sorted(root.glob(f"{policy}-[0-9]*"))]
+        if runs := [place for place in places if (place / "log.jsonl").is_file()]:
+            return runs
+    return []
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(prog=f"python -m benchmarks.{NAME}", description=__doc__)
+    parser.add_argument("--training", action="append", default=[], metavar="POLICY=RUN")
+    parser.add_argument("--out", type=Path, default=Path("docs/results"), metavar="DIR")
+    args = parser.parse_args()
+    given: dict[str, list[Path]] = {}
+    for text in args.training:
+        policy, _, run = text.partition("=")
+        given.setdefault(policy, []).append(Path(run))
+    write(args.out, given)
+
+
+if __name__ == "__main__":
+    main()

@@ -83,6 +83,12 @@ def decision_cost(place: Place) -> list[list[str]]:
     return [["benchmarks.decision_cost", *flags, "--out", str(place.out / "decision_cost.md")]]
 
 
+def sensing_cost(place: Place) -> list[list[str]]:
+    """What sensing costs an AV in a frame."""
+    flags = ["--small"] if place.small else []
+    return [["benchmarks.sensing_cost", *flags, "--out", str(place.out / "sensing_cost.md")]]
+
+
 def performance(place: Place) -> list[list[str]]:
     """What the loop, a batch and the Gaussian process cost."""
     where = str(place.work / "recordings")
@@ -211,6 +217,7 @@ PAGES = (
     Page("agent", agent, ("agent.md",)),
     Page("prediction_speed", prediction_speed, ("prediction_speed.md",)),
     Page("decision_cost", decision_cost, ("decision_cost.md",)),
+    Page("sensing_cost", sensing_cost, ("sensing_cost.md",)),
     Page("performance", performance, ("performance.md",)),
     Page("startup", startup, ("startup.md",)),
     Page("joining", joining, ("joining.md",)),

@@ -353,16 +353,23 @@ class Percept:
         world: the AV itself, as it is, and everybody it knows of, where it takes them to be; n in all.
         age: [n] s since the newest measurement of each.
         source: [n] `Source` of it.
-        unseen: vehicle or person on the road -> why the AV's own sensors do not detect it now; without those
-            out of range.
         hears: the AVs whose intentions reach it in time for a decision (MCM).
+        others: k vehicles and persons.
+        detected: [k] whether the AV's own sensors detect each of them now (3), else `Unseen`.
     """
 
     world: Snapshot
     age: Floats
     source: npt.NDArray[np.int8]
-    unseen: Mapping[str, Unseen]
     hears: frozenset[str]
+    others: tuple[str, ...]
+    detected: npt.NDArray[np.uint8]
+
+    @cached_property
+    def unseen(self) -> dict[str, Unseen]:
+        """Vehicle or person -> why the AV's own sensors do not detect it, without those out of range."""
+        within = (self.detected == Unseen.HIDDEN) | (self.detected == Unseen.MISSED)
+        return {self.others[k]: Unseen(self.detected[k]) for k in np.flatnonzero(within).tolist()}
 
 
 # Columns of the kinematic matrix, in the ego's frame at the newest frame of the history

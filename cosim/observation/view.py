@@ -5,9 +5,10 @@ an agent needs of them as plain arrays, and of the N maps only the new ones cros
 """
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from cosim.road.rules import RulesAhead
 from cosim.types import LANE_OFFSET, Bools, Bytes, Floats, Floats32, History, MetaAction
@@ -38,6 +39,8 @@ class View(NamedTuple):
         action_mask: [A] False for a lane change towards no lane, or while one is under way.
         time: s.
         rules: the law on its own way: signals, stop lines, crossings, limits.
+        age: [R] s since the newest measurement of each row's vehicle; 0 with ideal sensing.
+        source: [R] `cosim.types.Source` of that measurement.
     """
 
     velocity_map: Bytes
@@ -55,6 +58,8 @@ class View(NamedTuple):
     action_mask: Bools
     time: float
     rules: RulesAhead
+    age: Floats
+    source: npt.NDArray[np.int8]
 
     @property
     def ego_speed(self) -> float:
@@ -78,6 +83,8 @@ class Packed(NamedTuple):
     limits: Floats  # [k,2] m, m/s: those of all AVs one after the other
     lanes: Bools  # [B,3]
     lines: Floats32  # [B,3,P,2]
+    age: Floats  # [B,R]
+    source: npt.NDArray[np.int8]  # [B,R]
 
 
 class Packer:
@@ -121,6 +128,8 @@ class Packer:
             limits=np.concatenate([h.rules.limits for h in everyone]) if everyone else np.zeros((0, 2)),
             lanes=exists,
             lines=lines,
+            age=_by_row([h.age for h in everyone], everyone, np.float64),
+            source=_by_row([h.source for h in everyone], everyone, np.int8),
         )
 
 
@@ -163,6 +172,8 @@ class Unpacker:
             centre_lines=packed.lines[b],
             action_mask=mask,
             time=time,
+            age=packed.age[b],
+            source=packed.source[b],
             rules=RulesAhead(
                 *(chr(int(state)).strip("\0"), signal_distance, int(signal), switch, stop, bool(all_way)),
                 *(give_way, int(link), crossing, person, limits),
@@ -173,6 +184,14 @@ class Unpacker:
 def views(histories: Mapping[str, History]) -> dict[str, View]:
     """What an agent in the simulation's own process sees: AV id -> View."""
     return Unpacker().unpack(Packer().pack(histories, None))
+
+
+def _by_row(columns: list[npt.NDArray[Any]], histories: list[History], dtype: Any) -> npt.NDArray[Any]:
+    """[B,R] of columns [R] or, with ideal sensing, [0]: then all are 0."""
+    if not histories:
+        return np.zeros((0, 0), dtype)
+    ideal = np.zeros(len(histories[0].ids), dtype)
+    return np.array([column if len(column) else ideal for column in columns], dtype)
 
 
 def _lines(histories: list[History]) -> tuple[Floats32, Bools]:

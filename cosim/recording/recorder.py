@@ -1,7 +1,7 @@
 """The one recorder of an episode: a hook that keeps what was driven, decided and predicted."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,6 +10,7 @@ from cosim.episode import Episode, Hook, Step
 from cosim.types import (
     Collision,
     Decision,
+    Floats,
     Forecast,
     HumanError,
     Intervention,
@@ -17,6 +18,7 @@ from cosim.types import (
     Offence,
     Policy,
     Snapshot,
+    Unseen,
 )
 
 DRAWN = 400_000  # vehicle frames of a drawing: about 2 MB of page
@@ -39,6 +41,33 @@ class Choice:
     blocked: str | None  # why the command was not executed
 
 
+class Belief(NamedTuple):
+    """How what one AV knew at a decision differs from the truth of that moment: k vehicles and persons."""
+
+    ids: tuple[str, ...]
+    x: Floats  # [k] m, where it took each to be, less where it was
+    y: Floats  # [k] m
+    age: Floats  # [k] s since the newest measurement
+    source: Ints  # [k] `Source` of that
+    unseen: Mapping[str, Unseen]  # whom its own sensors did not detect though in range
+
+
+def beliefs(frame: Snapshot) -> dict[str, Belief] | None:
+    """AV -> what it knew of those on the road; None where sensing is ideal."""
+    if frame.percepts is None:
+        return None
+    found = {}
+    for av, percept in frame.percepts.items():
+        world = percept.world
+        mine = np.array([k for k, name in enumerate(world.ids) if name in frame.row and name != av], np.int64)
+        ids = tuple([world.ids[k] for k in mine])
+        true = np.array([frame.row[name] for name in ids], np.int64)
+        off = world.x[mine] - frame.x[true], world.y[mine] - frame.y[true]
+        known = percept.age[mine], percept.source[mine].astype(np.int64)
+        found[av] = Belief(ids, *off, *known, percept.unseen)
+    return found
+
+
 class Recorder(Hook):
     """Keeps the last episode; `recording.file.write` stores it, `recording.replay_data` reads it.
 
@@ -58,6 +87,7 @@ class Recorder(Hook):
         """Its frames, its decisions, and what the policy predicted for them."""
         self.decided.append(step.before.time)
         self.forecasts.append(getattr(self._policy, "last_forecast", None) if step.decisions else None)
+        self.beliefs.append(beliefs(step.before))
         outcomes = zip(step.commands, step.receipts, strict=True)
         self.choices.append(
             {c.vehicle: Choice(step.decisions[c.vehicle], c.target_speed, r.blocked) for c, r in outcomes}
@@ -69,12 +99,13 @@ class Recorder(Hook):
 
     def begin(self, frames: Sequence[Snapshot]) -> None:
         """Discard the last episode; the clock of the next one is 0 at the last of these frames."""
-        self.frames: list[Snapshot] = list(frames)
+        self.frames: list[Snapshot] = [_truth(frame) for frame in frames]
         self.first = len(frames) - 1
         self.known: dict[int, dict[str, Knowledge]] = {}  # decision frame -> AV -> what it knew
         self.decided: list[float] = []  # s, when decisions were taken
         self.choices: list[dict[str, Choice]] = []
         self.forecasts: list[Forecast | None] = []
+        self.beliefs: list[dict[str, Belief] | None] = []  # of every decision
         self.collisions: list[Collision] = [*frames[-1].events.collisions]
         self.offences: list[Offence] = []
         self.interventions: list[Intervention] = []
@@ -90,15 +121,16 @@ class Recorder(Hook):
         self._driven += 1
         if self._driven % self._stride:
             return
-        self.frames.append(frame)
+        self.frames.append(_truth(frame))
         self._kept += frame.n
         if self._kept > self._limit and len(self.frames) - self.first > 2:
             self.frames = self.frames[self.first :: 2]
             self.first, self._stride = 0, 2 * self._stride
             self._kept = sum(s.n for s in self.frames)
             kept = {s.time for s in self.frames}
-            decided = zip(self.decided, self.forecasts, strict=True)
-            self.forecasts = [forecast if time in kept else None for time, forecast in decided]
+            decided = zip(self.decided, self.forecasts, self.beliefs, strict=True)
+            drawn = [(f, b) if time in kept else (None, None) for time, f, b in decided]
+            self.forecasts, self.beliefs = [f for f, _ in drawn], [b for _, b in drawn]
 
     def vehicles(self, *columns: str) -> tuple[list[str], Ints, Ints, dict[str, Any]]:
         """Every vehicle in every frame: L rows, a vehicle's frames together.
@@ -117,3 +149,8 @@ class Recorder(Hook):
         self.known[len(self.frames) - 1] = {
             av: Knowledge(s.route(av), *s.commanded(av)) for av in episode.histories
         }
+
+
+def _truth(frame: Snapshot) -> Snapshot:
+    """Without percepts, which take a lot of room."""
+    return frame if frame.percepts is None else replace(frame, percepts=None)

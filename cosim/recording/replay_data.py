@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from cosim.recording.recorder import Choice, Recorder
+from cosim.recording.recorder import Belief, Choice, Recorder
 from cosim.road import RoadMap
 from cosim.scenario.behaviors import AS_IS
 from cosim.types import (
@@ -62,6 +62,7 @@ class ReplayData:
     signals: Bytes = field(default_factory=lambda: np.zeros((0, 0), np.uint8))  # [T,s] as in `Snapshot`
     offences: tuple[Offence, ...] = ()
     interventions: tuple[Intervention, ...] = ()
+    beliefs: tuple[Mapping[str, Belief] | None, ...] = ()  # [D] AV -> what it knew; None: everything
     errors: tuple[HumanError, ...] = ()  # those of the warm-up that went on into the counted time first
 
 
@@ -81,6 +82,7 @@ def replay_data(recorder: Recorder, simulator: Simulator, facts: Mapping[str, An
         decided=np.array(recorder.decided),
         choices=tuple(recorder.choices),
         forecasts=tuple(recorder.forecasts),
+        beliefs=tuple(recorder.beliefs),
         collisions=tuple(recorder.collisions),
         goal=simulator.goal_lanes,
         signals=np.stack([s.signals for s in frames]),

@@ -29,13 +29,13 @@ from cosim.sensing.kernels import (
     B_Y,
 )
 from cosim.sensing.lanes import lane_lines
-from cosim.types import Actor, Kind, Percept, Snapshot, Source, Timing, Unseen
+from cosim.types import Actor, Kind, Percept, Snapshot, Source, Timing
 
 COMPENSATION = {"hold": 0, "cv": 1, "lanes": 2, "truth": 3}
 HIDING = (Actor.CAR, Actor.TRUCK, Actor.BUS, Actor.OTHER)  # nobody is behind a motorcycle or a person
 LONGEST_JITTER = 6.0  # of its mean: one message in 400 comes later, and is not looked at
-WHY = (*Unseen,)  # by the kernels' codes
 NOBODY: frozenset[str] = frozenset()
+AV, HV, TRUTH = int(Kind.AV), int(Kind.HV), int(Source.TRUTH)  # members of an enum cost time
 OWN = -1.0  # in a belief's source: the AV itself
 SLOTS = 64  # objects that there is room for at first; AVs: a quarter
 
@@ -94,9 +94,7 @@ class Perception:
         if p.mcm:
             decision = self._timing.decision
             kernels.intentions_heard(state, slots.egos, slots.streams, now, decision, self._radio, hears)
-        return Percepts(
-            snapshot, slots.known, dict(slots.avs), slots.egos.copy(), seen.copy(), beliefs, hears
-        )
+        return Percepts(snapshot, slots.known, dict(slots.avs), seen.copy(), beliefs, hears)
 
     # ---- inside ----
 
@@ -112,6 +110,7 @@ class Known(NamedTuple):
     """What does not change of the objects that hold a place: k of them, by name."""
 
     names: tuple[str, ...]
+    row: dict[str, int]
     place: Ints  # [k]
     length: Floats  # [k] m
     width: Floats  # [k] m
@@ -128,14 +127,14 @@ class Percepts(Mapping[str, Percept]):
         truth: Snapshot,
         known: Known,
         avs: Mapping[str, int],
-        egos: Ints,
         seen: npt.NDArray[np.uint8],
         beliefs: Floats,
         hears: npt.NDArray[np.uint8],
     ) -> None:
-        self._truth, self._known, self._avs, self._egos = truth, known, avs, egos
+        self._truth, self._known, self._avs = truth, known, avs
         self._seen, self._beliefs, self._hears = seen, beliefs, hears
         self._names = {a: name for name, a in avs.items()}
+        self._ordered: tuple[Floats, npt.NDArray[np.uint8]] | None = None  # [A,k,10], [A,k] by `known`
         self._found: dict[str, Percept] = {}
 
     def __getitem__(self, av: str) -> Percept:
@@ -151,13 +150,16 @@ class Percepts(Mapping[str, Percept]):
 
     def _percept(self, av: str, a: int) -> Percept:
         known, truth = self._known, self._truth
-        beliefs = self._beliefs[a]
-        beliefs[self._egos[a]] = _own(truth, truth.row[av])
-        rows = np.flatnonzero(beliefs[known.place, B_SOURCE])
-        b = beliefs[known.place[rows]].T.copy()  # [10,m]
-        b[B_SOURCE, b[B_SOURCE] < 0.0] = Source.TRUTH
+        if self._ordered is None:
+            self._ordered = self._beliefs.take(known.place, 1), self._seen.take(known.place, 1)
+        beliefs, seen = self._ordered[0][a], self._ordered[1][a]  # [k,10], [k]
+        me = known.row[av]
+        beliefs[me] = _own(truth, truth.row[av])
+        rows = beliefs[:, B_SOURCE].nonzero()[0]
+        b = beliefs[rows].T.copy()  # [10,m]
+        b[B_SOURCE, np.searchsorted(rows, me)] = TRUTH
         kind, lane = known.kind[rows], b[B_LANE].astype(np.int32)
-        kind[(kind == Kind.AV) & (b[B_TOLD] == 0.0)] = Kind.HV  # it has not said what it is
+        kind[(kind == AV) & (b[B_TOLD] == 0.0)] = HV  # it has not said what it is
         unknown = np.full(len(rows), np.nan)
         world = Snapshot(
             time=truth.time,
@@ -181,12 +183,10 @@ class Percepts(Mapping[str, Percept]):
             co2=unknown,
             limits=truth.limits,
         )
-        codes = self._seen[a, known.place]
-        dark = ((codes == kernels.HIDDEN) | (codes == kernels.MISSED)).nonzero()[0]
-        unseen = {known.names[k]: WHY[codes[k]] for k in dark.tolist()}
         heard = self._hears[a].nonzero()[0]
         hears = frozenset([self._names[k] for k in heard.tolist()]) if len(heard) else NOBODY
-        return Percept(world, b[B_AGE], b[B_SOURCE].astype(np.int8), unseen, hears)
+        source = b[B_SOURCE].astype(np.int8)
+        return Percept(world, b[B_AGE], source, hears, known.names, seen)
 
 
 def _own(truth: Snapshot, row: int) -> Floats:
@@ -255,7 +255,7 @@ class _Slots:
         names = tuple(sorted(self.place))
         k = np.array([self.place[name] for name in names], np.int64)
         fixed = self.length[k], self.width[k], self.kind[k], self.actor[k], self.mission[k]
-        return Known(names, k, *fixed)
+        return Known(names, {name: row for row, name in enumerate(names)}, k, *fixed)
 
     def _enter(
         self, name: str, k: int, s: Snapshot, stream: Callable[[str], int], is_equipped: Callable[[str], bool]

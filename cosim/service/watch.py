@@ -14,7 +14,7 @@ import numpy as np
 from cosim.envs.host import SessionHost
 from cosim.episode import Episode, Hook, Step
 from cosim.policies import Explainer, explainer
-from cosim.recording.recorder import Choice
+from cosim.recording.recorder import Choice, beliefs
 from cosim.report.replay.packing import (
     DrawnRoad,
     Names,
@@ -109,7 +109,10 @@ class Picture:
         }
         forecast = getattr(self._policy, "last_forecast", None) if step.decisions else None
         found: dict[str, Any] = {
-            "decided": [ms(step.before.time), self._names.choices(choices), self._names.forecast(forecast)],
+            "decided": [
+                *(ms(step.before.time), self._names.choices(choices), self._names.forecast(forecast)),
+                self._names.beliefs(beliefs(step.before)),
+            ],
             "frames": frames,
             **self._now(episode),
         }

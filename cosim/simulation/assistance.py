@@ -14,18 +14,20 @@ ahead of it are told (V2V), and make room before the end of their queue has used
 import math
 from collections.abc import Set
 from dataclasses import dataclass
+from functools import partial
 
-from cosim.control import COMFORT, COMFORT_TIME, wished_accel
+from cosim.control import COMFORT, COMFORT_TIME, MAX_DECEL, wished_accel
 from cosim.road import RoadMap
 from cosim.road.rules import RED, YELLOW
 from cosim.simulation.backend import sumo
 from cosim.simulation.commands import SPEED_MODE, Commander, Controlled
 from cosim.simulation.derived_types import LATE_TYPE, LAWFUL_TYPE, derive, is_known, own_type, suffix
+from cosim.simulation.eyes import Eyes
 from cosim.simulation.fleet import set_type
 from cosim.simulation.gaps import Gaps
 from cosim.simulation.inside import FREE, SWERVES, Ahead, Inside
 from cosim.simulation.waves import NOBODY, Waves
-from cosim.types import Intervention, Preset
+from cosim.types import Intervention, Preset, Snapshot
 
 CORRECTED = 1.0  # m/s2 more braking than asked for: from there on the car drives otherwise than commanded
 STALLED = 0.2, 1.5  # m/s2, or so little acceleration where so much was asked for
@@ -51,6 +53,9 @@ AT_LINE = 5.0  # m: who is further away stands in a queue
 WAITS = 15.0  # s of waiting at a line; from then on it judges and takes its gap, whatever the agent asks for
 GOES_FIRST = SPEED_MODE[Preset.LAWFUL] - 8  # heeds nobody outside the junction
 GOES_ON = 32  # with it, of those inside nobody either: `Inside` looks who is in its way
+BRAKES_WITHIN = (
+    4  # of a speed mode: no commanded speed is reached by braking harder than the driver's `decel`
+)
 HOLDS = 10.0, 2.6  # m before a line, m/s2: from there on it goes before no AV that would brake harder
 LETS = 1.0  # s for which an AV that is asked lets another one in
 # where AVs alone come, and where humans do: SUMO adds a share of 180 s stood, which makes humans brake hard
@@ -98,6 +103,9 @@ class Assisted(Controlled):
     lets: float = -math.inf  # s, until when it stops before its line for who takes one
     has_let: float = 0.0  # s, for which it has done so at this one
     side: float = 0.0  # m to the left of its lane's centre, where it drives
+    led: bool = False  # whether the leader that it sees limited the last step
+    mode: int = SPEED_MODE[Preset.LAWFUL]  # SUMO's, but for `brakes_hard`
+    brakes_hard: bool = False  # for that leader, harder than its driver's comfort
     holds: bool = False  # for an AV that would have to brake hard
 
     @property
@@ -113,8 +121,9 @@ class Assistance(Commander):
 
     def __init__(self, step: float, road: RoadMap) -> None:
         super().__init__(Preset.LAWFUL, step)
-        self._junctions = Inside(road)
-        self._gaps = Gaps(road, self._junctions)
+        self._eyes = Eyes(road)
+        self._junctions = Inside(road, self._eyes)
+        self._gaps = Gaps(road, self._junctions, self._eyes)
         self._waves = Waves()
         self._looked = -math.inf  # s
         self._begun: list[Intervention] = []
@@ -134,9 +143,9 @@ class Assistance(Commander):
             self._mind_follower(name, speed, state, now)
             flees = now < state.flees
             # what SUMO's driver did in the last step, or would have done
-            allowed = get.getSpeedWithoutTraCI(name) if state.ours else speed
+            allowed = get.getSpeedWithoutTraCI(name) if state.ours or state.led else speed
             slower = allowed < state.wish - 1e-3
-            if not state.ours:
+            if not state.ours or state.led:
                 state.accel = (speed - state.speed) / self._step
             target = min(state.goal(speed, COMFORT_TIME), state.limit)
             state.idled = state.idled + self._step if state.target < KEEPS_MOVING else 0.0
@@ -167,11 +176,23 @@ class Assistance(Commander):
             self._mind_inside(name, lane, speed, state)
             state.wish, state.speed = max(speed + state.accel * self._step, 0.0), speed
             ours = not (slower or flees or swift) or (state.stays and not (slower and speed >= STARTS))
-            if ours:
+            behind = self._follow(name, speed)
+            led = behind < min(state.wish if ours else math.inf, allowed)
+            self._allow_hard_braking(name, led and behind < speed - get.getDecel(name) * self._step, state)
+            if led:
+                get.setSpeed(name, behind)
+            elif ours:
                 get.setSpeed(name, state.wish)
-            elif state.ours:
+            elif state.ours or state.led:
                 get.setSpeed(name, -1.0)
-            state.ours = ours
+            state.ours, state.led = ours, led
+
+    def see(self, snapshot: Snapshot) -> None:
+        """A new frame, with what every AV knows of it."""
+        self._eyes.open(snapshot)
+        if not self._eyes.ideal:
+            for name in self.controlled:
+                self._blind(name)
 
     def observe(self, now: float) -> list[Intervention]:
         """After every simulation step, at `now` (s): where the car began to drive otherwise than asked."""
@@ -202,18 +223,21 @@ class Assistance(Commander):
     def _take_over(self, name: str) -> Assisted:
         get = sumo.vehicle
         _drive_as(name, LAWFUL_TYPE)
+        self._blind(name)
         get.setSpeedFactor(name, min(get.getSpeedFactor(name), 1.0))
         return Assisted(0.0, speed=get.getSpeed(name), lateral=get.getLateralLanePosition(name))
 
     def _hand_back(self, name: str) -> None:
         """It keeps its comfortable driver."""
         self._waves.set(name, NOBODY)
+        self._waves.blind(name, (), ())
         _drive_as(name, LAWFUL_TYPE)
 
     def drop(self, name: str) -> None:
         """Also of one that crashed."""
         super().drop(name)
         self._waves.set(name, NOBODY)
+        self._waves.forget(name)
 
     def _forbidden(self, name: str, lane: str, offset: int) -> str | None:
         why = super()._forbidden(name, lane, offset)
@@ -225,13 +249,46 @@ class Assistance(Commander):
                 self._begun.append(Intervention(sumo.simulation.getTime(), name, why))
         return why
 
+    def _blind(self, name: str) -> None:
+        """SUMO's driver heeds no vehicle at junctions that the AV does not know of, and no leader at all:
+        `_follow` does, as far as the AV knows of one."""
+        everybody, unseen = self._eyes.unseen(name)
+        self._waves.blind(name, unseen, everybody)
+
+    def _follow(self, name: str, speed: float) -> float:
+        """The speed in m/s for the end of the step that the driver model has behind the leader as the AV
+        sees it; inf without one, and where SUMO's driver sees to it."""
+        get = sumo.vehicle
+        leader, gap = (not self._eyes.ideal and get.getLeader(name, NOTICE)) or ("", 0.0)
+        if not leader or not self._eyes.known(name, [leader]):
+            return math.inf
+        seen = self._eyes.of(name)
+        gap -= seen.behind_by(leader, math.radians(90.0 - get.getAngle(name)))
+        wanted = get.getFollowSpeed(name, speed, gap, seen.getSpeed(leader), get.getDecel(leader), leader)
+        return float(max(wanted, speed - MAX_DECEL * self._step, 0.0))
+
+    def _allow_hard_braking(self, name: str, hard: bool, state: Assisted) -> None:
+        """Let SUMO carry out a commanded speed that asks for more than its driver's own deceleration, or no
+        longer."""
+        if hard != state.brakes_hard:
+            state.brakes_hard = hard
+            sumo.vehicle.setSpeedMode(name, state.mode - BRAKES_WITHIN * hard)
+
+    def _is_human(self, name: str, other: str) -> bool:
+        """Whether the AV `name` takes `other` for no AV."""
+        return not self._eyes.is_av(name, other, self.controlled)
+
     def _mind_follower(self, name: str, speed: float, state: Assisted, now: float) -> None:
         """Keep a headway by who follows; use it up while he closes in and does not brake."""
         get = sumo.vehicle
         follower, gap = get.getFollower(name, CLOSE)
-        human = bool(follower) and follower not in self.controlled
+        human = bool(follower) and self._is_human(name, follower)
+        if human and not self._eyes.known(name, [follower]):
+            follower, gap, human = "", 0.0, False
         if human:
             gap += self._standing_gap(follower)
+            if not self._eyes.ideal:
+                gap += self._eyes.of(name).behind_by(follower, math.radians(90.0 - get.getAngle(name)))
         least = ASKED[now < state.flees]
         contact = self._contact(name, speed, follower, max(gap, 0.1), least) if human else math.inf
         if contact < math.inf:
@@ -267,7 +324,7 @@ class Assistance(Commander):
 
     def _contact(self, name: str, speed: float, follower: str, gap: float, least: float) -> float:
         """s until a follower `gap` m behind is here; inf where he brakes, or need not by `least` m/s2."""
-        get = sumo.vehicle
+        get = self._eyes.of(name)
         closing = get.getSpeed(follower) - speed
         if closing <= 0.0 or gap >= CLOSES[0] * closing:
             return math.inf
@@ -278,7 +335,8 @@ class Assistance(Commander):
     def _tell(self, name: str, follower: str, gap: float) -> None:
         """The AVs ahead hear of a follower `gap` m behind `name`, whoever drives between."""
         get, (soon, apart) = sumo.vehicle, TOLD
-        fast, away = get.getSpeed(follower), gap  # m/s, m
+        fast, away = self._eyes.of(name).getSpeed(follower), gap  # m/s, m
+        told_by = name
         while ahead := get.getLeader(name, apart):
             leader, free = ahead
             if not leader or free > apart:
@@ -288,7 +346,8 @@ class Assistance(Commander):
             closing = fast - get.getSpeed(leader)
             if away > soon * closing:
                 return
-            self._told[leader] = min(away / closing, self._told.get(leader, math.inf))
+            if self._eyes.hears(leader, told_by):
+                self._told[leader] = min(away / closing, self._told.get(leader, math.inf))
             name = leader
 
     def _standing_gap(self, name: str) -> float:
@@ -349,12 +408,13 @@ class Assistance(Commander):
             return
         goes = False
         if state.waited > WAITS:
-            goes, asked = self._gaps.take(name, lane, via, self._lets_in)
+            goes, asked = self._gaps.take(name, lane, via, partial(self._lets_in, name))
             for other in asked:
                 self.controlled[other].lets = sumo.simulation.getTime() + LETS
         if goes != bool(state.goes):
             state.goes = lane if goes else ""
             mode = GOES_FIRST + inside * GOES_ON if goes else SPEED_MODE[Preset.LAWFUL]
+            state.mode, state.brakes_hard = mode, False
             sumo.vehicle.setSpeedMode(name, mode)
 
     def _holds(self, name: str, lane: str, via: str) -> bool:
@@ -363,17 +423,20 @@ class Assistance(Commander):
         away, speed = sumo.lane.getLength(lane) - get.getLanePosition(name), get.getSpeed(name)
         if away > near or speed * speed > 2.0 * COMFORT * max(away - STOPS_SHORT, 0.1):
             return False
-        return self._gaps.brakes(name, lane, via, self._step, self._comes) > hard
+        return self._gaps.brakes(name, lane, via, self._step, partial(self._comes, name)) > hard
 
-    def _comes(self, name: str) -> bool:
-        """Whether it is an AV that lets nobody in."""
+    def _comes(self, asks: str, name: str) -> bool:
+        """Whether it is an AV that lets nobody in, as far as the one that `asks` hears of it."""
         state = self.controlled.get(name)
-        return state is not None and state.lets < sumo.simulation.getTime()
+        heard = self._eyes.hears(asks, name)
+        return state is not None and heard and state.lets < sumo.simulation.getTime()
 
-    def _lets_in(self, name: str, before: float) -> bool | None:
+    def _lets_in(self, asks: str, name: str, before: float) -> bool | None:
         """Whether it is an AV that can stop comfortably so many m before its line, and has not for long; None
-        for an AV that takes its own gap."""
+        for an AV that takes its own gap. It and the one that `asks` must hear one another."""
         state = self.controlled.get(name)
+        if not (self._eyes.hears(asks, name) and self._eyes.hears(name, asks)):
+            return False
         if state is not None and state.goes:
             return None
         if state is None or state.has_let >= PATIENCE or state.flees > sumo.simulation.getTime():
@@ -393,8 +456,8 @@ class Assistance(Commander):
         near, further = self._ways[own]
         for edges, comes in ((near, True), (further, False)):
             for edge in edges:
-                for other in sumo.edge.getLastStepVehicleIDs(edge):
-                    if other not in self.controlled and (comes or near & set(_route_ahead(other))):
+                for other in self._eyes.known(name, sumo.edge.getLastStepVehicleIDs(edge)):
+                    if self._is_human(name, other) and (comes or near & set(_route_ahead(other))):
                         return True
         return False
 
@@ -451,12 +514,15 @@ class Assistance(Commander):
 
     def _give(self, asked: list[str], name: str) -> None:
         for other in asked:
-            if other in self.controlled and not self.controlled[name].gap_for:
+            heard = other in self.controlled and self._eyes.hears(other, name)
+            if heard and not self.controlled[name].gap_for:
                 self.controlled[other].gap_for = name
 
     def _yielding(self, name: str, speed: float, state: Assisted) -> float:
         """The acceleration in m/s2 that opens a gap for who asked for one."""
-        get, (brakes, least) = sumo.vehicle, YIELDING
+        get, (brakes, least) = self._eyes.of(name), YIELDING
+        if not self._eyes.known(name, [state.gap_for]):
+            return COMFORT
         try:
             ahead = get.getLanePosition(state.gap_for) - get.getLength(state.gap_for)
             gap = ahead - get.getLanePosition(name)

@@ -8,7 +8,7 @@ from cosim.control import LANE_CHANGE_TIME, MAX_DECEL, TIME_CONSTANT, tracked_sp
 from cosim.simulation.backend import sumo
 from cosim.simulation.convert import may_change
 from cosim.simulation.fleet import AV_IDM
-from cosim.types import Command, Intervention, Preset, Receipt
+from cosim.types import Command, Intervention, Preset, Receipt, Snapshot
 
 # SUMO's bit fields (https://sumo.dlr.de/docs/TraCI/Change_Vehicle_State.html): 6 keeps only the physical
 # acceleration limits, so the agent can crash; 31 and 512 let SUMO's own safety override the agent.
@@ -154,6 +154,9 @@ class Commander:
                 state.requested = wanted
             if news or self.shared:  # another program may have set one
                 vehicle.setSpeed(name, state.requested)
+
+    def see(self, snapshot: Snapshot) -> None:
+        """A new frame, with what every AV knows of it."""
 
     def observe(self, now: float) -> list[Intervention]:
         """After every simulation step, at `now` (s): where the car began to drive otherwise than asked."""

@@ -6,13 +6,18 @@ from itertools import pairwise
 
 from cosim.road import RoadMap
 from cosim.simulation.backend import sumo
+from cosim.simulation.eyes import Eyes
 
 
 class Foes:
-    """The vehicles with the right of way over the links of `road`, at most `within` m before their line."""
+    """The vehicles with the right of way over the links of `road`, at most `within` m before their line.
 
-    def __init__(self, road: RoadMap, within: float) -> None:
+    `eyes`: with them, those that the vehicle which enters knows of.
+    """
+
+    def __init__(self, road: RoadMap, within: float, eyes: Eyes | None = None) -> None:
         self._road = road
+        self._eyes = eyes
         self._within = within
         self._position_of = partial(sumo.getter, "vehicle")("LanePosition")
 
@@ -34,6 +39,8 @@ class Foes:
                     taken = self._taken(other, lane, edges)
                     found.update((other, foe) for foe in first if foe in taken)
         found.pop(name, None)
+        if self._eyes is not None:
+            return tuple((other, found[other]) for other in self._eyes.known(name, found))
         return tuple(found.items())
 
     # ---- inside ----

@@ -7,12 +7,14 @@ in (V2V), and all others must be so far that they need not brake for it.
 
 import math
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 
 from cosim.geometry import Boxes, overlap
 from cosim.road import Link, RoadMap, Rule
 from cosim.simulation.backend import sumo
+from cosim.simulation.eyes import Eyes
 from cosim.simulation.foes import Foes
 from cosim.simulation.inside import SPACING, Inside
 from cosim.types import Floats
@@ -35,12 +37,13 @@ Met = tuple[float, float, float]  # m behind the lines: own way clear; from wher
 
 
 class Gaps:
-    """The gaps at the lines of `road`; `inside` knows the ways through its junctions."""
+    """The gaps at the lines of `road`, seen with `eyes`; `inside` knows the ways through its junctions."""
 
-    def __init__(self, road: RoadMap, inside: Inside) -> None:
+    def __init__(self, road: RoadMap, inside: Inside, eyes: Eyes) -> None:
         self._road = road
         self._inside = inside
-        self._foes = Foes(road, WITHIN)
+        self._eyes = eyes
+        self._foes = Foes(road, WITHIN, eyes)
 
     def take(
         self, name: str, lane: str, via: str, lets: Callable[[str, float], bool | None]
@@ -52,10 +55,10 @@ class Gaps:
             lane: also one inside a junction, at whose end the net lets it wait; `via` does not matter then.
             lets: whether a vehicle, so many m before its line, lets others in; None: it sets off itself.
         """
-        road = self._road
+        road, get = self._road, self._eyes.of(name)
         own = road.index.get(lane, -1)
         link, into = self._ahead(own, road.index.get(via, -1))
-        if link < 0 or self._left_to_sumo(link):
+        if link < 0 or self._left_to_sumo(name, link):
             return False, []
         line = road.lanes[own].length - sumo.vehicle.getLanePosition(name)  # m
         mine = self._inside.through(name, into, 0.0)
@@ -65,7 +68,7 @@ class Gaps:
         for before, other, number in self._by_distance(link, name):
             if before is None:
                 return False, []
-            theirs, speed = road.links[number], sumo.vehicle.getSpeed(other)
+            theirs, speed = road.links[number], get.getSpeed(other)
             agrees = lets(other, before) if before > 0.0 else None
             stands = agrees is not None and sumo.vehicle.getWaitingTime(other) > WAIVES
             if before > first.get(theirs.origin, math.inf) and not _slows(theirs, before):
@@ -99,7 +102,7 @@ class Gaps:
             step: s of a simulation step.
             comes: whether a vehicle is one that can be asked.
         """
-        road, get = self._road, sumo.vehicle
+        road, get = self._road, self._eyes.of(name)
         own = road.index.get(lane, -1)
         link, into = self._ahead(own, road.index.get(via, -1))
         if link < 0 or not road.links[link].foes:
@@ -110,7 +113,7 @@ class Gaps:
         for other, number in self._foes.of(link, name):
             if road.links[number].rule in STOPS or not comes(other):  # who stops brakes anyway
                 continue
-            before, speed = self._before(other, number), get.getSpeed(other)
+            before, speed = self._before(other, number, get), get.getSpeed(other)
             if before is None or before <= 0.0 or speed**2 <= 2.0 * GENTLY * before:
                 continue
             if mine is None:
@@ -133,7 +136,7 @@ class Gaps:
         link = road.links_through[own][0]
         return link, road.lanes[own].successors[0]
 
-    def _left_to_sumo(self, link: int) -> bool:
+    def _left_to_sumo(self, name: str, link: int) -> bool:
         """Whether there is a signal, or other rules than to give way; whether others drive too fast to be
         seen in time, or persons are at the junction, whom SUMO's driver looks for on its own way and beside
         it."""
@@ -142,12 +145,15 @@ class Gaps:
             return True
         if any(lanes[links[foe].origin].speed_limit > FASTEST for foe in links[link].foes):
             return True
-        return any(True for _ in self._inside.walkers(lanes[links[link].via].start, 0.0))
+        return any(True for _ in self._inside.walkers(name, lanes[links[link].via].start, 0.0))
 
     def _by_distance(self, link: int, name: str) -> Iterator[tuple[float | None, str, int]]:
         """Those with the right of way over a link: m before their line (below 0: beyond it; None: not
         known), who, and by which link; the nearest first."""
-        found = [(self._before(other, number), other, number) for other, number in self._foes.of(link, name)]
+        get = self._eyes.of(name)
+        found = [
+            (self._before(other, number, get), other, number) for other, number in self._foes.of(link, name)
+        ]
         yield from sorted(found, key=lambda foe: -math.inf if foe[0] is None else foe[0])
 
     def _meet(self, mine: Floats, other: str, number: int) -> Met | None:
@@ -180,9 +186,12 @@ class Gaps:
         passes = wait + _time(line + clear, 0.0, gains, turns)
         return there - passes - MARGIN, (before + gone) / max(speed, 1.0)
 
-    def _before(self, name: str, number: int) -> float | None:
-        """m that a vehicle is before the line of the link `number`; below 0: beyond it. None: not known."""
-        road, get = self._road, sumo.vehicle
+    def _before(self, name: str, number: int, get: Any) -> float | None:
+        """m that a vehicle is before the line of the link `number`; below 0: beyond it. None: not known.
+
+        `get`: of `Eyes.of`.
+        """
+        road = self._road
         lane, at = road.index.get(get.getLaneID(name), -1), get.getLanePosition(name)
         if lane < 0:
             return None
@@ -192,6 +201,8 @@ class Gaps:
                 return -float(beyond + at)
             beyond += road.lanes[inside].length
         away = float(road.lanes[lane].length - at)
+        if get is not sumo.vehicle and road.lanes[lane].id != sumo.vehicle.getLaneID(name):
+            return self._straight(lane, away, number)  # the links ahead of where it is are not the ones
         while road.lanes[lane].internal:  # `getNextLinks` begins at the end of the lane that it comes out on
             lane = next(iter(road.lanes[lane].successors), -1)
             if lane < 0:
@@ -201,6 +212,15 @@ class Gaps:
             if via and road.index.get(via, -1) == road.links[number].via:
                 return away
             away += float(length + sumo.lane.getLength(following))
+        return None
+
+    def _straight(self, lane: int, away: float, number: int) -> float | None:
+        """`_before` of one that is `away` m before the end of `lane` and drives on straight."""
+        following, length = self._road.straight_on
+        while away < WITHIN and (lane := int(following[lane])) >= 0:
+            if lane == self._road.links[number].via:
+                return away
+            away += float(length[lane])
         return None
 
 

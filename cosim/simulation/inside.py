@@ -8,10 +8,10 @@ looked at who is inside the junction with a part of his body, or soon will be, a
 
 import math
 from collections import defaultdict
-from collections.abc import Iterator, Sequence, Set
+from collections.abc import Iterable, Iterator, Sequence, Set
 from functools import cached_property
 from itertools import takewhile
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from cosim.road import LanePath, RoadMap
 from cosim.road.rules import RED, YELLOW
 from cosim.simulation.backend import sumo
 from cosim.simulation.conventions import centres
+from cosim.simulation.eyes import Eyes
 from cosim.types import Floats
 
 STOPS = 4.5  # m/s2, with which who is slow comes to a stand
@@ -46,10 +47,11 @@ FREE = Ahead(math.inf)
 
 
 class Inside:
-    """The insides of the junctions of `road`."""
+    """The insides of the junctions of `road`, as the AVs see them with their `eyes`."""
 
-    def __init__(self, road: RoadMap) -> None:
+    def __init__(self, road: RoadMap, eyes: Eyes) -> None:
         self._road = road
+        self._eyes = eyes
         self._ways: dict[int, tuple[LanePath, tuple[int, ...]]] = {}
 
     def blocked(self, name: str, lane: str, present: bool, waved: Set[str]) -> Ahead:
@@ -61,10 +63,10 @@ class Inside:
             waved: vehicles that the AV lets pass: their whole way out of the junction is theirs.
         """
         own = self._road.index.get(lane, -1)
-        others = [] if own < 0 else list(self._others(own, present, waved))
+        others = [] if own < 0 else list(self._others(name, own, present, waved))
         if not others:
             return FREE
-        get = sumo.vehicle
+        get = self._eyes.of(name)
         still = [bool(other) and get.getSpeed(other) < CREEPS for other, _ in others]
         mine = self.through(name, own, get.getLanePosition(name))
         for side in self._sides(name, own):
@@ -95,15 +97,15 @@ class Inside:
             at: m on that lane from which it drives, where it is not there yet, but `before` m before it.
         """
         own = self._road.index.get(lane, -1)
-        get = sumo.vehicle
-        standing = [] if own < 0 else list(self._standing(own, at is None, waved))
+        get = self._eyes.of(name)
+        standing = [] if own < 0 else list(self._standing(name, own, at is None, waved))
         if not standing:
             return FREE
         mine = self.through(name, own, get.getLanePosition(name) if at is None else at)
         found = FREE
         for side in self._sides(name, own):
             way = _aside(mine, get.getLateralLanePosition(name), side, before)
-            ahead = self._until(way, standing)
+            ahead = self._until(name, way, standing)
             if ahead.room == math.inf:
                 return ahead._replace(side=side)
             found = ahead if found is FREE else found
@@ -113,12 +115,12 @@ class Inside:
 
     def can_pass(self, other: str, name: str) -> bool:
         """Whether a vehicle gets out of the junction without touching the AV `name`, which stands."""
-        way = self.way_out(other)
-        return way is not None and not overlap(Boxes(*way), Boxes(*_body(name))).any()
+        way = self._way_out(other, name)
+        return way is not None and not overlap(Boxes(*way), Boxes(*_body(name, sumo.vehicle))).any()
 
     def inside(self, name: str) -> bool:
         """Whether the front of a vehicle is inside a junction."""
-        return self._lane_inside(name) >= 0
+        return self._lane_inside(name, sumo.vehicle) >= 0
 
     def behind(self, name: str, lane: str) -> set[str]:
         """The vehicles behind the AV `name` on its way into the junction: on its lane before the line, and
@@ -134,11 +136,6 @@ class Inside:
         ahead = {o for o in sumo.lane.getLastStepVehicleIDs(lane) if get.getLanePosition(o) >= at}
         return found - ahead
 
-    def way_out(self, name: str) -> Floats | None:
-        """`through` of a vehicle inside a junction from where it is; None for one that is not inside."""
-        lane = self._lane_inside(name)
-        return None if lane < 0 else self.through(name, lane, sumo.vehicle.getLanePosition(name))
-
     def through(self, name: str, lane: int, at: float) -> Floats:
         """[5,k] x, y (m), heading (rad), length and width (m) of a vehicle every `SPACING` m on its way from
         `at` (m) on a lane inside a junction until it has left it."""
@@ -152,28 +149,43 @@ class Inside:
         sizes = np.array([[length], [sumo.vehicle.getWidth(name)]])
         return np.concatenate([0.5 * (front + rear), [heading], sizes.repeat(len(arc), 1)])
 
-    def walkers(self, junction: str, seconds: float, kinds: str = "cw") -> Iterator[Floats]:
-        """The places of each person on the crossings and walking areas of a junction, for so many seconds;
-        `kinds`: c for those on crossings alone."""
+    def walkers(self, name: str, junction: str, seconds: float, kinds: str = "cw") -> Iterator[Floats]:
+        """The places of each person that the AV `name` knows of on the crossings and walking areas of a
+        junction, for so many seconds; `kinds`: c for those on crossings alone."""
         get = sumo.person
         edges = [edge for edge in self._walks[junction] if edge.rpartition("_")[2][0] in kinds]
         for who in (one for edge in edges for one in sumo.edge.getLastStepPersonIDs(edge)):
-            (x, y), heading = get.getPosition(who), math.radians(90.0 - get.getAngle(who))
+            place = self._eyes.place(name, who)
+            if place is None:
+                continue
+            (x, y), heading = place, math.radians(90.0 - get.getAngle(who))
             way = np.arange(0.0, get.getSpeed(who) * seconds + 1e-9, SPACING)
             places = x + way * math.cos(heading), y + way * math.sin(heading), np.full(len(way), heading)
             yield np.stack([*places, *np.full((2, len(way)), PERSON)])
 
     # ---- inside ----
 
-    def _lane_inside(self, name: str) -> int:
+    def _way_out(self, other: str, name: str) -> Floats | None:
+        """`through` of a vehicle inside a junction from where `name` sees it; None for one that is not
+        inside."""
+        get = self._eyes.of(name)
+        lane = self._lane_inside(other, get)
+        return None if lane < 0 else self.through(other, lane, get.getLanePosition(other))
+
+    def _on(self, name: str, lane: int) -> Iterable[str]:
+        """The vehicles on a lane that the AV `name` knows of."""
+        return self._eyes.known(name, sumo.lane.getLastStepVehicleIDs(self._road.lanes[lane].id))
+
+    def _lane_inside(self, name: str, get: Any) -> int:
         try:
-            lane = self._road.index.get(sumo.vehicle.getLaneID(name), -1)
+            lane = self._road.index.get(get.getLaneID(name), -1)
         except sumo.TraCIException:  # it has left the road
             return -1
         return lane if lane >= 0 and self._road.lanes[lane].internal else -1
 
-    def _until(self, mine: Floats, standing: Sequence[tuple[str, Floats]]) -> Ahead:
-        """The way `mine` until it touches somebody of `standing`; "" in it stands for those who walk."""
+    def _until(self, name: str, mine: Floats, standing: Sequence[tuple[str, Floats]]) -> Ahead:
+        """The way `mine` of the AV `name` until it touches somebody of `standing`; "" in it stands for those
+        who walk."""
         room = math.inf
         names: list[str] = []
         for other, theirs in standing:
@@ -182,9 +194,9 @@ class Inside:
                 continue
             if not other:
                 names.append(other)
-            elif sumo.vehicle.getSpeed(other) < CREEPS:
+            elif self._eyes.of(name).getSpeed(other) < CREEPS:
                 names.append(other)
-                way = self.way_out(other)
+                way = self._way_out(other, name)
                 away = away if way is None else min(away, _first_touch(mine, way))
             room = min(room, away)
         return Ahead(room, tuple(names))
@@ -198,53 +210,54 @@ class Inside:
             yield k * SIDE
             yield -k * SIDE
 
-    def _standing(self, own: int, inside: bool, waved: Set[str]) -> Iterator[tuple[str, Floats]]:
-        """Who stands in the junction of the lane `own`, with his tail at least, or slowly comes to a place
-        where the net lets him wait in it; not on the way over that lane, where SUMO's driver heeds them.
+    def _standing(self, name: str, own: int, inside: bool, waved: Set[str]) -> Iterator[tuple[str, Floats]]:
+        """Who stands, as the AV `name` sees it, in the junction of the lane `own`, with his tail at least, or
+        slowly comes to a place where the net lets him wait in it; not on the way over that lane, where SUMO's
+        driver heeds them.
         `inside`: who walks over its crossings too (without a name)."""
-        lanes, get = self._road.lanes, sumo.vehicle
+        lanes, get = self._road.lanes, self._eyes.of(name)
         for lane in self._lanes[lanes[own].start]:
             if lane in self._way(own)[1]:
                 continue
-            for other in sumo.lane.getLastStepVehicleIDs(lanes[lane].id):
+            for other in self._on(name, lane):
                 speed = get.getSpeed(other)
                 if other in waved:
                     yield other, self.through(other, lane, get.getLanePosition(other))
                 elif speed < CREEPS:
-                    yield other, _body(other)
+                    yield other, _body(other, get)
                 elif speed < SLOW and self._road.waits_inside(lane):
                     yield other, self.through(other, lane, lanes[lane].length - STOPS_BEFORE)[:, :1]
-        for other in self._tails(own):
+        for other in self._tails(name, own):
             if get.getSpeed(other) < CREEPS:
-                yield other, _body(other)
+                yield other, _body(other, get)
         if inside:
-            for walker in self.walkers(lanes[own].start, SOON[0], "c"):
+            for walker in self.walkers(name, lanes[own].start, SOON[0], "c"):
                 yield "", walker
 
-    def _tails(self, own: int) -> Iterator[str]:
+    def _tails(self, name: str, own: int) -> Iterator[str]:
         """Who has left that junction but for his tail."""
-        lanes, get = self._road.lanes, sumo.vehicle
+        lanes, get = self._road.lanes, self._eyes.of(name)
         mine = {k for lane in self._way(own)[1] for k in lanes[lane].successors}
         for lane in self._beyond[lanes[own].start] - mine:
-            for other in sumo.lane.getLastStepVehicleIDs(lanes[lane].id):
+            for other in self._on(name, lane):
                 if get.getLanePosition(other) < get.getLength(other):
                     yield other
 
-    def _others(self, own: int, present: bool, waved: Set[str]) -> Iterator[tuple[str, Floats]]:
-        """The places, as `through`'s, of those who are on other ways through the junction of the lane `own`,
-        or soon will be: where they stand, will wait, drive or walk (persons without a name); `present`: where
-        they are."""
-        get, lanes, (_, way) = sumo.vehicle, self._road.lanes, self._way(own)
+    def _others(self, name: str, own: int, present: bool, waved: Set[str]) -> Iterator[tuple[str, Floats]]:
+        """The places, as `through`'s, of those that the AV `name` knows of who are on other ways through the
+        junction of the lane `own`, or soon will be: where they stand, will wait, drive or walk (persons
+        without a name); `present`: where they are."""
+        get, lanes, (_, way) = self._eyes.of(name), self._road.lanes, self._way(own)
         seconds, metres = SOON
-        for walker in self.walkers(lanes[own].start, 0.0 if present else seconds):
+        for walker in self.walkers(name, lanes[own].start, 0.0 if present else seconds):
             yield "", walker
-        for other in self._tails(own):
-            yield other, _body(other)
+        for other in self._tails(name, own):
+            yield other, _body(other, get)
         for lane in self._lanes[lanes[own].start]:
             if lane in way:  # SUMO's driver heeds them
                 continue
             waits, end = self._road.waits_inside(lane), lanes[lane].length
-            for other in sumo.lane.getLastStepVehicleIDs(lanes[lane].id):
+            for other in self._on(name, lane):
                 at, speed = get.getLanePosition(other), get.getSpeed(other)
                 through = self.through(other, lane, at)
                 if other in waved:
@@ -257,7 +270,7 @@ class Inside:
                 last = end - STOPS_BEFORE - at if waits else stands if speed < SLOW else math.inf
                 yield other, through[:, : int(min(max(last, 0.0) / SPACING, through.shape[1])) + 1]
             for origin in self._origins[lane] if waits else ():
-                for other in sumo.lane.getLastStepVehicleIDs(lanes[origin].id):
+                for other in self._on(name, origin):
                     away, speed = lanes[origin].length - get.getLanePosition(other), get.getSpeed(other)
                     if away > max(seconds * speed, metres) or (present and speed < CREEPS):
                         continue
@@ -336,9 +349,8 @@ def _comes_to(mine: Floats, theirs: Floats) -> bool:
     return bool(touched.any()) and not touched[0].any()
 
 
-def _body(name: str) -> Floats:
-    """[5,1] x, y (m), heading (rad), length and width (m) of a vehicle where it is."""
-    get = sumo.vehicle
+def _body(name: str, get: Any) -> Floats:
+    """[5,1] x, y (m), heading (rad), length and width (m) of a vehicle where it is; `get`: of `Eyes.of`."""
     length = get.getLength(name)
     front = np.array([[*get.getPosition(name), get.getAngle(name), 0.5 * length]]).T
     return np.stack([*centres(*front), [length], [get.getWidth(name)]])

@@ -464,6 +464,7 @@ class SumoSimulator:
             snapshot = replace(snapshot, events=events)
         if self._perception is not None:
             snapshot = replace(snapshot, percepts=self._perception.perceive(snapshot))
+            self._commander.see(snapshot)
         return snapshot
 
     def _goal(self) -> tuple[frozenset[int], frozenset[int]]:

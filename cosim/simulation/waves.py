@@ -2,14 +2,16 @@
 
 SUMO's driver never goes before a vehicle with the right of way, though that vehicle stands and waits for it.
 A waved vehicle ignores the AV, and those who stand behind it, as foes (`junctionModel.ignoreIDs`,
-https://sumo.dlr.de/docs/TraCI/Change_Vehicle_State.html); all other foes count as before.
+https://sumo.dlr.de/docs/TraCI/Change_Vehicle_State.html); all other foes count as before. In the same way an
+AV ignores vehicles that it does not know of (`cosim.simulation.eyes`).
 """
 
-from collections.abc import Set
+from collections.abc import Collection, Set
 
 from cosim.simulation.backend import sumo
 
 IGNORES = "junctionModel.ignoreIDs"
+LEADERS = "carFollowModel.ignoreIDs"  # a driver follows none of these
 NOBODY: frozenset[str] = frozenset()
 
 
@@ -19,6 +21,8 @@ class Waves:
     def __init__(self) -> None:
         self._by: dict[str, frozenset[str]] = {}  # AV -> the vehicles that it waves through
         self._for: dict[str, frozenset[str]] = {}  # AV -> itself and those who cannot come past it
+        self._unseen: dict[str, frozenset[str]] = {}  # AV -> the vehicles that it does not know of
+        self._own_leaders: dict[str, list[str]] = {}  # AV -> the leaders that its file lets it ignore
         self._own: dict[str, list[str]] = {}  # waved vehicle -> the foes that its file lets it ignore
 
     def of(self, av: str) -> frozenset[str]:
@@ -37,11 +41,28 @@ class Waves:
         for vehicle in before | vehicles:
             self._tell(vehicle)
 
+    def blind(self, av: str, foes: Collection[str], leaders: Collection[str]) -> None:
+        """From now on the driver of `av` heeds none of `foes` at junctions, and follows none of `leaders`."""
+        if not leaders and av not in self._unseen:
+            return
+        get = sumo.vehicle
+        if av not in self._unseen:
+            self._own_leaders[av] = get.getParameter(av, LEADERS).split()
+        self._unseen[av] = frozenset(foes)
+        get.setParameter(av, LEADERS, " ".join([*self._own_leaders[av], *leaders]))
+        self._tell(av)
+        if not leaders:
+            self.forget(av)
+
+    def forget(self, av: str) -> None:
+        """The AV has left the road, or heeds everybody again."""
+        self._unseen.pop(av, None)
+        self._own_leaders.pop(av, None)
+
     def _tell(self, vehicle: str) -> None:
         get = sumo.vehicle
-        foes = sorted(
-            {foe for av, vehicles in self._by.items() if vehicle in vehicles for foe in self._for[av]}
-        )
+        waving = {foe for av, vehicles in self._by.items() if vehicle in vehicles for foe in self._for[av]}
+        foes = sorted(waving | self._unseen.get(vehicle, NOBODY))
         try:
             own = self._own.setdefault(vehicle, get.getParameter(vehicle, IGNORES).split())
             get.setParameter(vehicle, IGNORES, " ".join([*own, *foes]))

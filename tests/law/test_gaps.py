@@ -81,11 +81,13 @@ class Nears:
         import libsumo
 
         from cosim.simulation.convert import read_road
+        from cosim.simulation.eyes import Eyes
         from cosim.simulation.gaps import Gaps
         from cosim.simulation.inside import Inside
 
         get, road = libsumo.vehicle, read_road((), self._configuration)
-        gaps = Gaps(road, Inside(road))
+        eyes = Eyes(road)
+        gaps = Gaps(road, Inside(road, eyes), eyes)
         said: dict[tuple[str, str], list[tuple[str, float, float]]] = {}
         found: dict[str, list[tuple[float, float]]] = {"inside": [], "before": []}
         for step in range(steps):
@@ -100,7 +102,7 @@ class Nears:
                     continue
                 via = links[0][4]
                 number = next(k for k, link in enumerate(road.links) if link.via == road.index[via])
-                metres = gaps._before(name, number)
+                metres = gaps._before(name, number, get)
                 assert metres is not None
                 where = "inside" if lane.startswith(":") else "before"
                 said.setdefault((name, via), []).append((where, metres, odometer))

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 
 from cosim.errors import BadInput
 from cosim.host import Host
+from cosim.report.replay.packing import document
 from cosim.scenario import load
 from cosim.service.requests import RunRequest, flags
-from cosim.types import EpisodeResult, Preset, Snapshot
+from cosim.types import EpisodeResult, Kind, Preset, Snapshot, Source
 
 FLEET: dict[str, Any] = {"demand": "contested", "penetration": 0.4, "duration": 3.0}
 
@@ -48,6 +51,35 @@ def test_where_nobody_decides_by_it_sensing_changes_nothing_but_the_hash() -> No
     places = [driven(level, "keep-lane")[1] for level in (None, "harsh")]
     assert places[0].ids == places[1].ids
     assert places[0].x.tolist() == places[1].x.tolist()
+
+
+def test_a_replay_holds_what_each_av_believed_and_did_not_see() -> None:
+    scenario = load("merge", sensing="radar-camera,latency=0.8,compensation=hold", **FLEET)
+    host = Host(scenario, "altruist-rule", math.radians(45.0))
+    try:
+        _, replay = host.run_recorded(7)
+    finally:
+        host.close()
+    packed = document(replay)
+    names = [row[0] for row in packed["vehicles"]]
+    tracks = {track.id: track for track in replay.tracks}
+    hidden = believed = 0
+    for k, beliefs in zip(
+        np.searchsorted(replay.times, replay.decided - 1e-6), packed["beliefs"], strict=True
+    ):
+        for av, known, unseen in beliefs:
+            assert tracks[names[av]].kind == Kind.AV
+            hidden += len(unseen)
+            for vehicle, x, y, age, source in known:
+                track = tracks[names[vehicle]]
+                speed = track.speed[k - track.first]
+                assert source == Source.SENSOR
+                assert math.hypot(x, y) / 10.0 == pytest.approx(speed * age / 10.0, abs=4.0)
+                believed += 1
+    assert hidden > 20
+    assert believed > 20
+    json.dumps(packed)
+    assert driven(None)[1].percepts is None
 
 
 def test_http_takes_levels_and_parameters_but_no_file() -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cosim.recording.recorder import Choice
+from cosim.recording.recorder import Belief, Choice
 from cosim.recording.replay_data import ReplayData, Track
 from cosim.report.replay.shapes import LEAST, NAMES, SHAPES
 from cosim.report.replay.signs import LAMPS, stop_lines
@@ -49,6 +49,7 @@ def document(replay: ReplayData) -> dict[str, Any]:
         "decided": [ms(t) for t in r.decided],
         "choices": [names.choices(choices) for choices in r.choices],
         "forecasts": [names.forecast(f) for f in r.forecasts],
+        "beliefs": [names.beliefs(b) for b in r.beliefs],
         "forecast_interval": next((forecast_interval(f) for f in r.forecasts if f is not None), None),
         "collisions": [collision(c) for c in r.collisions],
         "shapes": shapes({t.actor for t in r.tracks}),
@@ -84,6 +85,23 @@ class Names:
             for k, name in enumerate(f.ids)
             if name in self.vehicles
         ]
+
+    def beliefs(self, beliefs: Mapping[str, Belief] | None) -> list[list[Any]] | None:
+        """[AV, [[vehicle, x dm, y dm, age ds, source], ...], [[vehicle, why unseen], ...]] each; None: each
+        knew everything. Places are differences to the true ones."""
+        known = self.vehicles
+        if beliefs is None:
+            return None
+        return [
+            [known[av], self._believed(b), [[known[n], int(w)] for n, w in b.unseen.items() if n in known]]
+            for av, b in beliefs.items()
+            if av in known
+        ]
+
+    def _believed(self, b: Belief) -> list[list[int]]:
+        tenths = np.rint(np.stack([b.x, b.y, b.age], axis=1) * 10.0).astype(int).tolist()
+        rows = zip(b.ids, tenths, b.source.tolist(), strict=True)
+        return [[self.vehicles[n], *place, source] for n, place, source in rows if n in self.vehicles]
 
     def violations(self, offences: Iterable[Offence]) -> list[list[int]]:
         """[ms, vehicle, word] each."""

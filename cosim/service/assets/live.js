@@ -49,7 +49,7 @@ function told(message) {
   if (message.road) road = message.road;
   const begins = Boolean(message.episode);
   if (begins) {
-    const none = { times: [], tracks: [], decided: [], choices: [], forecasts: [], forecast_interval: null, words: [], vehicles: [],
+    const none = { times: [], tracks: [], decided: [], choices: [], forecasts: [], beliefs: [], forecast_interval: null, words: [], vehicles: [],
       interventions: [], violations: [], errors: [], collisions: [] };
     data = read({ ...road, ...none, ...message.episode, signals: Array.from({ length: message.episode.signals }, () => ["", []]) });
     data.kept = 0; asked = 0; behind = false;
@@ -65,14 +65,14 @@ function told(message) {
 // One decision: what was decided, then the frames that it led to. Returns whether figures came along.
 function addStep(step) {
   if (step.decided) {
-    const [t, choices, forecast] = step.decided;
+    const [t, choices, forecast, beliefs] = step.decided;
     if (step.interval) data.forecastInterval = step.interval;
-    addDecisions(data, t, choices, forecast);
+    addDecisions(data, t, choices, forecast, beliefs);
     if (step.uses) {
       const of = data.vehicles[step.uses[0]].choices;
       if (of.length) of[of.length - 1].uses = step.uses[1];
     }
-    if (data.forecasts.length > FORECASTS) data.forecasts[data.forecasts.length - FORECASTS - 1] = null;
+    for (const drawn of [data.forecasts, data.beliefs]) if (drawn.length > FORECASTS) drawn[drawn.length - FORECASTS - 1] = null;
   }
   for (const frame of step.frames) addFrame(frame);
   data.over = step.over;
@@ -106,7 +106,7 @@ function addFrame([time, numbers, x, y, heading, speed, accel, lane, signals]) {
 function forget(n) {
   data.times.splice(0, n); data.kept = 0;
   const gone = Math.max(atOrBefore(data.decided, data.times[0]), 0);
-  data.decided.splice(0, gone); data.forecasts.splice(0, gone);
+  data.decided.splice(0, gone); data.forecasts.splice(0, gone); data.beliefs.splice(0, gone);
   for (const vehicle of data.vehicles) {
     vehicle.choices = vehicle.choices.filter((c) => c.k >= gone);
     for (const choice of vehicle.choices) choice.k -= gone;

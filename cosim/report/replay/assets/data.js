@@ -3,6 +3,9 @@
 const ACTIONS = ["lane left", "idle", "lane right", "accelerate", "decelerate"];
 const LANE = [1, 0, -1, 0, 0]; // of an action: to the left, to the right
 
+const SOURCES = ["truth", "own sensors", "CAM", "CPM"]; // cosim.types.Source
+const UNSEEN = ["out of range", "hidden", "missed"]; // cosim.types.Unseen
+
 function summed(steps, order = 1) {
   const values = Float64Array.from(steps);
   for (let n = 0; n < order; n++) for (let k = 1; k < values.length; k++) values[k] += values[k - 1];
@@ -30,7 +33,7 @@ function read(raw) {
   const data = {
     facts: raw.facts, begin, lamps: raw.lamps, words: [], vehicles: [], byId: new Map(), lanes,
     shapes: new Map(Object.entries(raw.shapes).map(([actor, [name, least, parts]]) => [Number(actor), { name, least, parts }])),
-    times, end: times.length ? times[times.length - 1] : 0, decided: [], forecasts: [], forecastInterval: raw.forecast_interval,
+    times, end: times.length ? times[times.length - 1] : 0, decided: [], forecasts: [], beliefs: [], forecastInterval: raw.forecast_interval,
     corrections: [], violations: [], errors: [], collisions: [],
     signals: raw.signals.map(([states, frames]) => ({ states, frames: Array.from(summed(frames)) })),
     crossings: raw.crossings.map(([width, shape, signal]) => ({ width: width / 100, signal, ...outline(shape) })),
@@ -47,7 +50,7 @@ function read(raw) {
       heading: scaled(heading, 0.001), speed: scaled(speed, 0.01), accel: scaled(accel, 0.01), lane: summed(lane),
     });
   }
-  raw.decided.forEach((t, k) => addDecisions(data, t, raw.choices[k], raw.forecasts[k]));
+  raw.decided.forEach((t, k) => addDecisions(data, t, raw.choices[k], raw.forecasts[k], raw.beliefs[k]));
   return data;
 }
 
@@ -81,7 +84,7 @@ function addSaid(data, kind, [t, v, word]) {
   data[kind].push(one); one.vehicle[kind].push(one);
 }
 
-function addDecisions(data, time, rows, forecast) {
+function addDecisions(data, time, rows, forecast, beliefs) {
   const k = data.decided.length, t = time / 1000 - data.begin;
   data.decided.push(t);
   for (const [v, action, target, flags, blamed, blocked, q, score, ttc, unsafe] of rows) {
@@ -92,6 +95,10 @@ function addDecisions(data, time, rows, forecast) {
   }
   data.forecasts.push(forecast && new Map(forecast.map(([v, x, y, along, across]) => [v, {
     x: scaled(x, 0.1), y: scaled(y, 0.1), along: scaled(along, 0.1), across: scaled(across, 0.1),
+  }])));
+  data.beliefs.push(beliefs && new Map(beliefs.map(([av, known, unseen]) => [av, {
+    known: new Map(known.map(([v, x, y, age, source]) => [v, { x: x / 10, y: y / 10, age: age / 10, source: SOURCES[source] }])),
+    unseen: new Map(unseen.map(([v, why]) => [v, UNSEEN[why]])),
   }])));
 }
 
@@ -145,6 +152,12 @@ function choiceOf(data, vehicle, t) {
   }
   const choice = vehicle.choices[low - 1];
   return choice && choice.k === k ? choice : null;
+}
+
+// What the chosen AV knew at its last decision: { known, unseen }; null where it knew everything.
+function beliefOf(data, vehicle, t) {
+  const beliefs = vehicle && vehicle.av ? data.beliefs[atOrBefore(data.decided, t)] : null;
+  return (beliefs && beliefs.get(vehicle.number)) || null;
 }
 
 // Kinds of events, the gravest first: what the filter calls them, and their colour.

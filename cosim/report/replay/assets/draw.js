@@ -182,7 +182,7 @@ function drawRow(ctx, state) {
   }
   for (const [vehicle, s] of shown) drawVehicle(ctx, vehicle, s, c, view, vehicle === state.chosen, data.shapes);
   view.inPixels(ctx);
-  for (const [vehicle, s] of shown) { drawChoice(ctx, state, vehicle, s); drawLaw(ctx, state, vehicle, s); drawError(ctx, state, vehicle, s); }
+  for (const [vehicle, s] of shown) { drawChoice(ctx, state, vehicle, s); drawLaw(ctx, state, vehicle, s); drawError(ctx, state, vehicle, s); drawBelief(ctx, state, vehicle, s); }
   for (const [vehicle, s] of shown) {
     const named = vehicle === state.chosen || vehicle.mission || (state.labels && view.scale > 1.5);
     const error = (named || view.scale > 3.5) && erring(vehicle, t);
@@ -195,6 +195,31 @@ function drawRow(ctx, state) {
   }
   for (const crash of data.collisions) if (crash.x != null && crash.t <= t + 0.05 && crash.t > t - 4) drawCrash(ctx, view, crash, c);
   return shown;
+}
+
+const SENSED = 200; // m around the chosen AV in which those it does not know of are marked
+const DIFFERS = 0.4; // m from where a vehicle is: from there on the place it is taken to be at is drawn
+
+// What the chosen AV knows of a vehicle: a dashed outline where it takes it to be, a cross where it knows of nobody.
+function drawBelief(ctx, state, vehicle, s) {
+  const { data, view, c, t, chosen } = state, belief = beliefOf(data, chosen, t);
+  if (!belief || vehicle === chosen) return;
+  const centre = stateOf(data, chosen, t), known = belief.known.get(vehicle.number), why = belief.unseen.get(vehicle.number);
+  const [px, py] = view.toPixels(s.x, s.y);
+  if (!known) {
+    if (!centre || Math.hypot(s.x - centre.x, s.y - centre.y) > SENSED) return;
+    ctx.strokeStyle = c.bad; ctx.lineWidth = 2; ctx.setLineDash([]);
+    ctx.beginPath(); ctx.moveTo(px - 5, py - 5); ctx.lineTo(px + 5, py + 5); ctx.moveTo(px - 5, py + 5); ctx.lineTo(px + 5, py - 5); ctx.stroke();
+    if (view.scale > 3.5) caption(ctx, why || "not known", px, py + 14, c.bad, c);
+    return;
+  }
+  if (Math.hypot(known.x, known.y) < DIFFERS) return;
+  const [gx, gy] = view.toPixels(s.x + known.x, s.y + known.y), l = vehicle.length * view.scale, w = vehicle.width * view.scale;
+  ctx.strokeStyle = c.pick; ctx.lineWidth = 1.5; ctx.setLineDash([4, 3]);
+  ctx.beginPath(); ctx.moveTo(px, py); ctx.lineTo(gx, gy); ctx.stroke();
+  ctx.save(); ctx.translate(gx, gy); ctx.rotate(-s.heading); ctx.strokeRect(-l / 2, -w / 2, l, w); ctx.restore();
+  ctx.setLineDash([]);
+  if (view.scale > 3.5) caption(ctx, `${known.source}, ${known.age.toFixed(1)} s`, gx, gy - w / 2 - 9, c.pick, c);
 }
 
 // A command as a sign of w pixels, for a vehicle that drives to the right: + and - of speed, a bent arrow to a lane.

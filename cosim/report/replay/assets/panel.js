@@ -168,6 +168,14 @@ function fillLegend(state) {
       ctx.globalAlpha = 0.3; ctx.beginPath(); ctx.ellipse(20, 8, 9, 5, 0, 0, 7); ctx.fill();
     });
   }
+  if (data.beliefs.some(Boolean)) {
+    entry("where the chosen AV takes a vehicle to be, from which source, how old", (ctx) => {
+      ctx.strokeStyle = c.pick; ctx.lineWidth = 1.5; ctx.setLineDash([4, 3]); ctx.strokeRect(4, 3, 22, 10); ctx.setLineDash([]);
+    });
+    entry("the chosen AV does not know of it: hidden, missed", (ctx) => {
+      ctx.strokeStyle = c.bad; ctx.lineWidth = 2; ctx.beginPath(); ctx.moveTo(10, 3); ctx.lineTo(20, 13); ctx.moveTo(10, 13); ctx.lineTo(20, 3); ctx.stroke();
+    });
+  }
   if (data.errors.length) entry("human error; line to the first vehicle it affects", (ctx) => {
     ctx.strokeStyle = c.error; ctx.lineWidth = 1.5; ctx.setLineDash([2, 3]); ctx.beginPath(); ctx.moveTo(10, 8); ctx.lineTo(29, 8); ctx.stroke(); ctx.setLineDash([]);
     triangle(ctx, 10, 8, 7, c);
@@ -278,6 +286,7 @@ function fillHead(data) {
   if (f.policy_label) chip(f.policy_label, "warn");
   chip(`seed ${f.seed}`); chip(f.preset); chip(`humans ${f.behavior}, ${f.driver_model}`); chip(`SVO ${f.svo_deg}\u00b0`);
   if (f.errors) chip(`human errors ${f.errors}`);
+  if (f.sensing) chip(`sensing ${f.sensing}`);
   const crashes = figure("collisions"), among = figure("crashed") ? "" : ", none of an AV or the mission vehicle";
   const running = data.over === false; // only what has happened can be said
   if (crashes != null && (crashes || !running)) chip(crashes ? `${crashes} collision${crashes > 1 ? "s" : ""}${among}` : "no collision", figure("crashed") ? "bad" : crashes ? "warn" : "good");

@@ -1,0 +1,150 @@
+"""What the car of an AV sees of others: the truth, or with a sensing level its percept.
+
+A percept is of the last frame. In the steps after it the difference to the truth of that frame is kept, so
+that a vehicle believed 3 m too far back stays so far back until the next frame.
+"""
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+from cosim.road import RoadMap
+from cosim.simulation.backend import sumo
+from cosim.types import Kind, Percept, Snapshot
+
+PERSON = "person:"  # before a person's id in a snapshot
+
+
+class Eyes:
+    """The eyes of all AVs; `open` with every frame."""
+
+    def __init__(self, road: RoadMap) -> None:
+        self._road = road
+        self._truth: Snapshot | None = None
+        self._views: dict[str, View] = {}
+
+    def open(self, snapshot: Snapshot) -> None:
+        """A new frame, with percepts unless sensing is ideal."""
+        self._truth = snapshot
+        self._views.clear()
+
+    @property
+    def ideal(self) -> bool:
+        """Whether every AV knows everything."""
+        return self._truth is None or self._truth.percepts is None
+
+    def of(self, av: str) -> Any:
+        """SUMO's calls for vehicles (`sumo.vehicle`) as `av` may make them: of those it knows."""
+        return self._view(av) or sumo.vehicle
+
+    def known(self, av: str, names: Iterable[str]) -> Iterable[str]:
+        """Those of the vehicles that `av` knows of."""
+        view = self._view(av)
+        return names if view is None else [name for name in names if name in view.rows]
+
+    def place(self, av: str, person: str) -> tuple[float, float] | None:
+        """Where `av` takes a person to be (m); None: it does not know of the person."""
+        view = self._view(av)
+        x, y = sumo.person.getPosition(person)
+        if view is None:
+            return x, y
+        known = view.rows.get(PERSON + person)
+        return None if known is None else (x + view.offsets[known][0], y + view.offsets[known][1])
+
+    def is_av(self, av: str, other: str, are: Iterable[str]) -> bool:
+        """Whether `av` takes another vehicle for an AV; `are`: those that are ones."""
+        view = self._view(av)
+        if view is None or other not in are:
+            return other in are
+        row = view.rows.get(other)
+        return row is not None and view.percept.world.kind[row] == Kind.AV
+
+    def hears(self, av: str, other: str) -> bool:
+        """Whether what `other` says now reaches `av` in time."""
+        view = self._view(av)
+        return view is None or av == other or other in view.percept.hears
+
+    def unseen(self, av: str) -> tuple[list[str], list[str]]:
+        """All vehicles on the road but `av`, and those of them that it does not know of."""
+        view, truth = self._view(av), self._truth
+        if view is None or truth is None:
+            return [], []
+        others = [n for n, kind in zip(truth.ids, truth.kind, strict=True) if kind != Kind.PERSON and n != av]
+        return others, [name for name in others if name not in view.rows]
+
+    def _view(self, av: str) -> "View | None":
+        truth = self._truth
+        if truth is None or truth.percepts is None or av not in truth.percepts:
+            return None
+        if av not in self._views:
+            self._views[av] = View(self._road, av, truth, truth.percepts[av])
+        return self._views[av]
+
+
+class View:
+    """`sumo.vehicle` as one AV may use it: states of the vehicles it knows of as it believes them, anything
+    else SUMO's."""
+
+    def __init__(self, road: RoadMap, av: str, truth: Snapshot, percept: Percept) -> None:
+        self.percept, self._road, self._av = percept, road, av
+        world = percept.world
+        # vehicle or person -> its row in the percept; those that have left the road since are left out
+        self.rows = {name: k for k, name in enumerate(world.ids) if name in truth.row}
+        here = [truth.row.get(name, 0) for name in world.ids]
+        columns = (
+            *(world.x - truth.x[here], world.y - truth.y[here], world.speed - truth.speed[here]),
+            *(world.heading - truth.heading[here], world.lane_position - truth.lane_position[here]),
+        )
+        self.offsets: list[tuple[float, ...]] = list(zip(*(c.tolist() for c in columns), strict=True))
+        self._same_lane = (world.lane == truth.lane[here]).tolist()
+        self._lane, self._position = world.lane.tolist(), world.lane_position.tolist()
+        self._accel = world.accel.tolist()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(sumo.vehicle, name)
+
+    def behind_by(self, name: str, heading: float) -> float:
+        """m by which a vehicle is believed behind where it is, in the direction `heading` (rad)."""
+        dx, dy, *_ = self.offsets[self.rows[name]]
+        return -(dx * math.cos(heading) + dy * math.sin(heading))
+
+    def getSpeed(self, name: str) -> float:
+        """m/s"""
+        speed = float(sumo.vehicle.getSpeed(name))
+        row = self.rows.get(name)
+        return speed if row is None else max(speed + self.offsets[row][2], 0.0)
+
+    def getAcceleration(self, name: str) -> float:
+        """m/s2"""
+        row = self.rows.get(name)
+        if row is None or name == self._av:
+            return float(sumo.vehicle.getAcceleration(name))
+        return float(self._accel[row])
+
+    def getPosition(self, name: str) -> tuple[float, float]:
+        """m, the front bumper"""
+        x, y = sumo.vehicle.getPosition(name)
+        row = self.rows.get(name)
+        return (x, y) if row is None else (x + self.offsets[row][0], y + self.offsets[row][1])
+
+    def getAngle(self, name: str) -> float:
+        """degrees clockwise from north"""
+        angle = float(sumo.vehicle.getAngle(name))
+        row = self.rows.get(name)
+        return angle if row is None else angle - math.degrees(self.offsets[row][3])
+
+    def getLaneID(self, name: str) -> str:
+        """The lane that it is believed on."""
+        row = self.rows.get(name)
+        if row is None or self._same_lane[row]:
+            return str(sumo.vehicle.getLaneID(name))
+        return self._road.lanes[self._lane[row]].id if self._lane[row] >= 0 else ""
+
+    def getLanePosition(self, name: str) -> float:
+        """m along that lane, the front bumper"""
+        row = self.rows.get(name)
+        if row is None:
+            return float(sumo.vehicle.getLanePosition(name))
+        if not self._same_lane[row]:
+            return float(self._position[row])
+        return max(float(sumo.vehicle.getLanePosition(name)) + self.offsets[row][4], 0.0)

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from cosim.files import whole
-from research.drive import Work
+from research.drive import Arms, Work
 from research.schema import Claim
 
 NOT_DRIVEN = "Not driven yet."
+SAMPLES = {"t_figures": ("t_figure8",)}  # claim -> pages that show sample episodes of it
+Key = tuple[str, str, str]  # scenario, condition and arm, as the CSV has them
 INDEX = """\
 # What the papers claimed, and what we found
 
@@ -50,24 +52,39 @@ def answer(claim: Claim, out: Path) -> str:
 
 
 def stale(claim: Claim, work: Work, out: Path) -> Iterator[str]:
-    """Why the claim's page is not of the weights and definitions that are here, a line each.
+    """Why the claim's pages are not of the weights and definitions that are here, a line each.
 
     A page that this engine has not written yet is none of its business.
     """
-    page, table = out / f"{claim.name}.md", out / "data" / f"{claim.name}.csv"
-    if answer(claim, out) == NOT_DRIVEN:
-        return
-    if f"({claim.digest})" not in page.read_text(encoding="utf-8"):
-        yield f"{page}: made of another definition of the claim"
-    with table.open(newline="", encoding="utf-8") as file:
-        made = {
-            (r["scenario"], r["condition"], r["arm"]): r for r in csv.DictReader(file) if not r["against"]
-        }
-    for (condition, name), arm in work.arms[claim.name].items():
+    page, arms = out / f"{claim.name}.md", work.arms[claim.name]
+    if answer(claim, out) != NOT_DRIVEN:
+        if f"({claim.digest})" not in page.read_text(encoding="utf-8"):
+            yield f"{page}: made of another definition of the claim"
+        made = _made(out, claim.name)
+        for condition, arm in arms:
+            if (condition.scenario, condition.text, arm) not in made:
+                yield f"{page}: {arm} in {condition.scenario} is not there"
+    for name in (claim.name, *SAMPLES.get(claim.name, ())):
+        yield from _differing(out / f"{name}.md", _made(out, name), arms)
+
+
+def _differing(page: Path, made: Mapping[Key, Mapping[str, str]], arms: Arms) -> Iterator[str]:
+    """What drives an arm now and did not when the page was made."""
+    for (condition, name), arm in arms.items():
         row = made.get((condition.scenario, condition.text, name))
         if row is None:
-            yield f"{table}: {name} in {condition.scenario} is not there"
-        elif row["weights"] != arm.weights:
-            yield f"{table}: {name} was driven by weights {row['weights']}, here are {arm.weights}"
+            continue
+        if row["weights"] != arm.weights:
+            yield f"{page}: {name} was driven by weights {row['weights']}, here are {arm.weights}"
         elif row["definitions"] != arm.definitions:
-            yield f"{table}: {name} in {condition.scenario} was driven with other files or settings"
+            yield f"{page}: {name} in {condition.scenario} was driven with other files or settings"
+
+
+def _made(out: Path, name: str) -> dict[Key, dict[str, str]]:
+    """A row of the page's CSV for every arm and condition; none where this engine has not written it."""
+    table = out / "data" / f"{name}.csv"
+    if not table.is_file():
+        return {}
+    with table.open(newline="", encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if "definitions" in row and not row["against"]]
+    return {(row["scenario"], row["condition"], row["arm"]): row for row in rows}

@@ -110,8 +110,8 @@ def tests(found: Found) -> str:
     return (
         f"Intervals are of 95 %. p is of {TESTS[claim.test]}, corrected by Holm's method "
         f"(tests: {len(found.tested)}). "
-        f"A condition says yes where p is below 0.05 and the figure {claim.primary.direction}, as claimed. "
-        f"It says no where the interval holds no effect of {smallest} or more that way. "
+        f"A condition says yes where p is below 0.05 and the figure is {claim.primary.direction}, "
+        f"as claimed. It says no where the interval holds no effect of {smallest} or more that way. "
         f"The claim must hold {claim.holds}."
     )
 
@@ -119,10 +119,10 @@ def tests(found: Found) -> str:
 def powered(found: Found) -> str:
     """The power that the tests had."""
     known = [t.power for t in found.tested if not math.isnan(t.power)]
-    span = _span(round(100 * x) for x in known) if known else "unknown"
+    span = f"{_span(round(100 * x) for x in known)} %" if known else "unknown"
     pairs = _span(t.found.n for t in found.tested)
     planned = f"{pairs} pairs a test, planned {found.claim.power.pairs}"
-    return f"Power to find the smallest effect of interest: {span} % ({planned})."
+    return f"Power to find the smallest effect of interest: {span} ({planned})."
 
 
 def flags(settings: Settings) -> str:

@@ -16,6 +16,7 @@ from cosim.report.statistics import Figure
 from research.evaluate import Found
 from research.schema import Condition
 
+PER_CENT = (0.0, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 STYLE: Any = {"svg.fonttype": "none", "svg.hashsalt": "cosim", "font.size": 9.0}  # equal figures, equal file
 
 
@@ -60,6 +61,10 @@ def _points(found: Found) -> Picture:
                     axes.plot(x + shift, published, "x", ms=4, color="0.4")
         axes.set_xticks(range(len(scenarios)), scenarios, rotation=20)
         axes.set(title=Condition("", values).text, ylabel=_named(measure))
+        if measure.is_share and measure.better == "lower":  # 1 % against 2 %, beside 60 %
+            axes.set_yscale("symlog", linthresh=1.0)
+            axes.set_yticks(PER_CENT, [f"{tick:g}" for tick in PER_CENT])
+            axes.set_ylim(-0.1, 110.0)
         axes.grid(axis="y", alpha=0.3)
     picture.legend(loc="outside right upper", fontsize="small")
     return picture

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from cosim.report.figures import measures
 from cosim.scenario.manifest import POLICY_FILES
 from cosim.workers.engines import LocalEngine
 from cosim.workers.tasks import Outcome, Task
@@ -90,6 +91,24 @@ def test_a_killed_drive_goes_on_and_each_episode_is_driven_once_for_all_claims(
     (first, second) = (found.arms[one.name] for one in claims)
     shared = next(key for key in first if key[1] == "rule")
     assert first[shared].rows == second[shared].rows
+
+
+def test_an_episode_has_every_figure_that_a_claim_names(settings: Settings, claims: list[Claim]) -> None:
+    found = drive.held(claims, settings)
+    rows = [row for arm in found.arms["first"].values() for row in arm.rows]
+    known = measures(rows, found.notes["units"], found.notes["better"])
+    assert {metric for claim in chosen([]) for metric in claim.metrics} <= known.keys()
+
+
+@pytest.mark.soak
+def test_every_claim_is_driven_and_written_in_small(tmp_path: Path) -> None:
+    flags = ["--seeds", "150000:150001", "--scenario", "merge", "--duration", "2", "--untrained", "--anew"]
+    flags += ["--runs", str(tmp_path / "runs"), "--out", str(tmp_path / "pages")]
+    assert cli.main(["drive", *flags]) == 0
+    assert cli.main(["page", *flags]) == 0
+    index_of = (tmp_path / "pages" / "README.md").read_text()
+    assert index_of.count("**Not resolved.**") == len([*chosen([])])
+    assert cli.main(["check", *flags]) == 0
 
 
 def test_page_check_and_index_follow(settings: Settings, folder: Path, tmp_path: Path, capsys: Any) -> None:

@@ -108,4 +108,14 @@ def test_a_page_of_other_weights_files_or_definition_is_found(found: Found, tmp_
         f"{tmp_path / 'small.md'}: made of another definition of the claim"
     ]
     (tmp_path / "small.md").write_text("# By another program\n")
+    (tmp_path / "data" / "small.csv").write_text("scenario,arm,against,figure\nmerge,rule,,collision_rate\n")
     assert stale(weights="fedcba987654") == []
+
+
+def test_a_page_of_sample_episodes_is_held_to_the_claim_they_are_of(found: Found, tmp_path: Path) -> None:
+    claim = replace(found.claim, name="t_figures")
+    page.write_csv(tmp_path / "data" / "t_figure8.csv", [*found.lines()][:1])
+    assert [*index.stale(claim, SimpleNamespace(arms={"t_figures": found.arms}), tmp_path)] == []  # type: ignore[arg-type]
+    other = {key: replace(arm, definitions="others") for key, arm in found.arms.items()}
+    (line,) = index.stale(claim, SimpleNamespace(arms={"t_figures": other}), tmp_path)  # type: ignore[arg-type]
+    assert line.endswith("t_figure8.md: rule in merge was driven with other files or settings")

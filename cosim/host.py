@@ -11,7 +11,7 @@ from cosim.episode import Episode, Hook, Progress, Step, run_episode
 from cosim.files import code
 from cosim.metrics import MetricFactory, joined
 from cosim.metrics import read as read_metric
-from cosim.policies import make
+from cosim.policies import compensator, make
 from cosim.recording.recorder import DRAWN, Recorder
 from cosim.recording.replay_data import ReplayData, replay_data
 from cosim.rewards import Reward, RewardTerms, rewards
@@ -19,6 +19,7 @@ from cosim.rewards import read as read_reward
 from cosim.scenario import ALWAYS, Scenario
 from cosim.scenario.manifest import POLICY_FILES, digests
 from cosim.scenario.sumo_outputs import drafts
+from cosim.sensing.perception import PREDICTED
 from cosim.types import EpisodeResult, LooksAhead, Metric, ObservationConfig, Policy, Simulator
 from cosim.workers.determinism import make_torch_deterministic
 
@@ -61,6 +62,10 @@ class Host:
         self._policy_files = digests([*getattr(self.policy, "files", ()), *own])
         make_torch_deterministic()
         self.simulator = (simulator or sumo)(scenario, self.policy.av_parameters, wanted.frames)
+        if scenario.sensing is not None and scenario.sensing.parameters.compensation in PREDICTED:
+            sensing: Any = self.simulator  # SUMO's alone has percepts
+            how = scenario.sensing.parameters.compensation
+            sensing.compensator = compensator(how, self.simulator.road, scenario.timing)
         if isinstance(self.policy, LooksAhead):
             self.policy.looks_ahead(self.simulator.ahead)
         self.episode = Episode(scenario, self.simulator, wanted, measured)

@@ -372,6 +372,34 @@ class Percept:
         return {self.others[k]: Unseen(self.detected[k]) for k in np.flatnonzero(within).tolist()}
 
 
+class Compensator(Protocol):
+    """Predicts states that were measured a while ago to now, with a policy's predictor.
+
+    Attributes:
+        frames: N, how many past frames it is given.
+    """
+
+    frames: int
+
+    def present(
+        self, state: Floats, valid: Bools, lane: Ints, lane_position: Floats, length: Floats, age: Floats
+    ) -> Floats:
+        """The present states of V vehicles and persons.
+
+        Args:
+            state: [V,N,4] x m, y m, speed m/s, heading rad as they were known in each frame, oldest first:
+                each of its measurement's time.
+            valid: [V,N] whether they were known.
+            lane: [V] index into `RoadMap.lanes`, -1 off every lane.
+            lane_position: [V] m, front bumper along that lane.
+            length: [V] m.
+            age: [V] s since the newest measurement.
+
+        Returns:
+            [V,4] the same columns.
+        """
+
+
 # Columns of the kinematic matrix, in the ego's frame at the newest frame of the history
 # (x ahead, y to the left), so that one history is in one fixed frame and series are smooth.
 KINEMATIC_FEATURES = ("x", "y", "speed", "heading", "length", "width", "is_av", "is_mission")

@@ -5,8 +5,9 @@ from typing import Protocol
 
 from cosim.errors import BadInput
 from cosim.policies.own import own
+from cosim.road import RoadMap
 from cosim.scenario.policy_name import WEIGHTS, read
-from cosim.types import Policy
+from cosim.types import Compensator, Policy, Timing
 from policy import agents
 
 
@@ -58,6 +59,13 @@ def explainer(policy: Policy) -> Explainer | None:
     from policy.attribution import Explainer as Asking
 
     return Asking(policy) if isinstance(policy, PredictionAware) else None
+
+
+def compensator(name: str, road: RoadMap, timing: Timing) -> Compensator:
+    """What predicts a sensing level's late states to now, by the name of its compensation."""
+    from cosim.policies.compensation import AlongLanes  # torch: only when it is asked for
+
+    return AlongLanes(name, road, timing)
 
 
 def make(text: str) -> Policy:

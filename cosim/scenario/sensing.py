@@ -54,7 +54,8 @@ class Parameters:
         confirm: detections by own sensors before a track counts; a message counts at once.
         forget: s without a measurement after which a track ends.
         compensation: how the state at measurement time is predicted to now: not at all (hold), at constant
-            velocity (cv), at constant speed along lanes (lanes), or the true present state (truth).
+            velocity (cv), at constant speed along lanes (lanes), along lanes at the speed that the shipped
+            Gaussian process predicts (gp), or the true present state (truth).
     """
 
     range: Positive = 1000.0
@@ -81,7 +82,7 @@ class Parameters:
     cam_heading_noise: NonNegative = 0.0
     confirm: int = 1
     forget: Positive = 1.0
-    compensation: Literal["hold", "cv", "lanes", "truth"] = "hold"
+    compensation: Literal["hold", "cv", "lanes", "gp", "truth"] = "hold"
 
     def __post_init__(self) -> None:
         if self.confirm < 1:

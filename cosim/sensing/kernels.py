@@ -535,6 +535,14 @@ def _drive_on(following: Rows, length: Floats, lane: int, position: float) -> tu
 
 
 @compiled
+def drive_on(following: Rows, length: Floats, lane: Rows, position: Floats) -> None:
+    """`lane` and `position` (m) of many, in place: see `_drive_on`."""
+    for k in range(lane.shape[0]):
+        if lane[k] >= 0:
+            lane[k], position[k] = _drive_on(following, length, lane[k], position[k])
+
+
+@compiled
 def believe(
     state: Floats,  # [S,6] now, for compensation with the truth
     length: Floats,  # [S] m

@@ -29,9 +29,11 @@ from cosim.sensing.kernels import (
     B_Y,
 )
 from cosim.sensing.lanes import lane_lines
-from cosim.types import Actor, Kind, Percept, Snapshot, Source, Timing
+from cosim.types import HEADING, Actor, Compensator, Kind, Percept, Snapshot, Source, Timing, X, Y
 
-COMPENSATION = {"hold": 0, "cv": 1, "lanes": 2, "truth": 3}
+COMPENSATION = {"hold": 0, "cv": 1, "lanes": 2, "truth": 3, "gp": 0}  # the kernels' part of it
+PREDICTED = ("gp",)  # what a `Compensator` is needed for
+STATE = [B_X, B_Y, B_SPEED, B_HEADING]  # of a belief, as a `Compensator` has it
 HIDING = (Actor.CAR, Actor.TRUCK, Actor.BUS, Actor.OTHER)  # nobody is behind a motorcycle or a person
 LONGEST_JITTER = 6.0  # of its mean: one message in 400 comes later, and is not looked at
 NOBODY: frozenset[str] = frozenset()
@@ -48,10 +50,21 @@ class Perception:
         parameters: the level.
         timing: the clocks.
         seed: the episode's, from which every draw comes.
+        compensator: for the compensations of `PREDICTED`.
     """
 
-    def __init__(self, road: RoadMap, parameters: Parameters, timing: Timing, seed: int) -> None:
+    def __init__(
+        self,
+        road: RoadMap,
+        parameters: Parameters,
+        timing: Timing,
+        seed: int,
+        compensator: Compensator | None = None,
+    ) -> None:
         p = self._parameters = parameters
+        if (compensator is None) != (p.compensation not in PREDICTED):
+            raise ValueError(f"compensation {p.compensation} and {compensator} do not go together")
+        self._compensator = compensator
         self._timing, self._seed = timing, seed
         self._lanes = lane_lines(road)
         self._noise = np.array([p.position_noise, p.speed_noise, math.radians(p.heading_noise)])
@@ -62,7 +75,8 @@ class Perception:
         self._lag = math.ceil(p.latency / timing.frame - 1e-6)
         oldest = max(p.delay + LONGEST_JITTER * p.jitter + p.period, p.forget) if p.cam or p.cpm else 0.0
         self._held, self._newest = 0, -1
-        self._slots = _Slots(self._lag + math.ceil(oldest / timing.frame) + 3)
+        past = 0 if compensator is None else compensator.frames
+        self._slots = _Slots(self._lag + math.ceil(oldest / timing.frame) + 3, past)
 
     def perceive(self, snapshot: Snapshot) -> Mapping[str, Percept]:
         """What every AV of the next frame knows."""
@@ -90,6 +104,8 @@ class Perception:
             *(state, slots.length, slots.egos, now, p.confirm, p.forget, COMPENSATION[p.compensation]),
             *(*self._lanes, slots.tracks, beliefs),
         )
+        if self._compensator is not None:
+            self._compensate(self._compensator, beliefs)
         hears = np.zeros((len(slots.egos), len(slots.egos)), np.uint8)
         if p.mcm:
             decision = self._timing.decision
@@ -97,6 +113,29 @@ class Perception:
         return Percepts(snapshot, slots.known, dict(slots.avs), seen.copy(), beliefs, hears)
 
     # ---- inside ----
+
+    def _compensate(self, compensator: Compensator, beliefs: Floats) -> None:
+        """Predict all beliefs [A,S,10] to now."""
+        slots, past = self._slots, self._slots.past  # [N,A,S,4]
+        known = beliefs[..., B_SOURCE] > 0.0
+        past[:-1] = past[1:]
+        past[-1] = np.nan
+        past[-1][known] = beliefs[known][:, STATE]
+        late = known & (beliefs[..., B_AGE] > 1e-6)
+        if not late.any():
+            return
+        state, then = past[:, late].swapaxes(0, 1), beliefs[late]  # [V,N,4], [V,10]
+        turn = state[..., HEADING] - state[:, -1:, HEADING]
+        state[..., HEADING] -= 2.0 * np.pi * np.round(turn / (2.0 * np.pi))
+        lane, position = then[:, B_LANE].astype(np.int64), then[:, B_POSITION].copy()
+        length = slots.length[late.nonzero()[1]]
+        valid = np.isfinite(state[..., X])
+        now = compensator.present(state, valid, lane, position, length, then[:, B_AGE])
+        position += np.hypot(now[:, X] - then[:, B_X], now[:, Y] - then[:, B_Y])
+        kernels.drive_on(self._lanes.following, self._lanes.length, lane, position)
+        then[:, STATE] = now
+        then[:, B_LANE], then[:, B_POSITION] = lane, position
+        beliefs[late] = then
 
     def _stream(self, name: str) -> int:
         return subseed(self._seed, "sensing", name)
@@ -198,7 +237,8 @@ def _own(truth: Snapshot, row: int) -> Floats:
 class _Slots:
     """Places of objects and AVs in the arrays; an object keeps its place while somebody tracks it."""
 
-    def __init__(self, frames: int) -> None:
+    def __init__(self, frames: int, past: int) -> None:
+        self._past = past  # frames of beliefs that a `Compensator` needs
         self.names: list[str] = [""] * SLOTS  # "": free
         self.place: dict[str, int] = {}
         self.avs: dict[str, int] = {}
@@ -211,6 +251,7 @@ class _Slots:
         self.ring = np.full((frames, objects, kernels.STATES), np.nan)
         self.seen = np.zeros((frames, avs, objects), np.uint8)
         self.tracks = _no_tracks(avs, objects)
+        self.past = np.full((self._past, avs, objects, len(STATE)), np.nan)
         self.heard = np.full((avs, avs), -1.0)
         self.egos = np.full(avs, -1, np.int64)
         self.length, self.width = np.zeros(objects), np.zeros(objects)
@@ -270,6 +311,7 @@ class _Slots:
         self.streams[k] = stream(name)
         self.ring[:, k] = np.nan
         self.seen[:, :, k] = 0
+        self.past[:, :, k] = np.nan
         self.tracks[:, k] = _no_tracks(1, 1)[0, 0]
 
     def _equip(self, name: str) -> None:
@@ -283,6 +325,7 @@ class _Slots:
         self.kind[k], self.equipped[k] = Kind.AV, 1
         self.tracks[a] = _no_tracks(1, len(self.names))[0]
         self.seen[:, a] = 0
+        self.past[:, a] = np.nan
         self.heard[a], self.heard[:, a] = -1.0, -1.0
 
     def _grow(self, objects: int, avs: int) -> None:
@@ -295,6 +338,7 @@ class _Slots:
         self.ring[:, :n] = before["ring"]
         self.seen[:, :b, :n] = before["seen"]
         self.tracks[:b, :n] = before["tracks"]
+        self.past[:, :b, :n] = before["past"]
         self.heard[:b, :b] = before["heard"]
         self.egos[:b] = before["egos"]
 

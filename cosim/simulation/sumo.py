@@ -42,6 +42,7 @@ from cosim.types import (
     INSIDE,
     Collision,
     Command,
+    Compensator,
     Due,
     Events,
     Kind,
@@ -77,6 +78,7 @@ class SumoSimulator:
     `history` frames are returned by `reset`, so that an agent starts with a full past.
     """
 
+    compensator: Compensator | None = None  # for the sensing that needs one, set before the first `reset`
     _SHARED = False  # whether other programs change things too
     _FLEET: type[Fleet] = Fleet
 
@@ -143,7 +145,7 @@ class SumoSimulator:
         self._perception = (
             None
             if sensing is None
-            else Perception(self.road, sensing.parameters, self._scenario.timing, seed)
+            else Perception(self.road, sensing.parameters, self._scenario.timing, seed, self.compensator)
         )
         self._reader.bodies_changed()
         self._entries.reset()

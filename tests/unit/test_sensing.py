@@ -14,6 +14,7 @@ from policy_scenes import straight_road
 
 from cosim.errors import BadInput
 from cosim.observation.observer import Observer
+from cosim.policies import compensator
 from cosim.road import Lane, RoadMap
 from cosim.scenario import load
 from cosim.scenario.manifest import manifest
@@ -182,6 +183,29 @@ def test_latency_is_the_age_and_the_place_is_of_then() -> None:
 def test_of_two_detections_a_track_is_confirmed() -> None:
     seen = [len(percepts["ego"].world.ids) for _, percepts in drive([EGO, Car("v", 50.0)], 4, confirm=3)]
     assert seen == [1, 1, 2, 2]
+
+
+def late_error(how: str, accel: float) -> float:
+    """m between where an AV takes a car to be and where it is, of one that changes its speed; 0.8 s late."""
+    compensation = compensator(how, ROAD, Timing()) if how == "gp" else None
+    perception = Perception(ROAD, Parameters(latency=0.8, compensation=how), Timing(), 1, compensation)
+    cars = [EGO, Car("v", 40.0, speed=20.0, accel=accel)]
+    for k in range(20):
+        truth = snapshot(cars, k * FRAME)
+        percepts = perception.perceive(truth)
+    known = of(percepts["ego"], "v")
+    assert known["age"] == pytest.approx(0.8)
+    row = truth.row["v"]
+    assert known["lane_position"] - known["x"] == pytest.approx(2.5, abs=0.1)
+    return abs(known["x"] - float(truth.x[row])) + abs(known["y"] - float(truth.y[row]))
+
+
+@pytest.mark.parametrize("accel", [-2.5, -1.5, 1.5])
+def test_a_predictor_that_knows_speeds_compensates_better_than_constant_speed(accel: float) -> None:
+    hold, lanes, gp = (late_error(how, accel) for how in ("hold", "lanes", "gp"))
+    assert lanes == pytest.approx(0.5 * abs(accel) * 0.8**2, rel=0.25)
+    assert hold > 5.0 * lanes
+    assert gp < 0.7 * lanes
 
 
 # ---- tracks ----
@@ -390,7 +414,7 @@ def test_single_parameters_stand_behind_a_level() -> None:
         ("v2v,loss=0.9", "must be at least 10 where 0.9 of the messages are lost"),
         ("v2v,loss=x", "--sensing.loss='x': a number from 0 to 0.99 is needed"),
         ("v2v,loss", "PARAMETER=VALUE is needed"),
-        ("v2v,compensation=guess", "must be one of hold, cv, lanes, truth"),
+        ("v2v,compensation=guess", "must be one of hold, cv, lanes, gp, truth"),
     ],
 )
 def test_a_wrong_level_is_one_sentence(what: str, said: str) -> None:

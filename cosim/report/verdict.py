@@ -240,7 +240,7 @@ def _cells(figure: PairedFigure) -> tuple[_Cell, _Cell, _Cell, _Cell]:
 def _notes(compared: Compared) -> list[str]:
     """Lines above a group's table: how many pairs, who drove, and what limits the comparison."""
     group = compared.group
-    caution = " (one cannot tell a difference from chance)" * (len(group.pairs) == 1)
+    caution = " (a single pair cannot show a difference)" * (len(group.pairs) == 1)
     notes = [f"{_pairs(len(group.pairs))}{caution}, A {driver(group.a)}, B {driver(group.b)}"]
     counted = {
         f"{_pairs(group.identical)} drove exactly alike (same trace hash)": group.identical,

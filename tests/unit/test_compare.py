@@ -209,7 +209,7 @@ def test_one_pair_has_no_interval_and_shows_no_difference(
 ) -> None:
     folder = write(tmp_path / "run", cell("idm", 1), cell("rash", 1))
     _, out, _ = run(capsys, f"{folder}:idm", f"{folder}:rash")
-    assert "1 pair (one cannot tell a difference from chance)" in out
+    assert "1 pair (a single pair cannot show a difference)" in out
     assert "no difference shown" not in out
     assert " to " not in out.split("B - A")[1]
     assert ", p " not in out

@@ -28,8 +28,7 @@ class Lane:
     def __init__(self, work: str, threads: int, waiting: int) -> None:
         self._work, self._most = work, threads + waiting
         self._threads = ThreadPoolExecutor(threads, "cosim-lane")
-        self._lock = threading.Lock()
-        self._taken = 0
+        self._free = threading.BoundedSemaphore(self._most)
 
     def __call__(self, route: Callable[P, T]) -> Callable[P, Awaitable[T]]:
         """The route, off the server's loop."""
@@ -46,21 +45,16 @@ class Lane:
 
     def begin(self, work: Callable[[], T]) -> Future[T]:
         """What `work` will return or raise."""
-        with self._lock:
-            if self._taken >= self._most:
-                raise Unavailable(f"{self._most} {self._work} are asked for already: try again later")
-            self._taken += 1
+        if not self._free.acquire(blocking=False):
+            raise Unavailable(f"{self._most} {self._work} are asked for already: try again later")
         future = self._threads.submit(work)
-        future.add_done_callback(self._leave)  # not when its client goes away: the thread is still taken
+        # Not when its client goes away: the thread is still taken.
+        future.add_done_callback(lambda _: self._free.release())
         return future
 
     def close(self) -> None:
         """What waits is not begun."""
         self._threads.shutdown(wait=False, cancel_futures=True)
-
-    def _leave(self, _: object) -> None:
-        with self._lock:
-            self._taken -= 1
 
 
 class Lanes:

@@ -65,12 +65,8 @@ class Replays:
                 return self._asked[key]
             page = functools.partial(self._page, run, episode, job.uploads)
             future = self._asked[key] = self._lane.begin(page)
-        future.add_done_callback(lambda _: self._forget(key))
+        future.add_done_callback(lambda _: self._asked.pop(key, None))
         return future
-
-    def _forget(self, key: tuple[str, str]) -> None:
-        with self._lock:
-            self._asked.pop(key, None)
 
     def _page(self, run: str, episode: str, uploads: list[str]) -> Path:
         try:

@@ -17,7 +17,6 @@ from cosim.scenario import sensing
 from cosim.scenario.options import MEASURED, OPTIONS, Option
 from cosim.scenario.sumo_outputs import OUTPUTS
 
-UPLOAD = "upload:"  # before an upload's id, where a scenario or a policy is named
 LONGEST = 1000  # characters of a text, items of a list
 _NAME = re.compile(r"[\w+-]+(\.[\w+-]+)*", re.ASCII)
 _FILE = re.compile(r".*\.(ya?ml|json|xml|gz|py|safetensors|sumocfg)", re.IGNORECASE)

@@ -14,7 +14,6 @@ from cosim.observation.view import View
 from cosim.types import KINEMATIC_FEATURES, Actor, Kind, MetaAction, Snapshot
 
 DECIMALS = 4
-_FLAGS = ("is_av", "is_mission")
 _LAW = ("signal_distance", "stop_distance", "yield_distance", "crossing_distance", "person_distance")
 
 

@@ -11,15 +11,17 @@ import numpy as np
 
 from cosim.envs.session import Session, StepResult
 from cosim.observation.view import View
-from cosim.types import KINEMATIC_FEATURES, Actor, Kind, MetaAction, Snapshot
+from cosim.types import KINEMATIC_FEATURES, Actor, Kind, MetaAction, Snapshot, Source
 
 DECIMALS = 4
+SOURCES = [source.name.lower() for source in Source]
 _LAW = ("signal_distance", "stop_distance", "yield_distance", "crossing_distance", "person_distance")
 
 
 def view(seen: View) -> dict[str, Any]:
     """What one AV sees now: m, m/s, rad, s; others in its own frame (x ahead, y to the left)."""
     rules, rows = seen.rules, np.round(seen.kinematics[-1].astype(np.float64), DECIMALS).tolist()
+    ages, sources = np.round(seen.age, DECIMALS).tolist(), [SOURCES[k] for k in seen.source.tolist()]
     x, y, heading = seen.pose.tolist()
     return {
         "time": seen.time,
@@ -40,8 +42,10 @@ def view(seen: View) -> dict[str, Any]:
         **{name: _ahead(getattr(rules, name)) for name in _LAW},
         "limits": [[_ahead(at), _ahead(limit)] for at, limit in rules.limits.tolist()],
         "vehicles": [
-            {"id": name, **dict(zip(KINEMATIC_FEATURES, row, strict=True))}
-            for name, row, known in zip(seen.ids, rows, seen.valid[-1].tolist(), strict=True)
+            {"id": name, **dict(zip(KINEMATIC_FEATURES, row, strict=True)), "age": age, "source": source}
+            for name, row, known, age, source in zip(
+                seen.ids, rows, seen.valid[-1].tolist(), ages, sources, strict=True
+            )
             if known
         ],
     }

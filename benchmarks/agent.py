@@ -44,7 +44,7 @@ from policy.training.ddqn import DdqnLearner
 from policy.training.replay_buffer import ReplayBuffer
 
 SIZES: Mapping[str, Callable[[str], AgentConfig]] = {"compact": compact, "paper": paper}
-POLICY = "vfn-p-demonstrated"
+POLICY = "vfn-p"
 TARGET_MS = 50.0  # compact size, 8 AVs, two cores; the period is 400 ms
 TARGET_RATE = 60.0  # joint decisions/s with the learner on the other core
 WARM_UP = 2  # decisions that are not counted: compilation, caches

@@ -1,6 +1,6 @@
 """What the engine of `cosim evaluate` costs, and what a second worker gains.
 
-    python -m benchmarks.batch [--policy vfn-p-demonstrated] [--duration 10] [--episodes 50] [--rounds 4]
+    python -m benchmarks.batch [--policy vfn-p] [--duration 10] [--episodes 50] [--rounds 4]
 
 with the defaults 200 episodes of about one second of processor time each, on merge / dense.
 
@@ -68,7 +68,7 @@ def measured(plan: matrix.Plan, workers: int, progress: Progress) -> Run:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--policy", default="vfn-p-demonstrated")
+    parser.add_argument("--policy", default="vfn-p")
     parser.add_argument("--duration", type=float, default=10.0)
     parser.add_argument("--episodes", type=int, default=50)
     parser.add_argument("--rounds", type=int, default=4)

@@ -22,7 +22,7 @@ from cosim.report.figures import Row
 from cosim.report.pairing import errors_begun
 from cosim.scenario.policy_name import read as read_name
 from cosim.seeding import FIRST_TEST_SEED
-from cosim.types import Decision, History, MetaAction, ObservationConfig, PolicyContext, Preset
+from cosim.types import Preset
 from cosim.workers.tasks import OK
 
 PAGE = Path("docs/results/humans.md")
@@ -35,7 +35,7 @@ DEMAND = {
     "highway": "dense",
 }
 LEVEL, IDM = "stress", "idm"
-CAR = "car-alone=benchmarks/humans.py:Accelerate"  # it always asks for more speed: the rest is the car's own
+CAR = "car-alone"
 BLOCK = 20  # seeds that are driven together
 COLUMNS = (
     *("world", "demand", "pairs", "policy", "beside"),
@@ -43,22 +43,6 @@ COLUMNS = (
     *("an AV caused one", "distance of all, m", "more than beside, m", "hard brakings of AVs", "beside"),
     "errors that began in both",
 )
-
-
-class Accelerate:
-    """Asks every AV for more speed: what it does beyond is the car's own."""
-
-    name = "accelerate"
-    observation = ObservationConfig(maps=False)
-    av_parameters: Mapping[str, str] = {}
-    label = ""
-
-    def reset(self, context: PolicyContext) -> None:
-        """Nothing to remember."""
-
-    def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
-        """The same for all."""
-        return {av: Decision(MetaAction.ACCELERATE) for av in histories}
 
 
 def label(policy: str) -> str:

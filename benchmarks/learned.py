@@ -4,9 +4,8 @@
         [--others idm altruist-rule] [--seeds-from 200000] [--runs runs/learned] [--workers 2]
         [--out docs/results/learned.md]
 
-POLICY (a name, weights or a training's folder) drives at 60 degrees and at 0, beside `idm`, `altruist-rule`
-and `vfn-p-demonstrated` (or `--others`) at 60 degrees, in preset `lawful`. The same command goes on where it
-stopped.
+POLICY (a name, weights or a training's folder) drives at 60 degrees and at 0, beside `idm` and
+`altruist-rule` (or `--others`) at 60 degrees, in preset `lawful`. The same command goes on where it stopped.
 """
 
 import argparse
@@ -25,7 +24,7 @@ from cosim.workers.tasks import OK
 
 SVO = 60
 MINE, THEIRS = "network", "others"  # folders of runs
-OTHERS = ("idm", "altruist-rule", "vfn-p-demonstrated")
+OTHERS = ("idm", "altruist-rule")
 COLUMNS = (
     "arm", "episodes", "mission vehicle served", "its time, s", "episodes with an AV in a collision",
     "AV-caused", "distance of the mission vehicle, m", "of AVs, m", "of all, m", "hard brakings of AVs",

@@ -108,20 +108,6 @@ def startup(place: Place) -> list[list[str]]:
     return [["benchmarks.startup", *flags, "--out", str(place.out / "startup.md")]]
 
 
-def attribution(place: Place) -> list[list[str]]:
-    """Which inputs the shipped value networks use."""
-    flags = ["--scenario", "merge", "--demand", "contested", "--workers", "2"]
-    flags += [
-        "--policy",
-        "vfn-p-demonstrated",
-        "--seeds",
-        "150000:150001" if place.small else "150000:150006",
-    ]
-    others = ["--policy", "vfn-demonstrated", "--policy", "vfn-p-egoistic"]
-    flags += SHORT if place.small else others
-    return [["cosim.cli.main", "bench", "attribution", *flags, "--out", str(place.work / "attribution")]]
-
-
 def uses(place: Place) -> list[list[str]]:
     """What drives lose when an input of the network that learned from rewards alone is replaced."""
     worlds = ("merge",) if place.small else ("merge", "exit", "roundabout", "intersection")
@@ -144,13 +130,6 @@ def learned(place: Place) -> list[list[str]]:
     flags = ["--errors", "none", *(["--worlds", "merge", "--episodes", "1", *SHORT] if place.small else [])]
     flags += ["--runs", str(place.work / "learned_runs")]
     return [["benchmarks.learned", LEARNED, *flags, "--out", str(place.out / "learned.md")]]
-
-
-def alone(place: Place) -> list[list[str]]:
-    """What networks drive into without the mask."""
-    flags = ["--episodes", "1" if place.small else "20", "--runs", str(place.work / "alone_runs")]
-    flags += ["--worlds", "merge", *SHORT] if place.small else []
-    return [["benchmarks.alone", *flags, "--out", str(place.out / "alone.md")]]
 
 
 def foresight(place: Place) -> list[list[str]]:
@@ -222,16 +201,9 @@ PAGES = (
     Page("startup", startup, ("startup.md",)),
     Page("joining", joining, ("joining.md",)),
     Page("estimate", estimate, ("estimate.md",)),
-    Page(
-        "attribution",
-        attribution,
-        ("attribution.md", "attribution.png", "data/attribution.csv"),
-        drop=("*.md", "*.png", "*.csv"),
-    ),
     Page("uses", uses, tuple(f"uses/{name}" for name in USES)),
     Page("turn", turn, ("turn.md", "turn.svg", "data/turn.csv")),
     Page("learned", learned, ("learned.md",)),
-    Page("alone", alone, ("alone.md",)),
     Page("foresight", foresight, ("foresight.md",)),
     Page("real_nets", real_nets, ("real_nets.md",)),
     Page("behaviors", behaviors, ("behaviors.md",)),

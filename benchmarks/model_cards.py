@@ -49,8 +49,6 @@ LIMITS = {
     "expert": "Imitated a scripted expert (`altruist-rule` and a cruise rule) beside learning from rewards, "
     "and mostly chooses as that expert does. What rewards added is not measured. Its human drivers made no "
     "errors.",
-    "maps unused": "Hardly uses its maps, past or predicted ([attribution](../results/attribution.md)): it "
-    "against its counterpart without predicted maps says nothing about prediction.",
     "maps only": "Sees nothing but maps, and brakes for whatever is near.",
     "head": "Outside `lawful` it drives with an output head that its training left unchanged.",
     "lawful only": "Learned in preset `lawful` alone; `unguarded` is untried.",
@@ -64,7 +62,6 @@ MEASURED = {
     "table3": "| {} |",
     "decisions": "| {} |",
     "learned": "| {} at ",
-    "alone": "| {}-alone |",
     "foresight": "| {} |",
     "turn": "--policy {} ",
     "humans": "| {} | idm |",
@@ -159,7 +156,7 @@ def limits(name: str, card: Card) -> Iterator[str]:
     yield "law"
     if name not in TRAINED:
         yield "expert"
-        yield "maps unused" if APPROACHES[name].kinematics else "maps only"
+        yield "maps only"
     elif card["configs"]["vfn"].get("assisted", False):
         yield "head"
     elif not any(lesson.get("preset") for lesson in card["data"]["training"]["lessons"]):
@@ -169,7 +166,8 @@ def limits(name: str, card: Card) -> Iterator[str]:
 def pages(name: str) -> Iterator[str]:
     """Links to the results that have figures of an agent."""
     for title, form in MEASURED.items():
-        if form.format(name) in (RESULTS / f"{title}.md").read_text(encoding="utf-8"):
+        page = RESULTS / f"{title}.md"  # of a claim that is not driven yet there is none
+        if page.is_file() and form.format(name) in page.read_text(encoding="utf-8"):
             yield f"[{title}]({LINK}/{title}.md)"
 
 

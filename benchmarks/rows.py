@@ -22,7 +22,6 @@ from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
-from benchmarks import alone, humans
 from benchmarks.forced_entry import forced
 from cosim.cli.main import main as cosim
 from cosim.errors import BadInput, CosimError
@@ -47,11 +46,6 @@ FIGURES = (
 )
 COLUMNS = (*IDENTITY, *FIGURES)
 FORCED = "forced_"  # a level of `benchmarks.forced_entry`: its lag follows
-# label of a policy that does not ship -> what `--policy` drives it by
-POLICIES = {
-    **{f"{arm.replace('_', '-')}-alone": f"benchmarks.alone:{arm}" for arm in alone.ARMS[1:]},
-    humans.CAR.partition("=")[0]: humans.CAR.partition("=")[2],
-}
 
 Kept = dict[str, str]  # column -> text
 
@@ -95,7 +89,7 @@ def words(row: Kept, folder: Path) -> list[str]:
     """The words after `cosim evaluate` that drive this row."""
     policy, errors = row["policy"], row["errors"]
     found = ["--scenario", row["scenario"], "--demand", row["demand"], "--preset", row["preset"]]
-    found += ["--policy", f"{policy}={POLICIES[policy]}" if policy in POLICIES else policy]
+    found += ["--policy", policy]
     found += ["--svo", row["svo_deg"], "--seeds", f"{row['seed']}:{int(row['seed']) + 1}"]
     if load(row["scenario"], demand=[row["demand"]]).behavior != row["behavior"]:
         found += ["--behavior", row["behavior"]]

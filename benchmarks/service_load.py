@@ -1,6 +1,6 @@
 """Two browsers and four sessions at once: pictures a second, memory, errors.
 
-    python -m benchmarks.service_load [--minutes 10] [--policy vfn-p-demonstrated]
+    python -m benchmarks.service_load [--minutes 10] [--policy vfn-p]
 
 Starts a server of its own. Each browser drives and watches a contested merge, episode after episode, in
 real time; two programs drive a session each by JSON, in real time too. Pictures are those that show another
@@ -48,7 +48,7 @@ def main() -> None:
     """Drive and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--minutes", type=float, default=10.0)
-    parser.add_argument("--policy", default="vfn-p-demonstrated")
+    parser.add_argument("--policy", default="vfn-p")
     args = parser.parse_args()
     chromium = shutil.which("chromium") or shutil.which("google-chrome")
     if chromium is None:

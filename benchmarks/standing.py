@@ -17,7 +17,6 @@ from collections.abc import Sequence
 from statistics import fmean
 from typing import Any
 
-from benchmarks.humans import Accelerate
 from benchmarks.tables import markdown_row
 from cosim.episode import Episode, Hook, Step
 from cosim.host import Host
@@ -29,7 +28,7 @@ from cosim.workers.worker import Worker
 
 LONG = 120.0  # s
 SIGNALS = frozenset(map(chr, WAIT))
-CAR, NONE = "car", "none"
+CAR, NONE = "car-alone", "none"
 POLICIES = (NONE, "idm", "idm-courteous", CAR)
 FIGURES = {
     "arrivals": "arrivals",
@@ -83,7 +82,7 @@ class Watcher(Host):
 def drive(scenario: Scenario, policy: str, seeds: range) -> dict[str, float]:
     """Means over the seeds."""
     rows: list[dict[str, Any]] = []
-    agent = Accelerate() if policy == CAR else "idm" if policy == NONE else policy
+    agent = "idm" if policy == NONE else policy
     with Worker(Watcher, scenario, agent, math.pi / 4) as worker:
         for seed in seeds:
             result, longest = worker.call("watched", seed)

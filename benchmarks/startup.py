@@ -18,7 +18,7 @@ from pathlib import Path
 
 IMPORTS = ("-c", "import numpy, libsumo")
 TORCH = ("-c", "import torch")
-POLICY = "vfn-p-demonstrated"
+POLICY = "vfn-p"
 RUN = ("-m", "cosim.cli.main", "run", "merge", "--json")
 SHORT = (*RUN, "--policy", "idm", "--demand", "free")
 NETWORK = (*RUN, "--policy", POLICY)

@@ -10,7 +10,7 @@ from cosim.scenario import BEHAVIORS
 from cosim.scenario.behaviors import AS_IS
 
 DEMANDS = ("dense", "contested")
-POLICIES = ("idm", "altruist-rule", "vfn-demonstrated")
+POLICIES = ("idm", "altruist-rule", "vfn")
 
 
 def add(commands: arguments.SubCommands) -> None:

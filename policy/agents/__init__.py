@@ -24,9 +24,6 @@ class Approach:
 APPROACHES = {
     "vfn-p": Approach(),
     "vfn": Approach(predicted_maps=False, mask="hold"),
-    "vfn-p-demonstrated": Approach(),  # the same two, from a scripted demonstrator
-    "vfn-demonstrated": Approach(predicted_maps=False, mask="hold"),
-    "vfn-p-egoistic": Approach(),  # the demonstrated one's twin: trained with phi = 0
     "safe-dqn": Approach(kinematics=False, predicted_maps=False, mask="hold"),
     "conv3d-dqn": Approach(kinematics=False, predicted_maps=False, mask="none"),
     "conv3d-a2c": Approach(kinematics=False, predicted_maps=False, mask="none", learning="a2c"),

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.humans import Accelerate
 from benchmarks.standing import Watcher
 from cosim.scenario import Fleet, load
 from cosim.scenario.vet import vetted
@@ -57,7 +56,7 @@ class Alone(Watcher):
 def drive(config: Path, fleet: Fleet, *without: str) -> tuple[EpisodeResult, dict[str, float]]:
     """The car alone, with an agent that always asks for more speed; how long each vehicle stood (s)."""
     scenario = vetted(load(str(config), preset=Preset.LAWFUL, fleet=fleet, mission="none"))
-    with Worker(Alone, scenario, Accelerate(), math.pi / 4) as worker:
+    with Worker(Alone, scenario, "car-alone", math.pi / 4) as worker:
         for what in without:
             worker.call("take_away", what)
         found: tuple[EpisodeResult, dict[str, float]] = worker.call("watched", SEED)

@@ -19,7 +19,7 @@ def test_who_is_asked_drives_the_same_episode() -> None:
         range(150000, 150001),
         scenario="merge",
         demand="contested",
-        policy="vfn-p-demonstrated",
+        policy="vfn-p",
         duration=3.2,
     )
     ((_, case),) = plan.cases()
@@ -39,7 +39,7 @@ def test_the_command_writes_table_page_and_picture(
 ) -> None:
     words = [
         "--policy",
-        "vfn-demonstrated",
+        "vfn",
         "--scenario",
         "merge",
         "--demand",
@@ -52,13 +52,11 @@ def test_the_command_writes_table_page_and_picture(
     assert main(["bench", "attribution", *words, "--out", str(tmp_path)]) == 0
     with (tmp_path / "attribution.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert {row["policy"] for row in rows} == {"vfn-demonstrated"}
-    assert len({(row["input"], row["replacement"]) for row in rows}) == len(rows) == 11
+    assert {row["policy"] for row in rows} == {"vfn"}
+    assert len({(row["input"], row["replacement"]) for row in rows}) == len(rows) == 8
     text = (tmp_path / "attribution.md").read_text()
     assert text in capsys.readouterr().out
-    assert text.startswith(
-        "# Which inputs the value networks use\n\n- `vfn-demonstrated`: inputs that change no choice"
-    )
+    assert text.startswith("# Which inputs the value networks use\n\n- `vfn`: inputs that change no choice")
     assert "preset `lawful`" in text
     assert "2 episodes a policy" in text
     assert (tmp_path / "attribution.png").stat().st_size > 1000
@@ -67,7 +65,7 @@ def test_the_command_writes_table_page_and_picture(
 def test_driving_with_an_input_replaced_is_compared_with_driving_by_all_of_them(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["--policy", "vfn-demonstrated", "--scenario", "merge", "--demand", "contested", "--closed-loop"]
+    words = ["--policy", "vfn", "--scenario", "merge", "--demand", "contested", "--closed-loop"]
     words += ["--seeds", "150000:150001", "--duration", "1.2", "--errors", "stress"]
     assert main(["bench", "attribution", *words, "--out", str(tmp_path)]) == 0
     with (tmp_path / "closed_loop.csv").open(newline="") as file:
@@ -75,7 +73,6 @@ def test_driving_with_an_input_replaced_is_compared_with_driving_by_all_of_them(
     assert [(row["input"], row["replacement"]) for row in rows] == [
         ("nothing", ""),
         ("maps", "another AV's"),
-        ("kinematics", "another AV's"),
         ("situation", "another AV's"),
         ("map branch", "its last layer zero"),
         ("phi", "0 degrees"),
@@ -83,7 +80,7 @@ def test_driving_with_an_input_replaced_is_compared_with_driving_by_all_of_them(
     ]
     assert {row["seed"] for row in rows} == {"150000"}
     text = capsys.readouterr().out
-    assert "### vfn-demonstrated, merge, 1 episodes" in text
+    assert "### vfn, merge, 1 episodes" in text
     assert "| map branch | its last layer zero |" in text
 
 

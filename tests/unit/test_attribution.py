@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import numpy as np
@@ -12,8 +11,8 @@ from policy_scenes import Car, histories, straight_road
 
 from cosim.errors import BadInput
 from cosim.learning.attribution import FIGURES, SHARED, closed_markdown, markdown, questioned, table
-from cosim.types import MetaAction, PolicyContext, Timing
-from policy.agents.approaches import compact
+from cosim.types import COMPACT, MetaAction, PolicyContext, Timing
+from policy.agents.approaches import AgentConfig, configure
 from policy.agents.prediction_aware import PredictionAware
 from policy.attribution import (
     OTHERS,
@@ -24,15 +23,25 @@ from policy.attribution import (
     questions,
     replacements,
 )
+from policy.chain.chain import ChainConfig
 from policy.inputs.tensors import States
+from policy.networks.hpn import HpnConfig
+from policy.networks.vfn import VfnConfig
 
 ROAD = straight_road(3)
 FREE = [Car("a", 300.0, 1, 20.0, is_av=True), Car("b", 100.0, 1, 20.0, is_av=True)]  # 200 m apart, alike
-NETWORK = Questioned("vfn-p-demonstrated").vfn  # takes maps, kinematics and situation
 
 
-def untrained(name: str = "vfn-p-demonstrated") -> Questioned:
-    return Questioned(name, dataclasses.replace(compact(name), vfn_weights=None, hpn_weights=None))
+def config(name: str) -> AgentConfig:
+    """An untrained agent of convolutions, in whatever layout its weights ship."""
+    return configure(name, COMPACT, ChainConfig(), HpnConfig(), VfnConfig())
+
+
+def untrained(name: str = "vfn-p") -> Questioned:
+    return Questioned(name, config(name))
+
+
+NETWORK = untrained().vfn  # takes maps, kinematics and situation
 
 
 def driven(
@@ -71,10 +80,10 @@ def test_a_network_that_reads_phi_alone_uses_nothing_else() -> None:
 
 
 def test_every_input_is_replaced_where_the_approach_has_it() -> None:
-    whole = {": ".join(key).split(":")[0] for key in _keys("vfn-p-demonstrated")}
+    whole = {": ".join(key).split(":")[0] for key in _keys("vfn-p")}
     framed = {f"{span} {what}" for span in ("past", "predicted", "all") for what in ("maps", "kinematics")}
     assert whole == framed | {"situation", "map branch", "phi"}
-    assert {name for name, _ in _keys("vfn-demonstrated")} == {
+    assert {name for name, _ in _keys("vfn")} == {
         "maps",
         "kinematics",
         "situation",
@@ -92,10 +101,9 @@ def _keys(name: str) -> list[tuple[str, str]]:
 
 def test_an_agent_drives_by_what_it_answers_with_an_input_replaced() -> None:
     base = led_by(untrained(), -2)  # cos(phi): Accelerate at 45 degrees, Idle at 90
-    config = dataclasses.replace(compact("vfn-p-demonstrated"), vfn_weights=None, hpn_weights=None)
     ways = [(None, "ACCELERATE"), (("phi", "90 degrees"), "IDLE"), (("situation", OTHERS), "ACCELERATE")]
     for what, action in ways:
-        agent = Replaced("vfn-p-demonstrated", config, what)
+        agent = Replaced("vfn-p", config("vfn-p"), what)
         agent.vfn.load_state_dict(base.vfn.state_dict())
         agent.reset(PolicyContext(ROAD, Timing(), agent.observation, math.pi / 4, np.random.default_rng(0)))
         decisions = agent.decide(histories(ROAD, FREE, agent.observation))
@@ -109,7 +117,7 @@ def test_an_agent_drives_by_what_it_answers_with_an_input_replaced() -> None:
 
 
 def test_an_av_that_decides_alone_has_no_other_to_swap_with() -> None:
-    assert not [key for key in driven(untrained("vfn-demonstrated"), cars=FREE[:1]) if "another" in key]
+    assert not [key for key in driven(untrained("vfn"), cars=FREE[:1]) if "another" in key]
 
 
 def test_swapping_avs_that_see_the_same_changes_nothing() -> None:
@@ -144,7 +152,9 @@ def test_replacements_touch_their_own_frames_and_nothing_else() -> None:
 
 
 def test_no_maps_is_the_last_layer_of_their_branch_at_zero() -> None:
-    agent = Questioned("vfn-p-demonstrated")
+    agent = untrained()
+    torch.manual_seed(0)
+    torch.nn.init.normal_(agent.vfn.value.weight)
     agent.reset(PolicyContext(ROAD, Timing(), agent.observation, 0.0, np.random.default_rng(0)))
     states = agent.perceive(histories(ROAD, FREE, agent.observation)).states
     without = answer(agent, (None, *states[1:]))

@@ -14,7 +14,6 @@ from policy.agents import POLICIES
 
 ROOT = Path(__file__).parents[2]
 PAGES = {
-    "alone": 100,
     "foresight": 240,
     "forced_entry": 200,
     "humans": 2000,
@@ -25,7 +24,7 @@ PAGES = {
 @pytest.mark.parametrize("page", PAGES)
 def test_what_is_kept_of_a_page_can_be_driven_anew(page: str, tmp_path: Path) -> None:
     known = rows.read(page, ROOT / rows.KEPT)
-    assert {row["policy"] for row in known} <= POLICIES.keys() | rows.POLICIES.keys()
+    assert {row["policy"] for row in known} <= POLICIES.keys()
     assert all(len(row["trace_hash"]) == 64 for row in known)
     identities = Counter(tuple(row[name] for name in rows.IDENTITY) for row in known)
     assert max(identities.values()) == 1
@@ -38,11 +37,11 @@ def test_what_is_kept_of_a_page_can_be_driven_anew(page: str, tmp_path: Path) ->
 
 def test_a_row_says_what_the_command_line_is_to_say(tmp_path: Path) -> None:
     row = dict.fromkeys(rows.COLUMNS, "") | {"scenario": "merge", "demand": "contested", "preset": "lawful"}
-    row |= {"behavior": "mixed", "policy": "vfn-alone", "errors": "forced_0.5-64deca90", "seed": "200007"}
+    row |= {"behavior": "mixed", "policy": "vfn", "errors": "forced_0.5-64deca90", "seed": "200007"}
     row |= {"svo_deg": "60.0"}
     assert rows.words(row, tmp_path) == [
         *("--scenario", "merge", "--demand", "contested", "--preset", "lawful"),
-        *("--policy", "vfn-alone=benchmarks.alone:vfn", "--svo", "60.0", "--seeds", "200007:200008"),
+        *("--policy", "vfn", "--svo", "60.0", "--seeds", "200007:200008"),
         *("--behavior", "mixed", "--errors", str(tmp_path / "forced_0.5.yaml")),
     ]
     assert (tmp_path / "forced_0.5.yaml").is_file()

@@ -81,7 +81,7 @@ def test_a_page_compares_episodes_of_equal_seeds() -> None:
 
 def test_rows_say_which_weights_drove(tmp_path: Path) -> None:
     assert weights_of("idm") == ""
-    assert len({weights_of(name) for name in ("vfn-p", "vfn", "vfn-p-demonstrated")}) == 3
+    assert len({weights_of(name) for name in ("vfn-p", "vfn", "safe-dqn")}) == 3
     driven = replace(DRIVES[0], weights=weights_of("vfn"))
     write_csv(tmp_path / "new.csv", [asdict(driven)])
     before = {k: v for k, v in asdict(driven).items() if k != "weights"}

@@ -53,9 +53,7 @@ AT_LINE = 5.0  # m: who is further away stands in a queue
 WAITS = 15.0  # s of waiting at a line; from then on it judges and takes its gap, whatever the agent asks for
 GOES_FIRST = SPEED_MODE[Preset.LAWFUL] - 8  # heeds nobody outside the junction
 GOES_ON = 32  # with it, of those inside nobody either: `Inside` looks who is in its way
-BRAKES_WITHIN = (
-    4  # of a speed mode: no commanded speed is reached by braking harder than the driver's `decel`
-)
+BRAKES_WITHIN = 4  # bit of a speed mode: a commanded speed asks for no more than the driver's `decel`
 HOLDS = 10.0, 2.6  # m before a line, m/s2: from there on it goes before no AV that would brake harder
 LETS = 1.0  # s for which an AV that is asked lets another one in
 # where AVs alone come, and where humans do: SUMO adds a share of 180 s stood, which makes humans brake hard

@@ -323,7 +323,7 @@ def only_a_tail(snapshot: Snapshot, road: RoadMap, i: int, j: int) -> bool:
     """Whether two cars in lanes side by side touch only because one of them stands askew.
 
     SUMO's front moves sideways at 1.6 m/s however slowly the car drives, and its tail follows over the
-    distance driven: after a change at a crawl the car is 30 degrees askew, its tail in the lane that it has
+    distance driven: after a change at a crawl the car stands askew, its tail in the lane that it has
     left, where SUMO's own drivers no longer see it (they are lane-based: it has arrived). No car can drive
     so; laid along its lane, with the front where it is, it touches none.
     """

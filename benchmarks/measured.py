@@ -189,7 +189,14 @@ def lawful_worlds(place: Place) -> list[list[str]]:
     return [["benchmarks.lawful_worlds", *flags, *kept]]
 
 
+def capacity(place: Place) -> list[list[str]]:
+    """What human drivers bring through the open roads."""
+    few = ["--roads", "minor", "--seeds", "100000:100001"] if place.small else []
+    return [["benchmarks.capacity", *few, "--out", str(place.out)]]
+
+
 PAGES = (
+    Page("capacity", capacity, ("capacity.md", "capacity.svg", "data/capacity.csv")),
     Page("law", law, ("law.md",)),
     Page("law_stress", law_stress, ("law_stress.md",)),
     Page("lawful_worlds", lawful_worlds, ("lawful_worlds.md",)),

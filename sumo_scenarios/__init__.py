@@ -22,18 +22,27 @@ def practice() -> tuple[str, ...]:
     return tuple(sorted(f"practice/{p.parent.name}" for p in ROOT.glob("practice/*/scenario.yaml")))
 
 
+def open_roads() -> tuple[str, ...]:
+    """Names of the roads that vehicles enter and leave at a fixed demand, sorted: `open/NAME`."""
+    return tuple(sorted(f"open/{p.parent.name}" for p in ROOT.glob("open/*/scenario.yaml")))
+
+
+def shipped() -> tuple[str, ...]:
+    """Names of all scenarios that ship."""
+    return (*names(), *open_roads(), *practice())
+
+
 def ships(name: str) -> bool:
-    """Whether a world or practice roads that ship are called so."""
-    return name in names() or name in practice()
+    """Whether a scenario that ships is called so."""
+    return name in shipped()
 
 
 def folder(name: str) -> Path:
-    """The folder of the world, or of the practice roads, called `name`.
+    """The folder of the scenario that ships as `name`.
 
     Raises:
-        BadInput: there is no such world; the sentence names the nearest one there is.
+        BadInput: there is no such scenario; the sentence names the nearest one there is.
     """
-    known = (*names(), *practice())
-    if name in known:
+    if ships(name):
         return ROOT / name
-    raise BadInput(f"no such scenario{hint(name, known)}", field="scenario", value=name)
+    raise BadInput(f"no such scenario{hint(name, shipped())}", field="scenario", value=name)

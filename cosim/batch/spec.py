@@ -140,7 +140,7 @@ def _files(name: str, folder: Path, file: object, field: str) -> tuple[str, ...]
 
 def _checked(spec: Spec, file: object) -> Spec:
     """What can be said without opening a scenario."""
-    known = (*sumo_scenarios.names(), *sumo_scenarios.practice())
+    known = sumo_scenarios.shipped()
     for name in spec.values["what"]:
         if name not in known and not os.path.isabs(name):
             raise BadInput(f"no such scenario{hint(name, known)}", file=file, field="scenario", value=name)

@@ -21,7 +21,7 @@ def add(commands: arguments.SubCommands) -> None:
 def work(args: argparse.Namespace) -> int:
     """List them."""
     from cosim.scenario import load
-    from sumo_scenarios import names
+    from sumo_scenarios import names, open_roads
 
     rows: list[dict[str, Any]] = [
         {
@@ -34,17 +34,17 @@ def work(args: argparse.Namespace) -> int:
             "warmup_s": s.warmup,
             "preset": s.preset,
         }
-        for name, s in ((name, load(name)) for name in names())
+        for name, s in ((name, load(name)) for name in (*names(), *open_roads()))
     ]
     if args.json:
         print(json.dumps(rows))
         return 0
     for row in rows:
-        print(f"{row['name']:<14}{row['title']}")
+        print(f"{row['name']:<17}{row['title']}")
         default = row["default_demand"]
         demands = ", ".join(f"{d} (default)" if d == default else d for d in row["demands"])
         print(
-            f"{'':<14}demand {demands}; mission {row['mission']}; "
+            f"{'':<17}demand {demands}; mission {row['mission']}; "
             f"{row['duration_s']:g} s after {row['warmup_s']:g} s of warm-up; {row['preset']}"
         )
     return 0

@@ -208,6 +208,8 @@ class _WorldFile:
     warmup: NonNegative = 0.0
     timing: Timing = Timing()
     preset: str = Preset.LAWFUL
+    behavior: str = ""  # of its own demands; "": mixed, and moderate in `contested`
+    on_collision: str = OnCollision.END
     demand: str = ""
     fleet: Fleet = Fleet()
     mission: Mission = Mission()
@@ -230,11 +232,15 @@ def _world(folder: Path) -> Scenario:
     name, ships = top.name or folder.name, folder.parent == sumo_scenarios.ROOT
     if ships and name != folder.name:
         raise BadInput("differs from its folder's name", file=file, field="name", value=name)
-    if not ships and name in sumo_scenarios.names():
+    if sumo_scenarios.ROOT not in folder.parents and name in (
+        *sumo_scenarios.names(),
+        *sumo_scenarios.open_roads(),
+    ):
         raise BadInput(
             "a world that ships is called so: name yours otherwise", file=file, field="name", value=name
         )
-    config = sumocfg.read(folder / f"{name}{CONFIG}", ("route-files",))  # its demands are in their folder
+    # of `open/NAME` the last part; its demands are in their folder
+    config = sumocfg.read(folder / f"{Path(name).name}{CONFIG}", ("route-files",))
     demands = {_demand_name(path): path for path in sorted((folder / "demand").glob("*.rou.xml"))}
     if not demands:
         raise BadInput("holds no *.rou.xml", file=file, field="demand", value=str(folder / "demand"))
@@ -245,6 +251,8 @@ def _world(folder: Path) -> Scenario:
     check_timing(top.timing, file, "timing.step", top.timing.step)
     preset = one_of(top.preset, Preset.ALL, "preset", file)
     return Scenario(
+        behavior=one_of(top.behavior, BEHAVIORS, "behavior", file) if top.behavior else AS_IS,
+        on_collision=one_of(top.on_collision, OnCollision.ALL, "on_collision", file),
         name=name,
         title=top.title,
         definition=file,
@@ -344,9 +352,12 @@ def _with_sumo_options(scenario: Scenario, chosen: Mapping[str, str]) -> Scenari
 
 
 def _default_behavior(scenario: Scenario) -> str:
-    """presets.md: a user's file drives as it is; ours `mixed`, and `contested` with moderate HVs."""
+    """presets.md: a user's file drives as it is; a scenario as it says, else `mixed`, `contested` with
+    moderate HVs."""
     if scenario.demands is None or any(path not in scenario.demands.values() for path in scenario.demand):
         return AS_IS
+    if scenario.behavior != AS_IS:
+        return scenario.behavior
     return "moderate" if scenario.demand_name == "contested" else MIXED
 
 

@@ -237,7 +237,7 @@ def _about(figures: Figures, ready: Readiness, reads: Lane) -> APIRouter:
     @router.get("/api/catalogue", summary="Worlds, policies and words that a run can name")
     @reads
     def catalogue() -> Catalogue:
-        worlds = [load(name) for name in sumo_scenarios.names()]
+        worlds = [load(name) for name in (*sumo_scenarios.names(), *sumo_scenarios.open_roads())]
         return Catalogue(
             scenarios=[
                 World(name=w.name, title=w.title, demands=[*(w.demands or {})], duration_s=w.duration)

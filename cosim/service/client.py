@@ -85,7 +85,7 @@ class Remote(Session):
         caller = _Caller(connection, request)
         about = caller.about
         known = {name: about[name] for name in ("behavior", "preset", "duration", "warmup")}
-        if request["scenario"] in sumo_scenarios.names():
+        if sumo_scenarios.ships(request["scenario"]):
             scenario = replace(load(request["scenario"]), demand_name=about["demand"], **known)
         else:
             elsewhere = Path(request["scenario"])

@@ -28,7 +28,7 @@ _ALLOWED: dict[str, Iterable[str]] = {  # names alone: no code is taken, and SUM
     "output": OUTPUTS,
 }
 _ABOUT = {  # where HTTP takes less than the command line
-    "scenario": f"scenarios by name ({', '.join(sumo_scenarios.names())}), or upload:ID",
+    "scenario": f"scenarios by name ({', '.join(sumo_scenarios.names())}, open/NAME), or upload:ID",
     "demand": "by name (free, dense, contested), or files of the upload; A,B is one demand of two files",
     "policy": f"by name ({', '.join(POLICIES)}), upload:ID or LABEL=upload:ID",
     "errors": "of human drivers: none (default), field or stress",
@@ -175,7 +175,7 @@ def _is_name(text: str) -> bool:
 
 def _named(name: str, item: Any, find: Find, uploads: list[str]) -> str:
     """A world or a policy: its name, or the file of an upload."""
-    known = POLICIES if name == "policy" else sumo_scenarios.names()
+    known = POLICIES if name == "policy" else sumo_scenarios.shipped()
     if not isinstance(item, str):
         raise BadInput("text is needed", field=name, value=item)
     if item in known:

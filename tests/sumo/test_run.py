@@ -165,5 +165,7 @@ def test_the_scenarios_are_listed_for_machines() -> None:
         check=True,
     )
     worlds = {row["name"]: row for row in json.loads(done.stdout)}
-    assert tuple(worlds) == sumo_scenarios.names()
-    assert all({"free", "dense", "contested"} <= set(row["demands"]) for row in worlds.values())
+    assert tuple(worlds) == (*sumo_scenarios.names(), *sumo_scenarios.open_roads())
+    assert all(
+        {"free", "dense", "contested"} <= set(worlds[name]["demands"]) for name in sumo_scenarios.names()
+    )

@@ -15,12 +15,12 @@ from cosim.scenario.vet import vet
 from cosim.simulation.sumo import SumoSimulator
 from cosim.types import Kind, Snapshot
 from cosim.workers.worker import Worker
-from sumo_scenarios import folder, names, practice
+from sumo_scenarios import folder, names, practice, shipped
 from sumo_scenarios.build import net_text
 
 WORLDS = names()
-ROADS = (*WORLDS, *practice())
-DEMANDS = [(world, demand) for world in ROADS for demand in load(world).demands or ()]
+ALL = [(world, demand) for world in shipped() for demand in load(world).demands or ()]
+DEMANDS = [(world, demand) for world, demand in ALL if world in (*WORLDS, *practice())]
 
 
 def first_frames(scenario: Scenario, seeds: tuple[int, ...]) -> list[Snapshot]:
@@ -29,7 +29,7 @@ def first_frames(scenario: Scenario, seeds: tuple[int, ...]) -> list[Snapshot]:
         return [worker.call("reset", seed)[-1] for seed in seeds]
 
 
-@pytest.mark.parametrize("world", ROADS)
+@pytest.mark.parametrize("world", shipped())
 def test_the_net_is_the_one_its_plain_sources_build(world: str) -> None:
     assert net_text(folder(world)) == (folder(world) / "net.net.xml").read_text()
 
@@ -58,7 +58,7 @@ def test_goal_and_conflict_zones_are_edges_of_the_net(world: str) -> None:
         assert all(any(e == z or e.startswith(f"{z}_") for e in edges) for z in zone.edges)
 
 
-@pytest.mark.parametrize(("world", "demand"), DEMANDS)
+@pytest.mark.parametrize(("world", "demand"), ALL)
 def test_a_demand_states_its_flows_and_is_sound(world: str, demand: str) -> None:
     scenario = load(world, demand=[demand])
     text = scenario.demand[0].read_text()

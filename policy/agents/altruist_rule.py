@@ -1,6 +1,6 @@
 """A scripted altruist: the AV best placed opens the gap for the mission vehicle, everybody else drives IDM.
 
-It shows what altruism can gain without learning anything (docs/results/altruism.md) and is the yardstick
+It shows what altruism can gain without learning anything (research/claims/altruism.yaml) and is the yardstick
 for the learned policies. AVs share what they know (V2V), so one guide is chosen for all of them.
 """
 

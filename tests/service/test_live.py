@@ -113,7 +113,8 @@ def test_what_a_page_draws_of_an_explained_decision_is_told(server: Server) -> N
         socket.send(json.dumps({"until": 0.8}))
         lasting, steps = drawn(socket, 0.8)
     server.http.delete(f"/api/sessions/{session}")
-    _, choices, forecast = steps[-1]["decided"]
+    _, choices, forecast, beliefs = steps[-1]["decided"]
+    assert beliefs is None, "all that is there is perceived"
     assert len(choices[0][6]) == 5  # action values
     assert len(forecast) > 5
     assert steps[-1]["interval"] == pytest.approx(0.4)

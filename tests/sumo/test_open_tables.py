@@ -228,7 +228,7 @@ def test_an_encoder_is_trained_on_one_s_own_roads(
     run = ["train", "encoder", "--config", "smoke", "--scenario", str(own / "mine"), "--out", str(tmp_path)]
     assert main([*run, "--seed", "3"]) == 0
     card = json.loads((tmp_path / "encoder.json").read_text())
-    assert card["data"]["sight"]["seed"] == 3
+    assert card["data"]["seed"] == 3
     assert card["data"]["frames"]["training"] > card["data"]["frames"]["validation"] // 2 > 0
     log = (tmp_path / "log.csv").read_text().splitlines()
     assert len(log) == 5, "a head, and a line of each update"

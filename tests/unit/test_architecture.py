@@ -10,7 +10,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 # These time, one by one, the parts of the loop, of the simulator and of a decision.
-MEASURE_PARTS = {"benchmarks/loop.py", "benchmarks/decision_cost.py", "benchmarks/sensing_cost.py"}
+MEASURE_PARTS = {f"benchmarks/{name}.py" for name in ("capacity", "decision_cost", "loop", "sensing_cost")}
 
 
 def calls() -> Iterator[tuple[str, str]]:

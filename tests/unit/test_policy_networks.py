@@ -73,7 +73,7 @@ def test_a_network_that_corrects_asks_for_the_rendered_map() -> None:
 def test_the_vfn_values_five_actions_at_every_size(
     strides: str, height: int, width: int, frames: int
 ) -> None:
-    network = VFN(VfnConfig(height, width, frames=frames, strides=strides)).eval()  # type: ignore[arg-type]
+    network = VFN(VfnConfig(height=height, width=width, frames=frames, strides=strides)).eval()  # type: ignore[arg-type]
     q = values(network, height, width, frames)
     assert q.shape == (2, 5)
     assert (q == 0.0).all(), "untrained: every action is worth the same"
@@ -155,7 +155,7 @@ def test_who_drives_by_a_larger_phi_is_driven_by_the_largest() -> None:
 
 def test_gradients_reach_every_layer_of_both_networks() -> None:
     torch.manual_seed(0)
-    hpn, vfn = MapBranch(MapBranchConfig(16, 128, correct=True, skips=True)), VFN(VfnConfig(16, 128))
+    hpn, vfn = MapBranch(MapBranchConfig(16, 128, correct=True, skips=True)), VFN(VfnConfig(height=16))
     for head in (vfn.value, vfn.state):
         torch.nn.init.normal_(head.weight)  # type: ignore[union-attr]
     torch.nn.init.normal_(hpn.decoder[2].weight)  # type: ignore[arg-type]

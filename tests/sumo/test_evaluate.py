@@ -141,6 +141,7 @@ def workers_of(pid: int) -> list[int]:
     ]
 
 
+@pytest.mark.soak
 def test_a_ray_node_killed_in_mid_run_loses_nothing(undisturbed: Path) -> None:
     pytest.importorskip("ray")
     script = Path(__file__).parent / "ray_two_nodes.py"

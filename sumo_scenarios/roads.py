@@ -55,21 +55,22 @@ class Road:
     kind: ClassVar[str]
     title: ClassVar[str]
     speed: float = 30.0  # limit of the main road
+    lanes: int = 2  # of the main road, a direction
 
     @property
     def layout(self) -> tuple[int, ...]:
         """Numbers of lanes, arms, signals: what two alike roads have in common."""
-        raise NotImplementedError
+        return (self.lanes,)
 
     @property
     def size(self) -> float | None:
         """m, the length on which drivers must agree; None where there is no such length."""
-        raise NotImplementedError
+        return None
 
     @property
     def lanes_at_bottleneck(self) -> int:
         """What a capacity is divided by, to compare roads of one kind."""
-        raise NotImplementedError
+        return self.lanes
 
     @property
     def section(self) -> Section:
@@ -106,10 +107,6 @@ class LaneDrop(Road):
     @property
     def layout(self) -> tuple[int, ...]:
         return self.lanes, self.after
-
-    @property
-    def size(self) -> float | None:
-        return None
 
     @property
     def lanes_at_bottleneck(self) -> int:
@@ -162,16 +159,8 @@ class OnRamp(Road):
     speed: float = 30.0
 
     @property
-    def layout(self) -> tuple[int, ...]:
-        return (self.lanes,)
-
-    @property
     def size(self) -> float | None:
         return self.acceleration_m
-
-    @property
-    def lanes_at_bottleneck(self) -> int:
-        return self.lanes
 
     @property
     def section(self) -> Section:
@@ -222,16 +211,8 @@ class Weave(Road):
     speed: float = 30.0
 
     @property
-    def layout(self) -> tuple[int, ...]:
-        return (self.lanes,)
-
-    @property
     def size(self) -> float | None:
         return self.weave_m
-
-    @property
-    def lanes_at_bottleneck(self) -> int:
-        return self.lanes
 
     @property
     def section(self) -> Section:
@@ -294,10 +275,6 @@ class Roundabout(Road):
     @property
     def size(self) -> float | None:
         return self.radius
-
-    @property
-    def lanes_at_bottleneck(self) -> int:
-        return self.lanes
 
     @property
     def section(self) -> Section:
@@ -371,14 +348,6 @@ class Minor(Road):
         return self.lanes, self.arms
 
     @property
-    def size(self) -> float | None:
-        return None
-
-    @property
-    def lanes_at_bottleneck(self) -> int:
-        return self.lanes
-
-    @property
     def section(self) -> Section:
         exits = ("west_out", "east_out", *(f"{arm}_out" for arm in self._minors))
         return Section(tuple(f"{arm}_in" for arm in self._minors), exits, 300.0)
@@ -438,10 +407,6 @@ class Arterial(Road):
     @property
     def size(self) -> float | None:
         return self.block_m
-
-    @property
-    def lanes_at_bottleneck(self) -> int:
-        return self.lanes
 
     @property
     def timing(self) -> Timing | None:

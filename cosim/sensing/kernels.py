@@ -16,6 +16,7 @@ from cosim.geometry.compiled import compiled
 Flags = npt.NDArray[np.uint8]
 Streams = npt.NDArray[np.uint64]
 Rows = npt.NDArray[np.int64]
+Radio = tuple[float, float, float, float, float, float]  # range m, period s, delay s, jitter s, loss, burst
 
 # Of `seen`: what an AV's own sensors make of an object.
 OUT_OF_RANGE, HIDDEN, MISSED, DETECTED = 0, 1, 2, 3
@@ -362,7 +363,7 @@ def follow(
     lag: int,  # frames until own measurements are there
     noise: Floats,  # [3] of own sensors: m, m/s, rad
     contents: Flags,  # [2] whether CAMs and CPMs are sent
-    radio: Floats,  # [6] range m, period, delay, jitter s, loss, burst
+    radio: Radio,
     sender_noise: Floats,  # [3]
     tracks: Floats,  # [A,S,18] in and out
     heard: Floats,  # [A,A] time of the newest CPM of each sender, in and out
@@ -373,14 +374,7 @@ def follow(
     source = np.empty(slots, np.int64)
     whose = np.empty(slots, np.int64)  # slot of the vehicle that measured it; of a CAM the message's number
     truth = np.empty(STATES)
-    reach2, period, delay, jitter, loss, burst = (
-        radio[0] ** 2,
-        radio[1],
-        radio[2],
-        radio[3],
-        radio[4],
-        radio[5],
-    )
+    reach, period, delay, jitter, loss, burst = radio
     oldest = now - (held - 1) * frame - 1e-6  # s: of earlier ones the state is not known any more
     for a in range(egos.shape[0]):
         ego = egos[a]
@@ -398,7 +392,7 @@ def follow(
                 if not equipped[o] or o == ego:
                     continue
                 dx, dy = ring[newest % size, o, X] - x0, ring[newest % size, o, Y] - y0
-                if not dx * dx + dy * dy <= reach2:
+                if not dx * dx + dy * dy <= reach * reach:
                     continue
                 after = max(tracks[a, o, T_CAM], oldest)
                 time, number = newest_message(
@@ -415,7 +409,7 @@ def follow(
                 if b == a or sender < 0:
                     continue
                 dx, dy = ring[newest % size, sender, X] - x0, ring[newest % size, sender, Y] - y0
-                if not dx * dx + dy * dy <= reach2:
+                if not dx * dx + dy * dy <= reach * reach:
                     continue
                 after = max(heard[a, b], oldest)
                 time, number = newest_message(
@@ -476,18 +470,11 @@ def intentions_heard(
     streams: Streams,  # [S]
     now: float,  # s
     decision: float,  # s in which an intention must arrive
-    radio: Floats,  # [6] as of `follow`
+    radio: Radio,
     heard: Flags,  # [A,A] out
 ) -> None:
     """Whether each AV hears what each other one intends now: its newest MCM arrives in time."""
-    reach2, period, delay, jitter, loss, burst = (
-        radio[0] ** 2,
-        radio[1],
-        radio[2],
-        radio[3],
-        radio[4],
-        radio[5],
-    )
+    reach, period, delay, jitter, loss, burst = radio
     heard[:] = 0
     for a in range(egos.shape[0]):
         for b in range(egos.shape[0]):
@@ -495,7 +482,7 @@ def intentions_heard(
             if a == b or me < 0 or other < 0:
                 continue
             dx, dy = state[other, X] - state[me, X], state[other, Y] - state[me, Y]
-            if not dx * dx + dy * dy <= reach2:
+            if not dx * dx + dy * dy <= reach * reach:
                 continue
             number = math.floor(now / period + 1e-9)
             wait = delay

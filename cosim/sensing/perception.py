@@ -70,7 +70,7 @@ class Perception:
         self._noise = np.array([p.position_noise, p.speed_noise, math.radians(p.heading_noise)])
         heading = math.radians(p.cam_heading_noise)
         self._sender_noise = np.array([p.cam_position_noise, p.cam_speed_noise, heading])
-        self._radio = np.array([p.message_range, p.period, p.delay, p.jitter, p.loss, p.burst])
+        self._radio = p.message_range, p.period, p.delay, p.jitter, p.loss, p.burst
         self._contents = np.array([p.cam, p.cpm], np.uint8)
         self._lag = math.ceil(p.latency / timing.frame - 1e-6)
         oldest = max(p.delay + LONGEST_JITTER * p.jitter + p.period, p.forget) if p.cam or p.cpm else 0.0

@@ -53,6 +53,8 @@ class Step(NamedTuple):
 
     before: Snapshot
     decisions: Mapping[str, Decision]  # of the AVs that were commanded
+    # Whose commands have had their time: `decisions`; with a `decision_latency` those of the step before
+    carried_out: Mapping[str, Decision]
     commands: tuple[Command, ...]
     receipts: tuple[Receipt, ...]  # of each command
     frames: tuple[Snapshot, ...]  # since `before`, newest last
@@ -155,6 +157,8 @@ class Episode:
         )
         sensing = self.scenario.sensing
         self._hash = hashlib.sha256(b"" if sensing is None else sensing.digest.encode())
+        self._late = sensing is not None and sensing.parameters.decision_latency > 0.0
+        self._acting: tuple[Mapping[str, Decision], tuple[Command, ...]] = {}, ()  # while they are late
         context = MetricContext(
             road=self.simulator.road,
             timing=self.scenario.timing,
@@ -190,6 +194,9 @@ class Episode:
         self._tally["fallbacks"] += sum(d.fallback for d in decisions.values())
         lawful = self.scenario.preset == Preset.LAWFUL
         commands = to_commands(decisions, self.histories, self.scenario.timing.decision, lawful)
+        held: tuple[Mapping[str, Decision], tuple[Command, ...]] = decisions, tuple(commands)
+        if self._late:
+            held, self._acting = self._acting, held
         self.histories.expire()
         began = clock()
         try:
@@ -198,10 +205,10 @@ class Episode:
             self.truncated, self._ended = True, str(error)
             return self.histories
         self.timings["simulation_s"] += clock() - began
-        self.step = step = Step(self.snapshot, decisions, tuple(commands), receipts, self.frames)
+        self.step = step = Step(self.snapshot, decisions, *held, receipts, self.frames)
         self.snapshot = step.after
         self.steps += 1
-        for command, receipt in zip(commands, receipts, strict=True):
+        for command, receipt in zip(step.commands, receipts, strict=True):
             self._tally["lane_changes"] += bool(command.lane_offset and receipt.executed)
             self._tally["blocked"] += not receipt.executed  # of any command
         for frame in self.frames:

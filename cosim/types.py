@@ -341,7 +341,7 @@ class Unseen(IntEnum):
     """Why an AV's own sensors do not detect an object in a frame."""
 
     OUT_OF_RANGE = 0  # or of the field of view
-    HIDDEN = 1  # another vehicle's body is in between
+    HIDDEN = 1  # another vehicle's body or a building is in between
     MISSED = 2
 
 
@@ -372,6 +372,25 @@ class Percept:
         return {self.others[k]: Unseen(self.detected[k]) for k in np.flatnonzero(within).tolist()}
 
 
+class Tracks(NamedTuple):
+    """What AVs know of V vehicles and persons, each AV itself among those it knows of.
+
+    An AV's own row is its state at the mean age of its tracks, so that its rows are of about one moment.
+    """
+
+    state: Floats  # [V,N,4] x m, y m, speed m/s, heading rad, a frame apart, newest at the measurement's time
+    valid: Bools  # [V,N] whether it was known
+    lane: Ints  # [V] index into `RoadMap.lanes`, -1 off every lane
+    lane_position: Floats  # [V] m, front bumper along that lane
+    length: Floats  # [V] m
+    width: Floats  # [V] m
+    is_av: Bools  # [V]
+    is_mission: Bools  # [V]
+    person: Bools  # [V]
+    age: Floats  # [V] s since the newest measurement
+    owner: Ints  # [V] the number of the AV whose knowledge it is
+
+
 class Compensator(Protocol):
     """Predicts states that were measured a while ago to now, with a policy's predictor.
 
@@ -381,23 +400,8 @@ class Compensator(Protocol):
 
     frames: int
 
-    def present(
-        self, state: Floats, valid: Bools, lane: Ints, lane_position: Floats, length: Floats, age: Floats
-    ) -> Floats:
-        """The present states of V vehicles and persons.
-
-        Args:
-            state: [V,N,4] x m, y m, speed m/s, heading rad as they were known in each frame, oldest first:
-                each of its measurement's time.
-            valid: [V,N] whether they were known.
-            lane: [V] index into `RoadMap.lanes`, -1 off every lane.
-            lane_position: [V] m, front bumper along that lane.
-            length: [V] m.
-            age: [V] s since the newest measurement.
-
-        Returns:
-            [V,4] the same columns.
-        """
+    def present(self, tracks: Tracks) -> Floats:
+        """[V,4] x m, y m, speed m/s, heading rad of `tracks` now."""
 
 
 # Columns of the kinematic matrix, in the ego's frame at the newest frame of the history

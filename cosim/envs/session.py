@@ -54,7 +54,8 @@ class StepResult(NamedTuple):
         truncated: whether the duration is over, the AV left the road (arrived, teleported), or another AV's
             collision ended the episode.
         ended: why an AV is terminated or truncated.
-        receipts: whether each command was carried out, and why not.
+        receipts: whether each command was carried out, and why not; with a `decision_latency` (sensing) of
+            the commands before.
         events: what happened in the step.
         info: time and elapsed in s, steps, over.
     """

@@ -63,9 +63,9 @@ def explainer(policy: Policy) -> Explainer | None:
 
 def compensator(name: str, road: RoadMap, timing: Timing) -> Compensator:
     """What predicts a sensing level's late states to now, by the name of its compensation."""
-    from cosim.policies.compensation import AlongLanes  # torch: only when it is asked for
+    from cosim.policies.compensation import COMPENSATORS  # torch: only when it is asked for
 
-    return AlongLanes(name, road, timing)
+    return COMPENSATORS[name](road, timing)
 
 
 def make(text: str) -> Policy:

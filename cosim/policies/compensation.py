@@ -1,41 +1,67 @@
-"""Late states predicted to now by a predictor of the agent's, carried along the lanes as its mask does."""
+"""Late states predicted to now by what the agent predicts with: the Gaussian process, or the HPN."""
+
+from collections.abc import Callable
 
 import numpy as np
 
 from cosim.road import RoadMap
-from cosim.types import HEADING, SPEED, Bools, Floats, Ints, Timing, X, Y
+from cosim.types import HEADING, SPEED, Compensator, Floats, Timing, Tracks, X, Y
+from policy.chain.late import LateStates
+from policy.prediction.forecast import KinematicForecast
 from policy.prediction.lane import along_lanes
 from policy.prediction.predictors import make_predictor
 from policy.prediction.traffic import TrafficConfig
 
-PREDICTORS = {"gp": "gp-indirect"}  # by the name of the compensation
+GP, HPN = "gp", "hpn"  # compensations
 PAST = 10  # frames, as of every history
 HORIZON = 4.0  # s: older states are predicted no further
 
 
-class AlongLanes:
-    """`cosim.types.Compensator`: the predictor's speed along the lanes of `road`."""
+class GaussianProcess:
+    """`cosim.types.Compensator`: the speed of the Gaussian process along the lanes of `road`."""
 
     frames = PAST
 
-    def __init__(self, name: str, road: RoadMap, timing: Timing) -> None:
-        horizon = round(HORIZON / timing.frame)
-        self._predictor = make_predictor(PREDICTORS[name], horizon, timing.frame)
+    def __init__(self, road: RoadMap, timing: Timing) -> None:
+        self._predictor = make_predictor("gp-indirect", round(HORIZON / timing.frame), timing.frame)
         self._road, self._config = road, TrafficConfig(dt=timing.frame)
 
-    def present(
-        self, state: Floats, valid: Bools, lane: Ints, lane_position: Floats, length: Floats, age: Floats
-    ) -> Floats:
+    def present(self, tracks: Tracks) -> Floats:
         """See `Compensator.present`."""
-        forecast = self._predictor.predict(state, valid)
-        where = lane, lane_position, length, self._road
-        led = along_lanes(forecast, state, valid, *where, self._config)
-        columns = {X: led.x, Y: led.y, SPEED: led.speed, HEADING: led.heading}
-        frames = np.minimum(age / self._predictor.dt, self._predictor.horizon - 1e-6)  # [V]
-        before, share = frames.astype(np.int64), frames % 1.0
-        rows, now = np.arange(len(state)), state[:, -1].copy()
-        for column, ahead in columns.items():
-            series = np.concatenate([now[:, column : column + 1], ahead], axis=1)  # [V,M+1]
-            first, second = series[rows, before], series[rows, before + 1]
-            now[:, column] = np.where(forecast.valid, first + share * (second - first), now[:, column])
-        return now
+        t = tracks
+        forecast = self._predictor.predict(t.state, t.valid)
+        where = t.lane, t.lane_position, t.length, self._road
+        return _at(along_lanes(forecast, t.state, t.valid, *where, self._config), t, self._config.dt)
+
+
+class HybridPredictiveNetwork:
+    """`cosim.types.Compensator`: what the shipped HPN makes of that, each AV by its own tracks."""
+
+    frames = PAST
+
+    def __init__(self, road: RoadMap, timing: Timing) -> None:
+        self._states, self._frame = LateStates(road, timing), timing.frame
+
+    def present(self, tracks: Tracks) -> Floats:
+        """See `Compensator.present`."""
+        return _at(self._states.ahead(tracks), tracks, self._frame)
+
+
+COMPENSATORS: dict[str, Callable[[RoadMap, Timing], Compensator]] = {
+    GP: GaussianProcess,
+    HPN: HybridPredictiveNetwork,
+}
+
+
+def _at(forecast: KinematicForecast, tracks: Tracks, dt: float) -> Floats:
+    """[V,4] a forecast [V,M], `dt` s between frames, at the age of each track."""
+    horizon = forecast.x.shape[1]
+    columns = {X: forecast.x, Y: forecast.y, SPEED: forecast.speed, HEADING: forecast.heading}
+    frames = np.minimum(tracks.age / dt, horizon - 1e-6)  # [V]
+    before, share = frames.astype(np.int64), frames % 1.0
+    rows, now = np.arange(len(tracks.state)), tracks.state[:, -1].copy()
+    for column, ahead in columns.items():
+        series = np.concatenate([now[:, column : column + 1], ahead], axis=1)  # [V,M+1]
+        first, second = series[rows, before], series[rows, before + 1]
+        now[:, column] = np.where(forecast.valid, first + share * (second - first), now[:, column])
+    return now

@@ -90,7 +90,7 @@ class Recorder(Hook):
         self.beliefs.append(beliefs(step.before))
         outcomes = zip(step.commands, step.receipts, strict=True)
         self.choices.append(
-            {c.vehicle: Choice(step.decisions[c.vehicle], c.target_speed, r.blocked) for c, r in outcomes}
+            {c.vehicle: Choice(step.carried_out[c.vehicle], c.target_speed, r.blocked) for c, r in outcomes}
         )
         for frame in step.frames:
             self.add(frame)

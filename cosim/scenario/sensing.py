@@ -32,6 +32,7 @@ class Parameters:
         range: m from centre to centre that an AV's own sensors reach.
         field_of_view: degrees about the AV's heading.
         line_of_sight: whether bodies of vehicles hide what is behind them.
+        buildings: type of the polygons (and its subtypes, `building.house`) that hide as well.
         visible_share: share of an object's angular width that must be in sight.
         position_noise: m, standard deviation of each coordinate.
         speed_noise: m/s, standard deviation.
@@ -53,14 +54,17 @@ class Parameters:
         cam_heading_noise: degrees, the same of its heading.
         confirm: detections by own sensors before a track counts; a message counts at once.
         forget: s without a measurement after which a track ends.
+        decision_latency: s from a decision until its commands act, at most until the next decision.
         compensation: how the state at measurement time is predicted to now: not at all (hold), at constant
             velocity (cv), at constant speed along lanes (lanes), along lanes at the speed that the shipped
-            Gaussian process predicts (gp), or the true present state (truth).
+            Gaussian process predicts (gp), by the shipped HPN's kinematic branch (hpn), or the true present
+            state (truth).
     """
 
     range: Positive = 1000.0
     field_of_view: Annotated[float, Range(0.0, above=True, high=360.0)] = 360.0
     line_of_sight: bool = False
+    buildings: str = "building"
     visible_share: Share = 0.3
     position_noise: NonNegative = 0.0
     speed_noise: NonNegative = 0.0
@@ -82,7 +86,8 @@ class Parameters:
     cam_heading_noise: NonNegative = 0.0
     confirm: int = 1
     forget: Positive = 1.0
-    compensation: Literal["hold", "cv", "lanes", "gp", "truth"] = "hold"
+    decision_latency: NonNegative = 0.0
+    compensation: Literal["hold", "cv", "lanes", "gp", "hpn", "truth"] = "hold"
 
     def __post_init__(self) -> None:
         if self.confirm < 1:

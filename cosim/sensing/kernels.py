@@ -16,6 +16,7 @@ from cosim.geometry.compiled import compiled
 Flags = npt.NDArray[np.uint8]
 Streams = npt.NDArray[np.uint64]
 Rows = npt.NDArray[np.int64]
+Outlines = tuple[Rows, Floats, Floats, Floats]  # as `cosim.sensing.walls.Walls`
 Radio = tuple[float, float, float, float, float, float]  # range m, period s, delay s, jitter s, loss, burst
 
 # Of `seen`: what an AV's own sensors make of an object.
@@ -180,6 +181,48 @@ def _spread(dx: float, dy: float, c: float, s: float, half: float, side: float) 
 
 
 @compiled
+def _within(points: Floats, first: int, last: int, x: float, y: float) -> bool:
+    """Whether a place (m) lies in the polygon of the points `first` to `last`, which are the same one."""
+    inside = False
+    for k in range(first, last):
+        ax, ay, bx, by = points[k, 0], points[k, 1], points[k + 1, 0], points[k + 1, 1]
+        if (ay > y) != (by > y) and x < ax + (y - ay) / (by - ay) * (bx - ax):
+            inside = not inside
+    return inside
+
+
+@compiled
+def _behind_walls(walls: Outlines, x0: float, y0: float, reach: float, depth: Floats) -> None:
+    """Lower `depth` [BINS] (m) to the nearest wall in each direction from (x0, y0); `reach` in m.
+
+    A building around that place hides nothing: a car drives under it, or the polygon is wrong.
+    """
+    begin, points, centre, radius = walls
+    for b in range(radius.shape[0]):
+        away = math.hypot(centre[b, 0] - x0, centre[b, 1] - y0)
+        if away > reach + radius[b]:
+            continue
+        if away < radius[b] and _within(points, begin[b], begin[b + 1] - 1, x0, y0):
+            continue
+        for k in range(begin[b], begin[b + 1] - 1):
+            px, py = points[k, 0] - x0, points[k, 1] - y0
+            dx, dy = points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1]
+            low = math.atan2(py, px)
+            turn = math.atan2(py + dy, px + dx) - low
+            turn -= 2.0 * math.pi * math.floor(turn / (2.0 * math.pi) + 0.5)
+            low = min(low, low + turn)
+            side = px * dy - py * dx
+            for i in range(math.floor(low / BIN), math.floor((low + abs(turn)) / BIN) + 1):
+                ux, uy = _COS[i % BINS], _SIN[i % BINS]
+                across = ux * dy - uy * dx
+                if across == 0.0:
+                    continue
+                far, share = side / across, (px * uy - py * ux) / across
+                if far >= 0.0 and -1e-9 <= share <= 1.0 + 1e-9:
+                    depth[i % BINS] = min(depth[i % BINS], far)
+
+
+@compiled
 def detect(
     state: Floats,  # [S,6] true states, x nan where absent
     length: Floats,  # [S] m
@@ -193,6 +236,7 @@ def detect(
     line_of_sight: bool,
     visible_share: float,
     miss: float,
+    walls: Outlines,
     seen: Flags,  # [A,S] out
 ) -> None:
     """What own sensors make of every object in this frame."""
@@ -206,6 +250,7 @@ def detect(
         x0, y0, h0 = state[ego, X], state[ego, Y], state[ego, HEADING]
         if line_of_sight:
             depth[:] = np.inf
+            _behind_walls(walls, x0, y0, reach, depth)
         for o in range(slots):
             dx, dy = state[o, X] - x0, state[o, Y] - y0
             if o == ego or not dx * dx + dy * dy <= reach * reach:
@@ -527,6 +572,35 @@ def drive_on(following: Rows, length: Floats, lane: Rows, position: Floats) -> N
     for k in range(lane.shape[0]):
         if lane[k] >= 0:
             lane[k], position[k] = _drive_on(following, length, lane[k], position[k])
+
+
+@compiled
+def resample(
+    time: Floats,  # [V,N] s of each measurement, in order; nan: none
+    state: Floats,  # [V,N,C] its columns
+    frame: float,  # s
+    out: Floats,  # [V,N,C] `frame` s apart, the last as it is; nan where nothing is known
+) -> None:
+    """Series of measurements that came when they came, at equal intervals: in between, straight lines."""
+    frames = time.shape[1]
+    for v in range(time.shape[0]):
+        out[v] = np.nan
+        out[v, frames - 1] = state[v, frames - 1]
+        later = frames - 1
+        for k in range(frames - 2, -1, -1):
+            at = time[v, frames - 1] - (frames - 1 - k) * frame
+            earlier = later
+            while earlier >= 0 and time[v, earlier] > at + 1e-6:
+                later = earlier
+                earlier -= 1
+            if earlier < 0 or not time[v, earlier] <= at + 1e-6:  # or nan
+                break
+            span = time[v, later] - time[v, earlier]
+            share = (at - time[v, earlier]) / span if span > 1e-9 else 0.0
+            share = 0.0 if share < 1e-6 else share
+            for c in range(state.shape[2]):
+                gain = 0.0 if share == 0.0 else share * (state[v, later, c] - state[v, earlier, c])
+                out[v, k, c] = state[v, earlier, c] + gain
 
 
 @compiled

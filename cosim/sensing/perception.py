@@ -5,7 +5,7 @@ and a wrong association would be an error of a kind of its own, which no paramet
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -29,15 +29,18 @@ from cosim.sensing.kernels import (
     B_Y,
 )
 from cosim.sensing.lanes import lane_lines
-from cosim.types import HEADING, Actor, Compensator, Kind, Percept, Snapshot, Source, Timing, X, Y
+from cosim.sensing.walls import walls
+from cosim.types import HEADING, Actor, Compensator, Kind, Percept, Snapshot, Source, Timing, Tracks, X, Y
 
-COMPENSATION = {"hold": 0, "cv": 1, "lanes": 2, "truth": 3, "gp": 0}  # the kernels' part of it
-PREDICTED = ("gp",)  # what a `Compensator` is needed for
+COMPENSATION = {"hold": 0, "cv": 1, "lanes": 2, "truth": 3, "gp": 0, "hpn": 0}  # the kernels' part of it
+PREDICTED = ("gp", "hpn")  # what a `Compensator` is needed for
 STATE = [B_X, B_Y, B_SPEED, B_HEADING]  # of a belief, as a `Compensator` has it
+PAST = [B_AGE, *STATE]  # of a belief, kept for a `Compensator`: with the time in place of the age
 HIDING = (Actor.CAR, Actor.TRUCK, Actor.BUS, Actor.OTHER)  # nobody is behind a motorcycle or a person
 LONGEST_JITTER = 6.0  # of its mean: one message in 400 comes later, and is not looked at
 NOBODY: frozenset[str] = frozenset()
-AV, HV, TRUTH = int(Kind.AV), int(Kind.HV), int(Source.TRUTH)  # members of an enum cost time
+AV, HV, PERSON = int(Kind.AV), int(Kind.HV), int(Kind.PERSON)  # members of an enum cost time
+TRUTH = int(Source.TRUTH)
 OWN = -1.0  # in a belief's source: the AV itself
 SLOTS = 64  # objects that there is room for at first; AVs: a quarter
 
@@ -51,6 +54,7 @@ class Perception:
         timing: the clocks.
         seed: the episode's, from which every draw comes.
         compensator: for the compensations of `PREDICTED`.
+        buildings: outlines [.,2] (m) that hide what is behind them, where there is a line of sight.
     """
 
     def __init__(
@@ -60,13 +64,15 @@ class Perception:
         timing: Timing,
         seed: int,
         compensator: Compensator | None = None,
+        buildings: Sequence[Floats] = (),
     ) -> None:
         p = self._parameters = parameters
         if (compensator is None) != (p.compensation not in PREDICTED):
             raise ValueError(f"compensation {p.compensation} and {compensator} do not go together")
         self._compensator = compensator
         self._timing, self._seed = timing, seed
-        self._lanes = lane_lines(road)
+        self._lanes, outlines = lane_lines(road), walls(buildings)
+        self._walls = outlines.begin, outlines.points, outlines.centre, outlines.radius
         self._noise = np.array([p.position_noise, p.speed_noise, math.radians(p.heading_noise)])
         heading = math.radians(p.cam_heading_noise)
         self._sender_noise = np.array([p.cam_position_noise, p.cam_speed_noise, heading])
@@ -92,7 +98,8 @@ class Perception:
         step = round(now / self._timing.frame)
         kernels.detect(
             *(state, slots.length, slots.width, slots.hides, slots.egos, slots.streams, step, p.range),
-            *(math.radians(p.field_of_view) / 2.0, p.line_of_sight, p.visible_share, p.miss, seen),
+            *(math.radians(p.field_of_view) / 2.0, p.line_of_sight, p.visible_share, p.miss),
+            *(self._walls, seen),
         )
         kernels.follow(
             *(slots.ring, slots.seen, self._newest, self._held, slots.egos, slots.equipped, slots.streams),
@@ -105,7 +112,7 @@ class Perception:
             *(*self._lanes, slots.tracks, beliefs),
         )
         if self._compensator is not None:
-            self._compensate(self._compensator, beliefs)
+            self._compensate(self._compensator, beliefs, now)
         hears = np.zeros((len(slots.egos), len(slots.egos)), np.uint8)
         if p.mcm:
             decision = self._timing.decision
@@ -114,28 +121,42 @@ class Perception:
 
     # ---- inside ----
 
-    def _compensate(self, compensator: Compensator, beliefs: Floats) -> None:
-        """Predict all beliefs [A,S,10] to now."""
-        slots, past = self._slots, self._slots.past  # [N,A,S,4]
-        known = beliefs[..., B_SOURCE] > 0.0
+    def _compensate(self, compensator: Compensator, beliefs: Floats, now: float) -> None:
+        """Predict all beliefs [A,S,10] to `now` (s)."""
+        slots, past = self._slots, self._slots.past  # [N,A,S,5]
+        self._add_own(beliefs)
+        known = beliefs[..., B_SOURCE] != 0.0
         past[:-1] = past[1:]
         past[-1] = np.nan
-        past[-1][known] = beliefs[known][:, STATE]
-        late = known & (beliefs[..., B_AGE] > 1e-6)
+        past[-1][known] = beliefs[known][:, PAST]
+        past[-1, ..., 0] = now - past[-1, ..., 0]
+        owner, place = known.nonzero()
+        then = beliefs[known]  # [V,10]
+        late = (then[:, B_SOURCE] > 0.0) & (then[:, B_AGE] > 1e-6)
         if not late.any():
             return
-        state, then = past[:, late].swapaxes(0, 1), beliefs[late]  # [V,N,4], [V,10]
-        turn = state[..., HEADING] - state[:, -1:, HEADING]
-        state[..., HEADING] -= 2.0 * np.pi * np.round(turn / (2.0 * np.pi))
+        tracks = _tracks(slots, owner, place, then, self._timing.frame)
+        present = compensator.present(tracks)[late]
+        owner, place, then = owner[late], place[late], then[late]
         lane, position = then[:, B_LANE].astype(np.int64), then[:, B_POSITION].copy()
-        length = slots.length[late.nonzero()[1]]
-        valid = np.isfinite(state[..., X])
-        now = compensator.present(state, valid, lane, position, length, then[:, B_AGE])
-        position += np.hypot(now[:, X] - then[:, B_X], now[:, Y] - then[:, B_Y])
+        position += np.hypot(present[:, X] - then[:, B_X], present[:, Y] - then[:, B_Y])
         kernels.drive_on(self._lanes.following, self._lanes.length, lane, position)
-        then[:, STATE] = now
+        then[:, STATE] = present
         then[:, B_LANE], then[:, B_POSITION] = lane, position
-        beliefs[late] = then
+        beliefs[owner, place] = then
+
+    def _add_own(self, beliefs: Floats) -> None:
+        """Each AV's own row: its state at the mean age of what it knows, in whole frames."""
+        ring, frame = self._slots.ring, self._timing.frame
+        for a in self._slots.avs.values():
+            known = beliefs[a, :, B_SOURCE] > 0.0
+            age = float(beliefs[a, known, B_AGE].mean()) if known.any() else 0.0
+            back = min(round(age / frame), self._held - 1)
+            e = self._slots.egos[a]
+            own, mine = ring[(self._newest - back) % len(ring), e], beliefs[a, e]
+            mine[[B_X, B_Y, B_HEADING, B_SPEED, B_LANE, B_POSITION]] = own
+            mine[B_AGE], mine[B_TOLD] = back * frame, 1.0
+            mine[B_SOURCE] = 0.0 if math.isnan(own[0]) else OWN
 
     def _stream(self, name: str) -> int:
         return subseed(self._seed, "sensing", name)
@@ -228,6 +249,28 @@ class Percepts(Mapping[str, Percept]):
         return Percept(world, b[B_AGE], source, hears, known.names, seen)
 
 
+def _tracks(slots: "_Slots", owner: Ints, place: Ints, then: Floats, frame: float) -> Tracks:
+    """The beliefs `then` [V,10] of AVs and objects [V], with their past, `frame` s apart."""
+    past = slots.past[:, owner, place].swapaxes(0, 1)  # [V,N,5]
+    state = np.empty((*past.shape[:2], len(STATE)))
+    turn = past[..., 1 + HEADING] - past[:, -1:, 1 + HEADING]
+    past[..., 1 + HEADING] -= 2.0 * np.pi * np.round(turn / (2.0 * np.pi))
+    kernels.resample(past[..., 0], past[..., 1:], frame, state)
+    return Tracks(
+        state=state,
+        valid=np.isfinite(state[..., X]),
+        lane=then[:, B_LANE].astype(np.int64),
+        lane_position=then[:, B_POSITION],
+        length=slots.length[place],
+        width=slots.width[place],
+        is_av=(slots.kind[place] == AV) & (then[:, B_TOLD] > 0.0),
+        is_mission=slots.mission[place],
+        person=slots.kind[place] == PERSON,
+        age=then[:, B_AGE],
+        owner=owner,
+    )
+
+
 def _own(truth: Snapshot, row: int) -> Floats:
     """[10] what an AV knows of itself."""
     state = [truth.x[row], truth.y[row], truth.heading[row], truth.speed[row], truth.accel[row]]
@@ -251,7 +294,7 @@ class _Slots:
         self.ring = np.full((frames, objects, kernels.STATES), np.nan)
         self.seen = np.zeros((frames, avs, objects), np.uint8)
         self.tracks = _no_tracks(avs, objects)
-        self.past = np.full((self._past, avs, objects, len(STATE)), np.nan)
+        self.past = np.full((self._past, avs, objects, len(PAST)), np.nan)
         self.heard = np.full((avs, avs), -1.0)
         self.egos = np.full(avs, -1, np.int64)
         self.length, self.width = np.zeros(objects), np.zeros(objects)
@@ -270,7 +313,8 @@ class _Slots:
         return self._rows
 
     def _change(self, s: Snapshot, stream: Callable[[str], int], is_equipped: Callable[[str], bool]) -> None:
-        for name in [name for name in self.avs if name not in s.row]:
+        avs = set(s.avs)
+        for name in [name for name in self.avs if name not in avs]:  # or one that is no AV any more
             self.egos[self.avs.pop(name)] = -1
         for name in [name for name in self.place if name not in s.row]:
             k = self.place[name]

@@ -105,7 +105,7 @@ class Picture:
         frames = [self._frame(frame) for frame in step.frames]
         outcomes = zip(step.commands, step.receipts, strict=True)
         choices = {
-            c.vehicle: Choice(step.decisions[c.vehicle], c.target_speed, r.blocked) for c, r in outcomes
+            c.vehicle: Choice(step.carried_out[c.vehicle], c.target_speed, r.blocked) for c, r in outcomes
         }
         forecast = getattr(self._policy, "last_forecast", None) if step.decisions else None
         found: dict[str, Any] = {

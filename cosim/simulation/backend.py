@@ -10,8 +10,8 @@ from typing import Any
 import libsumo
 
 NAMES = (
-    *("edge", "junction", "lane", "person", "simulation", "trafficlight", "vehicle", "vehicletype"),
-    *("simulationStep", "constants", "TraCIException", "FatalTraCIError"),
+    *("edge", "junction", "lane", "person", "polygon", "simulation", "trafficlight", "vehicle"),
+    *("vehicletype", "simulationStep", "constants", "TraCIException", "FatalTraCIError"),
 )
 
 
@@ -22,6 +22,7 @@ class Backend:
     junction: Any
     lane: Any
     person: Any
+    polygon: Any
     simulation: Any
     trafficlight: Any
     vehicle: Any

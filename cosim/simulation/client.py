@@ -96,7 +96,7 @@ class Client:
             raise SimulationError(f"{self.place}: {error}") from None
         c = self._connection
         self.edge, self.junction, self.lane, self.person = c.edge, c.junction, c.lane, c.person
-        self.vehicletype = c.vehicletype
+        self.vehicletype, self.polygon = c.vehicletype, c.polygon
         c.simulation.subscribe(list(SIMULATION.values()))
         for light in c.trafficlight.getIDList():
             c.trafficlight.subscribe(light, list(LIGHTS.values()))

@@ -1,6 +1,7 @@
 """Starts SUMO through libsumo and advances it one decision at a time: the only simulation of its process."""
 
 import contextlib
+import math
 import re
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -15,11 +16,13 @@ import libsumo
 import numpy as np
 
 import sumo_scenarios
+from cosim.arrays import Floats
 from cosim.errors import BadInput, SimulationError, SimulationInUse
 from cosim.road import RoadMap
 from cosim.scenario import Scenario
 from cosim.scenario.behaviors import AS_IS
 from cosim.scenario.disabled_outputs import NOWHERE, disable_outputs
+from cosim.scenario.sensing import Parameters
 from cosim.scenario.sumo_outputs import sumo_options
 from cosim.scenario.sumocfg import time_of
 from cosim.scenario.traffic import CHECKS_INSIDE, FORCED, USUAL, check
@@ -92,6 +95,7 @@ class SumoSimulator:
                 "use one process per simulation (cosim.envs and cosim.open do)"
             )
         check(scenario)
+        self._steps_late = _steps_late(scenario)
         self._types = self._types_of(scenario)
         fleet = scenario.fleet.type
         self._av_types = frozenset() if fleet is None else self._types.named(fleet)
@@ -145,7 +149,10 @@ class SumoSimulator:
         self._perception = (
             None
             if sensing is None
-            else Perception(self.road, sensing.parameters, self._scenario.timing, seed, self.compensator)
+            else Perception(
+                *(self.road, sensing.parameters, self._scenario.timing, seed, self.compensator),
+                buildings=_buildings(sensing.parameters),
+            )
         )
         self._reader.bodies_changed()
         self._entries.reset()
@@ -153,6 +160,8 @@ class SumoSimulator:
         self._inserted = 0
         self._stopped: set[str] = set()  # at a stop of their plan
         self._waiting: dict[str, Due] = {}  # due and not inserted, whether SUMO has dropped them or not
+        self._acting: Sequence[Command] = ()
+        self._receipts: tuple[Receipt, ...] = ()
         self._happened: list[tuple[Any, ...]] = []  # per step since the last frame: the fields of Events
         steps = round(self._scenario.warmup / self._scenario.timing.step)
         first_kept = steps - (self._history - 1) * self._steps_per_frame
@@ -167,19 +176,35 @@ class SumoSimulator:
         return tuple(frames) or (self._snapshot(),)
 
     def advance(self, commands: Sequence[Command]) -> tuple[tuple[Receipt, ...], tuple[Snapshot, ...]]:
-        """Hold the commands for one decision; one snapshot per frame. Raises SimulationError."""
+        """Hold the commands for one decision; one snapshot per frame. Raises SimulationError.
+
+        With a `decision_latency` they act that much later: those before are held until then, and the
+        receipts are theirs.
+        """
+        late = self._steps_late
         with self._stderr:
-            now = sumo.simulation.getTime()
-            self._commander.release(commands)
-            receipts = tuple(self._commander.take(c, now) for c in commands)
-            frames = self._drive(self._steps_per_decision)
-            receipts = self._commander.confirm(receipts, commands)
+            if not late:
+                self._act(commands)
+            frames = self._drive(late or self._steps_per_decision)
+            receipts = self._commander.confirm(self._receipts, self._acting)
+            if late:
+                self._act(commands)
+                frames += self._drive(self._steps_per_decision - late, driven=late)
         return receipts, frames
 
-    def _drive(self, steps: int, forced: Mapping[str, float] = NOBODY) -> tuple[Snapshot, ...]:
-        """As commanded; one snapshot per frame. `forced`: see `ahead`."""
+    def _act(self, commands: Sequence[Command]) -> None:
+        """From now on these commands hold."""
+        now = sumo.simulation.getTime()
+        self._commander.release(commands)
+        self._acting = commands
+        self._receipts = tuple(self._commander.take(c, now) for c in commands)
+
+    def _drive(
+        self, steps: int, forced: Mapping[str, float] = NOBODY, *, driven: int = 0
+    ) -> tuple[Snapshot, ...]:
+        """As commanded; one snapshot per frame. `forced`: see `ahead`; `driven`: steps since a decision."""
         frames = []
-        for k in range(1, steps + 1):
+        for k in range(driven + 1, driven + steps + 1):
             self._commander.drive()
             if forced:
                 for name in forced.keys() & set(sumo.vehicle.getIDList()):
@@ -496,3 +521,24 @@ class SumoSimulator:
         self._mission_found = True
         self._reader.bodies_changed()
         return self._reader.read(self._bodies, snapshot.events, snapshot.waiting)
+
+
+def _steps_late(scenario: Scenario) -> int:
+    """Steps until a decision acts. Raises BadInput where that is longer than until the next one."""
+    if scenario.sensing is None:
+        return 0
+    latency, timing = scenario.sensing.parameters.decision_latency, scenario.timing
+    if latency > timing.decision + 1e-9:
+        problem = f"must be at most the {timing.decision:g} s between decisions"
+        raise BadInput(problem, field="--sensing.decision_latency", value=latency)
+    return math.ceil(latency / timing.step - 1e-6)
+
+
+def _buildings(level: Parameters) -> list[Floats]:
+    """The outlines [.,2] m of the polygons that hide what is behind them."""
+    if not level.line_of_sight:
+        return []
+    shapes, wanted = sumo.polygon, level.buildings
+    found = [(name, shapes.getType(name)) for name in sorted(shapes.getIDList())]
+    hiding = [name for name, kind in found if kind == wanted or kind.startswith(f"{wanted}.")]
+    return [np.array(shapes.getShape(name), np.float64)[:, :2] for name in hiding]

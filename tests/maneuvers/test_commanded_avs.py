@@ -12,6 +12,7 @@ import cosim
 from cosim.errors import BadInput
 from cosim.geometry import boxes, overlapping_pairs
 from cosim.scenario import Scenario, load
+from cosim.scenario.sensing import read
 from cosim.simulation.backend import sumo
 from cosim.simulation.sumo import SumoSimulator
 from cosim.types import Collision, Command, Receipt, Snapshot
@@ -290,3 +291,31 @@ def test_an_acceleration_is_held_from_decision_to_decision(start: Start) -> None
     worker = start([vehicle("a", "av", 50.0)])
     _, frames = drive(worker, [Command("a", 0.0, 0, HOLD, accel=-1.5)], 5)
     assert frames[-1].speed[0] == pytest.approx(20.0 - 1.5 * 5 * HOLD, abs=0.01)
+
+
+@pytest.mark.parametrize("latency", [0.1, 0.2, 0.3, 0.4])
+def test_a_decision_acts_as_much_later_as_it_takes_to_compute(start: Start, latency: float) -> None:
+    sensing = read(f"ideal,decision_latency={latency:g}")
+    worker = start([vehicle("a", "av", 100.0, speed=20.0)], sensing=sensing)
+    _, frames = drive(worker, [Command("a", 20.0, 0, HOLD, accel=0.0)], 2)
+    speed = of(frames, "a", "speed")[-1]  # m/s, and it stays
+    (receipts, then), frames = drive(worker, [Command("a", 19.2, 0, HOLD, accel=-2.0)], 2)
+    assert receipts == then == (Receipt("a", True),)
+    since = 0.2 * np.arange(1, 5)  # s since the decision, of the frames
+    braked = np.maximum(since - latency, 0.0)  # s
+    assert of(frames, "a", "speed") == pytest.approx(speed - 2.0 * braked, abs=1e-3)
+
+
+def test_with_a_decision_latency_a_refusal_is_known_when_the_command_has_had_its_time(start: Start) -> None:
+    cars = [vehicle("a", "av", 100.0, speed=20.0), vehicle("beside", "hv", 100.0, lane=1, speed=20.0)]
+    late = read("ideal,decision_latency=0.2")
+    worker = start(cars, preset="guarded", sensing=late)
+    (first, second, third), _ = drive(worker, [Command("a", 20.0, 1, HOLD)], 3)
+    assert first == ()
+    assert "lane-change safety" in str(second[0].blocked)
+    assert second[0] == third[0]
+
+
+def test_a_decision_cannot_take_longer_than_until_the_next_one(start: Start) -> None:
+    with pytest.raises(BadInput, match=r"decision_latency.*at most the 0\.4 s between decisions"):
+        start([], sensing=read("ideal,decision_latency=0.5"))

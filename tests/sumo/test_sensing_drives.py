@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -80,6 +82,31 @@ def test_a_replay_holds_what_each_av_believed_and_did_not_see() -> None:
     assert believed > 20
     json.dumps(packed)
     assert driven(None)[1].percepts is None
+
+
+def test_a_building_of_an_additional_file_stands_between(tmp_path: Path) -> None:
+    at = -295.0  # m, where a wall crosses the road: what nobody could build, and everybody can check
+    file = tmp_path / "walls.add.xml"
+    shape = f"{at},-500 {at},500"
+    for kind, hides in (("building", True), ("building.house", True), ("park", False)):
+        file.write_text(f'<additional><poly id="w" type="{kind}" color="red" shape="{shape}"/></additional>')
+        scenario = load("merge", sensing="ideal,line_of_sight=true,forget=0.1", **FLEET)
+        host = Host(replace(scenario, additional=(file,)), "idm", 0.0)
+        try:
+            host.run(7)
+            snapshot = host.episode.snapshot
+        finally:
+            host.close()
+        assert snapshot.percepts is not None
+        beyond = [
+            snapshot.x[snapshot.row[name]] > at
+            for av, percept in snapshot.percepts.items()
+            if snapshot.x[snapshot.row[av]] < at - 5.0
+            for name in percept.world.ids
+            if abs(snapshot.x[snapshot.row[name]] - at) > 5.0
+        ]
+        assert len(beyond) > 20
+        assert any(beyond) is not hides, kind
 
 
 def test_http_takes_levels_and_parameters_but_no_file() -> None:

@@ -21,7 +21,7 @@ from cosim.scenario.manifest import manifest
 from cosim.scenario.options import EpisodeOptions
 from cosim.scenario.sensing import Parameters, asked, levels, read
 from cosim.sensing import kernels
-from cosim.sensing.perception import Perception
+from cosim.sensing.perception import PREDICTED, Perception
 from cosim.types import Actor, Kind, ObservationConfig, Percept, Snapshot, Source, Timing, Unseen
 
 FRAME = 0.2  # s
@@ -127,6 +127,40 @@ def test_behind_a_truck_nobody_is_seen(long: bool) -> None:
     assert "hidden" in percepts["ego"].world.ids
 
 
+HOUSE = np.array([[25.0, 5.0], [45.0, 5.0], [45.0, 30.0], [25.0, 30.0]])  # m
+
+
+def seen_past(*buildings: np.ndarray) -> Percept:
+    """What an AV at (0, 0) knows of five cars in a row, at (20, 6) to (100, 30)."""
+    perception = Perception(ROAD, Parameters(line_of_sight=True), Timing(), 1, buildings=buildings)
+    truth = snapshot([EGO, *(Car(f"v{k}", 20.0 * k, length=1.0, width=1.0) for k in range(1, 6))], 0.0)
+    apart = replace(truth, y=0.3 * truth.x, actor=np.full(truth.n, Actor.MOTORCYCLE, np.int8))
+    return perception.perceive(apart)["ego"]
+
+
+def test_behind_a_building_nobody_is_seen() -> None:
+    assert set(seen_past().world.ids) == {"ego", "v1", "v2", "v3", "v4", "v5"}
+    percept = seen_past(HOUSE)
+    assert set(percept.world.ids) == {"ego", "v1"}  # v2 stands inside, the others behind
+    assert percept.unseen == dict.fromkeys(("v2", "v3", "v4", "v5"), Unseen.HIDDEN)
+    behind_the_ego = HOUSE * (-1.0, 1.0)
+    assert seen_past(behind_the_ego, HOUSE[::-1]).unseen == percept.unseen
+
+
+def test_a_building_hides_what_is_in_its_shadow_alone() -> None:
+    wall = np.array([[30.0, -5.0], [30.0, 5.0]])
+    cars = [EGO, Car("near", 20.0), Car("far", 60.0), Car("aside", 60.0, 2), Car("back", -40.0)]
+    perception = Perception(ROAD, Parameters(line_of_sight=True), Timing(), 1, buildings=[wall])
+    truth = snapshot(cars, 0.0)
+    y = np.array([{"aside": 20.0}.get(name, 0.0) for name in truth.ids])
+    assert perception.perceive(replace(truth, y=y))["ego"].unseen == {"far": Unseen.HIDDEN}
+
+
+def test_a_building_around_an_av_hides_nothing() -> None:
+    tunnel = np.array([[-50.0, -20.0], [200.0, -20.0], [200.0, 20.0], [-50.0, 20.0]])
+    assert not seen_past(tunnel).unseen
+
+
 def test_a_motorcycle_hides_nobody_and_a_truck_is_seen_over_nobody() -> None:
     rider = Car("rider", 30.0, actor=Actor.MOTORCYCLE, length=2.2, width=0.9)
     _, percepts = last([EGO, rider, Car("behind", 60.0)], 2, line_of_sight=True)
@@ -187,7 +221,7 @@ def test_of_two_detections_a_track_is_confirmed() -> None:
 
 def late_error(how: str, accel: float) -> float:
     """m between where an AV takes a car to be and where it is, of one that changes its speed; 0.8 s late."""
-    compensation = compensator(how, ROAD, Timing()) if how == "gp" else None
+    compensation = compensator(how, ROAD, Timing()) if how in PREDICTED else None
     perception = Perception(ROAD, Parameters(latency=0.8, compensation=how), Timing(), 1, compensation)
     cars = [EGO, Car("v", 40.0, speed=20.0, accel=accel)]
     for k in range(20):
@@ -202,10 +236,40 @@ def late_error(how: str, accel: float) -> float:
 
 @pytest.mark.parametrize("accel", [-2.5, -1.5, 1.5])
 def test_a_predictor_that_knows_speeds_compensates_better_than_constant_speed(accel: float) -> None:
-    hold, lanes, gp = (late_error(how, accel) for how in ("hold", "lanes", "gp"))
+    hold, lanes, gp, hpn = (late_error(how, accel) for how in ("hold", "lanes", "gp", "hpn"))
     assert lanes == pytest.approx(0.5 * abs(accel) * 0.8**2, rel=0.25)
     assert hold > 5.0 * lanes
-    assert gp < 0.7 * lanes
+    assert max(gp, hpn) < 0.7 * lanes
+
+
+@pytest.mark.parametrize("how", PREDICTED)
+def test_messages_that_come_when_they_come_are_predicted_to_now_all_the_same(how: str) -> None:
+    level = Parameters(**MESSAGES, equipped=1.0, period=0.5, delay=0.3, jitter=0.1, compensation=how)
+    perception = Perception(ROAD, level, Timing(), 1, compensator(how, ROAD, Timing()))
+    cars, away = [EGO, Car("v", 50.0, speed=20.0), Car("w", 90.0, speed=20.0)], []
+    for k in range(30):
+        truth = snapshot(cars, k * FRAME)
+        percept = perception.perceive(truth)["ego"]
+        away += [percept.world.x[r] - truth.x[truth.row[i]] for i, r in percept.world.row.items()]
+    assert len(away) > 60
+    assert np.abs(away).max() < 0.3
+
+
+def test_a_series_of_measurements_is_sampled_at_equal_intervals() -> None:
+    time = np.array([[np.nan, 1.0, 1.0, 1.3, 1.6]])  # s: no new one in the third frame
+    state, out = np.stack([10.0 * time, -time], 2), np.empty((1, 5, 2))
+    kernels.resample(time, state, 0.2, out)
+    assert out[0, :, 0] == pytest.approx([np.nan, 10.0, 12.0, 14.0, 16.0], nan_ok=True)
+    assert out[0, :, 1] == pytest.approx([np.nan, -1.0, -1.2, -1.4, -1.6], nan_ok=True)
+
+
+def test_who_is_no_av_any_more_is_heard_as_none() -> None:
+    perception = Perception(ROAD, Parameters(mcm=True), Timing(), 1)
+    cars = [EGO, Car("other", 40.0, kind=Kind.AV)]
+    assert perception.perceive(snapshot(cars, 0.0))["ego"].hears == {"other"}
+    percepts = perception.perceive(snapshot([EGO, Car("other", 40.0)], FRAME))
+    assert set(percepts) == {"ego"}
+    assert percepts["ego"].hears == frozenset()
 
 
 # ---- tracks ----
@@ -414,7 +478,7 @@ def test_single_parameters_stand_behind_a_level() -> None:
         ("v2v,loss=0.9", "must be at least 10 where 0.9 of the messages are lost"),
         ("v2v,loss=x", "--sensing.loss='x': a number from 0 to 0.99 is needed"),
         ("v2v,loss", "PARAMETER=VALUE is needed"),
-        ("v2v,compensation=guess", "must be one of hold, cv, lanes, gp, truth"),
+        ("v2v,compensation=guess", "must be one of hold, cv, lanes, gp, hpn, truth"),
     ],
 )
 def test_a_wrong_level_is_one_sentence(what: str, said: str) -> None:

@@ -89,6 +89,12 @@ def sensing_cost(place: Place) -> list[list[str]]:
     return [["benchmarks.sensing_cost", *flags, "--out", str(place.out / "sensing_cost.md")]]
 
 
+def compensation(place: Place) -> list[list[str]]:
+    """What late knowledge is worth when it is predicted to now."""
+    flags = ["--small"] if place.small else []
+    return [["benchmarks.compensation", *flags, "--out", str(place.out / "compensation.md")]]
+
+
 def performance(place: Place) -> list[list[str]]:
     """What the loop, a batch and the Gaussian process cost."""
     where = str(place.work / "recordings")
@@ -204,6 +210,7 @@ PAGES = (
     Page("prediction_speed", prediction_speed, ("prediction_speed.md",)),
     Page("decision_cost", decision_cost, ("decision_cost.md",)),
     Page("sensing_cost", sensing_cost, ("sensing_cost.md",)),
+    Page("compensation", compensation, ("compensation.md",)),
     Page("performance", performance, ("performance.md",)),
     Page("startup", startup, ("startup.md",)),
     Page("joining", joining, ("joining.md",)),

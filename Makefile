@@ -70,7 +70,6 @@ pages: $(VENV)/.installed-dev
 # Some of the kept episodes driven anew: are they the same in every figure and the trace hash?
 audit: $(VENV)/.installed-dev
 	$(BIN)/python -m research audit --sample $(SAMPLE) --workers $(WORKERS)
-	$(BIN)/python -m benchmarks.rows check --sample $(SAMPLE)
 
 # The same in small: one scenario, two episodes each on validation seeds, two seconds long. Shows that all works.
 SMALL = --seeds 150000:150002 --scenario merge --duration 2 --untrained --workers $(WORKERS) \

@@ -22,6 +22,7 @@ import numpy.typing as npt
 from scipy.optimize import Bounds, differential_evolution
 
 from benchmarks.lane_changes import CLASSES, Traffic, build_highway, measure
+from benchmarks.tables import markdown_row
 from cosim.report.statistics import NA, Figure, quantile, rate, share
 from cosim.scenario.behaviors import LC2013, MIXED, MOBIL, Behaviors, load_behaviors
 from cosim.seeding import FIRST_TEST_SEED, TUNING_SEEDS
@@ -164,6 +165,10 @@ def write_attributes(path: Path, name: str, values: Mapping[str, float]) -> None
 
 # s per test seed, two seeds each: the whole report takes about three minutes on one core.
 REPORT_DURATION = {"aggressive": 100.0, "moderate": 200.0, "conservative": 3000.0, MIXED: 240.0}
+COLUMNS = (
+    *("class", "traffic", "model", "changes", "per vehicle-km", "incentive > a_th, egoistic, %", "with p, %"),
+    *("break b_safe, %", "front gap, m", "rear gap, m", "headway, s"),
+)
 BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
 
 
@@ -191,38 +196,30 @@ def report(folder: Path, scale: float) -> str:
         traffic = collect(MIXED, model, behaviors)
         rows += [(name, MIXED, label, traffic) for name in CLASSES]
 
-    head = "| class | traffic | model | changes | per vehicle-km | incentive > a_th, egoistic, % | with p, % "
-    head += "| break b_safe, % |"
-    one = [head, "|---|---|---|---|---|---|---|---|"]
-    two = [
-        "| class | traffic | model | front gap, m: 10 % | 50 % | rear gap, m: 10 % | 50 % "
-        "| imposed, m/s2: 50 % | 90 % | median headway, s |",
-        "|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    lines = [markdown_row(COLUMNS), markdown_row(["---"] * len(COLUMNS))]
     for name, traffic_name, label, traffic in rows:
-        changes, n = [c for c in traffic.changes if c.driver == name], 0
+        changes = [c for c in traffic.changes if c.driver == name]
         n = len(changes)
-        start = f"| {name} | {'mixed' if traffic_name == MIXED else 'own class'} | {label} |"
-        figures = [
-            str(n),
-            rate(n, traffic.kilometres[name]).text(3),
-            share(sum(c.worth_egoistic for c in changes), n).text(0, 100.0),
-            share(sum(c.worth for c in changes), n).text(0, 100.0),
-            share(sum(not c.safe for c in changes), n).text(1, 100.0),
-        ]
-        one.append(f"{start} {' | '.join(figures)} |")
-        gaps = [
-            quantile([getattr(c, side) for c in changes], q).text(1)
-            for side in ("front_gap", "rear_gap")
-            for q in (0.1, 0.5)
-        ]
-        imposed = [quantile([c.imposed for c in changes], q).text(2) for q in (0.5, 0.9)]
-        headway = median_of_blocks(traffic.headways[name]).text(2)
-        two.append(f"{start} {' | '.join([*gaps, *imposed, headway])} |")
+        shares = (
+            share(sum(of), n).text(0, 100.0)
+            for of in (
+                (c.worth_egoistic for c in changes),
+                (c.worth for c in changes),
+                (not c.safe for c in changes),
+            )
+        )
+        medians = (
+            quantile([getattr(c, gap) for c in changes], 0.5).value for gap in ("front_gap", "rear_gap")
+        )
+        headway = median_of_blocks(traffic.headways[name]).value
+        cells = [name, "mixed" if traffic_name == MIXED else "own class", label, str(n)]
+        cells += [rate(n, traffic.kilometres[name]).text(3), *shares]
+        cells += [*("-" if math.isnan(gap) else f"{gap:.0f}" for gap in medians), f"{headway:.1f}"]
+        lines.append(markdown_row(cells))
     collisions = sum(len(t.collisions) for t in {id(t): t for *_, t in rows}.values())
     vehicles = sum(t.vehicles for t in {id(t): t for *_, t in rows}.values())
-    safety = f"Collisions between HVs in all of these runs: {collisions} among {vehicles} vehicles."
-    return "\n".join(["", *one, "", *two, "", safety, ""])
+    safety = f"{collisions} collisions among {vehicles:,} vehicles in all of these runs."
+    return "\n".join(["", *lines, "", safety, ""])
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

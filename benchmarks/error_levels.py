@@ -145,16 +145,16 @@ def rates() -> list[str]:
 
 def stress(episodes: int) -> list[str]:
     """Plain IDM AVs among drivers who err as in `stress`."""
-    heads = "world, demand, episodes, with an AV in a collision, ended by a crash, collisions an episode"
+    heads = "scenario, demand, with an AV in a collision, ended by a crash, collisions an episode"
     heads += ", errors an episode"
-    lines = [markdown_row(heads.split(", ")), markdown_row(["---"] * 7)]
+    lines = [markdown_row(heads.split(", ")), markdown_row(["---"] * 6)]
     for world, demand in places():
         t = driven(world, demand, levels(world)["stress"], episodes)
         hit = share(t.av, t.episodes)
-        begun = ", ".join(f"{n / t.episodes:.1f} {kind}" for kind, n in t.errors.most_common())
         interval = f"{100 * hit.value:.0f} % ({100 * hit.low:.0f} to {100 * hit.high:.0f})"
-        cells = [world, demand, str(t.episodes), interval, f"{100 * t.ended / t.episodes:.0f} %"]
-        lines.append(markdown_row([*cells, f"{t.pairs / t.episodes:.1f}", begun]))
+        cells = [world, demand, interval, f"{100 * t.ended / t.episodes:.0f} %"]
+        counts = (f"{n / t.episodes:.1f}" for n in (t.pairs, t.errors.total()))
+        lines.append(markdown_row([*cells, *counts]))
     return lines
 
 
@@ -214,7 +214,7 @@ def cost(episodes: int) -> list[str]:
     drawn = Errors(
         "drawn", "", Kinds(**{k: replace(getattr(base.kinds, k), rate=RARE) for k in KINDS}), base.file
     )
-    heads = ["world", "demand", "episodes", "s without", "s with", "more, %"]
+    heads = ["episodes", "s without", "s with", "more, %"]
     lines = [markdown_row(heads), markdown_row(["---"] * len(heads))]
     every: list[tuple[float, float]] = []
     for world, demand in places():
@@ -227,8 +227,7 @@ def cost(episodes: int) -> list[str]:
                 assert before == after, "an error has begun"
                 took.append((without, with_))
         every += took[1:]  # nothing is warm in the first one
-        lines.append(_cost_row(world, demand, took[1:]))
-    return [*lines, _cost_row("together", "", every)]
+    return [*lines, _cost_row(every)]
 
 
 class Timed(Host):
@@ -241,11 +240,11 @@ class Timed(Host):
         return time.process_time() - begin, result.trace_hash
 
 
-def _cost_row(world: str, demand: str, took: Sequence[tuple[float, float]]) -> str:
+def _cost_row(took: Sequence[tuple[float, float]]) -> str:
     without, with_ = (list(each) for each in zip(*took, strict=True))
     more = paired_change(without, with_).text(1, 100.0)
     means = (f"{sum(each) / len(each):.3f}" for each in (without, with_))
-    return markdown_row([world, demand, str(len(took)), *means, more])
+    return markdown_row([str(len(took)), *means, more])
 
 
 def _raised(kind: Any, by: float) -> Any:

@@ -1,13 +1,12 @@
 """How well AVs keep the law in the worlds of tests/worlds, counted by figures and from SUMO's outputs.
 
-    python -m benchmarks.law [--worlds arterial ...] [--arms vfn-p ...] [--seeds 3] [--preset lawful] [--show]
+    python -m benchmarks.law [--worlds arterial ...] [--arms NAME ...] [--seeds 3] [--preset lawful] [--show]
     python -m benchmarks.law --page --seeds 20
-    python -m benchmarks.law --page --seeds 20 --errors stress --arms vfn-p --penetration 0.2
 
-The first prints, on seeds from 100,000; the second writes docs/results/law.md, on seeds from 200,000, the
-third law_stress.md, where humans err. `idm` is always driven beside the arms: what is asked of them is
-measured by it. The independent checker is tests/law/checker.py. With --runs DIR what was driven before is
-not driven again; the same command goes on.
+The first prints a table for each network, on seeds from 100,000, with `--errors LEVEL` also the collisions
+beside `idm`. The second writes docs/results/law.md, on seeds from 200,000. `idm` is always driven beside the
+arms: what is asked of them is measured by it. The independent checker is tests/law/checker.py. With
+--runs DIR what was driven before is not driven again; the same command goes on.
 """
 
 from __future__ import annotations
@@ -17,14 +16,14 @@ import itertools
 import json
 import tempfile
 import time
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks.humans import in_collisions
+import numpy as np
+
 from benchmarks.tables import markdown_row, write_page
 from cosim.batch.episode_runner import EpisodeRunner
 from cosim.report import statistics
@@ -40,10 +39,17 @@ from tests.law import checker
 from tests.worlds.build import NAMES, build
 
 TRYING, PAGE = 100_000, 200_000  # first seeds
+PAGE_FILE = Path("docs/results/law.md")
+IN_THE_TABLES_ALONE = ("interventions", "blocked", "persons", "figures agree")  # columns
 IDM = "idm"
-ARMS = ("vfn-p", "random")
+ARMS = ("car-alone", "random")  # no network: the subject is the car
 FREE = ("random",)  # arms of which neither distance nor trips nor brakings are asked
 SHARES = (0.2, 1.0)  # of AVs
+NOTES = {  # arm -> what a reader of the page must know
+    IDM: "`idm`: SUMO's driver in every AV, beside which targets are set.",
+    "car-alone": "`car-alone` asks the car for more speed at every decision.",
+    "random": "`random` asks the car for a random action at every decision.",
+}
 FIGURES = (  # of the rows, beside what the checker counts
     *("red_light_violations", "stop_sign_violations", "right_of_way_violations", "speeding_share"),
     *("worst_speeding_mps", "junctions_blocked", "avs_stuck", "av_trips_completed", "person_conflicts"),
@@ -223,7 +229,7 @@ def table(world: str, cells: Mapping[tuple[float, str], Cell]) -> list[str]:
         if not lines:
             lines = [f"## {world}", "", markdown_row(["AVs", "arm", *columns, "targets"])]
             lines.append("|---" * (len(columns) + 3) + "|")
-        missed = [name for name, (_, holds) in columns.items() if holds is False]
+        missed = _missed(cell, cells[share, IDM], arm)
         verdict = "-" if arm == IDM else f"missed: {', '.join(missed)}" if missed else "met"
         shown = [f"**{text}**" if holds is False and arm != IDM else text for text, holds in columns.values()]
         lines.append(markdown_row([f"{share:.0%}", arm, *shown, verdict]))
@@ -234,11 +240,7 @@ def tables(rows: Sequence[Row]) -> list[str]:
     """Every world's."""
     lines: list[str] = []
     for world in dict.fromkeys(row["world"] for row in rows):
-        cells: dict[tuple[float, str], list[Row]] = {}
-        for row in rows:
-            if row["world"] == world:
-                cells.setdefault((row["penetration"], row["arm"]), []).append(row)
-        lines += table(world, {key: Cell(found) for key, found in cells.items()})
+        lines += table(world, _cells(rows, world))
     return lines
 
 
@@ -282,39 +284,78 @@ def _paired(at: Mapping[tuple[Any, ...], Row], share: float, arm: str, worlds: S
     )
 
 
-def page(
-    rows: Sequence[Row], preset: str, seeds: range, command: str, errors: str | None = None
-) -> list[str]:
-    """docs/results/law.md, or law_stress.md"""
-    found = tables(rows)
-    verdicts = [line.rpartition(" | ")[2].strip(" |") for line in found if line.startswith("| ")]
-    asked = [verdict for verdict in verdicts if verdict == "met" or verdict.startswith("missed: ")]
-    missed = Counter(name for v in asked for name in v.removeprefix("missed: ").split(", ") if v != "met")
+def in_collisions(now: Sequence[Row], then: Sequence[Row]) -> list[str]:
+    """Cells of paired figures: episodes with an AV in a collision, those of `then`, the difference, p."""
+    hit, before = (np.array([bool(row["av_involved_collisions"]) for row in rows]) for rows in (now, then))
+    shares = (statistics.share(int(side.sum()), len(side)).text(1, 100.0) for side in (hit, before))
     return [
-        "# The law of the road" + (" among humans who err" if errors else ""),
-        "",
-        *(
-            [f"Errors `{errors}` (docs/explanation/driver_errors.md).", "", *beside_idm(rows), ""]
-            if errors
-            else []
-        ),
-        f"Made by `{command}`: the worlds of tests/worlds, which netconvert and netgenerate build, preset",
-        f"`{preset}`, {len(seeds)} seeds from {seeds.start:,}, the same for every arm. Counted from SUMO's",
-        "outputs by tests/law/checker.py, which shares no code with what drives; collisions caused,",
-        "interventions, junctions blocked and conflicts with persons are the rows' own figures",
-        "(figures.md). Events: how many, and how many an episode with the exact Poisson 95 %",
-        "interval. What is asked: no red light, no stop sign and no other vehicle's right of way taken (of",
-        "the last at most as many as `idm` beside it), no step of 0.1 s above the limit by more than 1 m/s,",
-        "no collision that an AV caused, nobody stuck; trips of AVs and distance of all at least 95 % of",
-        "`idm`'s, hard brakings of AVs at most twice `idm`'s or one in two episodes (these three not of",
-        "`random`). Missed targets are bold.",
-        "",
-        f"{asked.count('met')} of {len(asked)} rows of arms meet all of it; missed: "
-        + (", ".join(f"{name} in {count}" for name, count in missed.most_common()) or "none")
-        + ".",
-        "",
-        *found,
+        *(f"{share} %" for share in shares),
+        statistics.paired_share(before, hit).text(1, 100.0),
+        f"{statistics.mcnemar(*statistics.discordant(before, hit)):.2g}",
     ]
+
+
+def page(rows: Sequence[Row], preset: str, seeds: range, command: str) -> list[str]:
+    """docs/results/law.md: the networks together, and which of them miss a target."""
+    networks = list(dict.fromkeys(row["world"] for row in rows))
+    of_each = {(world, *key): cell for world in networks for key, cell in _cells(rows, world).items()}
+    missed = [
+        f"- {world}, {share:.0%}, `{arm}`: {', '.join(found)}"
+        for (world, share, arm), cell in of_each.items()
+        if arm != IDM and (found := _missed(cell, of_each[world, share, IDM], arm))
+    ]
+    asked = sum(arm != IDM for _, _, arm in of_each)
+    return [
+        "# Does the lawful car keep the law?",
+        "",
+        f"**{'No' if missed else 'Yes'}.** {asked - len(missed)} of {asked} cases meet every target.",
+        "A case is a network, a share of AVs and an agent.",
+        "",
+        *_summary(_cells(rows)),
+        "",
+        *([*missed, ""] if missed else []),
+        "## Conditions",
+        "",
+        f"{len(networks)} networks of tests/worlds, preset `{preset}`, {len(seeds)} seeds from",
+        f"{seeds.start:,}.",
+        *(NOTES[arm] for arm in dict.fromkeys(row["arm"] for row in rows) if arm in NOTES),
+        "",
+        "tests/law/checker.py counts from SUMO's outputs and shares no code with what drives. Counts are",
+        "events of AVs, with events an episode and the exact Poisson 95 % interval. Targets: no red light,",
+        "no stop sign, no step above the limit by more than 1 m/s, no collision that an AV caused, no AV",
+        "stuck; at most as many failures to yield as `idm`. Other agents than `random` also need 95 % of",
+        "`idm`'s trips and distance, and at most twice its hard brakings.",
+        "",
+        "```",
+        command,
+        "```",
+    ]
+
+
+def _cells(rows: Sequence[Row], world: str | None = None) -> dict[tuple[float, str], Cell]:
+    """(Share of AVs, arm) -> its rows in this network; in all of them together where none is named."""
+    found: dict[tuple[float, str], list[Row]] = {}
+    for row in rows:
+        if world in (None, row["world"]):
+            found.setdefault((row["penetration"], row["arm"]), []).append(row)
+    return {key: Cell(of) for key, of in sorted(found.items(), key=lambda item: item[0][0])}
+
+
+def _missed(cell: Cell, idm: Cell, arm: str) -> list[str]:
+    """The columns whose target is missed."""
+    return [name for name, (_, holds) in _columns(cell, idm, arm in FREE).items() if holds is False]
+
+
+def _summary(cells: Mapping[tuple[float, str], Cell]) -> list[str]:
+    """A line an arm and share, without a verdict."""
+    lines: list[str] = []
+    for (share, arm), cell in cells.items():
+        columns = _columns(cell, cells[share, IDM], arm in FREE)
+        shown = {name: text for name, (text, _) in columns.items() if name not in IN_THE_TABLES_ALONE}
+        if not lines:
+            lines = [markdown_row(["AVs", "agent", *shown]), "|---" * (len(shown) + 2) + "|"]
+        lines.append(markdown_row([f"{share:.0%}", arm, *shown.values()]))
+    return lines
 
 
 def _plain(value: float | None) -> str:
@@ -341,7 +382,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add("--keep", type=Path, metavar="DIR", help="keep SUMO's outputs there")
     add("--show", action="store_true", help="list every violation")
     add("--page", action="store_true", help="write the page")
-    add("--out", type=Path, metavar="FILE.md", help="docs/results/law.md, or, of stress, law_stress.md")
+    add("--out", type=Path, metavar="FILE.md", help=f"default {PAGE_FILE}")
     args = parser.parse_args(arguments)
     first = args.first or (PAGE if args.page else TRYING)
     seeds = range(first, first + args.seeds)
@@ -355,12 +396,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if args.page:
         said = f"python -m benchmarks.law --page --seeds {args.seeds}"
         said += "" if args.preset == Preset.LAWFUL else f" --preset {args.preset}"
-        if args.errors:
-            shares = " ".join(f"{share:g}" for share in args.penetration)
-            said += f" --errors {args.errors} --arms {' '.join(args.arms)} --penetration {shares}"
-        name = f"law_{Path(args.errors).stem}.md" if args.errors else "law.md"
-        out = args.out or Path("docs/results") / name
-        write_page(out, page(rows, args.preset, seeds, said, args.errors))
+        said += f" --errors {args.errors}" if args.errors else ""
+        said += "" if args.arms == [*ARMS] else f" --arms {' '.join(args.arms)}"
+        out = args.out or PAGE_FILE
+        write_page(out, page(rows, args.preset, seeds, said))
         print(out)
     else:
         print("\n".join([*tables(rows), *(beside_idm(rows) if args.errors else [])]))

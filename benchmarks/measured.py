@@ -22,15 +22,10 @@ from pathlib import Path
 from sumo_scenarios import names
 
 RESULTS = Path("docs/results")
-LEARNED = "vfn-p"
 PREDICTED = (  # what `cosim bench predict` leaves of figures
     *("position_error.png", "map_error.png", "hpn_training.png"),
     *("data/position_error.csv", "data/interval_coverage.csv", "data/map_error.csv", "data/map_gain.csv"),
 )
-
-
-USES = ("attribution.md", "attribution.png", "attribution.csv", "closed_loop.csv")
-SHORT = ["--duration", "4", "--workers", "1"]  # of episodes, in small
 
 
 @dataclass(frozen=True)
@@ -54,9 +49,9 @@ class Page:
 
 def prediction(place: Place) -> list[list[str]]:
     """P's figures 5 to 8 and 10: how far off predictors and predicted maps are, on recorded episodes."""
-    flags = ["--seeds", "200000:200001", "--out", str(place.work / "prediction")]
+    flags = ["--seeds", "200000:200001", "--behavior", "mixed", "--out", str(place.work / "prediction")]
     if place.small:
-        flags += ["--scenario", "merge", "--demand", "dense", "--behavior", "mixed", "--policy", "idm"]
+        flags += ["--scenario", "merge", "--demand", "dense", "--policy", "idm"]
     return [["cosim.cli.main", "bench", "predict", *flags]]
 
 
@@ -114,38 +109,6 @@ def startup(place: Place) -> list[list[str]]:
     return [["benchmarks.startup", *flags, "--out", str(place.out / "startup.md")]]
 
 
-def uses(place: Place) -> list[list[str]]:
-    """What drives lose when an input of the network that learned from rewards alone is replaced."""
-    worlds = ("merge",) if place.small else ("merge", "exit", "roundabout", "intersection")
-    flags = ["--policy", LEARNED, "--demand", "contested", "--svo", "60", "--workers", "2", "--closed-loop"]
-    flags += [word for world in worlds for word in ("--scenario", world)]
-    flags += ["--replace", "all maps", "--replace", "map branch"]
-    flags += ["--seeds", "200000:200001", *SHORT] if place.small else ["--seeds", "200000:200020"]
-    return [["cosim.cli.main", "bench", "attribution", *flags, "--out", str(place.out / "uses")]]
-
-
-def turn(place: Place) -> list[list[str]]:
-    """At which phi it begins to yield."""
-    flags = ["--worlds", "merge", "--episodes", "1"] if place.small else ["--episodes", "20"]
-    flags += ["--rows", str(place.out / "data" / "turn.csv"), *(SHORT if place.small else [])]
-    return [["benchmarks.turn", *flags, "--out", str(place.out / "turn.md")]]
-
-
-def learned(place: Place) -> list[list[str]]:
-    """What the network that learned from rewards alone does."""
-    flags = ["--errors", "none", *(["--worlds", "merge", "--episodes", "1", *SHORT] if place.small else [])]
-    flags += ["--runs", str(place.work / "learned_runs")]
-    return [["benchmarks.learned", LEARNED, *flags, "--out", str(place.out / "learned.md")]]
-
-
-def foresight(place: Place) -> list[list[str]]:
-    """What prediction is worth where humans err."""
-    few = ["--worlds", "merge", "--episodes", "1", *SHORT]
-    flags = few if place.small else []
-    kept = ["--runs", str(place.work / "foresight_runs"), "--out", str(place.out / "foresight.md")]
-    return [["benchmarks.foresight", *flags, *kept]]
-
-
 def behaviors(place: Place) -> list[list[str]]:
     """How faithfully LC2013 drives Table II."""
     flags = ["--report", "--scale", "0.002" if place.small else "1"]
@@ -180,21 +143,6 @@ def law(place: Place) -> list[list[str]]:
     return [["benchmarks.law", "--page", *flags, "--out", str(place.out / "law.md")]]
 
 
-def law_stress(place: Place) -> list[list[str]]:
-    """The same among humans who err."""
-    flags = ["--errors", "stress", "--arms", "vfn-p", "--penetration", "0.2"]
-    flags += ["--worlds", "arterial", "--seeds", "1"] if place.small else ["--seeds", "20"]
-    flags += ["--runs", str(place.work / "law_stress_runs")]
-    return [["benchmarks.law", "--page", *flags, "--out", str(place.out / "law_stress.md")]]
-
-
-def lawful_worlds(place: Place) -> list[list[str]]:
-    """Our worlds in preset lawful."""
-    flags = ["--worlds", "merge", "--episodes", "1", *SHORT] if place.small else []
-    kept = ["--runs", str(place.work / "lawful_runs"), "--out", str(place.out / "lawful_worlds.md")]
-    return [["benchmarks.lawful_worlds", *flags, *kept]]
-
-
 def capacity(place: Place) -> list[list[str]]:
     """What human drivers bring through the open roads."""
     few = ["--roads", "minor", "--seeds", "100000:100001"] if place.small else []
@@ -204,8 +152,6 @@ def capacity(place: Place) -> list[list[str]]:
 PAGES = (
     Page("capacity", capacity, ("capacity.md", "capacity.svg", "data/capacity.csv")),
     Page("law", law, ("law.md",)),
-    Page("law_stress", law_stress, ("law_stress.md",)),
-    Page("lawful_worlds", lawful_worlds, ("lawful_worlds.md",)),
     Page("agent", agent, ("agent.md",)),
     Page("prediction_speed", prediction_speed, ("prediction_speed.md",)),
     Page("decision_cost", decision_cost, ("decision_cost.md",)),
@@ -215,10 +161,6 @@ PAGES = (
     Page("startup", startup, ("startup.md",)),
     Page("joining", joining, ("joining.md",)),
     Page("estimate", estimate, ("estimate.md",)),
-    Page("uses", uses, tuple(f"uses/{name}" for name in USES)),
-    Page("turn", turn, ("turn.md", "turn.svg", "data/turn.csv")),
-    Page("learned", learned, ("learned.md",)),
-    Page("foresight", foresight, ("foresight.md",)),
     Page("real_nets", real_nets, ("real_nets.md",)),
     Page("behaviors", behaviors, ("behaviors.md",)),
     Page(

@@ -61,11 +61,6 @@ TRAINED = {"vfn-p": "assisted-0", "vfn": "assisted-0"}
 MEASURED = {
     "table3": "| {} |",
     "decisions": "| {} |",
-    "learned": "| {} at ",
-    "foresight": "| {} |",
-    "turn": "--policy {} ",
-    "humans": "| {} | idm |",
-    "law": "% | {} |",
 }
 
 

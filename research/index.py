@@ -19,8 +19,8 @@ INDEX = """\
 
 P: Valiente et al., prediction-aware cooperative driving. T: Toghi et al., altruistic maneuver planning.
 Both simulate with HighwayEnv, we with SUMO; scenarios and demands are ours. Every line is written by
-`python -m research page` from `research/claims/`. A claim that is not driven yet has no verdict: a page of
-its name, where there is one, shows earlier networks.
+`python -m research page` from `research/claims/`. A claim without a verdict is not driven yet; a page of
+its name, where there is one, answers a smaller question.
 
 | claim | source | verdict | page |
 |---|---|---|---|
@@ -34,8 +34,7 @@ def write(claims: Sequence[Claim], out: Path) -> Path:
         page = out / f"{claim.name}.md"
         there = f"[{claim.name}]({page.name})" if page.is_file() else ""
         text += f"| {claim.sentence} | {claim.source} | {answer(claim, out)} | {there} |\n"
-    pages = [*out.glob("*.md"), *out.glob("uses*/*.md")]
-    others = sorted(str(p.relative_to(out)) for p in pages if p.name != "README.md")
+    others = sorted(p.name for p in out.glob("*.md") if p.name != "README.md")
     text += "\nAll pages: " + ", ".join(f"[{name.removesuffix('.md')}]({name})" for name in others) + ".\n"
     with whole(out / "README.md") as draft:
         draft.write_text(text, encoding="utf-8")

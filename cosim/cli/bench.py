@@ -10,7 +10,7 @@ from cosim.scenario import BEHAVIORS
 from cosim.scenario.behaviors import AS_IS
 
 DEMANDS = ("dense", "contested")
-POLICIES = ("idm", "altruist-rule", "vfn")
+POLICIES = ("idm", "altruist-rule")  # no network: the pages outlive those that ship
 
 
 def add(commands: arguments.SubCommands) -> None:
@@ -71,8 +71,8 @@ def work(args: argparse.Namespace) -> int:
     elif args.demand or args.policy:
         raise BadInput("recordings are there already", field="--demand, --policy")
     folder = Folder(where)
-    folder.manifest()
-    command = "\n".join([*recorded_by(folder.manifest()), "cosim " + shlex.join(sys.argv[1:])])
+    recorded = recorded_by(folder.manifest()) if args.recordings else []
+    command = "\n".join([*recorded, "cosim " + shlex.join(sys.argv[1:])])
     named = [load(what).name if "/" in place(what) else what for what in args.scenario]
     wanted = {"scenarios": named, "behaviors": args.behavior, "seeds": args.seeds}
     bench_predict(folder, out, predictors=args.predictor, command=command, **wanted)

@@ -22,6 +22,7 @@ from policy.prediction.predictors import make_predictor
 from policy.training import hpn as trained
 from policy.training.networks import use_threads
 
+FORECAST = "gp-raster"  # the maps that the kinematic forecast alone gives
 STRIDE = 10  # decisions, 4 s: nearer ones look at almost the same traffic
 
 
@@ -170,37 +171,51 @@ def against(episodes: Sequence[EpisodeErrors], ours: str = "hpn") -> list[dict[s
     return out
 
 
-def markdown(
-    table: Sequence[Mapping[str, Any]], compared: Sequence[Mapping[str, Any]] = (), command: str = ""
-) -> str:
-    """The tables for people: PRE and IoU with their intervals, and what the HPN gains on the others."""
-    lines = ["# Predicted maps", "", *(["```", command, "```", ""] if command else [])]
-    total = [r for r in table if r["scenario"] == "all"]
-    lines += [
-        f"{total[0]['episodes']} episodes, {total[0]['n']} samples (an AV at a decision, one in {STRIDE}). "
-        "With 95 % intervals over episodes; PRE is the mean squared error per pixel of the vehicle channels, "
-        "IoU the overlap of occupied pixels.",
-    ]
+def markdown(table: Sequence[Mapping[str, Any]], compared: Sequence[Mapping[str, Any]] = ()) -> str:
+    """The tables for people: what the HPN gains on the others, and PRE and IoU over all scenarios."""
+    total = [row for row in table if row["scenario"] == "all"]
+    lines = ["# Predicted maps", ""]
     if compared:
-        lines += ["", "## What the HPN gains, mean over the horizons", ""]
-        lines += ["| world | against | PRE | IoU | better at every horizon |", "|---|---|---|---|---|"]
-        for r in compared:
-            pre, iou = (
-                statistics.Figure(r[f"{n}_change"], r[f"{n}_low"], r[f"{n}_high"]).text(1, 100.0)
-                for n in ("pre", "iou")
-            )
-            better = "yes" if r["everywhere"] else "no"
-            lines.append(f"| {r['scenario']} | {r['against']} | {pre} % | {iou} % | {better} |")
-    keys = list(dict.fromkeys((row["scenario"], row["predictor"]) for row in table))
+        lines += [*_verdict(compared), ""]
+        lines += ["| scenario | against | PRE | IoU | better at every horizon |", "|---|---|---|---|---|"]
+        lines += [_gain(row) for row in compared if row["scenario"] == "all" or row["against"] == FORECAST]
     head = " | ".join(f"{h:g} s" for h in HORIZONS)
     for name, title, scale, digits in (("pre", "PRE, 1e-5 per pixel", 1e5, 1), ("iou", "IoU", 1.0, 3)):
-        lines += ["", f"## {title}", "", f"| world | predictor | {head} |"]
-        lines += ["|" + "---|" * (2 + len(HORIZONS))]
-        for world, predictor in keys:
-            mine = [r for r in table if (r["scenario"], r["predictor"]) == (world, predictor)]
-            cells = [
-                statistics.Figure(r[name], r[f"{name}_low"], r[f"{name}_high"]).text(digits, scale)
-                for r in mine
-            ]
-            lines.append(f"| {world} | {predictor} | {' | '.join(cells)} |")
+        lines += ["", f"## {title}, all scenarios", "", f"| predictor | {head} |"]
+        lines += ["|" + "---|" * (1 + len(HORIZONS))]
+        for predictor in dict.fromkeys(row["predictor"] for row in total):
+            cells = [f"{scale * r[name]:.{digits}f}" for r in total if r["predictor"] == predictor]
+            lines.append(f"| {predictor} | {' | '.join(cells)} |")
+    lines += [
+        "",
+        "## Conditions",
+        "",
+        f"{total[0]['episodes']} episodes, {total[0]['n']:,} samples (an AV at a decision, one in {STRIDE}).",
+        "PRE is the mean squared error per pixel of the vehicle channels, IoU the overlap of occupied",
+        "pixels. Intervals are 95 % over episodes. The CSV files hold the rows by scenario.",
+    ]
     return "\n".join(lines) + "\n"
+
+
+def _verdict(compared: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Whether the HPN's maps are better than those drawn from the kinematic forecast."""
+    overall = {row["against"]: row for row in compared if row["scenario"] == "all"}
+    row = overall.get(FORECAST)
+    if row is None:
+        return ["What the HPN gains, mean over the horizons:"]
+    better = row["pre_high"] < 0.0 < row["iou_low"]
+    change = statistics.Figure(row["pre_change"], row["pre_low"], row["pre_high"]).text(1, 100.0)
+    answer = "**Yes.**" if better else "**Not resolved.**"
+    return [
+        f"Are the maps of the HPN better than maps drawn from the kinematic forecast (`{FORECAST}`)?",
+        f"{answer} The squared error changes by {change} %.",
+    ]
+
+
+def _gain(row: Mapping[str, Any]) -> str:
+    pre, iou = (
+        statistics.Figure(row[f"{name}_change"], row[f"{name}_low"], row[f"{name}_high"]).text(1, 100.0)
+        for name in ("pre", "iou")
+    )
+    better = "yes" if row["everywhere"] else "no"
+    return f"| {row['scenario']} | {row['against']} | {pre} % | {iou} % | {better} |"

@@ -12,9 +12,11 @@ from tests.docs.pages import ROOT
 
 DOCS = ROOT / "docs"
 MOST_WORDS = 30_000  # without results
+MOST_WORDS_OF_RESULTS = 12_000
 LONGEST_MEAN = 20.0  # words a sentence
 WIDEST = 100  # columns of a line of prose
 COUNTED = sorted(page for page in DOCS.rglob("*.md") if DOCS / "results" not in page.parents)
+RESULTS = sorted((DOCS / "results").rglob("*.md"))
 OTHERS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "examples" / "ci" / "README.md"]
 PAGES = [*OTHERS, *COUNTED]
 NO_PROSE = re.compile(r"^ *```.*?^ *```$|<!--.*?-->", re.DOTALL | re.MULTILINE)
@@ -43,6 +45,11 @@ def sentences(page: Path) -> list[str]:
 def test_the_documentation_has_few_words() -> None:
     words = {page.name: len(page.read_text(encoding="utf-8").split()) for page in COUNTED}
     assert sum(words.values()) <= MOST_WORDS, words
+
+
+def test_the_results_have_few_words() -> None:
+    words = {page.name: len(page.read_text(encoding="utf-8").split()) for page in RESULTS}
+    assert sum(words.values()) <= MOST_WORDS_OF_RESULTS, words
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))

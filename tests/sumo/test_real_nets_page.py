@@ -1,34 +1,38 @@
-"""The page of real nets on a machine that has driven none of them."""
+"""The page of other authors' networks on a machine that has driven none of them."""
 
 from __future__ import annotations
 
-import json
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from benchmarks.real_nets import KEPT, main
+from benchmarks.real_nets import KEPT, PAGE, keep, main, read
 
 ROOT = Path(__file__).parents[2]
-PAGE = Path("docs/results/real_nets.md")
 
 
 def test_the_page_is_what_the_rows_of_its_drives_make(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(ROOT)
-    main(["--held", "--out", str(tmp_path / "page.md")])
-    assert (tmp_path / "page.md").read_text() == PAGE.read_text()
+    made = tmp_path / "page.md"
+    shutil.copyfile(PAGE, made)  # with what a person read in it
+    main(["--held", "--out", str(made)])
+    assert made.read_text() == PAGE.read_text()
 
 
-def test_a_row_changed_by_hand_is_seen_on_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_was_driven_is_counted_and_what_was_not_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(ROOT)
-    for row in KEPT.glob("*.json"):
-        (tmp_path / row.name).write_text(row.read_text())
-    changed = json.loads((tmp_path / "grid6-idm-200000.json").read_text())
-    changed["collision_list"] = changed["collision_list"] * 7
-    (tmp_path / "grid6-idm-200000.json").write_text(json.dumps(changed))
-    main(["--held", "--runs", str(tmp_path), "--out", str(tmp_path / "page.md")])
+    rows = read(KEPT)
+    del rows["square", 200_000]
+    rows["grid6", 200_000] = replace(rows["grid6", 200_000], collisions=7, av_caused=5)
+    keep(tmp_path / "rows.csv", list(rows.values()))
+    main(["--held", "--runs", str(tmp_path / "rows.csv"), "--out", str(tmp_path / "page.md")])
     text = (tmp_path / "page.md").read_text()
-    assert "7 of this sort (HV into AV, overlap) in all: `:gneJ17_4_0` 7" in text
-    assert text.count("grid6, idm, seed 200000: 188.4 s") == 5
+    assert "**No.**" in text
+    assert "- square, seed 200000: not driven" in text
+    assert "| grid6 | 1 | 220 | 60 | 7 | 5 |" in text

@@ -7,39 +7,30 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import learning, measured
+from benchmarks import learning, measured, real_nets
 from benchmarks.tables import READ, marks, write_page
 from research import figure8, schema
 
 RESULTS = Path(__file__).parents[2] / measured.RESULTS
 
-CLAIMS = schema.names()  # one that is not driven yet has no page
-# by hand, or by commands of their own: docs/guides/reproduction.md
-AMONG_HUMANS = (
-    *("driver_errors.md", "forced_entry.md", "humans.md", "turn_stress.md"),
-    "uses_stress/attribution.md",
-)
+CLAIMS = schema.names()  # one that is not driven yet has no data
+OWN_COMMANDS = ("driver_errors.md", "forced_entry.md", "humans.md")  # docs/guides/reproduction.md
 
 
 def test_every_page_figure_and_picture_of_the_results_is_made_by_make_results() -> None:
-    driven = [name for name in (*CLAIMS, figure8.NAME) if (RESULTS / f"{name}.md").is_file()]
+    driven = [name for name in (*CLAIMS, figure8.NAME) if (RESULTS / "data" / f"{name}.csv").is_file()]
     driven += [learning.NAME]
-    pages = {f"{name}.md" for name in driven} | {"README.md", *AMONG_HUMANS}
+    pages = {f"{name}.md" for name in driven} | {"README.md", *OWN_COMMANDS}
     pages |= {file for page in measured.PAGES for file in page.files if file.endswith(".md")}
-    tables = {f"data/{name}.csv" for name in (*driven, "turn_stress")}
+    tables = {f"data/{name}.csv" for name in driven} | {f"data/{real_nets.KEPT.name}"}
     tables |= {file for page in measured.PAGES for file in page.files if file.endswith(".csv")}
-    tables |= {f"uses_stress/{name}.csv" for name in ("attribution", "closed_loop")}
     shown = {
-        str((page.parent / picture).relative_to(RESULTS))
-        for page in (*RESULTS.glob("*.md"), *RESULTS.glob("uses*/*.md"))
+        picture
+        for page in RESULTS.glob("*.md")
         for picture in re.findall(r"\]\(([^)]+\.(?:png|svg))\)", page.read_text())
     }
     files = {str(path.relative_to(RESULTS)) for path in RESULTS.rglob("*") if path.is_file()}
-    files = {
-        file
-        for file in files
-        if not file.startswith(("trainings/", "episodes/", "data/real_nets/", "data/rows/"))
-    }
+    files = {file for file in files if not file.startswith(("trainings/", "episodes/"))}
     assert files - tables - shown == pages
     assert tables <= files
     assert shown <= files

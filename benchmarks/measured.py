@@ -22,6 +22,7 @@ from pathlib import Path
 from sumo_scenarios import names
 
 RESULTS = Path("docs/results")
+REAL_NETS = "data/real_nets.csv"
 PREDICTED = (  # what `cosim bench predict` leaves of figures
     *("position_error.png", "map_error.png", "hpn_training.png"),
     *("data/position_error.csv", "data/interval_coverage.csv", "data/map_error.csv", "data/map_gain.csv"),
@@ -116,8 +117,8 @@ def behaviors(place: Place) -> list[list[str]]:
 
 
 def real_nets(place: Place) -> list[list[str]]:
-    """A scenario of another project."""
-    flags = ["--runs", str(place.work / "real_nets"), "--out", str(place.out / "real_nets.md")]
+    """Networks of other authors."""
+    flags = ["--runs", str(place.out / REAL_NETS), "--out", str(place.out / "real_nets.md")]
     few = ["--nets", "A10KW", "DRT", "fkk_in", "rail", "--duration", "4", "--seeds", "1"]
     return [["benchmarks.real_nets", *flags, *(few if place.small else [])]]
 
@@ -161,7 +162,7 @@ PAGES = (
     Page("startup", startup, ("startup.md",)),
     Page("joining", joining, ("joining.md",)),
     Page("estimate", estimate, ("estimate.md",)),
-    Page("real_nets", real_nets, ("real_nets.md",)),
+    Page("real_nets", real_nets, ("real_nets.md", REAL_NETS)),
     Page("behaviors", behaviors, ("behaviors.md",)),
     Page(
         "prediction",

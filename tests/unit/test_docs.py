@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[2]
 # The changelog names files as they were.
 PAGES = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "examples").rglob("*.md")]
 PAGES.remove(ROOT / "CHANGELOG.md")
-MADE = {"FILE.md"}  # what a command is asked to write
+MADE = {"FILE.md", "attribution.md"}  # what a command writes
 FOLDERS = "docs|policy|benchmarks|tests|examples|sumo_scenarios|docker"
 
 

@@ -17,7 +17,7 @@ PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(PROCESSES) --dist loadfi
 .PHONY: demo test soak docs quick pytest unit check kernels nets results pages results-small audit image smoke clean
 
 demo: $(VENV)/.installed
-	$(BIN)/cosim run merge --demand contested --policy vfn-p --beside idm --out $(RUN)
+	$(BIN)/cosim run merge --demand contested --policy altruist-rule --beside idm --out $(RUN)
 
 test: $(VENV)/.installed-dev
 	$(MAKE) --no-print-directory -j 2 check pytest

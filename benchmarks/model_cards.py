@@ -39,6 +39,7 @@ AGENTS = (
     "episodes",
     "phi, degrees",
     "training",
+    "in validation",
     "results",
     "limits",
 )
@@ -46,17 +47,15 @@ PREDICTORS = ("network", "predicts", "data", "training", "in validation", "resul
 LIMITS = {
     "law": "Knows no signal, no limit of a junction's lane, no pedestrian and no bicycle. In `unguarded` it "
     "drives through red lights.",
-    "expert": "Imitated a scripted expert (`altruist-rule` and a cruise rule) beside learning from rewards, "
-    "and mostly chooses as that expert does. What rewards added is not measured. Its human drivers made no "
-    "errors.",
-    "maps only": "Sees nothing but maps, and brakes for whatever is near.",
-    "head": "Outside `lawful` it drives with an output head that its training left unchanged.",
-    "lawful only": "Learned in preset `lawful` alone; `unguarded` is untried.",
+    "maps only": "Sees nothing but maps.",
+    "earlier recipe": "Made by an earlier recipe (commit f591cb8), which no command of this version repeats. "
+    "It imitated a scripted expert (`altruist-rule` and a cruise rule) beside learning from rewards, and "
+    "mostly chooses as that expert does. What rewards added is not measured. Its drivers made no errors.",
+    "one seed": "One training from one seed, in preset `unguarded`, among drivers who made no errors. How "
+    "much another seed differs is not measured.",
     "scenarios": "Learned from the shipped scenarios alone, with drivers who follow IDM and LC2013 or MOBIL "
     "and make no errors. Its error on recorded traffic or on other roads is unknown.",
 }
-# The folder of an agent's training in docs/results/trainings, where it is not NAME-0.
-TRAINED = {"vfn-p": "assisted-0", "vfn": "assisted-0"}
 # A page with figures of a network has it in a table in this form.
 MEASURED = {
     "table3": "| {} |",
@@ -103,11 +102,9 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]] | Iterator[Sequenc
 
 def agent(name: str, card: Card) -> tuple[str, ...]:
     """A value network or a baseline of P's Table III, by the heads `AGENTS`."""
-    data, folder = card["data"], RESULTS / "trainings" / TRAINED.get(name, f"{name}-0")
+    data, folder = card["data"], RESULTS / "trainings" / f"{name}-0"
     training = data["training"]
     log = [json.loads(line) for line in (folder / "log.jsonl").read_text("utf-8").splitlines()]
-    shipped = card["measured"].get("iteration")  # none: it was distilled after the last one
-    log = log if shipped is None else [row for row in log if row["iteration"] <= shipped]
     return (
         f"`{name}`",
         sees(name, card),
@@ -115,6 +112,7 @@ def agent(name: str, card: Card) -> tuple[str, ...]:
         str(len(log) * training["episodes"]),
         ", ".join(f"{phi:g}" for phi in training["svo"]),
         trained(card, folder, log),
+        validated(card),
         ", ".join(pages(name)) or "none yet",
         "; ".join(limits(name, card)),
     )
@@ -122,40 +120,36 @@ def agent(name: str, card: Card) -> tuple[str, ...]:
 
 def sees(name: str, card: Card) -> str:
     """What an agent chooses from, and what reads its maps."""
-    approach, layout = APPROACHES[name], card["configs"]["vfn"]
-    parts = {
-        "preset": layout.get("assisted", False),
-        "conflict with a mission vehicle": layout.get("meets", False),
-        "kinematics": approach.kinematics and layout.get("others", True),
-        "its own speed and command": approach.kinematics and not layout.get("others", True),
-        "maps": True,
-        "predicted maps": approach.predicted_maps,
-    }
-    return f"{', '.join(part for part, there in parts.items() if there)}; `{layout['extractor']}`"
+    approach, extractor = APPROACHES[name], card["configs"]["vfn"]["extractor"]
+    parts = {"maps": True, "predicted maps": approach.predicted_maps, "kinematics": approach.kinematics}
+    return f"{', '.join(part for part, there in parts.items() if there)}; `{extractor}`"
 
 
 def trained(card: Card, folder: Path, log: Sequence[Mapping[str, Any]]) -> str:
-    """How the weights came about: their iteration, updates and time, or the card's own words."""
-    data, measured = card["data"], card["measured"]
+    """How the weights came about: command, iteration, updates, and the time that the whole training took."""
+    chosen = card["measured"]["iteration"]
     config = f"[configuration]({LINK}/trainings/{folder.name}/config.yaml)"
-    if "agrees" in measured:
-        return f"{data['note']}; chooses as its teachers do in {measured['agrees']:.0%} of the states"
+    if "commands" in card["data"]:
+        config = f"`{card['data']['commands']['train']}` (commit {card['data']['commit']}), {config}"
+    updates = next(row["updates"] for row in log if row["iteration"] == chosen)
     hours = sum(row["iteration_s"] for row in log) / 3600
-    chosen = "best in validation" if "validation" in measured else "the last"
-    done = f"{log[-1]['updates']:,} updates, {hours:.1f} h"
-    return f"{config}, iteration {measured['iteration']} ({chosen}), {done}"
+    return f"{config}, iteration {chosen} of {len(log)}, {updates:,} updates; {hours:.1f} h in all"
+
+
+def validated(card: Card) -> str:
+    """What the weights that were chosen drove in validation."""
+    measured, training = card["measured"]["validation"], card["data"]["training"]
+    drives = training["validation"] * len(training["lessons"])
+    crashed, admitted = measured["valid/crashed"], measured["valid/mission_success"]
+    return f"{drives} drives: {crashed:.0%} crashed, {admitted:.0%} of missions fulfilled"
 
 
 def limits(name: str, card: Card) -> Iterator[str]:
     """Names of `LIMITS` that hold for an agent."""
     yield "law"
-    if name not in TRAINED:
-        yield "expert"
+    if not APPROACHES[name].kinematics:
         yield "maps only"
-    elif card["configs"]["vfn"].get("assisted", False):
-        yield "head"
-    elif not any(lesson.get("preset") for lesson in card["data"]["training"]["lessons"]):
-        yield "lawful only"
+    yield "one seed" if "commands" in card["data"] else "earlier recipe"
 
 
 def pages(name: str) -> Iterator[str]:

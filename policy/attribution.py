@@ -13,7 +13,6 @@ import torch
 from cosim.types import Decision, Floats, Floats32, History, Ints, PolicyContext
 from policy.agents.approaches import AgentConfig
 from policy.agents.prediction_aware import Inputs, PredictionAware
-from policy.inputs.situation import ASSISTED
 from policy.inputs.tensors import States, svo_tensor, to_numpy
 from policy.networks.vfn import VFN
 
@@ -48,8 +47,6 @@ def questions(
         whole: torch.Tensor = getattr(states, field)
         encoded = field == "maps" and whole.dim() == 3
         ways = {ZEROED: network.maps.blank.expand_as(whole) if encoded else torch.zeros_like(whole)}
-        if field == "situation":  # what its own car does is no perception: it picks the layers
-            ways[ZEROED][:, ASSISTED] = whole[:, ASSISTED]
         if field != "situation":
             ways[PRESENT] = whole[:, past - 1 : past].expand_as(whole)
         if len(whole) > 1:

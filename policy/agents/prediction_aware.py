@@ -133,7 +133,7 @@ class PredictionAware:
                 )
                 maps = torch.cat([maps, pixels(ahead.maps)], 1)
                 kinematics = torch.cat([kinematics, ahead.kinematics], 1)
-        known = situation_tensor(scene.histories, context.road, scene.shared, self._safety.assisted)
+        known = situation_tensor(scene.histories, context.road, scene.shared)
         return Inputs(scene, States(maps, kinematics, known, svo_tensor(context.svo, len(known))), traffic)
 
     def encoded(self, inputs: Inputs) -> Inputs:

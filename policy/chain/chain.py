@@ -32,7 +32,6 @@ class ChainConfig(Hypotheses):
     """How the next seconds are predicted (observation.md, Clocks)."""
 
     horizon: int = 20  # frames of 0.2 s: 4 s (P, Table I)
-    shade: bool = True  # vehicles are drawn the darker the less sure their places are (`shade`)
 
     def __post_init__(self) -> None:
         """Raises BadInput for a number out of range."""
@@ -123,8 +122,6 @@ def predict(
             raise ValueError("the kinematic branch needs the traffic along the lanes")
         corrected = apply(hpn.kinematic, vehicle_inputs(scene, forecast, traffic), forecast)
         forecast = corrected.forecast
-    if not config.shade:
-        corrected = None  # what is left of it shades
     m, every = config.horizon, config.every
     states = (forecast.x[:, :m], forecast.y[:, :m], forecast.speed[:, :m], forecast.heading[:, :m])
     rows, valid = rows_ahead(scene, *states)

@@ -20,12 +20,11 @@ NEAR = 100.0  # m: neighbours further away are
 FAST = 30.0  # m/s
 OWN = 7  # numbers of the command, before the lanes
 PER_LANE = 3 + 2 * len(LOOK_AHEAD) + 4
-MEETS = OWN + 3 * PER_LANE  # where the six of the mission vehicle begin: is there one
-ASSISTED = MEETS + 6  # behind them: whether the car itself keeps the law and its distance
-SITUATION_INPUTS = ASSISTED + 1
+MISSION = OWN + 3 * PER_LANE  # the six numbers of the mission vehicle begin here
+SITUATION_INPUTS = MISSION + 6
 
 
-def situation(histories: Sequence[History], road: RoadMap, shared: bool, assisted: bool = False) -> Floats32:
+def situation(histories: Sequence[History], road: RoadMap, shared: bool) -> Floats32:
     """[B,SITUATION_INPUTS], scaled to about [-1, 1], of AVs that decide together.
 
     Command (7): target speed, speed limit, distance to the conflict zone, lane change under way, own
@@ -34,11 +33,10 @@ def situation(histories: Sequence[History], road: RoadMap, shared: bool, assiste
     LOOK_AHEAD m ahead (offset and direction in the ego frame), and gap and relative speed of the next
     vehicle ahead and behind. Then (6) the mission vehicle whose way meets the AV's: is there one, how far
     behind it the AV will arrive, how far the AV arriving before it, do they cross, does it come from the
-    right, its speed. Last (1) `assisted`: the car keeps the law and its distance itself (preset `lawful`).
-    `shared`: V2V, mission vehicles and places in that order are known to all.
+    right, its speed. `shared`: V2V, mission vehicles and places in that order are known to all.
     """
-    met, car = _met(histories, road, shared), [float(assisted)]
-    each = [np.concatenate([_own(h), _lanes(h), m, car]) for h, m in zip(histories, met, strict=True)]
+    met = _met(histories, road, shared)
+    each = [np.concatenate([_own(h), _lanes(h), m]) for h, m in zip(histories, met, strict=True)]
     return np.array(each, np.float32)
 
 

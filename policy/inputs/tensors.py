@@ -55,10 +55,10 @@ def to_batch(histories: Sequence[History], device: str = "cpu") -> Batch:
 
 
 def situation_tensor(
-    histories: Sequence[History], road: RoadMap, shared: bool, assisted: bool = False, device: str = "cpu"
+    histories: Sequence[History], road: RoadMap, shared: bool, device: str = "cpu"
 ) -> torch.Tensor:
     """What they know besides [B,SITUATION_INPUTS]: `policy.inputs.situation`."""
-    return torch.from_numpy(situation(histories, road, shared, assisted)).to(device)
+    return torch.from_numpy(situation(histories, road, shared)).to(device)
 
 
 def svo_tensor(svo: float, agents: int, device: str = "cpu") -> torch.Tensor:

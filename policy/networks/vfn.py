@@ -5,23 +5,18 @@ and what the ego knows besides join after FC 512 through MLPs. The baselines of 
 network with parts left out.
 """
 
-import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import nn
 from torch.nn import functional
 
-from cosim.errors import BadInput
 from cosim.types import IS_MISSION, MetaAction
-from policy.inputs.situation import ASSISTED, MEETS, OWN
+from policy.inputs.situation import SITUATION_INPUTS
 from policy.inputs.tensors import APART, KINEMATIC_INPUTS, apart, unit
 from policy.networks.extractors import Conv2dMaps, Conv3dMaps, EncodedMaps, FrameMemory, Strides
 from policy.networks.frame_encoder import EncoderConfig
-
-# layers of their own, by part of `VFN`: which number of the situation picks them
-PICKED_BY = {"met": MEETS, "assisted": ASSISTED}
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,21 +51,8 @@ class VfnConfig(Layout):
     rows: int = 16
     kinematic: int = 64  # features of a vehicle; 0: maps and phi are all the network sees, read by `apart`
     situation: int = 64  # width of the branch of what the ego knows besides; goes with `kinematic`
-    others: bool = True  # False: they are seen in maps alone, beside the ego's own speed and command
-    meets: bool = False  # behind the maps, layers of their own for AVs whose way meets a mission vehicle's
-    assisted: bool = False  # and for those whose car keeps the law and its distance itself (`lawful`)
     latent: int = 128  # numbers that a frame becomes (with an encoder)
-    most: float = 90.0  # deg: who drives by a larger phi is driven by this one
     critic: bool = False  # True: action preferences and a state value (A2C), not action values
-
-    def __post_init__(self) -> None:
-        """Raises BadInput for an angle out of range, and what a critic has not: it values all AVs alike."""
-        for field, without in (("meets", False), ("assisted", False), ("most", 90.0)):
-            value = getattr(self, field)
-            if self.critic and value != without:
-                raise BadInput("is for networks that value actions", field=f"vfn.{field}", value=value)
-        if not 45.0 <= self.most <= 90.0:
-            raise BadInput("must be an angle from 45 to 90 degrees", field="vfn.most", value=self.most)
 
 
 TABLE_1 = VfnConfig(features=(32, 64, 64), hidden=512, strides="literal", dueling=False)
@@ -104,12 +86,6 @@ class Frames(NamedTuple):
     features: torch.Tensor  # [B,T,F,h,w]
 
 
-class Shown(NamedTuple):
-    """In place of maps: what all convolutions, or the encoder, made of them."""
-
-    flat: torch.Tensor  # [B,maps.flat]
-
-
 class VFN(nn.Module):
     """Q(s, .; w) for the five meta-actions (with `critic`: log-preferences and V(s; w)).
 
@@ -120,8 +96,7 @@ class VFN(nn.Module):
         super().__init__()
         self.config = c = config
         # without kinematics the same must be found in pixels
-        rows = c.kinematic if c.others else 0
-        channels, read = (c.channels, unit) if rows else (APART, apart)
+        channels, read = (c.channels, unit) if c.kinematic else (APART, apart)
         shape = c.frames, channels, c.height, c.width
         if c.encoded:
             count = c.frames if c.extractor == "frames" else 1
@@ -131,30 +106,22 @@ class VFN(nn.Module):
         else:
             self.maps = Conv3dMaps(*shape, c.features, c.strides, read)
         self.hidden = nn.Linear(int(self.maps.flat), c.hidden)
-        self.kinematics = Vehicles(c.frames, rows) if rows else None
+        self.kinematics = Vehicles(c.frames, c.kinematic) if c.kinematic else None
         own = c.situation if c.kinematic else 0
         if own:
             # a branch of its own: what few numbers say about the ego's way and command must not drown
             self.situation = nn.Sequential(
-                nn.Linear(ASSISTED if rows else OWN, c.situation),
+                nn.Linear(SITUATION_INPUTS, c.situation),
                 nn.ReLU(),
                 nn.Linear(c.situation, c.situation),
                 nn.ReLU(),
             )
-        self.joined = nn.Linear(c.hidden + 3 * rows + own + 2, c.joined)
+        self.joined = nn.Linear(c.hidden + 3 * c.kinematic + own + 2, c.joined)
         self.value = nn.Linear(c.joined, len(MetaAction) * c.parts)
         self.state = nn.Linear(c.joined, c.parts) if c.critic or c.dueling else None
         for head in (self.value, self.state) if self.state is not None else (self.value,):
             for parameter in head.parameters():
                 nn.init.zeros_(parameter)
-        # sets of layers for some AVs, which take what these maps show
-        self.met = VFN(replace(c, meets=False, assisted=False)).without_maps() if c.meets else None
-        self.assisted = VFN(replace(c, assisted=False)).without_maps() if c.assisted else None
-
-    def without_maps(self) -> "VFN":
-        """This one, for what other maps show."""
-        self.maps = None
-        return self
 
     @property
     def layout(self) -> torch.memory_format:
@@ -167,21 +134,19 @@ class VFN(nn.Module):
 
     def features(
         self,
-        maps: torch.Tensor | Frames | Shown | None,
+        maps: torch.Tensor | Frames | None,
         kinematics: torch.Tensor,
         situation: torch.Tensor,
         phi: torch.Tensor,
     ) -> torch.Tensor:
         """The joined representation [B,joined]; arguments as in `forward`."""
-        shown = self._shown(maps)
-        if shown is None:
+        if maps is None:
             parts = [phi.new_zeros(len(phi), self.config.hidden)]
         else:
-            parts = [functional.relu(self.hidden(shown.flat))]
+            flat = self.maps.stacked(maps.features) if isinstance(maps, Frames) else self.maps(maps)
+            parts = [functional.relu(self.hidden(flat))]
         if self.kinematics is not None:
-            parts += [self.kinematics(kinematics), self.situation(situation[:, :ASSISTED])]
-        elif self.config.kinematic:
-            parts.append(self.situation(situation[:, :OWN]))
+            parts += [self.kinematics(kinematics), self.situation(situation)]
         return functional.relu(self.joined(torch.cat([*parts, phi], 1)))
 
     def forward(
@@ -204,36 +169,22 @@ class VFN(nn.Module):
         Returns:
             q: [B,5] value of each `MetaAction`.
         """
-        phi = at_most(phi, self.config.most)
         return self.weighed(self.apart(maps, kinematics, situation, phi), phi)
 
     def apart(
         self,
-        maps: torch.Tensor | Frames | Shown | None,
+        maps: torch.Tensor | Frames | None,
         kinematics: torch.Tensor,
         situation: torch.Tensor,
         phi: torch.Tensor,
     ) -> torch.Tensor:
         """Values [B,parts,5] of what the reward weighs with cos and sin of phi (P, equation 6; with one part:
-        of all of it), for who drives by that phi. Arguments as in `forward`."""
-        shown = self._shown(maps)
-        if self.assisted is not None and (situation[:, ASSISTED] > 0.5).all():
-            return self.assisted.apart(shown, kinematics, situation, phi)
-        z = self.features(shown, kinematics, situation, phi)
+        of all of it), for an AV that drives by that phi. Arguments as in `forward`."""
+        z = self.features(maps, kinematics, situation, phi)
         q: torch.Tensor = self.value(z).view(len(z), self.config.parts, len(MetaAction))
         if self.config.dueling and self.state is not None:
             q = q - q.mean(2, keepdim=True) + self.state(z)[..., None]
-        for part, column in PICKED_BY.items():
-            network, here = getattr(self, part), situation[:, column, None, None] > 0.5
-            if network is not None and here.any():
-                q = torch.where(here, network.apart(shown, kinematics, situation, phi), q)
         return q
-
-    def _shown(self, maps: torch.Tensor | Frames | Shown | None) -> Shown | None:
-        """What the maps show, read once for all sets of layers."""
-        if maps is None or isinstance(maps, Shown):
-            return maps
-        return Shown(self.maps.stacked(maps.features) if isinstance(maps, Frames) else self.maps(maps))
 
     def weighed(self, apart: torch.Tensor, phi: torch.Tensor) -> torch.Tensor:
         """Action values [B,5] of their parts [B,parts,5]; phi [B,2]."""
@@ -254,9 +205,3 @@ class VFN(nn.Module):
             raise ValueError("this network has no critic")
         z = self.features(maps, kinematics, situation, phi)
         return self.value(z), self.state(z)[:, 0]
-
-
-def at_most(phi: torch.Tensor, most: float) -> torch.Tensor:
-    """[B,2] cosine and sine of the angles of `phi` [B,2], or of `most` deg where they are larger."""
-    limit = phi.new_tensor([math.cos(math.radians(most)), math.sin(math.radians(most))])
-    return torch.where((phi[:, :1] < limit[0]) & (most < 90.0), limit, phi)

@@ -7,7 +7,6 @@ import torch
 from torch.nn import functional
 
 from cosim.errors import in_range
-from policy.inputs.situation import ASSISTED
 from policy.networks.vfn import VfnConfig
 from policy.training.learner import Learner, Metrics
 from policy.training.replay_buffer import Batch
@@ -76,7 +75,7 @@ class DdqnLearner(Learner):
             "predicted_maps": ("maps", slice(past, None)),
             "kinematics": ("kinematics", slice(None)),
             "predicted_kinematics": ("kinematics", slice(past, None)),
-            "situation": ("situation", slice(ASSISTED)),  # not what its car does
+            "situation": ("situation", slice(None)),
             "phi": ("phi", slice(None)),
         }
         with torch.no_grad():

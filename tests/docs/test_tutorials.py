@@ -13,10 +13,10 @@ TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
 SEEN = {
     "first_drive": (
         "mission.0 is the mission vehicle: the human driver that has to merge.",
-        "With vfn-p it merged after",
+        "With altruist-rule it merged after",
         "With idm it did not merge within",
         "interventions",
-        "trace hash vfn-p",
+        "trace hash altruist-rule",
     ),
     "gate": ("exit code 1", "collision_rate"),
     "own_network": ("time-to-teleport 300 -> -1", "traffic as-is", "arrivals", "total_delay_hv_s"),

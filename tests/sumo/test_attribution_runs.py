@@ -53,7 +53,7 @@ def test_the_command_writes_table_page_and_picture(
     with (tmp_path / "attribution.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert {row["policy"] for row in rows} == {"vfn"}
-    assert len({(row["input"], row["replacement"]) for row in rows}) == len(rows) == 8
+    assert len({(row["input"], row["replacement"]) for row in rows}) == len(rows) == 11
     text = (tmp_path / "attribution.md").read_text()
     assert text in capsys.readouterr().out
     assert text.startswith("# Which inputs the value networks use\n\n- `vfn`: inputs that change no choice")
@@ -73,6 +73,7 @@ def test_driving_with_an_input_replaced_is_compared_with_driving_by_all_of_them(
     assert [(row["input"], row["replacement"]) for row in rows] == [
         ("nothing", ""),
         ("maps", "another AV's"),
+        ("kinematics", "another AV's"),
         ("situation", "another AV's"),
         ("map branch", "its last layer zero"),
         ("phi", "0 degrees"),

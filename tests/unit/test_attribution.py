@@ -24,6 +24,7 @@ from policy.attribution import (
     replacements,
 )
 from policy.chain.chain import ChainConfig
+from policy.inputs.situation import SITUATION_INPUTS
 from policy.inputs.tensors import States
 from policy.networks.hpn import HpnConfig
 from policy.networks.vfn import VfnConfig
@@ -124,7 +125,7 @@ def test_swapping_avs_that_see_the_same_changes_nothing() -> None:
     torch.manual_seed(0)
     twins = States(
         torch.randint(0, 255, (1, 14, 4, 32, 128), dtype=torch.uint8).expand(2, -1, -1, -1, -1),
-        *(torch.rand(1, *size).expand(2, *size) for size in ((14, 16, 9), (58,), (2,))),
+        *(torch.rand(1, *size).expand(2, *size) for size in ((14, 16, 9), (SITUATION_INPUTS,), (2,))),
     )
     swapped = [states for _, how, states in questions(NETWORK, twins, 10) if how == "another AV's"]
     assert len(swapped) == 7
@@ -136,7 +137,7 @@ def test_replacements_touch_their_own_frames_and_nothing_else() -> None:
     torch.manual_seed(0)
     states = States(
         torch.randint(1, 255, (3, 14, 4, 8, 8), dtype=torch.uint8),
-        *(torch.rand(3, *size) for size in ((14, 16, 9), (58,), (2,))),
+        *(torch.rand(3, *size) for size in ((14, 16, 9), (SITUATION_INPUTS,), (2,))),
     )
     asked = {(name, how): found for name, how, found in questions(NETWORK, states, 10)}
     zeroed, present = asked["predicted maps", "zeroed"][0], asked["predicted maps", "as at present"][0]

@@ -123,7 +123,7 @@ def test_the_paper_configuration_is_the_papers() -> None:
     assert config.vfn.frames == 30
     assert config.vfn.strides == "literal"
     assert compact("vfn-p").observation == COMPACT
-    assert compact("vfn").predictor == "cs"
+    assert compact("vfn").predictor == "hold"
     with pytest.raises(BadInput, match="policy='conv4d'"):
         compact("conv4d")
 
@@ -141,13 +141,6 @@ def test_a_frozen_encoder_stands_for_the_convolutions_of_all_six() -> None:
     layouts = {name: agent_config(name, sizes).vfn for name in TRAINABLE}
     assert all(layout.encoded for layout in layouts.values())
     assert [name for name, layout in layouts.items() if layout.extractor == "frame"] == ["conv2d-dqn"]
-
-
-def test_what_learned_from_rewards_alone_sees_others_in_its_maps_alone() -> None:
-    for name in ("vfn-p", "vfn"):
-        now = compact(name).vfn
-        assert (now.extractor, now.others) == ("frames", False)
-    assert (paper("vfn-p").vfn.extractor, paper("vfn-p").vfn.others) == ("conv3d", True), "its card's alone"
 
 
 def test_without_a_mask_the_best_valued_action_is_taken() -> None:

@@ -172,17 +172,6 @@ def test_a_vehicle_whose_place_is_doubtful_is_drawn_darker_but_never_vanishes() 
     assert pixel_value == pytest.approx([0.55, 0.275, 0.1])
 
 
-def test_without_shading_places_are_the_same_and_as_bright_as_they_are_sure() -> None:
-    torch.manual_seed(0)
-    hpn = HPN(HpnConfig()).eval()
-    _, shaded = chain(hpn, ChainConfig(horizon=20))
-    _, bright = chain(hpn, ChainConfig(horizon=20, shade=False))
-    assert torch.equal(bright.kinematics, shaded.kinematics)
-    assert torch.equal(bright.maps > 0, shaded.maps > 0)
-    assert (bright.maps >= shaded.maps).all()
-    assert (bright.maps > shaded.maps).any()
-
-
 def test_the_kinematic_branch_sees_a_scene_from_each_vehicle_and_nothing_of_the_unknown() -> None:
     slow = [*CARS, Car("next", 345.0, 1, 12.0, accel=-2.0), Car("new", 420.0, 2, 20.0, frames=3)]
     scene = join(histories(ROAD, slow))

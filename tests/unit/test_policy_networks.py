@@ -9,9 +9,8 @@ import pytest
 import torch
 from policy_scenes import Car, histories, straight_road
 
-from cosim.errors import BadInput
 from cosim.types import KINEMATIC_FEATURES
-from policy.inputs.situation import ASSISTED, FAR, MEETS, PER_LANE, SITUATION_INPUTS, situation
+from policy.inputs.situation import FAR, MISSION, PER_LANE, SITUATION_INPUTS, situation
 from policy.inputs.tensors import KINEMATIC_INPUTS, apart, kinematic_tensor, svo_tensor, to_batch
 from policy.networks import extractors
 from policy.networks.hpn import HPN, HpnConfig
@@ -106,51 +105,6 @@ def test_the_vfn_hears_the_social_value_orientation_and_sees_the_maps() -> None:
         blind = network.value(features)
     assert features.shape == (2, 256)
     assert not torch.equal(blind, egoist)
-
-
-@pytest.mark.parametrize(
-    ("sets", "part", "input_"), [({"meets": True}, "met", MEETS), ({"assisted": True}, "assisted", ASSISTED)]
-)
-def test_layers_of_their_own_drive_some_and_nobody_else(
-    sets: dict[str, bool], part: str, input_: int
-) -> None:
-    torch.manual_seed(0)
-    maps = torch.randint(0, 256, (2, 14, 4, 32, 128), dtype=torch.uint8)
-    states = maps, torch.zeros(0), torch.rand(2, SITUATION_INPUTS), torch.ones(2, 2)
-    states[2][:, [MEETS, ASSISTED]] = 0.0
-    states[2][1, input_] = 1.0
-    network = VFN(VfnConfig(others=False, **sets))
-    torch.nn.init.normal_(network.value.weight)
-    before = network(*states)
-    torch.nn.init.normal_(getattr(network, part).value.weight)
-    assert (network(*states) != before).any(1).tolist() == [False, True]
-
-
-def test_who_meets_a_mission_vehicle_has_layers_of_its_own_where_the_car_assists() -> None:
-    torch.manual_seed(0)
-    network = VFN(VfnConfig(others=False, meets=True, assisted=True))
-    maps = torch.randint(0, 256, (4, 14, 4, 32, 128), dtype=torch.uint8)
-    states = maps, torch.zeros(0), torch.rand(4, SITUATION_INPUTS), torch.ones(4, 2)
-    states[2][:, MEETS] = torch.tensor([0.0, 1.0, 0.0, 1.0])
-    states[2][:, ASSISTED] = torch.tensor([0.0, 0.0, 1.0, 1.0])
-    before = network(*states)
-    assert network.assisted is not None
-    assert network.assisted.met is not None
-    torch.nn.init.normal_(network.assisted.met.value.weight)
-    assert (network(*states) != before).any(1).tolist() == [False, False, False, True]
-
-
-def test_who_drives_by_a_larger_phi_is_driven_by_the_largest() -> None:
-    torch.manual_seed(0)
-    network = VFN(VfnConfig(parts=2, most=75.0))
-    torch.nn.init.normal_(network.value.weight)
-    seen = torch.rand(1, 14, 4, 32, 128), torch.rand(1, 14, 16, 9), torch.rand(1, SITUATION_INPUTS)
-    values = {deg: network(*seen, svo_tensor(np.radians(deg), 1)) for deg in (60.0, 75.0, 80.0, 90.0)}
-    assert torch.equal(values[90.0], values[80.0])
-    torch.testing.assert_close(values[90.0], values[75.0])
-    assert not torch.allclose(values[75.0], values[60.0])
-    with pytest.raises(BadInput, match=r"vfn.most=30"):
-        VfnConfig(most=30.0)
 
 
 def test_gradients_reach_every_layer_of_both_networks() -> None:
@@ -283,22 +237,14 @@ def test_the_avs_know_in_which_order_they_reach_the_mission_vehicle() -> None:
     ]
     seen = histories(road, cars)
     order = ("ahead", "guide", "later")
-    known = situation([seen[name] for name in order], road, shared=True)[:, MEETS:]
+    known = situation([seen[name] for name in order], road, shared=True)[:, MISSION:]
     assert known[:, 0].tolist() == [1.0] * 3, "their lanes lie side by side"
     assert np.diff(known[:, 1]) * FAR == pytest.approx([40.0, 30.0])
     assert known[:, 2] == pytest.approx([-1.0, known[0, 1], known[1, 1]]), "who arrives next before it"
     assert known[:, 3:5].tolist() == [[0.0, 1.0]] * 3, "beside, from the right"
     assert known[:, 5] == pytest.approx([0.6] * 3)
-    alone = situation([seen[name] for name in order], road, shared=False)[:, MEETS:]
+    alone = situation([seen[name] for name in order], road, shared=False)[:, MISSION:]
     assert alone[:, 2].tolist() == [-1.0] * 3, "without V2V nobody knows of the others"
-
-
-def test_the_ego_is_told_whether_its_car_keeps_the_law_itself() -> None:
-    road = straight_road(2)
-    seen = [histories(road, [Car("e", 300.0, 0, 20.0, is_av=True)])["e"]]
-    without, having = (situation(seen, road, shared=True, assisted=assisted) for assisted in (False, True))
-    assert (without[0, ASSISTED], having[0, ASSISTED]) == (0.0, 1.0)
-    assert np.array_equal(without[:, :ASSISTED], having[:, :ASSISTED])
 
 
 def test_frames_remembered_from_the_last_decision_give_the_same_values_to_the_bit() -> None:

@@ -121,13 +121,14 @@ def page(runs: Sequence[Training], command: str, drawn: str = "") -> list[str]:
 
 
 def write_csv(path: Path, runs: Iterable[Training]) -> None:
-    """Every point of every run."""
+    """Points of every run: all of validation, every `WINDOW`-th of the training drives, which are means."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(("agent", "run", "drives", "figure", "iteration", "value"))
         for run in runs:
             for (part, name), course in run.courses.items():
-                for x, y in zip(course.iteration, course.value, strict=True):
+                step = WINDOW if part == "train" else 1
+                for x, y in zip(course.iteration[::step], course.value[::step], strict=True):
                     writer.writerow((run.label, run.name, part, name, f"{x:g}", f"{y:.6g}"))
 
 

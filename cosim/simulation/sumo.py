@@ -28,7 +28,6 @@ from cosim.scenario.sumocfg import time_of
 from cosim.scenario.traffic import CHECKS_INSIDE, FORCED, USUAL, check
 from cosim.scenario.vehicle_types import VehicleTypes, vehicle_types
 from cosim.sensing.perception import Perception
-from cosim.simulation.assistance import Assistance
 from cosim.simulation.backend import sumo
 from cosim.simulation.collisions import CollisionDetector, Wrecks
 from cosim.simulation.commands import Commander, force
@@ -39,6 +38,7 @@ from cosim.simulation.drivers import Drivers
 from cosim.simulation.entries import EntryWatcher
 from cosim.simulation.fleet import Fleet
 from cosim.simulation.fork import forked
+from cosim.simulation.lawful import Lawful
 from cosim.simulation.stderr import SumoStderr
 from cosim.simulation.xerces import keep_initialized
 from cosim.types import (
@@ -129,7 +129,7 @@ class SumoSimulator:
         self._drivers = Drivers(self._scenario.behavior, self._scenario.driver_model, seed)
         self._fleet = self._FLEET(self._scenario, self._drivers, self._av_parameters, self._av_types)
         preset, step = self._scenario.preset, self._scenario.timing.step
-        self._commander = Assistance(step, self.road) if preset == Preset.LAWFUL else Commander(preset, step)
+        self._commander = Lawful(step, self.road) if preset == Preset.LAWFUL else Commander(preset, step)
         self._commander.shared = self._SHARED
         self._bodies: dict[str, Body] = {}
         self._routes: dict[str, tuple[str, ...]] = {}

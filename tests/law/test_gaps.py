@@ -82,8 +82,8 @@ class Nears:
 
         from cosim.simulation.convert import read_road
         from cosim.simulation.eyes import Eyes
-        from cosim.simulation.gaps import Gaps
-        from cosim.simulation.inside import Inside
+        from cosim.simulation.lawful.gaps import Gaps
+        from cosim.simulation.lawful.inside import Inside
 
         get, road = libsumo.vehicle, read_road((), self._configuration)
         eyes = Eyes(road)

@@ -19,7 +19,9 @@ from cosim.road.rules import RulesAhead
 from cosim.scenario import load
 from cosim.scenario.human_errors import levels
 from cosim.scenario.vet import vetted
-from cosim.simulation import assistance, inside
+from cosim.simulation.lawful import follower, inside, way
+from cosim.simulation.lawful.car import Car
+from cosim.simulation.lawful.waves import Waves
 from cosim.simulation.sumo import SumoSimulator
 from cosim.types import (
     Command,
@@ -101,7 +103,7 @@ class Unheeding(Host):
     """A host whose AVs drive without regard to who follows."""
 
     def run(self, *args: object, **options: object) -> EpisodeResult:
-        assistance.CLOSE = 0.0
+        follower.CLOSES = (0.0, 0.5)
         return super().run(*args, **options)  # type: ignore[arg-type]
 
 
@@ -124,7 +126,7 @@ class Unseeing(SumoSimulator):
     """One human keeps his speed whoever is ahead; `told`: whether AVs hear of it from one behind."""
 
     def look_away(self, name: str, told: bool) -> None:
-        assistance.TOLD = assistance.TOLD if told else (0.0, 0.0)
+        follower.TOLD = follower.TOLD if told else (0.0, 0.0)
         libsumo.vehicle.setSpeedMode(name, 0)
         libsumo.vehicle.setSpeed(name, 13.0)
 
@@ -141,20 +143,6 @@ def test_avs_ahead_make_room_for_a_queue_that_somebody_drives_into(start: Start,
         frames = worker.call("advance", lets_in)[1]
         hit = hit or any(c.victim_is_av for frame in frames for c in frame.events.collisions)
     assert hit is not told
-
-
-def test_the_headway_is_longer_with_a_human_close_behind(start: Start) -> None:
-    gaps = []
-    for behind in ([], [vehicle("close", "hv", 75.0, speed=15.0, more='speedFactor="0.6"')]):
-        ahead = vehicle("ahead", "hv", 130.0, speed=15.0, more='speedFactor="0.6"')
-        worker = start([ahead, vehicle("av", "av", 100.0, speed=15.0), *behind], preset=Preset.LAWFUL)
-        for _ in range(50):
-            frame = worker.call("advance", [Command("av", 30.0, 0, 0.4)])[1][-1]
-        place = {name: frame.lane_position[row] for name, row in frame.row.items()}
-        gaps.append(place["ahead"] - 5.0 - place["av"])
-    alone, followed = gaps
-    assert 12.0 < alone < 20.0
-    assert followed > alone + 5.0
 
 
 def test_from_a_stop_sign_it_enters_no_gap_that_a_human_has_to_brake_for(law_worlds: dict[str, Path]) -> None:
@@ -283,30 +271,26 @@ def test_who_stands_inside_a_junction_stays_for_who_may_come_but_not_for_ever_as
         there = False
 
         def blocked(self, name: str, lane: str, present: bool, waved: object) -> inside.Ahead:
-            return inside.Ahead(0.0) if self.there or not present else inside.FREE
+            return inside.Ahead(0.0) if self.there or not present else inside.CLEAR
 
         def room(self, name: str, lane: str, waved: object) -> inside.Ahead:
-            return inside.Ahead(3.0) if self.there else inside.FREE
+            return inside.Ahead(3.0) if self.there else inside.CLEAR
 
-    car, full = assistance.Assistance(STEP, RoadMap((), ())), Full()
-    car._junctions = full  # type: ignore[assignment]
-    state = assistance.Assisted(0.0)
+    full = Full()
+    rule = way.Way(full, Waves(), STEP)  # type: ignore[arg-type]
 
     def stays(lane: str, speed: float, steps: int = 1) -> int:
-        found = 0
-        for _ in range(steps):
-            car._mind_inside("av", lane, speed, state)
-            found += state.stays
-        return found
+        car = Car(0.0, name="av", lane=lane, speed=speed, inside=lane.startswith(":"))
+        return sum(rule.limit(car).accel < 0.0 for _ in range(steps))
 
     assert stays(":j_0_0", 0.5) == 0, "it rolls"
-    assert stays(":j_0_0", 0.0, 200) == pytest.approx(assistance.PATIENCE / STEP, abs=1)
+    assert stays(":j_0_0", 0.0, 200) == pytest.approx(way.PATIENCE / STEP, abs=1)
     assert stays("", 5.0) == 0, "it is out"
     assert stays(":k_0_0", 0.0) == 1, "another junction"
     full.there = True
     assert stays(":k_0_0", 0.0, 200) == 200, "somebody stands there"
     assert [stays(":k_0_0", speed) for speed in (2.0, 4.0)] == [0, 1], "it stops before him"
-    car._room = lambda *_: (inside.Ahead(3.0), 2.0)  # type: ignore[method-assign]
+    rule._ahead = lambda *_: (inside.Ahead(3.0), 2.0)  # type: ignore[method-assign]
     assert stays("w_0", 2.9, 400) == 400, "before its line it waits as long as he stands there"
 
 

@@ -10,7 +10,7 @@ import pytest
 from benchmarks.standing import Watcher
 from cosim.scenario import Fleet, load
 from cosim.scenario.vet import vetted
-from cosim.simulation import inside, waves
+from cosim.simulation.lawful import inside, waves
 from cosim.types import EpisodeResult, Preset
 from cosim.workers.worker import Worker
 from tests.law.drawn import KINDS, NO_TURNAROUNDS, build_net, configuration, draw

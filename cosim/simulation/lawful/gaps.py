@@ -16,7 +16,7 @@ from cosim.road import Link, RoadMap, Rule
 from cosim.simulation.backend import sumo
 from cosim.simulation.eyes import Eyes
 from cosim.simulation.foes import Foes
-from cosim.simulation.inside import SPACING, Inside
+from cosim.simulation.lawful.inside import SPACING, Inside
 from cosim.types import Floats
 
 WITHIN = 200.0  # m before their lines, in which others are looked at

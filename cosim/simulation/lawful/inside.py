@@ -43,7 +43,7 @@ class Ahead(NamedTuple):
     side: float = 0.0  # m to the left of its lane's centre, where it passes those who stand
 
 
-FREE = Ahead(math.inf)
+CLEAR = Ahead(math.inf)
 
 
 class Inside:
@@ -65,7 +65,7 @@ class Inside:
         own = self._road.index.get(lane, -1)
         others = [] if own < 0 else list(self._others(name, own, present, waved))
         if not others:
-            return FREE
+            return CLEAR
         get = self._eyes.of(name)
         still = [bool(other) and get.getSpeed(other) < CREEPS for other, _ in others]
         mine = self.through(name, own, get.getLanePosition(name))
@@ -100,15 +100,15 @@ class Inside:
         get = self._eyes.of(name)
         standing = [] if own < 0 else list(self._standing(name, own, at is None, waved))
         if not standing:
-            return FREE
+            return CLEAR
         mine = self.through(name, own, get.getLanePosition(name) if at is None else at)
-        found = FREE
+        found = CLEAR
         for side in self._sides(name, own):
             way = _aside(mine, get.getLateralLanePosition(name), side, before)
             ahead = self._until(name, way, standing)
             if ahead.room == math.inf:
                 return ahead._replace(side=side)
-            found = ahead if found is FREE else found
+            found = ahead if found is CLEAR else found
             if "" in found.standing:  # nobody dodges those who walk
                 break
         return found._replace(standing=tuple(filter(None, found.standing)))

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from cosim.control import courtesy
 from cosim.episode import Episode, Hook, Progress, Step, run_episode
 from cosim.files import code
 from cosim.metrics import MetricFactory, joined
@@ -66,6 +67,7 @@ class Host:
             sensing: Any = self.simulator  # SUMO's alone has percepts
             how = scenario.sensing.parameters.compensation
             sensing.compensator = compensator(how, self.simulator.road, scenario.timing)
+        self.simulator.courtesy = courtesy(svo)
         if isinstance(self.policy, LooksAhead):
             self.policy.looks_ahead(self.simulator.ahead)
         self.episode = Episode(scenario, self.simulator, wanted, measured)

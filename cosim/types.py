@@ -622,6 +622,7 @@ class Simulator(Protocol):
 
     road: RoadMap
     goal_lanes: frozenset[int]  # being on one of them fulfils the mission
+    courtesy: float  # of commanded AVs in preset `lawful`, 0 to 1, set before the first `reset`
 
     def reset(self, seed: int) -> tuple[Snapshot, ...]:
         """Start the episode `seed` and drive its warm-up; the warm-up's last frames, newest last."""

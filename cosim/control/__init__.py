@@ -70,6 +70,15 @@ def tracked_speed(speed: float, target: float, step: float) -> float:
     return max(speed + min(max(accel, -MAX_DECEL), MAX_ACCEL) * step, 0.0)
 
 
+def courtesy(svo: float) -> float:
+    """How far a lawful car slows down for vehicles that must change lanes: 0 not at all, 1 as SUMO's drivers.
+
+    `svo`: phi in rad. The weight of others in P's eq. (6), sin(phi), as a share of the AV's own, cos(phi).
+    """
+    own, others = math.cos(svo), math.sin(svo)
+    return 1.0 if others >= own and others > 0.0 else max(others / own, 0.0) if own > 0.0 else 0.0
+
+
 def wished_accel(speed: float, target: float, accel: float, step: float) -> tuple[float, float]:
     """The acceleration that a target speed asks for in preset `lawful`, and its comfortable course, m/s2.
 

@@ -42,6 +42,8 @@ class FakeSimulator:
     `vehicles` start each episode as given; `seed` only jitters their places by +-1 m.
     """
 
+    courtesy = 1.0
+
     def __init__(
         self,
         vehicles: Sequence[FakeVehicle],

@@ -81,7 +81,9 @@ class SumoSimulator:
     `history` frames are returned by `reset`, so that an agent starts with a full past.
     """
 
-    compensator: Compensator | None = None  # for the sensing that needs one, set before the first `reset`
+    # set before the first `reset`:
+    compensator: Compensator | None = None  # for the sensing that needs one
+    courtesy: float = 1.0  # of commanded AVs in preset `lawful`: SUMO's lcCooperative, 0 to 1
     _SHARED = False  # whether other programs change things too
     _FLEET: type[Fleet] = Fleet
 
@@ -129,7 +131,9 @@ class SumoSimulator:
         self._drivers = Drivers(self._scenario.behavior, self._scenario.driver_model, seed)
         self._fleet = self._FLEET(self._scenario, self._drivers, self._av_parameters, self._av_types)
         preset, step = self._scenario.preset, self._scenario.timing.step
-        self._commander = Lawful(step, self.road) if preset == Preset.LAWFUL else Commander(preset, step)
+        self._commander = (
+            Lawful(step, self.road, self.courtesy) if preset == Preset.LAWFUL else Commander(preset, step)
+        )
         self._commander.shared = self._SHARED
         self._bodies: dict[str, Body] = {}
         self._routes: dict[str, tuple[str, ...]] = {}

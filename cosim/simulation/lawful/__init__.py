@@ -45,11 +45,11 @@ class Lawful(Commander):
 
     controlled: dict[str, Car]  # type: ignore[assignment]  # `_take_over` makes all of them
 
-    def __init__(self, step: float, road: RoadMap) -> None:
+    def __init__(self, step: float, road: RoadMap, courtesy: float = 1.0) -> None:
         super().__init__(Preset.LAWFUL, step)
         fleet, self._eyes = self.controlled, Eyes(road)
         self._waves, inside = Waves(), Inside(road, self._eyes)
-        self._driver = Driver(step)
+        self._driver = Driver(step, courtesy)
         self._follower = Follower(fleet, self._driver, self._eyes, step)
         self._merging = Merging(fleet, self._eyes, step)
         self._crossing = Crossing(fleet, self._driver, road, self._eyes, inside, step)
@@ -135,9 +135,9 @@ class Lawful(Commander):
         return Car(0.0, name=name, speed=get.getSpeed(name), lateral=get.getLateralLanePosition(name))
 
     def _hand_back(self, name: str) -> None:
-        self._forget(name)
         self._waves.blind(name, (), ())
         self._driver.hand_back(name)
+        self._forget(name)
 
     def _forget(self, name: str) -> None:
         for rule in self._rules:

@@ -14,6 +14,7 @@ from cosim.simulation.fleet import set_type
 from cosim.simulation.lawful.car import Car, Limit, Rule
 from cosim.types import Preset
 
+COURTESY = "laneChangeModel.lcCooperative", "laneChangeModel.lcCooperativeSpeed"
 NOTICE = 150.0  # m: signals and stop lines further ahead are no reason yet
 SAME = 1e-3  # m/s
 HARD = 3.5  # m/s2: harder braking is an emergency's
@@ -26,6 +27,7 @@ BRAKES_WITHIN = 4  # in it a commanded speed asks for no more than the driver's 
 class Settings:
     """How SUMO's driver drives one AV."""
 
+    courtesy: dict[str, str]  # before it was commanded
     late: bool = False  # it leaves less room ahead and brakes late, as hard as it must
     tau: float = math.nan  # s
     impatience: float = 0.0
@@ -34,21 +36,30 @@ class Settings:
 
 
 class Driver(Rule):
-    """Limits the acceleration to what SUMO's driver allows; `step`: s of a simulation step."""
+    """Limits the acceleration to what SUMO's driver allows.
 
-    def __init__(self, step: float) -> None:
-        self._step = step
+    Args:
+        step: s of a simulation step.
+        courtesy: how far it slows down for vehicles that must change lanes, 0 to 1 (SUMO's lcCooperative).
+    """
+
+    def __init__(self, step: float, courtesy: float) -> None:
+        self._step, self._courtesy = step, courtesy
         self._of: dict[str, Settings] = {}
 
     def take_over(self, name: str) -> None:
         """The AV is commanded from now on."""
-        self._of[name] = Settings()
+        own = {parameter: sumo.vehicle.getParameter(name, parameter) for parameter in COURTESY}
+        self._of[name] = Settings(own)
         _drive_as(name, LAWFUL_TYPE)
+        for parameter in own:
+            sumo.vehicle.setParameter(name, parameter, str(self._courtesy))
 
     def hand_back(self, name: str) -> None:
         """It keeps its comfortable driver."""
-        self.drop(name)
         _drive_as(name, LAWFUL_TYPE)
+        for parameter, value in self._of.pop(name).courtesy.items():
+            sumo.vehicle.setParameter(name, parameter, value)
 
     def drop(self, name: str) -> None:
         """It is commanded no more."""

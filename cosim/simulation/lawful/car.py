@@ -15,6 +15,7 @@ class Limit(NamedTuple):
     reason: str = ""  # "": the agent asked for it
 
 
+SAME = 1e-3  # m/s
 FREE = Limit(math.inf)  # a rule that does not apply
 
 
@@ -63,7 +64,9 @@ class Car(Controlled):
         self.inside = self.lane.startswith(":")
         place = get.getLanePosition(self.name)
         self.left = sumo.lane.getLength(self.lane) - place if self.lane else math.inf
-        self.allowed = get.getSpeedWithoutTraCI(self.name) if self.commanded else self.speed
+        # of equal speeds SUMO's driver drives on who drives: a command at its own speed would brake harder
+        driver = get.getSpeedWithoutTraCI(self.name) - SAME if self.commanded else self.speed + SAME
+        self.allowed = driver
 
 
 class Rule:

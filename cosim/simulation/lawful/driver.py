@@ -16,7 +16,6 @@ from cosim.types import Preset
 
 COURTESY = "laneChangeModel.lcCooperative", "laneChangeModel.lcCooperativeSpeed"
 NOTICE = 150.0  # m: signals and stop lines further ahead are no reason yet
-SAME = 1e-3  # m/s
 HARD = 3.5  # m/s2: harder braking is an emergency's
 HEEDS_NOBODY_OUTSIDE = 8  # bits of a speed mode: in it who comes to the junction is heeded,
 HEEDS_NOBODY_INSIDE = 32  # with it those inside are not
@@ -67,7 +66,7 @@ class Driver(Rule):
 
     def limit(self, car: Car) -> Limit:
         """What its driver did in the last step, or would have done."""
-        return Limit((car.allowed + SAME - car.speed) / self._step, "law")
+        return Limit((car.allowed - car.speed) / self._step, "law")
 
     def drive(self, car: Car, least: Limit) -> None:
         """Carry out the smallest limit of all rules."""

@@ -15,6 +15,7 @@ from cosim.simulation.lawful.car import FREE, Car, Limit, Rule
 REACH = 120.0  # m ahead in which it looks
 AHEAD = 4  # vehicles ahead that it looks at, as far as it knows of them
 GENTLY = 0.5  # m/s2: what asks for less braking is left to the leader's own braking
+SOON = 1.0  # s, for which a vehicle ahead is taken to brake on
 SPACE = 2.0  # m that each vehicle between takes besides its length, when all stand
 
 
@@ -54,7 +55,8 @@ class Leader(Rule):
                 break
             # SUMO's gap is less by the follower's minGap
             room += gap + (sumo.vehicle.getMinGap(name) - SPACE if number else 0.0)
-            closing = car.speed - seen.getSpeed(ahead)
+            slower = min(seen.getAcceleration(ahead), 0.0) * SOON
+            closing = car.speed - max(seen.getSpeed(ahead) + slower, 0.0)
             if number and closing > 0.0:
                 hardest = max(hardest, closing**2 / (2.0 * max(room, 1.0)))
             name = ahead

@@ -14,7 +14,6 @@ from conftest import Start, vehicle
 
 from cosim.control import COMFORT, JERK, lawful_speed, wished_accel
 from cosim.host import Host
-from cosim.road import RoadMap
 from cosim.road.rules import RulesAhead
 from cosim.scenario import load
 from cosim.scenario.human_errors import levels

@@ -47,14 +47,23 @@ def test_courtesy_is_the_weight_of_others_as_a_share_of_ones_own(degrees: float,
     assert courtesy(math.radians(degrees)) == pytest.approx(found, abs=1e-3)
 
 
-@pytest.mark.parametrize("courteous", [0.0, 1.0])
-def test_it_slows_down_for_a_human_whose_lane_ends_as_far_as_phi_says(start: Start, courteous: float) -> None:
-    human = '<vehicle id="human" type="hv" route="ramp" depart="0" departPos="0" departSpeed="20"/>'
-    worker = start([RAMP, human, vehicle("av", "av", 0.0, speed=20.0)], simulator=Shown, preset=Preset.LAWFUL)
+def slowest(start: Start, courteous: float) -> tuple[float, float]:
+    """m/s of an AV, and of a human beside it whose lane ends."""
+    human = '<vehicle id="human" type="hv" route="ramp" depart="0" departPos="400" departSpeed="20"/>'
+    ahead = vehicle("ahead", "hv", 495.0, speed=20.0, more='speedFactor="0.8"')
+    row = [ahead, vehicle("av", "av", 465.0), vehicle("behind", "av", 440.0)]
+    worker = start([RAMP, human, *row], simulator=Shown, preset=Preset.LAWFUL)
     worker.call("be", courteous)
     worker.call("reset", 0)
-    lowest = min(float(frame.speed[frame.row["av"]]) for frame in driven(worker, "av") if "av" in frame.row)
-    assert lowest
+    frames = list(driven(worker, "av", "behind", decisions=40))
+    av, merging = (min(float(f.speed[f.row[name]]) for f in frames[10:]) for name in ("av", "human"))
+    return av, merging
+
+
+def test_it_slows_down_for_a_human_whose_lane_ends_if_phi_says_so(start: Start) -> None:
+    (egoist, blocked), (altruist, let_in) = slowest(start, 0.0), slowest(start, 1.0)
+    assert altruist < egoist - 3.0
+    assert let_in > blocked + 5.0
 
 
 def test_it_is_courteous_only_while_it_is_commanded(start: Start) -> None:
@@ -91,7 +100,7 @@ def test_it_brakes_gently_for_what_begins_beyond_its_leader(start: Start) -> Non
 
 
 def test_the_reason_is_that_of_the_smallest_limit(start: Start) -> None:
-    row = [vehicle("first", "hv", 220.0, speed=20.0), vehicle("leader", "hv", 190.0, speed=20.0)]
+    row = [vehicle("first", "hv", 280.0, speed=20.0), vehicle("leader", "hv", 240.0, speed=20.0)]
     worker = start([*row, vehicle("av", "av", 165.0, speed=20.0)], simulator=Shown, preset=Preset.LAWFUL)
     worker.call("slow_down", "first", 2.0)
     reasons = [one.reason for frame in driven(worker, "av") for one in frame.events.interventions]

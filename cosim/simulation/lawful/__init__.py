@@ -19,7 +19,7 @@ from cosim.road import RoadMap
 from cosim.simulation.backend import sumo
 from cosim.simulation.commands import Commander
 from cosim.simulation.eyes import Eyes
-from cosim.simulation.lawful.car import Car, Limit, Rule
+from cosim.simulation.lawful.car import LAW, Car, Limit, Rule
 from cosim.simulation.lawful.crossing import Crossing
 from cosim.simulation.lawful.driver import Driver
 from cosim.simulation.lawful.follower import Follower
@@ -124,7 +124,7 @@ class Lawful(Commander):
     def _reason(self, car: Car, accel: float) -> str:
         """Of the smallest limit; where it was the agent's, SUMO's driver was slower still."""
         limit: Limit = car.driven
-        words = limit.reason if limit.reason not in ("", "law") else self._driver.reason(car)
+        words = limit.reason if limit.reason not in ("", LAW) else self._driver.reason(car)
         return f"emergency: {words}" if accel < -HARD else words
 
     def _take_over(self, name: str) -> Car:

@@ -16,6 +16,7 @@ class Limit(NamedTuple):
 
 
 SAME = 1e-3  # m/s
+LAW = "law"  # the reason of a limit with which SUMO's driver drives by itself
 FREE = Limit(math.inf)  # a rule that does not apply
 
 

@@ -11,7 +11,7 @@ from cosim.simulation.backend import sumo
 from cosim.simulation.commands import SPEED_MODE
 from cosim.simulation.derived_types import LATE_TYPE, LAWFUL_TYPE, derive, is_known, own_type, suffix
 from cosim.simulation.fleet import set_type
-from cosim.simulation.lawful.car import Car, Limit, Rule
+from cosim.simulation.lawful.car import LAW, Car, Limit, Rule
 from cosim.types import Preset
 
 COURTESY = "laneChangeModel.lcCooperative", "laneChangeModel.lcCooperativeSpeed"
@@ -66,12 +66,12 @@ class Driver(Rule):
 
     def limit(self, car: Car) -> Limit:
         """What its driver did in the last step, or would have done."""
-        return Limit((car.allowed - car.speed) / self._step, "law")
+        return Limit((car.allowed - car.speed) / self._step, LAW)
 
     def drive(self, car: Car, least: Limit) -> None:
         """Carry out the smallest limit of all rules."""
         own, get = self._of[car.name], sumo.vehicle
-        commanded = least.reason != "law" and least.accel < math.inf
+        commanded = least.reason != LAW and least.accel < math.inf
         # a commanded speed is bounded by the driver's own deceleration, unless it says otherwise
         self._set_mode(car.name, own.mode, commanded and least.accel < -get.getDecel(car.name))
         if commanded:

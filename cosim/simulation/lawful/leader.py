@@ -10,10 +10,10 @@ import math
 from cosim.control import COMFORT, MAX_DECEL
 from cosim.simulation.backend import sumo
 from cosim.simulation.eyes import Eyes
-from cosim.simulation.lawful.car import FREE, Car, Limit, Rule
+from cosim.simulation.lawful.car import FREE, LAW, Car, Limit, Rule
 
 REACH = 120.0  # m ahead in which it looks
-AHEAD = 4  # vehicles ahead that it looks at, as far as it knows of them
+BEYOND = 3  # vehicles beyond the leader that it looks at, as far as it knows of them
 GENTLY = 0.5  # m/s2: what asks for less braking is left to the leader's own braking
 SOON = 1.0  # s, for which a vehicle ahead is taken to brake on
 SPACE = 2.0  # m that each vehicle between takes besides its length, when all stand
@@ -28,36 +28,43 @@ class Leader(Rule):
 
     def limit(self, car: Car) -> Limit:
         """The stricter of what the leader and what those beyond him ask for."""
-        believed = FREE if self._eyes.ideal else self._follow(car)
-        return min(believed, self._anticipate(car))
+        leader, gap = sumo.vehicle.getLeader(car.name, REACH) or ("", 0.0)
+        if not leader or not self._eyes.known(car.name, [leader]):
+            return FREE
+        return min(self._follow(car, leader, gap), self._anticipate(car, leader, gap))
 
     # ---- inside ----
 
-    def _follow(self, car: Car) -> Limit:
-        """The driver model's speed behind the leader as the AV sees him; SUMO's driver heeds none then."""
-        get = sumo.vehicle
-        leader, gap = get.getLeader(car.name, REACH) or ("", 0.0)
-        if not leader or not self._eyes.known(car.name, [leader]):
-            return FREE
-        seen = self._eyes.of(car.name)
-        gap -= seen.behind_by(leader, math.radians(90.0 - get.getAngle(car.name)))
-        wanted = get.getFollowSpeed(
-            car.name, car.speed, gap, seen.getSpeed(leader), get.getDecel(leader), leader
-        )
-        return Limit(max((wanted - car.speed) / self._step, -MAX_DECEL), "vehicle ahead")
+    def _follow(self, car: Car, leader: str, gap: float) -> Limit:
+        """The driver model's speed `gap` m behind the leader as the AV sees him.
 
-    def _anticipate(self, car: Car) -> Limit:
+        SUMO's driver heeds him too where everything is known, and brakes no harder than it must; a command
+        would make it brake as the model says. Else it heeds nobody ahead, and the command is ours.
+        """
+        get, seen = sumo.vehicle, self._eyes.of(car.name)
+        if not self._eyes.ideal:
+            gap -= seen.behind_by(leader, math.radians(90.0 - get.getAngle(car.name)))
+        theirs = seen.getSpeed(leader)
+        wanted = get.getFollowSpeed(car.name, car.speed, gap, theirs, get.getDecel(leader), leader)
+        accel = (wanted - car.speed) / self._step
+        if self._eyes.ideal:
+            return Limit(accel, LAW)
+        must = max(car.speed - theirs, 0.0) ** 2 / (2.0 * max(gap, 0.1))  # m/s2
+        return Limit(max(accel, -max(get.getDecel(car.name), must), -MAX_DECEL), "vehicle ahead")
+
+    def _anticipate(self, car: Car, leader: str, gap: float) -> Limit:
         """The braking with which the AV is as slow as each vehicle beyond its leader when it is behind it."""
-        seen, name, room, hardest = self._eyes.of(car.name), car.name, 0.0, GENTLY
-        for number in range(AHEAD):
-            ahead, gap = sumo.vehicle.getLeader(name, REACH) or ("", 0.0)
-            if not ahead or room + gap > REACH or not self._eyes.known(car.name, [ahead]):
-                break
+        get, seen = sumo.vehicle, self._eyes.of(car.name)
+        name, room, hardest = leader, gap, GENTLY
+        for _ in range(BEYOND):
+            ahead, gap = get.getLeader(name, REACH) or ("", 0.0)
             # SUMO's gap is less by the follower's minGap
-            room += gap + (sumo.vehicle.getMinGap(name) - SPACE if number else 0.0)
+            room += gap + get.getMinGap(name) - SPACE
+            if not ahead or room > REACH or not self._eyes.known(car.name, [ahead]):
+                break
             slower = min(seen.getAcceleration(ahead), 0.0) * SOON
             closing = car.speed - max(seen.getSpeed(ahead) + slower, 0.0)
-            if number and closing > 0.0:
+            if closing > 0.0:
                 hardest = max(hardest, closing**2 / (2.0 * max(room, 1.0)))
             name = ahead
         return FREE if hardest == GENTLY else Limit(-min(hardest, COMFORT), "traffic ahead")

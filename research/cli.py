@@ -108,7 +108,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add("--engine", choices=("local", "ray"), default=default.engine)
     add("--scale", type=float, default=default.scale, metavar="X", help="of the numbers of episodes")
     add("--seeds", metavar="A:B", help="in place of every claim's own")
-    add("--scenario", action="append", default=[], choices=sumo_scenarios.names())
+    add("--scenario", action="append", default=[], choices=sumo_scenarios.shipped())
     add("--duration", type=float, metavar="S", help="of an episode (default: the scenario's)")
     add("--untrained", action="store_true", help="networks with initial weights may drive, labelled so")
     add("--runs", type=Path, default=default.runs, metavar="DIR", help="where the episodes are stored")

@@ -106,7 +106,7 @@ class Claim:
 
     def __post_init__(self) -> None:
         for scenario in (*self.scenarios, *self.published, *self.seeds.more):
-            one_of(scenario, sumo_scenarios.names(), "scenarios")
+            one_of(scenario, sumo_scenarios.shipped(), "scenarios")
         for arm in (self.compare.arm, *self.compare.against):
             one_of(arm, self.arms, "compare")
         for scenario, values in self.published.items():

@@ -14,7 +14,7 @@ from cosim.simulation.lawful.car import FREE, LAW, Car, Limit, Rule
 
 REACH = 120.0  # m ahead in which it looks
 BEYOND = 3  # vehicles beyond the leader that it looks at, as far as it knows of them
-GENTLY = 0.5  # m/s2: what asks for less braking is left to the leader's own braking
+GENTLY = 1.0  # m/s2: what asks for less braking is left to the leader's own braking
 SOON = 1.0  # s, for which a vehicle ahead is taken to brake on
 SPACE = 2.0  # m that each vehicle between takes besides its length, when all stand
 

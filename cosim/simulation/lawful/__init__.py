@@ -8,7 +8,6 @@ limit is driven and is the reason that an intervention is reported with:
   is the slowest, it drives by itself, so that it brakes as hard as it must;
 - `leader`: braking early for what begins beyond the leader; the leader himself as the AV's sensors have him;
 - `follower`: room for a human behind who does not brake;
-- `merging`: a gap for an AV that asked for one (V2V);
 - `crossing`: lines at which it gives way;
 - `way`: vehicles that stand in its way inside a junction.
 """
@@ -25,7 +24,6 @@ from cosim.simulation.lawful.driver import Driver
 from cosim.simulation.lawful.follower import Follower
 from cosim.simulation.lawful.inside import Inside
 from cosim.simulation.lawful.leader import Leader
-from cosim.simulation.lawful.merging import Merging
 from cosim.simulation.lawful.waves import Waves
 from cosim.simulation.lawful.way import Way
 from cosim.simulation.lawful.wish import Wish
@@ -35,7 +33,7 @@ CORRECTED = 1.0  # m/s2 more braking than asked for: from there on the car drive
 STALLED = 0.2, 1.5  # m/s2, or so little acceleration where so much was asked for
 RESPITE = 2.0  # s without a correction: the next one is a new one
 HARD = 3.5  # m/s2: harder braking is an emergency's
-LOOKS = 0.4  # s between looks at right of way and blocked lane changes
+LOOKS = 0.4  # s between looks at right of way
 ENTERS = 1.0  # s before a line: so near to it no lane change is begun
 SERVES = 60.0, 100.0  # m that a lane must serve the route at least, and more for every lane to change back
 
@@ -51,7 +49,6 @@ class Lawful(Commander):
         self._waves, inside = Waves(), Inside(road, self._eyes)
         self._driver = Driver(step, courtesy)
         self._follower = Follower(fleet, self._driver, self._eyes, step)
-        self._merging = Merging(fleet, self._eyes, step)
         self._crossing = Crossing(fleet, self._driver, road, self._eyes, inside, step)
         self._way = Way(inside, self._waves, step)
         self._wish = Wish(step)
@@ -59,7 +56,7 @@ class Lawful(Commander):
             Rule, ...
         ] = (  # the follower first: whether there must be room decides what else counts
             *(self._follower, self._wish, self._driver, Leader(self._eyes, step)),
-            *(self._merging, self._crossing, self._way),
+            *(self._crossing, self._way),
         )
         self._looked = -math.inf  # s
         self._begun: list[Intervention] = []
@@ -112,14 +109,13 @@ class Lawful(Commander):
     # ---- inside ----
 
     def _look(self, now: float) -> None:
-        """Where every AV is; from time to time, who gives way and who asks for a gap."""
+        """Where every AV is; from time to time, who gives way."""
         for car in self.controlled.values():
             car.look(now)
         if now - self._looked > LOOKS - 1e-6:
             self._looked = now
             for car in self.controlled.values():
                 self._crossing.look(car, LOOKS)
-            self._merging.ask()
 
     def _reason(self, car: Car, accel: float) -> str:
         """Of the smallest limit; where it was the agent's, SUMO's driver was slower still."""

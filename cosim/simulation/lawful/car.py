@@ -45,7 +45,6 @@ class Car(Controlled):
     waited: float = 0.0  # s at a line, to give way
     room_until: float = -math.inf  # s, until when it makes room for the vehicle behind
     lets_in_until: float = -math.inf  # s, until when it stops before its line for another AV
-    gap_for: str = ""  # who asked it for a gap
 
     @property
     def makes_room(self) -> bool:

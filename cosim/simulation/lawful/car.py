@@ -31,7 +31,7 @@ class Car(Controlled):
     lane: str = ""  # "": it is parked, or SUMO carries it elsewhere
     left: float = math.inf  # m to the end of its lane
     inside: bool = False  # on a lane inside a junction
-    allowed: float = math.inf  # m/s that SUMO's driver would have had now
+    allowed: float = math.inf  # m/s that SUMO's driver goes to, or would have gone to
     raw: float = 0.0  # m/s2, what the target alone asks for
     accel: float = 0.0  # m/s2, of the wish, whose jerk is bounded
     driven: Limit = FREE  # the limit of the last step
@@ -64,9 +64,9 @@ class Car(Controlled):
         self.inside = self.lane.startswith(":")
         place = get.getLanePosition(self.name)
         self.left = sumo.lane.getLength(self.lane) - place if self.lane else math.inf
-        # of equal speeds SUMO's driver drives on who drives: a command at its own speed would brake harder
-        driver = get.getSpeedWithoutTraCI(self.name) - SAME if self.commanded else self.speed + SAME
-        self.allowed = driver
+        # where SUMO's driver drives it is taken to go on as it did
+        goes_on = 2.0 * self.speed - self.before
+        self.allowed = (get.getSpeedWithoutTraCI(self.name) if self.commanded else goes_on) + SAME
 
 
 class Rule:

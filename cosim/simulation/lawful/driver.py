@@ -65,7 +65,7 @@ class Driver(Rule):
         self._of.pop(name, None)
 
     def limit(self, car: Car) -> Limit:
-        """What its driver did in the last step, or would have done."""
+        """What its driver does as it did in the last step, or would have done."""
         return Limit((car.allowed - car.speed) / self._step, LAW)
 
     def drive(self, car: Car, least: Limit) -> None:

@@ -15,6 +15,7 @@ from cosim.simulation.lawful.driver import Driver
 
 BEHIND = 60.0  # m in which it looks
 HEADWAY = 0.8  # s to the leader
+STANDS = 2.0, 5.0  # m to a standing leader; with a human that close behind: the room that there is to use up
 CLOSES = 3.0, 0.5  # s to contact, and the share of the braking that would avoid it of who heeds
 ASKED = 2.0, 0.5  # m/s2 that would avoid it: from there on the car makes room; goes on doing so
 ROOM = (1.5, 0.2), (3.0, 0.5)  # s to contact, s to the leader that it makes do with; between them linear
@@ -42,7 +43,9 @@ class Follower(Rule):
     def limit(self, car: Car) -> Limit:
         """Free."""
         headway = self._headways.get(car.name, HEADWAY)
-        contact = self._contact(car)
+        human = self._human(car)
+        heard = self._heard.get(car.name, math.inf)
+        contact = heard if human is None else min(self._contact(car, *human), heard)
         if contact < math.inf:
             car.room_until = car.now + LASTS
             (soon, shortest), (later, most) = ROOM
@@ -52,7 +55,8 @@ class Follower(Rule):
             headway = min(headway + RETURNS * self._step, HEADWAY)
         self._headways[car.name] = headway
         # an IDM nears a line with speed = distance / headway: so it stops, and does not creep there
-        self._driver.keep(car.name, min(headway, max(STOPS, car.speed / COMFORT)), headway < HEADWAY)
+        tau = min(headway, max(STOPS, car.speed / COMFORT))
+        self._driver.keep(car.name, tau, STANDS[human is not None], headway < HEADWAY)
         return FREE
 
     def drop(self, name: str) -> None:
@@ -61,26 +65,30 @@ class Follower(Rule):
 
     # ---- inside ----
 
-    def _contact(self, car: Car) -> float:
-        """s until a human who does not brake is here, or at the end of the queue behind; else inf."""
+    def _human(self, car: Car) -> tuple[str, float] | None:
+        """The vehicle behind that is no AV, as far as this one knows of it, and m to it."""
         follower, gap = sumo.vehicle.getFollower(car.name, BEHIND)
-        heard = self._heard.get(car.name, math.inf)
         if not follower or self._eyes.is_av(car.name, follower, self._fleet):
-            return heard
+            return None
         if not self._eyes.known(car.name, [follower]):
-            return heard
+            return None
         gap += self._standing_gap(follower)
-        seen = self._eyes.of(car.name)
         if not self._eyes.ideal:
-            gap += seen.behind_by(follower, math.radians(90.0 - sumo.vehicle.getAngle(car.name)))
-        gap, closing = max(gap, 0.1), seen.getSpeed(follower) - car.speed
+            heading = math.radians(90.0 - sumo.vehicle.getAngle(car.name))
+            gap += self._eyes.of(car.name).behind_by(follower, heading)
+        return follower, max(gap, 0.1)
+
+    def _contact(self, car: Car, follower: str, gap: float) -> float:
+        """s until a human `gap` m behind is here who does not brake; else inf."""
+        seen = self._eyes.of(car.name)
+        closing = seen.getSpeed(follower) - car.speed
         if closing <= 0.0 or gap >= CLOSES[0] * closing:
-            return heard
+            return math.inf
         asked = closing**2 / (2.0 * gap) + max(-sumo.vehicle.getAcceleration(car.name), 0.0)
         if asked < ASKED[car.makes_room] or -seen.getAcceleration(follower) > CLOSES[1] * asked:
-            return heard
+            return math.inf
         self._tell(car.name, seen.getSpeed(follower), gap)
-        return float(min(gap / closing, heard))
+        return float(gap / closing)
 
     def _tell(self, name: str, fast: float, away: float) -> None:
         """The AVs ahead hear of one who drives `fast` m/s, `away` m behind `name`, whoever is between."""

@@ -25,11 +25,6 @@ DEMAND_TIME = 900.0  # s in which vehicles want to depart
 DURATION = 1500.0  # s, the horizon that all are counted to: ten minutes to drain
 SIGNALS = "signals.add.xml"
 HOUR = 3600.0  # s
-TYPE = "car"
-# Table II "moderate" as IDM + LC2013 (behaviors.yaml). Every HV gets its behaviour class on top of it, every
-# AV the parameters of its policy.
-CAR = f"""    <vType id="{TYPE}" carFollowModel="IDM" laneChangeModel="LC2013" sigma="0" delta="4" tau="1.0"
-           minGap="2.0" accel="3.0" decel="7.0" emergencyDecel="9.0" apparentDecel="7.0" lcKeepRight="0"/>"""
 
 CONFIGURATION = """<?xml version="1.0" encoding="UTF-8"?>
 <!-- Runs under plain `sumo -c {name}.sumocfg` too; cosim adds the fleet, the behaviour classes and the seed.
@@ -166,14 +161,13 @@ def _flows(road: Road, per_hour: float, begin: float, end: float) -> list[str]:
     for number, flow in enumerate(road.flows()):
         way = f'from="{flow.origin}" to="{flow.destination}"'
         rate = f'begin="{begin:g}" end="{end:g}" period="exp({flow.share * per_hour / HOUR:.6f})"'
-        departs = f'type="{TYPE}" departLane="{flow.lane}" departSpeed="max"'
+        departs = f'departLane="{flow.lane}" departSpeed="max"'
         lines.append(f'    <flow id="f{number}_{begin:g}" {way} {rate} {departs}/>')
     return lines
 
 
 def _routes(comment: str, lines: list[str]) -> str:
-    opens = ['<?xml version="1.0" encoding="UTF-8"?>', comment, "<routes>"]
-    return "\n".join([*opens, CAR, *lines, "</routes>", ""])
+    return "\n".join(['<?xml version="1.0" encoding="UTF-8"?>', comment, "<routes>", *lines, "</routes>", ""])
 
 
 def _write(file: Path, text: str) -> None:

@@ -61,13 +61,15 @@ class WrittenType:
 class Driver:
     """A driver who replaces that of a type; such a type's name is `prefix` + the type's own + `suffix`.
 
-    `attributes` are the driver's, by SUMO's names; none: as the type's own. `types`: whose; None: all.
+    `attributes` are the driver's, by SUMO's names; none: as the type's own, of SUMO's own types `fallback`.
+    `types`: whose; None: all.
     """
 
     prefix: str
     suffix: str
     attributes: Mapping[str, str]
     types: frozenset[str] | None = None
+    fallback: Mapping[str, str] = field(default_factory=dict)
 
     def of(self, own: str) -> str:
         """The name of type `own` with this driver."""
@@ -197,7 +199,9 @@ def _written(name: str, kind: WrittenType, who: Driver) -> str:
         for tag, values in kind.children
         if not (who.attributes and tag.startswith(_MODEL))
     ]
-    attributes = {**own, **files, **who.attributes, "id": who.of(name)}
+    sumos_own = "id" not in kind.attributes
+    driver = who.attributes or (who.fallback if sumos_own else {})
+    attributes = {**own, **files, **driver, "id": who.of(name)}
     return f"<vType{_attributes(attributes)}>{''.join(children)}</vType>"
 
 

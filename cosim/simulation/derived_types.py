@@ -47,9 +47,9 @@ def drivers(scenario: Scenario, av_types: frozenset[str]) -> tuple[Driver, ...]:
     }
     found = []
     if scenario.fleet != Fleet():
-        # in our worlds an AV drives as its type says, one of a user's file by IDM
-        avs = av_types or None
-        found.append(Driver(AV_TYPE, "", {} if scenario.built_in else base[IDM_TYPE], avs))
+        # in our worlds an AV drives as its type says, one of a user's file, or of no type, by IDM
+        avs, idm = av_types or None, base[IDM_TYPE]
+        found.append(Driver(AV_TYPE, "", {} if scenario.built_in else idm, avs, fallback=idm))
         if scenario.preset == Preset.LAWFUL:
             found += [Driver(AV_TYPE, suffix(kind), base[kind], avs) for kind in (LAWFUL_TYPE, LATE_TYPE)]
     if scenario.behavior != AS_IS:

@@ -52,12 +52,9 @@ class Lawful(Commander):
         self._crossing = Crossing(fleet, self._driver, road, self._eyes, inside, step)
         self._way = Way(inside, self._waves, step)
         self._wish = Wish(step)
-        self._rules: tuple[
-            Rule, ...
-        ] = (  # the follower first: whether there must be room decides what else counts
-            *(self._follower, self._wish, self._driver, Leader(self._eyes, step)),
-            *(self._crossing, self._way),
-        )
+        # the follower first: whether there must be room decides what else counts
+        first = self._follower, self._wish, self._driver
+        self._rules: tuple[Rule, ...] = *first, Leader(self._eyes, step), self._crossing, self._way
         self._looked = -math.inf  # s
         self._begun: list[Intervention] = []
 

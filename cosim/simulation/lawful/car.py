@@ -15,7 +15,7 @@ class Limit(NamedTuple):
     reason: str = ""  # "": the agent asked for it
 
 
-SAME = 1e-3  # m/s
+TOLERANCE = 1e-3  # m/s: so much slower SUMO's driver still counts as the wish
 LAW = "law"  # the reason of a limit with which SUMO's driver drives by itself
 FREE = Limit(math.inf)  # a rule that does not apply
 
@@ -66,7 +66,7 @@ class Car(Controlled):
         self.left = sumo.lane.getLength(self.lane) - place if self.lane else math.inf
         # where SUMO's driver drives it is taken to go on as it did
         goes_on = 2.0 * self.speed - self.before
-        self.allowed = (get.getSpeedWithoutTraCI(self.name) if self.commanded else goes_on) + SAME
+        self.allowed = (get.getSpeedWithoutTraCI(self.name) if self.commanded else goes_on) + TOLERANCE
 
 
 class Rule:

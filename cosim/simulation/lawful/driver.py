@@ -16,7 +16,6 @@ from cosim.types import Preset
 
 COURTESY = "laneChangeModel.lcCooperative", "laneChangeModel.lcCooperativeSpeed"
 NOTICE = 150.0  # m: signals and stop lines further ahead are no reason yet
-HARD = 3.5  # m/s2: harder braking is an emergency's
 HEEDS_NOBODY_OUTSIDE = 8  # bits of a speed mode: in it who comes to the junction is heeded,
 HEEDS_NOBODY_INSIDE = 32  # with it those inside are not
 BRAKES_WITHIN = 4  # in it a commanded speed asks for no more than the driver's `decel`

@@ -41,7 +41,7 @@ class Follower(Rule):
         self._heard, self._told = self._told, {}
 
     def limit(self, car: Car) -> Limit:
-        """Free."""
+        """Free: how close to its leader the car may come is handed to SUMO's driver."""
         headway = self._headways.get(car.name, HEADWAY)
         human = self._human(car)
         heard = self._heard.get(car.name, math.inf)

@@ -4,9 +4,9 @@ Before every simulation step each rule says how much the car may accelerate at m
 limit is driven and is the reason that an intervention is reported with:
 
 - `wish`: what the agent asks for, comfortably;
-- `driver`: SUMO's driver (speed mode 31): signals, right of way, limits, persons, whoever is ahead. Where it
-  is the slowest, it drives by itself, so that it brakes as hard as it must;
-- `leader`: braking early for what begins beyond the leader; the leader himself as the AV's sensors have him;
+- `driver`: SUMO's driver (speed mode 31): signals, right of way, limits, persons. Where it is the slowest, it
+  drives by itself, so that it brakes as hard as it must;
+- `leader`: following whoever is ahead, and braking early for what begins beyond him;
 - `follower`: room for a human behind who does not brake;
 - `crossing`: lines at which it gives way;
 - `way`: vehicles that stand in its way inside a junction.
@@ -54,7 +54,7 @@ class Lawful(Commander):
         self._wish = Wish(step)
         # the follower first: whether there must be room decides what else counts
         first = self._follower, self._wish, self._driver
-        self._rules: tuple[Rule, ...] = *first, Leader(self._eyes, step), self._crossing, self._way
+        self._rules: tuple[Rule, ...] = *first, Leader(self._eyes, self._waves, step), self._crossing, self._way
         self._looked = -math.inf  # s
         self._begun: list[Intervention] = []
 
@@ -128,7 +128,8 @@ class Lawful(Commander):
         return Car(0.0, name=name, speed=get.getSpeed(name), lateral=get.getLateralLanePosition(name))
 
     def _hand_back(self, name: str) -> None:
-        self._waves.blind(name, (), ())
+        self._waves.blind(name, ())
+        self._waves.follow(name, ())
         self._driver.hand_back(name)
         self._forget(name)
 
@@ -137,10 +138,10 @@ class Lawful(Commander):
             rule.drop(name)
 
     def _blind(self, name: str) -> None:
-        """SUMO's driver heeds no vehicle at junctions that the AV does not know of, and no leader at all:
-        `Leader` does, as far as the AV knows of one."""
+        """SUMO's driver heeds no vehicle at junctions that the AV does not know of, and follows none."""
         everybody, unseen = self._eyes.unseen(name)
-        self._waves.blind(name, unseen, everybody)
+        self._waves.blind(name, unseen)
+        self._waves.follow(name, everybody)
 
     def _forbidden(self, name: str, lane: str, offset: int) -> str | None:
         why = super()._forbidden(name, lane, offset)

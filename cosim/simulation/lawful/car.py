@@ -39,6 +39,8 @@ class Car(Controlled):
     lateral: float = 0.0  # m to the left of its lane's centre
     corrected: float = -math.inf  # s, when it last drove otherwise than asked
     # what the rules tell one another
+    headway: float = 0.8  # s to the leader
+    stands: float = 2.0  # m to one that stands
     gives_way: bool = False  # at the next junction, or in this one
     goes: bool = False  # it takes a gap of its own choice
     holds: bool = False  # before its line, for an AV that would have to brake hard

@@ -1,4 +1,4 @@
-"""SUMO's driver in the AV, which keeps the law: signals, right of way, limits, persons, whoever is ahead.
+"""SUMO's driver in the AV, which keeps the law: signals, right of way, limits, persons.
 
 Of its own accord it brakes as hard as it must: where it is slower than all rules, it drives by itself.
 """
@@ -26,9 +26,7 @@ class Settings:
     """How SUMO's driver drives one AV."""
 
     courtesy: dict[str, str]  # before it was commanded
-    late: bool = False  # it leaves less room ahead and brakes late, as hard as it must
-    tau: float = math.nan  # s
-    stands: float = math.nan  # m
+    late: bool = False  # it brakes late, as hard as it must
     impatience: float = 0.0
     mode: int = SPEED_MODE[Preset.LAWFUL]  # but for `BRAKES_WITHIN`
     set_mode: int = SPEED_MODE[Preset.LAWFUL]  # SUMO's now
@@ -82,19 +80,12 @@ class Driver(Rule):
         car.commanded, car.driven = commanded, least
         car.accel = least.accel if commanded else 0.0
 
-    def keep(self, name: str, headway: float, stands: float, late: bool) -> None:
-        """From now on it keeps this headway (s) to its leader, and so many m to one that stands; `late`: it
-        brakes late, and closer."""
+    def brake_late(self, name: str, late: bool) -> None:
+        """Whether from now on it brakes late, as hard as it must."""
         own = self._of[name]
         if late != own.late:
-            own.late, own.tau, own.stands = late, math.nan, math.nan
+            own.late = late
             _drive_as(name, LATE_TYPE if late else LAWFUL_TYPE, own.impatience)
-        if headway != own.tau:
-            own.tau = headway
-            sumo.vehicle.setTau(name, headway)
-        if stands != own.stands and not late:
-            own.stands = stands
-            sumo.vehicle.setMinGap(name, stands)
 
     def be_impatient(self, name: str, impatience: float) -> None:
         """How much it makes others brake who have the right of way; below 0: not at all."""

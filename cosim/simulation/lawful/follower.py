@@ -7,7 +7,6 @@ It uses up the distance to its leader, and brakes later and harder, until he bra
 import math
 from collections.abc import Mapping
 
-from cosim.control import COMFORT
 from cosim.simulation.backend import sumo
 from cosim.simulation.eyes import Eyes
 from cosim.simulation.lawful.car import FREE, Car, Limit, Rule
@@ -21,16 +20,14 @@ ASKED = 2.0, 0.5  # m/s2 that would avoid it: from there on the car makes room; 
 ROOM = (1.5, 0.2), (3.0, 0.5)  # s to contact, s to the leader that it makes do with; between them linear
 LASTS = 1.0  # s at least
 TOLD = 8.0, 30.0  # s to contact of the AVs ahead that are told, m between one vehicle and the next up to them
-STOPS = 0.3  # s to the leader at walking pace and below
 RETURNS = 0.1  # s of headway won back per s
 
 
 class Follower(Rule):
-    """Limits nothing: it sets the headway of SUMO's driver, and says whether the wish counts."""
+    """Limits nothing: it sets the headway, and says whether the wish counts."""
 
     def __init__(self, fleet: Mapping[str, Car], driver: Driver, eyes: Eyes, step: float) -> None:
         self._fleet, self._driver, self._eyes, self._step = fleet, driver, eyes, step
-        self._headways: dict[str, float] = {}  # AV -> s
         self._standing_gaps: dict[str, float] = {}  # human -> m
         # AV -> s until somebody further behind, who does not brake, would be there
         self._told: dict[str, float] = {}
@@ -41,8 +38,8 @@ class Follower(Rule):
         self._heard, self._told = self._told, {}
 
     def limit(self, car: Car) -> Limit:
-        """Free: how close to its leader the car may come is handed to SUMO's driver."""
-        headway = self._headways.get(car.name, HEADWAY)
+        """Free: how close to its leader the car may come is the leader's rule."""
+        headway = car.headway
         human = self._human(car)
         heard = self._heard.get(car.name, math.inf)
         contact = heard if human is None else min(self._contact(car, *human), heard)
@@ -53,15 +50,9 @@ class Follower(Rule):
             headway = min(shortest + share * (most - shortest), headway)
         elif not car.makes_room:
             headway = min(headway + RETURNS * self._step, HEADWAY)
-        self._headways[car.name] = headway
-        # an IDM nears a line with speed = distance / headway: so it stops, and does not creep there
-        tau = min(headway, max(STOPS, car.speed / COMFORT))
-        self._driver.keep(car.name, tau, STANDS[human is not None], headway < HEADWAY)
+        car.headway, car.stands = headway, STANDS[human is not None]
+        self._driver.brake_late(car.name, headway < HEADWAY)
         return FREE
-
-    def drop(self, name: str) -> None:
-        """It is commanded no more."""
-        self._headways.pop(name, None)
 
     # ---- inside ----
 

@@ -1,8 +1,10 @@
-"""Whoever drives ahead: brake gently for what begins beyond the leader, and follow him as he is believed.
+"""Whoever drives ahead: follow him, and brake gently for what begins beyond him.
 
-Behind an AV that brakes early and gently nobody has to brake hard. How much braking beyond the leader asks
-for is judged as in the multi-anticipative driver models (Treiber, Kesting and Helbing, "Delays, inaccuracies
-and anticipation in microscopic traffic models", Physica A 360, 2006).
+The AV keeps the safe speed of Krauss's model (Krauss, Wagner and Gawron, "Metastable states in a microscopic
+model of traffic flow", Physical Review E 55, 1997) with both braking alike, so that its gap is its headway;
+an IDM's grows without bound near the speed that it wants, and behind it jams begin. How much braking beyond
+the leader asks for is judged as in the multi-anticipative driver models (Treiber, Kesting and Helbing,
+"Delays, inaccuracies and anticipation in microscopic traffic models", Physica A 360, 2006).
 """
 
 import math
@@ -10,7 +12,8 @@ import math
 from cosim.control import COMFORT, MAX_DECEL
 from cosim.simulation.backend import sumo
 from cosim.simulation.eyes import Eyes
-from cosim.simulation.lawful.car import FREE, LAW, Car, Limit, Rule
+from cosim.simulation.lawful.car import FREE, Car, Limit, Rule
+from cosim.simulation.lawful.waves import Waves
 
 REACH = 120.0  # m ahead in which it looks
 BEYOND = 3  # vehicles beyond the leader that it looks at, as far as it knows of them
@@ -20,51 +23,59 @@ SPACE = 2.0  # m that each vehicle between takes besides its length, when all st
 
 
 class Leader(Rule):
-    """Limits the acceleration behind the vehicles ahead; `step`: s of a simulation step."""
+    """Limits the acceleration behind the vehicles ahead; `step`: s of a simulation step.
 
-    def __init__(self, eyes: Eyes, step: float) -> None:
-        self._eyes = eyes
-        self._step = step
+    SUMO's own driver then follows none of them.
+    """
+
+    def __init__(self, eyes: Eyes, waves: Waves, step: float) -> None:
+        self._eyes, self._waves, self._step = eyes, waves, step
 
     def limit(self, car: Car) -> Limit:
         """The stricter of what the leader and what those beyond him ask for."""
-        leader, gap = sumo.vehicle.getLeader(car.name, REACH) or ("", 0.0)
-        if not leader or not self._eyes.known(car.name, [leader]):
+        ahead = self._ahead(car)
+        if self._eyes.ideal:  # else it follows nobody at all
+            self._waves.follow(car.name, [name for name, _ in ahead])
+        if not ahead:
             return FREE
-        return min(self._follow(car, leader, gap), self._anticipate(car, leader, gap))
+        return min(self._follow(car, *ahead[0]), self._anticipate(car, ahead[1:]))
 
     # ---- inside ----
 
-    def _follow(self, car: Car, leader: str, gap: float) -> Limit:
-        """The driver model's speed `gap` m behind the leader as the AV sees him.
-
-        SUMO's driver heeds him too where everything is known, and brakes no harder than it must; a command
-        would make it brake as the model says. Else it heeds nobody ahead, and the command is ours.
-        """
-        get, seen = sumo.vehicle, self._eyes.of(car.name)
-        if not self._eyes.ideal:
-            gap -= seen.behind_by(leader, math.radians(90.0 - get.getAngle(car.name)))
-        theirs = seen.getSpeed(leader)
-        wanted = get.getFollowSpeed(car.name, car.speed, gap, theirs, get.getDecel(leader), leader)
-        accel = (wanted - car.speed) / self._step
-        if self._eyes.ideal:
-            return Limit(accel, LAW)
-        must = max(car.speed - theirs, 0.0) ** 2 / (2.0 * max(gap, 0.1))  # m/s2
-        return Limit(max(accel, -max(get.getDecel(car.name), must), -MAX_DECEL), "vehicle ahead")
-
-    def _anticipate(self, car: Car, leader: str, gap: float) -> Limit:
-        """The braking with which the AV is as slow as each vehicle beyond its leader when it is behind it."""
-        get, seen = sumo.vehicle, self._eyes.of(car.name)
-        name, room, hardest = leader, gap, GENTLY
-        for _ in range(BEYOND):
+    def _ahead(self, car: Car) -> list[tuple[str, float]]:
+        """The leader, with m to him, and those beyond him, with m up to them when all between stand; as far
+        as the AV knows of them."""
+        get, name, room = sumo.vehicle, car.name, -car.stands
+        found: list[tuple[str, float]] = []
+        while len(found) <= BEYOND:
             ahead, gap = get.getLeader(name, REACH) or ("", 0.0)
-            # SUMO's gap is less by the follower's minGap
-            room += gap + get.getMinGap(name) - SPACE
-            if not ahead or room > REACH or not self._eyes.known(car.name, [ahead]):
+            if not ahead or room + gap > REACH or not self._eyes.known(car.name, [ahead]):
                 break
-            slower = min(seen.getAcceleration(ahead), 0.0) * SOON
-            closing = car.speed - max(seen.getSpeed(ahead) + slower, 0.0)
+            # SUMO's gap is less by the follower's minGap
+            room += gap + get.getMinGap(name) - (SPACE if found else 0.0)
+            found.append((ahead, room))
+            name = ahead
+        return found
+
+    def _follow(self, car: Car, leader: str, gap: float) -> Limit:
+        """The safe speed, reached within the headway; sooner where that takes more than comfort."""
+        seen = self._eyes.of(car.name)
+        if not self._eyes.ideal:
+            gap -= seen.behind_by(leader, math.radians(90.0 - sumo.vehicle.getAngle(car.name)))
+        theirs = seen.getSpeed(leader)
+        brakes = MAX_DECEL if car.makes_room else COMFORT
+        lag = brakes * car.headway  # m/s
+        safe = math.sqrt(lag * lag + theirs * theirs + 2.0 * brakes * max(gap, 0.0)) - lag
+        accel = (safe - car.speed) / max(car.headway, self._step)
+        must = max(car.speed - theirs, 0.0) ** 2 / (2.0 * max(gap, 0.1))  # m/s2
+        return Limit(max(min(accel, -must) if must > brakes else accel, -MAX_DECEL), "vehicle ahead")
+
+    def _anticipate(self, car: Car, beyond: list[tuple[str, float]]) -> Limit:
+        """The braking with which the AV is as slow as each vehicle beyond its leader when it is behind it."""
+        seen, hardest = self._eyes.of(car.name), GENTLY
+        for name, room in beyond:
+            slower = min(seen.getAcceleration(name), 0.0) * SOON
+            closing = car.speed - max(seen.getSpeed(name) + slower, 0.0)
             if closing > 0.0:
                 hardest = max(hardest, closing**2 / (2.0 * max(room, 1.0)))
-            name = ahead
         return FREE if hardest == GENTLY else Limit(-min(hardest, COMFORT), "traffic ahead")

@@ -22,7 +22,8 @@ class Waves:
         self._by: dict[str, frozenset[str]] = {}  # AV -> the vehicles that it waves through
         self._for: dict[str, frozenset[str]] = {}  # AV -> itself and those who cannot come past it
         self._unseen: dict[str, frozenset[str]] = {}  # AV -> the vehicles that it does not know of
-        self._own_leaders: dict[str, list[str]] = {}  # AV -> the leaders that its file lets it ignore
+        self._own_leaders: dict[str, str] = {}  # AV -> the leaders that its file lets it ignore
+        self._leaders: dict[str, str] = {}  # AV -> those that it ignores now
         self._own: dict[str, list[str]] = {}  # waved vehicle -> the foes that its file lets it ignore
 
     def of(self, av: str) -> frozenset[str]:
@@ -41,23 +42,27 @@ class Waves:
         for vehicle in before | vehicles:
             self._tell(vehicle)
 
-    def blind(self, av: str, foes: Collection[str], leaders: Collection[str]) -> None:
-        """From now on the driver of `av` heeds none of `foes` at junctions, and follows none of `leaders`."""
-        if not leaders and av not in self._unseen:
-            return
-        get = sumo.vehicle
-        if av not in self._unseen:
-            self._own_leaders[av] = get.getParameter(av, LEADERS).split()
-        self._unseen[av] = frozenset(foes)
-        get.setParameter(av, LEADERS, " ".join([*self._own_leaders[av], *leaders]))
-        self._tell(av)
-        if not leaders:
-            self.forget(av)
+    def blind(self, av: str, foes: Collection[str]) -> None:
+        """From now on the driver of `av` heeds none of `foes` at junctions."""
+        if foes or av in self._unseen:
+            self._unseen[av] = frozenset(foes)
+            self._tell(av)
+            if not foes:
+                del self._unseen[av]
+
+    def follow(self, av: str, leaders: Collection[str]) -> None:
+        """From now on the driver of `av` follows none of `leaders`: the AV does."""
+        if av not in self._own_leaders:
+            self._own_leaders[av] = sumo.vehicle.getParameter(av, LEADERS)
+        ignored = " ".join([self._own_leaders[av], *leaders]).strip()
+        if ignored != self._leaders.get(av, self._own_leaders[av]):
+            self._leaders[av] = ignored
+            sumo.vehicle.setParameter(av, LEADERS, ignored)
 
     def forget(self, av: str) -> None:
-        """The AV has left the road, or heeds everybody again."""
-        self._unseen.pop(av, None)
-        self._own_leaders.pop(av, None)
+        """The AV has left the road, or drives by itself again."""
+        for known in (self._unseen, self._own_leaders, self._leaders):
+            known.pop(av, None)
 
     def _tell(self, vehicle: str) -> None:
         get = sumo.vehicle

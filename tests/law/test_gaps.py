@@ -35,7 +35,7 @@ TRAFFIC = f"""<routes>{CAR}
 <vehicle id="av" type="car" route="minor" depart="10" departPos="60" departSpeed="8"/></routes>"""
 TURN = f"""<routes>{CAR}
 <route id="left" edges="B1A1 A1A0"/><route id="on" edges="left1A1 A1B1"/>
-<vehicle id="av" type="car" route="left" depart="0" departPos="143" departSpeed="0"/>
+<vehicle id="av" type="car" route="left" depart="0" departPos="144.5" departSpeed="0"/>
 <flow id="hv" type="car" route="on" begin="{{human}}" number="9" period="3" departPos="20" departSpeed="13"/>
 </routes>"""
 STREAM = f"""<routes>{CAR}

@@ -47,23 +47,20 @@ def test_courtesy_is_the_weight_of_others_as_a_share_of_ones_own(degrees: float,
     assert courtesy(math.radians(degrees)) == pytest.approx(found, abs=1e-3)
 
 
-def slowest(start: Start, courteous: float) -> tuple[float, float]:
-    """m/s of an AV, and of a human beside it whose lane ends."""
-    human = '<vehicle id="human" type="hv" route="ramp" depart="0" departPos="400" departSpeed="20"/>'
+def slowest(start: Start, courteous: float) -> float:
+    """m/s of a human beside an AV, whose lane ends."""
+    human = '<vehicle id="human" type="hv" route="ramp" depart="0" departPos="410" departSpeed="20"/>'
     ahead = vehicle("ahead", "hv", 495.0, speed=20.0, more='speedFactor="0.8"')
     row = [ahead, vehicle("av", "av", 465.0), vehicle("behind", "av", 440.0)]
     worker = start([RAMP, human, *row], simulator=Shown, preset=Preset.LAWFUL)
     worker.call("be", courteous)
     worker.call("reset", 0)
     frames = list(driven(worker, "av", "behind", decisions=40))
-    av, merging = (min(float(f.speed[f.row[name]]) for f in frames[10:]) for name in ("av", "human"))
-    return av, merging
+    return min(float(frame.speed[frame.row["human"]]) for frame in frames[10:])
 
 
-def test_it_slows_down_for_a_human_whose_lane_ends_if_phi_says_so(start: Start) -> None:
-    (egoist, blocked), (altruist, let_in) = slowest(start, 0.0), slowest(start, 1.0)
-    assert altruist < egoist - 3.0
-    assert let_in > blocked + 5.0
+def test_it_lets_a_human_in_whose_lane_ends_if_phi_says_so(start: Start) -> None:
+    assert slowest(start, 1.0) > slowest(start, 0.0) + 10.0
 
 
 def test_it_is_courteous_only_while_it_is_commanded(start: Start) -> None:

@@ -14,7 +14,8 @@ from cosim.simulation.lawful.driver import Driver
 
 BEHIND = 60.0  # m in which it looks
 HEADWAY = 0.8  # s to the leader
-STANDS = 2.0, 5.0  # m to a standing leader; with a human that close behind: the room that there is to use up
+STANDS = 2.0, 5.0  # m to a standing leader; with a human that close behind: the room that there is to use up,
+USES_UP = 1.0  # m to him when it is
 CLOSES = 3.0, 0.5  # s to contact, and the share of the braking that would avoid it of who heeds
 ASKED = 2.0, 0.5  # m/s2 that would avoid it: from there on the car makes room; goes on doing so
 ROOM = (1.5, 0.2), (3.0, 0.5)  # s to contact, s to the leader that it makes do with; between them linear
@@ -50,8 +51,9 @@ class Follower(Rule):
             headway = min(shortest + share * (most - shortest), headway)
         elif not car.makes_room:
             headway = min(headway + RETURNS * self._step, HEADWAY)
-        car.headway, car.stands = headway, STANDS[human is not None]
-        self._driver.brake_late(car.name, headway < HEADWAY)
+        late = headway < HEADWAY
+        car.headway, car.stands = headway, USES_UP if late else STANDS[human is not None]
+        self._driver.brake_late(car.name, late)
         return FREE
 
     # ---- inside ----

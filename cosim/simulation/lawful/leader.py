@@ -44,13 +44,19 @@ class Leader(Rule):
 
     def _ahead(self, car: Car) -> list[tuple[str, float]]:
         """The leader, with m to him, and those beyond him, with m up to them when all between stand; as far
-        as the AV knows of them."""
+        as the AV knows of them, and they are on its way: those on others SUMO's driver heeds."""
         get, name, room = sumo.vehicle, car.name, -car.stands
+        way: set[str] = set()
         found: list[tuple[str, float]] = []
         while len(found) <= BEYOND:
             ahead, gap = get.getLeader(name, REACH) or ("", 0.0)
             if not ahead or room + gap > REACH or not self._eyes.known(car.name, [ahead]):
                 break
+            edge = get.getRoadID(ahead)
+            if edge != get.getRoadID(car.name):
+                way = way or {_edge(lane) for link in get.getNextLinks(car.name) for lane in (link[0], link[4])}
+                if edge not in way:
+                    break
             # SUMO's gap is less by the follower's minGap
             room += gap + get.getMinGap(name) - (SPACE if found else 0.0)
             found.append((ahead, room))
@@ -58,7 +64,7 @@ class Leader(Rule):
         return found
 
     def _follow(self, car: Car, leader: str, gap: float) -> Limit:
-        """The safe speed, reached within the headway; sooner where that takes more than comfort."""
+        """The safe speed, reached within half the headway; sooner where that takes more than comfort."""
         seen = self._eyes.of(car.name)
         if not self._eyes.ideal:
             gap -= seen.behind_by(leader, math.radians(90.0 - sumo.vehicle.getAngle(car.name)))
@@ -66,7 +72,7 @@ class Leader(Rule):
         brakes = MAX_DECEL if car.makes_room else COMFORT
         lag = brakes * car.headway  # m/s
         safe = math.sqrt(lag * lag + theirs * theirs + 2.0 * brakes * max(gap, 0.0)) - lag
-        accel = (safe - car.speed) / max(car.headway, self._step)
+        accel = (safe - car.speed) / max(0.5 * car.headway, self._step)
         must = max(car.speed - theirs, 0.0) ** 2 / (2.0 * max(gap, 0.1))  # m/s2
         return Limit(max(min(accel, -must) if must > brakes else accel, -MAX_DECEL), "vehicle ahead")
 
@@ -79,3 +85,7 @@ class Leader(Rule):
             if closing > 0.0:
                 hardest = max(hardest, closing**2 / (2.0 * max(room, 1.0)))
         return FREE if hardest == GENTLY else Limit(-min(hardest, COMFORT), "traffic ahead")
+
+
+def _edge(lane: str) -> str:
+    return lane.rpartition("_")[0]

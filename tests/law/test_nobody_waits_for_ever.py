@@ -63,15 +63,14 @@ def drive(config: Path, fleet: Fleet, *without: str) -> tuple[EpisodeResult, dic
     return found
 
 
-@pytest.mark.parametrize(("without", "trips"), [((), 12), (("waves",), 12), (("aside",), 6)])
+@pytest.mark.parametrize("without", [(), ("waves",)])
 def test_a_human_who_waits_to_turn_and_an_av_that_comes_from_opposite_both_get_on(
-    tmp_path: Path, without: tuple[str, ...], trips: int
+    tmp_path: Path, without: tuple[str, ...]
 ) -> None:
-    """The nose of the human reaches 0.1 m into the AV's way. Either way out suffices: the AV passes beside
-    it, or waves it through, which takes longer."""
+    """The nose of the human reaches 0.1 m into the way of the AV, which passes beside it."""
     result, longest = drive(narrow_junction(tmp_path), Fleet(type="cav"), *without)
 
-    assert (result.value("av_trips_completed") or 0) >= trips
+    assert (result.value("av_trips_completed") or 0) >= 12
     assert max(longest.values()) < LONG
     assert result.value("avs_stuck") == result.value("av_involved_collisions") == 0
 

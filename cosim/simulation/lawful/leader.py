@@ -38,7 +38,8 @@ class Leader(Rule):
             self._waves.follow(car.name, [name for name, _ in ahead])
         if not ahead:
             return FREE
-        return min(self._follow(car, *ahead[0]), self._anticipate(car, ahead[1:]))
+        follows = self._follow(car, *ahead[0])
+        return follows if car.makes_room else min(follows, self._anticipate(car, ahead[1:]))
 
     # ---- inside ----
 

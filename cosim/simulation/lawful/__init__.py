@@ -54,7 +54,8 @@ class Lawful(Commander):
         self._wish = Wish(step)
         # the follower first: whether there must be room decides what else counts
         first = self._follower, self._wish, self._driver
-        self._rules: tuple[Rule, ...] = *first, Leader(self._eyes, self._waves, step), self._crossing, self._way
+        leader = Leader(self._eyes, self._waves, step)
+        self._rules: tuple[Rule, ...] = *first, leader, self._crossing, self._way
         self._looked = -math.inf  # s
         self._begun: list[Intervention] = []
 

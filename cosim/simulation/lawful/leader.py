@@ -55,7 +55,7 @@ class Leader(Rule):
                 break
             edge = get.getRoadID(ahead)
             if edge != get.getRoadID(car.name):
-                way = way or {_edge(lane) for link in get.getNextLinks(car.name) for lane in (link[0], link[4])}
+                way = way or _edges_ahead(car.name)
                 if edge not in way:
                     break
             # SUMO's gap is less by the follower's minGap
@@ -88,5 +88,7 @@ class Leader(Rule):
         return FREE if hardest == GENTLY else Limit(-min(hardest, COMFORT), "traffic ahead")
 
 
-def _edge(lane: str) -> str:
-    return lane.rpartition("_")[0]
+def _edges_ahead(name: str) -> set[str]:
+    """Those that a vehicle comes to, inside junctions too."""
+    links = sumo.vehicle.getNextLinks(name)
+    return {lane.rpartition("_")[0] for link in links for lane in (link[0], link[4])}

@@ -14,6 +14,7 @@ from cosim.arrays import Floats
 from cosim.geometry.compiled import compiled
 
 Flags = npt.NDArray[np.uint8]
+Lists = npt.NDArray[np.int32]
 Streams = npt.NDArray[np.uint64]
 Rows = npt.NDArray[np.int64]
 Outlines = tuple[Rows, Floats, Floats, Floats]  # as `cosim.sensing.walls.Walls`
@@ -33,9 +34,11 @@ STATES = 6
 T_TIME, T_X, T_Y, T_VX, T_VY, T_HEADING, T_XX, T_XV, T_VV, T_HH, T_ACCEPTED, T_LANE, T_POSITION = range(13)
 T_SOURCE, T_HITS, T_ACCEL, T_CAM, T_TOLD = range(13, 18)
 TRACK = 18
-# Columns of a belief: the state that an AV takes an object to have now, its age (s) and source (0: unknown).
+# Columns of a belief: the state that an AV takes an object to have now, its age (s), source (`OWN`:
+# the AV itself) and whether it has sent a CAM.
 B_X, B_Y, B_HEADING, B_SPEED, B_ACCEL, B_LANE, B_POSITION, B_AGE, B_SOURCE, B_TOLD = range(10)
 BELIEF = 10
+OWN = -1.0
 
 BINS = 720  # directions of the line of sight, half a degree each
 BIN = 2.0 * math.pi / BINS  # rad
@@ -238,13 +241,14 @@ def detect(
     miss: float,
     walls: Outlines,
     seen: Flags,  # [A,S] out
+    found: Lists,  # [A,S] out: the slots that are DETECTED, then -1
 ) -> None:
     """What own sensors make of every object in this frame."""
     slots = state.shape[0]
     depth = np.empty(BINS)  # m to the nearest body in each direction
     for a in range(egos.shape[0]):
         ego = egos[a]
-        seen[a] = OUT_OF_RANGE
+        seen[a], found[a, 0] = OUT_OF_RANGE, -1
         if ego < 0:
             continue
         x0, y0, h0 = state[ego, X], state[ego, Y], state[ego, HEADING]
@@ -264,6 +268,7 @@ def detect(
                     bin_ = k % BINS
                     away = _entry(dx, dy, _COS[bin_], _SIN[bin_], c, s, half, side)
                     depth[bin_] = min(depth[bin_], away)
+        many = 0
         for o in range(slots):
             if seen[a, o] == OUT_OF_RANGE:
                 continue
@@ -280,6 +285,10 @@ def detect(
                 continue
             if miss > 0.0 and draw(stream_of(streams[ego], streams[o], _DETECTS), step) < miss:
                 seen[a, o] = MISSED
+                continue
+            found[a, many] = o
+            many += 1
+        found[a, many] = -1
 
 
 @compiled
@@ -397,6 +406,7 @@ def _between(ring: Floats, at: float, newest: int, held: int, slot: int, out: Fl
 def follow(
     ring: Floats,  # [T,S,6]
     seen: Flags,  # [T,A,S]
+    found: Lists,  # [T,A,S] as of `detect`; a slot whose object has left since is not DETECTED in `seen`
     newest: int,  # the frame that is in the rings last
     held: int,  # frames that are in them
     egos: Rows,  # [A]
@@ -428,9 +438,11 @@ def follow(
         best[:] = -1.0
         x0, y0 = ring[newest % size, ego, X], ring[newest % size, ego, Y]
         if lag < held:
-            mine = seen[(newest - lag) % size, a]
-            for o in range(slots):
-                if mine[o] == DETECTED:
+            k = (newest - lag) % size
+            for o in found[k, a]:
+                if o < 0:
+                    break
+                if seen[k, a, o] == DETECTED:
                     best[o], source[o], whose[o] = now - lag * frame, SENSOR, ego
         if contents[0]:
             for o in range(slots):
@@ -466,14 +478,16 @@ def follow(
                 back = lag - math.floor((time - now) / frame + 1e-6)  # frames
                 if back >= held:
                     continue
-                theirs, when = seen[(newest - back) % size, b], now - back * frame
-                for o in range(slots):
-                    if theirs[o] == DETECTED and when > best[o] and o != ego:
+                k, when = (newest - back) % size, now - back * frame
+                for o in found[k, b]:
+                    if o < 0:
+                        break
+                    if seen[k, b, o] == DETECTED and when > best[o] and o != ego:
                         best[o], source[o], whose[o] = when, CPM, sender
         for o in range(slots):
-            track = tracks[a, o]
-            if best[o] < 0.0 or best[o] <= track[T_TIME] + 1e-6:
+            if best[o] < 0.0 or best[o] <= tracks[a, o, T_TIME] + 1e-6:
                 continue
+            track = tracks[a, o]
             if not _between(ring, (best[o] - now) / frame, newest, held, o, truth):
                 continue
             if source[o] == CAM:
@@ -618,15 +632,27 @@ def believe(
     following: Rows,  # [l]
     lane_length: Floats,  # [l] m
     tracks: Floats,  # [A,S,18] in and out: those that ended are cleared
-    beliefs: Floats,  # [A,S,10] out
+    first: Rows,  # [A+1] out: where the M beliefs of each AV begin
+    slot: Rows,  # [A*S] out, the first M: whom they are about; of one AV ascending
+    beliefs: Floats,  # [A*S,10] out, the first M
 ) -> None:
-    """What every AV takes everybody's present state to be; it knows its own."""
+    """What every AV takes everybody's present state to be; it knows its own (but for the acceleration: 0)."""
+    many = 0
     for a in range(egos.shape[0]):
+        first[a] = many
         if egos[a] < 0:
             continue
         for o in range(state.shape[0]):
-            track, belief = tracks[a, o], beliefs[a, o]
-            belief[B_SOURCE] = 0.0
+            if o == egos[a]:
+                belief = beliefs[many]
+                slot[many] = o
+                many += 1
+                belief[B_X], belief[B_Y], belief[B_HEADING] = state[o, X], state[o, Y], state[o, HEADING]
+                belief[B_SPEED], belief[B_LANE] = state[o, SPEED], state[o, LANE]
+                belief[B_POSITION], belief[B_ACCEL] = state[o, POSITION], 0.0
+                belief[B_AGE], belief[B_SOURCE], belief[B_TOLD] = 0.0, OWN, 1.0
+                continue
+            track = tracks[a, o]
             if math.isnan(track[T_TIME]):
                 continue
             if now - track[T_ACCEPTED] > forget + 1e-6:
@@ -635,6 +661,9 @@ def believe(
                 continue
             if track[T_HITS] < confirm and track[T_SOURCE] == SENSOR:
                 continue
+            belief = beliefs[many]
+            slot[many] = o
+            many += 1
             heading, lane, position = track[T_HEADING], int(track[T_LANE]), track[T_POSITION]
             speed = max(track[T_VX] * math.cos(heading) + track[T_VY] * math.sin(heading), 0.0)
             x, y, age = track[T_X], track[T_Y], now - track[T_TIME]
@@ -662,3 +691,29 @@ def believe(
                 lane, position = _drive_on(following, lane_length, lane, position)
             belief[B_X], belief[B_Y], belief[B_HEADING], belief[B_SPEED] = x, y, heading, speed
             belief[B_LANE], belief[B_POSITION] = lane, position
+    first[egos.shape[0]] = many
+
+
+@compiled
+def arrange(
+    first: Rows,  # [A+1], [M] and [M,10] of `believe`
+    slot: Rows,
+    beliefs: Floats,
+    place: Rows,  # [k] of S slots, in the order that is wanted
+    slots: int,  # S
+    rows: Rows,  # [M] out: which of the k each belief is about
+    columns: Floats,  # [10,M] out
+) -> None:
+    """The beliefs of each AV in the order of `place`."""
+    at = np.full(slots, -1)  # the belief about each
+    for a in range(first.shape[0] - 1):
+        for m in range(first[a], first[a + 1]):
+            at[slot[m]] = m
+        n = first[a]
+        for k in range(place.shape[0]):
+            m = at[place[k]]
+            if m >= 0:
+                rows[n], at[place[k]] = k, -1
+                for c in range(BELIEF):
+                    columns[c, n] = beliefs[m, c]
+                n += 1

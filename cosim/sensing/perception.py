@@ -27,6 +27,7 @@ from cosim.sensing.kernels import (
     B_TOLD,
     B_X,
     B_Y,
+    OWN,
 )
 from cosim.sensing.lanes import lane_lines
 from cosim.sensing.walls import walls
@@ -41,7 +42,6 @@ LONGEST_JITTER = 6.0  # of its mean: one message in 400 comes later, and is not 
 NOBODY: frozenset[str] = frozenset()
 AV, HV, PERSON = int(Kind.AV), int(Kind.HV), int(Kind.PERSON)  # members of an enum cost time
 TRUTH = int(Source.TRUTH)
-OWN = -1.0  # in a belief's source: the AV itself
 SLOTS = 64  # objects that there is room for at first; AVs: a quarter
 
 
@@ -99,64 +99,72 @@ class Perception:
         kernels.detect(
             *(state, slots.length, slots.width, slots.hides, slots.egos, slots.streams, step, p.range),
             *(math.radians(p.field_of_view) / 2.0, p.line_of_sight, p.visible_share, p.miss),
-            *(self._walls, seen),
+            *(self._walls, seen, slots.found[k]),
         )
         kernels.follow(
-            *(slots.ring, slots.seen, self._newest, self._held, slots.egos, slots.equipped, slots.streams),
-            *(step, now, self._timing.frame, self._lag, self._noise, self._contents, self._radio),
-            *(self._sender_noise, slots.tracks, slots.heard),
+            *(slots.ring, slots.seen, slots.found, self._newest, self._held, slots.egos, slots.equipped),
+            *(slots.streams, step, now, self._timing.frame, self._lag, self._noise, self._contents),
+            *(self._radio, self._sender_noise, slots.tracks, slots.heard),
         )
-        beliefs = np.zeros((len(slots.egos), len(slots.names), kernels.BELIEF))
         kernels.believe(
             *(state, slots.length, slots.egos, now, p.confirm, p.forget, COMPENSATION[p.compensation]),
-            *(*self._lanes, slots.tracks, beliefs),
+            *self._lanes,
+            *(slots.tracks, slots.first, slots.about, slots.beliefs),
         )
+        about, beliefs = slots.about[: slots.first[-1]], slots.beliefs[: slots.first[-1]]
         if self._compensator is not None:
-            self._compensate(self._compensator, beliefs, now)
+            self._compensate(self._compensator, about, beliefs, now)
+        own = beliefs[:, B_SOURCE] == OWN
+        slots.accel[rows] = snapshot.accel
+        beliefs[own, B_ACCEL] = slots.accel[about[own]]
         hears = np.zeros((len(slots.egos), len(slots.egos)), np.uint8)
         if p.mcm:
             decision = self._timing.decision
             kernels.intentions_heard(state, slots.egos, slots.streams, now, decision, self._radio, hears)
-        return Percepts(snapshot, slots.known, dict(slots.avs), seen.copy(), beliefs, hears)
+        return Percepts(snapshot, slots, seen, about, beliefs, hears)
 
     # ---- inside ----
 
-    def _compensate(self, compensator: Compensator, beliefs: Floats, now: float) -> None:
-        """Predict all beliefs [A,S,10] to `now` (s)."""
+    def _compensate(self, compensator: Compensator, about: Ints, beliefs: Floats, now: float) -> None:
+        """Predict all beliefs [M,10], of the slots `about` [M], to `now` (s)."""
         slots, past = self._slots, self._slots.past  # [N,A,S,5]
-        self._add_own(beliefs)
-        known = beliefs[..., B_SOURCE] != 0.0
+        then = self._own_then(beliefs)
+        known = np.flatnonzero(then[:, B_SOURCE])
+        owner = np.repeat(np.arange(len(slots.egos)), np.diff(slots.first))[known]
+        place, then = about[known], then[known]  # [V], [V,10]
         past[:-1] = past[1:]
         past[-1] = np.nan
-        past[-1][known] = beliefs[known][:, PAST]
+        past[-1, owner, place] = then[:, PAST]
         past[-1, ..., 0] = now - past[-1, ..., 0]
-        owner, place = known.nonzero()
-        then = beliefs[known]  # [V,10]
         late = (then[:, B_SOURCE] > 0.0) & (then[:, B_AGE] > 1e-6)
         if not late.any():
             return
         tracks = _tracks(slots, owner, place, then, self._timing.frame)
-        present = compensator.present(tracks)[late]
-        owner, place, then = owner[late], place[late], then[late]
+        present, then = compensator.present(tracks)[late], then[late]
         lane, position = then[:, B_LANE].astype(np.int64), then[:, B_POSITION].copy()
         position += np.hypot(present[:, X] - then[:, B_X], present[:, Y] - then[:, B_Y])
         kernels.drive_on(self._lanes.following, self._lanes.length, lane, position)
         then[:, STATE] = present
         then[:, B_LANE], then[:, B_POSITION] = lane, position
-        beliefs[owner, place] = then
+        beliefs[known[late]] = then
 
-    def _add_own(self, beliefs: Floats) -> None:
-        """Each AV's own row: its state at the mean age of what it knows, in whole frames."""
-        ring, frame = self._slots.ring, self._timing.frame
-        for a in self._slots.avs.values():
-            known = beliefs[a, :, B_SOURCE] > 0.0
-            age = float(beliefs[a, known, B_AGE].mean()) if known.any() else 0.0
+    def _own_then(self, beliefs: Floats) -> Floats:
+        """The same [M,10] with each AV's own state at the mean age of what it knows, in whole frames."""
+        ring, frame, result = self._slots.ring, self._timing.frame, beliefs.copy()
+        for a, e in enumerate(self._slots.egos):
+            if e < 0:
+                continue
+            all_ = result[self._slots.first[a] : self._slots.first[a + 1]]
+            source = all_[:, B_SOURCE]
+            known, mine = source > 0.0, all_[(source == OWN).argmax()]
+            age = float(all_[known, B_AGE].mean()) if known.any() else 0.0
             back = min(round(age / frame), self._held - 1)
-            e = self._slots.egos[a]
-            own, mine = ring[(self._newest - back) % len(ring), e], beliefs[a, e]
+            own = ring[(self._newest - back) % len(ring), e]
             mine[[B_X, B_Y, B_HEADING, B_SPEED, B_LANE, B_POSITION]] = own
-            mine[B_AGE], mine[B_TOLD] = back * frame, 1.0
-            mine[B_SOURCE] = 0.0 if math.isnan(own[0]) else OWN
+            mine[B_AGE] = back * frame
+            if math.isnan(own[0]):
+                mine[B_SOURCE] = 0.0
+        return result
 
     def _stream(self, name: str) -> int:
         return subseed(self._seed, "sensing", name)
@@ -170,7 +178,6 @@ class Known(NamedTuple):
     """What does not change of the objects that hold a place: k of them, by name."""
 
     names: tuple[str, ...]
-    row: dict[str, int]
     place: Ints  # [k]
     length: Floats  # [k] m
     width: Floats  # [k] m
@@ -185,21 +192,31 @@ class Percepts(Mapping[str, Percept]):
     def __init__(
         self,
         truth: Snapshot,
-        known: Known,
-        avs: Mapping[str, int],
-        seen: npt.NDArray[np.uint8],
-        beliefs: Floats,
-        hears: npt.NDArray[np.uint8],
+        slots: "_Slots",
+        seen: npt.NDArray[np.uint8],  # [A,S]
+        about: Ints,  # [M] slots
+        beliefs: Floats,  # [M,10]
+        hears: npt.NDArray[np.uint8],  # [A,A]
     ) -> None:
-        self._truth, self._known, self._avs = truth, known, avs
-        self._seen, self._beliefs, self._hears = seen, beliefs, hears
-        self._names = {a: name for name, a in avs.items()}
-        self._ordered: tuple[Floats, npt.NDArray[np.uint8]] | None = None  # [A,k,10], [A,k] by `known`
+        known = slots.known
+        rows, columns = np.empty(len(about), np.int64), np.empty((kernels.BELIEF, len(about)))
+        kernels.arrange(slots.first, about, beliefs, known.place, len(slots.names), rows, columns)
+        self._truth, self._others, self._avs = truth, known.names, dict(slots.avs)
+        self._detected, self._hears = seen.take(known.place, 1), hears  # [A,k], [A,A]
+        self._first, self._beliefs = slots.first.tolist(), columns
+        self._names = {a: name for name, a in slots.avs.items()}
+        self._ids = [*map(known.names.__getitem__, rows.tolist())]
+        self._kind, self._actor = known.kind[rows], known.actor[rows]
+        self._kind[(self._kind == AV) & (columns[B_TOLD] == 0.0)] = HV  # it has not said what it is
+        self._length, self._width, self._mission = known.length[rows], known.width[rows], known.mission[rows]
+        self._lane = columns[B_LANE].astype(np.int32)
+        self._source = np.maximum(columns[B_SOURCE], TRUTH).astype(np.int8)  # OWN is the truth
+        self._unknown = np.full(len(rows), np.nan)
         self._found: dict[str, Percept] = {}
 
     def __getitem__(self, av: str) -> Percept:
         if av not in self._found:
-            self._found[av] = self._percept(av, self._avs[av])
+            self._found[av] = self._percept(self._avs[av])
         return self._found[av]
 
     def __iter__(self) -> Iterator[str]:
@@ -208,34 +225,24 @@ class Percepts(Mapping[str, Percept]):
     def __len__(self) -> int:
         return len(self._avs)
 
-    def _percept(self, av: str, a: int) -> Percept:
-        known, truth = self._known, self._truth
-        if self._ordered is None:
-            self._ordered = self._beliefs.take(known.place, 1), self._seen.take(known.place, 1)
-        beliefs, seen = self._ordered[0][a], self._ordered[1][a]  # [k,10], [k]
-        me = known.row[av]
-        beliefs[me] = _own(truth, truth.row[av])
-        rows = beliefs[:, B_SOURCE].nonzero()[0]
-        b = beliefs[rows].T.copy()  # [10,m]
-        b[B_SOURCE, np.searchsorted(rows, me)] = TRUTH
-        kind, lane = known.kind[rows], b[B_LANE].astype(np.int32)
-        kind[(kind == AV) & (b[B_TOLD] == 0.0)] = HV  # it has not said what it is
-        unknown = np.full(len(rows), np.nan)
+    def _percept(self, a: int) -> Percept:
+        truth, known = self._truth, slice(self._first[a], self._first[a + 1])
+        b, lane, unknown = self._beliefs[:, known], self._lane[known], self._unknown[known]
         world = Snapshot(
             time=truth.time,
-            ids=tuple([known.names[k] for k in rows]),
-            kind=kind,
-            mission=known.mission[rows],
+            ids=tuple(self._ids[known]),
+            kind=self._kind[known],
+            mission=self._mission[known],
             x=b[B_X],
             y=b[B_Y],
             heading=b[B_HEADING],
             speed=b[B_SPEED],
             accel=b[B_ACCEL],
-            length=known.length[rows],
-            width=known.width[rows],
+            length=self._length[known],
+            width=self._width[known],
             lane=lane,
             lane_position=b[B_POSITION],
-            actor=known.actor[rows],
+            actor=self._actor[known],
             place=lane,
             signals=truth.signals,
             switches=truth.switches,
@@ -245,8 +252,7 @@ class Percepts(Mapping[str, Percept]):
         )
         heard = self._hears[a].nonzero()[0]
         hears = frozenset([self._names[k] for k in heard.tolist()]) if len(heard) else NOBODY
-        source = b[B_SOURCE].astype(np.int8)
-        return Percept(world, b[B_AGE], source, hears, known.names, seen)
+        return Percept(world, b[B_AGE], self._source[known], hears, self._others, self._detected[a])
 
 
 def _tracks(slots: "_Slots", owner: Ints, place: Ints, then: Floats, frame: float) -> Tracks:
@@ -271,12 +277,6 @@ def _tracks(slots: "_Slots", owner: Ints, place: Ints, then: Floats, frame: floa
     )
 
 
-def _own(truth: Snapshot, row: int) -> Floats:
-    """[10] what an AV knows of itself."""
-    state = [truth.x[row], truth.y[row], truth.heading[row], truth.speed[row], truth.accel[row]]
-    return np.array([*state, truth.lane[row], truth.lane_position[row], 0.0, OWN, 1.0])
-
-
 class _Slots:
     """Places of objects and AVs in the arrays; an object keeps its place while somebody tracks it."""
 
@@ -293,11 +293,14 @@ class _Slots:
     def _allocate(self, frames: int, objects: int, avs: int) -> None:
         self.ring = np.full((frames, objects, kernels.STATES), np.nan)
         self.seen = np.zeros((frames, avs, objects), np.uint8)
+        self.found = np.full((frames, avs, objects), -1, np.int32)
         self.tracks = _no_tracks(avs, objects)
+        self.first, self.about = np.zeros(avs + 1, np.int64), np.zeros(avs * objects, np.int64)
+        self.beliefs = np.zeros((avs * objects, kernels.BELIEF))  # of the newest frame, as are these two
         self.past = np.full((self._past, avs, objects, len(PAST)), np.nan)
         self.heard = np.full((avs, avs), -1.0)
         self.egos = np.full(avs, -1, np.int64)
-        self.length, self.width = np.zeros(objects), np.zeros(objects)
+        self.length, self.width, self.accel = np.zeros(objects), np.zeros(objects), np.zeros(objects)
         self.kind, self.actor = np.zeros(objects, np.int8), np.zeros(objects, np.int8)
         self.mission = np.zeros(objects, np.bool_)
         self.hides, self.equipped = np.zeros(objects, np.uint8), np.zeros(objects, np.uint8)
@@ -340,7 +343,7 @@ class _Slots:
         names = tuple(sorted(self.place))
         k = np.array([self.place[name] for name in names], np.int64)
         fixed = self.length[k], self.width[k], self.kind[k], self.actor[k], self.mission[k]
-        return Known(names, {name: row for row, name in enumerate(names)}, k, *fixed)
+        return Known(names, k, *fixed)
 
     def _enter(
         self, name: str, k: int, s: Snapshot, stream: Callable[[str], int], is_equipped: Callable[[str], bool]
@@ -381,6 +384,7 @@ class _Slots:
             getattr(self, name)[:n] = before[name]
         self.ring[:, :n] = before["ring"]
         self.seen[:, :b, :n] = before["seen"]
+        self.found[:, :b, :n] = before["found"]
         self.tracks[:b, :n] = before["tracks"]
         self.past[:, :b, :n] = before["past"]
         self.heard[:b, :b] = before["heard"]

@@ -131,7 +131,7 @@ class Episode:
         self.scenario = scenario
         self.simulator = simulator
         self.observation = observation
-        self._observer = Observer(simulator.road, observation)
+        self._observer = Observer(simulator.road, observation, scenario.decision_latency)
         self._metrics = Metrics(metrics)
 
     def start(self, seed: int, hooks: Sequence[Hook] = ()) -> Observed:
@@ -157,7 +157,7 @@ class Episode:
         )
         sensing = self.scenario.sensing
         self._hash = hashlib.sha256(b"" if sensing is None else sensing.digest.encode())
-        self._late = sensing is not None and sensing.parameters.decision_latency > 0.0
+        self._late = self.scenario.decision_latency > 0.0
         self._acting: tuple[Mapping[str, Decision], tuple[Command, ...]] = {}, ()  # while they are late
         context = MetricContext(
             road=self.simulator.road,

@@ -439,6 +439,7 @@ class History(NamedTuple):
     source: npt.NDArray[np.int8] = NO_SOURCE  # [R] `Source` of that measurement; empty: all are the truth
     # the AVs whose intentions reach it in time for this decision (MCM); None: all, where they are shared
     hears: frozenset[str] | None = None
+    decision_latency: float = 0.0  # s until what is decided now acts; the command before holds until then
 
     @property
     def ego_speed(self) -> float:

@@ -90,7 +90,8 @@ class SumoEnv(gymnasium.Env[Observation, Any]):
             views = self._session.act({}).observations
         self.learner = found
         self._view = views[found]
-        return self._observation(), {"action_mask": self.action_masks(), "learner": found, "seed": seed}
+        told = {"learner": found, "seed": seed, "decision_latency": self._view.decision_latency}
+        return self._observation(), {"action_mask": self.action_masks(), **told}
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """One decision of the learner."""

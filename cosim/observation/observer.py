@@ -21,13 +21,15 @@ class Observer:
     Args:
         road: the net, for the road channel and the routes ahead.
         config: sizes and ranges; a History has N = `config.frames` frames and R = `config.rows` rows.
+        decision_latency: s until a decision acts, for every History.
 
     Arrays inside a History are views or fresh copies that stay valid for at least N further frames.
     """
 
-    def __init__(self, road: RoadMap, config: ObservationConfig) -> None:
+    def __init__(self, road: RoadMap, config: ObservationConfig, decision_latency: float = 0.0) -> None:
         self._road = road
         self._config = config
+        self._decision_latency = decision_latency
         version = config.road_version
         self._raster: RoadRaster | None = rasterize_road(road, version) if config.maps else None
         self._rules = RuleBook(road)
@@ -147,6 +149,7 @@ class Observer:
                 time=s.time,
                 rules=self._rules.ahead(way, place * way.scale, now),
                 signals=s.signals,
+                decision_latency=self._decision_latency,
             )
         return result
 

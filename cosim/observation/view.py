@@ -41,6 +41,7 @@ class View(NamedTuple):
         rules: the law on its own way: signals, stop lines, crossings, limits.
         age: [R] s since the newest measurement of each row's vehicle; 0 with ideal sensing.
         source: [R] `cosim.types.Source` of that measurement.
+        decision_latency: s until an action given now acts; the command before holds until then.
     """
 
     velocity_map: Bytes
@@ -60,6 +61,7 @@ class View(NamedTuple):
     rules: RulesAhead
     age: Floats
     source: npt.NDArray[np.int8]
+    decision_latency: float
 
     @property
     def ego_speed(self) -> float:
@@ -77,8 +79,8 @@ class Packed(NamedTuple):
     kinematics: Floats32  # [B,N,R,F]
     valid: Bools  # [B,N,R]
     ids: tuple[tuple[str, ...], ...]
-    # [B,22] pose 3, target speed, change, limit, dead ends 3, conflict, time; of `rules` the signal's state
-    # (0: none), all other fields in their order, and how many rows of `limits`
+    # [B,23] pose 3, target speed, change, limit, dead ends 3, conflict, time, latency; of `rules` the
+    # signal's state (0: none), all other fields in their order, and how many rows of `limits`
     numbers: Floats
     limits: Floats  # [k,2] m, m/s: those of all AVs one after the other
     lanes: Bools  # [B,3]
@@ -111,7 +113,7 @@ class Packer:
             (
                 *(*h.pose, h.target_speed, h.lane_changing, h.route.speed_limit),
                 *map(h.route.to_end, range(len(SIDES))),
-                *(h.route.conflict_distance, h.time),
+                *(h.route.conflict_distance, h.time, h.decision_latency),
                 *(ord(h.rules.signal or "\0"), *h.rules[1:-1], len(h.rules.limits)),
             )
             for h in everyone
@@ -124,7 +126,7 @@ class Packer:
             kinematics=np.stack([h.kinematics for h in everyone]) if everyone else empty.astype(np.float32),
             valid=np.stack([h.valid for h in everyone]) if everyone else empty.astype(np.bool_),
             ids=tuple(h.ids for h in everyone),
-            numbers=np.array(numbers, np.float64).reshape(-1, 22),
+            numbers=np.array(numbers, np.float64).reshape(-1, 23),
             limits=np.concatenate([h.rules.limits for h in everyone]) if everyone else np.zeros((0, 2)),
             lanes=exists,
             lines=lines,
@@ -150,8 +152,8 @@ class Unpacker:
         return {name: self._view(packed, b, name, limits[b]) for b, name in enumerate(packed.avs)}
 
     def _view(self, packed: Packed, b: int, name: str, limits: Floats) -> View:
-        own, law = packed.numbers[b, :11].tolist(), packed.numbers[b, 11:-1].tolist()
-        x, y, heading, target, change, limit, left, keep, right, conflict, time = own
+        own, law = packed.numbers[b, :12].tolist(), packed.numbers[b, 12:-1].tolist()
+        x, y, heading, target, change, limit, left, keep, right, conflict, time, latency = own
         state, signal_distance, signal, switch, stop, all_way, give_way, link, crossing, person = law
         lanes = packed.lanes[b]
         mask = np.ones(len(MetaAction), np.bool_)
@@ -174,6 +176,7 @@ class Unpacker:
             time=time,
             age=packed.age[b],
             source=packed.source[b],
+            decision_latency=latency,
             rules=RulesAhead(
                 *(chr(int(state)).strip("\0"), signal_distance, int(signal), switch, stop, bool(all_way)),
                 *(give_way, int(link), crossing, person, limits),

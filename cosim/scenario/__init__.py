@@ -1,5 +1,6 @@
 """What to simulate: a world by name or by its folder, or any user's .sumocfg, read into one `Scenario`."""
 
+import math
 import os
 import re
 from collections.abc import Collection, Mapping, Sequence
@@ -103,6 +104,14 @@ class Scenario:
     @property
     def ships(self) -> bool:
         return self.definition is not None and self.definition.parent.parent == sumo_scenarios.ROOT
+
+    @property
+    def decision_latency(self) -> float:
+        """s from a decision until its commands act, in whole simulation steps."""
+        if self.sensing is None:
+            return 0.0
+        step = self.timing.step
+        return round(math.ceil(self.sensing.parameters.decision_latency / step - 1e-6) * step, 9)
 
     def identity(self, policy: str, label: str | None, svo_deg: float, seed: int) -> Identity:
         """What an episode of it is called, driven by this policy."""

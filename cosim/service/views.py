@@ -25,6 +25,7 @@ def view(seen: View) -> dict[str, Any]:
     x, y, heading = seen.pose.tolist()
     return {
         "time": seen.time,
+        "decision_latency": seen.decision_latency,
         "x": x,
         "y": y,
         "heading": heading,

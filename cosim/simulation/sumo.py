@@ -1,7 +1,6 @@
 """Starts SUMO through libsumo and advances it one decision at a time: the only simulation of its process."""
 
 import contextlib
-import math
 import re
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -535,7 +534,7 @@ def _steps_late(scenario: Scenario) -> int:
     if latency > timing.decision + 1e-9:
         problem = f"must be at most the {timing.decision:g} s between decisions"
         raise BadInput(problem, field="--sensing.decision_latency", value=latency)
-    return math.ceil(latency / timing.step - 1e-6)
+    return round(scenario.decision_latency / timing.step)
 
 
 def _buildings(level: Parameters) -> list[Floats]:

@@ -11,11 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+import cosim
+from cosim.envs.gym import SumoEnv
 from cosim.errors import BadInput
 from cosim.host import Host
 from cosim.report.replay.packing import document
 from cosim.scenario import load
 from cosim.service.requests import RunRequest, flags
+from cosim.service.views import view
 from cosim.types import EpisodeResult, Kind, Preset, Snapshot, Source
 
 FLEET: dict[str, Any] = {"demand": "contested", "penetration": 0.4, "duration": 3.0}
@@ -53,6 +56,20 @@ def test_where_nobody_decides_by_it_sensing_changes_nothing_but_the_hash() -> No
     places = [driven(level, "keep-lane")[1] for level in (None, "harsh")]
     assert places[0].ids == places[1].ids
     assert places[0].x.tolist() == places[1].x.tolist()
+
+
+def test_an_agent_is_told_how_late_its_decisions_act() -> None:
+    for sensing, latency in (("v2v,decision_latency=0.25", 0.3), (None, 0.0)):
+        words: dict[str, Any] = {"sensing": sensing, "preset": Preset.UNGUARDED, "worker": False} | FLEET
+        with cosim.open("merge", seed=7, **words) as session:
+            seen = session.observe()
+            assert {v.decision_latency for v in seen.values()} == {latency}
+            assert {view(v)["decision_latency"] for v in seen.values()} == {latency}
+            seen = session.act({}).observations
+            assert {v.decision_latency for v in seen.values()} == {latency}
+        env = SumoEnv("merge", flatten="kinematics", **words)
+        assert env.reset(seed=7)[1]["decision_latency"] == latency
+        env.close()
 
 
 def test_a_replay_holds_what_each_av_believed_and_did_not_see() -> None:

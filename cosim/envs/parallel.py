@@ -188,5 +188,4 @@ class SumoParallelEnv(ParallelEnv):  # type: ignore[misc]
     def _info(self, agent: str) -> dict[str, Any]:
         seen = self._views.get(agent)
         mask = np.arange(len(MetaAction)) == MetaAction.IDLE if seen is None else seen.action_mask
-        latency = self._session.scenario.decision_latency
-        return {"action_mask": mask.astype(np.int8), "decision_latency": latency}
+        return {"action_mask": mask.astype(np.int8)}

@@ -69,7 +69,7 @@ def test_the_vehicle_is_its_own_and_the_driver_is_not(scenario: Scenario, tmp_pa
         kind = found[f"cosim.av.b/1{name}"]
         kept = {key: value for key, value in VEHICLE.items() if kind.get(key) == value}
         assert VEHICLE.items() - kept.items() <= ({("impatience", "0.3")} if name else set())
-        assert kind.get("carFollowModel") == "IDM"
+        assert kind.get("carFollowModel") == ("Krauss" if name else "IDM")
         assert not {"lcStrategic", "actionStepLength"} & set(kind.keys())
         assert float(kind.get("decel", "")) in (7.0, 2.8, 8.0)
         assert kind.get("imgFile") == str(tmp_path / "b.png")

@@ -130,7 +130,7 @@ class Lawful(Commander):
 
     def _hand_back(self, name: str) -> None:
         self._waves.blind(name, ())
-        self._waves.follow(name, ())
+        self._waves.ignore(name, ())
         self._driver.hand_back(name)
         self._forget(name)
 
@@ -142,7 +142,7 @@ class Lawful(Commander):
         """SUMO's driver heeds no vehicle at junctions that the AV does not know of, and follows none."""
         everybody, unseen = self._eyes.unseen(name)
         self._waves.blind(name, unseen)
-        self._waves.follow(name, everybody)
+        self._waves.ignore(name, everybody)
 
     def _forbidden(self, name: str, lane: str, offset: int) -> str | None:
         why = super()._forbidden(name, lane, offset)

@@ -2,9 +2,9 @@
 
 The AV keeps the safe speed of Krauss's model (Krauss, Wagner and Gawron, "Metastable states in a microscopic
 model of traffic flow", Physical Review E 55, 1997) with both braking alike, so that its gap is its headway;
-an IDM's grows without bound near the speed that it wants, and behind it jams begin. How much braking beyond
-the leader asks for is judged as in the multi-anticipative driver models (Treiber, Kesting and Helbing,
-"Delays, inaccuracies and anticipation in microscopic traffic models", Physica A 360, 2006).
+an IDM's grows without bound near the speed that it wants. How much braking beyond the leader asks for is
+judged as in the multi-anticipative driver models (Treiber, Kesting and Helbing, "Delays, inaccuracies and
+anticipation in microscopic traffic models", Physica A 360, 2006).
 """
 
 import math
@@ -35,7 +35,7 @@ class Leader(Rule):
         """The stricter of what the leader and what those beyond him ask for."""
         ahead = self._ahead(car)
         if self._eyes.ideal:  # else it follows nobody at all
-            self._waves.follow(car.name, [name for name, _ in ahead])
+            self._waves.ignore(car.name, [name for name, _ in ahead])
         if not ahead:
             return FREE
         follows = self._follow(car, *ahead[0])
@@ -47,15 +47,15 @@ class Leader(Rule):
         """The leader, with m to him, and those beyond him, with m up to them when all between stand; as far
         as the AV knows of them, and they are on its way: those on others SUMO's driver heeds."""
         get, name, room = sumo.vehicle, car.name, -car.stands
-        way: set[str] = set()
+        way = {car.lane.rpartition("_")[0]}
         found: list[tuple[str, float]] = []
         while len(found) <= BEYOND:
             ahead, gap = get.getLeader(name, REACH) or ("", 0.0)
             if not ahead or room + gap > REACH or not self._eyes.known(car.name, [ahead]):
                 break
             edge = get.getRoadID(ahead)
-            if edge != get.getRoadID(car.name):
-                way = way or _edges_ahead(car.name)
+            if edge not in way:
+                way |= _edges_ahead(car.name)
                 if edge not in way:
                     break
             # SUMO's gap is less by the follower's minGap

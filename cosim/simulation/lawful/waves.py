@@ -50,7 +50,7 @@ class Waves:
             if not foes:
                 del self._unseen[av]
 
-    def follow(self, av: str, leaders: Collection[str]) -> None:
+    def ignore(self, av: str, leaders: Collection[str]) -> None:
         """From now on the driver of `av` follows none of `leaders`: the AV does."""
         if av not in self._own_leaders:
             self._own_leaders[av] = sumo.vehicle.getParameter(av, LEADERS)

@@ -99,10 +99,9 @@ def page(runs: Sequence[Training], command: str, drawn: str = "") -> list[str]:
     """The Markdown page."""
     lines = ["# How learning went", "", f"Made by `{command}`.", ""]
     lines += [
-        f"Training drives: means over {WINDOW} iterations; they explore, those of an earlier recipe also",
-        "imitate a script (docs/reference/models.md). Validation: greedy, on validation seeds. Thin: a",
-        "training seed each; thick: their mean. In the table the mean over seeds, in brackets the lowest and",
-        "the highest.",
+        f"Training drives: means over {WINDOW} iterations; they explore.",
+        "Validation: greedy, on validation seeds. Thin: a training seed each; thick: their mean. In the",
+        "table the mean over seeds, in brackets the lowest and the highest.",
         "",
         *([f"![crashes, missions, distance over training]({drawn})", ""] if drawn else []),
         markdown_row(["agent", "seeds", "iterations", "drives", "figure", "first", "last"]),

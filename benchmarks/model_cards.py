@@ -48,9 +48,6 @@ LIMITS = {
     "law": "Knows no signal, no limit of a junction's lane, no pedestrian and no bicycle. In `unguarded` it "
     "drives through red lights.",
     "maps only": "Sees nothing but maps.",
-    "earlier recipe": "Made by an earlier recipe (commit f591cb8), which no command of this version repeats. "
-    "It imitated a scripted expert (`altruist-rule` and a cruise rule) beside learning from rewards, and "
-    "mostly chooses as that expert does. What rewards added is not measured. Its drivers made no errors.",
     "one seed": "One training from one seed, in preset `unguarded`, among drivers who made no errors. How "
     "much another seed differs is not measured.",
     "scenarios": "Learned from the shipped scenarios alone, with drivers who follow IDM and LC2013 or MOBIL "
@@ -114,7 +111,7 @@ def agent(name: str, card: Card) -> tuple[str, ...]:
         trained(card, folder, log),
         validated(card),
         ", ".join(pages(name)) or "none yet",
-        "; ".join(limits(name, card)),
+        "; ".join(limits(name)),
     )
 
 
@@ -129,8 +126,7 @@ def trained(card: Card, folder: Path, log: Sequence[Mapping[str, Any]]) -> str:
     """How the weights came about: command, iteration, updates, and the time that the whole training took."""
     chosen = card["measured"]["iteration"]
     config = f"[configuration]({LINK}/trainings/{folder.name}/config.yaml)"
-    if "commands" in card["data"]:
-        config = f"`{card['data']['commands']['train']}` (commit {card['data']['commit']}), {config}"
+    config = f"`{card['data']['commands']['train']}` (commit {card['data']['commit']}), {config}"
     updates = next(row["updates"] for row in log if row["iteration"] == chosen)
     hours = sum(row["iteration_s"] for row in log) / 3600
     return f"{config}, iteration {chosen} of {len(log)}, {updates:,} updates; {hours:.1f} h in all"
@@ -144,12 +140,12 @@ def validated(card: Card) -> str:
     return f"{drives} drives: {crashed:.0%} crashed, {admitted:.0%} of missions fulfilled"
 
 
-def limits(name: str, card: Card) -> Iterator[str]:
+def limits(name: str) -> Iterator[str]:
     """Names of `LIMITS` that hold for an agent."""
     yield "law"
     if not APPROACHES[name].kinematics:
         yield "maps only"
-    yield "one seed" if "commands" in card["data"] else "earlier recipe"
+    yield "one seed"
 
 
 def pages(name: str) -> Iterator[str]:

@@ -33,7 +33,7 @@ Line = Mapping[str, float]
 def commands() -> dict[str, str]:
     """The networks that a command of this version trains -> the command."""
     data = {name: read_card(SHIPPED / f"{name}.safetensors")["data"] for name in APPROACHES}
-    return {name: about["commands"]["train"] for name, about in data.items() if "commands" in about}
+    return {name: about["commands"]["train"] for name, about in data.items()}
 
 
 def differences(name: str, iterations: int) -> list[str]:

@@ -66,8 +66,8 @@ class Car(Controlled):
         self.inside = self.lane.startswith(":")
         place = get.getLanePosition(self.name)
         self.left = sumo.lane.getLength(self.lane) - place if self.lane else math.inf
-        # where SUMO's driver drives it is taken to go on as it did
-        goes_on = 2.0 * self.speed - self.before
+        # where SUMO's driver drives it is taken to go on as it did; once it stands it may start at any time
+        goes_on = max(2.0 * self.speed - self.before, 0.0)
         self.allowed = (get.getSpeedWithoutTraCI(self.name) if self.commanded else goes_on) + TOLERANCE
 
 

@@ -125,11 +125,11 @@ def sees(name: str, card: Card) -> str:
 def trained(card: Card, folder: Path, log: Sequence[Mapping[str, Any]]) -> str:
     """How the weights came about: command, iteration, updates, and the time that the whole training took."""
     chosen = card["measured"]["iteration"]
+    command = f"`{card['data']['commands']['train']}` (commit {card['data']['commit']})"
     config = f"[configuration]({LINK}/trainings/{folder.name}/config.yaml)"
-    config = f"`{card['data']['commands']['train']}` (commit {card['data']['commit']}), {config}"
     updates = next(row["updates"] for row in log if row["iteration"] == chosen)
     hours = sum(row["iteration_s"] for row in log) / 3600
-    return f"{config}, iteration {chosen} of {len(log)}, {updates:,} updates; {hours:.1f} h in all"
+    return f"{command}, {config}, iteration {chosen} of {len(log)}, {updates:,} updates; {hours:.1f} h in all"
 
 
 def validated(card: Card) -> str:

@@ -6,6 +6,7 @@ that a vehicle believed 3 m too far back stays so far back until the next frame.
 
 import math
 from collections.abc import Iterable
+from itertools import compress
 from typing import Any
 
 from cosim.road import RoadMap
@@ -21,11 +22,15 @@ class Eyes:
     def __init__(self, road: RoadMap) -> None:
         self._road = road
         self._truth: Snapshot | None = None
+        self._vehicles: list[str] = []  # on the road, where sensing is not ideal
         self._views: dict[str, View] = {}
 
     def open(self, snapshot: Snapshot) -> None:
         """A new frame, with percepts unless sensing is ideal."""
         self._truth = snapshot
+        if not self.ideal:
+            vehicles = (snapshot.kind != int(Kind.PERSON)).tolist()
+            self._vehicles = list(compress(snapshot.ids, vehicles))
         self._views.clear()
 
     @property
@@ -64,13 +69,12 @@ class Eyes:
         view = self._view(av)
         return view is None or av == other or other in view.percept.hears
 
-    def unseen(self, av: str) -> tuple[list[str], list[str]]:
-        """All vehicles on the road but `av`, and those of them that it does not know of."""
-        view, truth = self._view(av), self._truth
-        if view is None or truth is None:
-            return [], []
-        others = [n for n, kind in zip(truth.ids, truth.kind, strict=True) if kind != Kind.PERSON and n != av]
-        return others, [name for name in others if name not in view.rows]
+    def unseen(self, av: str) -> list[str]:
+        """The vehicles on the road that `av` does not know of."""
+        view = self._view(av)
+        if view is None:
+            return []
+        return [name for name in self._vehicles if name not in view.rows and name != av]
 
     def _view(self, av: str) -> "View | None":
         truth = self._truth

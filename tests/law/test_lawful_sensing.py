@@ -12,7 +12,13 @@ from cosim.types import Command, Preset
 
 
 class Stopping(SumoSimulator):
-    """One human may be made to brake hard."""
+    """One human may be made to brake hard, or to change lanes."""
+
+    def change(self, name: str) -> None:
+        libsumo.vehicle.setSpeedMode(name, 0)
+        libsumo.vehicle.setSpeed(name, 0.5)
+        libsumo.vehicle.setLaneChangeMode(name, 0)
+        libsumo.vehicle.changeLane(name, 1, 10.0)
 
     def brake(self, name: str) -> None:
         libsumo.vehicle.setSpeedMode(name, 0)
@@ -55,6 +61,20 @@ def test_it_stops_for_one_that_stands_if_it_knows_of_it(start: Start, sensing: s
     worker.call("brake", "ahead")
     found = False
     for _ in range(30):
+        frames = worker.call("advance", [Command("av", 20.0, 0, 0.4)])[1]
+        found = found or any(c.collider_is_av for frame in frames for c in frame.events.collisions)
+    assert found is hits
+
+
+@pytest.mark.parametrize(
+    ("sensing", "hits"), [("ideal", False), ("ideal,range=120", False), ("ideal,range=2", True)]
+)
+def test_it_brakes_for_one_that_is_coming_onto_its_lane(start: Start, sensing: str, hits: bool) -> None:
+    pair = [vehicle("slow", "hv", 120.0, speed=0.1), vehicle("av", "av", 100.0, lane=1, speed=10.0)]
+    worker = start(pair, simulator=Stopping, preset=Preset.LAWFUL, sensing=read(sensing))
+    worker.call("change", "slow")
+    found = False
+    for _ in range(8):
         frames = worker.call("advance", [Command("av", 20.0, 0, 0.4)])[1]
         found = found or any(c.collider_is_av for frame in frames for c in frame.events.collisions)
     assert found is hits

@@ -139,10 +139,8 @@ class Lawful(Commander):
             rule.drop(name)
 
     def _blind(self, name: str) -> None:
-        """SUMO's driver heeds no vehicle at junctions that the AV does not know of, and follows none."""
-        everybody, unseen = self._eyes.unseen(name)
-        self._waves.blind(name, unseen)
-        self._waves.ignore(name, everybody)
+        """SUMO's driver heeds no vehicle that the AV does not know of."""
+        self._waves.blind(name, self._eyes.unseen(name))
 
     def _forbidden(self, name: str, lane: str, offset: int) -> str | None:
         why = super()._forbidden(name, lane, offset)

@@ -34,8 +34,7 @@ class Leader(Rule):
     def limit(self, car: Car) -> Limit:
         """The stricter of what the leader and what those beyond him ask for."""
         ahead = self._ahead(car)
-        if self._eyes.ideal:  # else it follows nobody at all
-            self._waves.ignore(car.name, [name for name, _ in ahead])
+        self._waves.ignore(car.name, [name for name, _ in ahead])
         if not ahead:
             return FREE
         follows = self._follow(car, *ahead[0])
@@ -51,7 +50,7 @@ class Leader(Rule):
         found: list[tuple[str, float]] = []
         while len(found) <= BEYOND:
             ahead, gap = get.getLeader(name, REACH) or ("", 0.0)
-            if not ahead or room + gap > REACH or not self._eyes.known(car.name, [ahead]):
+            if not ahead or room + gap > REACH:
                 break
             edge = get.getRoadID(ahead)
             if edge not in way:
@@ -60,7 +59,10 @@ class Leader(Rule):
                     break
             # SUMO's gap is less by the follower's minGap
             room += gap + get.getMinGap(name) - (SPACE if found else 0.0)
-            found.append((ahead, room))
+            if self._eyes.known(car.name, [ahead]):
+                found.append((ahead, room))
+            elif not found:  # who is not known of leaves his place to the one ahead of him
+                room += get.getLength(ahead)
             name = ahead
         return found
 

@@ -21,7 +21,7 @@ class Waves:
     def __init__(self) -> None:
         self._by: dict[str, frozenset[str]] = {}  # AV -> the vehicles that it waves through
         self._for: dict[str, frozenset[str]] = {}  # AV -> itself and those who cannot come past it
-        self._unseen: dict[str, frozenset[str]] = {}  # AV -> the vehicles that it does not know of
+        self._unseen: dict[str, tuple[str, ...]] = {}  # AV -> the vehicles that it does not know of
         self._own_leaders: dict[str, str] = {}  # AV -> the leaders that its file lets it ignore
         self._leaders: dict[str, str] = {}  # AV -> those that it ignores now
         self._own: dict[str, list[str]] = {}  # waved vehicle -> the foes that its file lets it ignore
@@ -42,19 +42,19 @@ class Waves:
         for vehicle in before | vehicles:
             self._tell(vehicle)
 
-    def blind(self, av: str, foes: Collection[str]) -> None:
-        """From now on the driver of `av` heeds none of `foes` at junctions."""
-        if foes or av in self._unseen:
-            self._unseen[av] = frozenset(foes)
+    def blind(self, av: str, unseen: Collection[str]) -> None:
+        """From now on the driver of `av` heeds none of these: the AV does not know of them."""
+        if unseen or av in self._unseen:
+            self._unseen[av] = tuple(unseen)
             self._tell(av)
-            if not foes:
+            if not unseen:
                 del self._unseen[av]
 
     def ignore(self, av: str, leaders: Collection[str]) -> None:
-        """From now on the driver of `av` follows none of `leaders`: the AV does."""
+        """From now on the driver of `av` follows none of `leaders`: the AV does. Nor the unknown."""
         if av not in self._own_leaders:
             self._own_leaders[av] = sumo.vehicle.getParameter(av, LEADERS)
-        ignored = " ".join([self._own_leaders[av], *leaders]).strip()
+        ignored = " ".join([self._own_leaders[av], *self._unseen.get(av, ()), *leaders]).strip()
         if ignored != self._leaders.get(av, self._own_leaders[av]):
             self._leaders[av] = ignored
             sumo.vehicle.setParameter(av, LEADERS, ignored)
@@ -67,7 +67,7 @@ class Waves:
     def _tell(self, vehicle: str) -> None:
         get = sumo.vehicle
         waving = {foe for av, vehicles in self._by.items() if vehicle in vehicles for foe in self._for[av]}
-        foes = sorted(waving | self._unseen.get(vehicle, NOBODY))
+        foes = sorted(waving.union(self._unseen.get(vehicle, ())))
         try:
             own = self._own.setdefault(vehicle, get.getParameter(vehicle, IGNORES).split())
             get.setParameter(vehicle, IGNORES, " ".join([*own, *foes]))

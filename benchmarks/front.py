@@ -1,0 +1,255 @@
+"""What each habit of the lawful car costs everybody in delay, and buys in safety.
+
+    python -m benchmarks.front [--seeds A:B] [--roads NAME ...] [--habits NAME ...] [--workers N] [--again]
+
+Each habit is taken away, or one of its constants is changed, on the same drives; beside them stand the
+drivers that SUMO itself offers. Delay is that of errors `field`, collisions are those of `stress`. Rows are
+kept in docs/results/data/front.csv; the page and its picture are made of them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import importlib
+import math
+import multiprocessing
+import sys
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import fmean
+from typing import Any, NamedTuple, get_type_hints
+
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+
+from benchmarks.tables import markdown_row, write_page
+from cosim.batch.episode_runner import EpisodeRunner
+from cosim.files import write_csv
+from cosim.report.statistics import Figure as Rate
+from cosim.report.statistics import pooled_rate
+from cosim.scenario.options import EpisodeOptions
+from cosim.seeding import TUNING_SEEDS
+
+RESULTS = Path("docs/results")
+PAGE, PICTURE, DATA = "front.md", "front.svg", "data/front.csv"
+ROADS = ("lane_drop", "on_ramp")
+DELAY, SAFETY = ERRORS = ("field", "stress")
+RULES = "cosim.simulation.lawful"
+CAR = "the car"
+PER = 1000.0  # AV-km, in which collisions are counted
+NEVER = math.inf
+
+
+@dataclass(frozen=True)
+class Habit:
+    """One way to drive the AVs: the car with constants changed (`module.NAME`), or other options."""
+
+    constants: dict[str, object] = field(default_factory=dict)
+    options: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def is_car(self) -> bool:
+        """Whether the lawful car drives."""
+        return "policy" not in self.options
+
+
+HABITS = {
+    CAR: Habit(),
+    "headway 0.6 s": Habit({"follower.HEADWAY": 0.6}),
+    "headway 1.2 s": Habit({"follower.HEADWAY": 1.2}),
+    "headway 1.8 s": Habit({"follower.HEADWAY": 1.8}),
+    "no early braking": Habit({"leader.BEYOND": 0}),
+    "no room for who closes in": Habit({"follower.ASKED": (NEVER, NEVER)}),
+    "no more space before a human": Habit({"follower.STANDS": (2.0, 2.0)}),
+    "no courtesy (phi 0)": Habit(options={"svo_deg": 0.0}),
+    "`idm`": Habit(options={"policy": "idm"}),
+    "`idm-courteous`": Habit(options={"policy": "idm-courteous"}),
+    "no AVs": Habit(options={"policy": "idm", "penetration": 0.0}),
+}
+
+
+class Drive(NamedTuple):
+    """A row of the CSV."""
+
+    habit: str
+    road: str
+    errors: str
+    seed: int
+    total_delay_s: float
+    av_involved_collisions: int
+    av_caused_collisions: int
+    av_km: float
+    hard_brakings_av: int
+
+
+Key = tuple[str, str, str, int]
+
+
+def drive(key: Key) -> Drive:
+    """One episode; in a process of its own, whose constants are changed."""
+    name, road, errors, seed = key
+    habit = HABITS[name]
+    for constant, value in habit.constants.items():
+        module, _, constant_name = constant.partition(".")
+        rules = importlib.import_module(f"{RULES}.{module}")
+        getattr(rules, constant_name)  # a constant that is no more is an error
+        setattr(rules, constant_name, value)
+    options: dict[str, Any] = {
+        **{"policy": "car-alone", "penetration": 0.2, "behavior": "moderate", "demand": ("over",)},
+        **habit.options,
+    }
+    case = EpisodeOptions(what=f"open/{road}", seed=seed, errors=errors, **options)
+    row = EpisodeRunner().run(case, (), None, lambda *_, **__: None)
+    return Drive(*key, **{column: row[column] for column in Drive._fields[len(key) :]})
+
+
+def measure(rows: list[Drive], wanted: Sequence[Key], workers: int, data: Path) -> None:
+    """Drive what `rows` lack; they are kept in `data` after every drive."""
+    there = {row[:4] for row in rows}
+    missing = [key for key in wanted if key not in there]
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, spawn, max_tasks_per_child=1) as pool:
+        for number, done in enumerate(as_completed([pool.submit(drive, key) for key in missing])):
+            rows.append(done.result())
+            rows.sort(key=lambda row: (list(HABITS).index(row.habit), *row[1:4]))
+            data.parent.mkdir(parents=True, exist_ok=True)
+            write_csv(data, [row._asdict() for row in rows])
+            print(f"front {number + 1}/{len(missing)}: {rows[-1][:4]}", file=sys.stderr, flush=True)
+
+
+def read(file: Path) -> list[Drive]:
+    """The rows of an earlier call; none where there is no file."""
+    if not file.is_file():
+        return []
+    kinds = get_type_hints(Drive)
+    with file.open(encoding="utf-8", newline="") as lines:
+        return [Drive(**{k: kinds[k](v) for k, v in row.items()}) for row in csv.DictReader(lines)]
+
+
+class Point(NamedTuple):
+    """What one habit came to."""
+
+    habit: str
+    delays: tuple[float, ...]  # s, of everybody, by road, errors `field`
+    hit: Rate  # collisions that an AV was in, in `PER` AV-km, errors `stress`
+    caused: int
+    brakings: float  # hard ones of AVs in an AV-km, errors `field`
+
+    @property
+    def delay(self) -> float:
+        """s, the mean of the roads."""
+        return fmean(self.delays)
+
+
+def points(rows: Sequence[Drive]) -> Iterator[Point]:
+    """Habit by habit, those driven on every road under both errors."""
+    roads = list(dict.fromkeys(row.road for row in rows))
+    for habit in HABITS:
+        calm, stress = ([row for row in rows if (row.habit, row.errors) == (habit, e)] for e in ERRORS)
+        late = [[row.total_delay_s for row in calm if row.road == road] for road in roads]
+        if not all(late) or not stress:
+            continue
+        hits, km = ([getattr(row, c) for row in stress] for c in ("av_involved_collisions", "av_km"))
+        hit = pooled_rate(hits, [one / PER for one in km]) if any(km) else Rate(*[math.nan] * 3)
+        driven = sum(row.av_km for row in calm)
+        brakings = sum(row.hard_brakings_av for row in calm) / driven if driven else math.nan
+        caused = sum(row.av_caused_collisions for row in stress)
+        yield Point(habit, tuple(map(fmean, late)), hit, caused, brakings)
+
+
+# ---- what is written ----
+
+
+def page(rows: Sequence[Drive]) -> list[str]:
+    """The page."""
+    roads, seeds = dict.fromkeys(row.road for row in rows), sorted({row.seed for row in rows})
+    columns = [*(f"`open/{road}`, s" for road in roads), "collisions", "caused by AVs", "hard brakings"]
+    found = list(points(rows))
+    table = [["", *columns], *([one.habit, *_cells(one)] for one in found)]
+    lines = [markdown_row(line) for line in table]
+    return WORDS.format(
+        table="\n".join([lines[0], "|---" * (len(columns) + 1) + "|", *lines[1:]]),
+        picture=PICTURE,
+        seeds=f"{seeds[0]} to {seeds[-1]}",
+        n=len(seeds),
+        data=DATA,
+    ).splitlines()
+
+
+def _cells(one: Point) -> list[str]:
+    delays = [f"{delay:.1f}" for delay in one.delays]
+    if math.isnan(one.hit.value):
+        return [*delays, "", "", ""]
+    hit = f"{one.hit.value:.0f} ({one.hit.low:.0f} to {one.hit.high:.0f})"
+    return [*delays, hit, str(one.caused), f"{one.brakings:.2f}"]
+
+
+def picture(rows: Sequence[Drive], file: Path) -> None:
+    """Delay against collisions, a point a habit."""
+    figure = Figure(figsize=(7.0, 4.4), layout="constrained")
+    axes = figure.subplots()
+    for one in points(rows):
+        if math.isnan(one.hit.value):
+            axes.axvline(one.delay, color="0.6", linestyle=":")
+            axes.text(one.delay, 0.0, " no AVs", fontsize=8, color="0.4", va="bottom")
+            continue
+        below, above = one.hit.value - one.hit.low, one.hit.high - one.hit.value
+        mark = "o" if HABITS[one.habit].is_car else "s"
+        colour = "C3" if one.habit == CAR else "C0" if mark == "o" else "0.5"
+        axes.errorbar(one.delay, one.hit.value, [[below], [above]], fmt=mark, color=colour, elinewidth=0.6)
+        axes.annotate(one.habit.strip("`"), (one.delay, one.hit.value), (4, 4), textcoords="offset points")
+    axes.set_ylim(bottom=0.0)
+    axes.set_xlabel("mean delay of everybody, s")
+    axes.set_ylabel("collisions with an AV in 1,000 AV-km")
+    for text in axes.texts:
+        text.set_fontsize(8)
+    with rc_context({"svg.hashsalt": "front", "svg.fonttype": "none"}):
+        figure.savefig(file, metadata={"Date": None})
+
+
+WORDS = """# The lawful car: what each habit costs and buys
+
+Each row takes one habit of the car away, or changes one of its constants, on the same drives. Delay
+is everybody's, under the driver errors `field`. Collisions are those with an AV in 1,000 AV-km, under
+`stress`, with 95 % intervals. Hard brakings are those of AVs in an AV-km, under `field`.
+
+{table}
+
+![Delay against collisions]({picture})
+
+## Conditions
+
+Demand `over`, drivers `moderate`, 20 % AVs that always ask for more speed, sensing `ideal`. Validation
+seeds {seeds} ({n} of each); each delay is a mean over them. One seed scatters by a third, so that small
+differences of delay say nothing. Rows: [{data}]({data}). To go on: `python -m benchmarks.front`, with
+more seeds: `--seeds A:B`.
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure what is missing, keep, write."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    first = TUNING_SEEDS.start
+    parser.add_argument("--seeds", default=f"{first + 20}:{first + 24}", metavar="A:B")
+    parser.add_argument("--roads", nargs="*", default=ROADS, metavar="NAME")
+    parser.add_argument("--habits", nargs="*", default=[*HABITS], choices=[*HABITS], metavar="NAME")
+    parser.add_argument("--workers", type=int, default=2, metavar="N")
+    parser.add_argument("--again", action="store_true", help="also what is measured")
+    parser.add_argument("--out", type=Path, default=RESULTS, metavar="FOLDER")
+    args = parser.parse_args(arguments)
+    data, seeds = args.out / DATA, range(*map(int, args.seeds.split(":")))
+    rows = [] if args.again else read(data)
+    wanted = [(h, r, e, s) for s in seeds for e in ERRORS for r in args.roads for h in args.habits]
+    measure(rows, wanted, args.workers, data)
+    picture(rows, args.out / PICTURE)
+    write_page(args.out / PAGE, page(rows))
+    print(args.out / PAGE)
+
+
+if __name__ == "__main__":
+    main()

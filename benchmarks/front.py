@@ -1,6 +1,7 @@
 """What each habit of the lawful car costs everybody in delay, and buys in safety.
 
-    python -m benchmarks.front [--seeds A:B] [--roads NAME ...] [--habits NAME ...] [--workers N] [--again]
+    python -m benchmarks.front [--seeds A:B] [--roads NAME ...] [--habits NAME ...] [--duration S]
+                               [--workers N] [--again] [--out docs/results]
 
 Each habit is taken away, or one of its constants is changed, on the same drives; beside them stand the
 drivers that SUMO itself offers. Delay is that of errors `field`, collisions are those of `stress`. Rows are
@@ -88,8 +89,8 @@ class Drive(NamedTuple):
 Key = tuple[str, str, str, int]
 
 
-def drive(key: Key) -> Drive:
-    """One episode; in a process of its own, whose constants are changed."""
+def drive(key: Key, duration: float | None) -> Drive:
+    """One episode; in a process of its own, whose constants are changed. `duration`: s; None: to its end."""
     name, road, errors, seed = key
     habit = HABITS[name]
     for constant, value in habit.constants.items():
@@ -100,19 +101,22 @@ def drive(key: Key) -> Drive:
     options: dict[str, Any] = {
         **{"policy": "car-alone", "penetration": 0.2, "behavior": "moderate", "demand": ("over",)},
         **habit.options,
+        **{"what": f"open/{road}", "errors": errors, "seed": seed, "duration": duration},
     }
-    case = EpisodeOptions(what=f"open/{road}", seed=seed, errors=errors, **options)
+    case = EpisodeOptions(**options)
     row = EpisodeRunner().run(case, (), None, lambda *_, **__: None)
     return Drive(*key, **{column: row[column] for column in Drive._fields[len(key) :]})
 
 
-def measure(rows: list[Drive], wanted: Sequence[Key], workers: int, data: Path) -> None:
+def measure(
+    rows: list[Drive], wanted: Sequence[Key], duration: float | None, workers: int, data: Path
+) -> None:
     """Drive what `rows` lack; they are kept in `data` after every drive."""
     there = {row[:4] for row in rows}
     missing = [key for key in wanted if key not in there]
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, spawn, max_tasks_per_child=1) as pool:
-        for number, done in enumerate(as_completed([pool.submit(drive, key) for key in missing])):
+        for number, done in enumerate(as_completed([pool.submit(drive, key, duration) for key in missing])):
             rows.append(done.result())
             rows.sort(key=lambda row: (list(HABITS).index(row.habit), *row[1:4]))
             data.parent.mkdir(parents=True, exist_ok=True)
@@ -238,6 +242,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seeds", default=f"{first + 20}:{first + 24}", metavar="A:B")
     parser.add_argument("--roads", nargs="*", default=ROADS, metavar="NAME")
     parser.add_argument("--habits", nargs="*", default=[*HABITS], choices=[*HABITS], metavar="NAME")
+    parser.add_argument("--duration", type=float, metavar="S", help="of a drive; default: to its end")
     parser.add_argument("--workers", type=int, default=2, metavar="N")
     parser.add_argument("--again", action="store_true", help="also what is measured")
     parser.add_argument("--out", type=Path, default=RESULTS, metavar="FOLDER")
@@ -245,7 +250,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     data, seeds = args.out / DATA, range(*map(int, args.seeds.split(":")))
     rows = [] if args.again else read(data)
     wanted = [(h, r, e, s) for s in seeds for e in ERRORS for r in args.roads for h in args.habits]
-    measure(rows, wanted, args.workers, data)
+    measure(rows, wanted, args.duration, args.workers, data)
     picture(rows, args.out / PICTURE)
     write_page(args.out / PAGE, page(rows))
     print(args.out / PAGE)

@@ -150,8 +150,15 @@ def capacity(place: Place) -> list[list[str]]:
     return [["benchmarks.capacity", *few, "--out", str(place.out)]]
 
 
+def front(place: Place) -> list[list[str]]:
+    """What each habit of the lawful car costs and buys."""
+    few = ["--roads", "lane_drop", "--seeds", "100000:100001", "--duration", "30"] if place.small else []
+    return [["benchmarks.front", *few, "--out", str(place.out)]]
+
+
 PAGES = (
     Page("capacity", capacity, ("capacity.md", "capacity.svg", "data/capacity.csv")),
+    Page("front", front, ("front.md", "front.svg", "data/front.csv")),
     Page("law", law, ("law.md",)),
     Page("agent", agent, ("agent.md",)),
     Page("prediction_speed", prediction_speed, ("prediction_speed.md",)),

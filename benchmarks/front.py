@@ -11,27 +11,20 @@ kept in docs/results/data/front.csv; the page and its picture are made of them.
 from __future__ import annotations
 
 import argparse
-import csv
-import importlib
 import math
-import multiprocessing
-import sys
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import fmean
-from typing import Any, NamedTuple, get_type_hints
+from typing import Any, NamedTuple
 
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
+from benchmarks.drives import Case, measure
 from benchmarks.tables import markdown_row, write_page
-from cosim.batch.episode_runner import EpisodeRunner
-from cosim.files import write_csv
 from cosim.report.statistics import Figure as Rate
 from cosim.report.statistics import pooled_rate
-from cosim.scenario.options import EpisodeOptions
 from cosim.seeding import TUNING_SEEDS
 
 RESULTS = Path("docs/results")
@@ -86,51 +79,15 @@ class Drive(NamedTuple):
     hard_brakings_av: int
 
 
-Key = tuple[str, str, str, int]
-
-
-def drive(key: Key, duration: float | None) -> Drive:
-    """One episode; in a process of its own, whose constants are changed. `duration`: s; None: to its end."""
-    name, road, errors, seed = key
-    habit = HABITS[name]
-    for constant, value in habit.constants.items():
-        module, _, constant_name = constant.partition(".")
-        rules = importlib.import_module(f"{RULES}.{module}")
-        getattr(rules, constant_name)  # a constant that is no more is an error
-        setattr(rules, constant_name, value)
+def case(habit: str, road: str, errors: str, seed: int, duration: float | None) -> Case:
+    """One episode; `duration`: s, None: to its end."""
     options: dict[str, Any] = {
         **{"policy": "car-alone", "penetration": 0.2, "behavior": "moderate", "demand": ("over",)},
-        **habit.options,
+        **HABITS[habit].options,
         **{"what": f"open/{road}", "errors": errors, "seed": seed, "duration": duration},
     }
-    case = EpisodeOptions(**options)
-    row = EpisodeRunner().run(case, (), None, lambda *_, **__: None)
-    return Drive(*key, **{column: row[column] for column in Drive._fields[len(key) :]})
-
-
-def measure(
-    rows: list[Drive], wanted: Sequence[Key], duration: float | None, workers: int, data: Path
-) -> None:
-    """Drive what `rows` lack; they are kept in `data` after every drive."""
-    there = {row[:4] for row in rows}
-    missing = [key for key in wanted if key not in there]
-    spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, spawn, max_tasks_per_child=1) as pool:
-        for number, done in enumerate(as_completed([pool.submit(drive, key, duration) for key in missing])):
-            rows.append(done.result())
-            rows.sort(key=lambda row: (list(HABITS).index(row.habit), *row[1:4]))
-            data.parent.mkdir(parents=True, exist_ok=True)
-            write_csv(data, [row._asdict() for row in rows])
-            print(f"front {number + 1}/{len(missing)}: {rows[-1][:4]}", file=sys.stderr, flush=True)
-
-
-def read(file: Path) -> list[Drive]:
-    """The rows of an earlier call; none where there is no file."""
-    if not file.is_file():
-        return []
-    kinds = get_type_hints(Drive)
-    with file.open(encoding="utf-8", newline="") as lines:
-        return [Drive(**{k: kinds[k](v) for k, v in row.items()}) for row in csv.DictReader(lines)]
+    constants = {f"{RULES}.{name}": value for name, value in HABITS[habit].constants.items()}
+    return Case((habit, road, errors, seed), options, constants)
 
 
 class Point(NamedTuple):
@@ -248,9 +205,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=RESULTS, metavar="FOLDER")
     args = parser.parse_args(arguments)
     data, seeds = args.out / DATA, range(*map(int, args.seeds.split(":")))
-    rows = [] if args.again else read(data)
-    wanted = [(h, r, e, s) for s in seeds for e in ERRORS for r in args.roads for h in args.habits]
-    measure(rows, wanted, args.duration, args.workers, data)
+    cases = [
+        case(habit, road, errors, seed, args.duration)
+        for seed in seeds
+        for errors in ERRORS
+        for road in args.roads
+        for habit in args.habits
+    ]
+    rows = measure(Drive, cases, args.workers, data, args.again)
     picture(rows, args.out / PICTURE)
     write_page(args.out / PAGE, page(rows))
     print(args.out / PAGE)

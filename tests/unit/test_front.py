@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import front
+from benchmarks import drives, front
 
 
 def row(habit: str, road: str, errors: str, seed: int, delay: float, hits: int) -> front.Drive:
@@ -34,7 +34,7 @@ def test_delays_are_of_errors_field_and_collisions_of_stress(tmp_path: Path) -> 
     assert point.hit.value == pytest.approx(16 / 2.0)
     assert point.hit.low < 8.0 < point.hit.high
     assert (point.caused, point.brakings) == (8, pytest.approx(0.2))
-    front.write_csv(tmp_path / "rows.csv", [one._asdict() for one in rows])
-    assert front.read(tmp_path / "rows.csv") == rows
+    drives.write(tmp_path / "rows.csv", front.Drive._fields, rows)
+    assert drives.read(front.Drive, tmp_path / "rows.csv") == rows
     front.picture(rows, tmp_path / "front.svg")
     assert "| the car | 31.5 | 51.5 | 8 (" in "\n".join(front.page(rows))

@@ -1,0 +1,83 @@
+"""Episodes of one benchmark, each in a process of its own: driven once, kept as rows of a CSV file."""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import multiprocessing
+import sys
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar, get_type_hints
+
+from cosim.batch.episode_runner import EpisodeRunner
+from cosim.files import write_csv
+from cosim.scenario.options import EpisodeOptions
+
+Row = TypeVar(
+    "Row", bound=tuple[Any, ...]
+)  # a NamedTuple: the key of its case, then columns of an episode's row
+
+
+class Case(NamedTuple):
+    """One episode that is wanted."""
+
+    key: tuple[Any, ...]  # the first columns of its row
+    options: Mapping[str, Any]  # of `EpisodeOptions`
+    constants: Mapping[str, object] = {}  # `package.module.NAME` -> what it is instead
+
+
+def drive(case: Case, columns: Sequence[str]) -> tuple[Any, ...]:
+    """The episode's values of these columns; in a process of its own, whose constants are changed.
+
+    Raises AttributeError for a constant that its module does not have.
+    """
+    for place, value in case.constants.items():
+        module, _, name = place.rpartition(".")
+        rules = importlib.import_module(module)
+        getattr(rules, name)
+        setattr(rules, name, value)
+    row = EpisodeRunner().run(EpisodeOptions(**case.options), (), None, lambda *_, **__: None)
+    return tuple(row[column] for column in columns)
+
+
+def measure(kind: type[Row], cases: Sequence[Case], workers: int, file: Path, again: bool) -> list[Row]:
+    """All rows of `file`, in the order of the cases, after those that it lacks have been driven.
+
+    Args:
+        kind: a NamedTuple of the row.
+        workers: processes at a time.
+        file: written after every episode.
+        again: drive every case, also those in `file`.
+    """
+    fields = get_type_hints(kind)
+    rows = [] if again else read(kind, file)
+    size = len(cases[0].key)
+    there = {row[:size] for row in rows}
+    missing = [case for case in cases if case.key not in there]
+    place = {case.key: number for number, case in enumerate(cases)}
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, spawn, max_tasks_per_child=1) as pool:
+        running = {pool.submit(drive, case, [*fields][size:]): case for case in missing}
+        for number, done in enumerate(as_completed(running), 1):
+            rows.append(kind(*running[done].key, *done.result()))
+            rows.sort(key=lambda row: place.get(row[:size], -1))
+            write(file, fields, rows)
+            print(f"{file.stem} {number}/{len(missing)}: {running[done].key}", file=sys.stderr, flush=True)
+    return rows
+
+
+def read(kind: type[Row], file: Path) -> list[Row]:
+    """The rows of a CSV file; none where there is no file."""
+    if not file.is_file():
+        return []
+    types = get_type_hints(kind)
+    with file.open(encoding="utf-8", newline="") as lines:
+        return [kind(*(types[k](v) for k, v in row.items())) for row in csv.DictReader(lines)]
+
+
+def write(file: Path, columns: Sequence[str] | Mapping[str, Any], rows: Sequence[tuple[Any, ...]]) -> None:
+    """Keep the rows."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    write_csv(file, [dict(zip(columns, row, strict=True)) for row in rows])

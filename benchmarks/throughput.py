@@ -1,0 +1,133 @@
+"""Do AVs choke networks that others made? Arrivals beside the same traffic without AVs.
+
+    python -m benchmarks.throughput [--seeds A:B] [--nets NAME ...] [--config FILE.sumocfg ...]
+                                    [--duration S] [--workers N] [--again] [--out docs/results]
+
+Drives A10KW, a motorway interchange, on every seed and the other games of the eclipse-sumo package on the
+first; `--config` drives a network of your own instead. Rows are kept in docs/results/data/throughput.csv; the
+page is made of them. Needs `pip install cosim-sumo[tools]`.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from benchmarks.drives import Case, measure
+from benchmarks.real_nets import a10kw
+from benchmarks.tables import markdown_row, write_page
+from cosim.report.statistics import paired_change
+
+RESULTS = Path("docs/results")
+PAGE, DATA = "throughput.md", "data/throughput.csv"
+NETS = ("A10KW", "corridor", "cross_demo", "fokr_bs_demo", "grid6", "ramp", "square")  # those with >= 18 AVs
+FIRST, SEEDS = 300_000, 10
+LONGEST = 900.0  # s of each drive
+NONE, CAR = "no AVs", "the lawful car"
+SHARE = 0.2
+DRIVERS: dict[str, dict[str, Any]] = {
+    NONE: {"policy": "idm", "penetration": 0.0},
+    "`idm`": {"policy": "idm", "penetration": SHARE},
+    "`idm-courteous`": {"policy": "idm-courteous", "penetration": SHARE},
+    CAR: {"policy": "car-alone", "penetration": SHARE, "svo_deg": 45.0},
+}
+
+
+class Drive(NamedTuple):
+    """A row of the CSV."""
+
+    network: str
+    driver: str
+    seed: int
+    arrivals: int
+    total_delay_s: float
+    avs_stuck: int
+    av_involved_collisions: int
+    av_caused_collisions: int
+
+
+def cases(configs: Sequence[Path], seeds: range, every: bool, duration: float) -> Iterator[Case]:
+    """Every episode that is wanted; `every`: all networks on every seed, else A10KW alone."""
+    for config in configs:
+        for seed in seeds if every or config.stem == "A10KW" else seeds[:1]:
+            for driver, options in DRIVERS.items():
+                wanted = {"what": str(config), "seed": seed, "duration": duration, **options}
+                yield Case((config.stem, driver, seed), wanted)
+
+
+def page(rows: Sequence[Drive]) -> list[str]:
+    """The page."""
+    others = [driver for driver in DRIVERS if driver != NONE]
+    columns = ["network", "seeds", "arrivals without AVs", *others, f"{CAR}: AVs stuck", "collisions, caused"]
+    lines = [markdown_row(columns), "|---" * len(columns) + "|"]
+    for network in dict.fromkeys(row.network for row in rows):
+        of = {(row.driver, row.seed): row for row in rows if row.network == network}
+        seeds = [seed for driver, seed in of if driver == NONE and all((d, seed) in of for d in DRIVERS)]
+        if not seeds:
+            continue
+        arrived = {driver: [of[driver, seed].arrivals for seed in seeds] for driver in DRIVERS}
+        cars = [of[CAR, seed] for seed in seeds]
+        hits, caused = (
+            sum(getattr(row, f"av_{c}_collisions") for row in cars) for c in ("involved", "caused")
+        )
+        lines.append(
+            markdown_row(
+                [
+                    *(network, str(len(seeds)), f"{sum(arrived[NONE]) / len(seeds):,.0f}"),
+                    *(_change(arrived[NONE], arrived[driver]) for driver in others),
+                    *(str(sum(row.avs_stuck for row in cars)), f"{hits}, {caused}"),
+                ]
+            )
+        )
+    return WORDS.format(table="\n".join(lines), longest=LONGEST, data=DATA).splitlines()
+
+
+def _change(before: Sequence[float], after: Sequence[float]) -> str:
+    """`-1.2 % (-2.0 to -0.4)`; no interval of fewer than five pairs."""
+    if not any(before):
+        return ""
+    found = paired_change(before, after)
+    bounds = f" ({100.0 * found.low:+.1f} to {100.0 * found.high:+.1f})" if len(before) >= 5 else ""
+    return f"{100.0 * found.value:+.1f} %{bounds}"
+
+
+WORDS = """# Do AVs choke networks of other authors?
+
+Arrivals beside the same demand without AVs, with 95 % intervals over paired seeds. 20 % of the
+vehicles are AVs. The lawful car's agent always asks for more speed, at phi 45.
+
+{table}
+
+## Conditions
+
+Each network is driven as it stands, for {longest:.0f} s at most, without driver errors. Its human
+drivers are its own. Seeds are from 300,000. An AV is stuck that stands for a minute without a reason
+([figures](../reference/figures.md)). One seed is no evidence. Rows: [{data}]({data}). To go on:
+`python -m benchmarks.throughput`; your own network: `--config FILE.sumocfg --out FOLDER`.
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Drive what is missing, keep, write."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--seeds", default=f"{FIRST}:{FIRST + SEEDS}", metavar="A:B")
+    parser.add_argument("--nets", nargs="+", default=NETS, metavar="NAME")
+    parser.add_argument("--config", nargs="+", type=Path, metavar="FILE")
+    parser.add_argument("--duration", type=float, default=LONGEST, metavar="S")
+    parser.add_argument("--workers", type=int, default=2, metavar="N")
+    parser.add_argument("--again", action="store_true", help="also what is measured")
+    parser.add_argument("--out", type=Path, default=RESULTS, metavar="FOLDER")
+    args = parser.parse_args(arguments)
+    configs = args.config or [a10kw().with_name(f"{name}.sumocfg") for name in args.nets]
+    wanted = list(cases(configs, range(*map(int, args.seeds.split(":"))), bool(args.config), args.duration))
+    rows = measure(Drive, wanted, args.workers, args.out / DATA, args.again)
+    write_page(args.out / PAGE, page(rows))
+    print(args.out / PAGE)
+
+
+if __name__ == "__main__":
+    main()

@@ -246,7 +246,7 @@ class _Counter:
         self._newest = snapshot
 
     def _note_jumps(self, snapshot: Snapshot) -> None:
-        """Note the vehicles that have just jumped to another lane (`MAX_LATERAL_SPEED`); drop settled ones."""
+        """Note vehicles that have just jumped to another lane (`MAX_LATERAL_SPEED`); drop settled ones."""
         s, before = snapshot, self._newest
         self._jumped = {name: t for name, t in self._jumped.items() if s.time - t < SETTLING_TIME - 1e-9}
         if before is None or s.n == 0:

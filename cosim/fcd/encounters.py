@@ -144,7 +144,7 @@ class Encounters:
         known.encounter = closest
 
     def _type(self, a: int, b: int, turned: float) -> str:
-        """Conflict type of vehicles on lanes `a` and `b` (-1: off every lane), headings `turned` rad apart."""
+        """Conflict type on lanes `a` and `b` (-1: off every lane), with headings `turned` rad apart."""
         turned = abs(math.remainder(turned, math.tau))
         if turned > ONCOMING:
             return "oncoming"

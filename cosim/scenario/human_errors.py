@@ -36,8 +36,7 @@ class Kind:
 
 @dataclass(frozen=True, slots=True)
 class Inattention(Kind):
-    """The driver keeps speed and lane and sees no other vehicle. Trial: a second of driving within 100 m
-    behind a leader."""
+    """The driver holds speed and lane and sees no other vehicle. Trial: a second within 100 m of a leader."""
 
     duration: Span = (1.0, 3.0)  # s
 
@@ -132,8 +131,7 @@ def read(
 ) -> Errors | None:
     """The errors of a shipped level or of a user's YAML file (a table of kinds); None: no errors.
 
-    `field` and `file`: origin of `what`, for errors; `scenario`: see `levels`. Raises BadInput naming file,
-    field and value.
+    `field`, `file`: origin of `what`; `scenario`: see `levels`. Raises BadInput naming file, field and value.
     """
     if what is None or what == NONE:
         return None

@@ -243,8 +243,8 @@ def _connect(host: str, port: int, timeout: float) -> _Connection:
         except ConnectionRefusedError:
             if time.monotonic() > until:
                 raise BadInput(
-                    f"no SUMO listens there (tried for {timeout:g} s); one that drives already takes nobody "
-                    "in: it waits at its start for --num-clients",
+                    f"no SUMO listens there (tried for {timeout:g} s); a running SUMO accepts no further "
+                    "clients: at its start it waits for --num-clients",
                     value=f"{host}:{port}",
                 ) from None
             time.sleep(RETRY)

@@ -250,10 +250,10 @@ def _links(
             last = via
             while last and (inner := next((way[4] for way in get.getLinks(last) if way[0] == target), "")):
                 last = inner
-            before, met = requests.get(last, ((), ()))
+            before, foes = requests.get(last, ((), ()))
             rule = RULES.get(state, Rule.PRIORITY) if signal < 0 else Rule.YIELD if before else Rule.PRIORITY
             row_of[last] = len(links)
-            yields.append(tuple(name for name in before if name in met))
+            yields.append(tuple(name for name in before if name in foes))
             links.append(Link(place[lane.id], place.get(via, -1), place[target], signal, rule))
     found = [tuple(row_of[name] for name in names if name in row_of) for names in yields]
     return tuple(replace(k, foes=f) for k, f in zip(links, found, strict=True)), tuple(signals)
@@ -285,13 +285,13 @@ def _requests() -> dict[str, tuple[tuple[str, ...], tuple[str, ...]]]:
         if tag == "junction":
             inside[:] = attributes.get("intLanes", "").split()
         elif tag == "request" and int(attributes["index"]) < len(inside):
-            before, met = (
+            before, foes = (
                 tuple(
                     name for name, bit in zip(inside, reversed(attributes[row]), strict=False) if bit == "1"
                 )
                 for row in ("response", "foes")
             )
-            found[inside[int(attributes["index"])]] = before, met
+            found[inside[int(attributes["index"])]] = before, foes
 
     scan(Path(sumo.simulation.getOption("net-file")), ("net",), start)
     return found

@@ -146,7 +146,7 @@ class TraciSimulator(SharedSimulator):
 
     def write_outputs(self, files: Mapping[str, Path]) -> None:
         """Refused: outputs belong to SUMO's owner."""
-        raise BadInput("SUMO's outputs are written by who starts it", field="--output")
+        raise BadInput("a joined SUMO writes outputs only for its owner", field="--output")
 
     def _hand_back(self) -> None:
         fleet = getattr(self, "_fleet", None)

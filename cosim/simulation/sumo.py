@@ -69,7 +69,7 @@ WRONG_DEMAND = re.compile(
 NO_FILES = {"device.ssm.file": NOWHERE}  # a vType with this device would write a file per vehicle
 GIVES_UP = "max-depart-delay"  # SUMO drops vehicles that waited longer, without a message
 DERIVED = "types.add.xml"  # file of the derived vTypes
-NOBODY: Mapping[str, float] = MappingProxyType({})
+NO_FORCED: Mapping[str, float] = MappingProxyType({})
 
 _in_use = False
 
@@ -203,7 +203,7 @@ class SumoSimulator:
         self._receipts = tuple(self._commander.take(c, now) for c in commands)
 
     def _drive(
-        self, steps: int, forced: Mapping[str, float] = NOBODY, *, driven: int = 0
+        self, steps: int, forced: Mapping[str, float] = NO_FORCED, *, driven: int = 0
     ) -> tuple[Snapshot, ...]:
         """Advance; one snapshot per frame. `forced`: see `ahead`; `driven`: steps since the decision."""
         frames = []
@@ -223,7 +223,7 @@ class SumoSimulator:
         commands: Sequence[Command] = (),
         *,
         errors: bool = False,
-        forced: Mapping[str, float] = NOBODY,
+        forced: Mapping[str, float] = NO_FORCED,
     ) -> tuple[Snapshot, ...]:
         """A counterfactual rollout of `frames` frames: the present commands hold, except for `commands`.
 
@@ -236,7 +236,7 @@ class SumoSimulator:
         """
         if self._outputs or self._SHARED:
             why = "other programs share it" if self._SHARED else "SUMO writes outputs of its own"
-            raise BadInput(f"nobody can look ahead in this simulation: {why}", file=self._scenario.config)
+            raise BadInput(f"rollouts are impossible in this simulation: {why}", file=self._scenario.config)
         return forked(partial(self._drive_on, frames, commands, errors, forced))
 
     def _drive_on(
@@ -448,7 +448,7 @@ class SumoSimulator:
                     self._waiting[name] = Due(since, self._fleet.is_av(name, self._seed))
 
     def _crashed(self, collisions: list[Collision]) -> list[Collision]:
-        """Make wrecks of their vehicles where the episode goes on; the same collisions, attributed."""
+        """Attribute the collisions to human errors; in a continuing episode their vehicles become wrecks."""
         if self._errors is not None and collisions:
             collisions = self._errors.attribute(collisions)
         if self._wrecks is not None:

@@ -119,8 +119,8 @@ class HumanErrors:
         return found
 
     def attribute(self, collisions: Sequence[Collision]) -> list[Collision]:
-        """The collisions with `human_error_involved` set: whether the collider, the victim or a leader of
-        either errs, or erred at most `REMEMBERED` s before."""
+        """The collisions with `human_error_involved` set: whether collider, victim or a leader of either has
+        an active error, or had one at most `REMEMBERED` s before."""
         return [replace(c, human_error_involved=self._involves_error(c)) for c in collisions]
 
     @property

@@ -1,13 +1,12 @@
-"""What the agent costs: one decision for 8 AVs by its parts, simulation apart, and how fast it trains.
+"""Cost of the agent: one decision for 8 AVs by its parts, without simulation, and the speed of training.
 
     python -m benchmarks.agent [--size compact paper] [--threads 1 2] [--decisions 40] [--out FILE.md]
     python -m benchmarks.agent --only training [--config paper] [--episodes 1]
 
-Decisions: real histories (highway, dense, tuning seed 100,000, the share of AVs chosen so that 8 decide) are
-gathered first, then prediction, values and prioritizer are timed on them; medians over decisions. Simulation
-and observation are those of whole episodes that the agent drives. Training: one rollout process drives and
-explores while this process updates without a pause. Weights do not matter to any of it. On a busy machine
-every time is an upper bound, every rate a lower one.
+Decisions: prediction, values and prioritizer are timed on recorded histories (highway, dense, validation seed
+100,000, a share of AVs such that 8 decide); medians over decisions. Simulation and observation are timed in
+whole episodes driven by the agent. Training: one rollout process explores while this process updates without
+a pause. Results do not depend on the weights. On a busy machine times are upper, rates lower bounds.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ SIZES: Mapping[str, Callable[[str], AgentConfig]] = {"compact": compact, "paper"
 POLICY = "vfn-p"
 TARGET_MS = 50.0  # compact size, 8 AVs, two cores; the period is 400 ms
 TARGET_RATE = 60.0  # joint decisions/s with the learner on the other core
-WARM_UP = 2  # decisions that are not counted: compilation, caches
+WARM_UP = 2  # uncounted decisions, for compilation and caches
 SVO = math.radians(45.0)
 FILL = 4  # episodes in the replay before updates are timed
 
@@ -55,11 +54,11 @@ FILL = 4  # episodes in the replay before updates are timed
 def decision(
     config: AgentConfig, road: Any, kept: Sequence[Mapping[str, History]], context: PolicyContext
 ) -> dict[str, float]:
-    """ms of every part of a joint decision, medians; and of processor time in all."""
+    """Median ms of every part of a joint decision, and of its processor time."""
     agent = PredictionAware(POLICY, config)
     agent.reset(replace(context, road=road, observation=agent.observation))
     spent: dict[str, list[float]] = {name: [] for name in ("prediction", "values", "prioritizer")}
-    processor: list[float] = []  # ms of all threads: what other work on the machine does not change
+    processor: list[float] = []  # ms of all threads, insensitive to other load
     warm_up = kept[:WARM_UP]
     for number, histories in enumerate([*warm_up, *kept]):
         worked, clock = time.process_time(), [time.perf_counter()]
@@ -82,10 +81,10 @@ def decision(
 def decisions(
     size: str, threads: Sequence[int], count: int, scenario: Scenario, *, bf16: bool = False
 ) -> dict[int, dict[str, float]]:
-    """Threads -> ms by part, at one size."""
+    """Threads -> ms by part, for one size."""
     config = replace(SIZES[size](POLICY), bf16=bf16)
     if size == "paper":
-        config = replace(config, vfn_weights=None)  # compact ones are shipped
+        config = replace(config, vfn_weights=None)  # only compact ones are shipped
     with Worker(Gatherer, scenario, config.observation) as worker:
         road, kept = worker.call("gather", TUNING_SEEDS.start, count)
     context = PolicyContext(road, scenario.timing, config.observation, SVO, np.random.default_rng(0))
@@ -101,7 +100,7 @@ def decisions(
 
 
 def closed_loop(scenario: Scenario, episodes: int) -> dict[str, float]:
-    """ms a decision of whole episodes driven by the compact agent in one process: who spends the time."""
+    """ms per decision by part, in whole episodes driven by the compact agent in one process."""
     with Worker(Host, scenario, POLICY, SVO) as worker:
         worker.call("run", TUNING_SEEDS.start)  # compilation
         done: list[EpisodeResult] = [worker.call("run", TUNING_SEEDS.start + 1 + k) for k in range(episodes)]
@@ -111,9 +110,9 @@ def closed_loop(scenario: Scenario, episodes: int) -> dict[str, float]:
 
 
 def training(config: str, lesson: Lesson, episodes: int) -> dict[str, float]:
-    """Rates of a rollout process and of this one, which learns meanwhile.
+    """Rates of a rollout process and of the learner in this process, running in parallel.
 
-    Joint decisions are those of all AVs of a world at a time; every one commands each AV on the road.
+    A joint decision commands all AVs of an episode at once.
     """
     file = configuration(config).file
     agent = agent_config(POLICY, file)
@@ -155,7 +154,7 @@ def training(config: str, lesson: Lesson, episodes: int) -> dict[str, float]:
 
 
 def figure(one: Drove, name: str) -> float:
-    """A figure that every drive has."""
+    """A figure present in every drive."""
     value = one.figures[name]
     assert value is not None
     return value
@@ -196,7 +195,7 @@ def page(found: Mapping[str, Any], command: str) -> list[str]:
 
 
 def rate_text(value: float) -> str:
-    """Three digits, whole numbers whole."""
+    """Three significant digits; integers without decimals."""
     return f"{value:,.0f}" if value == round(value) or value >= 1000.0 else f"{value:.3g}"
 
 
@@ -213,8 +212,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--decisions", type=int, default=40)
     parser.add_argument("--bf16", action="store_true", help="networks in bfloat16")
-    parser.add_argument("--episodes", type=int, default=4, help="whole episodes, of driving and of training")
-    parser.add_argument("--config", nargs="+", default=["compact"], help="of the training; a file likewise")
+    parser.add_argument("--episodes", type=int, default=4, help="whole episodes, to drive and to train")
+    parser.add_argument("--config", nargs="+", default=["compact"], help="of the training: a name or a file")
     parser.add_argument("--scenario", default="merge", help="of the training")
     parser.add_argument("--demand", default="contested", help="of the training")
     parser.add_argument("--only", choices=("decision", "loop", "training"))

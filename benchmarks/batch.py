@@ -1,14 +1,14 @@
-"""What the engine of `cosim evaluate` costs, and what a second worker gains.
+"""Overhead of the engine of `cosim evaluate`, and speedup by a second worker.
 
     python -m benchmarks.batch [--policy vfn-p] [--duration 10] [--episodes 50] [--rounds 4]
 
-with the defaults 200 episodes of about one second of processor time each, on merge / dense.
+By default 200 episodes of about one second of processor time each, on merge / dense.
 
-Each round drives the same episodes with one worker and with two, the order swapped from round to round, so
-that whatever else the machine does falls on both; with all of `cosim evaluate`: processes, rows, store.
-Overhead is all the time with one worker, from the first row to the last, that is not `total_s`, which an
-episode measures inside its process. `busy` is the share of time in which the workers had an episode: what is
-missing there is the engine's fault (start and end included), the rest is the machine's.
+Each round drives the same episodes with one worker and with two, in alternating order, so that other load
+affects both. It includes all of `cosim evaluate`: processes, rows, store. Overhead is the time with one
+worker, from the first row to the last, without the `total_s` that episodes measure inside their process.
+`busy` is the share of time in which workers had an episode. Idle time is due to the engine, including start
+and end; other losses are due to the machine.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ from cosim.batch.store import Store
 from cosim.workers.engines import LocalEngine
 from cosim.workers.progress import Progress
 
-GAIN = 0.6  # of the time of one worker, at most, that two may take
-OVERHEAD = 0.05  # of the serial time, at most
+GAIN = 0.6  # target: largest time of two workers, as a share of the time of one
+OVERHEAD = 0.05  # target: largest share of the serial time
 
 
 @dataclass(frozen=True)
 class Run:
-    """One batch: wall time, time inside the episodes, all in s."""
+    """One batch; times in s."""
 
     wall: float
     episodes: tuple[float, ...]  # total_s of each
-    start: float  # until the first episode was in, less that episode
+    start: float  # until the first result, without that episode
     busy: float  # share of the workers' time
-    between: float  # from the first arrival to the last
+    between: float  # from the first result to the last
 
 
 def measured(plan: matrix.Plan, workers: int, progress: Progress) -> Run:
-    """Drive the plan into a fresh store."""
+    """Run the plan with a new store."""
     arrivals: list[float] = []
 
     def arrived(done: float, total: float) -> None:
@@ -72,7 +72,7 @@ def main() -> None:
     parser.add_argument("--duration", type=float, default=10.0)
     parser.add_argument("--episodes", type=int, default=50)
     parser.add_argument("--rounds", type=int, default=4)
-    parser.add_argument("--json", action="store_true", help="one document in the end, and nothing else")
+    parser.add_argument("--json", action="store_true", help="print only one document, at the end")
     args = parser.parse_args()
     seeds = range(200_000, 200_000 + args.episodes)
     plan = planned(seeds, scenario="merge", demand="dense", policy=args.policy, duration=args.duration)

@@ -1,4 +1,4 @@
-"""How faithfully SUMO's LC2013 drives Table II: measured against our MOBIL, and calibrated to it.
+"""Fidelity of SUMO's LC2013 to Table II: comparison with cosim's MOBIL, and calibration to it.
 
 python -m benchmarks.behaviors --report      # test seeds; rewrites docs/results/behaviors.md
 python -m benchmarks.behaviors --calibrate   # tuning seeds; rewrites lc2013 in behaviors.yaml
@@ -38,13 +38,13 @@ FORMULAS = {  # the uncalibrated mapping: b_safe -> lcAssertive, a_th -> lcSpeed
     "conservative": {"lcAssertive": 1.41, "lcSpeedGain": 0.95, "lcSpeedGainLookahead": 0.0},
 }
 
-# Free attributes and their bounds; lcSpeedGain is searched by its logarithm. lcAssertive is not free: it
-# alone rules mandatory changes too (merges, exits), where MOBIL has no incentive but only b_safe, and there
-# its formula is exact. lcCooperative is p; on a highway without merges it changes nothing.
+# Free attributes and their bounds; lcSpeedGain is searched by its logarithm. lcAssertive is not free: it also
+# governs mandatory changes (merges, exits), where MOBIL has only b_safe and the formula is exact.
+# lcCooperative is p; it has no effect on a highway without merges.
 FREE = {"lcSpeedGain": (-2.0, 3.0), "lcSpeedGainLookahead": (0.0, 10.0)}
-TUNING_DURATION = {"aggressive": 240.0, "moderate": 240.0, "conservative": 1800.0}  # s: few changes need long
-# Share of changes whose egoistic incentive must hold: nearly what MOBIL itself reaches (0.99, 0.91) where the
-# drivers are (almost) egoists; for p = 1 the 70 % that was asked for and some margin.
+TUNING_DURATION = {"aggressive": 240.0, "moderate": 240.0, "conservative": 1800.0}  # s, long for rare changes
+# Target for the share of changes with an egoistic incentive. For (nearly) egoistic drivers almost the share
+# of MOBIL (0.99, 0.91); for p = 1 the required 70 % and a margin.
 WANTED_SHARE = {"aggressive": 0.9, "moderate": 0.9, "conservative": 0.75}
 WORST_UNSAFE = 0.02
 
@@ -67,14 +67,14 @@ def median_of_blocks(samples: Sequence[tuple[int, float]]) -> Figure:
 
 
 def with_attributes(behaviors: Behaviors, name: str, values: Mapping[str, float]) -> Behaviors:
-    """The same behaviours with some LC2013 attributes of one class replaced."""
+    """The behaviors with some LC2013 attributes of one class replaced."""
     driver = behaviors.classes[name]
     lc2013 = tuple({**dict(driver.lc2013), **values}.items())
     return replace(behaviors, classes={**behaviors.classes, name: replace(driver, lc2013=lc2013)})
 
 
 def summary(traffic: Traffic, name: str) -> dict[str, float]:
-    """What the calibration compares; nan where a class never changed lanes."""
+    """The values compared by the calibration; nan for a class without lane changes."""
     changes = [c for c in traffic.changes if c.driver == name]
     values: dict[str, float] = {"rate": (len(changes) + 0.5) / traffic.kilometres[name]}
     for key in ("front_gap", "rear_gap", "imposed"):
@@ -90,7 +90,7 @@ def summary(traffic: Traffic, name: str) -> dict[str, float]:
 def loss(found: Mapping[str, float], wanted: Mapping[str, float], b_safe: float, least_share: float) -> float:
     """Squared distance from the MOBIL reference: log rate, log gaps, imposed deceleration per b_safe.
 
-    Penalties keep the egoistic incentive at `least_share` and breaches of b_safe below WORST_UNSAFE.
+    Penalties keep egoistic changes above the share `least_share`, breaches of b_safe below WORST_UNSAFE.
     """
     gaps = [f"{side}_gap_{q}" for side in ("front", "rear") for q in (10, 50)]
     terms = [math.log(found["rate"] / wanted["rate"]) ** 2]
@@ -104,8 +104,8 @@ def loss(found: Mapping[str, float], wanted: Mapping[str, float], b_safe: float,
 def calibrate(
     folder: Path, names: Sequence[str], cache_file: Path, population: int, generations: int
 ) -> None:
-    """Fit each class on tuning seeds; results go into behaviors.yaml. Every evaluation is cached: an
-    interrupted run continues where it stopped, since the search itself is deterministic."""
+    """Fit each class on validation seeds and write behaviors.yaml. Evaluations are cached, so an interrupted
+    run continues; the search itself is deterministic."""
     cache: dict[str, dict[str, float]] = json.loads(cache_file.read_text()) if cache_file.exists() else {}
     behaviors = load_behaviors()
 
@@ -151,7 +151,7 @@ def calibrate(
 
 
 def write_attributes(path: Path, name: str, values: Mapping[str, float]) -> None:
-    """Replace numbers in one class's lc2013 block; the rest of the file, comments included, stays."""
+    """Replace numbers in one class's lc2013 block; the rest of the file, with its comments, stays."""
     text = path.read_text(encoding="utf-8")
     head, block, tail = re.split(rf"(?m)^(  {name}:\n(?:    .*\n)+)", text, maxsplit=1)
     for key, value in values.items():
@@ -173,7 +173,7 @@ BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
 
 
 def report(folder: Path, scale: float) -> str:
-    """Measure on test seeds; the Markdown tables."""
+    """Measure on test seeds; return the Markdown tables."""
     behaviors = load_behaviors()
 
     def collect(behavior: str, model: str, used: Behaviors) -> Traffic:

@@ -1,10 +1,10 @@
-"""What human drivers bring through each open road: capacity, capacity drop, flow against density.
+"""Capacity of each open road with human drivers: capacity, capacity drop, flow against density.
 
     python -m benchmarks.capacity [--roads NAME ...] [--seeds A:B] [--again]
 
-Demand rises step by step until traffic breaks down; then it stays at `over` of what was found. No AV drives.
-Rows are kept in docs/results/data/capacity.csv; the page, its picture and `sumo_scenarios/open/capacity.yaml`
-are made of them, and the demands of the six roads of the last.
+Demand rises in steps until traffic breaks down; a second run has a constant demand `over` the capacity found.
+There are no AVs. Rows are kept in docs/results/data/capacity.csv. The page, its picture and
+`sumo_scenarios/open/capacity.yaml` are made from the rows, the demands of the six roads from the latter.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from sumo_scenarios.roads import NAMED, Minor, Section
 RESULTS = Path("docs/results")
 PAGE, PICTURE, DATA = "capacity.md", "capacity.svg", "data/capacity.csv"
 RISING, OVER = "rising", "over"
-# vehicles/h a lane at the bottleneck: where the rising demand begins and ends
+# range of the rising demand, vehicles/h per lane at the bottleneck
 SPAN = {
     "lane_drop": (1600.0, 2600.0),
     "on_ramp": (1500.0, 2500.0),
@@ -47,22 +47,20 @@ SPAN = {
     "minor": (750.0, 1900.0),
     "arterial": (1900.0, 3300.0),
 }
-STEP, STEPS = 120.0, 12  # s of each step of the rising demand, and their number
-FILLING = 2  # minutes until the first vehicles are through
+STEP, STEPS = 120.0, 12  # s per step of the rising demand, number of steps
+FILLING = 2  # minutes until the first vehicles have passed
 CONSTANT = 720.0  # s of the demand `over`
-SAMPLES = Timing(
-    step=0.1, frame=1.0, decision=1.0
-)  # s: nobody decides, the section is looked at every second
-MINUTE = 60.0  # s, what a row is a mean of
+SAMPLES = Timing(step=0.1, frame=1.0, decision=1.0)  # s: no decisions; the section is sampled every second
+MINUTE = 60.0  # s, averaging period of a row
 WINDOW = 5  # minutes of a flow rate, as in Brilon, Geistefeldt and Regler (2005)
-# Traffic has broken down when it is slower than this share of the limit before the bottleneck, for `LASTING`
-SLOWED = {"lane_drop": 0.5, "on_ramp": 0.5, "weave": 0.5, "roundabout": 0.3, "minor": 0.3, "arterial": 0.3}
-LASTING = 3  # minutes
-SETTLED = 2  # minutes after the breakdown, from where on discharge is measured
+# Breakdown: mean speed before the bottleneck below this share of the limit for `BREAKDOWN_TIME`
+SLOW = {"lane_drop": 0.5, "on_ramp": 0.5, "weave": 0.5, "roundabout": 0.3, "minor": 0.3, "arterial": 0.3}
+BREAKDOWN_TIME = 3  # minutes
+DISCHARGE_DELAY = 2  # minutes from the breakdown to the measurement of the discharge
 
 
 class Minute(NamedTuple):
-    """A row of the CSV: one minute of one drive."""
+    """A row of the CSV file: one minute of one drive."""
 
     road: str
     demand: str
@@ -72,11 +70,11 @@ class Minute(NamedTuple):
     flow_per_h: float
     density_per_km_lane: float
     speed_mps: float
-    waiting: int  # to be inserted, at its end
+    waiting: int  # vehicles waiting for insertion at the end of the minute
 
 
 class Counter:
-    """A simulation of human drivers: counts them on a section."""
+    """Simulates human drivers and counts them on a section."""
 
     def __init__(self, scenario: Scenario, section: Section) -> None:
         self._simulator = SumoSimulator(scenario)
@@ -84,7 +82,7 @@ class Counter:
         self._decisions = round(MINUTE / scenario.timing.decision)
         lanes = self._simulator.road.lanes
         self._exit = np.array([lane.edge in section.exits for lane in lanes])
-        self._from = np.array(  # m along the lane, from where on it is the section's
+        self._from = np.array(  # m along the lane, beginning of the section
             [lane.length - section.reach if lane.edge in section.approaches else np.inf for lane in lanes]
         )
         of_section = [min(lane.length, section.reach) for lane in lanes if lane.edge in section.approaches]
@@ -93,7 +91,7 @@ class Counter:
     def drive(self, seed: int, slow: float | None) -> list[tuple[float, float, float, int]]:
         """Minute by minute: flow (vehicles/h), density (vehicles/km and lane), speed (m/s), waiting.
 
-        `slow`: ends when traffic has broken down to this speed (m/s).
+        `slow`: speed (m/s) of a breakdown, which ends the drive.
         """
         self._simulator.reset(seed)
         through: set[str] = set()
@@ -112,7 +110,7 @@ class Counter:
         self._simulator.close()
 
     def _minute(self, through: set[str]) -> tuple[float, float]:
-        """Mean number on the section and their mean speed; adds those that came through."""
+        """Mean number and mean speed of vehicles on the section; adds passed vehicles to `through`."""
         present, speeds = 0, 0.0
         for _ in range(self._decisions):
             snapshot = self._simulator.advance(())[1][-1]
@@ -125,15 +123,15 @@ class Counter:
 
 
 def slow(name: str) -> float:
-    """m/s, below which traffic before the bottleneck has broken down."""
+    """Speed (m/s) before the bottleneck below which traffic has broken down."""
     road = NAMED[name]
-    return SLOWED[name] * (road.minor_speed if isinstance(road, Minor) else road.speed)
+    return SLOW[name] * (road.minor_speed if isinstance(road, Minor) else road.speed)
 
 
 def breakdown(speeds: Sequence[float], slow: float) -> int | None:
-    """The minute from which on traffic is slower than `slow` (m/s) for `LASTING` minutes."""
-    for k in range(FILLING + WINDOW, len(speeds) - LASTING + 1):
-        if all(speed < slow for speed in speeds[k : k + LASTING]):
+    """The first minute with speeds below `slow` (m/s) for `BREAKDOWN_TIME` minutes."""
+    for k in range(FILLING + WINDOW, len(speeds) - BREAKDOWN_TIME + 1):
+        if all(speed < slow for speed in speeds[k : k + BREAKDOWN_TIME]):
             return k
     return None
 
@@ -141,7 +139,7 @@ def breakdown(speeds: Sequence[float], slow: float) -> int | None:
 def drive(
     name: str, demand: str, text: str, due: Sequence[float], seeds: Sequence[int]
 ) -> Iterator[list[Minute]]:
-    """The road `name` with the route file `text`, seed by seed; `due`: vehicles/h by minute."""
+    """Drive the road `name` with the route file `text`, seed by seed; `due`: vehicles/h by minute."""
     if not seeds:
         return
     with tempfile.TemporaryDirectory() as folder:
@@ -160,7 +158,7 @@ def drive(
 
 
 def rising(name: str, seeds: Sequence[int]) -> Iterator[list[Minute]]:
-    """Demand that rises until traffic breaks down."""
+    """Drives with a demand that rises until traffic breaks down."""
     road = NAMED[name]
     levels = [float(level) for level in np.linspace(*SPAN[name], STEPS) * road.lanes_at_bottleneck]
     text = road_folders.ramp(road, {k * STEP: level for k, level in enumerate(levels)}, STEP)
@@ -169,28 +167,28 @@ def rising(name: str, seeds: Sequence[int]) -> Iterator[list[Minute]]:
 
 
 def over(name: str, capacity: float, seeds: Sequence[int]) -> Iterator[list[Minute]]:
-    """Demand above capacity."""
+    """Drives with a constant demand above capacity."""
     level = road_folders.LEVELS[OVER] * capacity
     text = road_folders.demand(NAMED[name], level, OVER, CONSTANT)
     return drive(name, OVER, text, [level] * round(CONSTANT / MINUTE), seeds)
 
 
 def flows(rows: Sequence[Minute]) -> list[float]:
-    """Vehicles/h over `WINDOW` minutes, for every such window after `FILLING`."""
+    """Vehicles/h in every window of `WINDOW` minutes after `FILLING`."""
     each = [row.flow_per_h for row in rows]
     return [fmean(each[k - WINDOW : k]) for k in range(FILLING + WINDOW, len(each) + 1)]
 
 
 def before(rows: Sequence[Minute]) -> float:
-    """The largest flow of one drive with rising demand up to its breakdown; to its end where it had none."""
+    """The largest flow of a drive with rising demand, before its breakdown or else its end."""
     end = breakdown([row.speed_mps for row in rows], slow(rows[0].road))
     return max(flows(rows[:end]))
 
 
 def after(rows: Sequence[Minute]) -> float | None:
-    """The mean flow of one drive with demand `over`, from `SETTLED` minutes after its breakdown on."""
+    """The mean flow of a drive with demand `over`, from `DISCHARGE_DELAY` minutes after its breakdown."""
     begin = breakdown([row.speed_mps for row in rows], slow(rows[0].road))
-    later = [] if begin is None else [row.flow_per_h for row in rows[begin + SETTLED :]]
+    later = [] if begin is None else [row.flow_per_h for row in rows[begin + DISCHARGE_DELAY :]]
     return fmean(later) if later else None
 
 
@@ -204,12 +202,12 @@ def drives(rows: Sequence[Minute], name: str, demand: str) -> list[list[Minute]]
 
 
 def capacity(rows: Sequence[Minute], name: str) -> float:
-    """Vehicles/h, the mean over the seeds, to ten."""
+    """Capacity in vehicles/h, the mean over seeds, rounded to ten."""
     return round(fmean(before(one) for one in drives(rows, name, RISING)), -1)
 
 
 def measure(rows: list[Minute], names: Sequence[str], seeds: range, data: Path) -> None:
-    """Drive what `rows` lack of these roads; they are kept in `data` after every drive."""
+    """Drive the cases of these roads that `rows` lack; write `data` after every drive."""
 
     def missing(name: str, demand: str) -> list[int]:
         there = {row.seed for row in rows if (row.road, row.demand) == (name, demand)}
@@ -230,7 +228,7 @@ def measure(rows: list[Minute], names: Sequence[str], seeds: range, data: Path) 
 
 
 def read(file: Path) -> list[Minute]:
-    """The rows of an earlier call; none where there is no file."""
+    """The rows of earlier calls; empty without a file."""
     if not file.is_file():
         return []
     with file.open(encoding="utf-8", newline="") as lines:
@@ -239,7 +237,7 @@ def read(file: Path) -> list[Minute]:
 
 
 def write(file: Path, rows: Sequence[Minute]) -> None:
-    """Keep the rows."""
+    """Write the rows to a CSV file."""
     file.parent.mkdir(parents=True, exist_ok=True)
     with file.open("w", encoding="utf-8", newline="") as lines:
         kept = csv.writer(lines, lineterminator="\n")
@@ -260,7 +258,7 @@ def page(rows: Sequence[Minute], picture: str) -> str:
 
 
 def cells(rows: Sequence[Minute], name: str) -> list[str]:
-    """One road's."""
+    """The cells of one road."""
     most = [before(one) for one in drives(rows, name, RISING)]
     discharge = [flow for one in drives(rows, name, OVER) if (flow := after(one)) is not None]
     found = capacity(rows, name)
@@ -277,14 +275,14 @@ def cells(rows: Sequence[Minute], name: str) -> list[str]:
 
 
 def _broken(rows: Sequence[Minute], name: str, demand: str) -> str:
-    """How many drives broke down."""
+    """Number of drives with a breakdown, of all."""
     each = drives(rows, name, demand)
     hits = sum(breakdown([row.speed_mps for row in one], slow(name)) is not None for one in each)
     return f"{hits} of {len(each)}"
 
 
 def picture(rows: Sequence[Minute], file: Path) -> None:
-    """Flow against density, a panel a road, a point a minute."""
+    """Plot flow against density: one panel per road, one point per minute."""
     figure = Figure(figsize=(9.0, 5.6), layout="constrained")
     for axes, name in zip(figure.subplots(2, 3).flat, NAMED, strict=True):
         for demand, mark in ((RISING, "o"), (OVER, "x")):
@@ -340,14 +338,14 @@ seed, and seeds scatter. Rows by minute: [data/capacity.csv](data/capacity.csv).
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Measure what is missing, keep, write."""
+    """Measure missing cases; write rows, page and capacities."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     first = TUNING_SEEDS.start
     parser.add_argument("--roads", nargs="*", default=[*NAMED], choices=[*NAMED], metavar="NAME")
     parser.add_argument("--seeds", default=f"{first}:{first + 3}", metavar="A:B")
-    parser.add_argument("--again", action="store_true", help="also roads that are measured")
+    parser.add_argument("--again", action="store_true", help="also roads that have been measured")
     parser.add_argument("--out", type=Path, default=RESULTS, metavar="FOLDER")
     args = parser.parse_args(arguments)
     data = args.out / DATA

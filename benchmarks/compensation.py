@@ -1,10 +1,10 @@
-"""How far from the truth late states are that are predicted to now, by compensation and delay.
+"""Errors of delayed states that are predicted to the present, by compensation and delay.
 
     python -m benchmarks.compensation [--seeds A:B] [--small] [--out FILE.md]
 
 `altruist-rule` drives the AVs once per scenario and seed; each compensation then perceives the same frames.
-Distances between where an AV takes a human driver's vehicle to be and where it is. In the first rows own
-sensors see everybody without noise, and late; in the last ones the level `v2v` does what it does.
+The error is the distance between the perceived and the true position of a human-driven vehicle. In the first
+rows own sensors see all vehicles late but without noise; the last rows use the level `v2v`.
 """
 
 from __future__ import annotations
@@ -37,15 +37,15 @@ POLICY = "altruist-rule"
 DELAYS = (0.4, 0.8, 1.6)  # s
 COMPENSATIONS: tuple[Any, ...] = get_args(get_type_hints(Parameters)["compensation"])
 LATE = "own sensors, {delay:g} s late"
-SKIPPED = 20  # frames, in which an AV's past of everybody fills
-EVERY = 5  # frames: once a second
-PERCEIVING = 1  # AVs an episode, those longest on the road: late and without noise all see the same
+SKIPPED = 20  # frames, until the AV's histories are full
+EVERY = 5  # frames, once a second
+PERCEIVING = 1  # AVs per episode, longest on the road; without noise all AVs perceive the same
 DURATION, SMALL = 24.0, 8.0  # s
 DRAWS, BOOTSTRAP_SEED = 1000, 1
 
 
 class Drive(NamedTuple):
-    """One episode's frames; only `PERCEIVING` of its AVs perceive."""
+    """The frames of one episode; only `PERCEIVING` of its AVs perceive."""
 
     seed: int
     road: RoadMap
@@ -55,7 +55,7 @@ class Drive(NamedTuple):
 
 
 class Sometimes:
-    """`cosim.types.Compensator`: another one, where it is `asked`: results are not read in between."""
+    """A `cosim.types.Compensator` that calls another one only while `asked`, to save time between samples."""
 
     asked = False
 
@@ -77,7 +77,7 @@ class Frames(Hook):
 
 
 def driven(scenario: str, numbers: Sequence[int], duration: float) -> list[Drive]:
-    """The episodes `numbers` of one scenario, mixed and contested."""
+    """The episodes of the seeds `numbers` in one scenario, mixed and contested."""
     options = EpisodeOptions(
         scenario,
         demand=("contested",),
@@ -103,14 +103,14 @@ def driven(scenario: str, numbers: Sequence[int], duration: float) -> list[Drive
 
 
 def _with_avs(frame: Snapshot, avs: set[str]) -> Snapshot:
-    """A frame in which no others than `avs` are AVs."""
+    """The frame with only `avs` as AVs."""
     kind = frame.kind.copy()
     kind[[frame.row[name] for name in frame.avs if name not in avs]] = Kind.HV
     return replace(frame, kind=kind)
 
 
 def errors(drive: Drive, level: Parameters) -> Floats:
-    """[k,2] m and m/s that an AV is wrong about a human driver's vehicle, once a second."""
+    """[k,2] m and m/s, errors of position and speed of human-driven vehicles, once a second."""
     how = level.compensation
     made = Sometimes(compensator(how, drive.road, drive.timing)) if how in PREDICTED else None
     perception = Perception(drive.road, level, drive.timing, drive.seed, made)
@@ -132,7 +132,7 @@ def errors(drive: Drive, level: Parameters) -> Floats:
 
 
 def conditions() -> Iterator[tuple[str, Parameters]]:
-    """Every row's name and level."""
+    """Name and level of every row."""
     for delay in DELAYS:
         yield LATE.format(delay=delay), Parameters(latency=delay)
     yield "`v2v`", levels()["v2v"]
@@ -147,7 +147,7 @@ def interval(means: Floats) -> str:
 
 
 def table(drives: Sequence[Drive]) -> list[str]:
-    """One scenario's tables: mean distance, and its 99th percentile."""
+    """The tables of one scenario: mean distance and 99th percentile."""
     head = [markdown_row(["knowledge", *COMPENSATIONS]), markdown_row(["---"] * (1 + len(COMPENSATIONS)))]
     means, tails = list(head), list(head)
     for name, level in conditions():

@@ -1,13 +1,12 @@
-"""What a decision costs an AV in a city, with 25, 50 and 100 AVs on the road, on one thread.
+"""Cost of a decision per AV in a city, with 25, 50 and 100 AVs on the road, on one thread.
 
     python -m benchmarks.decision_cost [--avs 25 50 100] [--decisions 40] [--real] [--out FILE.md] [--profile]
 
-A grid of signalised junctions is built by netgenerate, and one vehicle in five is an AV: each drives a
-random walk of `WALK` edges, so that all of them stay on the road. SUMO drives everybody, the policy decides
-beside it (nothing is carried out), so that the traffic is the same whatever the policy is. Medians over
-decisions, in a process of its own. `--real`: A10KW of the `eclipse-sumo` package, driven by the policy for as
-long as at most 100 AVs are on the road. `--profile`: cProfile's table instead. Ratios are to a fixed piece of
-work that is timed between decisions.
+netgenerate builds a grid of signalised junctions, and one vehicle in five is an AV. Each vehicle drives a
+random walk of `WALK` edges, so that all vehicles stay on the road. SUMO drives all vehicles and the decisions
+are not executed, so that the traffic does not depend on the policy. Medians over decisions, in a separate
+process. `--real`: A10KW of the `eclipse-sumo` package, driven by the policy with at most 100 AVs on the road.
+`--profile`: cProfile's table instead. Ratios refer to a fixed piece of work, timed between decisions.
 """
 
 from __future__ import annotations
@@ -40,21 +39,21 @@ from cosim.workers.memory import keep_freed_memory
 from cosim.workers.worker import Worker
 
 POLICY = "vfn-p"
-TARGET_MS = 4.0  # a decision, per AV
+TARGET_MS = 4.0  # per decision and AV
 AVS = (25, 50, 100)
-SHARE = 5  # one vehicle in so many is an AV
-GRID, BLOCK, WALK = 6, 200.0, 40  # junctions a side, m between them, edges of a walk
-WARM_UP = 90.0  # s: all have departed, queues stand at the signals
-INSERTED = 60.0  # s within which all depart
-UNCOUNTED = 5  # decisions: kernels are compiled, caches filled
+SHARE = 5  # vehicles per AV
+GRID, BLOCK, WALK = 6, 200.0, 40  # junctions per side, m between junctions, edges of a walk
+WARM_UP = 90.0  # s, after which all vehicles have departed and queues stand at the signals
+INSERTED = 60.0  # s, period of departures
+UNCOUNTED = 5  # decisions, for the compilation of kernels and caches
 SVO = math.radians(45.0)
-MOST_AVS = 100  # on the road, while A10KW has to run in real time
+MOST_AVS = 100  # on the road, up to which A10KW has to run in real time
 DECIDING = ("prediction", "values", "prioritizer")
 PARTS = ("simulation", "figures", "observing", *DECIDING)
 
 
 def build_city(folder: Path, avs: int) -> Path:
-    """A signalised grid and `SHARE` times `avs` vehicles on it, ids `av.K` and `hv.K`: its .sumocfg."""
+    """The .sumocfg of a new signalised grid with `SHARE` times `avs` vehicles, ids `av.K` and `hv.K`."""
     net = folder / "city.net.xml"
     flags = ["--grid", "--grid.number", str(GRID), "--grid.length", f"{BLOCK:g}", "--no-turnarounds"]
     flags += ["--default.lanenumber", "2", "--default-junction-type", "traffic_light"]
@@ -78,7 +77,7 @@ def build_city(folder: Path, avs: int) -> Path:
 
 
 def _walk(draw: random.Random) -> list[str]:
-    """Edges of netgenerate's grid, `WALK` of them, no U-turn."""
+    """`WALK` edges of netgenerate's grid, without U-turns."""
     before, at = None, (draw.randrange(GRID), draw.randrange(GRID))
     edges: list[str] = []
     while len(edges) < WALK:
@@ -90,7 +89,7 @@ def _walk(draw: random.Random) -> list[str]:
 
 
 def reference_ms() -> float:
-    """Time of the fixed work, on one thread: 100,000 additions in Python, 400,000 sines in numpy."""
+    """ms of the reference work on one thread: 100,000 additions in Python, 400,000 sines in numpy."""
     angles = np.linspace(0.0, 6.0, 100_000)
     began = time.perf_counter()
     total = 0
@@ -102,7 +101,7 @@ def reference_ms() -> float:
 
 
 class Driven:
-    """Runs in a worker: SUMO drives, the policy decides beside it, each part of it timed."""
+    """Runs in a worker: SUMO drives; the policy's decisions are timed by part and not executed."""
 
     def __init__(self, scenario: Scenario) -> None:
         import torch
@@ -112,7 +111,7 @@ class Driven:
         self._host = Host(scenario, POLICY, SVO)
 
     def start(self, seed: int) -> None:
-        """Drive the warm-up, and what is not counted."""
+        """Drive the warm-up and the uncounted decisions."""
         host = self._host
         host.policy.reset(host.episode.context(seed, SVO))
         host.episode.start(seed)
@@ -121,7 +120,7 @@ class Driven:
         self.go(UNCOUNTED)
 
     def go(self, decisions: int) -> list[dict[str, float]]:
-        """ms of every part of each decision; AVs and vehicles on the road; the reference's ms."""
+        """Per decision: ms of every part, AVs and vehicles on the road, ms of the reference work."""
         episode = self._host.episode
         agent: Any = self._host.policy
         found = []
@@ -157,7 +156,7 @@ class Driven:
         return found
 
     def profile(self, decisions: int) -> str:
-        """The same under cProfile, as its table."""
+        """As `go`, under cProfile; returns its table."""
         stream = io.StringIO()
         with cProfile.Profile() as profiler:
             self.go(decisions)
@@ -170,10 +169,10 @@ class Driven:
 
 
 class Real(Driven):
-    """The same, but the policy's decisions are carried out, and whole runs are timed."""
+    """Executes the policy's decisions and times whole runs."""
 
     def drive(self, seed: int, most: int) -> dict[str, float]:
-        """Drive until more than `most` AVs are on the road, or to the end: simulated s and wall s."""
+        """Drive to the end, or until more than `most` AVs are on the road: simulated s and wall s."""
         host = self._host
         times: list[tuple[int, float]] = []  # AVs, wall s
         host.policy.reset(host.episode.context(seed, SVO))
@@ -183,7 +182,7 @@ class Real(Driven):
             histories = host.episode.advance(host.policy.decide(histories))
             times.append((len(histories), time.perf_counter() - began))
         period = host.episode.scenario.timing.decision
-        late = [second for _, second in times[-50:]]  # the most AVs
+        late = [second for _, second in times[-50:]]  # with the most AVs
         return {
             "simulated s": period * len(times),
             "wall s": sum(second for _, second in times),
@@ -194,7 +193,7 @@ class Real(Driven):
 
 
 def city(avs: int, decisions: int, *, profile: bool = False) -> Any:
-    """Medians over decisions of one size: ms; with `profile` cProfile's table."""
+    """Medians over decisions for `avs` AVs, in ms; with `profile` cProfile's table."""
     with tempfile.TemporaryDirectory(prefix="cosim-city-") as folder:
         scenario = vetted(load(str(build_city(Path(folder), avs)), fleet=Fleet(ids=r"av\..*")))
         with Worker(Driven, scenario) as worker:
@@ -208,7 +207,7 @@ def city(avs: int, decisions: int, *, profile: bool = False) -> Any:
 
 
 def real() -> dict[str, float]:
-    """A10KW at a share of AVs of one in `SHARE`, driven by the policy."""
+    """A10KW with one AV per `SHARE` vehicles, driven by the policy."""
     scenario = vetted(load(str(a10kw()), fleet=Fleet(penetration=1 / SHARE)))
     with Worker(Real, scenario) as worker:
         found: dict[str, float] = worker.call("drive", TUNING_SEEDS.start, MOST_AVS)

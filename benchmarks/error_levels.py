@@ -1,14 +1,13 @@
-"""The tables of driver_errors.md: rates, what `stress` does to IDM AVs, crashes of humans alone, cost.
+"""The tables of driver_errors.md: rates, effect of `stress` on IDM AVs, crashes of human drivers, cost.
 
     python -m benchmarks.error_levels [rates] [stress] [alone] [cost] [--episodes 40] [--page PAGE]
 
-`stress`: AVs driven by SUMO's IDM, tuning seeds, every world, dense and contested. `alone`: nobody is an AV,
-errors of `field` at raised rates, in which brute force sees crashes; what happens is scaled back: errors that
-crash by themselves by the factor of their rate, and those that need two errors (an inattentive follower
-behind somebody who brakes hard or cuts in) by the product of both factors. `cost`: processor time of episodes
-in which every error of `stress` is drawn and none begins, so that they drive what those without errors do,
-against these, in turns. Each table stands between a pair of markers in the page; `rates` only reads
-sumo_scenarios/errors.yaml.
+`stress`: AVs driven by SUMO's IDM, validation seeds, every scenario, dense and contested. `alone`: no AVs,
+and errors of `field` at raised rates, so that brute force finds crashes. Results are scaled back, by the
+factor of the rate for single errors, by the product of both factors for pairs. A pair is inattention behind
+hard braking or a cut-in. `cost`: processor time of episodes in which all errors of `stress` are drawn but
+none begins, against equal episodes without errors, alternating. Each table stands between a pair of markers
+in the page; `rates` only reads sumo_scenarios/errors.yaml.
 """
 
 from __future__ import annotations
@@ -39,16 +38,16 @@ from cosim.workers.worker import Worker
 RATES, MEASURED = Path("docs/explanation/driver_errors.md"), Path("docs/results/driver_errors.md")
 DEMANDS = ("dense", "contested")
 MILLION = 1e6  # km
-RARE = 1e-15  # rate of an error that is drawn and never begins
+RARE = 1e-15  # rate of an error that is drawn but never begins
 
 
 class Raised(NamedTuple):
     """One line of `alone`."""
 
     name: str
-    by: dict[str, float]  # kind -> how many times its rate of `field`
-    factor: float  # what happens so many times as often
-    parts: tuple[str, ...] = ()  # lines whose collisions are not counted again: these kinds alone
+    by: dict[str, float]  # kind -> factor on its rate in `field`
+    factor: float  # by which the collisions of this line are more frequent
+    parts: tuple[str, ...] = ()  # lines of the single kinds, to subtract their collisions
 
 
 ALONE = (
@@ -74,7 +73,7 @@ ALONE = (
 
 
 class Kilometres(Hook):
-    """What all vehicles together drive in the counted time."""
+    """The distance driven by all vehicles in the counted time."""
 
     def __init__(self) -> None:
         self.driven = 0.0  # km
@@ -87,13 +86,13 @@ class Kilometres(Hook):
 
 @dataclass
 class Tally:
-    """What happened in some episodes."""
+    """Counts over several episodes."""
 
     episodes: int = 0
     av: int = 0  # episodes with an AV in a collision
     ended: int = 0  # episodes with a collision of an AV or the mission vehicle
     pairs: int = 0  # collisions
-    near: int = 0  # near-misses by time to collision, where that is a figure
+    near: int = 0  # near-misses by time to collision, if measured
     driven: float = 0.0  # km
     errors: Counter[str] = field(default_factory=Counter)
 
@@ -111,13 +110,13 @@ class Tally:
 
 
 def places() -> list[tuple[str, str]]:
-    """Every world with those of `DEMANDS` that it has."""
+    """Every scenario with its demands among `DEMANDS`."""
     return [(w, d) for w in sumo_scenarios.names() for d in DEMANDS if d in (load(w).demands or {})]
 
 
-def driven(world: str, demand: str, errors: Errors, episodes: int, fleet: Fleet | None = None) -> Tally:
-    """Episodes on tuning seeds, whose AVs SUMO drives."""
-    scenario = vetted(replace(load(world, demand=[demand], fleet=fleet), errors=errors))
+def driven(name: str, demand: str, errors: Errors, episodes: int, fleet: Fleet | None = None) -> Tally:
+    """Counts over episodes on validation seeds, with AVs driven by SUMO."""
+    scenario = vetted(replace(load(name, demand=[demand], fleet=fleet), errors=errors))
     host, tally = Host(scenario, "idm", math.radians(45.0)), Tally()
     try:
         for seed in TUNING_SEEDS[:episodes]:
@@ -125,12 +124,12 @@ def driven(world: str, demand: str, errors: Errors, episodes: int, fleet: Fleet 
             tally.add(host.run(seed, hooks=[hook]), hook.driven)
     finally:
         host.close()
-    print(world, demand, tally, flush=True)
+    print(name, demand, tally, flush=True)
     return tally
 
 
 def rates() -> list[str]:
-    """Every kind of every level."""
+    """The table of all kinds and levels."""
     shipped = levels()
     lines = [
         markdown_row(["kind", *shipped, "source of `field`"]),
@@ -138,30 +137,30 @@ def rates() -> list[str]:
     ]
     for kind in KINDS:
         of = [getattr(level.kinds, kind) for level in shipped.values()]
-        cells = [_in_worlds(_magnitudes(one), name, kind) for one, name in zip(of, shipped, strict=True)]
+        cells = [_with_scenarios(_magnitudes(one), name, kind) for one, name in zip(of, shipped, strict=True)]
         lines.append(markdown_row([f"`{kind}`", *cells, of[0].source]))
     return lines
 
 
 def stress(episodes: int) -> list[str]:
-    """Plain IDM AVs among drivers who err as in `stress`."""
+    """The table for IDM AVs among human drivers with errors of level `stress`."""
     heads = "scenario, demand, with an AV in a collision, ended by a crash, collisions an episode"
     heads += ", errors an episode"
     lines = [markdown_row(heads.split(", ")), markdown_row(["---"] * 6)]
-    for world, demand in places():
-        t = driven(world, demand, levels(world)["stress"], episodes)
+    for name, demand in places():
+        t = driven(name, demand, levels(name)["stress"], episodes)
         hit = share(t.av, t.episodes)
         interval = f"{100 * hit.value:.0f} % ({100 * hit.low:.0f} to {100 * hit.high:.0f})"
-        cells = [world, demand, interval, f"{100 * t.ended / t.episodes:.0f} %"]
+        cells = [name, demand, interval, f"{100 * t.ended / t.episodes:.0f} %"]
         counts = (f"{n / t.episodes:.1f}" for n in (t.pairs, t.errors.total()))
         lines.append(markdown_row([*cells, *counts]))
     return lines
 
 
 def alone(episodes: int) -> list[str]:
-    """Humans alone at raised rates of `field`, and what that means at its own rates.
+    """The table for human drivers without AVs at raised rates of `field`, scaled back to its own rates.
 
-    Near-misses happen without any error too: what errors add is the difference to the first line.
+    Near-misses happen without errors too: the effect of errors is the difference to the first line.
     """
     base = levels()["field"]
     heads = "raised, by, km, collisions, near-misses, per million km at the rates of `field`: collisions"
@@ -169,7 +168,7 @@ def alone(episodes: int) -> list[str]:
     lines = [markdown_row(heads.split(", ")), markdown_row(["---"] * 7)]
     raw: dict[str, float] = {}  # collisions per million km
     added: dict[str, tuple[float, float]] = {}  # near-misses per million km, and their variance
-    each: list[tuple[bool, float]] = []  # collisions, or none, and what one of them is worth
+    each: list[tuple[bool, float]] = []  # (whether a collision, weight of a collision)
     most, more, scatter = 0.0, 0.0, 0.0
     for name, factors, factor, parts in (Raised("nothing", {}, 1.0), *ALONE):
         kinds = Kinds(**{kind: _raised(getattr(base.kinds, kind), by) for kind, by in factors.items()})
@@ -202,14 +201,14 @@ def alone(episodes: int) -> list[str]:
 
 
 def _signed(value: float, variance: float) -> str:
-    """With its normal 95 % interval, to two digits of that."""
+    """The value with its normal 95 % interval, rounded to two digits of the interval."""
     half = Z * math.sqrt(variance)
     digits = max(1 - math.floor(math.log10(half)), 0) if half else 0
     return f"{value:,.{digits}f} ({value - half:,.{digits}f} to {value + half:,.{digits}f})"
 
 
 def cost(episodes: int) -> list[str]:
-    """What drawing takes: the same drives with trials of every kind, none of which begins an error."""
+    """The table of the cost of drawing: equal drives with and without trials, none of which succeeds."""
     base = levels()["stress"]
     drawn = Errors(
         "drawn", "", Kinds(**{k: replace(getattr(base.kinds, k), rate=RARE) for k in KINDS}), base.file
@@ -217,21 +216,21 @@ def cost(episodes: int) -> list[str]:
     heads = ["episodes", "s without", "s with", "more, %"]
     lines = [markdown_row(heads), markdown_row(["---"] * len(heads))]
     every: list[tuple[float, float]] = []
-    for world, demand in places():
-        scenario = load(world, demand=[demand])
-        worlds = [vetted(replace(scenario, errors=errors)) for errors in (None, drawn)]
+    for name, demand in places():
+        scenario = load(name, demand=[demand])
+        scenarios = [vetted(replace(scenario, errors=errors)) for errors in (None, drawn)]
         took: list[tuple[float, float]] = []
-        with Worker(Timed, worlds[0], "idm", 0.0) as one, Worker(Timed, worlds[1], "idm", 0.0) as other:
+        with Worker(Timed, scenarios[0], "idm", 0.0) as one, Worker(Timed, scenarios[1], "idm", 0.0) as other:
             for seed in TUNING_SEEDS[: episodes + 1]:
                 (without, before), (with_, after) = (w.call("timed", seed) for w in (one, other))
                 assert before == after, "an error has begun"
                 took.append((without, with_))
-        every += took[1:]  # nothing is warm in the first one
+        every += took[1:]  # the first one is a warm-up
     return [*lines, _cost_row(every)]
 
 
 class Timed(Host):
-    """Hosted by a worker's process, for SUMO drives one simulation in each."""
+    """A host in a worker process, since a process can hold only one simulation."""
 
     def timed(self, seed: int) -> tuple[float, str]:
         """Processor time (s) of an episode, and the hash of its trace."""
@@ -260,9 +259,9 @@ def _magnitudes(kind: Any) -> str:
     return "; ".join([f"{kind.rate:.2g}", *words])
 
 
-def _in_worlds(everywhere: str, level: str, kind: str) -> str:
-    """With what it is in worlds that have it otherwise."""
-    of = {world: _magnitudes(getattr(levels(world)[level].kinds, kind)) for world in sumo_scenarios.names()}
+def _with_scenarios(everywhere: str, level: str, kind: str) -> str:
+    """The magnitudes, with the deviating ones of single scenarios."""
+    of = {name: _magnitudes(getattr(levels(name)[level].kinds, kind)) for name in sumo_scenarios.names()}
     return "; ".join([everywhere, *(f"{w}: {said}" for w, said in of.items() if said != everywhere)])
 
 
@@ -270,7 +269,7 @@ TABLES = {"stress": stress, "alone": alone, "cost": cost}
 
 
 def main() -> None:
-    """Make the tables that are asked for."""
+    """Make the requested tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("tables", nargs="*", choices=("rates", *TABLES), default=["rates"])
     parser.add_argument("--episodes", type=int, default=40)

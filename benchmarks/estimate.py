@@ -1,13 +1,13 @@
-"""The tilts of `cosim estimate`, and what its intervals are worth: a toy of known truth, brute force, speed.
+"""Tilts for `cosim estimate`, and validity of its intervals: a toy model, brute force, speed.
 
     python -m benchmarks.estimate tune --world merge --runs runs/tilts [--episodes 400 400 3000 2000]
     python -m benchmarks.estimate measure --runs runs/estimate [--worlds merge] [--episodes 4000]
     python -m benchmarks.estimate page --runs runs/estimate [--out PAGE] [--intervals 400]
 
-`tune` drives tilted episodes of `idm` AVs on tuning seeds, and raises errors the more, the more the crashes
-after them weigh (estimate.md); it prints the tilt for sumo_scenarios/tilts.yaml. `measure` drives what
-`page` shows, on test seeds: a case that brute force reaches, with and without a tilt, and `dense` at the
-level `field`. Both go on where they stopped. `page` adds the toy and writes docs/results/estimate.md.
+`tune` drives tilted episodes of `idm` AVs on validation seeds. It raises the probabilities of errors by the
+weight of the crashes after them (estimate.md), and prints the tilt for sumo_scenarios/tilts.yaml. `measure`
+drives the episodes of `page` on test seeds: a case within reach of brute force, with and without a tilt, and
+`dense` at the level `field`. Both resume. `page` adds the toy model and writes docs/results/estimate.md.
 """
 
 from __future__ import annotations
@@ -33,27 +33,27 @@ from cosim.seeding import FIRST_TEST_SEED, TUNING_SEEDS
 from cosim.workers.tasks import OK
 
 Array = npt.NDArray[np.float64]
-FIRST = 0.4  # errors a tilted episode that the first tilts aim at: few, so that the rare ones find room
-MEET = 0.75  # share of them that meets an AV first
-FOLLOW = 0.3  # second errors, if none ended the trials, where a first one has begun
-FOLLOWING = ("inattention", "hard_braking")  # what meets another error within seconds: a lapse, or before one
-ROUNDS = (400, 400, 3000, 2000)  # episodes: crashes are few, and the first rounds need none
-BALANCED = 2  # rounds in which all kinds are made equally frequent, before crashes are looked at
-DURING = 10.0  # at first the second error has a tenth of the time and of the drivers of the first
+FIRST = 0.4  # target of the first rounds: errors per tilted episode; few, to leave room for rare kinds
+MEET = 0.75  # share of these errors that affect an AV first
+FOLLOW = 0.3  # target: second errors per episode with a first error
+FOLLOWING = ("inattention", "hard_braking")  # kinds likely to interact with another error within seconds
+ROUNDS = (400, 400, 3000, 2000)  # episodes; the first rounds do not need crashes
+BALANCED = 2  # rounds that make all kinds equally frequent, before crashes are evaluated
+DURING = 10.0  # initially: a second error has a tenth of the first one's time and drivers
 PAGE = Path("docs/results/estimate.md")
 INTERVALS = 400
-REAL = ("exit", "contested", "stress")  # world, demand, errors: AVs crash so often that brute force sees it
+REAL = ("exit", "contested", "stress")  # scenario, demand, errors: AV crashes within reach of brute force
 REAL_TILT = Tilt({ALL: 3.0, ALL + OTHER: 2.0}, 2.0, 0.1)
-FRESH = FIRST_TEST_SEED + 10_000  # of the level `field`: what was driven on seeds before was looked at
-BRUTE, REPETITIONS, EACH = 1600, 40, 40  # episodes; estimates, and episodes of each
-UNSEEN = 0.5  # crashes that every case is given beside those seen
-FIRST_WITH, FOLLOW_WITH = 1.0, 0.7  # as FIRST and FOLLOW, once crashes say which errors tell most
+FRESH = FIRST_TEST_SEED + 10_000  # first seed for level `field`; results on earlier seeds were known
+BRUTE, REPETITIONS, EACH = 1600, 40, 40  # episodes; estimates, and episodes per estimate
+UNSEEN = 0.5  # pseudo-crashes added to every case
+FIRST_WITH, FOLLOW_WITH = 1.0, 0.7  # as FIRST and FOLLOW, in rounds that evaluate crashes
 
 
 def drive(
     folder: Path, world: str, demand: str, errors: str, tilt: Tilt | None, seeds: range, workers: int
 ) -> list[Row]:
-    """The episodes of `idm` AVs under a tilt; what is in the folder already is not driven again."""
+    """The episodes of `idm` AVs under a tilt; episodes already in the folder are not driven again."""
     flags = {
         "--scenario": world,
         "--demand": demand,
@@ -78,13 +78,13 @@ def trials(rows: Sequence[Row]) -> dict[str, Array]:
 
 
 def balanced(rows: Sequence[Row], before: Tilt) -> Tilt:
-    """`FIRST` errors an episode, `MEET` of them meeting an AV, every kind as often as the next, and `FOLLOW`
-    second ones of the kinds `FOLLOWING`."""
+    """The tilt with `FIRST` errors per episode, a share `MEET` of them affecting an AV, all kinds equally
+    frequent; and with `FOLLOW` second errors of the kinds `FOLLOWING`."""
     factors: dict[str, float] = {}
     found = trials(rows)
     begun = begun_first(found, len(rows))
     for ending, aim in (("", FIRST * MEET), (OTHER, FIRST * (1.0 - MEET)), (SECOND, FOLLOW)):
-        of = begun if ending == SECOND else np.ones(len(rows), bool)  # episodes that could show them
+        of = begun if ending == SECOND else np.ones(len(rows), bool)  # episodes with possible errors
         names = [n for n in found if ending == ending_of(n)]
         if ending == SECOND:
             names = [n for n in names if n.removesuffix(SECOND) in FOLLOWING]
@@ -94,18 +94,18 @@ def balanced(rows: Sequence[Row], before: Tilt) -> Tilt:
 
 
 def ending_of(name: str) -> str:
-    """What of a `cosim.scenario.tilt.case` follows the kind."""
+    """The part of a `cosim.scenario.tilt.case` after the kind."""
     return "".join(name.partition(".")[1:])
 
 
 def allotted(rows: Sequence[Row], before: Tilt) -> Tilt:
-    """As many errors as tell most, and every case as often as it is worth.
+    """The tilt with the smallest variance for a given number of errors.
 
-    A case of factor f begins in n of the episodes, n in proportion to f; the variance is the sum S of the
-    squared weights of the crashes after it, in proportion to 1 / f. Of all cases whose begun errors add up
-    to as many, sqrt(S / n) is then the best change of f (Neyman allocation). To S comes half a crash that
-    weighs as those seen do: none seen does not mean none. A factor that most trials do not follow (q is at
-    its most, or they ended before) does not rise. Without any crash the tilt stays.
+    A case with factor f begins in n episodes, where n is proportional to f. Its variance is S, the sum of
+    squared weights of the subsequent crashes, proportional to 1 / f. For a fixed total of errors, sqrt(S / n)
+    is the best change of f (Neyman allocation). S includes half a crash of mean weight, since no observed
+    crash does not mean none. A factor that most trials do not follow (q at its maximum, or trials ended
+    before) is not raised. Without any crash the tilt stays.
     """
     squares = np.array(weights(rows)) ** 2
     crashed = np.array([row["av_involved_collisions"] > 0 for row in rows])
@@ -118,7 +118,7 @@ def allotted(rows: Sequence[Row], before: Tilt) -> Tilt:
         begun = {n: b > 0 for n, (b, _) in found.items() if n.endswith(SECOND) == second}
         begun = {n: b for n, b in begun.items() if b.any()}
         change = {n: math.sqrt((squares[b & crashed].sum() + unseen) / b.sum()) for n, b in begun.items()}
-        changed = sum(begun[n].sum() * change[n] for n in begun)  # errors, by the change as it is
+        changed = sum(begun[n].sum() * change[n] for n in begun)  # errors after the unscaled change
         wanted = aim * (first if second else len(rows))
         for name, by in change.items():
             kind = name.removesuffix(SECOND)
@@ -130,13 +130,13 @@ def allotted(rows: Sequence[Row], before: Tilt) -> Tilt:
 
 
 def begun_first(found: Mapping[str, Array], episodes: int) -> npt.NDArray[np.bool_]:
-    """Of each of so many episodes with these `trials`, whether a first error near an AV began in it."""
+    """[n] whether a first error near an AV began in each episode with these `trials`."""
     of_first = [begun for name, (begun, _) in found.items() if not name.endswith(SECOND)]
     return np.array(np.sum([np.zeros(episodes), *of_first], 0) > 0)
 
 
 def tune(world: str, demand: str, errors: str, runs: Path, episodes: Sequence[int], workers: int) -> Tilt:
-    """The tilt after the last round; every round has so many episodes, on seeds of its own."""
+    """The tilt after the last round; `episodes`: per round, on separate seeds."""
     tilt = Tilt({ALL: 2.0, ALL + OTHER: 2.0}, DURING)
     first = TUNING_SEEDS.start
     for k, count in enumerate(episodes):
@@ -152,7 +152,7 @@ def tune(world: str, demand: str, errors: str, runs: Path, episodes: Sequence[in
 
 
 def measure(runs: Path, worlds: Sequence[str], episodes: int, workers: int) -> None:
-    """The episodes of the page."""
+    """Drive the episodes of the page."""
     for name, tilt, count in (("brute", None, BRUTE), ("tilted", REAL_TILT, REPETITIONS * EACH)):
         first = FIRST_TEST_SEED + (BRUTE if name == "tilted" else 0)
         drive(runs / name, *REAL, tilt, range(first, first + count), workers)
@@ -165,7 +165,7 @@ def measure(runs: Path, worlds: Sequence[str], episodes: int, workers: int) -> N
 
 
 def page(runs: Path, out: Path, intervals: int) -> None:
-    """Write it from the toy (`intervals` estimates a line) and from what `measure` left."""
+    """Write the page from the toy model (`intervals` estimates per line) and the results of `measure`."""
     lines = ["# What the intervals of `cosim estimate` are worth", ""]
     lines += [
         "Made by `python -m benchmarks.estimate page`; [what is estimated, and how](../guides/estimate.md).",
@@ -176,7 +176,7 @@ def page(runs: Path, out: Path, intervals: int) -> None:
 
 
 def _toy(intervals: int) -> list[str]:
-    """Coverage of so many intervals at several tilts and sizes."""
+    """Coverage of `intervals` intervals, for several tilts and sizes."""
     toy = Toy()
     truth = toy.truth()
     lines = [
@@ -211,7 +211,7 @@ def _toy(intervals: int) -> list[str]:
 
 
 def _real(runs: Path) -> list[str]:
-    """Brute force against repetitions of the tilted estimate."""
+    """Comparison of brute force with repetitions of the tilted estimate."""
     if not ((runs / "brute").is_dir() and (runs / "tilted").is_dir()):
         return []
     brute, tilted = (_ok(runs / name) for name in ("brute", "tilted"))
@@ -237,7 +237,7 @@ def _real(runs: Path) -> list[str]:
 
 
 def _field(runs: Path) -> list[str]:
-    """What the level `field` costs, and the tilts that it was driven with."""
+    """Cost of the level `field`, and its tilts."""
     folders = sorted(runs.glob("field-*"))
     if not folders:
         return []
@@ -279,7 +279,7 @@ def _ok(folder: Path) -> list[Row]:
 
 
 def main() -> None:
-    """One of the commands."""
+    """Run one of the commands."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -1,10 +1,10 @@
-"""How fast `cosim join` drives in a SUMO that somebody else started, alone and beside other programs.
+"""Speed of `cosim join` in a running SUMO, alone and beside other TraCI clients.
 
     python -m benchmarks.joining [--rounds 5] [--seconds 20] [--small] [--out docs/results/joining.md]
 
-The motorway interchange that SUMO's package ships (A10KW), with 200 vehicles. SUMO runs in a process of its
-own, as does every other program; the ways take turns. Wants a machine with nothing else to do: what else it
-does leaves only the ratio by processor time alone.
+Network: the motorway interchange A10KW of SUMO's package, with 200 vehicles. SUMO and every other client run
+in separate processes; the conditions alternate. Run on an idle machine: under other load only the ratio by
+processor time is valid.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ try:
 except traci.exceptions.FatalTraCIError:
     pass
 """
-# SUMO's own platoons (sumo/tools/simpla), of the cars that our agents leave alone.
+# SUMO's platoons (sumo/tools/simpla), of vehicles that are no AVs.
 PLATOONS = STEPS.replace("try:", "import simpla\nsimpla.load(sys.argv[2])\ntry:", 1)
 PLATOONED = "mw_passenger"
 SIMPLA = f"""<configuration>
@@ -60,10 +60,10 @@ SIMPLA = f"""<configuration>
 
 
 class Way(NamedTuple):
-    """One way of sharing SUMO."""
+    """One condition: a way of sharing SUMO."""
 
     what: str
-    other: str = ""  # the other program
+    other: str = ""  # code of the other client
     preset: str = "lawful"
     fleet: Fleet = Fleet(penetration=0.2)
 
@@ -77,32 +77,32 @@ WAYS = (
 
 
 class Drive(NamedTuple):
-    """What one drive came to."""
+    """Results of one drive."""
 
-    ratio: float  # times real time
-    busy: float  # the same by the processor time of all its processes
+    ratio: float  # simulated time over wall time
+    busy: float  # simulated time over the processor time of all processes
     vehicles: float  # mean over the decisions
     avs: float
 
 
 class Clock(Hook):
-    """Times and numbers from the end of the warm-up on; `others`: process ids."""
+    """Times and vehicle numbers after the warm-up; `others`: process ids."""
 
     def __init__(self, others: Sequence[int]) -> None:
         self._others = others
 
     def on_start(self, episode: Episode) -> None:
-        """The warm-up is driven."""
+        """The warm-up has ended."""
         self._began = self._now()
         self.numbers: list[tuple[int, int]] = []
 
     def on_step(self, episode: Episode, step: Step) -> None:
-        """A decision was carried out."""
+        """A decision was executed."""
         self.numbers.append((step.after.n, len(step.after.avs)))
         self.wall, self.busy = (now - began for now, began in zip(self._now(), self._began, strict=True))
 
     def _now(self) -> tuple[float, float]:
-        """s of wall time, and of processor time of all processes (proc(5): stat, utime and stime)."""
+        """Wall time and processor time of all processes, s (proc(5): stat, utime and stime)."""
         ticks = 0
         for process in self._others:
             ticks += sum(
@@ -112,7 +112,7 @@ class Clock(Hook):
 
 
 def drive(way: Way, warmup: float, seconds: float, work: Path) -> Drive:
-    """One drive of `seconds` counted s, every AV commanded at random."""
+    """One drive of `seconds` counted s with random commands to every AV."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -185,7 +185,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, metavar="FILE.md", help="default: printed")
     args = parser.parse_args(arguments)
     ways, warmup = (WAYS[:1], 2.0) if args.small else (WAYS, WARMUP)
-    os.environ["SUMO_HOME"] = str(GAME.parents[1])  # where simpla looks for SUMO's tools
+    os.environ["SUMO_HOME"] = str(GAME.parents[1])  # simpla finds SUMO's tools there
     found: dict[str, list[Drive]] = {way.what: [] for way in ways}
     with tempfile.TemporaryDirectory(prefix="cosim-joining-") as work:
         for number in range(args.rounds):

@@ -1,10 +1,10 @@
-"""Kill `cosim evaluate` and its workers with -9 at random, resume, compare with an undisturbed run.
+"""Kills `cosim evaluate` and its workers at random (SIGKILL), resumes, compares with an undisturbed run.
 
     python -m benchmarks.kill [--rounds 20] [--kills 4] [--seed 0] [--engine local] [--out DIR]
 
-In each round workers and the parent are killed at random until `--kills` blows have fallen; a killed parent
-is started again with --resume. In the end every episode must be there exactly once, and equal in everything
-but its timings and the number of attempts. Exits with 1 if one is not.
+In each round workers and the parent are killed `--kills` times at random; a killed parent is restarted with
+--resume. In the end every episode must exist exactly once, and be equal except for timings and the number of
+attempts. Exits with 1 otherwise.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ LIMIT = 600.0  # s for a round
 
 
 def command(out: Path, engine: str) -> list[str]:
-    """`cosim evaluate` of the matrix, going on with whatever is in `out`."""
+    """`cosim evaluate` of the matrix, resuming in `out`."""
     start = [sys.executable, "-m", "cosim.cli.main", "evaluate"]
     return [*start, *MATRIX.split(), "--workers", "2", "--engine", engine, "--out", str(out), "--resume"]
 
 
 def rows(out: Path) -> list[dict[str, Any]]:
-    """What the run left, without what may differ."""
+    """The rows of a run, without fields that may differ."""
     table = pyarrow.parquet.read_table(out / "episodes.parquet").to_pylist()
     return [{k: v for k, v in row.items() if k not in TIMES} for row in table]
 
 
 def children(pid: int) -> list[int]:
-    """The processes that a process's threads started."""
+    """The child processes of a process."""
     found = []
     for file in Path(f"/proc/{pid}/task").glob("*/children"):
         try:
@@ -54,13 +54,13 @@ def children(pid: int) -> list[int]:
 
 
 def disturbed(out: Path, kills: int, dice: random.Random, longest: float, engine: str) -> str:
-    """One round; which blows fell."""
+    """One round; the kills: "w" of a worker, "P" of the parent."""
     blows = ""
     began = time.monotonic()
     while True:
         parent = subprocess.Popen(command(out, engine), stderr=subprocess.PIPE, stdout=subprocess.DEVNULL)
         while len(blows) < kills:
-            if dice.random() < 0.75:  # else the blow may fall before there are workers
+            if dice.random() < 0.75:  # else the parent may be killed before it has workers
                 while parent.poll() is None and not children(parent.pid):
                     time.sleep(0.05)
             try:
@@ -85,7 +85,7 @@ def disturbed(out: Path, kills: int, dice: random.Random, longest: float, engine
 
 
 def check_gone(workers: list[int]) -> None:
-    """Workers must end with their parent."""
+    """Raises SystemExit if workers outlive their parent."""
     end = time.monotonic() + 5.0
     while any(alive(pid) for pid in workers):
         if time.monotonic() > end:
@@ -94,7 +94,7 @@ def check_gone(workers: list[int]) -> None:
 
 
 def alive(pid: int) -> bool:
-    """Whether a process runs (a zombie whose parent has not waited for it yet does not)."""
+    """Whether a process is running (a zombie is not)."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:

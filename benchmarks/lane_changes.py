@@ -1,8 +1,8 @@
-"""A three-lane highway of human drivers on which every lane change is measured at its beginning.
+"""A three-lane highway with human drivers, on which every lane change is measured at its beginning.
 
-3 lanes, 3 km, 25 m/s, 3,600 vehicles an hour wished (conservative drivers with T = 3 s cannot all enter: the
-flow is then what their headway allows). A change is judged by the IDM and MOBIL formulas of Table II in the
-state in which it begins, whoever decided it.
+3 lanes, 3 km, 25 m/s, demand 3,600 vehicles/h. Conservative drivers with T = 3 s cannot all enter: their
+headway limits the flow. A lane change of any model is evaluated by the IDM and MOBIL formulas of Table II, in
+the state at its beginning.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from cosim.simulation.mobil import (
 
 CLASSES = ("aggressive", "moderate", "conservative")
 LENGTH = 3000.0  # m
-MEASURED = (500.0, 2500.0)  # m: away from where vehicles appear and vanish
-FLOW = 3600.0  # vehicles per hour
+MEASURED = (500.0, 2500.0)  # m, section away from the insertion and removal of vehicles
+FLOW = 3600.0  # vehicles/h
 WARM_UP = 120.0  # s: the time to cross the road at the speed limit
 STEP = 0.1  # s
 
@@ -49,14 +49,14 @@ class Change:
     worth: bool  # the polite incentive exceeds a_th
     worth_egoistic: bool  # the egoistic incentive exceeds a_th
     safe: bool  # the new follower need not brake harder than b_safe
-    front_gap: float  # m, to the new leader; nan: nobody
+    front_gap: float  # m, to the new leader; nan: none
     rear_gap: float  # m
-    imposed: float  # m/s2, deceleration that IDM asks of the new follower (0: none or it accelerates)
+    imposed: float  # m/s2, IDM deceleration of the new follower (0: no follower, or no braking)
 
 
 @dataclass
 class Traffic:
-    """What was measured: changes, vehicle-kilometres and headways per class, collided pairs."""
+    """Measurements: lane changes, vehicle-kilometres and headways per class, colliding pairs."""
 
     changes: list[Change] = field(default_factory=list)
     kilometres: dict[str, float] = field(default_factory=lambda: dict.fromkeys(CLASSES, 0.0))
@@ -88,7 +88,7 @@ def build_highway(folder: Path) -> None:
 
 
 def _flow(folder: Path, driver: DriverClass, duration: float) -> Path:
-    """Vehicles are inserted with the gaps of `driver`, at random moments and lanes."""
+    """Route file that inserts vehicles with the gaps of `driver`, at random times and lanes."""
     idm = driver.idm
     path = folder / "flow.rou.xml"
     path.write_text(
@@ -144,7 +144,7 @@ def _drive(drivers: Drivers, duration: float) -> Traffic:
 
 
 def _judge(drivers: Drivers, vehicle: str, known: Known) -> Change:
-    """The change of `vehicle` that began in this step; neighbours as SUMO sees them at this moment."""
+    """The lane change of `vehicle` that began in this step, with SUMO's neighbours at this time."""
     name = drivers.classes[vehicle]
     mobil = drivers.behaviors.classes[name].mobil
     direction = LEFT if libsumo.vehicle.getLateralSpeed(vehicle) > 0.0 else RIGHT
@@ -165,7 +165,7 @@ def _judge(drivers: Drivers, vehicle: str, known: Known) -> Change:
 
 
 def _sample(drivers: Drivers, traffic: Traffic, vehicles: Iterable[str], block: int) -> None:
-    """Once a second: distance driven and time headway (front to front) on the measured stretch."""
+    """Once a second: distance driven and time headway (front to front) on the measured section."""
     get = libsumo.vehicle
     for vehicle in vehicles:
         if not MEASURED[0] <= get.getLanePosition(vehicle) <= MEASURED[1]:

@@ -1,12 +1,12 @@
-"""How well AVs keep the law in the worlds of tests/worlds, counted by figures and from SUMO's outputs.
+"""Compliance of AVs with traffic rules in the networks of tests/worlds, by figures and SUMO's outputs.
 
     python -m benchmarks.law [--worlds arterial ...] [--arms NAME ...] [--seeds 3] [--preset lawful] [--show]
     python -m benchmarks.law --page --seeds 20
 
-The first prints a table for each network, on seeds from 100,000, with `--errors LEVEL` also the collisions
-beside `idm`. The second writes docs/results/law.md, on seeds from 200,000. `idm` is always driven beside the
-arms: what is asked of them is measured by it. The independent checker is tests/law/checker.py. With
---runs DIR what was driven before is not driven again; the same command goes on.
+The first prints a table per network, on seeds from 100,000; with `--errors LEVEL` also the collisions
+compared with `idm`. The second writes docs/results/law.md, on seeds from 200,000. The baseline `idm` is
+always driven too, since targets refer to it. The independent checker is tests/law/checker.py. With --runs
+DIR finished episodes are kept, and the same command resumes.
 """
 
 from __future__ import annotations
@@ -38,19 +38,19 @@ from cosim.workers.tasks import Task
 from tests.law import checker
 from tests.worlds.build import NAMES, build
 
-TRYING, PAGE = 100_000, 200_000  # first seeds
+VALIDATION, PAGE = 100_000, 200_000  # first seeds
 PAGE_FILE = Path("docs/results/law.md")
 IN_THE_TABLES_ALONE = ("interventions", "blocked", "persons", "figures agree")  # columns
 IDM = "idm"
-ARMS = ("car-alone", "random")  # no network: the subject is the car
-FREE = ("random",)  # arms of which neither distance nor trips nor brakings are asked
+ARMS = ("car-alone", "random")  # without networks, since the lawful car is under test
+FREE = ("random",)  # arms without targets for distance, trips and braking
 SHARES = (0.2, 1.0)  # of AVs
-NOTES = {  # arm -> what a reader of the page must know
+NOTES = {  # arm -> explanation on the page
     IDM: "`idm`: SUMO's driver in every AV, beside which targets are set.",
     "car-alone": "`car-alone` asks the car for more speed at every decision.",
     "random": "`random` asks the car for a random action at every decision.",
 }
-FIGURES = (  # of the rows, beside what the checker counts
+FIGURES = (  # of the rows, beside the checker's counts
     *("red_light_violations", "stop_sign_violations", "right_of_way_violations", "speeding_share"),
     *("worst_speeding_mps", "junctions_blocked", "avs_stuck", "av_trips_completed", "person_conflicts"),
     *("interventions", "av_involved_collisions", "av_caused_collisions", "hard_brakings_av", "dt_mean_m"),
@@ -60,21 +60,21 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Case(EpisodeOptions):
-    """An episode whose floating-car data hold every simulation step."""
+    """An episode with floating-car data of every simulation step."""
 
     def scenario(self, options: Sequence[str] = ()) -> Scenario:
-        """The scenario with the options that the checker needs."""
+        """The scenario with the options of the checker."""
         words = [word for name, value in checker.OPTIONS.items() for word in (f"--{name}", value)]
         return super().scenario((*words, *options))
 
 
 class Checked(EpisodeRunner):
-    """Hosted by the engine: drives, and has SUMO's outputs checked where they were written."""
+    """Hosted by the engine: drives an episode and checks SUMO's outputs in the same process."""
 
     def run(  # type: ignore[override]
         self, case: Case, warnings: tuple[str, ...], keep: str | None, progress: tasks.Progress
     ) -> Row:
-        """`law`: what the checker counted, `figures`: the document's; outputs stay in `keep`, if given."""
+        """The row: `law`, the checker's counts; `figures`, the document's. Outputs stay in `keep`, if any."""
         host = self.open(case, warnings)
         with tempfile.TemporaryDirectory(prefix="cosim-law-") as scratch:
             folder = Path(scratch) if keep is None else Path(keep) / case.key
@@ -87,7 +87,7 @@ class Checked(EpisodeRunner):
             "seed": case.seed,
             "law": asdict(law),
             "figures": {name: document.get(name) for name in FIGURES},
-            "boxes": sum(c["source"] == "box" for c in document["collision_list"]),  # SUMO does not report
+            "boxes": sum(c["source"] == "box" for c in document["collision_list"]),  # not reported by SUMO
             "ended": document["steps"] * host.episode.scenario.timing.decision,
             "seconds": sum(document["timings"].values()) if document["timings"] else None,
         }
@@ -109,8 +109,8 @@ def cases(
 
 
 def driven(todo: Sequence[Case], workers: int, runs: Path | None, keep: Path | None) -> list[Row]:
-    """The rows of all cases; those that `runs` holds are not driven again."""
-    names = {case.key: f"{Path(case.what).stem}-{case.key}" for case in todo}  # the net's place may differ
+    """The rows of all cases; those in `runs` are not driven again."""
+    names = {case.key: f"{Path(case.what).stem}-{case.key}" for case in todo}  # independent of folders
     held: dict[str, Row] = {}
     if runs is not None and runs.is_file():
         held = {row["key"]: row for row in map(json.loads, runs.read_text().splitlines())}
@@ -141,26 +141,26 @@ def driven(todo: Sequence[Case], workers: int, runs: Path | None, keep: Path | N
 
 @dataclass(frozen=True)
 class Cell:
-    """What one arm did in one world at one share of AVs."""
+    """The results of one arm in one network at one share of AVs."""
 
     rows: list[Row]
 
     def total(self, name: str) -> float:
-        """Over all episodes, as the checker counted."""
+        """Sum over all episodes of a count of the checker."""
         return float(sum(row["law"][name] for row in self.rows))
 
     def figure(self, name: str) -> float | None:
-        """Over all episodes, as the rows say."""
+        """Sum over all episodes of a figure of the rows."""
         known = [row["figures"][name] for row in self.rows if row["figures"].get(name) is not None]
         return float(sum(known)) if known else None
 
     def rate(self, name: str) -> str:
-        """Events an episode with the interval; bare where there were none."""
+        """Events per episode with the interval; "0" without events."""
         count = int(self.total(name))
         return "0" if not count else f"{count}: {statistics.rate(count, len(self.rows)).text(2)}"
 
 
-# Column -> text of a cell, and whether what must hold does, beside idm's cell (None: nothing is asked).
+# Column -> text of a cell, and whether its target is met, given idm's cell (None: no target).
 def _columns(cell: Cell, idm: Cell, free: bool) -> dict[str, tuple[str, bool | None]]:
     episodes = len(cell.rows)
     worst = max(row["law"]["worst_speeding_mps"] for row in cell.rows)
@@ -200,8 +200,8 @@ COUNTED_TWICE = (
 
 
 def differences(row: Row) -> dict[str, tuple[float, float]]:
-    """Figure -> (the checker's count, the row's), where they differ, other than by collisions that SUMO does
-    not report."""
+    """Figure -> (the checker's count, the row's) for differing figures; differences due to collisions that
+    SUMO does not report are ignored."""
     law, figures = row["law"], row["figures"]
     by_collision = ("right_of_way_violations", "av_involved_collisions", "av_trips_completed")
     law = law | {"worst_speeding_mps": law["worst_speeding_in_frames_mps"]}
@@ -222,7 +222,7 @@ def _agreement(cell: Cell) -> tuple[str, bool | None]:
 
 
 def table(world: str, cells: Mapping[tuple[float, str], Cell]) -> list[str]:
-    """One world: a line an arm and share; what must hold and does not is bold."""
+    """The table of one network: one line per arm and share; missed targets are bold."""
     lines: list[str] = []
     for (share, arm), cell in cells.items():
         columns = _columns(cell, cells[share, IDM], arm in FREE)
@@ -237,7 +237,7 @@ def table(world: str, cells: Mapping[tuple[float, str], Cell]) -> list[str]:
 
 
 def tables(rows: Sequence[Row]) -> list[str]:
-    """Every world's."""
+    """The tables of all networks."""
     lines: list[str] = []
     for world in dict.fromkeys(row["world"] for row in rows):
         lines += table(world, _cells(rows, world))
@@ -245,7 +245,7 @@ def tables(rows: Sequence[Row]) -> list[str]:
 
 
 def shown(rows: Sequence[Row]) -> list[str]:
-    """Each violation of each episode, and what figures and checker count differently."""
+    """All violations of all episodes, and differences between figures and checker."""
     lines = []
     for row in rows:
         where = f"{row['world']} {row['arm']} {row['penetration']:.0%} {row['seed']}"
@@ -259,7 +259,7 @@ def shown(rows: Sequence[Row]) -> list[str]:
 
 
 def beside_idm(rows: Sequence[Row]) -> list[str]:
-    """Markdown: episodes with an AV in a collision, paired with `idm`'s, of every world and of all."""
+    """Markdown: episodes with an AV in a collision, paired with `idm`'s, per network and for all."""
     head = ["world", "AVs", "arm", "pairs", "an AV in a collision", "of `idm`", "difference, pp", "p"]
     head += ["an AV caused one", "of `idm`", "distance of all, more m"]
     lines = [markdown_row(head), markdown_row(["---"] * len(head))]
@@ -285,7 +285,7 @@ def _paired(at: Mapping[tuple[Any, ...], Row], share: float, arm: str, worlds: S
 
 
 def in_collisions(now: Sequence[Row], then: Sequence[Row]) -> list[str]:
-    """Cells of paired figures: episodes with an AV in a collision, those of `then`, the difference, p."""
+    """Cells: episodes with an AV in a collision, those of `then`, the paired difference, p."""
     hit, before = (np.array([bool(row["av_involved_collisions"]) for row in rows]) for rows in (now, then))
     shares = (statistics.share(int(side.sum()), len(side)).text(1, 100.0) for side in (hit, before))
     return [
@@ -296,7 +296,7 @@ def in_collisions(now: Sequence[Row], then: Sequence[Row]) -> list[str]:
 
 
 def page(rows: Sequence[Row], preset: str, seeds: range, command: str) -> list[str]:
-    """docs/results/law.md: the networks together, and which of them miss a target."""
+    """docs/results/law.md: all networks together, and the missed targets."""
     networks = list(dict.fromkeys(row["world"] for row in rows))
     of_each = {(world, *key): cell for world in networks for key, cell in _cells(rows, world).items()}
     missed = [
@@ -333,7 +333,7 @@ def page(rows: Sequence[Row], preset: str, seeds: range, command: str) -> list[s
 
 
 def _cells(rows: Sequence[Row], world: str | None = None) -> dict[tuple[float, str], Cell]:
-    """(Share of AVs, arm) -> its rows in this network; in all of them together where none is named."""
+    """(Share of AVs, arm) -> rows in this network; None: in all networks together."""
     found: dict[tuple[float, str], list[Row]] = {}
     for row in rows:
         if world in (None, row["world"]):
@@ -342,12 +342,12 @@ def _cells(rows: Sequence[Row], world: str | None = None) -> dict[tuple[float, s
 
 
 def _missed(cell: Cell, idm: Cell, arm: str) -> list[str]:
-    """The columns whose target is missed."""
+    """The columns with a missed target."""
     return [name for name, (_, holds) in _columns(cell, idm, arm in FREE).items() if holds is False]
 
 
 def _summary(cells: Mapping[tuple[float, str], Cell]) -> list[str]:
-    """A line an arm and share, without a verdict."""
+    """The table of all networks together: one line per arm and share, without targets."""
     lines: list[str] = []
     for (share, arm), cell in cells.items():
         columns = _columns(cell, cells[share, IDM], arm in FREE)
@@ -374,7 +374,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add("--arms", nargs="+", default=list(ARMS), metavar="POLICY", help=f"beside idm; {' '.join(ARMS)}")
     add("--penetration", nargs="+", type=float, default=list(SHARES), metavar="X", help="share of AVs")
     add("--seeds", type=int, default=3, metavar="N", help="how many")
-    add("--first", type=int, metavar="SEED", help=f"default {TRYING}; of the page {PAGE}")
+    add("--first", type=int, metavar="SEED", help=f"default {VALIDATION}; of the page {PAGE}")
     add("--preset", choices=Preset.ALL, default=Preset.LAWFUL)
     add("--errors", metavar="LEVEL", help="of human drivers; none")
     add("--workers", type=int, default=2, metavar="N")
@@ -384,7 +384,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add("--page", action="store_true", help="write the page")
     add("--out", type=Path, metavar="FILE.md", help=f"default {PAGE_FILE}")
     args = parser.parse_args(arguments)
-    first = args.first or (PAGE if args.page else TRYING)
+    first = args.first or (PAGE if args.page else VALIDATION)
     seeds = range(first, first + args.seeds)
     place = args.runs or Path(tempfile.mkdtemp(prefix="cosim-law-"))
     began = time.perf_counter()

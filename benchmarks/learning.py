@@ -1,9 +1,9 @@
-"""How the shipped approaches learned: crashes, missions and distance over training. Drives nothing.
+"""Learning curves of the shipped approaches: crashes, missions and distance over training.
 
     python -m benchmarks.learning [--training vfn-p=runs/vfn-p-0] [--out docs/results]
 
-Drawn from runs/POLICY, runs/POLICY-0, -1, ... or, where there are none, from the logs of the trainings that
-made the shipped weights (docs/results/trainings). Other runs: `python -m benchmarks.learning_curves`.
+Sources: runs/POLICY, runs/POLICY-0, -1, ... or else the logs of the trainings of the shipped weights
+(docs/results/trainings). No episode is driven. Other runs: `python -m benchmarks.learning_curves`.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from benchmarks.tables import write_page
 from policy.agents import APPROACHES
 
 NAME = "learning"
-TRAININGS = Path("docs/results/trainings")  # logs of the trainings that made the shipped weights
+TRAININGS = Path("docs/results/trainings")  # training logs of the shipped weights
 
 
 def write(out: Path, given: Mapping[str, Sequence[Path]]) -> None:
-    """learning.md, learning.png, data/learning.csv; nothing where no training is known of.
+    """Write learning.md, learning.png and data/learning.csv; nothing without a known training.
 
-    `given`: policy -> runs of `cosim train`, in place of those that are found.
+    `given`: policy -> runs of `cosim train`, in place of those found.
     """
     runs = [
         learning_curves.read(f"{name}={run}") for name in APPROACHES for run in given.get(name, found(name))
@@ -40,7 +40,7 @@ def write(out: Path, given: Mapping[str, Sequence[Path]]) -> None:
 
 
 def found(policy: str) -> list[Path]:
-    """The runs of `cosim train` that are known of a policy."""
+    """The known runs of `cosim train` of a policy."""
     for root in (Path("runs"), TRAININGS):
         places = [root / policy, *sorted(root.glob(f"{policy}-[0-9]*"))]
         if runs := [place for place in places if (place / "log.jsonl").is_file()]:

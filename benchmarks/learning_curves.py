@@ -1,10 +1,10 @@
-"""How learning went: crashes, missions and distance over training, several seeds of one agent together.
+"""Learning curves: crashes, missions and distance over training, with several seeds per agent.
 
     python -m benchmarks.learning_curves vfn-p=runs/vfn-p-0 vfn-p=runs/vfn-p-1 twin=runs/twin-0 \\
         [--out docs/results/learning.md]
 
-RUN is a folder of `cosim train`; runs of one LABEL are one agent trained from several seeds (without
-a label it is the folder's name). With --out a page, CSV and picture are written, else the page is printed.
+RUN is a folder of `cosim train`; runs of one LABEL are one agent trained from several seeds (default label:
+the folder's name). With --out a page, CSV and picture are written, else the page is printed.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ COURSES = {"crashed": "crashed, %", "mission_success": "missions fulfilled, %", 
 PERCENT = ("crashed", "mission_success")
 PARTS = {"train": "training drives", "valid": "validation, greedy"}
 DPI = 110
-WINDOW = 20  # iterations a point of the training drives is the mean of
+WINDOW = 20  # iterations, averaging window of training drives
 
 
 @dataclass(frozen=True)
 class Course:
-    """One figure over one run; [k] each."""
+    """The curve of one figure over one run; [k] each."""
 
     iteration: Floats
-    value: Floats  # in the figure's own unit, shares as fractions
+    value: Floats  # in the figure's unit, shares as fractions
 
 
 @dataclass(frozen=True)
@@ -49,11 +49,11 @@ class Training:
     name: str
     courses: Mapping[tuple[str, str], Course]
     iterations: int
-    seed: int | None  # None: the folder does not say
+    seed: int | None  # None: unknown
 
 
 def read(text: str) -> Training:
-    """`[LABEL=]RUN`. Raises BadInput when there is no log of a training in it."""
+    """Read `[LABEL=]RUN`. Raises BadInput without a training log in it."""
     label, _, folder = text.rpartition("=")
     path = Path(folder)
     log = path / "log.jsonl"
@@ -81,13 +81,13 @@ def read(text: str) -> Training:
 
 
 def smoothed(x: Floats, y: Floats, window: int = WINDOW) -> Course:
-    """Means over `window` neighbours, each at the last of them; over all there are when these are fewer."""
+    """Moving means over `window` points (or all, if fewer), each at its last point."""
     width = min(window, len(y))
     return Course(x[width - 1 :], np.convolve(y, np.full(width, 1.0 / width), "valid"))
 
 
 def together(courses: Sequence[Course]) -> tuple[Floats, Floats, Floats, Floats]:
-    """Iterations that all courses reach, and there the mean, the lowest and the highest of them: [k] each."""
+    """Iterations common to all courses, and the mean, minimum and maximum there: [k] each."""
     first, last = max(c.iteration[0] for c in courses), min(c.iteration[-1] for c in courses)
     x = courses[0].iteration
     x = x[(x >= first) & (x <= last)]
@@ -120,7 +120,7 @@ def page(runs: Sequence[Training], command: str, drawn: str = "") -> list[str]:
 
 
 def write_csv(path: Path, runs: Iterable[Training]) -> None:
-    """Points of every run: all of validation, every `WINDOW`-th of the training drives, which are means."""
+    """Write the points of every run: all of validation, every `WINDOW`-th mean of the training drives."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(("agent", "run", "drives", "figure", "iteration", "value"))
@@ -132,7 +132,7 @@ def write_csv(path: Path, runs: Iterable[Training]) -> None:
 
 
 def draw(path: Path, runs: Sequence[Training]) -> None:
-    """A row per part, a column per figure."""
+    """Draw the curves: one row per part, one column per figure."""
     parts = [part for part in PARTS if any(p == part for run in runs for p, _ in run.courses)]
     picture = Picture(figsize=(4.2 * len(COURSES) + 1.6, 3.2 * len(parts)), layout="constrained")
     axes = picture.subplots(len(parts), len(COURSES), squeeze=False)
@@ -172,7 +172,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _seed(folder: Path) -> int | None:
-    """The training seed, as the checkpoint has it."""
+    """The training seed from the checkpoint."""
     try:
         return int(json.loads((folder / "state.json").read_text())["config"]["seed"])
     except (OSError, ValueError, KeyError, TypeError):
@@ -187,7 +187,7 @@ def _by_label(runs: Iterable[Training]) -> dict[str, list[Training]]:
 
 
 def _shared(runs: Sequence[Training]) -> dict[tuple[str, str], list[Course]]:
-    """What all of these runs have."""
+    """The courses common to all of these runs."""
     keys = [key for key in runs[0].courses if all(key in run.courses for run in runs)]
     return {key: [run.courses[key] for run in runs] for key in keys}
 

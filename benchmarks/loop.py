@@ -1,12 +1,12 @@
-"""One decision without the agent against bare libsumo, and against HighwayEnv, side by side in one run.
+"""Speed of the loop without agent, compared with bare libsumo and with HighwayEnv in one run.
 
     python -m benchmarks.loop [--scenario merge] [--demand dense] [--decisions 75] [--rounds 5] [--profile]
 
-Each round drives the same episode (same seed, same traffic: AVs driven by SUMO's IDM) in three processes that
-take turns, five decisions each, so that whatever else the machine does meets all of them alike: bare, four
-`libsumo.simulationStep()` per decision and nothing else but giving newcomers their driver; and ours, the same
-steps plus two frames of VelocityMap and kinematics for every AV with full history, at compact and at paper
-size. Figures are medians over decisions; only the ratios mean anything elsewhere.
+Each round drives the same episode (same seed, AVs driven by SUMO's IDM) in three processes. They alternate
+every five decisions, so that other load affects all equally. `bare`: four `libsumo.simulationStep()` per
+decision, and drivers for departed vehicles. `compact` and `paper`: the same steps plus two frames of
+VelocityMap and kinematics for every AV with full history. Figures are medians over decisions; only the
+ratios carry over to other machines.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from cosim.workers.worker import Worker
 TARGET = {"compact": 3.0, "paper": 6.0}  # times bare libsumo
 HIGHWAY_TARGET = 20.0  # times HighwayEnv's simulated seconds per second
 VEHICLES, AVS = 50, 8
-TURN = 5  # decisions before the next process has its turn
+TURN = 5  # decisions of a process before the next one continues
 
 
 class Bare:
-    """Bare libsumo: the same episode, nothing read."""
+    """Bare libsumo: the same episode without reading any state."""
 
     def __init__(self, scenario: Scenario) -> None:
         import libsumo
@@ -49,7 +49,7 @@ class Bare:
         self._simulator.reset(seed)
 
     def go(self, decisions: int) -> dict[str, list[float]]:
-        """Drive on; seconds per decision."""
+        """Continue; seconds per decision."""
         step, departed = self._sumo.simulationStep, self._sumo.simulation.getDepartedIDList
         times = []
         for _ in range(decisions):
@@ -67,7 +67,7 @@ class Bare:
 
 
 class Ours:
-    """The loop up to the agent: advance, read, draw, keep the history."""
+    """The loop without agent: advance, read, draw, keep the history."""
 
     def __init__(self, scenario: Scenario, observation: ObservationConfig) -> None:
         from cosim.observation.observer import Observer
@@ -77,7 +77,7 @@ class Ours:
         self._observer = Observer(self._simulator.road, observation)
 
     def start(self, seed: int) -> None:
-        """Begin an episode; everything is compiled before the clock starts."""
+        """Begin an episode, with all kernels compiled before the measurement."""
         simulator, observer = self._simulator, self._observer
         for _ in range(2):
             observer.reset()
@@ -86,7 +86,7 @@ class Ours:
             observer.histories(simulator.route, simulator.commanded)
 
     def go(self, decisions: int) -> dict[str, list[float]]:
-        """Drive on; seconds per decision and the part spent observing; vehicles and AVs there were."""
+        """Continue; seconds per decision, seconds of observation, and numbers of vehicles and AVs."""
         simulator, observer = self._simulator, self._observer
         seen: dict[str, list[float]] = {"total": [], "observing": [], "vehicles": [], "avs": []}
         for _ in range(decisions):
@@ -104,7 +104,7 @@ class Ours:
         return seen
 
     def profile(self, seed: int, decisions: int) -> str:
-        """The same under cProfile, as its table."""
+        """As `go`, under cProfile; returns its table."""
         self.start(seed)
         stream = io.StringIO()
         with cProfile.Profile() as profiler:
@@ -113,7 +113,7 @@ class Ours:
         return stream.getvalue()
 
     def reset_times(self, seeds: range) -> list[float]:
-        """Seconds of `libsumo.load` + the first snapshot (no warm-up: that is simulated time)."""
+        """Seconds of `libsumo.load` and the first snapshot, without warm-up."""
         times = []
         for seed in seeds:
             began = time.perf_counter()
@@ -124,7 +124,7 @@ class Ours:
         return times
 
     def load_times(self, n: int) -> list[float]:
-        """Seconds of bare `libsumo.load` with the same options: what no reset can undercut."""
+        """Seconds of bare `libsumo.load` with the same options: a lower bound for a reset."""
         import libsumo
 
         arguments, times = self._simulator._arguments(100_000), []
@@ -145,10 +145,10 @@ class Ours:
 
 
 class Highway:
-    """HighwayEnv with as many vehicles, 8 agents and a grid observation of comparable size."""
+    """HighwayEnv with equally many vehicles, 8 agents and a grid observation of similar size."""
 
     def run(self, steps: int) -> tuple[float, float]:
-        """Simulated seconds, seconds."""
+        """Simulated time and wall time, s."""
         import gymnasium
         import highway_env  # noqa: F401 - registers its environments
 
@@ -200,7 +200,7 @@ def main() -> None:
 
     scenario = load(args.scenario, demand=[args.demand], fleet=Fleet(penetration=args.penetration))
     result: dict[str, Any] = {"scenario": args.scenario, "demand": args.demand, "rounds": args.rounds}
-    rounds: list[dict[str, dict[str, float]]] = []  # [round][who][figure], medians over decisions
+    rounds: list[dict[str, dict[str, float]]] = []  # [round][size][figure], medians over decisions
     with (
         Worker(Bare, scenario) as plain,
         Worker(Ours, scenario, COMPACT) as compact,
@@ -208,33 +208,33 @@ def main() -> None:
     ):
         workers = {"bare": plain, "compact": compact, "paper": paper}
         for k in range(args.rounds + 1):
-            seen: dict[str, dict[str, list[float]]] = {who: {} for who in workers}
+            seen: dict[str, dict[str, list[float]]] = {size: {} for size in workers}
             for worker in workers.values():
                 worker.call("start", 100_000 + k)
             for _ in range(0, args.decisions, TURN):
-                for who, worker in workers.items():
+                for size, worker in workers.items():
                     for figure, values in worker.call("go", TURN).items():
-                        seen[who].setdefault(figure, []).extend(values)
+                        seen[size].setdefault(figure, []).extend(values)
             if k:  # the first round warms up
                 rounds.append({w: {f: statistics.median(v) for f, v in s.items()} for w, s in seen.items()})
         if args.profile:
-            for who in TARGET:
-                print(workers[who].call("profile", 100_000, args.decisions))
+            for size in TARGET:
+                print(workers[size].call("profile", 100_000, args.decisions))
 
-    def typical(who: str, figure: str) -> float:
-        return statistics.median(r[who][figure] for r in rounds)
+    def typical(size: str, figure: str) -> float:
+        return statistics.median(r[size][figure] for r in rounds)
 
     result["vehicles"] = typical("compact", "vehicles")
     result["avs"] = typical("compact", "avs")
     result["bare_us"] = round(1e6 * typical("bare", "total"), 1)
-    for who in TARGET:
-        ratios = [r[who]["total"] / r["bare"]["total"] for r in rounds]
-        result[who] = {
-            "decision_us": round(1e6 * typical(who, "total"), 1),
-            "observation_us": round(1e6 * typical(who, "observing"), 1),
+    for size in TARGET:
+        ratios = [r[size]["total"] / r["bare"]["total"] for r in rounds]
+        result[size] = {
+            "decision_us": round(1e6 * typical(size, "total"), 1),
+            "observation_us": round(1e6 * typical(size, "observing"), 1),
             "ratio": round(statistics.median(ratios), 2),
             "ratio_range": [round(min(ratios), 2), round(max(ratios), 2)],
-            "target": TARGET[who],
+            "target": TARGET[size],
         }
     short = replace(scenario, warmup=0.0)
     with Worker(Ours, short, COMPACT) as worker:

@@ -1,10 +1,10 @@
-"""The result pages that the papers' episodes do not make: predictions, costs, drivers, foreign nets.
+"""Result pages not made from the papers' episodes: predictions, costs, drivers, other networks.
 
     python -m benchmarks.measured [--only NAME ...] [--again] [--small]        # part of `make results`
 
-Each page by its own command, one after the other. What is finished is not measured again until its command
-changes (`--again` does): killed, the same goes on. Costs are measured best on a machine with nothing else to
-do. `--small`: as little as possible of everything, to see that it works; its figures are worth nothing.
+Each page has its own command. A finished page is not measured again until its command changes (or with
+`--again`), so that an interrupted run resumes. Measure costs on an idle machine. `--small`: minimal sizes to
+test the commands; the figures are meaningless.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from sumo_scenarios import names
 
 RESULTS = Path("docs/results")
 REAL_NETS = "data/real_nets.csv"
-PREDICTED = (  # what `cosim bench predict` leaves of figures
+PREDICTED = (  # pictures and data of `cosim bench predict`
     *("position_error.png", "map_error.png", "hpn_training.png"),
     *("data/position_error.csv", "data/interval_coverage.csv", "data/map_error.csv", "data/map_gain.csv"),
 )
@@ -31,25 +31,25 @@ PREDICTED = (  # what `cosim bench predict` leaves of figures
 
 @dataclass(frozen=True)
 class Place:
-    """Where one run of a page's commands reads and writes."""
+    """Folders and size of a run of a page's commands."""
 
-    out: Path  # pages and pictures; CSV files below it in data/
-    work: Path  # everything between
+    out: Path  # pages and pictures; CSV files in its data/
+    work: Path  # intermediate files
     small: bool
 
 
 @dataclass(frozen=True)
 class Page:
-    """One page (or several made together)."""
+    """One page, or several made together."""
 
     name: str
-    commands: Callable[[Place], list[list[str]]]  # what to run, modules with their flags
-    files: tuple[str, ...]  # what they leave, relative to the results
-    drop: tuple[str, ...] = ()  # patterns of what they leave in work/NAME, to be brought to the results
+    commands: Callable[[Place], list[list[str]]]  # modules with their flags
+    files: tuple[str, ...]  # resulting files, relative to the results
+    drop: tuple[str, ...] = ()  # patterns of files in work/NAME to copy to the results
 
 
 def prediction(place: Place) -> list[list[str]]:
-    """P's figures 5 to 8 and 10: how far off predictors and predicted maps are, on recorded episodes."""
+    """P's figures 5 to 8 and 10: errors of predictors and predicted maps on recorded episodes."""
     flags = ["--seeds", "200000:200001", "--behavior", "mixed", "--out", str(place.work / "prediction")]
     if place.small:
         flags += ["--scenario", "merge", "--demand", "dense", "--policy", "idm"]
@@ -57,7 +57,7 @@ def prediction(place: Place) -> list[list[str]]:
 
 
 def prediction_speed(place: Place) -> list[list[str]]:
-    """What predicting four seconds costs."""
+    """Cost of a prediction over four seconds."""
     size = ["--size", "compact", "--threads", "1"] if place.small else ["--threads", "2"]
     flags = ["--rounds", "1", "--decisions", "2" if place.small else "12"]
     flags += ["--backend", "eager"] if place.small else []  # inductor compiles C++ for a minute
@@ -65,7 +65,7 @@ def prediction_speed(place: Place) -> list[list[str]]:
 
 
 def agent(place: Place) -> list[list[str]]:
-    """What a decision costs, and how fast training is."""
+    """Cost of a decision, and speed of training."""
     sizes = ["compact"] if place.small else ["compact", "paper"]
     flags = ["--size", *sizes, "--threads", "1", "2", "--decisions", "12", "--episodes", "4"]
     if place.small:
@@ -74,25 +74,25 @@ def agent(place: Place) -> list[list[str]]:
 
 
 def decision_cost(place: Place) -> list[list[str]]:
-    """What a decision costs an AV in a city."""
+    """Cost of a decision per AV in a city."""
     flags = ["--avs", "2", "--decisions", "2"] if place.small else ["--real"]
     return [["benchmarks.decision_cost", *flags, "--out", str(place.out / "decision_cost.md")]]
 
 
 def sensing_cost(place: Place) -> list[list[str]]:
-    """What sensing costs an AV in a frame."""
+    """Cost of sensing per AV and frame."""
     flags = ["--small"] if place.small else []
     return [["benchmarks.sensing_cost", *flags, "--out", str(place.out / "sensing_cost.md")]]
 
 
 def compensation(place: Place) -> list[list[str]]:
-    """What late knowledge is worth when it is predicted to now."""
+    """Errors of delayed states with latency compensation."""
     flags = ["--small"] if place.small else []
     return [["benchmarks.compensation", *flags, "--out", str(place.out / "compensation.md")]]
 
 
 def performance(place: Place) -> list[list[str]]:
-    """What the loop, a batch and the Gaussian process cost."""
+    """Cost of the loop, a batch and the Gaussian process."""
     where = str(place.work / "recordings")
     traffic = ["--demand", "dense", "--behavior", "mixed"]
     record = ["cosim.cli.main", "record", *traffic, "--out", where, "--resume"]
@@ -105,13 +105,13 @@ def performance(place: Place) -> list[list[str]]:
 
 
 def startup(place: Place) -> list[list[str]]:
-    """How long a short command takes to start."""
+    """Start-up time of short commands."""
     flags = ["--rounds", "1" if place.small else "7"]
     return [["benchmarks.startup", *flags, "--out", str(place.out / "startup.md")]]
 
 
 def behaviors(place: Place) -> list[list[str]]:
-    """How faithfully LC2013 drives Table II."""
+    """Fidelity of LC2013 to Table II."""
     flags = ["--report", "--scale", "0.002" if place.small else "1"]
     return [["benchmarks.behaviors", *flags, "--out", str(place.out / "behaviors.md")]]
 
@@ -124,20 +124,20 @@ def real_nets(place: Place) -> list[list[str]]:
 
 
 def joining(place: Place) -> list[list[str]]:
-    """How fast `cosim join` drives."""
+    """Speed of `cosim join`."""
     flags = ["--rounds", "1", "--seconds", "1", "--small"] if place.small else ["--rounds", "5"]
     return [["benchmarks.joining", *flags, "--out", str(place.out / "joining.md")]]
 
 
 def estimate(place: Place) -> list[list[str]]:
-    """What the intervals of `cosim estimate` are worth."""
+    """Validity of the intervals of `cosim estimate`."""
     flags = ["--intervals", "2"] if place.small else []
     runs = str(place.work / "estimate")
     return [["benchmarks.estimate", "page", "--runs", runs, *flags, "--out", str(place.out / "estimate.md")]]
 
 
 def law(place: Place) -> list[list[str]]:
-    """How well AVs keep the law in the worlds of tests/worlds."""
+    """Compliance of AVs with traffic rules in the networks of tests/worlds."""
     flags = ["--seeds", "20", "--runs", str(place.work / "law_runs")]
     if place.small:
         flags = ["--worlds", "arterial", "--arms", "random", "--penetration", "0.2", "--seeds", "1"]
@@ -145,13 +145,13 @@ def law(place: Place) -> list[list[str]]:
 
 
 def capacity(place: Place) -> list[list[str]]:
-    """What human drivers bring through the open roads."""
+    """Capacity of the open roads with human drivers."""
     few = ["--roads", "minor", "--seeds", "100000:100001"] if place.small else []
     return [["benchmarks.capacity", *few, "--out", str(place.out)]]
 
 
 def front(place: Place) -> list[list[str]]:
-    """What each habit of the lawful car costs and buys."""
+    """Costs and benefits of each habit of the lawful car."""
     few = ["--roads", "lane_drop", "--seeds", "100000:100001", "--duration", "30"] if place.small else []
     return [["benchmarks.front", *few, "--out", str(place.out)]]
 
@@ -181,7 +181,7 @@ PAGES = (
 
 
 def make(page: Page, place: Place, *, again: bool = False) -> bool:
-    """Measure one page, unless it is finished; whether it was measured. Raises CalledProcessError."""
+    """Measure a page unless it is finished; return whether it was. Raises CalledProcessError."""
     commands = page.commands(place)
     mark = place.work / f"{page.name}.json"
     there = all((place.out / file).is_file() for file in page.files)
@@ -208,8 +208,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--only", nargs="+", choices=[page.name for page in PAGES], metavar="NAME")
-    parser.add_argument("--again", action="store_true", help="what is finished, too")
-    parser.add_argument("--small", action="store_true", help="hardly anything of everything")
+    parser.add_argument("--again", action="store_true", help="also finished pages")
+    parser.add_argument("--small", action="store_true", help="minimal sizes, to test")
     parser.add_argument("--out", type=Path, default=RESULTS, metavar="DIR", help="pages and pictures")
     parser.add_argument("--runs", type=Path, default=Path("runs/measured"), metavar="DIR")
     args = parser.parse_args(arguments)

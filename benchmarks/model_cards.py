@@ -1,9 +1,9 @@
-"""The networks that ship, in two tables: what each is, learned from, measured at, and not good for.
+"""Model cards of the shipped networks in two tables: inputs, training, results and limits.
 
     python -m benchmarks.model_cards [--out docs/reference/models.md]
 
-Made of the JSON cards beside the weights (`policy.checkpoint`), the logs of their trainings and the pages of
-docs/results; nothing is driven.
+Sources: the JSON cards beside the weights (`policy.checkpoint`), the training logs and docs/results. No
+episode is driven.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ LIMITS = {
     "scenarios": "Learned from the shipped scenarios alone, with drivers who follow IDM and LC2013 or MOBIL "
     "and make no errors. Its error on recorded traffic or on other roads is unknown.",
 }
-# A page with figures of a network has it in a table in this form.
+# Results page -> form of a network's name in its table.
 MEASURED = {
     "table3": "| {} |",
     "decisions": "| {} |",
@@ -61,13 +61,13 @@ MEASURED = {
 
 
 def names() -> list[str]:
-    """Every network that ships, agents first."""
+    """The shipped networks, agents first."""
     found = sorted(path.stem for path in SHIPPED.glob("*.safetensors"))
     return sorted(found, key=lambda name: (name not in APPROACHES, not name.startswith("hpn"), name))
 
 
 def page() -> list[str]:
-    """The Markdown page. Raises BadInput and WeightsMismatch where weights and card do not agree."""
+    """The Markdown page. Raises BadInput and WeightsMismatch if weights and card disagree."""
     cards = {name: read_card(SHIPPED / f"{name}.safetensors") for name in names()}
     agents = [agent(name, card) for name, card in cards.items() if name in APPROACHES]
     others = [
@@ -98,7 +98,7 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]] | Iterator[Sequenc
 
 
 def agent(name: str, card: Card) -> tuple[str, ...]:
-    """A value network or a baseline of P's Table III, by the heads `AGENTS`."""
+    """The row of a value network or a baseline of P's Table III, with columns `AGENTS`."""
     data, folder = card["data"], RESULTS / "trainings" / f"{name}-0"
     training = data["training"]
     log = [json.loads(line) for line in (folder / "log.jsonl").read_text("utf-8").splitlines()]
@@ -116,14 +116,14 @@ def agent(name: str, card: Card) -> tuple[str, ...]:
 
 
 def sees(name: str, card: Card) -> str:
-    """What an agent chooses from, and what reads its maps."""
+    """The inputs of an agent, and its map extractor."""
     approach, extractor = APPROACHES[name], card["configs"]["vfn"]["extractor"]
     parts = {"maps": True, "predicted maps": approach.predicted_maps, "kinematics": approach.kinematics}
     return f"{', '.join(part for part, there in parts.items() if there)}; `{extractor}`"
 
 
 def trained(card: Card, folder: Path, log: Sequence[Mapping[str, Any]]) -> str:
-    """How the weights came about: command, iteration, updates, and the time that the whole training took."""
+    """The training of the weights: command, iteration, updates, and duration of the whole training."""
     chosen = card["measured"]["iteration"]
     command = f"`{card['data']['commands']['train']}` (commit {card['data']['commit']})"
     config = f"[configuration]({LINK}/trainings/{folder.name}/config.yaml)"
@@ -133,7 +133,7 @@ def trained(card: Card, folder: Path, log: Sequence[Mapping[str, Any]]) -> str:
 
 
 def validated(card: Card) -> str:
-    """What the weights that were chosen drove in validation."""
+    """The validation results of the chosen weights."""
     measured, training = card["measured"]["validation"], card["data"]["training"]
     drives = training["validation"] * len(training["lessons"])
     crashed, admitted = measured["valid/crashed"], measured["valid/mission_success"]
@@ -141,7 +141,7 @@ def validated(card: Card) -> str:
 
 
 def limits(name: str) -> Iterator[str]:
-    """Names of `LIMITS` that hold for an agent."""
+    """Names of the `LIMITS` of an agent."""
     yield "law"
     if not APPROACHES[name].kinematics:
         yield "maps only"
@@ -149,19 +149,19 @@ def limits(name: str) -> Iterator[str]:
 
 
 def pages(name: str) -> Iterator[str]:
-    """Links to the results that have figures of an agent."""
+    """Links to the results pages with figures of an agent."""
     for title, form in MEASURED.items():
-        page = RESULTS / f"{title}.md"  # of a claim that is not driven yet there is none
+        page = RESULTS / f"{title}.md"  # missing for a claim without results yet
         if page.is_file() and form.format(name) in page.read_text(encoding="utf-8"):
             yield f"[{title}]({LINK}/{title}.md)"
 
 
 def predictor(name: str, card: Card) -> tuple[str, ...]:
-    """A variant of HPN or a predictor of trajectories, by the heads `PREDICTORS`."""
+    """The row of an HPN variant or a trajectory predictor, with columns `PREDICTORS`."""
     data, measured = card["data"], card["measured"]
     if name.startswith("hpn"):
         episodes, command = data["train"]["episodes"], data["commands"]["train"]
-        loss = "plain loss" if "validation_maps" in measured else "loss"  # another sum: not comparable
+        loss = "plain loss" if "validation_maps" in measured else "loss"  # another sum, not comparable
         what, error = "maps and kinematics", f"{loss} {measured['validation_loss']:.3g}"
         result = f"[prediction_maps]({LINK}/prediction_maps.md)"
     else:
@@ -172,7 +172,7 @@ def predictor(name: str, card: Card) -> tuple[str, ...]:
 
 
 def encoder(name: str, card: Card) -> tuple[str, ...]:
-    """The frame encoder, by the heads `PREDICTORS`."""
+    """The row of the frame encoder, with columns `PREDICTORS`."""
     frames, r2 = card["data"]["frames"]["training"], card["measured"]["R2 on tuning seeds"]
     shown = {"gap": "gap ahead, own lane", "speed": "speed ahead, own lane"}
     error = "R² ahead in its lane: " + ", ".join(f"{what} {r2[key]:.2f}" for what, key in shown.items())

@@ -1,9 +1,9 @@
-"""What the loop, a batch and a prediction cost, on one page: `loop`, `batch` and `prediction`, one by one.
+"""Cost of the loop, a batch and a prediction on one page: runs `loop`, `batch` and `prediction`.
 
     python -m benchmarks.performance --recordings DIR [--out docs/results/performance.md] [--small]
 
-Wants a machine with nothing else to do. `--recordings`: a folder of `cosim record`, tuning seeds. `--small`:
-as little as possible of everything; the figures are worth nothing then.
+Run on an idle machine. `--recordings`: a folder of `cosim record`, validation seeds. `--small`: minimal
+sizes; the figures are meaningless then.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--recordings", required=True, metavar="DIR", help="a folder of `cosim record`")
     parser.add_argument("--out", type=Path, default=Path("docs/results/performance.md"), metavar="FILE.md")
-    parser.add_argument("--small", action="store_true", help="hardly anything of everything")
+    parser.add_argument("--small", action="store_true", help="minimal sizes, to test")
     args = parser.parse_args(arguments)
     flags: dict[str, Sequence[str]] = {"loop": LOOP, "batch": BATCH, "prediction": PREDICTION}
     flags = {**(SMALL if args.small else flags)}

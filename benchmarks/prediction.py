@@ -1,8 +1,8 @@
-"""What one forecast of the indirect Gaussian process costs, for 50 vehicles at a time.
+"""Cost of one forecast of the indirect Gaussian process for 50 vehicles.
 
     python -m benchmarks.prediction --recordings DIR [--vehicles 50] [--seconds 5] [--json]
 
-The fastest of many, so that other work on the machine counts least.
+The minimum of many runs, to reduce the effect of other load.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from cosim.workers.memory import keep_freed_memory
 from policy.prediction.gp import GaussianProcessIndirect
 
 TARGET_MS = 1.0
-MOMENTS = 20  # of a recording, at most
+MOMENTS = 20  # per recording, at most
 
 
 def fastest(work: Callable[[], Any], seconds: float) -> float:
-    """Fastest of as many calls as fit, in s."""
+    """Duration of the fastest of all calls within `seconds`, s."""
     work()
     best, end = np.inf, time.perf_counter() + seconds
     while time.perf_counter() < end:
@@ -38,7 +38,7 @@ def fastest(work: Callable[[], Any], seconds: float) -> float:
 
 
 def speed(past: Floats, seconds: float) -> dict[str, float]:
-    """Costs for the vehicles of `past` [V,10,4], in ms; each is the fastest of what fits into `seconds`."""
+    """Costs for the vehicles of `past` [V,10,4], ms; each the fastest of all calls within `seconds`."""
     predictor = GaussianProcessIndirect()
     valid = np.ones(past.shape[:2], np.bool_)
     banks = [
@@ -54,7 +54,7 @@ def speed(past: Floats, seconds: float) -> dict[str, float]:
 
 
 def sample(folder: Folder, vehicles: int) -> Floats:
-    """Past [V,10,4] of vehicles drawn from every recording, seen for the whole of it."""
+    """Past [V,10,4] of random vehicles from all recordings, with complete histories."""
     rng = np.random.default_rng(0)
     parts = []
     for recording in folder.recordings():

@@ -1,12 +1,11 @@
-"""What predicting the next four seconds costs: forecast, HPN, chain and rendering, for 8 AVs at a time.
+"""Cost of a prediction over four seconds for 8 AVs: forecast, HPN, chain and rendering.
 
     python -m benchmarks.prediction_maps [--size compact paper] [--threads 1 2] [--out FILE.md | --json]
 
-Real histories (highway, dense, tuning seed 100,000, the share of AVs chosen so that about 8 decide) are
-gathered first; then every part is timed on them, medians over decisions. The map branch at paper size (one
-frame a step, 20 steps) is timed eager, compiled, in bfloat16 and, where it is installed, by ONNX Runtime.
-"Real time" is
-the decision period, 0.4 s. Compare ratios, not seconds: other work on the machine moves everything.
+Every part is timed on recorded histories (highway, dense, validation seed 100,000, a share of AVs such that
+about 8 decide); medians over decisions. The map branch at paper size (one frame per step, 20 steps) is timed
+eager, compiled, in bfloat16 and, if installed, in ONNX Runtime. "Real time" is the decision period, 0.4 s.
+Compare ratios, not seconds, since other load affects all times.
 """
 
 from __future__ import annotations
@@ -48,13 +47,13 @@ AGENTS, PENETRATION = 8, 0.19
 
 
 class Gatherer:
-    """Runs in a worker: drives an episode and keeps what 8 AVs saw."""
+    """Runs in a worker: drives an episode and keeps the histories of 8 AVs."""
 
     def __init__(self, scenario: Scenario, observation: ObservationConfig) -> None:
         self._host = Host(scenario, "idm", 0.0, observation=observation)
 
     def gather(self, seed: int, decisions: int) -> tuple[Any, list[Any]]:
-        """The road, and histories of the first AGENTS AVs (copies)."""
+        """The road, and copies of the histories of the first AGENTS AVs."""
         kept = Kept()
         self._host.run(seed, hooks=[kept])
         return self._host.simulator.road, kept.histories[:decisions]
@@ -65,13 +64,13 @@ class Gatherer:
 
 
 class Kept(Hook):
-    """Copies of what the first AGENTS AVs observe at every decision."""
+    """Copies of the histories of the first AGENTS AVs at every decision."""
 
     def __init__(self) -> None:
         self.histories: list[dict[str, History]] = []
 
     def on_start(self, episode: Episode) -> None:
-        """The first one."""
+        """Keep the histories of the first decision."""
         chosen = sorted(episode.histories)[:AGENTS]
         if len(chosen) == AGENTS:
             seen = {a: episode.histories[a] for a in chosen}
@@ -80,12 +79,12 @@ class Kept(Hook):
             )
 
     def on_step(self, episode: Episode, step: Step) -> None:
-        """The next one."""
+        """Keep the histories of the next decision."""
         self.on_start(episode)
 
 
 def median_ms(work: Callable[[], object], rounds: int) -> float:
-    """Median wall time in ms; the first round (compilation, caches) is not counted."""
+    """Median wall time in ms, without the first round (compilation, caches)."""
     times = []
     for _ in range(rounds + 1):
         began = time.perf_counter()
@@ -95,7 +94,7 @@ def median_ms(work: Callable[[], object], rounds: int) -> float:
 
 
 def parts(road: Any, kept: list[Any], size: ObservationConfig, chain: ChainConfig) -> dict[str, float]:
-    """ms of every part of one joint prediction with the shipped kind of HPN."""
+    """ms of every part of one joint prediction with the shipped HPN architecture."""
     predictor, raster, hpn = (
         make_predictor("gp-indirect", 20, 0.2),
         rasterize_road(road),
@@ -127,7 +126,7 @@ def parts(road: Any, kept: list[Any], size: ObservationConfig, chain: ChainConfi
 
 
 def map_branch(config: MapBranchConfig, horizon: int, rounds: int, backend: str) -> dict[str, float | str]:
-    """ms of the map branch's whole chain for 8 AVs, by the way it is computed."""
+    """ms of the map branch's whole chain for 8 AVs, by backend."""
     torch.manual_seed(0)
     branch = MapBranch(config).eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     seen = config.seen * config.channels
@@ -164,7 +163,7 @@ def map_branch(config: MapBranchConfig, horizon: int, rounds: int, backend: str)
 
 
 def say(line: str) -> None:
-    """Progress: paper size takes minutes."""
+    """Print progress, since paper size takes minutes."""
     print(line, file=sys.stderr, flush=True)
 
 
@@ -173,7 +172,7 @@ def _ratio(ms: float | str) -> str:
 
 
 def page(result: Mapping[str, Mapping[str, Any]], command: str) -> list[str]:
-    """Markdown: the whole prediction by its parts, then the map branch by the way it is computed."""
+    """Markdown: the whole prediction by its parts, then the map branch by backend."""
     lines = [
         "# What a prediction costs",
         "",
@@ -205,13 +204,13 @@ def page(result: Mapping[str, Mapping[str, Any]], command: str) -> list[str]:
 
 
 def onnx(branch: MapBranch, past: torch.Tensor, rows: torch.Tensor, steps: int, rounds: int) -> float | str:
-    """ms by ONNX Runtime, or why not."""
+    """ms in ONNX Runtime, or the reason why it is not possible."""
     if importlib.util.find_spec("onnxruntime") is None or importlib.util.find_spec("onnx") is None:
         return "not installed"
     import onnxruntime
 
     file = io.BytesIO()
-    export: Any = torch.onnx.export  # its types know of paths alone
+    export: Any = torch.onnx.export  # typed for paths only
     export(branch, ([past], rows), file, dynamo=False)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()

@@ -1,12 +1,11 @@
-"""Networks of other authors, driven as they stand: the games of the eclipse-sumo package.
+"""Unmodified networks of other authors: the games of the eclipse-sumo package.
 
     python -m benchmarks.real_nets [--duration S] [--seeds N] [--nets NAME ...] [--workers N]
                                    [--runs FILE.csv] [--held] [--out docs/results/real_nets.md]
 
 Drives A10KW, a motorway interchange, and every other configuration that loads, with SUMO's driver in every
-AV: time, memory, collisions and offences. What `--runs` holds is not driven again: by default what the page
-was made of, so that another file drives everything anew. `--held` drives nothing.
-Needs `pip install cosim-sumo[tools]`.
+AV. Measures time, memory, collisions and offences. Episodes in `--runs` are not driven again (default: those
+of the page). `--held` drives nothing. Needs `pip install cosim-sumo[tools]`.
 """
 
 from __future__ import annotations
@@ -33,10 +32,10 @@ from cosim.workers.worker import Worker
 
 POLICY = "idm"
 FIRST_SEED = 200000
-SEEDS = 10  # of A10KW; the other networks are driven on one seed
+SEEDS = 10  # of A10KW; one for every other network
 PENETRATION = 0.2
-LONGEST = 10_000.0  # s: of demonstrations that go on for days
-SETTLED = 60.0  # s: the memory is read from then on
+LONGEST = 10_000.0  # s, limit for scenarios that last for days
+MEMORY_START = 60.0  # s, first reading of the memory
 KEPT = Path("docs/results/data/real_nets.csv")
 PAGE = Path("docs/results/real_nets.md")
 OFFENCES = ("red_light_violations", "stop_sign_violations", "right_of_way_violations")
@@ -48,11 +47,11 @@ COLUMNS = (
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """One episode that is wanted."""
+    """One requested episode."""
 
     config: Path
     seed: int
-    duration: float | None  # s; None: to its end
+    duration: float | None  # s; None: to the scenario's end
 
     @property
     def key(self) -> tuple[str, int]:
@@ -62,7 +61,7 @@ class Run:
 
 @dataclass(frozen=True, slots=True)
 class Driven:
-    """What an episode gave; a row of the CSV file."""
+    """Results of an episode; a row of the CSV file."""
 
     network: str
     seed: int
@@ -73,7 +72,7 @@ class Driven:
     offences: int  # of AVs: red lights, stop signs, failures to yield
     stuck: int  # AVs
     memory_mb: float  # of the simulation's process, at the end
-    growth_mb: float  # since `SETTLED`
+    growth_mb: float  # since `MEMORY_START`
     took_s: float
     trace_hash: str
 
@@ -82,7 +81,7 @@ TYPES = {one.name: {"str": str, "int": int, "float": float}[str(one.type)] for o
 
 
 class Cost(Hook):
-    """The process's resident memory in MB after `SETTLED` s and at the end, and the AVs that there were."""
+    """Resident memory of the process in MB after `MEMORY_START` s and at the end, and all AVs."""
 
     first = last = math.nan
 
@@ -93,12 +92,12 @@ class Cost(Hook):
         self.avs.update(step.after.avs)
         pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
         self.last = pages * os.sysconf("SC_PAGE_SIZE") / 1e6
-        if episode.elapsed <= SETTLED or math.isnan(self.first):
+        if episode.elapsed <= MEMORY_START or math.isnan(self.first):
             self.first = self.last
 
 
 class Driver:
-    """Hosted in a process of its own, since a network may end SUMO and with it the process."""
+    """Runs in a separate process, since a network may crash SUMO and with it the process."""
 
     def __init__(self, run: Run) -> None:
         fleet = Fleet(penetration=PENETRATION)
@@ -108,7 +107,7 @@ class Driver:
         self._host = Host(vetted(scenario), POLICY, svo=math.radians(45.0))
 
     def drive(self) -> Driven:
-        """The episode, and what it cost."""
+        """Drive the episode; return its results and cost."""
         cost = Cost()
         began = time.perf_counter()
         document = self._host.run(self._run.seed, hooks=[cost]).document()
@@ -132,7 +131,7 @@ class Driver:
 
 
 def a10kw() -> Path:
-    """The configuration file of eclipse-sumo's game. Raises ImportError where that is not installed."""
+    """The configuration file of A10KW in eclipse-sumo. Raises ImportError without that package."""
     import sumo
 
     return Path(sumo.__file__).parent / "tools" / "game" / "A10KW.sumocfg"
@@ -148,7 +147,7 @@ def wanted(seeds: int, duration: float | None, nets: Sequence[str] | None) -> It
 
 
 def drive(run: Run) -> Driven | str:
-    """What one run gave, or why it was refused."""
+    """The results of a run, or the reason why it was refused."""
     try:
         worker = Worker(Driver, run, timeout=3600.0, name="real-nets")
         try:
@@ -161,7 +160,7 @@ def drive(run: Run) -> Driven | str:
 
 
 def read(file: Path) -> dict[tuple[str, int], Driven]:
-    """The rows of a CSV file, by network and seed; none where there is no file."""
+    """The rows of a CSV file, by network and seed; empty without a file."""
     if not file.is_file():
         return {}
     with file.open(newline="", encoding="utf-8") as lines:
@@ -177,7 +176,7 @@ def keep(file: Path, rows: Sequence[Driven]) -> None:
 
 
 def line(rows: Sequence[Driven]) -> list[str]:
-    """One network's cells: sums over its seeds, means of memory and time."""
+    """The cells of one network: sums over its seeds, means of memory and time."""
     simulated, took = sum(row.simulated_s for row in rows), sum(row.took_s for row in rows)
     names = ("collisions", "av_caused", "offences", "stuck")
     counts = (sum(getattr(row, name) for row in rows) for name in names)
@@ -189,7 +188,7 @@ def line(rows: Sequence[Driven]) -> list[str]:
 
 
 def page(rows: Sequence[Driven], lacking: Sequence[str], command: str) -> list[str]:
-    """The Markdown page; `lacking`: a line for every run that is wanted and not there."""
+    """The Markdown page; `lacking`: a line for every missing run."""
     names = dict.fromkeys(row.network for row in rows)
     networks = {name: [row for row in rows if row.network == name] for name in names}
     populated = {name: of for name, of in networks.items() if any(row.avs for row in of)}
@@ -223,7 +222,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--duration", type=float, metavar="S", help="default: to each scenario's end")
     parser.add_argument("--seeds", type=int, default=SEEDS, metavar="N", help=f"of A10KW ({SEEDS})")
-    parser.add_argument("--nets", nargs="+", metavar="NAME", help="these alone: A10KW, grid6 ...")
+    parser.add_argument("--nets", nargs="+", metavar="NAME", help="only these: A10KW, grid6 ...")
     parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes (1)")
     parser.add_argument("--runs", type=Path, default=KEPT, metavar="FILE.csv")
     parser.add_argument(

@@ -1,10 +1,9 @@
-"""What sensing costs an AV in a frame, by level, on the merge and in a city, on one thread.
+"""Cost of sensing per AV and frame, by level, on the merge and in a city, on one thread.
 
     python -m benchmarks.sensing_cost [--levels ideal v2v ...] [--frames 100] [--small] [--out FILE.md]
 
-SUMO drives everybody once; each level then perceives the same frames: sensors, messages, tracks, and every
-AV's percept put together. Processor time, which other work on the machine changes little; the least of
-`ROUNDS` rounds.
+SUMO drives all vehicles once; each level then perceives the same frames: sensors, messages, tracks, and the
+percept of every AV. Processor time, which other load changes little; the minimum of `ROUNDS` rounds.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from cosim.sensing.perception import Perception
 from cosim.simulation.sumo import SumoSimulator
 from cosim.types import Preset, Snapshot, Timing
 
-TARGET_US = {IDEAL: 20.0, "v2v": 100.0}  # an AV and frame
+TARGET_US = {IDEAL: 20.0, "v2v": 100.0}  # per AV and frame
 ROUNDS = 3
 CITY_AVS = 50
 
@@ -57,10 +56,10 @@ def driven(name: str, scenario: Scenario, warm_up: float, frames: int) -> Drive:
 
 
 def cost(drive: Drive, level: str) -> float:
-    """Microseconds of processor time an AV and frame, the least of `ROUNDS`."""
+    """Microseconds of processor time per AV and frame, the minimum of `ROUNDS`."""
     sensing = read(level)
     least = math.inf
-    for _ in range(ROUNDS + 1):  # in the first one kernels are compiled
+    for _ in range(ROUNDS + 1):  # the first one compiles kernels
         began, many = time.thread_time(), 0
         perception = None
         if sensing is not None:

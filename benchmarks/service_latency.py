@@ -1,9 +1,9 @@
-"""What a session's step costs over HTTP, beside the same step of `cosim.open` on this machine.
+"""Latency of a session's step over HTTP, compared with the same step of `cosim.open` on this machine.
 
     cosim serve &
     python -m benchmarks.service_latency [--url http://127.0.0.1:8000] [--scenario merge] [--episodes 3]
 
-Both drive the same episodes decision by decision, in turns, so that a busy machine hits both alike.
+Both drive the same episodes in alternating decisions, so that other load affects both equally.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from cosim.types import MetaAction
 
 
 class Json:
-    """The same session driven by plain JSON."""
+    """The same session over plain JSON."""
 
     def __init__(self, url: str, words: dict[str, Any]) -> None:
         parts = urlsplit(url)
@@ -31,7 +31,7 @@ class Json:
         self._path = f"/api/sessions/{self.ask('POST', '/api/sessions', words)['id']}"
 
     def ask(self, method: str, path: str, document: dict[str, Any] | None = None) -> Any:
-        """The answer's document."""
+        """The document of the response."""
         body = None if document is None else json.dumps(document)
         self._connection.request(method, path, body, {"Content-Type": "application/json"})
         return json.loads(self._connection.getresponse().read() or b"null")
@@ -51,12 +51,12 @@ class Json:
 
 
 def idle(session: Session) -> None:
-    """One decision in which every AV keeps its speed and lane."""
+    """One decision in which every AV keeps speed and lane."""
     session.act(dict.fromkeys(session.avs, MetaAction.IDLE))
 
 
 def timed(work: Any, *arguments: Any) -> float:
-    """ms that it took."""
+    """Duration of the call in ms."""
     began = time.perf_counter()
     work(*arguments)
     return 1e3 * (time.perf_counter() - began)

@@ -2,10 +2,10 @@
 
     python -m benchmarks.service_load [--minutes 10] [--policy vfn-p]
 
-Starts a server of its own. Each browser drives and watches a contested merge, episode after episode, in
-real time; two programs drive a session each by JSON, in real time too. Pictures are those that show another
-moment, a second of driving: while the next episode's warm-up is simulated nothing moves ("waited"). Needs
-Chromium (Debian: apt-get install chromium).
+Starts a separate server. Each browser drives and watches a contested merge, episode after episode, in real
+time; two programs drive one session each over JSON, also in real time. Pictures are distinct frames per
+second of driving; the warm-ups of later episodes count as "waited". Needs Chromium (Debian: apt-get install
+chromium).
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def main() -> None:
 
 
 def _measure(pages: list[Page], pid: int, log: Path, wrong: list[str], minutes: float) -> None:
-    """A row a minute."""
+    """Print one row per minute."""
     print(f"| {' | '.join(HEADS)} |\n|{'---|' * len(HEADS)}", flush=True)
     began = time.monotonic()
     before = [_drawn(page) for page in pages]
@@ -108,7 +108,7 @@ def _measure(pages: list[Page], pid: int, log: Path, wrong: list[str], minutes: 
 
 
 def _page(page: Page, url: str, policy: str, wrong: list[str]) -> Page:
-    """A browser that drives and watches, episode after episode."""
+    """A browser page that drives and shows episode after episode."""
     page.on("pageerror", lambda error: wrong.append(f"page: {error}"))
     page.on("console", lambda said: wrong.append(f"console: {said.text}") if said.type == "error" else None)
     page.goto(url)
@@ -125,13 +125,13 @@ def _page(page: Page, url: str, policy: str, wrong: list[str]) -> Page:
 
 
 def _drawn(page: Page) -> tuple[float, float]:
-    """Pictures, and s of driving, so far."""
+    """Number of pictures and s of driving so far."""
     drawn, driven = page.evaluate("() => [drawn, driven]")
     return float(drawn), float(driven)
 
 
 def _program(url: str, policy: str, stop: threading.Event, wrong: list[str]) -> None:
-    """A program that drives a session in real time, every AV idle but those of the policy."""
+    """Drive a session in real time, with idle AVs except those of the policy."""
 
     def ask(method: str, path: str, document: Any = None) -> Any:
         body = None if document is None else json.dumps(document).encode()
@@ -156,7 +156,7 @@ def _program(url: str, policy: str, stop: threading.Event, wrong: list[str]) -> 
 
 
 def _memory(pid: int) -> tuple[float, float]:
-    """MB resident: of the server, and of all its processes."""
+    """Resident MB of the server, and of all its child processes."""
     sizes = {}
     for entry in Path("/proc").iterdir():
         try:

@@ -1,12 +1,12 @@
-"""Who stands for long without a reason, on any network, and what everybody loses by it.
+"""Vehicles that stand for long without a reason on any network, and the resulting delays.
 
     python -m benchmarks.standing CONFIG [--av-type NAME | --penetration P] [--policies NAME ...]
                                   [--seeds A:B] [--duration S] [--warmup S]
 
 Drives CONFIG (a .sumocfg) in preset `lawful` and prints a row per policy: means over the seeds, with the
-number of vehicles, AVs and humans, that stood (below 0.1 m/s) for `LONG` s without a red light ahead, a stop
-of their plan or a crash. `car` is the car alone, with an agent that always asks for more speed; `none` has no
-AVs, in the same traffic.
+number of vehicles (AVs and HVs) that stood (below 0.1 m/s) for `LONG` s without a red light ahead, a <stop>
+or a crash. `car-alone` is the lawful car with an agent that always accelerates; `none` has no AVs, in the
+same traffic.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ FIGURES = {
 
 
 class LongStands(Hook):
-    """The longest time (s) that each vehicle stood without a reason."""
+    """The longest standstill (s) of each vehicle without a reason."""
 
     def on_start(self, episode: Episode) -> None:
         self._since: dict[str, float] = {}
@@ -54,7 +54,7 @@ class LongStands(Hook):
         self.longest: dict[str, float] = {}
 
     def on_step(self, episode: Episode, step: Step) -> None:
-        from cosim.simulation.backend import sumo  # libsumo: in the worker's process alone
+        from cosim.simulation.backend import sumo  # libsumo, only in the worker process
 
         frame = step.after
         self._wrecks.update(step.events.wrecked)
@@ -71,10 +71,10 @@ class LongStands(Hook):
 
 
 class Watcher(Host):
-    """A host that says besides how long each vehicle stood."""
+    """A host that also returns the longest standstill of each vehicle."""
 
     def watched(self, seed: int) -> tuple[EpisodeResult, dict[str, float]]:
-        """One episode."""
+        """Drive one episode."""
         stands = LongStands()
         return self.run(seed, hooks=[stands]), stands.longest
 

@@ -1,9 +1,9 @@
-"""How much longer a short command takes than what it cannot do without: its start, measured from outside.
+"""Start-up time of short commands, relative to their unavoidable imports and episodes.
 
     python -m benchmarks.startup [--rounds 7] [--out docs/results/startup.md]
 
-Whole processes take turns, after one round that does not count (it compiles the kernels);
-ratios are formed within a round, so that whatever else the machine does meets both sides alike.
+Whole processes alternate, after one uncounted round that compiles kernels. Ratios are formed within a round,
+so that other load affects both sides equally.
 """
 
 from __future__ import annotations
@@ -43,14 +43,14 @@ medians of {rounds} rounds (range). Ratios are formed within a round. Compare ra
 
 
 def timed(arguments: tuple[str, ...]) -> tuple[float, str]:
-    """Seconds of a whole Python process, and what it printed. Raises CalledProcessError."""
+    """Duration of a whole Python process in s, and its output. Raises CalledProcessError."""
     began = time.perf_counter()
     done = subprocess.run([sys.executable, *arguments], check=True, capture_output=True, text=True)
     return time.perf_counter() - began, done.stdout
 
 
 def one_round() -> dict[str, float]:
-    """Every process once: its seconds, those of the episodes, and both ratios."""
+    """Run every process once: durations in s, those of the episodes, and both ratios."""
     imports, torch = timed(IMPORTS)[0], timed(TORCH)[0]
     short, quick = timed(SHORT)
     network, slow = timed(NETWORK)

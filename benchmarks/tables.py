@@ -1,4 +1,4 @@
-"""Markdown pages of benchmarks: a table's row, a page, and a part of a page between marks."""
+"""Markdown pages of benchmarks: table rows, pages, and parts of a page between marks."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from pathlib import Path
 
 from cosim.files import whole
 
-READ = "read"  # between these marks stands what a person read in the figures
+READ = "read"  # marks around the interpretation of the figures, written by hand
 
 
 def marks(name: str) -> tuple[str, str]:
-    """What stands before and behind a part of a page that is kept, or made anew, by itself."""
+    """The marks before and after a part of a page that is kept or replaced separately."""
     return f"<!-- {name} -->", f"<!-- end of {name} -->"
 
 
 def marked(text: str, name: str) -> tuple[str, str, str] | None:
-    """What stands before the marks of this name, between and behind them; None where they are not there.
+    """The text before, between and after the marks of this name; None without marks.
 
-    Raises SystemExit where only the first is: what a person wrote behind it is not to be lost.
+    Raises SystemExit if the end mark is missing, so that handwritten text is not lost.
     """
     begin, end = marks(name)
     before, begun, rest = text.partition(begin)
@@ -30,7 +30,7 @@ def marked(text: str, name: str) -> tuple[str, str, str] | None:
 
 
 def fill(page: Path, name: str, lines: Sequence[str]) -> None:
-    """Put the lines between the page's marks of this name. Raises SystemExit where it has none."""
+    """Put the lines between the page's marks of this name. Raises SystemExit without these marks."""
     begin, end = marks(name)
     parts = marked(page.read_text(encoding="utf-8"), name)
     if parts is None:
@@ -40,10 +40,10 @@ def fill(page: Path, name: str, lines: Sequence[str]) -> None:
 
 
 def write_page(path: Path | None, lines: Sequence[str]) -> None:
-    """The Markdown page, whole or not at all; printed where there is no path.
+    """Write a Markdown page atomically; print it if `path` is None.
 
-    What the page that was there has between the marks of `READ` stays, before the first section; stderr asks
-    to read it.
+    Text between the marks of `READ` on the old page is kept before the first section, with a reminder on
+    stderr to check it.
     """
     if path is None:
         print("\n".join(lines))

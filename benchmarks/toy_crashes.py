@@ -1,4 +1,4 @@
-"""A toy traffic of known crash rate, with errors drawn and tilted as those of human drivers are."""
+"""A toy traffic model of known crash rate, with errors drawn and tilted like those of human drivers."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
 KINDS = ("inattention", "hard_braking", "stalled_car")
 SECONDS = 60
-LASTS = 3  # s of inattention
+LAPSE = 3  # s, duration of inattention
 KM = np.array([0.025, 0.010])  # km per s in open and in dense traffic
-MOVES = np.array([[0.9, 0.1], [0.2, 0.8]])  # [from,to] open, dense
+TRANSITION = np.array([[0.9, 0.1], [0.2, 0.8]])  # probability per s, [from,to] open, dense
 
 
 class Episodes(NamedTuple):
-    """Any number of episodes, all arrays of one shape."""
+    """Several episodes, all arrays of the same shape."""
 
     crashes: Array  # 0 or 1: a crash ends an episode
     km: Array
@@ -29,11 +29,11 @@ class Episodes(NamedTuple):
 
 
 class Toy:
-    """Traffic is open or dense by a Markov chain, and a driver errs second by second.
+    """Traffic is open or dense by a Markov chain, with trials of errors every second.
 
-    Inattention begins while there is none, lasts and crashes seldom, in dense traffic alone. Hard braking
-    happens in dense traffic, and crashes seldom too but if the follower is inattentive. A stalled car is
-    very rare and dangerous. `danger` multiplies the probabilities of a crash: another policy.
+    Inattention lasts for `LAPSE` s and rarely causes a crash, only in dense traffic. Hard braking happens in
+    dense traffic and rarely causes a crash, unless the follower is inattentive. A stalled car is very rare
+    and dangerous. `danger` multiplies the crash probabilities, which stands for another policy.
     """
 
     def __init__(self, rates: tuple[float, float, float] = (1e-4, 2e-4, 2e-6), danger: float = 1.0) -> None:
@@ -51,8 +51,8 @@ class Toy:
         return np.asarray(1.0 - safe * (1.0 - self.danger * 0.3 * stalled))
 
     def truth(self) -> float:
-        """Crashes per km: the chain's states are followed through an episode, all outcomes of each second."""
-        states = [np.array(s) for s in np.indices((2, LASTS + 1)).reshape(2, -1)]
+        """Exact crashes per km, from the distribution of the chain's states in every second."""
+        states = [np.array(s) for s in np.indices((2, LAPSE + 1)).reshape(2, -1)]
         dense, inattentive = states
         size = len(dense)
         step, crash = np.zeros((size, size)), np.zeros(size)
@@ -65,12 +65,12 @@ class Toy:
             ]
             chance, crashes = np.prod(chances, 0), self.crash(dense, inattentive, begun)
             crash += chance * crashes
-            after = np.where(begun[0], LASTS, np.maximum(inattentive - 1, 0))
+            after = np.where(begun[0], LAPSE, np.maximum(inattentive - 1, 0))
             for now in (0, 1):
                 np.add.at(
                     step,
-                    (np.arange(size), now * (LASTS + 1) + after),
-                    chance * (1.0 - crashes) * MOVES[dense, now],
+                    (np.arange(size), now * (LAPSE + 1) + after),
+                    chance * (1.0 - crashes) * TRANSITION[dense, now],
                 )
         here = np.zeros(size)
         here[0] = 1.0
@@ -82,7 +82,7 @@ class Toy:
         return crashed / km
 
     def drive(self, shape: tuple[int, ...], tilt: Tilt, seed: int) -> Episodes:
-        """Episodes drawn from the mixture of `tilt`; equal seeds are equal draws under every `danger`."""
+        """Episodes drawn from the mixture of `tilt`; draws depend on the seed, not on `danger`."""
         rng = np.random.default_rng(seed)
         tilted = rng.random(shape) >= tilt.untilted
         log_ratio, crashes, km = np.zeros(shape), np.zeros(shape), np.zeros(shape)
@@ -98,6 +98,6 @@ class Toy:
             crash = live & (rng.random(shape) < self.crash(dense, inattentive, begun))
             crashes += crash
             live &= ~crash
-            inattentive = np.where(begun[0], LASTS, np.maximum(inattentive - 1, 0))
-            dense = (rng.random(shape) < MOVES[dense, 1]).astype(int)
+            inattentive = np.where(begun[0], LAPSE, np.maximum(inattentive - 1, 0))
+            dense = (rng.random(shape) < TRANSITION[dense, 1]).astype(int)
         return Episodes(crashes, km, np.vectorize(tilt.weight)(log_ratio))

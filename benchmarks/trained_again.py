@@ -1,12 +1,12 @@
-"""Train the networks that ship once more, by their own commands: does the log begin as the shipped one?
+"""Trains the shipped networks again by their own commands, and compares the logs with the shipped ones.
 
     python -m benchmarks.trained_again [NETWORK ...] [--iterations 10]
 
-Commands are those of the cards (docs/reference/models.md), logs those of docs/results/trainings, which hold
-four digits and some of the fields. Every field of them is compared but seconds. A command is ended after so
-many iterations. `conv2d-dqn` and `conv3d-dqn` fill the replay buffer until iteration 22 and learn nothing
-before. Exits with 1 if a field differs. On a processor with other vector instructions (here AVX2) sums
-are rounded otherwise: losses may differ there, and drives after them.
+Commands are from the model cards (docs/reference/models.md), logs from docs/results/trainings, with four
+digits and a part of the fields. All of these fields except seconds are compared. A command is stopped after
+`--iterations`. `conv2d-dqn` and `conv3d-dqn` fill the replay buffer until iteration 22, without learning.
+Exits with 1 if a field differs. A processor with other vector instructions (here AVX2) rounds sums
+differently, so that losses and later drives may differ.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ Line = Mapping[str, float]
 
 
 def commands() -> dict[str, str]:
-    """The networks that a command of this version trains -> the command."""
+    """Network -> training command in this version."""
     data = {name: read_card(SHIPPED / f"{name}.safetensors")["data"] for name in APPROACHES}
     return {name: about["commands"]["train"] for name, about in data.items()}
 
 
 def differences(name: str, iterations: int) -> list[str]:
-    """What the first iterations of a network's command log otherwise than the shipped log.
+    """Differences between the first iterations of a new training and the shipped log.
 
-    Raises SystemExit where the shipped log has fewer.
+    Raises SystemExit if the shipped log is shorter.
     """
     shipped = log(TRAININGS / f"{name}-0")[:iterations]
     if len(shipped) < iterations:
@@ -50,7 +50,7 @@ def differences(name: str, iterations: int) -> list[str]:
 
 
 def trained(command: str, iterations: int, folder: Path) -> list[Line]:
-    """The log of the first iterations of `cosim train ...`; of fewer, if it ends before."""
+    """The log of the first iterations of `cosim train ...`; shorter if the training ends earlier."""
     words = [*shlex.split(command)[1:], "--out", str(folder)]
     with subprocess.Popen(
         [sys.executable, "-m", "cosim.cli.main", *words], stdout=subprocess.DEVNULL
@@ -62,7 +62,7 @@ def trained(command: str, iterations: int, folder: Path) -> list[Line]:
 
 
 def log(folder: Path) -> list[Line]:
-    """Every whole line of a training's log; none where there is no log yet."""
+    """Every complete line of a training's log; empty without a log."""
     file = folder / "log.jsonl"
     lines = file.read_text("utf-8").splitlines(keepends=True) if file.is_file() else []
     return [json.loads(line) for line in lines if line.endswith("\n")]

@@ -1,7 +1,7 @@
-"""Roads and demands drawn from seeds: `python -m sumo_scenarios.draw A:B --out FOLDER` writes FOLDER/SEED.
+"""Random roads and demands: `python -m sumo_scenarios.draw A:B --out FOLDER` writes FOLDER/SEED.
 
-Training draws from seeds below 100,000, validation from those below 200,000; others are refused. No drawn
-road is alike (`sumo_scenarios.roads.alike`) to one of the six that are tests.
+Training seeds are below 100,000, validation seeds below 200,000; other seeds are refused. No random road is
+similar (`sumo_scenarios.roads.alike`) to one of the six test roads.
 """
 
 from __future__ import annotations
@@ -31,29 +31,29 @@ from sumo_scenarios.roads import (
 )
 
 SEEDS = range(TRAINING_SEEDS.start, TUNING_SEEDS.stop)
-LEVEL = (0.5, 1.3)  # of the nominal capacity
+LEVEL = (0.5, 1.3)  # demand range, as a share of the nominal capacity
 MOTORWAY = (22.22, 25.0, 27.78, 30.56, 33.33)  # m/s
 STREET = (11.11, 13.89, 16.67, 19.44)  # m/s
-METRES_AN_ARM = 7.0  # of a roundabout's radius at least, so that lanes can be changed between two arms
+RADIUS_PER_ARM = 7.0  # m, minimum for a roundabout, to leave room for lane changes between two arms
 DEMAND = "drawn"
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """A road and what wants to pass it."""
+    """A random road and its demand."""
 
     road: Road
     level: float  # demand, as a share of the nominal capacity
-    per_hour: float  # vehicles
+    per_hour: float  # vehicles/h
 
 
 def draw(seed: int) -> Drawn:
-    """The road and the demand of a seed, always the same.
+    """The road and demand of a seed (deterministic).
 
-    Nominal capacity is that of the named road of its kind, in proportion to the lanes at the bottleneck.
+    The nominal capacity is that of the named road of this kind, scaled by the lanes at the bottleneck.
 
     Raises:
-        BadInput: a seed that is neither for training nor for validation.
+        BadInput: neither a training nor a validation seed.
     """
     if seed not in SEEDS:
         problem = f"roads are drawn for training and validation: {SEEDS.start} to {SEEDS.stop - 1}"
@@ -69,7 +69,7 @@ def draw(seed: int) -> Drawn:
 
 
 def write(seed: int, folder: Path) -> Path:
-    """Write the scenario `drawn/SEED` to `folder`/SEED. Raises as `draw`, and without netconvert."""
+    """Write the scenario `drawn/SEED` to `folder`/SEED. Raises BadInput as `draw` or without netconvert."""
     drawn, place = draw(seed), folder / str(seed)
     text = road_folders.demand(drawn.road, drawn.per_hour, f"{drawn.level:.2f} of a nominal capacity")
     road_folders.write(drawn.road, place, f"drawn/{seed}", {DEMAND: text}, DEMAND)
@@ -94,7 +94,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-# ---- inside: one function a kind ----
+# ---- inside: one function per kind ----
 
 
 def _road(random: np.random.Generator) -> Road:
@@ -145,7 +145,7 @@ def _roundabout(random: np.random.Generator) -> Road:
     return Roundabout(
         lanes=int(random.integers(1, 3)),
         arms=arms,
-        radius=_round(random, METRES_AN_ARM * arms, 55.0, 1.0),
+        radius=_round(random, RADIUS_PER_ARM * arms, 55.0, 1.0),
         through_share=float(random.uniform(0.3, 0.8)),
         first_exit_share=float(random.uniform(0.1, 0.5)),
         arm_m=_round(random, 200.0, 400.0),

@@ -1,7 +1,7 @@
-"""Write a road as a folder that `cosim` loads: `python -m sumo_scenarios.road_folders` writes the named six.
+"""Writes roads as scenario folders: `python -m sumo_scenarios.road_folders` writes the six named roads.
 
-Their demands are shares of the capacities in `open/capacity.yaml`, which `python -m benchmarks.capacity`
-measures. netconvert comes with the `eclipse-sumo` package (extra `tools`).
+Demands are shares of the capacities in `open/capacity.yaml`, measured by `python -m benchmarks.capacity`.
+netconvert comes with the `eclipse-sumo` package (extra `tools`).
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ OPEN = ROOT / "open"
 CAPACITY = OPEN / "capacity.yaml"
 LEVELS: Mapping[str, float] = {"below": 0.85, "near": 1.0, "over": 1.1}  # of the human-only capacity
 DEFAULT = "near"
-DEMAND_TIME = 900.0  # s in which vehicles want to depart
-DURATION = 1500.0  # s, the horizon that all are counted to: ten minutes to drain
+DEMAND_TIME = 900.0  # s, period of departures
+DURATION = 1500.0  # s, counted time, with ten minutes for the traffic to drain
 SIGNALS = "signals.add.xml"
 HOUR = 3600.0  # s
 
@@ -64,7 +64,7 @@ conflict_zones: []
 
 
 def write(road: Road, folder: Path, name: str, demands: Mapping[str, str], default: str) -> None:
-    """The scenario `name` of `road`: sources, net, signals, demands (name -> XML), configuration, definition.
+    """Write the scenario folder of `road`: sources, net, signals, `demands` (name -> XML), configuration.
 
     Raises:
         BadInput: netconvert is missing.
@@ -91,7 +91,7 @@ def demand(road: Road, per_hour: float, about: str, until: float = DEMAND_TIME) 
 
 
 def ramp(road: Road, steps: Mapping[float, float], step: float) -> str:
-    """A route file of a demand that changes: start (s) -> vehicles an hour, each for `step` s."""
+    """A route file with a time-varying demand: start (s) -> vehicles/h, each for `step` s."""
     lines = [
         line for begin, per_hour in steps.items() for line in _flows(road, per_hour, begin, begin + step)
     ]
@@ -99,9 +99,9 @@ def ramp(road: Road, steps: Mapping[float, float], step: float) -> str:
 
 
 def signals(net: Path, timing: Timing) -> str:
-    """The signal programs of a net with this timing: an additional file.
+    """An additional file with the signal programs of a net for this timing.
 
-    A green of the arterial's links lasts `timing.main`, another `timing.side`; yellow stays as built.
+    Green of the arterial's links lasts `timing.main`, other green `timing.side`; yellow is not changed.
     """
     lines = []
     for number, logic in enumerate(ElementTree.parse(net).getroot().iter("tlLogic")):
@@ -120,7 +120,7 @@ def signals(net: Path, timing: Timing) -> str:
 
 
 def named(name: str, capacity: float) -> dict[str, str]:
-    """Level -> route file of the open road `name`, of its capacity (vehicles/h)."""
+    """Level -> route file of the open road `name`, from its `capacity` (vehicles/h)."""
     return {
         level: demand(NAMED[name], share * capacity, f"{share:g} of the human-only capacity")
         for level, share in LEVELS.items()
@@ -128,7 +128,7 @@ def named(name: str, capacity: float) -> dict[str, str]:
 
 
 def capacities() -> dict[str, float]:
-    """Open road -> vehicles/h that human drivers bring through it."""
+    """Open road -> capacity with human drivers, vehicles/h."""
     found: dict[str, float] = yaml.safe_load(CAPACITY.read_text(encoding="utf-8"))
     return found
 
@@ -150,7 +150,7 @@ def main() -> None:
 
 
 def _links_of_the_arterial(net: Path, light: str) -> list[int]:
-    """Numbers of the links of a light that go on along the arterial."""
+    """Indices of a traffic light's links along the arterial."""
     links = ElementTree.parse(net).getroot().iter("connection")
     mains = [link for link in links if link.get("tl") == light and link.get("dir") == "s"]
     return [int(m.get("linkIndex", "")) for m in mains if m.get("from", "").startswith(("east", "west"))]

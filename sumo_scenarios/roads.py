@@ -1,6 +1,6 @@
-"""Open roads as parameters: what each kind's plain XML sources and flows are, and which two are alike.
+"""Parametric open roads: plain XML sources and flows of each kind, and the similarity of two roads.
 
-The six that ship (`NAMED`, folders `open/NAME`) are tests; `sumo_scenarios.draw` draws others.
+The six named roads (`NAMED`, folders `open/NAME`) are tests; `sumo_scenarios.draw` draws random ones.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from itertools import pairwise
 from typing import Any, ClassVar, NamedTuple
 from xml.sax.saxutils import quoteattr
 
-ENTRY = 100.0  # m without lane changes: SUMO inserts beside a vehicle that is still changing lanes
-PARALLEL = 60.0  # m that a ramp runs beside the main road; else netconvert builds a junction of 50 m
-LANE_WIDTH = 3.2  # m, SUMO's
+ENTRY_LENGTH = 100.0  # m without lane changes, since SUMO inserts vehicles beside lane-changing ones
+PARALLEL_LENGTH = 60.0  # m of ramp beside the main road; else netconvert builds a junction of 50 m
+LANE_WIDTH = 3.2  # m, SUMO's default
 RAMP_SPEED = 22.22  # m/s
-SIDE = 200.0  # m of a side street
-FREE, BEST = "free", "best"  # SUMO's departLane
+SIDE_LENGTH = 200.0  # m, of a side street
+FREE, BEST = "free", "best"  # values of SUMO's departLane
 
 
 class Flow(NamedTuple):
@@ -30,11 +30,11 @@ class Flow(NamedTuple):
 
 
 class Section(NamedTuple):
-    """Where the flow through a bottleneck, and the density before it, are measured."""
+    """The measurement section of a bottleneck: flow through it and density upstream."""
 
     approaches: tuple[str, ...]  # edges before the bottleneck
     exits: tuple[str, ...]  # edges behind it
-    reach: float  # m before the end of each approach
+    reach: float  # m, length of the section at the end of each approach
 
 
 class Timing(NamedTuple):
@@ -45,41 +45,41 @@ class Timing(NamedTuple):
     offset: float  # from one signal to the next
 
 
-Sources = Mapping[str, str]  # nod, edg, con -> XML, as `sumo_scenarios.build.SOURCES` calls them
+Sources = Mapping[str, str]  # nod, edg, con -> XML; keys of `sumo_scenarios.build.SOURCES`
 
 
 @dataclass(frozen=True)
 class Road:
-    """A road and how its vehicles are distributed; lengths in m, speeds in m/s."""
+    """A road and its flows; lengths in m, speeds in m/s."""
 
     kind: ClassVar[str]
     title: ClassVar[str]
     speed: float = 30.0  # limit of the main road
-    lanes: int = 2  # of the main road, a direction
+    lanes: int = 2  # of the main road, per direction
 
     @property
     def layout(self) -> tuple[int, ...]:
-        """Numbers of lanes, arms, signals: what two alike roads have in common."""
+        """Numbers of lanes, arms and signals, equal for similar roads."""
         return (self.lanes,)
 
     @property
     def size(self) -> float | None:
-        """m, the length on which drivers must agree; None where there is no such length."""
+        """m, the length in which drivers interact; None without such a length."""
         return None
 
     @property
     def lanes_at_bottleneck(self) -> int:
-        """What a capacity is divided by, to compare roads of one kind."""
+        """Divisor of the capacity when comparing roads of one kind."""
         return self.lanes
 
     @property
     def section(self) -> Section:
-        """Where capacity is measured."""
+        """The section for measuring capacity."""
         raise NotImplementedError
 
     @property
     def timing(self) -> Timing | None:
-        """Of its signals."""
+        """The signal timing; None without signals."""
         return None
 
     def sources(self) -> Sources:
@@ -87,13 +87,13 @@ class Road:
         raise NotImplementedError
 
     def flows(self) -> Sequence[Flow]:
-        """Shares sum to 1."""
+        """The flows, with shares that sum to 1."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True)
 class LaneDrop(Road):
-    """Lanes of a motorway end, the right ones or the left ones."""
+    """Right or left lanes of a motorway end."""
 
     kind = "lane_drop"
     title = "a motorway whose lanes end"
@@ -117,10 +117,10 @@ class LaneDrop(Road):
         return Section(("before",), ("after",), 500.0)
 
     def sources(self) -> Sources:
-        x = [-self.before_m - ENTRY, -self.before_m, 0.0, self.after_m]
+        x = [-self.before_m - ENTRY_LENGTH, -self.before_m, 0.0, self.after_m]
         first = (
             self.lanes - self.after if self.from_the_right else 0
-        )  # the lane that goes on as the rightmost
+        )  # the lane that continues as the rightmost
         return {
             "nod": _nodes({name: (at, 0.0) for name, at in zip("abcd", x, strict=True)}),
             "edg": _edges(
@@ -136,7 +136,7 @@ class LaneDrop(Road):
 
     @property
     def _after(self) -> str:
-        """Along the left edge of the carriageway, which moves where left lanes end."""
+        """Shape along the left edge of the carriageway, which shifts if left lanes end."""
         y = 0.0 if self.from_the_right else -LANE_WIDTH * (self.lanes - self.after)
         return f"0,{y:g} {self.after_m:g},{y:g}"
 
@@ -146,7 +146,7 @@ class LaneDrop(Road):
 
 @dataclass(frozen=True)
 class OnRamp(Road):
-    """An on-ramp of one lane joins a motorway by an acceleration lane."""
+    """An on-ramp of one lane joins a motorway with an acceleration lane."""
 
     kind = "on_ramp"
     title = "an on-ramp with an acceleration lane"
@@ -168,7 +168,7 @@ class OnRamp(Road):
 
     def sources(self) -> Sources:
         n, join, end = self.lanes, self.acceleration_m, self.acceleration_m + self.after_m
-        x = [-self.before_m - ENTRY, -self.before_m, 0.0, join, end]
+        x = [-self.before_m - ENTRY_LENGTH, -self.before_m, 0.0, join, end]
         nodes = {name: (at, 0.0) for name, at in zip("abcde", x, strict=True)}
         return {
             "nod": _nodes(nodes | {"r": (-self.ramp_m, -LANE_WIDTH * n - 60.0)}),
@@ -196,11 +196,11 @@ class OnRamp(Road):
 
 @dataclass(frozen=True)
 class Weave(Road):
-    """Between an on-ramp and an off-ramp a lane connects both: drivers must cross."""
+    """A lane connects an on-ramp with an off-ramp, and traffic streams weave there."""
 
     kind = "weave"
     title = "a weaving section between two ramps"
-    lanes: int = 2  # of the main road, beside the lane that connects the ramps
+    lanes: int = 2  # of the main road, without the lane that connects the ramps
     weave_m: float = 400.0
     on_share: float = 0.14
     off_share: float = 0.14
@@ -220,7 +220,7 @@ class Weave(Road):
 
     def sources(self) -> Sources:
         n, cross, end = self.lanes, self.weave_m, self.weave_m + self.after_m
-        x = [-self.before_m - ENTRY, -self.before_m, 0.0, cross, end]
+        x = [-self.before_m - ENTRY_LENGTH, -self.before_m, 0.0, cross, end]
         nodes = {name: (at, 0.0) for name, at in zip("abcde", x, strict=True)}
         away = -LANE_WIDTH * n - 60.0
         ramps = {"r": (-self.ramp_m, away), "o": (cross + self.ramp_m, away)}
@@ -255,14 +255,14 @@ class Weave(Road):
 
 @dataclass(frozen=True)
 class Roundabout(Road):
-    """Arms of as many lanes as the ring; whoever enters gives way."""
+    """A roundabout with equally many lanes on arms and ring; entering vehicles yield."""
 
     kind = "roundabout"
     title = "a roundabout"
     lanes: int = 2
     arms: int = 4
     radius: float = 35.0  # of the ring's middle
-    through_share: float = 0.5  # of those that do not take the first exit; else they go one farther
+    through_share: float = 0.5  # weight of the second exit, for vehicles that pass the first
     first_exit_share: float = 0.25
     arm_m: float = 350.0
     speed: float = 13.89
@@ -296,8 +296,8 @@ class Roundabout(Road):
             ]
         ring = " ".join(f"ring{k}" for k in every)
         edges.append(f'    <roundabout nodes="{ring}" edges="{ring}"/>')
-        # The outer one of several lanes ends at the next exit, so that no lane crosses another at an exit;
-        # where both go on and off (or only the outer one off, netconvert's default) human traffic locks.
+        # The outer of several ring lanes ends at the next exit, so that lanes do not cross at exits. If both
+        # lanes continue and exit (or only the outer one exits, netconvert's default), human traffic locks.
         links: list[tuple[str, str, int, int]] = []
         for k in every:
             before = f"ring{(k - 1) % self.arms}"
@@ -308,7 +308,7 @@ class Roundabout(Road):
         return {"nod": _nodes(nodes), "edg": _edges(*edges), "con": _connections(*links)}
 
     def _at(self, arm: float, out: float) -> tuple[float, float]:
-        """`out` m outside the ring; arms counter-clockwise, as traffic drives."""
+        """The point `out` m outside the ring at `arm`; arms count counter-clockwise, as traffic drives."""
         angle, far = 2.0 * math.pi * arm / self.arms, self.radius + out
         return far * math.cos(angle), far * math.sin(angle)
 
@@ -320,7 +320,7 @@ class Roundabout(Road):
         )
 
     def _turns(self) -> Iterator[tuple[int, float]]:
-        """How many arms farther, and the share of an arm's vehicles."""
+        """Exits: number of arms from the entry, and share of the arm's vehicles."""
         later = range(2, self.arms)
         yield 1, self.first_exit_share
         rest = 1.0 - self.first_exit_share
@@ -330,14 +330,14 @@ class Roundabout(Road):
 
 @dataclass(frozen=True)
 class Minor(Road):
-    """A minor road meets a busy one and gives way: a T, or a crossing."""
+    """A minor road yields to a busy road, at a T-junction or crossroads."""
 
     kind = "minor"
     title = "a minor road onto a busy one"
-    lanes: int = 1  # of the busy road, each way
+    lanes: int = 1  # of the busy road, per direction
     arms: int = 3
     minor_share: float = 0.2
-    into_share: float = 0.06  # of each direction of the busy road, turns right into a minor one
+    into_share: float = 0.06  # of each direction of the busy road: right turns into a minor road
     main_m: float = 600.0
     minor_m: float = 400.0
     speed: float = 16.67
@@ -386,17 +386,17 @@ class Minor(Road):
 
 @dataclass(frozen=True)
 class Arterial(Road):
-    """Signals in a row; the arterial goes through or right, the side streets anywhere."""
+    """Signals in a row; the arterial has through and right turns, the side streets all turns."""
 
     kind = "arterial"
     title = "a signalised arterial"
     signals: int = 3
-    lanes: int = 2  # each way
+    lanes: int = 2  # per direction
     block_m: float = 300.0
     main_green: float = 26.0  # s
     side_green: float = 30.0  # s
     offset: float = 21.0  # s
-    side_share: float = 0.4  # of all, from the side streets
+    side_share: float = 0.4  # of all vehicles, from the side streets
     speed: float = 13.89
     ends_m: float = 400.0
 
@@ -432,7 +432,7 @@ class Arterial(Road):
         far = {}
         for k in range(n):
             for side, way in (("south", -1.0), ("north", 1.0)):
-                far[f"{side}{k}"] = (k * self.block_m, way * SIDE)
+                far[f"{side}{k}"] = (k * self.block_m, way * SIDE_LENGTH)
                 edges += [
                     _edge(f"{side}{k}_in", f"{side}{k}", f"tls{k}", 1, self.speed, 1),
                     _edge(f"{side}{k}_out", f"tls{k}", f"{side}{k}", 1, self.speed, 1),
@@ -458,7 +458,7 @@ class Arterial(Road):
         yield f"north{k}_in", f"east{k + 1}", 0, left
 
     def flows(self) -> Sequence[Flow]:
-        n, turning = self.signals, 0.06  # of the arterial's vehicles, at each signal
+        n, turning = self.signals, 0.06  # turning share of the arterial's vehicles per signal
         main, side = (1.0 - self.side_share) / 2.0, self.side_share / (2.0 * n)
         through = main * (1.0 - turning * n)
         found = [Flow("east0", f"east{n}", through, BEST), Flow(f"west{n}", "west0", through, BEST)]
@@ -475,12 +475,12 @@ class Arterial(Road):
 
 KINDS: tuple[type[Road], ...] = (LaneDrop, OnRamp, Weave, Roundabout, Minor, Arterial)
 NAMED: Mapping[str, Road] = {kind.kind: kind() for kind in KINDS}  # open/NAME
-ALIKE = 1.5  # two lengths on which drivers must agree are alike up to this ratio
+ALIKE = 1.5  # ratio of `Road.size`, below which roads are similar
 
 
 def alike(one: Road, other: Road) -> bool:
-    """Whether one is geometrically like the other: same kind, same numbers of lanes, arms and signals, and,
-    where the kind has a length on which drivers must agree, a ratio of both below `ALIKE`."""
+    """Whether two roads are geometrically similar: same kind, same numbers of lanes, arms and signals, and,
+    if the kind has a `size`, a ratio of sizes below `ALIKE`."""
     if one.kind != other.kind or one.layout != other.layout:
         return False
     if one.size is None or other.size is None:
@@ -533,7 +533,7 @@ def _edge(
 
 
 def _entry(name: str, begin: str, end: str, lanes: int, speed: float, shape: str) -> str:
-    """An edge on which nobody changes lanes."""
+    """An edge without lane changes."""
     opening = _edge(name, begin, end, lanes, speed, 3, shape, "right").removesuffix("/>") + ">"
     banned = [
         f'        <lane index="{k}"'
@@ -550,11 +550,11 @@ def _straight(a: str, b: str, lanes: int) -> list[tuple[str, str, int, int]]:
 
 
 def _ramp(start: float, lanes: int) -> str:
-    """From `start` m before the main road's x of 0, beside its `lanes`; along its left edge."""
+    """Shape of a ramp along its left edge, from x = `start` m to x = 0, beside the `lanes` of the road."""
     y = -LANE_WIDTH * lanes
     return (
-        f"{start:g},{y - 60.0:g} {start * 0.6:g},{y - 30.0:g} {-PARALLEL - 60.0:g},{y - 4.0:g} "
-        f"{-PARALLEL:g},{y:g} 0,{y:g}"
+        f"{start:g},{y - 60.0:g} {start * 0.6:g},{y - 30.0:g} {-PARALLEL_LENGTH - 60.0:g},{y - 4.0:g} "
+        f"{-PARALLEL_LENGTH:g},{y:g} 0,{y:g}"
     )
 
 

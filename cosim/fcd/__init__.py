@@ -1,4 +1,4 @@
-"""A user's floating-car data (SUMO's fcd-output) through the same metrics as an episode."""
+"""The metrics of an episode, computed for a user's floating-car data (SUMO's fcd-output)."""
 
 import itertools
 import math
@@ -23,21 +23,21 @@ from cosim.simulation.conventions import OURS, centres, type_names
 from cosim.types import Kind, Metric, Snapshot, Timing
 
 FIGURES = ("time_to_collision", "post_encroachment", "drac", "hard_braking", "jerk", "headway", "exposure")
-CONFLICTS = ("time_to_collision", "drac")  # figures of single frames, which a jump would make up
-SIDEWAYS = 2.5  # m/s: nobody moves faster to the side, but for SUMO's lane changes that take no time
-STRAIGHT = math.radians(5.0)  # who turns less has not come to the side by a bend
-LANE = 2.5  # m: onto another edge, less is a step between the two edges' lanes
-SETTLED = 2.0  # s that a lane change takes elsewhere: so long what it leads to is none of a driver's doing
-FRAME = Timing().frame  # s: finer data are thinned to it, so that figures compare with an episode's
-DRIVEN = 200.0  # m that all vehicles have driven before the positions are checked
-WHOLE_LANE = 1e6  # m, of a lane whose length is not known
+CONFLICTS = ("time_to_collision", "drac")  # single-frame figures, which a lane jump would falsify
+MAX_LATERAL_SPEED = 2.5  # m/s; a faster lateral move is a lane change of SUMO that takes no time
+MAX_TURN = math.radians(5.0)  # a larger change of heading explains a lateral move by a bend
+MIN_LATERAL_JUMP = 2.5  # m to another edge; less is an offset between the lanes of the two edges
+SETTLING_TIME = 2.0  # s, usual duration of a lane change: conflicts in it are an artefact of the jump
+FRAME = Timing().frame  # s; finer data are thinned, so that figures compare with an episode's
+MIN_CHECK_DISTANCE = 200.0  # m driven by all vehicles before the check of the positions
+UNKNOWN_LENGTH = 1e6  # m, of a lane without a known length
 
 
 @dataclass(frozen=True, slots=True)
 class Roles:
-    """Whose conflicts, braking, jerk and headways are counted: everybody's unless something is given."""
+    """The vehicles with counted conflicts, braking, jerk and headways: by default all."""
 
-    av_type: str | None = None  # a vType; `cosim.`: every AV of a file that cosim had SUMO write
+    av_type: str | None = None  # a vType; `cosim.`: every AV in an output of a cosim run
     av_ids: re.Pattern[str] | None = None  # full match
     mission: re.Pattern[str] | None = None  # full match
 
@@ -63,14 +63,14 @@ class Analysis:
     """The figures of one file."""
 
     figures: Mapping[str, Metric]
-    begin: float  # s, first frame counted
-    end: float  # s, last one
-    interval: float  # s between the frames counted
+    begin: float  # s, first counted frame
+    end: float  # s, last counted frame
+    interval: float  # s between counted frames
     frames: int
     vehicles: int
     watched: int
-    notes: tuple[str, ...]  # what was assumed, and what the file does not hold
-    encounters: tuple[Mapping[str, Any], ...] = ()  # `Encounters.found`, where they were asked for
+    notes: tuple[str, ...]  # assumptions, and data missing in the file
+    encounters: tuple[Mapping[str, Any], ...] = ()  # `Encounters.found`, on request
 
 
 def analyse(
@@ -85,10 +85,10 @@ def analyse(
     critical: float | None = None,
     progress: Progress | None = None,
 ) -> Analysis:
-    """Read the file once, as a stream. `begin`, `end` in s; `frame`: s between the frames that are counted.
-    `critical`: list the encounters with a time to collision (s) below this.
+    """Read the file once, as a stream. `begin`, `end` in s; `frame`: s between counted frames. `critical`:
+    list the encounters with a smaller time to collision (s).
 
-    Without a `road` vehicles on and below a bridge cannot be distinguished, and a headway ends with the lane.
+    Without a `road`, vehicles on and below a bridge are not distinguished, and headways end with the lane.
 
     Raises:
         BadInput: malformed or truncated, not FCD, a number missing or not finite, a vehicle twice in a step,
@@ -102,13 +102,13 @@ def analyse(
 
 
 def _loose_lanes(path: Path) -> RoadMap:
-    """The lanes that the file names, joined to nothing; vehicles on any two of them may touch."""
+    """The lanes named in the file, without connections; vehicles on any two lanes may touch."""
     shape = np.array([[0.0, 0.0], [1.0, 0.0]])
-    return RoadMap(tuple(Lane(name, "", 0, shape, WHOLE_LANE, 3.2, 0.0) for name in lanes_named(path)))
+    return RoadMap(tuple(Lane(name, "", 0, shape, UNKNOWN_LENGTH, 3.2, 0.0) for name in lanes_named(path)))
 
 
 class _Counter:
-    """Steps become snapshots, snapshots figures."""
+    """Turns steps into snapshots and feeds them to the metrics."""
 
     def __init__(
         self,
@@ -125,11 +125,11 @@ class _Counter:
         self._wanted = frame
         self._metrics = {name: METRICS[name]() for name in FIGURES}
         self._encounters = encounters
-        self._first: Step | None = None  # kept until the second one says how far apart they are
+        self._first: Step | None = None  # kept until the second step gives the interval
         self._interval = 0.0  # s between the file's steps
-        self._stride = 1  # in steps: 2 counts every other
-        self._index = 0  # of the step last seen
-        self._time = 0.0  # s, of the step last seen
+        self._stride = 1  # steps per frame
+        self._index = 0  # of the last step
+        self._time = 0.0  # s, of the last step
         self._newest: Snapshot | None = None
         self._frames = 0
         self._began = math.nan  # s, of the first frame
@@ -137,8 +137,8 @@ class _Counter:
         self._unknown_types: set[str] = set()
         self._laneless = self._rows = 0  # vehicle frames
         self._strange: Counter[str] = Counter()  # lanes that the road lacks
-        self._jumps = 0  # lane changes from one frame to the next
-        self._jumped: dict[str, float] = {}  # vehicle -> s, the last one, while it has not settled
+        self._jumps = 0  # lane changes between two frames
+        self._jumped: dict[str, float] = {}  # vehicle -> s of the last jump, within `SETTLING_TIME`
         self._driven = self._moved = 0.0  # m, by the speeds and by the positions
 
     def see(self, step: Step) -> None:
@@ -155,7 +155,7 @@ class _Counter:
         self._advance(step)
 
     def _set_clock(self, interval: float, first: float) -> None:
-        """The first two steps say how fine the file is."""
+        """Set the interval of the file from its first two steps."""
         if interval <= 1e-9:
             raise self._wrong("times must increase", "timestep.time", f"{first + interval:g}")
         self._interval = interval = round(interval, 9)
@@ -165,7 +165,7 @@ class _Counter:
             if self._wanted is not None:
                 problem = f"must be a whole number of the file's steps of {interval:g} s"
                 raise BadInput(problem, field="--frame", value=f"{wanted:g}")
-            ratio = 1.0  # 0.2 s does not fit: the file's own steps
+            ratio = 1.0  # 0.2 s is no multiple: use the file's steps
         self._stride = max(round(ratio), 1)
         timing = Timing(interval, self._stride * interval, self._stride * interval)
         self._context = MetricContext(self._road, timing, "none", frozenset(), math.inf)
@@ -181,7 +181,7 @@ class _Counter:
             raise self._wrong(problem, "timestep.time", f"{step.time:g}")
         skipped = range(self._index + 1, self._index + round(passed))
         self._index += round(passed)
-        # steps with nobody on the road may be left out: nobody was there, as long as any memory reaches
+        # the file may omit steps without vehicles: add empty ones, as far back as any metric remembers
         for k in list(skipped)[-math.ceil(LONGEST / self._interval) - 1 :]:
             if k % self._stride == 0:
                 empty = Step(step.time - (self._index - k) * self._interval)
@@ -192,7 +192,7 @@ class _Counter:
 
     def _snapshot(self, step: Step) -> Snapshot:
         rows = [step.rows[name] for name in sorted(step.rows)]
-        known = [self._who(row) for row in rows]
+        known = [self._identify(row) for row in rows]
         length = np.array([k[3].length for k in known], np.float64)  # [n] m
         table = np.array([(r.x, r.y, r.angle, r.speed) for r in rows], np.float64).reshape(-1, 4)
         x, y, heading = centres(table[:, 0], table[:, 1], table[:, 2], 0.5 * length)
@@ -210,14 +210,14 @@ class _Counter:
             y=y,
             heading=heading,
             speed=table[:, 3].copy(),
-            accel=np.zeros(len(rows)),  # the metrics take theirs from the speeds
+            accel=np.zeros(len(rows)),  # the metrics derive accelerations from the speeds
             length=length,
             width=np.array([k[3].width for k in known], np.float64),
             lane=np.array([-1 if math.isnan(r.pos) else index.get(r.lane, -1) for r in rows], np.int32),
             lane_position=np.array([r.pos for r in rows], np.float64),
         )
 
-    def _who(self, row: Row) -> tuple[str, Kind, bool, Size]:
+    def _identify(self, row: Row) -> tuple[str, Kind, bool, Size]:
         known = self._known.get(row.id)
         if known is None or known[0] != row.type:
             size = size_of(row.type, self._sizes)
@@ -240,33 +240,33 @@ class _Counter:
             self._encounters.add(snapshot, self._jumped)
         if self._newest is None:
             self._began = snapshot.time
-        elif self._driven < DRIVEN:
+        elif self._driven < MIN_CHECK_DISTANCE:
             self._doubt(self._newest, snapshot)
         self._frames += 1
         self._newest = snapshot
 
     def _note_jumps(self, snapshot: Snapshot) -> None:
-        """Who has just been put on another lane (`SIDEWAYS`); forget those who have settled there."""
+        """Note vehicles that have just jumped to another lane (`MAX_LATERAL_SPEED`); drop settled ones."""
         s, before = snapshot, self._newest
-        self._jumped = {name: t for name, t in self._jumped.items() if s.time - t < SETTLED - 1e-9}
+        self._jumped = {name: t for name, t in self._jumped.items() if s.time - t < SETTLING_TIME - 1e-9}
         if before is None or s.n == 0:
             return
         both = [(before.row[name], row) for row, name in enumerate(s.ids) if name in before.row]
-        then, now = np.array(both, np.int64).reshape(-1, 2).T  # [c] rows of who is in both frames
+        then, now = np.array(both, np.int64).reshape(-1, 2).T  # [c] rows of the vehicles in both frames
         x, y = s.x[now] - before.x[then], s.y[now] - before.y[then]
         aside = np.abs(np.cos(s.heading[now]) * y - np.sin(s.heading[now]) * x)  # [c] m
         turned = np.abs(np.remainder(s.heading[now] - before.heading[then] + np.pi, 2.0 * np.pi) - np.pi)
-        for k in np.flatnonzero(aside > SIDEWAYS * (s.time - before.time)):
+        for k in np.flatnonzero(aside > MAX_LATERAL_SPEED * (s.time - before.time)):
             a, b = int(before.lane[then[k]]), int(s.lane[now[k]])
             if a == b or min(a, b) < 0:
                 continue
-            whole = turned[k] < STRAIGHT and aside[k] > LANE
+            whole = turned[k] < MAX_TURN and aside[k] > MIN_LATERAL_JUMP
             if whole or edge_of(self._road, a) == edge_of(self._road, b):
                 self._jumped[s.ids[now[k]]] = s.time
                 self._jumps += 1
 
     def _settled(self, snapshot: Snapshot) -> Snapshot:
-        """The frame without the vehicles that have jumped in the last `SETTLED` s."""
+        """The frame without the vehicles that jumped in the last `SETTLING_TIME` s."""
         s = snapshot
         kept = np.array([row for row, name in enumerate(s.ids) if name not in self._jumped], np.int64)
         if len(kept) == s.n:
@@ -274,19 +274,19 @@ class _Counter:
         return s.only(kept)
 
     def _doubt(self, before: Snapshot, after: Snapshot) -> None:
-        """Longitudes and latitudes hardly change while the speeds are those of cars."""
+        """Detect positions in degrees: they hardly change while the speeds are those of cars."""
         elapsed = after.time - before.time
         for i, name in enumerate(after.ids):
             j = before.row.get(name)
             if j is not None:
                 self._driven += after.speed[i] * elapsed
                 self._moved += math.hypot(after.x[i] - before.x[j], after.y[i] - before.y[j])
-        if self._driven >= DRIVEN and self._moved < 0.01 * self._driven:
+        if self._driven >= MIN_CHECK_DISTANCE and self._moved < 0.01 * self._driven:
             problem = "positions do not move with the speeds: degrees (fcd-output.geo)? metres are needed"
             raise self._wrong(problem, "vehicle.x")
 
     def finish(self, has_road: bool, has_sizes: bool) -> Analysis:
-        """The figures, or why there are none."""
+        """The figures. Raises BadInput if the file allows none."""
         if self._first is not None:  # a file of one step
             self._set_clock(self._wanted or FRAME, self._first.time)
             self._count(self._snapshot(self._first))
@@ -311,7 +311,7 @@ class _Counter:
 
     @property
     def _watched(self) -> int:
-        """How many vehicles were AVs or mission vehicles."""
+        """Number of AVs and mission vehicles."""
         return sum(kind == Kind.AV or mission for _, kind, mission, _ in self._known.values())
 
     def _notes(self, has_road: bool, has_sizes: bool) -> list[str]:
@@ -329,7 +329,7 @@ class _Counter:
             f"{self._laneless} vehicle frames have no lane position: no headway there": bool(self._laneless),
             f"{self._strange.total()} vehicle frames on lanes that --net lacks: {lanes}": bool(lanes),
             f"{self._jumps} lane changes that took no time (lanechange.duration 0): no time to collision and "
-            f"no DRAC of that vehicle for {SETTLED:g} s": bool(self._jumps),
+            f"no DRAC of that vehicle for {SETTLING_TIME:g} s": bool(self._jumps),
             f"steps of {self._interval:g} s are thinned to frames of {apart:g} s": self._stride > 1,
             f"frames every {apart:g} s: brief events are missed, jerk is damped": apart > FRAME + 1e-9,
         }

@@ -1,4 +1,4 @@
-"""Single conflicts behind the figures: who met whom, when, where, and how close it came."""
+"""Single conflicts behind the figures: the two vehicles, time, place and severity."""
 
 import math
 from collections.abc import Collection
@@ -20,34 +20,34 @@ from cosim.metrics.post_encroachment import LONGEST
 from cosim.road import RoadMap
 from cosim.types import Snapshot
 
-STEPS = 3  # lanes followed ahead to see whether two ways become one
+MAX_LANES_AHEAD = 3  # followed to find out whether two paths merge
 ALIGNED, ONCOMING = math.radians(15.0), math.radians(135.0)  # as in PET and DRAC
 
 
 @dataclass(slots=True)
 class Encounter:
-    """Two vehicles while their time to collision was critical; values at its smallest, but for the DRAC."""
+    """Two vehicles during a critical time to collision. Values at its minimum, except the DRAC."""
 
     begin_s: float
     end_s: float
     ego: str  # a watched vehicle
     foe: str
     min_ttc_s: float
-    at_s: float  # when that was
-    x_m: float  # the ego's centre then
+    at_s: float  # time of the smallest time to collision
+    x_m: float  # the ego's centre at that time
     y_m: float
-    lane: str  # the ego's then; "" off every lane
+    lane: str  # the ego's at that time; "" off every lane
     ego_speed_mps: float
     foe_speed_mps: float
-    max_drac_mps2: float  # largest of the encounter; 0 where they only overlapped
-    type: str = ""  # following, lane change, merging, crossing or oncoming, when it was closest
-    lane_jump: bool = False  # then one of them had just changed lanes in no time (not in headline figures)
-    pet_s: float = math.nan  # post-encroachment time of crossing or merging paths; NaN: none up to 5 s
+    max_drac_mps2: float  # largest of the encounter; 0 if the vehicles only overlapped
+    type: str = ""  # following, lane change, merging, crossing or oncoming, at that time
+    lane_jump: bool = False  # a vehicle had just jumped to another lane (not in headline figures)
+    pet_s: float = math.nan  # post-encroachment time of crossing or merging paths; NaN: above 5 s
 
 
 @dataclass(slots=True)
 class _Followed:
-    """An encounter with both vehicles' trajectories from its begin on, for the PET."""
+    """An encounter with the trajectories of both vehicles from its begin, for the PET."""
 
     encounter: Encounter
     sizes: tuple[tuple[float, float], ...]  # length and width of ego and foe, m
@@ -73,18 +73,18 @@ class _Followed:
 
 
 class Encounters:
-    """Frames in, encounters out: every pair of a watched vehicle with anybody whose time to collision fell
-    below `critical` s (oriented boxes at constant velocity, as in `min_ttc_s`)."""
+    """Finds encounters in frames: pairs of a watched and any other vehicle with a time to collision below
+    `critical` s (oriented boxes at constant velocity, as in `min_ttc_s`)."""
 
     def __init__(self, road: RoadMap, critical: float = CRITICAL) -> None:
         self._road, self._critical = road, critical
         self._open: dict[tuple[str, str], _Followed] = {}
-        self._late: list[_Followed] = []  # over, and followed on for their PET
+        self._late: list[_Followed] = []  # ended, still followed for the PET
         self._closed: list[Encounter] = []
-        self._interval, self._time = math.nan, math.nan  # s between frames, of the newest
+        self._interval, self._time = math.nan, math.nan  # s: between frames, and of the newest frame
 
     def add(self, snapshot: Snapshot, jumped: Collection[str] = ()) -> None:
-        """The next frame; `jumped`: who has just changed lanes in no time."""
+        """Add the next frame; `jumped`: vehicles that have just jumped to another lane."""
         s = snapshot
         self._jumped = jumped
         self._interval, self._time = snapshot.time - self._time, snapshot.time
@@ -104,7 +104,7 @@ class Encounters:
         self._closed += [f.finish(self._interval) for f in gone]
 
     def found(self) -> list[dict[str, Any]]:
-        """All so far, in the order they began, as rows of a table."""
+        """All encounters so far as table rows, in the order of their begins."""
         rest = [f.finish(self._interval) for f in (*self._late, *self._open.values())]
         return [asdict(e) for e in sorted([*self._closed, *rest], key=lambda e: (e.begin_s, e.ego, e.foe))]
 
@@ -144,7 +144,7 @@ class Encounters:
         known.encounter = closest
 
     def _type(self, a: int, b: int, turned: float) -> str:
-        """How vehicles on lanes `a` and `b` (-1: off every lane) meet, their headings `turned` rad apart."""
+        """Conflict type on lanes `a` and `b` (-1: off every lane), with headings `turned` rad apart."""
         turned = abs(math.remainder(turned, math.tau))
         if turned > ONCOMING:
             return "oncoming"
@@ -159,13 +159,13 @@ class Encounters:
         return "following" if turned <= ALIGNED else "crossing"
 
     def _ahead(self, lane: int) -> set[int]:
-        """The lane and those that a vehicle on it drives on to, as long as there is no choice."""
+        """The lane and its successors, as long as each has only one."""
         found = [lane]
-        while len(found) <= STEPS and len(onward := self._road.lanes[found[-1]].successors) == 1:
+        while len(found) <= MAX_LANES_AHEAD and len(onward := self._road.lanes[found[-1]].successors) == 1:
             found.append(onward[0])
         return set(found)
 
 
 def edge_of(road: RoadMap, lane: int) -> str:
-    """The edge of a lane, by SUMO's way to name lanes (a road without a net has no other)."""
+    """The edge of a lane from SUMO's lane name (the only source without a net)."""
     return road.lanes[lane].id.rpartition("_")[0]

@@ -1,4 +1,4 @@
-"""Reads SUMO's fcd-output as a stream of steps: every number checked, whatever the file's size."""
+"""Reads SUMO's fcd-output as a stream of steps; every number is checked."""
 
 import math
 import re
@@ -10,34 +10,34 @@ from cosim.errors import BadInput
 from cosim.files.xml_input import Progress, chunks, scan
 from cosim.scenario.sumocfg import time_of
 
-NUMBERS = ("x", "y", "angle", "speed")  # what every vehicle must have
-LONGEST_NAME = 1000  # bytes: a lane's name cut by the end of a chunk is found again within these
+NUMBERS = ("x", "y", "angle", "speed")  # required attributes of a vehicle
+LONGEST_NAME = 1000  # bytes kept from the previous chunk, for a lane name across the boundary
 
 
 @dataclass(slots=True)
 class Row:
-    """One vehicle at one step, as the file has it: SUMO's conventions."""
+    """One vehicle at one step, in SUMO's conventions."""
 
     id: str
     type: str
-    lane: str  # "" when the file does not say
+    lane: str  # "" if missing
     x: float  # m, front bumper
     y: float  # m
     angle: float  # degrees clockwise from north
     speed: float  # m/s
-    pos: float  # m along the lane; NaN when the file does not say
+    pos: float  # m along the lane; NaN if missing
 
 
 @dataclass(slots=True)
 class Step:
-    """Everybody on the road at one moment."""
+    """All vehicles on the road at one time."""
 
     time: float  # s
     rows: dict[str, Row] = field(default_factory=dict)
 
 
 def read_steps(path: Path, each: Callable[[Step], None], progress: Progress | None = None) -> None:
-    """Call `each` for every timestep of the file, in its order; memory does not grow with the file.
+    """Call `each` for every timestep of the file, in order, in constant memory.
 
     Raises:
         BadInput: malformed or truncated, not FCD, a number missing or not finite, a vehicle twice in a step.
@@ -47,7 +47,7 @@ def read_steps(path: Path, each: Callable[[Step], None], progress: Progress | No
 
 
 def lanes_named(path: Path) -> list[str]:
-    """The lanes that the file names, sorted. Raises BadInput when it cannot be read."""
+    """The lanes named in the file, sorted. Raises BadInput for an unreadable file."""
     names: set[bytes] = set()
     text = b""
     for chunk in chunks(path, math.inf):
@@ -57,7 +57,7 @@ def lanes_named(path: Path) -> list[str]:
 
 
 class _Reader:
-    """The handlers of the one pass."""
+    """The handlers of one pass."""
 
     def __init__(self, path: Path, each: Callable[[Step], None]) -> None:
         self._path, self._each = path, each

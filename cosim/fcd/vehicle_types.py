@@ -1,4 +1,4 @@
-"""Vehicle sizes out of SUMO's route and additional files, since floating-car data do not hold any."""
+"""Vehicle sizes from SUMO's route and additional files, since floating-car data contain none."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -18,7 +18,7 @@ class Size(NamedTuple):
 
 
 DEFAULT = Size(5.0, 1.8)  # SUMO's default vehicle
-# SUMO 1.28's sizes of a vClass whose vType gives none (read back from libsumo; the rest is DEFAULT).
+# SUMO 1.28's default sizes by vClass (read back from libsumo; all others are DEFAULT).
 OF_CLASS = {
     "bicycle": Size(1.6, 0.65),
     "bus": Size(12.0, 2.5),
@@ -42,7 +42,7 @@ OF_CLASS = {
 
 
 def read_sizes(files: Iterable[Path]) -> dict[str, Size]:
-    """vType -> size, of all `<vType>` in these files; a later file wins.
+    """vType -> size, of every `<vType>` in these files; later files win.
 
     Raises:
         BadInput: a file is malformed, or a length or width is not a positive number.
@@ -63,7 +63,7 @@ def read_sizes(files: Iterable[Path]) -> dict[str, Size]:
 
 
 def size_of(vehicle_type: str, sizes: Mapping[str, Size]) -> Size | None:
-    """The size of a type as SUMO writes it (`type_names`)."""
+    """The size of a type by its name in SUMO's outputs (`type_names`)."""
     return next((sizes[name] for name in type_names(vehicle_type) if name in sizes), None)
 
 

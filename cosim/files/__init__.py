@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, and one clear error for those that cannot be read or written."""
+"""Atomic file writes, and clear errors for files that cannot be read or written."""
 
 import contextlib
 import csv
@@ -16,10 +16,10 @@ from cosim.errors import BadInput
 
 @contextlib.contextmanager
 def whole(path: Path, *, contended: bool = False) -> Iterator[Path]:
-    """A draft beside `path` that takes its place when the block ends well, and is gone when it does not.
+    """A draft beside `path` that replaces `path` if the block succeeds, and is deleted otherwise.
 
-    `contended`: several processes may write it at the same time, and the last one's stands. What a killed
-    process has left is written over by the next one, if no other one writes it. OSErrors are not caught.
+    `contended`: several processes may write at the same time, and the last writer wins. Otherwise the next
+    writer overwrites the draft of a killed process. OSErrors are not caught.
     """
     mine = f".{os.getpid()}" if contended else ""
     draft = path.with_name(f".{path.name}{mine}.part")
@@ -43,10 +43,10 @@ def cannot(
 
 
 def read_json(path: Path, absent: str = "no such file") -> dict[str, Any]:
-    """The JSON object that `path` holds.
+    """The JSON object in file `path`.
 
     Raises:
-        BadInput: it is not there (`absent` says what is needed), cannot be read, is not a JSON object.
+        BadInput: the file is missing (`absent` is the message), unreadable, or no JSON object.
     """
     try:
         with cannot("read", file=path):
@@ -61,9 +61,9 @@ def read_json(path: Path, absent: str = "no such file") -> dict[str, Any]:
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None) -> None:
-    """Rows with a header, whole or not at all; numbers with six digits, NA (nan, infinities) is empty.
+    """Write rows with a header atomically; numbers with six digits, NA (nan, infinities) as empty cells.
 
-    `columns`: needed where there may be no row; default: those of the first.
+    `columns`: required if there may be no row; default: those of the first row.
     """
     with whole(path) as draft, draft.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(rows[0] if columns is None else columns))
@@ -80,7 +80,7 @@ def _plain(value: Any) -> Any:
 
 @contextlib.contextmanager
 def new_folder(path: str | None) -> Iterator[Path | None]:
-    """The folder that --out names, made now; gone again where what is done in it fails and it is new.
+    """The folder of --out, created now; removed again if it is new and the block fails.
 
     Raises BadInput.
     """
@@ -94,10 +94,10 @@ def new_folder(path: str | None) -> Iterator[Path | None]:
         raise
 
 
-def lock(folder: Path, field: str, shown: str, who: str = "process") -> int:
-    """Lock a folder until what is returned is closed (`os.close`), or the process ends, however it does.
+def lock(folder: Path, field: str, shown: str, worker: str = "process") -> int:
+    """Lock a folder until the returned descriptor is closed (`os.close`) or the process ends.
 
-    Raises BadInput: another `who` is working in it.
+    Raises BadInput: another `worker` is working in the folder.
     """
     with cannot("lock this folder", field=field, value=shown):
         held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
@@ -106,14 +106,14 @@ def lock(folder: Path, field: str, shown: str, who: str = "process") -> int:
         except OSError as error:
             os.close(held)
             if isinstance(error, BlockingIOError):
-                raise BadInput(f"another {who} is working in it", field=field, value=shown) from None
+                raise BadInput(f"another {worker} is working in it", field=field, value=shown) from None
             raise
     return held
 
 
 @contextlib.contextmanager
 def working_in(path: str) -> Iterator[Path]:
-    """The folder that --out names, made and locked for the block. Raises BadInput."""
+    """The folder of --out, created and locked for the block. Raises BadInput."""
     folder = prepare_folder(path)
     held = lock(folder, "--out", path)
     try:
@@ -123,7 +123,7 @@ def working_in(path: str) -> Iterator[Path]:
 
 
 def prepare_folder(path: str, field: str = "--out") -> Path:
-    """Make the folder that `field` names now, so that a bad path fails before the work. Raises BadInput."""
+    """Create the folder of option `field` now, so that a bad path fails early. Raises BadInput."""
     folder = Path(path)
     with cannot("make this folder", field=field, value=path):
         folder.mkdir(parents=True, exist_ok=True)

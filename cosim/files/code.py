@@ -1,4 +1,4 @@
-"""A user's own code, named FILE.py:NAME or MODULE:NAME: loaded, called, its mistakes named as its own."""
+"""User code named FILE.py:NAME or MODULE:NAME: loading, calling, and attribution of its errors."""
 
 import hashlib
 import importlib
@@ -19,20 +19,20 @@ _MODULE = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*")
 
 
 class Code(NamedTuple):
-    """Where a class, factory or function stands."""
+    """The location of a class, factory or function."""
 
     place: str  # a file's absolute path, or a module's name
     member: str
 
     @property
     def text(self) -> str:
-        """Reads back as the same, wherever one stands."""
+        """The text that `read` parses to the same code in any working directory."""
         return f"{self.place}:{self.member}"
 
     def load(self, field: str) -> Any:
-        """The class, factory or function; calling it raises what `guarded` does.
+        """The class, factory or function itself, not guarded.
 
-        Raises BadInput: it cannot be imported, or has nothing of that name that can be called.
+        Raises BadInput: the module cannot be imported, or has no callable of that name.
         """
         module = guarded(self.place, "import", _imported, self.place)
         found = getattr(module, self.member, None)
@@ -43,9 +43,8 @@ class Code(NamedTuple):
         return found
 
     def make(self, field: str, *arguments: Any) -> Any:
-        """What the class or factory makes of `arguments`, or, without any, the function itself; `Guarded`.
-
-        Raises BadInput as `load`.
+        """The object that the class or factory makes from `arguments`, `Guarded`. A function without
+        `arguments` is not called. Raises BadInput as `load`.
         """
         found = self.load(field)
         place = self.file() or self.place
@@ -54,7 +53,7 @@ class Code(NamedTuple):
         return Guarded(found, place)
 
     def file(self) -> Path | None:
-        """The file it is in, once it was loaded."""
+        """The source file; of a module once it is loaded."""
         if self.place.endswith(".py"):
             return Path(self.place)
         file = getattr(sys.modules.get(self.place), "__file__", None)
@@ -62,7 +61,7 @@ class Code(NamedTuple):
 
 
 class Guarded:
-    """An object of the user's: what its methods raise becomes a BadInput with the file and line."""
+    """A user's object; an exception of its methods becomes a BadInput with file and line."""
 
     def __init__(self, inner: Any, place: object) -> None:
         self._inner, self._place = inner, place
@@ -79,19 +78,19 @@ class Guarded:
 
 
 def is_code(text: str) -> bool:
-    """Whether `text` names code rather than an entry of a table."""
+    """Whether `text` names user code rather than a built-in entry."""
     return ":" in text or text.endswith(".py")
 
 
 def read(
     text: str, field: str, *, folder: Path | None = None, file: object = None, value: str | None = None
 ) -> Code:
-    """The code that FILE.py:NAME or MODULE:NAME names; a file is relative to `folder` (default: here).
+    """Parse FILE.py:NAME or MODULE:NAME; a file is relative to `folder` (default: working directory).
 
-    `file`, `field`, `value`: where and as what the text was written.
+    `file`, `field`, `value`: origin of the text, for errors.
 
     Raises:
-        BadInput: a file that is not there, no name behind it, a colon that belongs to neither.
+        BadInput: a missing file, a missing name, or a malformed text.
     """
 
     def wrong(problem: str) -> BadInput:
@@ -112,25 +111,25 @@ def read(
 
 
 def absolute(text: str, folder: Path, field: str, file: object = None) -> str:
-    """Code by its absolute path, found from anywhere; an entry of a table as it is. Raises as `read`."""
+    """User code by its absolute path; a built-in entry unchanged. Raises as `read`."""
     return read(text, field, folder=folder, file=file).text if is_code(text) else text
 
 
 def files_of(texts: Iterable[object]) -> list[Path]:
-    """The files of those that name code, once it is loaded."""
+    """The source files of those texts that name code, once the code is loaded."""
     named = [read(text, "").file() for text in texts if isinstance(text, str) and is_code(text)]
     return [file for file in named if file is not None]
 
 
 def place_of(thing: object) -> object:
-    """The file or module that a user's object is from; None for ours."""
+    """The file or module of a user's object; None for built-in objects."""
     return vars(thing)["_place"] if isinstance(thing, Guarded) else None
 
 
 def guarded(place: object, what: str, call: Callable[..., Any], *arguments: Any) -> Any:
-    """`call(*arguments)`, code of the user's in `place`.
+    """`call(*arguments)`, where `call` is user code in `place`.
 
-    Raises BadInput for what it raises, in one line: of a file of his with the deepest line that is in it.
+    Raises BadInput for any exception, in one line, with the deepest line number in the user's file.
     """
     try:
         return call(*arguments)
@@ -143,7 +142,7 @@ def guarded(place: object, what: str, call: Callable[..., Any], *arguments: Any)
 
 
 def _imported(place: str) -> ModuleType:
-    """A file is imported once a process, with its folder on the path, as if it were run."""
+    """Import a module or file; a file once per process, with its folder on the path, as if it were run."""
     if not place.endswith(".py"):
         return importlib.import_module(place)
     path = Path(place)

@@ -1,10 +1,9 @@
-"""Read one XML file of unknown origin as a stream, so that nothing in it can hurt the process that reads.
+"""Reads an untrusted XML file safely, as a stream.
 
-SUMO itself answers a bad file with "Process Error", with gigabytes of memory or with SIGSEGV
-(docs/reference/sumo.md); everything SUMO is handed therefore passes through `scan` first. The
-parser is expat with three refusals (entities, external references, encodings other than
-UTF-8 and Latin-1) and caps on depth, token length and unpacked size; memory does not grow
-with the file.
+SUMO answers a bad file with "Process Error", gigabytes of memory or SIGSEGV (docs/reference/sumo.md).
+Therefore every input of SUMO passes through `scan` first. The parser is expat. It refuses entities,
+external references, and encodings other than UTF-8 and Latin-1. Depth, token length and unpacked size
+are limited; memory does not grow with the file.
 """
 
 import codecs
@@ -19,9 +18,9 @@ from xml.parsers import expat
 from cosim.errors import BadInput
 
 MAX_DEPTH = 64  # SUMO's own files nest 6 deep; a million nested tags hang SUMO
-MAX_TOKEN = 64 << 20  # bytes between two parser events: expat buffers a tag until it is whole
-MAX_UNPACKED = 1 << 30  # bytes out of one .gz: a 3 GB bomb costs SUMO 4.2 GB of memory
-ENCODINGS = frozenset({"utf-8", "utf8", "us-ascii", "ascii", "iso-8859-1", "latin1"})  # that expat reads
+MAX_TOKEN = 64 << 20  # bytes between two parser events: expat buffers a tag until its end
+MAX_UNPACKED = 1 << 30  # bytes from one .gz: a 3 GB bomb costs SUMO 4.2 GB of memory
+ENCODINGS = frozenset({"utf-8", "utf8", "us-ascii", "ascii", "iso-8859-1", "latin1"})  # supported by expat
 CHUNK = 1 << 18  # bytes
 
 Start = Callable[[str, dict[str, str], int], None]  # tag, attributes, line
@@ -36,8 +35,8 @@ def regular_file(path: Path, *, file: object, field: str) -> Path:
     """`path` if it is a readable regular file.
 
     Raises:
-        BadInput: missing, a folder, a FIFO or device (SUMO hangs on these), or not readable; names
-            `file` and `field` as the place where the path was written.
+        BadInput: missing, a folder, a FIFO or device (SUMO hangs on these), or not readable; `file` and
+            `field` name the origin of the path.
     """
     try:
         mode = path.stat().st_mode
@@ -53,7 +52,7 @@ def regular_file(path: Path, *, file: object, field: str) -> Path:
 
 
 def is_there(path: Path) -> bool:
-    """`path.exists()`, and False for names no system takes (too long, a NUL byte)."""
+    """`path.exists()`; False for invalid names (too long, a NUL byte)."""
     try:
         return path.exists()
     except (OSError, ValueError):
@@ -71,8 +70,8 @@ def scan(
 ) -> str:
     """Call `start` for every element (the root included) and `end` when it closes; return the root's tag.
 
-    Plain and gzip-packed files are distinguished by their first bytes, as SUMO does. `roots`: the root tags
-    that are right here; empty for any. `unpacked`: bytes that a .gz may hold (MAX_UNPACKED).
+    Plain and gzip files are distinguished by their first bytes, as in SUMO. `roots`: permitted root tags;
+    empty for any. `unpacked`: limit for the content of a .gz in bytes (default MAX_UNPACKED).
 
     Raises:
         BadInput: not readable, not UTF-8, truncated or malformed (with line and column), wrong root,
@@ -118,7 +117,7 @@ def scan(
 
 
 def content(path: Path) -> bytes:
-    """The whole of a plain or gzip file, unpacked; raises BadInput like `scan`."""
+    """The unpacked content of a plain or gzip file; raises BadInput like `scan`."""
     return b"".join(chunks(path))
 
 
@@ -157,7 +156,7 @@ def _unpacked(raw: IO[bytes], path: Path, most: float) -> Iterator[bytes]:
 
 
 def _refuse_entities(parser: expat.XMLParserType, path: Path) -> None:
-    """Billion laughs and file disclosure: no entity may be declared, no external part referenced."""
+    """Refuse entity declarations and external references (billion laughs, file disclosure)."""
 
     def entity(name: str, *_: object) -> None:
         raise BadInput("entities may not be declared", file=path, field="ENTITY", value=name)
@@ -183,7 +182,7 @@ def _refuse_entities(parser: expat.XMLParserType, path: Path) -> None:
 
 
 def _malformed(error: expat.ExpatError, path: Path, fed: int, stack: list[str]) -> BadInput:
-    """expat's error in a user's words, with the place."""
+    """expat's error as a message for users, with line and column."""
     messages = expat.errors.messages
     place = f"line {error.lineno}, column {error.offset + 1}"
     if error.code == expat.errors.codes[expat.errors.XML_ERROR_INVALID_TOKEN]:
@@ -202,7 +201,7 @@ def _malformed(error: expat.ExpatError, path: Path, fed: int, stack: list[str]) 
 
 
 def _first_undecodable(path: Path) -> str | None:
-    """The first byte that is not UTF-8, in hexadecimal; None when all are."""
+    """The first byte that is not UTF-8, in hexadecimal; None if all are."""
     decoder = codecs.getincrementaldecoder("utf-8")()
     try:
         for chunk in chunks(path):

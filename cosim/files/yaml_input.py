@@ -1,4 +1,4 @@
-"""YAML into frozen dataclasses: every field checked by its type, errors name file, field and value."""
+"""Reads YAML into frozen dataclasses with type checks; errors name file, field and value."""
 
 import dataclasses
 import enum
@@ -20,7 +20,7 @@ _WANTED = {int: "a whole number", bool: "true or false", str: "text"}
 
 
 def document(path: Path) -> dict[Any, Any]:
-    """The mapping that the YAML file `path` holds; {} when it is empty.
+    """The mapping in the YAML file `path`; {} for an empty file.
 
     Raises BadInput: missing, not UTF-8, not YAML (with the line), no mapping.
     """
@@ -39,7 +39,7 @@ def document(path: Path) -> dict[Any, Any]:
 
 
 def check_known(values: Mapping[Any, object], known: Iterable[str]) -> None:
-    """Raises BadInput for a field of `values` that is not in `known`, with the nearest one that is."""
+    """Raises BadInput for a field of `values` that is not in `known`, with the nearest known name."""
     names = tuple(known)
     for name in (name for name in values if name not in names):
         raise BadInput(f"unknown field{hint(str(name), names)}", field=str(name), value=values[name])
@@ -51,25 +51,25 @@ def read(path: Path, cls: type[Config]) -> Config:
 
 
 def dataclass_from(cls: type[Config], values: object, file: Path | None, where: str = "") -> Config:
-    """An instance of `cls` from a mapping as YAML gives it; absent and empty fields keep their defaults.
+    """An instance of `cls` from a mapping parsed from YAML; absent and empty fields keep their defaults.
 
     Fields may be int, float, bool, str, Literal, IntEnum, X | None, tuples (one value stands for a list of
-    one), mappings and further dataclasses of these; `Annotated[float, Range(...)]` has bounds, `Any` is as it
-    stands. `where`: the mapping's own name in the file.
+    one), mappings and dataclasses of these. `Annotated[float, Range(...)]` has bounds; `Any` is not checked.
+    `where`: the mapping's name in the file.
 
     Raises:
-        BadInput: an unknown field (with the nearest name), a value of the wrong type, or what the
-            dataclass itself refuses.
+        BadInput: an unknown field (with the nearest name), a value of the wrong type, or a value that
+            the dataclass refuses.
     """
     with inside(where, file):
         return typing.cast(Config, _instance(cls, mapping(values)))
 
 
 def value_of(kind: Any, value: object) -> Any:
-    """`value`, as YAML gives it, as a `kind`: a type or what stands in its place in a dataclass.
+    """`value`, parsed from YAML, as a `kind`: a type or another annotation of a dataclass field.
 
     Raises:
-        BadInput: of another type or out of bounds; the field is named only where it is below `value`.
+        BadInput: wrong type or out of bounds; the error names a field only if it lies inside `value`.
     """
     origin, arguments = get_origin(kind), get_args(kind)
     if kind is Any:
@@ -153,7 +153,7 @@ def _tuple(kinds: tuple[Any, ...], value: object) -> tuple[Any, ...]:
 
 
 class _OnceOnly(yaml.SafeLoader):
-    """Refuses a key that is twice in a mapping: YAML would keep the last without a word."""
+    """Refuses duplicate keys in a mapping; YAML would silently keep the last."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen: set[str] = set()

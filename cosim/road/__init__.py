@@ -1,4 +1,4 @@
-"""The road as pure data: lanes with centre lines, how they connect, and the paths ahead of a vehicle."""
+"""The road as pure data: lanes with centre lines, their connections, and the paths ahead of a vehicle."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -13,25 +13,25 @@ from cosim.road.link import Crossing as Crossing
 from cosim.road.link import Link as Link
 from cosim.road.link import Rule as Rule
 
-REMEMBERED = 20_000  # routes ahead: a city's vehicles have a new one on every edge
-PATH_HORIZON = 400.0  # m: further than any AV drives within the 4 s horizon, and than arms are long
+MAX_CACHED_PATHS = 20_000  # in a city every vehicle has a new route ahead on every edge
+PATH_HORIZON = 400.0  # m: longer than junction arms and than any distance driven in the 4 s horizon
 
 
 @dataclass(frozen=True, eq=False)
 class LanePath:
-    """A lane's centre line followed ahead through its successors; one object per way (`RoadMap.path`).
+    """A lane's centre line, continued through its successors; one object per path (`RoadMap.path`).
 
-    `arc` starts at 0 at the beginning of the first lane; SUMO lane positions are scaled to it.
+    `arc` is 0 at the beginning of the first lane; SUMO lane positions are scaled to it.
     """
 
     points: Floats  # [p,2] m
     arc: Floats  # [p] m, distance along `points`
     lanes: tuple[int, ...]  # lanes passed, in order
     lane_start: Floats  # [len(lanes)] m, arc where each lane begins
-    dead_end: bool  # ends because the lane (or its use for this route) ends, not at the horizon
-    leaves: bool  # ends because the route is finished there (the vehicle arrives)
+    dead_end: bool  # the path ends where the lane, or its use for this route, ends
+    leaves: bool  # the path ends where the route ends (the vehicle arrives)
     scale: float  # arc length per SUMO lane position on the first lane
-    conflict: float  # m, arc where the conflict zone begins; inf when the path meets none
+    conflict: float  # m, arc where the conflict zone begins; inf for a path through none
 
     @property
     def length(self) -> float:
@@ -40,13 +40,13 @@ class LanePath:
 
     @cached_property
     def next_lanes(self) -> Ints:
-        """Its first three lanes (or as many as there are)."""
+        """The first three lanes, or fewer on a short path."""
         return np.array(self.lanes[:3], np.int64)
 
     def pose(self, arc: Floats) -> tuple[Floats, Floats, Floats]:
         """Positions and headings at arc lengths. [k] m -> x [k] m, y [k] m, heading [k] rad.
 
-        Beyond either end the path goes on straight.
+        Beyond either end the path is extended straight.
         """
         a = np.asarray(arc, dtype=np.float64)
         i = np.clip(np.searchsorted(self.arc, a, side="right") - 1, 0, len(self.arc) - 2)
@@ -61,12 +61,12 @@ class RouteAhead(NamedTuple):
     """An AV's own route knowledge at one decision (contract, Observation)."""
 
     paths: tuple[LanePath | None, LanePath | None, LanePath | None]  # left, keep, right; None: no lane
-    arc: float  # m, the vehicle centre's place along every path
-    conflict_distance: float  # m to the conflict zone along the present lane; inf when none is ahead
+    arc: float  # m, position of the vehicle's centre along every path
+    conflict_distance: float  # m to the conflict zone along the present lane; inf: none ahead
     speed_limit: float  # m/s
 
     def to_end(self, side: int) -> float:
-        """m until the path ends in a dead end; inf when it does not (side 0 left, 1 keep, 2 right)."""
+        """m to the dead end of a path; inf without one (side 0 left, 1 keep, 2 right)."""
         path = self.paths[side]
         if path is None:
             return 0.0
@@ -75,32 +75,32 @@ class RouteAhead(NamedTuple):
 
 @dataclass(frozen=True)
 class ConflictZone:
-    """Where streams meet: a set of lanes (indices into RoadMap.lanes)."""
+    """Lanes on which traffic streams conflict (indices into RoadMap.lanes)."""
 
     name: str
     lanes: frozenset[int]
 
 
 class LaneGraph(NamedTuple):
-    """Which lane follows which, for walking ahead quickly; l lanes as in RoadMap.lanes."""
+    """The default successor of every lane, for fast lookahead; l lanes as in RoadMap.lanes."""
 
-    following: Ints  # [l] the lane one drives on to, -1 at the end
+    following: Ints  # [l] successor, -1 at the end
     length: Floats  # [l] m
 
 
 @dataclass(frozen=True)
 class RoadMap:
-    """Every lane of a net. Paths are cached: asking again is free, and equal ways share one."""
+    """Every lane of a net. Paths are cached, and equal paths share one object."""
 
     lanes: tuple[Lane, ...]
     zones: tuple[ConflictZone, ...] = ()
     junctions: tuple[Floats, ...] = ()  # [p,2] m, outlines
-    links: tuple[Link, ...] = ()  # every way from a lane into a junction
+    links: tuple[Link, ...] = ()  # every connection from a lane into a junction
     signals: tuple[
         tuple[str, int], ...
     ] = ()  # (traffic light, its link index) of every entry of `Snapshot.signals`
     crossings: tuple[Crossing, ...] = ()
-    closed: tuple[Lane, ...] = ()  # a lane of every edge that is closed to motor vehicles: where others are
+    closed: tuple[Lane, ...] = ()  # one lane of every edge closed to motor vehicles
     _paths: dict[tuple[int, tuple[str, ...] | None], LanePath] = field(default_factory=dict, repr=False)
     _ways: dict[tuple[tuple[int, ...], bool, bool], LanePath] = field(default_factory=dict, repr=False)
     index: dict[str, int] = field(default_factory=dict, repr=False)
@@ -109,16 +109,16 @@ class RoadMap:
         self.index.update({lane.id: i for i, lane in enumerate(self.lanes)})
 
     def path(self, lane: int, route: tuple[str, ...] | None = None) -> LanePath:
-        """The way ahead from the start of `lane`.
+        """The path ahead from the start of `lane`.
 
-        `route`: edges from the lane's own edge on (internal edges left out); the path follows them and
-        dead-ends where the lane does not lead on. Without a route (other drivers' is unknown) it takes
-        the straightest successor.
+        `route`: edges from the lane's own edge on, without internal edges. The path follows the route and
+        dead-ends where the lane does not continue it. Without a route (unknown for other vehicles), the path
+        follows the straightest successors.
         """
         key = (lane, route)
         found = self._paths.get(key)
         if found is None:
-            if len(self._paths) >= REMEMBERED:
+            if len(self._paths) >= MAX_CACHED_PATHS:
                 self._paths.clear()
             way = self._follow(lane, route)
             if way not in self._ways:
@@ -128,7 +128,7 @@ class RoadMap:
 
     @cached_property
     def link_of(self) -> dict[tuple[int, int], int]:
-        """(lane before the stop line, lane inside the junction or beyond it) -> index of the link."""
+        """(lane before the stop line, internal or target lane) -> index of the link."""
         found: dict[tuple[int, int], int] = {}
         for k, link in enumerate(self.links):
             found[link.origin, link.target] = k
@@ -138,16 +138,15 @@ class RoadMap:
 
     @cached_property
     def contact(self) -> Contact:
-        """Which lanes' vehicles can touch: roads on a bridge and below it do not."""
+        """Lanes whose vehicles can touch: not those on a bridge and below it."""
         return Contact(self.lanes, self.closed)
 
     def connected(self, a: int, b: int) -> bool:
-        """Whether vehicles on lanes or places (`Snapshot.place`) `a` and `b` can touch; -1 touches all."""
+        """Whether vehicles on lanes or places (`Snapshot.place`) `a` and `b` can touch; -1: with all."""
         return bool(self.contact.touch(a, np.array([b]))[0])
 
     def waits_inside(self, lane: int) -> bool:
-        """Whether the lane lies in a junction and ends at a place in it where the net lets vehicles wait for
-        others (SUMO's internal junctions)."""
+        """Whether the lane ends at a waiting position inside the junction (SUMO's internal junctions)."""
         lanes = self.lanes
         return lane >= 0 and lanes[lane].internal and any(lanes[k].internal for k in lanes[lane].successors)
 
@@ -170,7 +169,7 @@ class RoadMap:
 
     @cached_property
     def links_through(self) -> dict[int, tuple[int, ...]]:
-        """Lane inside a junction -> the links (indices) that lead over it."""
+        """Internal lane -> the links (indices) over this lane."""
         found: dict[int, tuple[int, ...]] = {}
         for number, lanes in enumerate(self.inside):
             for lane in lanes:
@@ -179,7 +178,7 @@ class RoadMap:
 
     @cached_property
     def inside(self) -> tuple[tuple[int, ...], ...]:
-        """The lanes inside the junction of each link, in driving order."""
+        """The internal lanes of each link, in driving order."""
         found = []
         for link in self.links:
             ways: list[int] = []
@@ -192,13 +191,13 @@ class RoadMap:
 
     @cached_property
     def straight_on(self) -> LaneGraph:
-        """The straightest successor of every lane (another vehicle's route is unknown)."""
+        """The straightest successor of every lane, for vehicles with an unknown route."""
         steps = [self._successor(k, None, 0) for k in range(len(self.lanes))]
         following = np.array([-1 if step is None else step[0] for step in steps], np.int64)
         return LaneGraph(following, np.array([lane.length for lane in self.lanes], np.float64))
 
     def ahead(self, lane: int, lane_position: float, length: float, route: tuple[str, ...]) -> RouteAhead:
-        """Route knowledge of a vehicle of `length` m whose front bumper is at `lane_position` m of `lane`."""
+        """Route knowledge of a vehicle of `length` m with its front bumper at `lane_position` m of `lane`."""
         here = self.lanes[lane]
         keep = self.path(lane, route)
         left = None if here.left < 0 else self.path(here.left, route)
@@ -219,10 +218,10 @@ class RoadMap:
         return [float(np.arctan2(d[1], d[0])) for d in last]
 
     def _follow(self, first: int, route: tuple[str, ...] | None) -> tuple[tuple[int, ...], bool, bool]:
-        """The lanes of a path, whether it ends in a dead end, and whether because the route is finished."""
+        """The lanes of a path, whether it has a dead end, and whether it ends with the route."""
         lanes = [first]
         total = self._lengths[first]
-        place = 0  # where on the route we are
+        place = 0  # index into the route
         dead_end = leaves = False
         while total < PATH_HORIZON + self._lengths[first]:
             lane = self.lanes[lanes[-1]]
@@ -236,7 +235,7 @@ class RoadMap:
                 leaves = not dead_end
                 break
             following, place = step
-            if following in lanes:  # a ring: once round is far enough
+            if following in lanes:  # a ring: stop after one round
                 break
             lanes.append(following)
             total += self._lengths[following]
@@ -252,12 +251,12 @@ class RoadMap:
         if not fitting:
             return None
         best = fitting[0]
-        if len(fitting) > 1:  # the road widens: SUMO takes the lane that follows the route furthest
+        if len(fitting) > 1:  # the road widens: as in SUMO, the lane that follows the route furthest
             best = max(fitting, key=lambda s: self._reach(s, route, self._place_on(s, place), 300.0))
         return best, self._place_on(best, place)
 
     def _fitting(self, lane: Lane, route: tuple[str, ...], place: int) -> list[int]:
-        """Successors that lead to the route's next edge."""
+        """Successors that lead to the next edge of the route."""
         wanted = route[place + 1] if place + 1 < len(route) else None
         return [s for s in lane.successors if self._leads_to(s, wanted)]
 
@@ -265,7 +264,7 @@ class RoadMap:
         return place if self.lanes[lane].internal else place + 1
 
     def _reach(self, lane: int, route: tuple[str, ...], place: int, left: float) -> float:
-        """How many of the next `left` m of the route can be driven from the start of `lane` on, in m."""
+        """m of the next `left` m of the route that are drivable from the start of `lane`."""
         here = self.lanes[lane]
         own = self._lengths[lane]
         if own >= left or (place >= len(route) - 1 and not here.internal):
@@ -277,7 +276,7 @@ class RoadMap:
         return own + max(further, default=0.0)
 
     def _leads_to(self, lane: int, edge: str | None) -> bool:
-        """Whether the lane is on `edge`, or is an internal lane that ends there."""
+        """Whether the lane is on `edge`, or is an internal lane that leads there."""
         seen = 0
         while self.lanes[lane].internal and self.lanes[lane].successors and seen < 8:
             lane = self.lanes[lane].successors[0]

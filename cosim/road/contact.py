@@ -1,4 +1,4 @@
-"""Which roads can touch: vehicles on a bridge and below it are on top of one another only on the map."""
+"""Lanes whose vehicles can touch: vehicles on a bridge and below it overlap only on the map."""
 
 from functools import cached_property
 
@@ -8,16 +8,16 @@ import numpy.typing as npt
 from cosim.arrays import Bools, Ints
 from cosim.road.lane import Lane
 
-REACH = 100.0  # m of road between two edges, within which vehicles on them may meet
+MAX_ROAD_DISTANCE = 100.0  # m of road between two edges whose vehicles can touch
 
 
 class Contact:
-    """Answers for places: lanes (indices into RoadMap.lanes), and -2 - k on edge k of `edges`, on no lane.
+    """Contact between places: lanes (indices into RoadMap.lanes), or -2 - k for edge k without a lane.
 
-    Vehicles can touch when one's edge is reached from the other's within `REACH` m of road (either way), and
-    when one of them is off every edge. Edges that are closed to motor vehicles (`closed`: a lane of each) can
-    be reached, but lead nowhere: nobody gets from a bridge to the road below it by a footpath. `table` [S,S]
-    holds the answers for the edges met so far; `numbers` gives each place's row in it.
+    Vehicles can touch if one edge is reached from the other within `MAX_ROAD_DISTANCE` (either way), or if
+    one vehicle is off every edge. Edges closed to motor vehicles (`closed`: one lane of each) can be reached
+    but lead nowhere, so that a footpath does not join a bridge to the road below it. `table` [S,S] holds the
+    answers for the edges queried so far; `numbers` gives the row of each place.
     """
 
     def __init__(self, lanes: tuple[Lane, ...], closed: tuple[Lane, ...] = ()) -> None:
@@ -29,10 +29,10 @@ class Contact:
         self._first = tuple(first.values())
         count = len(first)
         numbered = [self.edges[lane.edge] for lane in lanes]
-        # [l + count + 1] negative places count from the end: -1 is OFF, -2 the edge 0, -3 the edge 1
+        # [l + count + 1] negative places count from the end: -1 is off every edge, -2 edge 0, -3 edge 1
         self._edge: Ints = np.array([*numbered, *reversed(range(count)), count], np.int64)
-        self._number: Ints = np.full(count + 1, -1, np.int64)  # of every edge, -1 not met yet
-        self._members: list[int] = []  # the edges met
+        self._number: Ints = np.full(count + 1, -1, np.int64)  # row of every edge, -1: none yet
+        self._members: list[int] = []  # edges with a row
         self.table: Bools = np.zeros((16, 16), np.bool_)
 
     def edge(self, place: int) -> str:
@@ -57,7 +57,7 @@ class Contact:
     def _meet(self, edge: int) -> None:
         if self._number[edge] >= 0:
             return
-        everywhere = len(self._first)  # the edge of OFF
+        everywhere = len(self._first)  # pseudo-edge of place -1
         near = None if edge == everywhere else self._edges_near(self._first[edge])  # None: all
         new = self._number[edge] = len(self._members)
         self._members.append(edge)
@@ -77,7 +77,7 @@ class Contact:
         return found
 
     def _edges_near(self, lane: Lane) -> set[str]:
-        """The edges reached from the lane's within `REACH` m of road, its own among them."""
+        """The edges within `MAX_ROAD_DISTANCE` of the lane's edge, including that edge."""
         found, seen = {lane.edge}, {lane.start: 0.0, lane.end: 0.0}
         waiting = [lane.start, lane.end]
         while waiting:
@@ -88,7 +88,7 @@ class Contact:
                     continue
                 far = other.end if other.start == junction else other.start
                 distance = seen[junction] + other.length
-                if distance < min(REACH, seen.get(far, np.inf)):
+                if distance < min(MAX_ROAD_DISTANCE, seen.get(far, np.inf)):
                     seen[far] = distance
                     waiting.append(far)
         return found

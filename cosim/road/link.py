@@ -1,4 +1,4 @@
-"""Ways through junctions: which lane leads to which, by which signal, and who has the right of way."""
+"""Links: connections of lanes through junctions, with signals and right of way."""
 
 import math
 from dataclasses import dataclass
@@ -11,26 +11,26 @@ from cosim.arrays import Floats
 
 
 class Rule(IntEnum):
-    """What the sign at a stop line asks for (SUMO, Networks/SUMO_Road_Networks, link states)."""
+    """The rule at a stop line without signals (SUMO, Networks/SUMO_Road_Networks, link states)."""
 
-    PRIORITY = 0  # nothing: others give way
-    YIELD = 1  # give way to the link's foes; also a link with signals that are off or green without priority
-    STOP = 2  # stop, then give way
-    ALL_WAY_STOP = 3  # stop; who stopped first goes first
-    EQUAL = 4  # the right before the left (the left before the right in left-hand traffic)
-    ZIPPER = 5  # by turns
+    PRIORITY = 0  # foes yield
+    YIELD = 1  # yield to the link's foes; also a link with signals that are off or green without priority
+    STOP = 2  # stop, then yield
+    ALL_WAY_STOP = 3  # stop; first stopped, first served
+    EQUAL = 4  # yield to the right (to the left in left-hand traffic)
+    ZIPPER = 5  # alternate
 
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """One connection; lanes are indices into `RoadMap.lanes`. The stop line is where lane `origin` ends."""
+    """One connection; lanes are indices into `RoadMap.lanes`. The stop line is the end of lane `origin`."""
 
     origin: int
-    via: int  # the first lane inside the junction, -1 where there is none
+    via: int  # first internal lane, -1 without one
     target: int
     signal: int  # index into `Snapshot.signals`, -1 without a signal
     rule: Rule
-    foes: tuple[int, ...] = ()  # indices of the links that have the right of way over this one
+    foes: tuple[int, ...] = ()  # indices of the links with right of way over this link
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,11 +40,11 @@ class Crossing:
     id: str
     shape: Floats  # [p,2] m, its centre line
     width: float  # m
-    lanes: tuple[int, ...]  # the lanes that it crosses
+    lanes: tuple[int, ...]  # crossed lanes
     signal: int = -1  # index into `Snapshot.signals`
 
     def away(self, x: Floats, y: Floats) -> Floats:
-        """[n] m from places x, y [n] m to its centre line."""
+        """[n] m from positions x, y [n] m to the centre line."""
         distance = np.full(len(x), np.inf)
         for (ax, ay), (bx, by) in pairwise(self.shape.tolist()):
             length = max(math.hypot(bx - ax, by - ay), 1e-6)

@@ -1,4 +1,4 @@
-"""What the law says on a vehicle's own way: signals, stop lines, right of way, crossings, limits."""
+"""Traffic rules ahead on a vehicle's path: signals, stop lines, right of way, crossings, speed limits."""
 
 from __future__ import annotations
 
@@ -16,47 +16,47 @@ from cosim.arrays import Bytes, Floats
 from cosim.road import PATH_HORIZON, Crossing, LanePath, Link, RoadMap, Rule
 
 RED, YELLOW, GREEN = "ru", "yY", "gG"  # a signal's states (SUMO, Simulation/Traffic_Lights)
-STOP_STATES = "s"  # the green arrow: stop, then give way
+STOP_STATES = "s"  # the green arrow: stop, then yield
 YIELD_STATES = "gos"  # green without priority, off and blinking, the green arrow
 STOP_SIGNS = (Rule.STOP, Rule.ALL_WAY_STOP)
-BESIDE = 2.0  # m from a crossing's end within which a person waits at it
-STANDING = 0.1  # m/s
-TOWARDS = 0.5  # cosine: a person who walks within 60 degrees of the crossing's direction is about to enter it
-STEP = 0.25  # m, how finely the place of a crossing along a lane is sought
-UNCHANGED: Mapping[int, float] = MappingProxyType({})  # no limit but the road's
-_GRID = 16.0  # m, persons are looked up in squares of this size
+WAITING_ZONE = 2.0  # m beyond a crossing's end, in which a person waits for the crossing
+STANDSTILL = 0.1  # m/s, of a person
+ENTRY_COSINE = 0.5  # a person walking within 60 degrees of the crossing's direction will enter
+SAMPLE_SPACING = 0.25  # m, resolution of a crossing's position along a lane
+UNCHANGED: Mapping[int, float] = MappingProxyType({})  # no variable speed limits
+_GRID = 16.0  # m, cell size of the spatial index of persons
 
 
 def no_limits() -> Floats:
-    """[1,2] the limits ahead of a vehicle about whose way nothing is known."""
+    """[1,2] the limits ahead of a vehicle with an unknown path."""
     return np.array([[0.0, np.inf]])
 
 
 class RulesAhead(NamedTuple):
-    """The law on one vehicle's own way at one time (docs/reference/observation.md).
+    """The traffic rules on one vehicle's path at one time (docs/reference/observation.md).
 
-    Distances in m from the front bumper along `RouteAhead.paths[1]`; inf: none within `PATH_HORIZON`, or
-    none before the lane stops leading on. Which lanes serve the route, and how far: `RouteAhead.to_end`.
+    Distances in m from the front bumper along `RouteAhead.paths[1]`; inf: none within `PATH_HORIZON` or
+    before the path's dead end. For the lanes that serve the route, see `RouteAhead.to_end`.
     """
 
-    signal: str = ""  # state of the next signal, one of rRyYgGosu; "" when none is ahead
+    signal: str = ""  # state of the next signal, one of rRyYgGosu; "": none ahead
     signal_distance: float = math.inf  # m to its stop line
     signal_index: int = -1  # into `RoadMap.signals`
-    switch_in: float = -1.0  # s to the next phase of its light; -1 unless `signal_timing` was asked for
-    stop_distance: float = math.inf  # m to the next line at which one must stop: signs, green arrows
-    all_way_stop: bool = False  # whether that line is one of an all-way stop
-    yield_distance: float = math.inf  # m to the next line at which one must give way
-    yield_link: int = -1  # index into `RoadMap.links`; the links that go first are its `foes`
+    switch_in: float = -1.0  # s to the next phase of the traffic light; -1 without `signal_timing`
+    stop_distance: float = math.inf  # m to the next line with a stop sign or green arrow
+    all_way_stop: bool = False  # whether that line belongs to an all-way stop
+    yield_distance: float = math.inf  # m to the next yield line
+    yield_link: int = -1  # its index into `RoadMap.links`; `foes` are the links with right of way
     crossing_distance: float = math.inf  # m to the near edge of the next pedestrian crossing; 0 on it
-    person_distance: float = math.inf  # m to the next crossing that a person is on, or waits at
-    limits: Floats = no_limits()  # [k,2] m and m/s: where a limit begins, the present one at 0 m
+    person_distance: float = math.inf  # m to the next crossing with a person on it or waiting
+    limits: Floats = no_limits()  # [k,2] m and m/s: start of each limit, the present one at 0 m
 
 
 NO_RULES = RulesAhead()
 
 
 class Moment:
-    """What of the law changes, at one time: the states of signals, and where persons are."""
+    """The time-dependent part of the rules: signal states, persons and variable limits."""
 
     def __init__(
         self,
@@ -68,17 +68,17 @@ class Moment:
         """Take the state of all signals.
 
         Args:
-            signals: [s] `ord` of every signal's state in the order of `RoadMap.signals`; none: none is known,
-                and every line asks for what it asks without its signal.
-            switches: [s] s until the next phase of every signal's light; None: not told.
-            persons: [p,4] x m, y m, heading rad, speed m/s of the persons who are perceived.
-            limits: lane -> m/s where the limit is not the road's.
+            signals: [s] `ord` of every signal's state in the order of `RoadMap.signals`; None: unknown, so
+                that every line has its rule without signals.
+            switches: [s] s until the next phase of every signal's traffic light; None: unknown.
+            persons: [p,4] x m, y m, heading rad, speed m/s of the perceived persons.
+            limits: lane -> m/s, limits that differ from the road map.
         """
         self.limits = limits
         self.states = "" if signals is None else signals.tobytes().decode("latin-1")
         self.switches = switches
-        self.taken: dict[int, bool] = {}  # crossings that were looked at
-        self.persons: dict[tuple[int, int], list[list[float]]] = {}  # by squares of _GRID m
+        self.taken: dict[int, bool] = {}  # cache: crossing -> occupied
+        self.persons: dict[tuple[int, int], list[list[float]]] = {}  # by cell of `_GRID` m
         if persons is not None:
             squares = np.floor(persons[:, :2] / _GRID).astype(int).tolist()
             for (column, row), person in zip(squares, persons.tolist(), strict=True):
@@ -86,16 +86,16 @@ class Moment:
 
 
 class _Way(NamedTuple):
-    """What does not change along one path: arcs in m from its start, in order."""
+    """The static rules along one path: arcs in m from its start, in order."""
 
     lines: tuple[tuple[float, int, Link], ...]  # (arc, index of the link, the link)
     crossings: tuple[tuple[float, float, int], ...]  # (arc of the near edge, of the far edge, index)
-    limits: Floats  # [k,2] arc, m/s: where the limit changes
+    limits: Floats  # [k,2] arc, m/s: changes of the limit
     starts: list[float]  # the arcs of `limits`
 
 
 class RuleBook:
-    """The law of one road. What belongs to a path is worked out once; a look ahead is then a few look-ups."""
+    """The traffic rules of one road map. Static rules are cached per path."""
 
     def __init__(self, road: RoadMap) -> None:
         self._road = road
@@ -107,7 +107,7 @@ class RuleBook:
                 self._crossed.setdefault(lane, []).append(number)
 
     def ahead(self, path: LanePath, front: float, now: Moment) -> RulesAhead:
-        """The law for a vehicle with its front bumper at arc `front` m of `path`, on its first lane."""
+        """The rules for a vehicle on the first lane of `path`, with its front bumper at arc `front` m."""
         way = self._ways.get(path)
         if way is None:
             way = self._ways[path] = self._survey(path)
@@ -153,7 +153,7 @@ class RuleBook:
         )
 
     def _taken(self, number: int, now: Moment) -> bool:
-        """Whether a person is on the crossing, or waits at it without a red signal."""
+        """Whether a person is on the crossing, or waits there without a red signal."""
         taken = now.taken.get(number)
         if taken is None:
             zebra = self._crossings[number]
@@ -177,7 +177,7 @@ class RuleBook:
         return _Way(tuple(lines), tuple(sorted(crossings)), *self._limits(path, UNCHANGED))
 
     def _limits(self, path: LanePath, changed: Mapping[int, float]) -> tuple[Floats, list[float]]:
-        """`_Way.limits` and `_Way.starts`, with the limits that have changed."""
+        """`_Way.limits` and `_Way.starts`, with the `changed` limits."""
         limits: list[tuple[float, float]] = []
         for start, lane in zip(path.lane_start.tolist(), path.lanes, strict=True):
             limit = changed.get(lane, self._road.lanes[lane].speed_limit)
@@ -187,17 +187,17 @@ class RuleBook:
 
 
 class _Zebra:
-    """Where a crossing is."""
+    """The geometry of a pedestrian crossing."""
 
     def __init__(self, crossing: Crossing) -> None:
         ends = crossing.shape.tolist()
         self.signal, self._half, self._crossing = crossing.signal, 0.5 * crossing.width, crossing
-        self._pieces = []  # of its centre line: x m, y m, direction, length m, m to go on before and after it
+        self._pieces = []  # of the centre line: x m, y m, direction, length m, extension before and after, m
         for k, ((ax, ay), (bx, by)) in enumerate(pairwise(ends)):
             length = max(math.hypot(bx - ax, by - ay), 1e-6)
-            before, after = BESIDE * (k == 0), BESIDE * (k == len(ends) - 2)
+            before, after = WAITING_ZONE * (k == 0), WAITING_ZONE * (k == len(ends) - 2)
             self._pieces.append((ax, ay, (bx - ax) / length, (by - ay) / length, length, before, after))
-        margin = self._half + BESIDE
+        margin = self._half + WAITING_ZONE
         low, high = (
             np.floor((edge + d) / _GRID).astype(int).tolist()
             for edge, d in ((crossing.shape.min(0), -margin), (crossing.shape.max(0), margin))
@@ -206,7 +206,7 @@ class _Zebra:
         self.squares = [(column, row) for column in columns for row in rows]
 
     def holds(self, person: list[float], red: bool) -> bool:
-        """Whether that person is on it or, unless its signal is `red`, waits at it or is about to enter."""
+        """Whether the person is on the crossing, or waits or enters there while its signal is not `red`."""
         x, y, heading, speed = person
         for ax, ay, ux, uy, length, before, after in self._pieces:
             along, across = (x - ax) * ux + (y - ay) * uy, (y - ay) * ux - (x - ax) * uy
@@ -215,14 +215,14 @@ class _Zebra:
             if 0.0 <= along <= length:
                 return True
             inwards = math.cos(heading) * ux + math.sin(heading) * uy  # cosine to the centre line
-            if not red and (speed < STANDING or (inwards if along < 0.0 else -inwards) > TOWARDS):
+            if not red and (speed < STANDSTILL or (inwards if along < 0.0 else -inwards) > ENTRY_COSINE):
                 return True
         return False
 
     def place_on(self, lane: Floats) -> tuple[float, float]:
-        """Where the centre line [p,2] of a lane enters and leaves the crossing, m along the lane."""
+        """Entry and exit of the crossing along the centre line [p,2] of a lane, m."""
         arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(lane, axis=0).T))])
-        at = np.arange(0.0, arc[-1] + STEP, STEP)
+        at = np.arange(0.0, arc[-1] + SAMPLE_SPACING, SAMPLE_SPACING)
         x, y = np.interp(at, arc, lane[:, 0]), np.interp(at, arc, lane[:, 1])
         distance = self._crossing.away(x, y)
         inside = np.flatnonzero(distance <= max(self._half, float(distance.min())))

@@ -1,4 +1,4 @@
-"""Lanes so close together that vehicles on them overlap though each follows its own: a fault of the net."""
+"""Net faults: lanes so close together that vehicles overlap although each keeps its own lane."""
 
 from collections.abc import Iterator, Sequence
 from itertools import combinations
@@ -8,13 +8,13 @@ import numpy as np
 from cosim.arrays import Floats
 from cosim.road import RoadMap
 
-BROAD = 2.5  # m: SUMO's broadest vehicles on the road, buses
+BUS_WIDTH = 2.5  # m, SUMO's widest road vehicles
 SPACING = 2.0  # m between the points compared
 
 
 def heed_each_other(road: RoadMap, a: int, b: int) -> bool:
-    """Whether drivers on lanes `a` and `b` (indices) have to heed one another: one lane, or one after the
-    other, or two that part, join or cross, or of which one has the right of way over the other."""
+    """Whether drivers on lanes `a` and `b` (indices) have to heed one another. True for lanes that are
+    equal, consecutive, diverge, merge or cross, and for links of which one yields to the other."""
     if along_one_another(road, a, b) or _cross(road.lanes[a].shape, road.lanes[b].shape):
         return True
     ways = [road.links_through.get(lane, ()) for lane in (a, b)]
@@ -22,23 +22,22 @@ def heed_each_other(road: RoadMap, a: int, b: int) -> bool:
 
 
 def along_one_another(road: RoadMap, a: int, b: int) -> bool:
-    """Whether two lanes (indices) are one, follow one another, or part or join at one place."""
+    """Whether two lanes (indices) are equal, consecutive, or diverge or merge at one point."""
     near = [{lane, *road.lanes[lane].successors, *road.before[lane]} for lane in (a, b)]
     return not near[0].isdisjoint(near[1])
 
 
 def walks_beside(road: RoadMap, place: int) -> bool:
-    """Whether a place (`Snapshot.place`) is a walking area: persons on it are beside every road, and vehicles
-    and persons do not heed one another (SUMO: Simulation/Pedestrians)."""
+    """Whether a place (`Snapshot.place`) is a walking area. Persons there are off the road, and vehicles and
+    persons do not heed one another (SUMO: Simulation/Pedestrians)."""
     edge = road.contact.edge(place)
     return edge.startswith(":") and edge.rpartition("_")[2].startswith("w")
 
 
 def foot(road: RoadMap, lane: int, behind: float, rear: Floats) -> list[int]:
-    """The lanes that a vehicle stands on: the one of its front, and those before it.
+    """The lanes under a vehicle: the lane of its front, and the lanes before.
 
-    `behind`: m of the vehicle that are before the beginning of `lane`; `rear`: [2] m, its rear end, which
-    says by which of several lanes it came.
+    `behind`: m of the vehicle before `lane`. `rear`: [2] m, the rear end, to choose among preceding lanes.
     """
     found = [lane]
     while behind > 0.0 and (before := road.before[found[-1]]):
@@ -51,26 +50,27 @@ def foot(road: RoadMap, lane: int, behind: float, rear: Floats) -> list[int]:
 
 
 def too_close(road: RoadMap) -> list[tuple[float, int, int]]:
-    """Pairs of lanes (indices) of one edge on which vehicles of `BROAD` m side by side overlap though their
-    drivers need not heed each other, with the distance of their centre lines in m, the closest first."""
+    """Pairs of lanes (indices) of one edge, less than `BUS_WIDTH` apart, whose drivers need not heed
+    each other; with the distance of the centre lines in m, the closest first."""
     found = []
     for a, b in _neighbours(road):
         if not heed_each_other(road, a, b):
             p, q = _points(road.lanes[a].shape), _points(road.lanes[b].shape)
             distance = float(np.hypot(*(p[:, None] - q[None]).transpose(2, 0, 1)).min())
-            if distance < BROAD:
+            if distance < BUS_WIDTH:
                 found.append((distance, a, b))
     return sorted(found)
 
 
 def described(road: RoadMap, pairs: Sequence[tuple[float, int, int]], most: int = 3) -> str:
-    """`too_close` in one line that names `most` pairs; "" where there is none."""
+    """`too_close` in one line that names at most `most` pairs; "" for none."""
     if not pairs:
         return ""
     named = [f"{road.lanes[a].id} and {road.lanes[b].id} ({d:.2f} m)" for d, a, b in pairs[:most]]
     more = f" and {len(pairs) - most} more pairs" if len(pairs) > most else ""
     return (
-        f"less than {BROAD:g} m apart, so that vehicles overlap without a collision: {', '.join(named)}{more}"
+        f"less than {BUS_WIDTH:g} m apart, so that vehicles overlap without a collision: "
+        f"{', '.join(named)}{more}"
     )
 
 
@@ -78,7 +78,7 @@ def described(road: RoadMap, pairs: Sequence[tuple[float, int, int]], most: int 
 
 
 def _neighbours(road: RoadMap) -> Iterator[tuple[int, int]]:
-    """Pairs of lanes of one edge, inside a junction or not."""
+    """Pairs of lanes of one edge, internal or not."""
     edges: dict[str, list[int]] = {}
     for k, lane in enumerate(road.lanes):
         edges.setdefault(lane.edge, []).append(k)

@@ -1,4 +1,4 @@
-"""What to simulate: a world by name or by its folder, or any user's .sumocfg, read into one `Scenario`."""
+"""Loads a `Scenario`: a scenario by its name or folder, or a user's .sumocfg."""
 
 import math
 import os
@@ -26,32 +26,32 @@ from cosim.scenario.traffic import STEP, SUMO_STEP, Changed, check_timing, clock
 from cosim.types import Identity, OnCollision, Preset, Timing, Traffic
 
 CONFIG = ".sumocfg"
-DEFINITION = "scenario.yaml"  # what makes a folder a world
-FOREIGN_DURATION = 60.0  # s, for a .sumocfg that names no end
+DEFINITION = "scenario.yaml"  # marks a scenario folder
+FOREIGN_DURATION = 60.0  # s, for a .sumocfg without an end
 NONE, AUTO = "none", "auto"
 MISSIONS = ("merge", "exit", "roundabout", "intersection", NONE, AUTO)
 
 
 @dataclass(frozen=True, slots=True)
 class Mission:
-    """The vehicle that needs another driver's help. Kind `auto` without `vehicles`: it is guessed from the
-    net while running, the first HV on a lane that ends or gives way."""
+    """The mission vehicle, which depends on other drivers. Kind `auto` without `vehicles`: guessed during the
+    episode, as the first HV on a lane that ends or yields."""
 
     kind: str = AUTO
     vehicles: str = ""  # a vehicle's id, or a regular expression on ids; full match
-    goal: tuple[str, ...] = ()  # edges; being on one of them is success (off internal lanes)
+    goal: tuple[str, ...] = ()  # edges; reaching one of them is success (without internal lanes)
 
     @property
     def guessed(self) -> bool:
         return self.kind == AUTO and not self.vehicles
 
     def includes(self, vehicle: str) -> bool:
-        """Whether the vehicle of this id is named as a mission vehicle."""
+        """Whether the vehicle with this id is named as a mission vehicle."""
         named = self.vehicles
         return bool(named) and (vehicle == named or re.fullmatch(named, vehicle) is not None)
 
 
-ALWAYS = {"keep-lane": Preset.UNGUARDED}  # what it shows is what happens where nobody brakes
+ALWAYS = {"keep-lane": Preset.UNGUARDED}  # demonstrates traffic in which no AV brakes
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ class Zone:
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """Everything the simulator needs; paths are absolute."""
+    """All inputs of the simulator; paths are absolute."""
 
     name: str
     config: Path  # the .sumocfg
@@ -72,12 +72,12 @@ class Scenario:
     demand: tuple[Path, ...]
     additional: tuple[Path, ...] = ()
     options: tuple[tuple[str, str], ...] = ()  # further SUMO options that change the traffic
-    ignored: tuple[str, ...] = ()  # options of the .sumocfg that were not passed on (outputs and such)
+    ignored: tuple[str, ...] = ()  # options of the .sumocfg that are not passed on (such as outputs)
     traffic: str = Traffic.CONTROLLED
-    changed: tuple[Changed, ...] = ()  # options of a user's file, for controlled traffic
+    changed: tuple[Changed, ...] = ()  # options of a user's file, changed for controlled traffic
     begin: float = 0.0  # s
-    warmup: float = 0.0  # s, not counted
-    duration: float = 60.0  # s, counted
+    warmup: float = 0.0  # s, before the counted time
+    duration: float = 60.0  # s, of the counted time
     timing: Timing = Timing()
     preset: str = Preset.LAWFUL
     on_collision: str = OnCollision.END  # of an AV or of the mission vehicle
@@ -87,18 +87,18 @@ class Scenario:
     demand_name: str = "as-is"
     behavior: str = AS_IS
     driver_model: str = LC2013
-    errors: Errors | None = None  # of human drivers and persons; None: nobody errs
+    errors: Errors | None = None  # of human drivers and persons; None: no errors
     sensing: Sensing | None = None  # of AVs; None: ideal
-    tilt: Tilt | None = None  # of these errors; None: they are drawn as they happen
-    demands: Mapping[str, Path] | None = None  # name -> file, of a world
+    tilt: Tilt | None = None  # importance sampling of the errors; None: natural probabilities
+    demands: Mapping[str, Path] | None = None  # name -> file, of a scenario folder
     title: str = ""
-    definition: Path | None = None  # the scenario.yaml of a world
-    asked: EpisodeOptions = EpisodeOptions("")  # what a caller asked for, of which this came
-    warnings: tuple[str, ...] = ()  # what `cosim.scenario.vet` found odd: reasons not to compare the result
+    definition: Path | None = None  # the scenario.yaml of a scenario folder
+    asked: EpisodeOptions = EpisodeOptions("")  # the options as requested by the caller
+    warnings: tuple[str, ...] = ()  # from `cosim.scenario.vet`: reasons not to compare the result
 
     @property
     def built_in(self) -> bool:
-        """A world, ours or a user's, whose scenario.yaml says everything; not a bare .sumocfg."""
+        """Whether a scenario.yaml (shipped or a user's) defines the scenario; False for a .sumocfg."""
         return self.demands is not None
 
     @property
@@ -114,7 +114,7 @@ class Scenario:
         return round(math.ceil(self.sensing.parameters.decision_latency / step - 1e-6) * step, 9)
 
     def identity(self, policy: str, label: str | None, svo_deg: float, seed: int) -> Identity:
-        """What an episode of it is called, driven by this policy."""
+        """The identity of an episode of this scenario under this policy."""
         return Identity(
             scenario=self.name,
             demand=self.demand_name,
@@ -132,7 +132,7 @@ class Scenario:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """Every file that has a say in the traffic, ours included."""
+        """Every file that affects the traffic, including cosim's own."""
         ours = [sumo_scenarios.TYPES] if self.definition is None else [self.definition]
         if self.behavior != AS_IS:
             ours.append(sumo_scenarios.BEHAVIORS)
@@ -143,41 +143,40 @@ class Scenario:
         return (self.config, self.net, *self.demand, *self.additional, *ours)
 
 
-# Options that replace the scenario's field of the same name; the others have a line each in `load`.
-_READ = {"demand", "mission", "errors", "sensing", "tilt", "traffic"}  # into something else
+# Options that replace the scenario's field of the same name; `load` handles the others one by one.
+_READ = {"demand", "mission", "errors", "sensing", "tilt", "traffic"}  # converted to another type
 OWN = {f.name for f in fields(Scenario)} & {f.name for f in fields(EpisodeOptions)} - _READ
 
 
 def load(
     what: str | EpisodeOptions, *, fleet: Fleet | None = None, options: Sequence[str] = (), **words: Any
 ) -> Scenario:
-    """The scenario of an episode as it is asked for.
+    """The scenario of an episode as requested.
 
-    `what`: a scenario's name or folder, or a .sumocfg, with `words`, options of `EpisodeOptions` by their
-    names, beside it; `fleet` stands for those that choose the AVs. `options`: SUMO options as typed after
-    `--`, which win over the file's. Only this file's own syntax is checked: `cosim.scenario.vet` reads the
-    rest.
+    `what`: a scenario's name or folder, or a .sumocfg. `words`: options of `EpisodeOptions` by their names;
+    `fleet` replaces the options that choose the AVs. `options`: SUMO options as typed after `--`, which
+    override the file's. Only the syntax of this file is checked; `cosim.scenario.vet` checks the other files.
 
     Raises:
-        BadInput: names file (or option), field and value, with the nearest name where one is near.
+        BadInput: names file (or option), field and value, and a similar known name if there is one.
     """
     words |= {} if fleet is None else fleet.words
     asked = EpisodeOptions.of(what, words) if isinstance(what, str) else what
     chosen = sumocfg.command_line(options)
     replaced = chosen.keys() | ({"route-files"} if asked.demand else set())
     if sumo_scenarios.ships(asked.what):
-        scenario = _world(sumo_scenarios.folder(asked.what))
+        scenario = _from_folder(sumo_scenarios.folder(asked.what))
     elif is_there(Path(asked.what) / DEFINITION):
-        scenario = _world(Path(os.path.abspath(asked.what)))
+        scenario = _from_folder(Path(os.path.abspath(asked.what)))
     else:
-        scenario = _foreign(asked.what, replaced)
+        scenario = _from_sumocfg(asked.what, replaced)
     if asked.demand:
         scenario = _with_demand(scenario, asked.demand)
     scenario = _with_sumo_options(scenario, chosen)
     scenario = replace(
         scenario,
         behavior=_default_behavior(scenario),
-        errors=human_errors.read(asked.errors, world=scenario.name if scenario.ships else ""),
+        errors=human_errors.read(asked.errors, scenario=scenario.name if scenario.ships else ""),
         sensing=sensing.read(asked.sensing),
         tilt=None if asked.tilt is None else tilt.read(asked.tilt, "tilt"),
     )
@@ -185,7 +184,7 @@ def load(
 
 
 def with_options(scenario: Scenario, asked: EpisodeOptions) -> Scenario:
-    """`scenario` with the options that say how it is driven, not whose traffic it is. Raises BadInput."""
+    """`scenario` with the options that affect AVs and measurement, not the human traffic. Raises BadInput."""
     given = {name: value for name in OWN if (value := getattr(asked, name)) is not None}
     if asked.mission is not None:
         given["mission"] = chosen_mission(scenario.mission, asked.mission)
@@ -196,19 +195,19 @@ def with_options(scenario: Scenario, asked: EpisodeOptions) -> Scenario:
 
 
 def with_preset(asked: EpisodeOptions) -> EpisodeOptions:
-    """`asked` with the preset that its episode is driven in, named.
+    """`asked` with the preset of its episode made explicit.
 
-    A policy of `ALWAYS` has one of its own; else it is the one asked for, else that of a user's
-    `scenario.yaml` (which cannot ask for `unguarded`), else `lawful`.
+    In order of precedence: the fixed preset of a policy in `ALWAYS`, the requested preset, that of a user's
+    `scenario.yaml` (which cannot request `unguarded`), `lawful`.
     """
     own = ALWAYS.get(asked.policy) or asked.preset
     if own is None and not sumo_scenarios.ships(asked.what) and is_there(Path(asked.what) / DEFINITION):
-        own = _world(Path(os.path.abspath(asked.what))).preset
+        own = _from_folder(Path(os.path.abspath(asked.what))).preset
     return replace(asked, preset=own or Preset.LAWFUL)
 
 
 @dataclass(frozen=True, slots=True)
-class _WorldFile:
+class _Definition:
     """scenario.yaml as written."""
 
     name: str = ""
@@ -217,7 +216,7 @@ class _WorldFile:
     warmup: NonNegative = 0.0
     timing: Timing = Timing()
     preset: str = Preset.LAWFUL
-    behavior: str = ""  # of its own demands; "": mixed, and moderate in `contested`
+    behavior: str = ""  # for the scenario's demands; "": mixed, and moderate in `contested`
     on_collision: str = OnCollision.END
     demand: str = ""
     fleet: Fleet = Fleet()
@@ -226,18 +225,18 @@ class _WorldFile:
 
 
 def file_name(config: Path) -> str:
-    """The name of a user's .sumocfg: its folder's name and its own, "city/run" of any city/run.sumocfg."""
+    """The name of a user's .sumocfg, with its folder: "city/run" for city/run.sumocfg anywhere."""
     path = Path(os.path.abspath(config))
     return "/".join(filter(None, (path.parent.name, path.name.removesuffix(CONFIG))))
 
 
-def _world(folder: Path) -> Scenario:
-    """A world, ours or a user's: its scenario.yaml over its NAME.sumocfg.
+def _from_folder(folder: Path) -> Scenario:
+    """The scenario of a folder: scenario.yaml and NAME.sumocfg, of which the former takes precedence.
 
-    A user's may be in a folder of another name than its own, but may not be called as one that ships.
+    A user's scenario may have another name than its folder, but not the name of a shipped scenario.
     """
     file = folder / DEFINITION
-    top = yaml_input.read(file, _WorldFile)
+    top = yaml_input.read(file, _Definition)
     name, ships = top.name or folder.name, folder.parent == sumo_scenarios.ROOT
     if ships and name != folder.name:
         raise BadInput("differs from its folder's name", file=file, field="name", value=name)
@@ -248,7 +247,7 @@ def _world(folder: Path) -> Scenario:
         raise BadInput(
             "a world that ships is called so: name yours otherwise", file=file, field="name", value=name
         )
-    # of `open/NAME` the last part; its demands are in their folder
+    # the last part of `open/NAME`; the demands are in their own folder
     config = sumocfg.read(folder / f"{Path(name).name}{CONFIG}", ("route-files",))
     demands = {_demand_name(path): path for path in sorted((folder / "demand").glob("*.rou.xml"))}
     if not demands:
@@ -277,8 +276,8 @@ def _world(folder: Path) -> Scenario:
         warmup=top.warmup,
         duration=top.duration,
         timing=top.timing,
-        # only the caller takes the guard away: the files of our worlds, whose digests are part of every
-        # shipped episode's key, say `unguarded`, and so do copies of them
+        # only the caller may switch the guard off. The shipped scenario.yaml files and copies of them say
+        # `unguarded`, and cannot change: their digests are part of every episode key
         preset=Preset.LAWFUL if preset == Preset.UNGUARDED else preset,
         mission=top.mission,
         zones=tuple(replace(z, name=z.name or f"zone{i}") for i, z in enumerate(top.conflict_zones)),
@@ -286,8 +285,8 @@ def _world(folder: Path) -> Scenario:
     )
 
 
-def _foreign(what: str, replaced: Collection[str]) -> Scenario:
-    """A user's .sumocfg as plain SUMO drives it. `replaced`: its files that the command line replaces."""
+def _from_sumocfg(what: str, replaced: Collection[str]) -> Scenario:
+    """The scenario of a user's .sumocfg, as in plain SUMO. `replaced`: files given on the command line."""
     path = Path(what)
     if not is_there(path) and path.suffix != CONFIG:
         sumo_scenarios.folder(what)  # raises, with the nearest name
@@ -313,7 +312,7 @@ def _foreign(what: str, replaced: Collection[str]) -> Scenario:
 
 
 def _with_demand(scenario: Scenario, wanted: Sequence[str]) -> Scenario:
-    """`--demand`: each a name of the world's demands, or else a file; they replace the file's routes."""
+    """`--demand`: names of the scenario's demands, or files; they replace the routes of the .sumocfg."""
     known = scenario.demands or {}
     files, names = [], []
     for item in wanted:
@@ -329,7 +328,7 @@ def _with_demand(scenario: Scenario, wanted: Sequence[str]) -> Scenario:
 
 
 def _with_sumo_options(scenario: Scenario, chosen: Mapping[str, str]) -> Scenario:
-    """SUMO options typed after `--`: files and clocks to their fields, the rest over the file's own."""
+    """SUMO options typed after `--`: files and clocks set fields; the rest override the file's options."""
     if not chosen:
         return scenario
     here, place = Path.cwd(), "command line"
@@ -338,7 +337,7 @@ def _with_sumo_options(scenario: Scenario, chosen: Mapping[str, str]) -> Scenari
     if "begin" in chosen:
         begin = sumocfg.time_of(chosen["begin"], place, "--begin")
         if not scenario.built_in:
-            duration += scenario.begin - begin  # the file's end stays where it is
+            duration += scenario.begin - begin  # the file's end time stays
     if "end" in chosen:
         duration = sumocfg.time_of(chosen["end"], place, "--end") - begin
     if duration <= 0.0:
@@ -361,8 +360,8 @@ def _with_sumo_options(scenario: Scenario, chosen: Mapping[str, str]) -> Scenari
 
 
 def _default_behavior(scenario: Scenario) -> str:
-    """presets.md: a user's file drives as it is; a scenario as it says, else `mixed`, `contested` with
-    moderate HVs."""
+    """The behavior by presets.md: as-is for a user's routes; else the scenario's, or `mixed`, or `moderate`
+    in demand `contested`."""
     if scenario.demands is None or any(path not in scenario.demands.values() for path in scenario.demand):
         return AS_IS
     if scenario.behavior != AS_IS:
@@ -371,7 +370,7 @@ def _default_behavior(scenario: Scenario) -> str:
 
 
 def chosen_mission(own: Mission, wanted: str) -> Mission:
-    """`--mission`: what a scenario's own becomes."""
+    """The mission for `--mission`, based on the scenario's own."""
     if wanted in (NONE, AUTO):
         return Mission(wanted)
     if not wanted:

@@ -1,4 +1,4 @@
-"""Human drivers as data: P's Table II and its LC2013 mapping, read from sumo_scenarios/behaviors.yaml."""
+"""Human driver classes: P's Table II and its LC2013 mapping, read from sumo_scenarios/behaviors.yaml."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from cosim.files import yaml_input
 from cosim.files.yaml_input import NonNegative, Positive
 from cosim.scenario.vet_rules import LC2013 as LC2013_ATTRIBUTES
 
-AS_IS = "as-is"  # no behaviour of ours: vehicles drive as their file says
+AS_IS = "as-is"  # no Table II class: vehicles drive as their file says
 MIXED = "mixed"
 LC2013, MOBIL = DRIVER_MODELS = ("lc2013", "mobil")
 
@@ -40,7 +40,7 @@ class MobilParameters:
 
 @dataclass(frozen=True, slots=True)
 class DesiredSpeed:
-    """Distribution of the desired speed as a factor on the speed limit: normal, clipped."""
+    """Clipped normal distribution of the desired speed, as a factor of the speed limit."""
 
     mean: Positive
     deviation: NonNegative
@@ -83,7 +83,7 @@ class Behaviors:
         return (*self.classes, MIXED, AS_IS)
 
     def draw(self, behavior: str, u: float) -> DriverClass:
-        """The class at quantile `u` in [0, 1) of a behaviour: one class, or the mixture."""
+        """The class at quantile `u` in [0, 1) of a behavior: one class, or the mixture."""
         if behavior != MIXED:
             return self.classes[behavior]
         return self.classes[next((name for name, share in self.mixed if u < share), self.mixed[-1][0])]
@@ -112,7 +112,7 @@ class _Written:
 
 @lru_cache
 def load_behaviors(path: Path = sumo_scenarios.BEHAVIORS) -> Behaviors:
-    """Read behaviors.yaml (default: the one that ships with the worlds).
+    """Read behaviors.yaml (default: the shipped file).
 
     Raises BadInput naming file, field and value.
     """

@@ -1,12 +1,12 @@
-"""A user's files as SUMO is given them: copies in which no output is written and lists of types are whole.
+"""Copies of a user's files for SUMO, with outputs disabled and lists of vTypes completed.
 
-Detectors, edgeData and timed events write wherever their `file` or `dest` says, beside the scenario as a
-rule (A10KW: netstate.xml, tlsstate.xml). That fails in a read-only folder, is overwritten by the next run,
-races between workers, and `host:port` opens a connection. The elements stay, so that whatever refers to a
-detector still finds it; only the name of the file becomes SUMO's own word for no file.
+Detectors, edgeData and timed events write to their `file` or `dest`, usually beside the scenario (A10KW:
+netstate.xml, tlsstate.xml). That fails in a read-only folder, overwrites earlier runs, and races between
+workers; `host:port` opens a connection. The elements stay, so that references to detectors remain valid.
+Only the file name becomes SUMO's name for no file.
 
-Rerouters, detectors, calibrators and signals can be for some vehicle types alone. An AV drives as another
-type than its own (`cosim.scenario.vehicle_types`), which such lists then name too.
+Rerouters, detectors, calibrators and signals may apply to some vTypes only. AVs drive with a derived vType
+(`cosim.scenario.vehicle_types`), so it is added to such lists.
 """
 
 import re
@@ -21,8 +21,8 @@ from cosim.scenario import Scenario
 from cosim.scenario.vehicle_types import TYPE_LISTS
 from cosim.scenario.vet_demand import OUTPUT_PARAMETERS, OUTPUTS
 
-NOWHERE = "NUL"  # SUMO's OutputDevice makes no file of it, on every system
-# Attributes by which a file reads another one, relative to itself: absolute in a copy.
+NOWHERE = "NUL"  # SUMO's OutputDevice writes no file for this name, on every system
+# Attributes that name an input file, relative to the present file: made absolute in a copy.
 _INPUTS = {
     "include": "href",
     "rerouter": "file",
@@ -30,31 +30,31 @@ _INPUTS = {
     "poly": "imgFile",
     "poi": "imgFile",
 }
-Also = Callable[[str], Iterable[str]]  # a type's name -> what vehicles of it may be called besides
+Also = Callable[[str], Iterable[str]]  # vType -> derived vTypes
 _TAG = re.compile(rb"<(?:[^\"'>]|\"[^\"]*\"|'[^']*')*>")
 
 
 def disable_outputs(scenario: Scenario, folder: Path, also: Also = lambda _: ()) -> Scenario:
-    """`scenario` with its writing files replaced by copies in `folder` that write nothing; the others stay.
+    """`scenario` with copies, in `folder`, of those files that would write outputs; other files stay.
 
-    Lists of types get the names that `also` gives to those they hold. Call after `cosim.scenario.vet.vet`:
-    the files are taken to be sound XML.
+    Lists of vTypes are extended by `also`. Call after `cosim.scenario.vet.vet`, which checks that the files
+    are valid XML.
     """
     return replace(
         scenario,
-        net=_disabled(scenario.net, folder, also, only=b"vTypes"),  # its signals may be for some types
+        net=_disabled(scenario.net, folder, also, only=b"vTypes"),  # signals may apply to some vTypes only
         additional=tuple(_disabled(path, folder, also) for path in scenario.additional),
         demand=tuple(_disabled(path, folder, also) for path in scenario.demand),
     )
 
 
 def _disabled(path: Path, folder: Path, also: Also, only: bytes = b"") -> Path:
-    """`path` itself when nothing in it has to change, or `only` is not in it, else its copy in `folder`."""
+    """A copy of `path` in `folder`; `path` itself if nothing has to change or it lacks `only`."""
     whole = content(path)
     edits = _edits(whole, path, folder, also) if only in whole else []
     if not any(writes for *_, writes in edits):
         return path
-    for begin, end, value, _ in sorted(edits, reverse=True):  # from the back, so that places stay
+    for begin, end, value, _ in sorted(edits, reverse=True):  # from the end: earlier positions stay
         whole = whole[:begin] + value + whole[end:]
     folder.mkdir(parents=True, exist_ok=True)
     copy = folder / f"{sum(1 for _ in folder.iterdir())}-{path.name.removesuffix('.gz')}"
@@ -66,7 +66,7 @@ def _edits(whole: bytes, path: Path, folder: Path, also: Also) -> list[tuple[int
     """(first byte, byte after the last, new value, whether the file must change), in the file's order."""
     found: list[tuple[int, int, bytes, bool]] = []
     parser = expat.ParserCreate()
-    owner = ""  # the tag that parameters belong to
+    owner = ""  # the element of the present <param>
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         nonlocal owner
@@ -98,7 +98,7 @@ def _quoted(value: str) -> bytes:
 
 
 def _place(whole: bytes, tag_begin: int, attribute: str) -> tuple[int, int]:
-    """Where the value of `attribute` lies in the tag that begins at byte `tag_begin`."""
+    """Byte span of the value of `attribute` in the tag at byte `tag_begin`."""
     tag = _TAG.match(whole, tag_begin)
     assert tag is not None, "vetted XML"
     values = re.finditer(rb"([\w:.-]+)\s*=\s*(?:\"([^\"]*)\"|'([^']*)')", tag[0])

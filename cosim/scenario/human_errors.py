@@ -1,4 +1,4 @@
-"""Errors of human drivers and of persons as data: how often, when and how much, by kind."""
+"""Parameters of human driver and pedestrian errors: rates and magnitudes by kind."""
 
 import hashlib
 import json
@@ -14,18 +14,18 @@ from cosim.files import yaml_input
 from cosim.files.xml_input import is_there
 from cosim.files.yaml_input import NonNegative, Positive
 
-NONE = "none"  # the default: nobody errs
+NONE = "none"  # the default: no errors
 Probability = Annotated[float, Range(0.0, high=1.0)]
-Span = tuple[NonNegative, NonNegative]  # the least and the most; drawn uniformly between them
+Span = tuple[NonNegative, NonNegative]  # minimum and maximum of a uniform distribution
 DIGITS = 8  # hexadecimal digits of a file's digest in its name
 
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """One kind of error: the probability of every trial (driver_errors.md says what a trial is)."""
+    """One kind of error. `rate`: probability per trial (driver_errors.md defines the trials)."""
 
     rate: Probability
-    source: str = ""  # where the rate is from
+    source: str = ""  # of the rate
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -36,15 +36,14 @@ class Kind:
 
 @dataclass(frozen=True, slots=True)
 class Inattention(Kind):
-    """It keeps its speed and its lane and sees nobody. A trial: a second of driving within 100 m behind
-    somebody."""
+    """The driver holds speed and lane and sees no other vehicle. Trial: a second within 100 m of a leader."""
 
     duration: Span = (1.0, 3.0)  # s
 
 
 @dataclass(frozen=True, slots=True)
 class HardBraking(Kind):
-    """It brakes for no reason. A trial: a second in which it drives."""
+    """The driver brakes for no reason. Trial: a second of driving."""
 
     deceleration: Span = (4.0, 7.0)  # m/s2
     duration: Span = (0.8, 1.6)  # s
@@ -52,56 +51,56 @@ class HardBraking(Kind):
 
 @dataclass(frozen=True, slots=True)
 class CutIn(Kind):
-    """It changes lanes though the new follower must brake hard. A trial: a second with such a gap beside."""
+    """The driver changes lanes although the new follower must brake hard. Trial: a second at such a gap."""
 
-    deceleration: Span = (3.0, 8.0)  # m/s2 that the gap asks of the follower
+    deceleration: Span = (3.0, 8.0)  # m/s2, required of the new follower
 
 
 @dataclass(frozen=True, slots=True)
 class AbortedCutIn(CutIn):
-    """The same, and it swerves back at once. A trial: as of a cut-in."""
+    """A cut-in after which the driver swerves back at once. Trial: as for a cut-in."""
 
 
 @dataclass(frozen=True, slots=True)
 class ForcedEntry(Kind):
-    """It enters though it must wait. A trial: a second at the line, or near its lane's end, in which the gap
-    is one that it takes; the probability is `rate` times the seconds waited beyond `patience`."""
+    """The driver enters although it must wait. Trial: a second at the stop line, or near the lane end, with
+    an acceptable gap. The probability is `rate` times the seconds waited beyond `patience`."""
 
     patience: NonNegative = 3.0  # s
-    zone: Positive = 150.0  # m before the end of its lane in which it wants to change
-    lag: NonNegative = 0.5  # s: it refuses to enter before somebody who would be there sooner at its speed
+    zone: Positive = 150.0  # m before the lane end, in which the driver wants to change lanes
+    lag: NonNegative = 0.5  # s, shortest accepted time until the conflicting vehicle arrives
 
 
 @dataclass(frozen=True, slots=True)
 class FailureToYield(Kind):
-    """It does not see who has the right of way. A trial: an approach to a line where it must give way."""
+    """The driver overlooks the vehicles with right of way. Trial: an approach to a yield line."""
 
 
 @dataclass(frozen=True, slots=True)
 class RedLight(Kind):
-    """It enters late, on red. A trial: an approach at yellow that would be on red by at most so much."""
+    """The driver enters on red. Trial: an approach at yellow with an arrival at most `late` after red."""
 
     late: Positive = 2.0  # s
 
 
 @dataclass(frozen=True, slots=True)
 class StalledCar(Kind):
-    """It stops in its lane. A trial: a second in which it drives."""
+    """The driver stops in the lane. Trial: a second of driving."""
 
     deceleration: Span = (2.0, 4.0)  # m/s2
-    duration: Span = (30.0, 120.0)  # s, from standing on
+    duration: Span = (30.0, 120.0)  # s, of the standstill
 
 
 @dataclass(frozen=True, slots=True)
 class StepOut(Kind):
-    """A person walks onto the crossing without waiting. A trial: a second in which it waits there."""
+    """A person walks onto the crossing without waiting. Trial: a second of waiting there."""
 
-    duration: Span = (3.0, 6.0)  # s in which it waits for nobody
+    duration: Span = (3.0, 6.0)  # s in which the person ignores vehicles and signals
 
 
 @dataclass(frozen=True, slots=True)
 class Kinds:
-    """One level: the kinds that happen in it, by their names."""
+    """One level: its kinds of errors by name; None: absent."""
 
     inattention: Inattention | None = None
     hard_braking: HardBraking | None = None
@@ -119,23 +118,24 @@ KINDS = tuple(field.name for field in fields(Kinds))
 
 @dataclass(frozen=True, slots=True)
 class Errors:
-    """A level by its name, or a user's file."""
+    """A shipped level or a user's file."""
 
-    name: str  # the level's; of a file its stem and the beginning of its digest
+    name: str  # of the level; of a file: stem and first digits of the digest
     digest: str  # SHA-256 of the rates and magnitudes
     kinds: Kinds
     file: Path
 
 
-def read(what: str | None, field: str = "--errors", file: object = None, *, world: str = "") -> Errors | None:
-    """The errors of a level that ships or of a user's YAML file (a table of kinds); None: nobody errs.
+def read(
+    what: str | None, field: str = "--errors", file: object = None, *, scenario: str = ""
+) -> Errors | None:
+    """The errors of a shipped level or of a user's YAML file (a table of kinds); None: no errors.
 
-    `field` and `file` are where `what` is asked for; `world`: as of `levels`. Raises BadInput naming file,
-    field and value.
+    `field`, `file`: origin of `what`; `scenario`: see `levels`. Raises BadInput naming file, field and value.
     """
     if what is None or what == NONE:
         return None
-    shipped = levels(world)
+    shipped = levels(scenario)
     if what in shipped:
         return shipped[what]
     path = Path(what)
@@ -148,23 +148,23 @@ def read(what: str | None, field: str = "--errors", file: object = None, *, worl
 
 
 def asked(what: str, folder: Path = Path(), field: str = "--errors", file: object = None) -> str | None:
-    """`what` as it is found from anywhere: a level's name, the absolute path of a file relative to `folder`,
-    None for no errors. Raises BadInput as `read`."""
+    """`what` independent of the working directory: a level's name, or a file's absolute path (relative paths
+    start at `folder`); None for no errors. Raises BadInput as `read`."""
     path = os.path.abspath(folder / what)
     found = path if what not in (NONE, *levels()) and is_there(Path(path)) else what
     return None if read(found, field, file) is None else found
 
 
 @lru_cache
-def levels(world: str = "") -> dict[str, Errors]:
-    """The levels that ship by name, as they are in a world that ships.
+def levels(scenario: str = "") -> dict[str, Errors]:
+    """The shipped levels by name, as they apply in the shipped scenario `scenario`.
 
-    A table `LEVEL.WORLD` of the file replaces kinds of `LEVEL` there. Raises BadInput.
+    A table `LEVEL.SCENARIO` of the file replaces kinds of `LEVEL` there. Raises BadInput.
     """
     file = sumo_scenarios.ERRORS
     tables = yaml_input.document(file)
     found = {
-        name: yaml_input.dataclass_from(Kinds, table | tables.get(f"{name}.{world}", {}), file, name)
+        name: yaml_input.dataclass_from(Kinds, table | tables.get(f"{name}.{scenario}", {}), file, name)
         for name, table in tables.items()
         if "." not in name
     }
@@ -172,7 +172,7 @@ def levels(world: str = "") -> dict[str, Errors]:
 
 
 def _digest(kinds: Kinds) -> str:
-    """Of what the errors do: not of the sources, comments or the order of a file."""
+    """SHA-256 of rates and magnitudes, independent of sources, comments and the order of a file."""
     plain = {kind: values for kind, values in asdict(kinds).items() if values is not None}
     for values in plain.values():
         del values["source"]

@@ -1,4 +1,4 @@
-"""What was run, with which versions, on which files: lies beside every result."""
+"""The manifest of a result: options, versions, and digests of the input files."""
 
 import hashlib
 import platform
@@ -17,8 +17,8 @@ from cosim.scenario.sensing import Sensing
 from cosim.scenario.sumocfg import CLOCK, INPUTS, command_line, keeps
 from cosim.types import OnCollision
 
-POLICY_FILES = "policy_files"  # what decides how the policy drives: weights, or its own code
-_KINDS: Mapping[str, Any] = {  # what is read again of the documents of `cosim run` and `cosim evaluate`
+POLICY_FILES = "policy_files"  # the policy's weights or code
+_KINDS: Mapping[str, Any] = {  # types of the fields that cosim reads back from manifests
     **dict.fromkeys(("files", POLICY_FILES, "sumo_options", "units", "better"), Mapping[str, str]),
     "versions": Mapping[str, str | None],
     "traffic": str,
@@ -28,9 +28,9 @@ _KINDS: Mapping[str, Any] = {  # what is read again of the documents of `cosim r
     "seeds": tuple[int, int],
     "trace_hash": str,
 }
-CASE, OPTIONS = "case", "sumo_arguments"  # what `cosim run --out` adds
-TRACI = "traci"  # in their place where other TraCI programs drove along
-# A name in the manifest -> the distribution whose version it is.
+CASE, OPTIONS = "case", "sumo_arguments"  # fields added by `cosim run --out`
+TRACI = "traci"  # replaces these fields in a simulation shared with other TraCI clients
+# Name in the manifest -> distribution package.
 PACKAGES = {"cosim": "cosim-sumo", "libsumo": "libsumo", "numpy": "numpy", "numba": "numba", "torch": "torch"}
 
 
@@ -39,7 +39,7 @@ def manifest(scenario: Scenario, seed: int) -> dict[str, Any]:
     return {
         "seed": seed,
         "preset": scenario.preset,
-        # named where they are not a world's own: episodes are told apart by this document, older ones too
+        # only values that differ from a scenario folder's own: this document identifies old episodes too
         **({"on_collision": goes_on} if (goes_on := scenario.on_collision) != OnCollision.END else {}),
         **({} if scenario.built_in else {"mission": scenario.mission.vehicles or scenario.mission.kind}),
         **({} if scenario.built_in else {"traffic": scenario.traffic}),
@@ -69,10 +69,10 @@ def manifest(scenario: Scenario, seed: int) -> dict[str, Any]:
 
 
 def checked(document: object, file: Path, where: str = "") -> dict[str, Any]:
-    """`document`, a manifest as `file` has it (there called `where`), with what is read again of its kind.
+    """`document`, the manifest at `where` in `file`, with checked types of the fields that cosim reads back.
 
     Raises:
-        BadInput: a field of another type, in the manifest itself or in those of its cells.
+        BadInput: a field of another type, in the manifest or in those of its cells.
     """
     with inside(where, file):
         found = mapping(document)
@@ -88,9 +88,9 @@ def checked(document: object, file: Path, where: str = "") -> dict[str, Any]:
 
 
 def remembered(case: EpisodeOptions, options: Sequence[str]) -> dict[str, Any]:
-    """What a manifest has to hold beside the usual so that `cosim replay` finds the episode again.
+    """The additional manifest fields from which `cosim replay` repeats the episode.
 
-    Outputs are left out: a replay does not write them again.
+    Without outputs: a replay does not write them again.
     """
     kept: list[str] = []
     for name, value in command_line(options).items():
@@ -107,7 +107,7 @@ def digests(files: Iterable[Path]) -> dict[str, str]:
 
 
 def named(files: Iterable[Path]) -> dict[str, Path]:
-    """Each file by its name, or by as much of its path as tells it from the others."""
+    """Each file by its name, extended by as many parent folders as make the names unique."""
     each = list(dict.fromkeys(files))
 
     def end(path: Path, parts: int) -> str:
@@ -122,7 +122,7 @@ def named(files: Iterable[Path]) -> dict[str, Path]:
 
 
 def _changed(scenario: Scenario) -> dict[str, dict[str, str]]:
-    """SUMO option -> the file's value, the one that is used, and why."""
+    """SUMO option -> the file's value, the used value, and the reason."""
     return {c.option: {"file": c.file, "used": c.used, "why": c.why} for c in scenario.changed}
 
 

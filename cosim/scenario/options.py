@@ -1,7 +1,7 @@
-"""What a user may ask of an episode: one field each, from which everything else is derived.
+"""The options of an episode, defined once as the fields of `EpisodeOptions`.
 
-Flags of the command line, fields of SPEC.yaml and of HTTP requests, words of `cosim.open`, the episode's key
-and the columns of its row all come from the fields of `EpisodeOptions`.
+Command-line flags, fields of SPEC.yaml and of HTTP requests, arguments of `cosim.open`, the episode's key and
+the columns of its row are derived from these fields.
 """
 
 from __future__ import annotations
@@ -32,22 +32,22 @@ if TYPE_CHECKING:
     from cosim.scenario import Scenario
 
 BEHAVIORS = load_behaviors().names
-FLEET = ("av_type", "av_ids", "penetration")  # ways to choose the AVs: one excludes the others
+FLEET = ("av_type", "av_ids", "penetration")  # mutually exclusive ways to choose the AVs
 Share = Annotated[float, Range(0.0, high=1.0)]
-KEY_LENGTH = 12  # hexadecimal digits of a cell: 48 bits, a collision among 10,000 cells has odds of 2e-7
-# Every key names these fields, the others where they were asked for: so an older key stays as it is.
+KEY_LENGTH = 12  # hexadecimal digits: 48 bits, collision probability 2e-7 among 10,000 cells
+# Fields in every key. Keys contain other fields only if set, so that older keys stay valid.
 IN_EVERY_KEY = (
     *("what", "policy", "seed", "demand", "behavior", "driver_model", "svo_deg", "preset", "duration"),
     *(*FLEET, "outputs"),
 )
-TRAFFIC, DRIVING, MEASURED = "traffic", "driving", "measured"  # what an option decides
-# Makes a text that a user wrote the field's value; with the folder of relative paths, the field and the file.
+TRAFFIC, DRIVING, MEASURED = "traffic", "driving", "measured"  # what an option affects
+# Converts a user's text to the field's value; arguments: text, folder of relative paths, field, file.
 Reader = Callable[[str, Path, str, object], str | None]
 
 
 @dataclass(frozen=True, slots=True)
 class Fleet:
-    """Which vehicles are AVs: by vehicle type, by id, or a share of all (the first one given holds)."""
+    """Selects the AVs: by vehicle type, by id, or as a share of all vehicles (the first non-empty rule)."""
 
     type: str | None = None
     ids: str | None = None  # regular expression, full match
@@ -59,7 +59,7 @@ class Fleet:
 
     @property
     def words(self) -> dict[str, Any]:
-        """The options that ask for it."""
+        """The options that select this fleet."""
         values = dict(zip(FLEET, (self.type, self.ids, self.penetration), strict=True))
         return {name: value for name, value in values.items() if value is not None}
 
@@ -73,15 +73,15 @@ class Fleet:
 
 @dataclass(frozen=True, slots=True)
 class Option:
-    """How one field of `EpisodeOptions` is written and read."""
+    """Metadata of one field of `EpisodeOptions`."""
 
     help: str
-    name: str = ""  # as users write it; "": the field's own name
+    name: str = ""  # for users; "": the field's own name
     metavar: str | None = None
     choices: Sequence[str] = ()
     scope: str = DRIVING
-    axis: bool = False  # a matrix may have several values of it
-    free: bool = False  # a text that names no file, whatever it holds
+    axis: bool = False  # several values are possible in a matrix
+    free: bool = False  # a text that never names a file
     reader: Reader | None = None
     field: str = ""
     kind: Any = None
@@ -89,18 +89,18 @@ class Option:
 
     @property
     def flag(self) -> str:
-        """On the command line."""
+        """The command-line flag."""
         return "--" + self.name.replace("_", "-")
 
     @property
     def several(self) -> bool:
-        """Whether one episode has a list of it."""
+        """Whether one episode has a list of values."""
         return typing.get_origin(self.kind) is tuple
 
     @property
     def item(self) -> Any:
         """The type of one value: `str`, or a number with its `Range`."""
-        parts = typing.get_args(self.kind)  # () of `str`, (str, ...) of a tuple, (X, None) of an optional one
+        parts = typing.get_args(self.kind)  # () for `str`, (str, ...) for a tuple, (X, None) for an optional
         return self.kind if typing.get_origin(self.kind) is Annotated or not parts else parts[0]
 
     @property
@@ -117,7 +117,7 @@ class Option:
             return found
 
     def read(self, value: Any, folder: Path, name: str, file: object = None) -> Any:
-        """The field's value from what a user wrote as `name`; paths are relative to `folder`."""
+        """The field's value from a user's `value` for `name`; paths are relative to `folder`."""
         found = self.checked(value, file, name)
         if self.reader is not None:
             texts = [self.reader(text, folder, name, file) for text in (found if self.several else (found,))]
@@ -126,7 +126,7 @@ class Option:
 
 
 def place(what: str, folder: Path = Path()) -> str:
-    """`what` as it is found from anywhere: a file or folder by its absolute path, a name as it is."""
+    """`what` independent of the working directory: the absolute path of a file or folder, or a name."""
     is_path = not sumo_scenarios.ships(what) and is_there(folder / what)
     return os.path.abspath(folder / what) if is_path else what
 
@@ -138,10 +138,10 @@ def option(default: Any, about: str, **how: Any) -> Any:
 
 @dataclass(frozen=True)
 class EpisodeOptions:
-    """One episode as it was asked for. Files are absolute paths; None: the scenario decides.
+    """One requested episode. Files are absolute paths; None: the scenario decides.
 
-    The order of the fields is that of a matrix's cells. All episodes that differ in nothing but the seed are
-    one `cell`.
+    The order of the fields is that of a matrix's cells. Episodes that differ only in the seed form one
+    `cell`.
 
     Raises:
         BadInput: a value of another type, out of its bounds, or none of the choices; two fleets.
@@ -266,7 +266,7 @@ class EpisodeOptions:
         scope=MEASURED,
         reader=code.absolute,
     )
-    tilt: str | None = None  # of the errors (`cosim.scenario.tilt`), set by `cosim estimate`; None: none
+    tilt: str | None = None  # of the errors (`cosim.scenario.tilt`), set by `cosim estimate`
     seed: int = FIRST_TEST_SEED
 
     def __post_init__(self) -> None:
@@ -282,19 +282,19 @@ class EpisodeOptions:
 
     @classmethod
     def of(cls, what: str, words: Mapping[str, Any]) -> EpisodeOptions:
-        """The episode of `what` with options by their names, as `cosim.open` takes them. Raises BadInput."""
+        """The episode of `what` with options by name, as in `cosim.open`. Raises BadInput."""
         check_known(words, WORDS)
         return cls(what, **{WORDS[name].field: value for name, value in words.items()})
 
     @classmethod
     def read(cls, document: object, file: Path | None = None, where: str = "case") -> EpisodeOptions:
-        """The episode of a `document()` that `file` holds under the name `where`.
+        """The episode of a `document()`, at `where` in `file`.
 
         Raises BadInput: a field is missing, of another type, or out of its bounds.
         """
         with inside(where, file):
             given = mapping(document)
-            for name in ("policy", "seed"):  # a document does not leave them to a default
+            for name in ("policy", "seed"):  # required: no defaults in a document
                 if given.get(name) is None:
                     raise BadInput("is missing", field=name)
         known = {one.name: given[one.name] for one in fields(cls) if given.get(one.name) is not None}
@@ -302,33 +302,33 @@ class EpisodeOptions:
 
     @property
     def fleet(self) -> Fleet | None:
-        """The AVs that are asked for; None: the scenario's own."""
+        """The requested fleet; None: the scenario's own."""
         fleet = Fleet(self.av_type, self.av_ids, self.penetration)
         return fleet if fleet.words else None
 
     @property
     def columns(self) -> dict[str, Any]:
-        """What a row says of options that were asked for, beside its `Identity`."""
+        """Row columns of the set options that are not in `Identity`."""
         return {n: v for n, o in COLUMNS.items() if (v := getattr(self, o.field)) != o.default}
 
     @cached_property
     def cell(self) -> str:
-        """A short stable hash of everything but the seed."""
+        """A short stable hash of all options but the seed."""
         return hashlib.sha256(self.text().encode()).hexdigest()[:KEY_LENGTH]
 
     @property
     def key(self) -> str:
-        """Names the episode: unique in every matrix."""
+        """The name of the episode, unique in a matrix."""
         return f"{self.cell}-{self.seed}"
 
     def text(self) -> str:
-        """Everything but the seed as one line of JSON, always spelled the same."""
+        """All options but the seed as one line of canonical JSON."""
         settings = self.document()
         del settings["seed"]
         return json.dumps(settings, sort_keys=True)
 
     def document(self) -> dict[str, Any]:
-        """Plain JSON values; `EpisodeOptions.read` is the way back."""
+        """Plain JSON values; `EpisodeOptions.read` is the inverse."""
         defaults = {one.name: one.default for one in fields(self)}
         given = {k: v for k, v in asdict(self).items() if k in IN_EVERY_KEY or v != defaults[k]}
         return {k: list(v) if isinstance(v, tuple) else v for k, v in given.items()}
@@ -338,7 +338,7 @@ class EpisodeOptions:
         return replace(self, seed=seed)
 
     def scenario(self, options: Sequence[str] = ()) -> Scenario:
-        """The scenario as asked for, with SUMO `options` as typed after `--`; not vetted.
+        """The requested scenario, with SUMO `options` as typed after `--`; not vetted.
 
         Raises:
             BadInput: see `cosim.scenario.load`.
@@ -356,15 +356,15 @@ def _options() -> Iterable[Option]:
             yield replace(about, name=name, field=one.name, kind=kinds[one.name], default=one.default)
 
 
-OPTIONS = {one.name: one for one in _options()}  # by the names that users write
-# What `load` and `cosim.open` take beside the scenario; they have other ways for the rest.
+OPTIONS = {one.name: one for one in _options()}  # by users' names
+# Keyword options of `load` and `cosim.open`; the other options have parameters of their own.
 WORDS = {n: o for n, o in OPTIONS.items() if o.scope != MEASURED and n not in ("scenario", "policy")}
-# Columns of a row that are there where they were asked for: no column of `Identity` says them.
+# Row columns that exist only for set options, since `Identity` lacks them.
 COLUMNS = {n: o for n, o in WORDS.items() if not {n, o.field} & {*IDENTITY}}
 
 
 def of_flags(flags: Mapping[str, Any]) -> EpisodeOptions:
-    """One episode from the command line; `flags` by the options' names, None where not given.
+    """One episode from the command line; `flags` by option name, None: not given.
 
     Raises BadInput.
     """

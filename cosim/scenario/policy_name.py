@@ -1,8 +1,8 @@
-"""How a policy is named: one that ships, the weights of a training, or a user's own code.
+"""Policy names: a shipped policy, weights of a training, or user code.
 
-`[LABEL=]RUN` or `[LABEL=]FILE.safetensors` are weights of `cosim train`, `[LABEL=]FILE.py:NAME` and
-`[LABEL=]MODULE:NAME` code; anything else is the name of a policy that ships. The label stands in rows and
-tables. Text only: `cosim.policies` checks whether there is such a policy.
+`[LABEL=]RUN` and `[LABEL=]FILE.safetensors` are weights of `cosim train`. `[LABEL=]FILE.py:NAME` and
+`[LABEL=]MODULE:NAME` are code. Anything else is a shipped policy. The label is used in rows and tables.
+This module only parses the text; `cosim.policies` checks that the policy exists.
 """
 
 import os
@@ -14,15 +14,15 @@ from cosim.errors import BadInput
 from cosim.files.code import Code, is_code
 from cosim.files.code import read as read_code
 
-WEIGHTS, BEST = ".safetensors", "best.safetensors"  # a training's folder stands for its best
+WEIGHTS, BEST = ".safetensors", "best.safetensors"  # a training's folder means its best weights
 _LABEL = re.compile(r"[\w.+-]+")
 
 
 class PolicyName(NamedTuple):
-    """A policy as it was asked for; `place` is absolute when it is a file."""
+    """A requested policy; `place` is absolute if it is a file."""
 
     label: str
-    place: str = ""  # a file of weights, a file of code or a module; "": it ships
+    place: str = ""  # a file of weights, a file of code or a module; "": a shipped policy
     member: str = ""  # of code: the class, factory or function
 
     @property
@@ -31,25 +31,25 @@ class PolicyName(NamedTuple):
 
     @property
     def code(self) -> Code:
-        """Of code: where it stands."""
+        """The location of the code."""
         return Code(self.place, self.member)
 
     @property
     def text(self) -> str:
-        """Reads back as the same, wherever one stands."""
+        """The text that `read` parses to the same policy in any working directory."""
         if self.ships:
             return self.label
         return f"{self.label}={self.place}" + (f":{self.member}" if self.member else "")
 
 
 def read(text: str, folder: Path | None = None, field: str = "--policy", file: object = None) -> PolicyName:
-    """The policy that `text` names; files are relative to `folder` (default: here).
+    """Parse a policy name; files are relative to `folder` (default: working directory).
 
-    A bare word ships; a run's folder has a slash or a label (`./mine`, `new=mine`). `file`, `field`: where
-    the text was written.
+    A bare word is a shipped policy; a run's folder needs a slash or a label (`./mine`, `new=mine`). `file`,
+    `field`: origin of the text, for errors.
 
     Raises:
-        BadInput: a label that cannot stand in a table, files that are not there, code without a name in it.
+        BadInput: an invalid label, a missing file, or code without a name in it.
     """
 
     def wrong(problem: str) -> BadInput:
@@ -82,7 +82,7 @@ def read(text: str, folder: Path | None = None, field: str = "--policy", file: o
 
 
 def label(text: str) -> str:
-    """What stands in rows and tables for a policy whose name was read before."""
+    """The label, for rows and tables, of a policy name that was parsed before."""
     head, equals, _ = text.partition("=")
     return head if equals else text
 

@@ -1,4 +1,4 @@
-"""What AVs measure of others, as data: levels by name, a user's file, single parameters."""
+"""Sensing parameters of AVs: shipped levels, a user's file, single parameters."""
 
 from __future__ import annotations
 
@@ -19,45 +19,45 @@ from cosim.files import yaml_input
 from cosim.files.xml_input import is_there
 from cosim.files.yaml_input import NonNegative, Positive
 
-IDEAL = "ideal"  # the default: every AV knows everybody's present state
+IDEAL = "ideal"  # the default: every AV knows the present state of all road users
 DIGITS = 8  # hexadecimal digits of a file's digest in its name
 Share = Annotated[float, Range(0.0, high=1.0)]
 
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """One level. The defaults are sensors that measure everything at once, and no messages.
+    """One level. The defaults are perfect sensors without latency, and no messages.
 
     Attributes:
-        range: m from centre to centre that an AV's own sensors reach.
+        range: m, range of the AV's own sensors, from centre to centre.
         field_of_view: degrees about the AV's heading.
-        line_of_sight: whether bodies of vehicles hide what is behind them.
-        buildings: type of the polygons (and its subtypes, `building.house`) that hide as well.
-        visible_share: share of an object's angular width that must be in sight.
+        line_of_sight: whether vehicles occlude what is behind them.
+        buildings: type of polygons that occlude too, including subtypes (`building.house`).
+        visible_share: share of an object's angular width that must be visible.
         position_noise: m, standard deviation of each coordinate.
         speed_noise: m/s, standard deviation.
         heading_noise: degrees, standard deviation.
-        miss: probability that an object in sight is not detected in one frame.
+        miss: probability that a visible object is not detected in one frame.
         latency: s from a measurement of own sensors until the tracker has it.
         cam: whether equipped vehicles send their own state (CAM).
-        cpm: whether AVs send what their own sensors detect (CPM).
-        mcm: whether AVs send what they intend to do (MCM).
-        equipped: share of human drivers' vehicles that send CAMs; AVs are equipped.
+        cpm: whether AVs send the detections of their own sensors (CPM).
+        mcm: whether AVs send their intentions (MCM).
+        equipped: share of human-driven vehicles that send CAMs; all AVs are equipped.
         message_range: m from sender to receiver.
-        period: s between two messages of one kind of one sender.
-        delay: s from a message's state until its reception, at least.
-        jitter: s more, mean of an exponential distribution.
+        period: s between two messages of the same kind and sender.
+        delay: s, minimum from a message's state until its reception.
+        jitter: s, additional delay, mean of an exponential distribution.
         loss: share of the messages that a receiver loses (Gilbert-Elliott channel).
         burst: messages, mean length of a run of losses.
-        cam_position_noise: m, standard deviation of each coordinate that a sender states of itself.
-        cam_speed_noise: m/s, the same of its speed.
-        cam_heading_noise: degrees, the same of its heading.
-        confirm: detections by own sensors before a track counts; a message counts at once.
+        cam_position_noise: m, standard deviation of each coordinate in a CAM.
+        cam_speed_noise: m/s, standard deviation of the speed in a CAM.
+        cam_heading_noise: degrees, standard deviation of the heading in a CAM.
+        confirm: detections by own sensors before a track is confirmed; one message suffices.
         forget: s without a measurement after which a track ends.
         decision_latency: s from a decision until its commands act, at most until the next decision.
-        compensation: how the state at measurement time is predicted to now: not at all (hold), at constant
-            velocity (cv), at constant speed along lanes (lanes), along lanes at the speed that the shipped
-            Gaussian process predicts (gp), by the shipped HPN's kinematic branch (hpn), or the true present
+        compensation: prediction of states from measurement time to the present: none (hold), constant
+            velocity (cv), constant speed along lanes (lanes), along lanes with the speed predicted by the
+            shipped Gaussian process (gp), by the shipped HPN's kinematic branch (hpn), or the true present
             state (truth).
     """
 
@@ -92,7 +92,7 @@ class Parameters:
     def __post_init__(self) -> None:
         if self.confirm < 1:
             raise BadInput("must be at least 1", field="confirm", value=self.confirm)
-        least = 1.0 / (1.0 - self.loss)  # messages: of losses that do not depend on one another
+        least = 1.0 / (1.0 - self.loss)  # messages, mean run length of independent losses
         if self.loss and self.burst < least - 1e-9:
             problem = f"must be at least {least:.3g} where {self.loss:g} of the messages are lost"
             raise BadInput(problem, field="burst", value=self.burst)
@@ -103,9 +103,9 @@ NAMES = tuple(field.name for field in fields(Parameters))
 
 @dataclass(frozen=True, slots=True)
 class Sensing:
-    """A level by its name, or a user's file, with the parameters that were changed."""
+    """A shipped level or a user's file, with changed parameters."""
 
-    name: str  # `v2v`, `mine-1a2b3c4d` of mine.yaml, with changed parameters `v2v,delay=0.8`
+    name: str  # `v2v`; `mine-1a2b3c4d` for mine.yaml; `v2v,delay=0.8` with a changed parameter
     digest: str  # SHA-256 of the parameters
     parameters: Parameters
     file: Path
@@ -114,7 +114,7 @@ class Sensing:
 def read(what: str | None, field: str = "--sensing", file: object = None) -> Sensing | None:
     """The sensing of `LEVEL|FILE[,PARAMETER=VALUE...]`; None: ideal.
 
-    `field` and `file` are where `what` is asked for. Raises BadInput naming file, field and value.
+    `field`, `file`: origin of `what`, for errors. Raises BadInput naming file, field and value.
     """
     if what is None or what == IDEAL:
         return None
@@ -139,8 +139,8 @@ def read(what: str | None, field: str = "--sensing", file: object = None) -> Sen
 
 
 def asked(what: str, folder: Path = Path(), field: str = "--sensing", file: object = None) -> str | None:
-    """`what` as it is found from anywhere and always spelled the same: a file by its absolute path relative
-    to `folder`, parameters sorted, those left out that change nothing. None: ideal. Raises BadInput."""
+    """`what` in canonical form: a file's absolute path (relative paths start at `folder`), sorted parameters
+    without those that change nothing. None: ideal. Raises BadInput."""
     base, changed = _split(what, field, file)
     path = os.path.abspath(folder / base)
     place = path if base not in (IDEAL, *levels()) and is_there(Path(path)) else base
@@ -150,7 +150,7 @@ def asked(what: str, folder: Path = Path(), field: str = "--sensing", file: obje
 
 @lru_cache
 def levels() -> dict[str, Parameters]:
-    """The levels that ship by name. Raises BadInput."""
+    """The shipped levels by name. Raises BadInput."""
     file = sumo_scenarios.SENSING
     tables = yaml_input.document(file)
     return {name: yaml_input.dataclass_from(Parameters, table, file, name) for name, table in tables.items()}

@@ -1,7 +1,7 @@
-"""SUMO's own output files on request: which there are, by SUMO's names, and whole files or none.
+"""SUMO's own output files on request, by SUMO's names, complete or not at all.
 
-SUMO writes them itself; where to and with which settings is ours to say, so that a run writes into its own
-folder only. What a setting does is written beside it; all of them yield to options typed after `--`.
+SUMO writes the files. cosim sets the paths, so that a run writes into its own folder only, and the options
+below. Options typed after `--` override these.
 """
 
 import contextlib
@@ -15,13 +15,13 @@ from cosim.errors import BadInput, SimulationError, one_of
 from cosim.files import cannot
 from cosim.scenario import Scenario
 
-DRAFT = ".part"  # folder of files that SUMO is still writing
+DRAFT = ".part"  # folder of unfinished files
 FIELD = "--output"
 
 
 @dataclass(frozen=True, slots=True)
 class Output:
-    """One kind of output: the option that names its file, and the settings that go with it."""
+    """One kind of output: the option for its file name, and accompanying settings."""
 
     option: str
     settings: tuple[tuple[str, str], ...] = ()
@@ -31,16 +31,16 @@ def _plain(name: str, *settings: tuple[str, str]) -> tuple[str, Output]:
     return name, Output(f"{name}-output", settings)
 
 
-# Left out: `vtk` (a file for every step) and what writes for trains, buses and battery cars only.
+# Omitted: `vtk` (one file per step), and outputs only for trains, buses or battery vehicles.
 OUTPUTS: dict[str, Output] = dict(
     (
-        # vehicles are still on the road when an episode ends: without this the file would be empty
+        # includes vehicles still on the road at the end of the episode
         _plain("tripinfo", ("tripinfo-output.write-unfinished", "true"),
                            ("tripinfo-output.write-undeparted", "true")),
         _plain("vehroute", ("vehroute-output.write-unfinished", "true")),
         _plain("stop", ("stop-output.write-unfinished", "true")),
         _plain("fcd"),
-        # on every vehicle; SUMO has more measures than these three, which are the ones that cosim reports too
+        # for every vehicle; of SUMO's measures the three that cosim reports too
         ("ssm", Output("device.ssm.file", (("device.ssm.probability", "1"),
                                             ("device.ssm.measures", "TTC DRAC PET")))),
         _plain("summary"),
@@ -63,9 +63,9 @@ OUTPUTS: dict[str, Output] = dict(
 
 
 def check(names: Sequence[str], options: Mapping[str, str] | Sequence[tuple[str, str]] = ()) -> None:
-    """Raises BadInput for a name that SUMO does not have (with the nearest one), or a file named twice.
+    """Raises BadInput for an unknown name (with the nearest known one), or an output requested twice.
 
-    `options`: SUMO options of the scenario, which may name the same file.
+    `options`: SUMO options of the scenario, which may request the same output.
     """
     given = dict(options)
     for name in names:
@@ -76,11 +76,11 @@ def check(names: Sequence[str], options: Mapping[str, str] | Sequence[tuple[str,
 
 
 def sumo_options(files: Mapping[str, Path], scenario: Scenario) -> tuple[dict[str, str], dict[str, str]]:
-    """The SUMO options for these files (name -> path): (settings a user may override, the files' names).
+    """The SUMO options for these files (name -> path): (settings a user may override, file names).
 
-    Floating-car data begin with the counted time and hold the frames that the figures are made of, so
-    that `cosim metrics` finds the same figures again; SUMO stamps a step with the time it began. All files
-    get six digits: with SUMO's two, a jerk from speeds 0.2 s apart would be off by 0.5 m/s3.
+    Floating-car data begin with the counted time and contain the frames of the figures, so that `cosim
+    metrics` reproduces the figures. SUMO stamps a step with its begin. All files have six digits: with SUMO's
+    two, a jerk from speeds 0.2 s apart would be off by 0.5 m/s3.
     """
     if not files:
         return {}, {}
@@ -96,16 +96,16 @@ def sumo_options(files: Mapping[str, Path], scenario: Scenario) -> tuple[dict[st
 
 @contextlib.contextmanager
 def drafts(names: Sequence[str], folder: Path | None) -> Iterator[dict[str, Path]]:
-    """Paths for SUMO to write to; they become `folder`/NAME.xml when the block ends well, else they vanish.
+    """Draft paths for SUMO; moved to `folder`/NAME.xml if the block succeeds, else deleted.
 
-    Close SUMO inside the block: it writes the last lines then. Raises SimulationError when a file is not
-    whole (a full disk), BadInput when the folder cannot be written.
+    Close SUMO inside the block, since it writes the last lines at its end. Raises SimulationError for an
+    incomplete file (a full disk), BadInput for a folder that cannot be written.
     """
     if not names or folder is None:
         yield {}
         return
     draft = folder / DRAFT
-    shutil.rmtree(draft, ignore_errors=True)  # of a run that was killed
+    shutil.rmtree(draft, ignore_errors=True)  # left by a killed run
     with cannot("make this folder", file=draft, field=FIELD):
         draft.mkdir(parents=True)
     try:

@@ -1,7 +1,7 @@
-"""Read a .sumocfg and the SUMO options of the command line, and sort them: kept, resolved, or set aside.
+"""Reads a .sumocfg and the SUMO options of the command line, and keeps those that change the traffic.
 
-A foreign configuration is never handed to SUMO as it is: its outputs could write anywhere and its
-`remote-port` would wait for ever (docs/reference/sumo.md). What changes the traffic is kept.
+A user's configuration is never passed to SUMO unchanged: its outputs could write anywhere, and its
+`remote-port` would wait for ever (docs/reference/sumo.md).
 """
 
 import math
@@ -38,13 +38,13 @@ _SYNONYMS = {
     "C": "save-configuration",
     "save-config": "save-configuration",
 }
-# SUMO takes any root in a configuration; these are files of another kind, given by mistake.
+# SUMO accepts any root element; these indicate a file of another kind, given by mistake.
 OTHER_ROOTS = frozenset(
     {"net", "nodes", "edges", "connections", "types", "routes", "trips", "additional", "add"}
 )
 INPUTS = ("net-file", "route-files", "additional-files")
 CLOCK = ("begin", "end", "step-length")
-# Options whose value is a list of files to read; relative to the configuration's folder.
+# Options with a list of input files, relative to the configuration's folder.
 FILE_OPTIONS = frozenset(
     {
         "weight-files",
@@ -54,8 +54,8 @@ FILE_OPTIONS = frozenset(
         "device.fcd-replay.files",
     }
 )
-# Everything of SUMO's topics `processing`, `routing` and `emissions`, and of devices that change how vehicles
-# drive or what tripinfo says of them; not of those that only fill a file of their own (ssm, fcd, btreceiver).
+# All options of SUMO's topics `processing`, `routing` and `emissions`, and of devices that affect driving or
+# tripinfo; not of devices that only write their own file (ssm, fcd, btreceiver).
 _KEPT = re.compile(
     r"""weight-(files|attribute) | load-state(\..+)? | junction-taz | step-method\.ballistic
     | extrapolate-departpos | route-steps | no-internal-links
@@ -77,13 +77,13 @@ _KEPT = re.compile(
 _NEVER_KEPT = re.compile(
     r".+[.-](output|file)|.*output.*|tls\.actuated\.show-detectors|.*\.wkt|.*jupedsim\.py"
 )
-# Why an option of the command line cannot hold here (docs/reference/sumo.md).
+# Refused options of the command line, with the reason (docs/reference/sumo.md).
 _REFUSED = {
     "configuration-file": "name the .sumocfg in place of a scenario",
     "seed": "use cosim's own --seed",
     "random": "an episode is repeatable by its --seed; SUMO's --random is not",
-    "remote-port": "cosim steps the simulation itself; nobody else can connect",
-    "num-clients": "cosim steps the simulation itself; nobody else can connect",
+    "remote-port": "cosim steps the simulation itself; other clients cannot connect",
+    "num-clients": "cosim steps the simulation itself; other clients cannot connect",
     "save-configuration": "SUMO would write its options and stop",
     "save-template": "SUMO would write its options and stop",
     "save-schema": "SUMO would write its schema and stop",
@@ -92,7 +92,7 @@ _REFUSED = {
     "mesosim": "the mesoscopic model has no vehicle positions",
     "lateral-resolution": "say it in a .sumocfg: AVs change lanes by LC2013, which has no sublane model",
 }
-# Why an option of a .sumocfg is set aside, where that is not plain.
+# Reasons for ignored options of a .sumocfg that are not obvious.
 _SET_ASIDE = {
     "seed": " (the episode's --seed decides)",
     "random": " (the episode's --seed decides)",
@@ -101,7 +101,7 @@ _SET_ASIDE = {
 
 @dataclass(frozen=True, slots=True)
 class SumoConfig:
-    """A .sumocfg, read: files absolute, options sorted. Times in s; None where the file sets nothing."""
+    """A parsed .sumocfg with absolute paths. Times in s; None: not set in the file."""
 
     path: Path
     net: Path
@@ -109,17 +109,17 @@ class SumoConfig:
     additional: tuple[Path, ...]
     begin: float
     end: float | None
-    options: tuple[tuple[str, str], ...]  # kept: they change the traffic
-    ignored: tuple[str, ...]  # set aside, "name=value" with the reason where there is one
+    options: tuple[tuple[str, str], ...]  # kept, since they change the traffic
+    ignored: tuple[str, ...]  # "name=value", with the reason if there is one
 
 
 def read(path: Path, replaced: Collection[str] = ()) -> SumoConfig:
-    """The configuration `path` with its relative names resolved against its own folder.
+    """The configuration `path`, with relative paths resolved against its folder.
 
-    `replaced`: names of `INPUTS` that are given otherwise: those of the file need not be there.
+    `replaced`: names of `INPUTS` given elsewhere; the file's own values are not checked.
 
     Raises:
-        BadInput: the file is missing or malformed, names no net, or names files that are not there.
+        BadInput: the file is missing or malformed, names no net, or names missing files.
     """
     path = path.absolute()
     unread = {*INPUTS} & {*replaced}
@@ -159,10 +159,10 @@ def read(path: Path, replaced: Collection[str] = ()) -> SumoConfig:
 def command_line(arguments: Sequence[str]) -> dict[str, str]:
     """SUMO options as typed after `--` -> {long name: value}; an option without a value is "true".
 
-    Outputs are let through here: the user asked for them by name.
+    Outputs are permitted here, since the user requests them by name.
 
     Raises:
-        BadInput: not an option, or one that cannot hold in a co-simulation.
+        BadInput: not an option, or an option that is impossible in a co-simulation.
     """
     options: dict[str, str] = {}
     rest = list(arguments)
@@ -189,7 +189,7 @@ def keeps(name: str) -> bool:
 
 
 def boolean(value: str) -> bool:
-    """SUMO's reading of a truth value; anything that is not a clear no counts as yes."""
+    """A boolean as SUMO parses it; any other value than a clear no is True."""
     return value.strip().lower() not in ("false", "f", "0", "no", "off", "-", "x")
 
 
@@ -237,8 +237,8 @@ def _values(path: Path) -> dict[str, str]:
 
 
 def files(value: str, folder: Path, file: object, field: str) -> tuple[Path, ...]:
-    """SUMO's comma (or space) separated list of files, absolute, each one checked to be there."""
-    # Spaces separate only where the whole is not a file: folders may have spaces in their names.
+    """SUMO's comma (or space) separated list of files, as absolute paths, each checked to exist."""
+    # Spaces separate only if the whole text is not a file, since paths may contain spaces.
     found: list[Path] = []
     for name in filter(None, map(str.strip, value.split(","))):
         for part in [name] if is_there(folder / name) else name.split():
@@ -250,7 +250,7 @@ def files(value: str, folder: Path, file: object, field: str) -> tuple[Path, ...
 
 
 def _off(lateral_resolution: str, file: object) -> bool:
-    """Whether no sublane model drives. Raises BadInput."""
+    """Whether the sublane model is off. Raises BadInput."""
     try:
         return float(lateral_resolution) <= 0.0
     except ValueError:
@@ -259,6 +259,6 @@ def _off(lateral_resolution: str, file: object) -> bool:
 
 
 def _check_finite(value: str, file: object, field: str) -> None:
-    """SUMO takes `scale` NaN without a word."""
+    """Raises BadInput for NaN and infinities, which SUMO accepts silently (such as `scale`)."""
     if value.strip().lstrip("+-").lower() in ("nan", "inf", "infinity"):
         raise BadInput("must be finite", file=file, field=field, value=value)

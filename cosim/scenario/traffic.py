@@ -1,5 +1,5 @@
-"""Whose SUMO options drive a user's file: the file's own (`as-is`), or those that cosim's drivers and
-figures need (`controlled`). What that changes is named in every result (formats.md, Traffic options)."""
+"""SUMO options for a user's file: the file's own (`as-is`), or those that cosim's drivers and figures need
+(`controlled`). Every result lists the changed options (formats.md, Traffic options)."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ if TYPE_CHECKING:
 
 STEP, STEP_NEEDED = "step-length", "AVs are commanded, and conflicts measured, every 0.1 s"
 CHECKS_INSIDE = "collision.check-junctions"
-SUMO_STEP = "1"  # s, where a file names none
+SUMO_STEP = "1"  # s, SUMO's default
 
 
 @dataclass(frozen=True, slots=True)
 class Rule:
     """A SUMO option of controlled traffic."""
 
-    default: str  # SUMO's own
+    default: str  # SUMO's default
     used: str  # "": the option is not passed on
     why: str
-    forced: bool = True  # over the file's own value
+    forced: bool = True  # overrides the file's value
 
 
 RULES: Mapping[str, Rule] = {
@@ -36,7 +36,7 @@ RULES: Mapping[str, Rule] = {
     # continuous lateral motion
     "lanechange.duration": Rule("0", "2", "a lane change is a movement that others can see", forced=False),
     "time-to-teleport": Rule("300", "-1", "a teleport would put a vehicle before an AV", forced=False),
-    # docs/reference/sumo.md: never `none`, nothing would be reported
+    # docs/reference/sumo.md: not `none`, with which SUMO reports no collision
     "collision.action": Rule("teleport", "warn", "collisions are counted, and who crashed stands"),
     CHECKS_INSIDE: Rule("false", "true", "collisions inside junctions are counted"),
     "collision.mingap-factor": Rule("-1", "0", "only contact is a collision"),
@@ -47,23 +47,23 @@ FORCED = {name: rule.used for name, rule in RULES.items() if rule.forced and rul
 
 
 class Changed(NamedTuple):
-    """An option that is not as the file has it."""
+    """An option with another value than in the file."""
 
     option: str
-    file: str  # the file's value, SUMO's default where the file names none
+    file: str  # the file's value, else SUMO's default
     used: str
     why: str
 
 
 def clocks(step: float) -> Timing:
-    """The usual clocks where SUMO's step divides them, else the next whole multiples; `step` in s."""
+    """The default clocks, rounded up to multiples of SUMO's `step` (s)."""
     usual = Timing()
     frame = step * _times(usual.frame, step)
     return Timing(step=step, frame=frame, decision=frame * _times(usual.decision, frame))
 
 
 def check_timing(timing: Timing, file: object, field: str, value: object) -> None:
-    """Each clock must be a whole number of the one below it (observation.md, Clocks)."""
+    """Raises BadInput unless each clock is a multiple of the next faster one (observation.md, Clocks)."""
     for name, long, short in (
         ("frame", timing.frame, timing.step),
         ("decision", timing.decision, timing.frame),
@@ -75,7 +75,7 @@ def check_timing(timing: Timing, file: object, field: str, value: object) -> Non
 
 
 def stepped(timing: Timing, typed: Mapping[str, str], traffic: str) -> Timing:
-    """`timing` with the step length typed after `--`, where there is one. Raises BadInput."""
+    """`timing` with the step length typed after `--`, if any. Raises BadInput."""
     if STEP not in typed:
         return timing
     place, field, text = "command line", f"--{STEP}", typed[STEP]
@@ -90,19 +90,19 @@ def stepped(timing: Timing, typed: Mapping[str, str], traffic: str) -> Timing:
 
 
 def settled(scenario: Scenario, typed: Mapping[str, str], wanted: str | None) -> Scenario:
-    """`scenario` with its clocks and options as its traffic wants them.
+    """`scenario` with the clocks and options of its kind of traffic.
 
-    Where cosim drives nobody (`driven`), the traffic of a user's .sumocfg is as it is. `typed`: options of
-    the command line, which win. `wanted`: `--traffic`.
+    If cosim controls no driver (`driven`), the traffic of a user's .sumocfg is as-is. `typed`: options of the
+    command line, which take precedence. `wanted`: `--traffic`.
 
     Raises:
-        BadInput: `as-is` where cosim drives somebody; a step that does not divide a frame.
+        BadInput: `as-is` although cosim controls a driver; a step that does not divide a frame.
     """
-    who = _driven(scenario)
-    who = "the scenario's own file says how it drives" if scenario.built_in else who
-    if wanted is not None and one_of(wanted, Traffic.ALL, "--traffic") == Traffic.AS_IS and who:
-        raise BadInput(f"cannot be: {who}", field="--traffic", value=wanted)
-    traffic = wanted or (Traffic.CONTROLLED if who else Traffic.AS_IS)
+    reason = _driven(scenario)
+    reason = "the scenario's own file says how it drives" if scenario.built_in else reason
+    if wanted is not None and one_of(wanted, Traffic.ALL, "--traffic") == Traffic.AS_IS and reason:
+        raise BadInput(f"cannot be: {reason}", field="--traffic", value=wanted)
+    traffic = wanted or (Traffic.CONTROLLED if reason else Traffic.AS_IS)
     if traffic == Traffic.CONTROLLED and typed.get("collision.action", "warn") != "warn":
         problem = "collisions are counted, never removed"
         raise BadInput(problem, field="--collision.action", value=typed["collision.action"])
@@ -117,7 +117,7 @@ def settled(scenario: Scenario, typed: Mapping[str, str], wanted: str | None) ->
     written = own if file_step is None else {STEP: file_step, **own}
     for name, rule in rules.items():
         if scenario.built_in and name not in written:
-            continue  # its own file leaves it to cosim
+            continue  # not set in a scenario folder: cosim decides
         file, used = written.get(name, rule.default), rule.used or rule.default
         if (rule.forced or name not in written) and not _same(file, used):
             changed.append(Changed(name, file, used, rule.why))
@@ -127,7 +127,7 @@ def settled(scenario: Scenario, typed: Mapping[str, str], wanted: str | None) ->
 
 
 def driven(fleet: Fleet | None, behavior: str | None, errors: str | None) -> str:
-    """Whom cosim may drive in a user's file, in words; "" for nobody. None: as the file has it."""
+    """The drivers that cosim controls in a user's file, in words; "": none. An option of None: unchanged."""
     if fleet is not None and fleet.may_have_avs:
         return f"AVs are driven (by {fleet.describe()})"
     if behavior not in (None, AS_IS):
@@ -136,16 +136,16 @@ def driven(fleet: Fleet | None, behavior: str | None, errors: str | None) -> str
 
 
 def in_words(manifest: Mapping[str, Any]) -> str:
-    """`as-is`, or `controlled: step-length 1 -> 0.1, ...` of a user's file; "" of a scenario of ours."""
+    """`as-is`, or `controlled: step-length 1 -> 0.1, ...` for a user's file; "" for a scenario folder."""
     changed = manifest.get("changed_options", {})
     words = ", ".join(f"{name} {c['file']} -> {c['used']}" for name, c in changed.items())
     return ": ".join(filter(None, (manifest.get("traffic", ""), words)))
 
 
 def check(scenario: Scenario) -> None:
-    """Raises BadInput where traffic is as it is though cosim drives somebody: they came after `load`."""
-    if scenario.traffic == Traffic.AS_IS and (who := _driven(scenario)):
-        raise BadInput(f"{who}: load the scenario with them", field="traffic", value=scenario.traffic)
+    """Raises BadInput for as-is traffic with drivers controlled by cosim, if these were set after `load`."""
+    if scenario.traffic == Traffic.AS_IS and (reason := _driven(scenario)):
+        raise BadInput(f"{reason}: load the scenario with them", field="traffic", value=scenario.traffic)
 
 
 def _driven(scenario: Scenario) -> str:
@@ -155,12 +155,12 @@ def _driven(scenario: Scenario) -> str:
 
 
 def _times(wanted: float, unit: float) -> int:
-    """How often `unit` fits into `wanted`, rounded up."""
+    """`wanted` as a multiple of `unit`, rounded up."""
     return max(math.ceil(wanted / unit - 1e-6), 1)
 
 
 def _same(a: str, b: str) -> bool:
-    """Whether SUMO reads two values of these options alike."""
+    """Whether SUMO parses two values of these options as equal."""
     try:
         return float(a) == float(b)
     except ValueError:

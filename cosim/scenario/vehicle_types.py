@@ -1,9 +1,9 @@
-"""The vehicle types of a scenario's files, written once more for every driver that replaces their own.
+"""Derived vTypes: the vehicle types of a scenario's files, written again with other drivers.
 
-SUMO's car-following model belongs to the type, so that nothing but another type changes it while a vehicle
-drives. A type that is made at run time knows only what SUMO's calls can set: no capacities, no parking, no
-parameters. So each type is written again before SUMO starts, all attributes and parameters its own but for
-the driver's, and lists of types (rerouters, detectors, signals, ...) name it beside the original
+In SUMO the car-following model belongs to the vType, so only another vType changes it at run time. A vType
+made at run time has only attributes that TraCI can set: no capacities, no parking, no parameters. So each
+vType is written again before SUMO starts, with all its attributes and parameters except the driver's. Lists
+of vTypes (rerouters, detectors, signals, ...) name it beside the original
 (`cosim.scenario.disabled_outputs`).
 """
 
@@ -17,7 +17,7 @@ from cosim.scenario import Scenario
 from cosim.scenario.vet import DEFAULT_TYPES
 from cosim.scenario.vet_rules import words
 
-# What describes a driver, not a vehicle: of a family all attributes are replaced, or none.
+# Attributes that describe the driver, by family; either all attributes of a family are replaced, or none.
 _FAMILIES = {
     "lc": "lane changes",
     "jm": "junctions",
@@ -30,11 +30,11 @@ _FAMILIES = {
     ),
     "laneChangeModel": "lane changes",
 }
-_FILES = ("imgFile", "osgFile")  # attributes that name a file, relative to their own
-_MODEL = "carFollowing-"  # the children of a vType that describe its driver
+_FILES = ("imgFile", "osgFile")  # attributes that name a file, relative to the defining file
+_MODEL = "carFollowing-"  # prefix of the children of a vType that describe its driver
 
 
-# Who heeds vehicles of some types only, and the attribute that lists these; of signals it is a parameter.
+# Elements restricted to some vTypes, and the attribute that lists these; signals have a parameter instead.
 TYPE_LISTS: Mapping[str, str] = dict.fromkeys(
     words(
         "rerouter calibrator routeProbe edgeData laneData inductionLoop e1Detector instantInductionLoop "
@@ -42,15 +42,15 @@ TYPE_LISTS: Mapping[str, str] = dict.fromkeys(
     ),
     "vTypes",
 )
-# Who changes speed limits, and the attributes that say where.
+# Elements that change speed limits, and the attributes with the edges or lanes.
 _LIMITS = {"variableSpeedSign": ("lanes", "edges"), "calibrator": ("lane", "edge")}
 _DRIVERS = words("vehicle trip flow")
-DEFAULT_TYPE = "DEFAULT_VEHTYPE"  # of a vehicle that names none
+DEFAULT_TYPE = "DEFAULT_VEHTYPE"  # of a vehicle without a type
 
 
 @dataclass(frozen=True, slots=True)
 class WrittenType:
-    """A vType as its file has it."""
+    """A vType as written in its file."""
 
     file: Path
     attributes: dict[str, str]
@@ -59,10 +59,10 @@ class WrittenType:
 
 @dataclass(frozen=True, slots=True)
 class Driver:
-    """A driver who replaces that of a type; such a type's name is `prefix` + the type's own + `suffix`.
+    """A driver that replaces that of a vType; the derived vType is named `prefix` + own name + `suffix`.
 
-    `attributes` are the driver's, by SUMO's names; none: as the type's own, of SUMO's own types `fallback`.
-    `types`: whose; None: all.
+    `attributes`: the driver's, by SUMO's names; if empty, the vType's own, or `fallback` for SUMO's default
+    vTypes. `types`: the vTypes concerned; None: all.
     """
 
     prefix: str
@@ -72,55 +72,55 @@ class Driver:
     fallback: Mapping[str, str] = field(default_factory=dict)
 
     def of(self, own: str) -> str:
-        """The name of type `own` with this driver."""
+        """The name of vType `own` with this driver."""
         return f"{self.prefix}{own}{self.suffix}"
 
     def replaces(self, attribute: str) -> bool:
-        """Whether an attribute of a type is replaced, or dropped."""
+        """Whether an attribute of a vType is replaced or dropped."""
         family = _family(attribute)
         return attribute in self.attributes or (family != "" and family in map(_family, self.attributes))
 
 
 @dataclass(frozen=True, slots=True)
 class VehicleTypes:
-    """All types of a scenario's files, and those of SUMO's own that they use."""
+    """All vTypes of a scenario's files, and the SUMO default types in use."""
 
     types: Mapping[str, WrittenType]
-    distributions: Mapping[str, Sequence[str]]  # of types -> the types
-    listed: frozenset[str]  # what rerouters, detectors and the like are for
-    variable: frozenset[str]  # lanes and edges whose speed limit may change while SUMO drives
+    distributions: Mapping[str, Sequence[str]]  # vTypeDistribution -> its vTypes
+    listed: frozenset[str]  # vTypes to which rerouters, detectors and the like are restricted
+    variable: frozenset[str]  # lanes and edges with a variable speed limit
 
     def named(self, name: str) -> frozenset[str]:
-        """The types that `name` means: the members of a distribution, or the type itself."""
+        """The vTypes of `name`: the members of a distribution, or the vType itself."""
         return frozenset(self.distributions.get(name, (name,)))
 
     def write(self, file: Path, drivers: Sequence[Driver]) -> None:
-        """An additional file: every type with each of these drivers."""
+        """Write an additional file: every vType with each of these drivers."""
         written = (
-            _written(name, kind, who)
-            for who in drivers
+            _written(name, kind, driver)
+            for driver in drivers
             for name, kind in self.types.items()
-            if who.types is None or name in who.types
+            if driver.types is None or name in driver.types
         )
         file.write_text("\n".join(("<additional>", *written, "</additional>", "")), encoding="utf-8")
 
     def also(self, name: str, drivers: Iterable[Driver]) -> Iterator[str]:
-        """Where a list of types names `name`: what such vehicles with these drivers are called."""
+        """The derived vTypes of `name` with these drivers, for lists of vTypes."""
         return (
-            who.of(own)
-            for who in drivers
+            driver.of(own)
+            for driver in drivers
             for own in sorted(self.named(name))
-            if who.types is None or own in who.types
+            if driver.types is None or own in driver.types
         )
 
 
 def vehicle_types(scenario: Scenario) -> VehicleTypes:
-    """The types of a scenario's files. Raises BadInput: see `cosim.files.xml_input.scan`."""
+    """The vTypes of a scenario's files. Raises BadInput: see `cosim.files.xml_input.scan`."""
     return read_types((*scenario.additional, *scenario.demand))
 
 
 def read_types(files: Iterable[Path]) -> VehicleTypes:
-    """The types of these files and of those that they include. Raises BadInput: see `vehicle_types`."""
+    """The vTypes of these files and their includes. Raises BadInput: see `vehicle_types`."""
     reader, waiting = _Reader(), list(files)
     while waiting:
         waiting += reader.read(waiting.pop(0))
@@ -133,18 +133,18 @@ def read_types(files: Iterable[Path]) -> VehicleTypes:
 
 
 class _Reader:
-    """What the files read so far say of types."""
+    """Collects the vTypes of several files."""
 
     def __init__(self) -> None:
         self.types: dict[str, WrittenType] = {}
         self.distributions: dict[str, list[str]] = {}
-        self.defaults: set[str] = set()  # of SUMO's own types, those that are used
+        self.defaults: set[str] = set()  # SUMO's default types in use
         self.listed: set[str] = set()
         self.variable: set[str] = set()
         self._read: set[Path] = set()
 
     def read(self, path: Path) -> list[Path]:
-        """One file; the files that it includes."""
+        """Read one file; return its includes."""
         if path in self._read:
             return []
         self._read.add(path)
@@ -183,7 +183,7 @@ class _Reader:
 
 
 def describes_driver(attribute: str) -> bool:
-    """Whether an attribute of a type says how its driver drives."""
+    """Whether an attribute of a vType describes its driver."""
     return _family(attribute) != ""
 
 
@@ -191,17 +191,17 @@ def _family(attribute: str) -> str:
     return _FAMILIES.get(attribute) or _FAMILIES.get(attribute[:2], "")
 
 
-def _written(name: str, kind: WrittenType, who: Driver) -> str:
-    own = {key: value for key, value in kind.attributes.items() if not who.replaces(key)}
+def _written(name: str, kind: WrittenType, driver: Driver) -> str:
+    own = {key: value for key, value in kind.attributes.items() if not driver.replaces(key)}
     files = {key: str((kind.file.parent / own[key]).absolute()) for key in _FILES if own.get(key)}
     children = [
         f"<{tag}{_attributes(values)}/>"
         for tag, values in kind.children
-        if not (who.attributes and tag.startswith(_MODEL))
+        if not (driver.attributes and tag.startswith(_MODEL))
     ]
     sumos_own = "id" not in kind.attributes
-    driver = who.attributes or (who.fallback if sumos_own else {})
-    attributes = {**own, **files, **driver, "id": who.of(name)}
+    changed = driver.attributes or (driver.fallback if sumos_own else {})
+    attributes = {**own, **files, **changed, "id": driver.of(name)}
     return f"<vType{_attributes(attributes)}>{''.join(children)}</vType>"
 
 

@@ -1,8 +1,8 @@
-"""Vet everything a scenario hands to SUMO before SUMO sees it: bad input becomes one clear sentence.
+"""Checks all input files of a scenario before SUMO reads them, with one clear error for bad input.
 
-SUMO answers bad input with "Process Error", nothing or SIGSEGV (docs/reference/sumo.md). Here every
-file is read once as a stream (memory does not grow with the demand's size, except for its names), its
-numbers are checked, and every name it refers to must exist. Files that have not changed are not read again.
+SUMO answers bad input with "Process Error", nothing or SIGSEGV (docs/reference/sumo.md). Here every file is
+read once as a stream, in memory that grows only with the number of names. Numbers are checked, and every
+name that is referred to must exist. Unchanged files are not read again.
 """
 
 import contextlib
@@ -24,8 +24,8 @@ from cosim.scenario.vet_rules import OFF_ROAD, some
 from cosim.scenario.vet_signals import check_lengths
 
 MAX_WARNINGS = 20  # of one kind
-MAX_INCLUDES = 64  # files; more is a cycle
-# Types SUMO always has, and their classes.
+MAX_INCLUDES = 64  # files; more indicate a cycle
+# SUMO's default types and their vehicle classes.
 DEFAULT_TYPES: Mapping[str, str] = {
     "DEFAULT_VEHTYPE": "passenger",
     "DEFAULT_PEDTYPE": "pedestrian",
@@ -38,20 +38,20 @@ DEFAULT_TYPES: Mapping[str, str] = {
 
 @dataclass(frozen=True, slots=True)
 class VetReport:
-    """What the vetted files hold; `warnings` belong into a result's validity."""
+    """Content of the vetted files; `warnings` belong into a result's validity."""
 
     edges: int  # internal ones not counted
     vehicles: int  # single vehicles and trips
     flows: int
     warnings: tuple[str, ...] = ()
-    outputs: tuple[str, ...] = ()  # files the additional files would have SUMO write
+    outputs: tuple[str, ...] = ()  # files that the additional files make SUMO write
 
 
 def vet(scenario: Scenario) -> VetReport:
     """Read and check every file of `scenario`.
 
     Raises:
-        BadInput: the first thing that is wrong, with file, field and value.
+        BadInput: the first fault, with file, field and value.
     """
     config = scenario.config
     _read.set(_Read(scenario.net, *scenario.additional, *scenario.demand))
@@ -94,7 +94,7 @@ def vetted(scenario: Scenario) -> Scenario:
 
 @contextlib.contextmanager
 def watched(progress: Progress) -> Iterator[None]:
-    """In this block `progress` is told how many MB of a scenario's files are read, of how many."""
+    """In this block `progress` receives the MB read of a scenario's files, and the total."""
     before = _progress.set(progress)
     try:
         yield
@@ -103,7 +103,7 @@ def watched(progress: Progress) -> Iterator[None]:
 
 
 def _all(paths: Iterable[Path], config: Path, *, additional: bool = False) -> list[Demand]:
-    """The files and what they include, in SUMO's order of loading."""
+    """The files and their includes, in SUMO's order of loading."""
     waiting = [
         regular_file(path, file=config, field="additional-files" if additional else "route-files")
         for path in paths
@@ -127,7 +127,7 @@ def _check_options(scenario: Scenario) -> None:
 
 
 def _check_references(net: Net, demands: list[Demand], types: frozenset[str]) -> None:
-    """Every edge, lane, junction, type and route that is used must exist."""
+    """Raises BadInput unless every used edge, lane, junction, type and route exists."""
     routes = frozenset[str]().union(*(d.routes for d in demands))
     here = f" in {net.path.name}"
     near = net.lanes if len(net.lanes) < 5000 else ()
@@ -147,9 +147,9 @@ def _check_references(net: Net, demands: list[Demand], types: frozenset[str]) ->
 
 
 def _check_drivers(demands: list[Demand]) -> list[str]:
-    """No vehicle and no flow may be in two files: SUMO would stop in mid-run when the second one departs.
+    """Raises BadInput for a vehicle or flow in two files: SUMO would stop when the second one departs.
 
-    A vehicle and a flow may share an id; a vehicle named like one that a flow makes (FLOW.0, FLOW.1, ...)
+    A vehicle and a flow may share an id. A vehicle with the id of a flow's vehicle (FLOW.0, FLOW.1, ...)
     stops SUMO if both depart, which is a warning.
     """
     for field in ("vehicles", "flows"):
@@ -171,10 +171,10 @@ def _check_drivers(demands: list[Demand]) -> list[str]:
 
 
 def _gaps(net: Net, demands: list[Demand]) -> list[str]:
-    """Where nobody can drive or walk, which SUMO finds out only on the way or never: these are warnings."""
+    """Warnings about gaps in routes and walks, which SUMO finds only under way or never."""
     found = []
     driven = frozenset[str]().union(*(d.driven for d in demands))
-    on_foot = frozenset[str]().union(*(d.used[WALKED] for d in demands)) - driven  # either way, on any edge
+    on_foot = frozenset[str]().union(*(d.used[WALKED] for d in demands)) - driven  # both directions, any edge
     for demand in demands:
         steps, walks = dict(demand.steps), dict(demand.walks)
         for name, (edges, place) in demand.named.items():
@@ -199,7 +199,7 @@ def _gaps(net: Net, demands: list[Demand]) -> list[str]:
 
 
 def _unsupported(scenario: Scenario, demands: list[Demand]) -> list[str]:
-    """What cosim does not know, though SUMO drives it (formats.md, Not supported): these are warnings."""
+    """Warnings about features that SUMO supports but cosim does not (formats.md, Not supported)."""
     found = []
     found += [
         f"{scenario.config}: {c.option}={c.file}: without SUMO's sublane model the traffic is another"
@@ -219,7 +219,7 @@ def _unsupported(scenario: Scenario, demands: list[Demand]) -> list[str]:
 
 
 def _check_mission(scenario: Scenario, demands: list[Demand]) -> None:
-    """Somebody has the name of the mission vehicle of a user's file, as far as names are known beforehand."""
+    """Raises BadInput if the mission vehicle is not in the demand, as far as ids are known in advance."""
     mission = scenario.mission
     wanted = mission.vehicles
     if not wanted or scenario.built_in or any(demand.makes_vehicles for demand in demands):
@@ -235,12 +235,10 @@ def _check_mission(scenario: Scenario, demands: list[Demand]) -> None:
 
 
 class _Read:
-    """How much of a scenario's files is read."""
+    """Read progress over a scenario's files."""
 
     def __init__(self, *files: Path) -> None:
-        self._all = sum(
-            path.stat().st_size for path in files if is_there(path)
-        )  # bytes, without what they include
+        self._all = sum(path.stat().st_size for path in files if is_there(path))  # bytes, without includes
         self._done = 0  # bytes, of whole files
 
     def next(self, size: int) -> Progress:
@@ -255,7 +253,7 @@ _read: ContextVar[_Read] = ContextVar("read")
 
 
 def _stamp(path: Path) -> tuple[Path, int, int]:
-    """A key that changes when the file does: path, modification time in ns, size in bytes."""
+    """A cache key of a file: path, modification time in ns, size in bytes."""
     status = path.stat()
     return path, status.st_mtime_ns, status.st_size
 

@@ -1,4 +1,4 @@
-"""Read a route or additional file as a stream: check its numbers and names, note what it refers to."""
+"""Reads a route or additional file as a stream: checks numbers and names, and collects references."""
 
 from collections import defaultdict
 from collections.abc import Mapping
@@ -21,7 +21,7 @@ from cosim.scenario.vet_rules import (
 )
 from cosim.scenario.vet_signals import SignalReader
 
-# SUMO takes any root; these are kinds of their own, given by mistake.
+# SUMO accepts any root element; these indicate a file of another kind, given by mistake.
 OTHER_ROOTS = frozenset(
     {"net", "nodes", "edges", "connections", "types", "configuration", "sumoConfiguration", "html", "project"}
 )
@@ -37,8 +37,8 @@ _ON_A_LANE = words(
     "stop busStop trainStop containerStop chargingStation parkingArea inductionLoop e1Detector "
     "instantInductionLoop laneAreaDetector e2Detector detEntry detExit"
 )
-WALKED = "route of a walk"  # a kind of what is `used`
-# Attributes by which an additional file writes files; `file` of other elements is read.
+WALKED = "route of a walk"  # a key of `Demand.used`
+# Attributes that name output files; `file` of other elements is an input.
 OUTPUTS: Mapping[str, str] = {
     **dict.fromkeys(
         words(
@@ -55,7 +55,7 @@ OUTPUT_PARAMETERS = frozenset({"device.ssm.file", "device.toc.file", "device.rer
 
 @dataclass(slots=True)
 class Demand:
-    """What one route or additional file defines and what it refers to."""
+    """Definitions and references of one route or additional file."""
 
     path: Path
     types: set[str] = field(default_factory=set)
@@ -63,30 +63,27 @@ class Demand:
     vehicles: dict[str, int] = field(default_factory=dict)  # vehicle or trip -> line
     flows: dict[str, tuple[int, float]] = field(default_factory=dict)  # -> line, vehicles at most
     used: defaultdict[str, dict[str, Place]] = field(default_factory=lambda: defaultdict(dict))
-    # kind (edge, lane, junction, vehicle type, route, `WALKED`) -> name -> where it is first used
+    # kind (edge, lane, junction, vehicle type, route, `WALKED`) -> name -> place of its first use
     steps: dict[tuple[str, str], Place] = field(default_factory=dict)  # (edge, next edge) of vehicles' routes
-    named: dict[str, tuple[str, Place]] = field(
-        default_factory=dict
-    )  # route of its own -> its edges as written
+    named: dict[str, tuple[str, Place]] = field(default_factory=dict)  # named route -> its edges as written
     driven: set[str] = field(default_factory=set)  # routes that vehicles may take
     includes: list[Path] = field(default_factory=list)
     walks: dict[tuple[str, str], Place] = field(default_factory=dict)  # (edge, next edge) of walks
-    classes: dict[str, str] = field(default_factory=dict)  # vehicle type -> its class, where it is given
-    mixtures: set[str] = field(default_factory=set)  # types that are part of a distribution
+    classes: dict[str, str] = field(default_factory=dict)  # vehicle type -> vClass, "" if not given
+    mixtures: set[str] = field(default_factory=set)  # members of type distributions
     programs: dict[tuple[str, str], int] = field(default_factory=dict)  # as `SignalReader.programs`
-    makes_vehicles: bool = False  # by calibrators, whose vehicles have names of SUMO's
-    outputs: list[str] = field(default_factory=list)  # files SUMO would write, as written
+    makes_vehicles: bool = False  # by calibrators, with ids chosen by SUMO
+    outputs: list[str] = field(default_factory=list)  # files that SUMO would write, as written
     warnings: list[str] = field(default_factory=list)
 
 
 def read_demand(path: Path, *, additional: bool, progress: Progress | None = None) -> Demand:
-    """The file `path`, its numbers and lane-change attributes checked, its references noted; `progress` in
-    bytes.
+    """Check the file `path` and collect its definitions and references; `progress` in bytes.
 
     Raises:
-        BadInput: what `cosim.files.xml_input.scan` refuses; NaN, infinite or negative numbers; unknown
+        BadInput: a file that `cosim.files.xml_input.scan` refuses; NaN, infinite or negative numbers; unknown
             lane-change attributes (with the nearest name); the same vehicle twice; a missing include; a
-            person without a plan, a walk from or to nowhere; malformed signal programs.
+            person without a plan, a walk without origin or destination; malformed signal programs.
     """
     reader = _DemandReader(path, additional)
     scan(path, (), reader.start, reader.end, progress=progress)
@@ -105,9 +102,9 @@ class _DemandReader(Reader):
         self._last_depart = 0.0  # s
         self._unsorted: list[str] = []
         self._signals = SignalReader(path)
-        self._person: Place | None = None  # the person or container whose plan is being read
+        self._person: Place | None = None  # person or container of the present plan
         self._stages = 0  # of that plan so far
-        self._picked_up = False  # it departs in a vehicle, wherever that is
+        self._picked_up = False  # departs in a vehicle, at that vehicle's place
 
     def start(self, tag: str, attributes: dict[str, str], line: int) -> None:
         if not self._owners and tag in OTHER_ROOTS:
@@ -160,7 +157,7 @@ class _DemandReader(Reader):
         self._owners.append((tag, owner))
 
     def _driven(self, tag: str, attributes: dict[str, str]) -> list[str]:
-        """The routes that an element gives to vehicles."""
+        """The routes that an element assigns to vehicles."""
         if tag == "routeDistribution":
             return attributes.get("routes", "").split()
         in_distribution = tag == "route" and self._parent == "routeDistribution"
@@ -176,7 +173,7 @@ class _DemandReader(Reader):
             self._person = None
 
     def _stage(self, tag: str, attributes: dict[str, str], owner: str, line: int) -> None:
-        """A stage of a plan: the first one says where it begins, each where it ends."""
+        """Check a stage of a plan: the first one needs an origin, each a destination."""
         self._stages += 1
         if "route" in attributes:
             self._use(WALKED, attributes["route"], tag, "route", owner, line)
@@ -200,7 +197,7 @@ class _DemandReader(Reader):
         return self.found
 
     def _unknown(self, tag: str, name: str, value: str, owner: str, line: int) -> None:
-        """An attribute of a vehicle type that SUMO would ignore without a word."""
+        """Refuse or report an attribute of a vehicle type that SUMO would ignore silently."""
         if name.startswith("xsi:") or name.startswith("xmlns"):
             return
         lane_change = name.lower().startswith("lc")
@@ -228,11 +225,11 @@ class _DemandReader(Reader):
             self._use("route", attributes["route"], tag, "route", owner, line)
 
     def _departs(self, tag: str, attributes: dict[str, str]) -> None:
-        """Note who is written behind somebody that departs later: SUMO drops it, persons too."""
-        # a flow that names no begin begins with the simulation, so it is late behind anything later
+        """Note vehicles and persons that follow a later departure in the file: SUMO drops them."""
+        # a flow without begin starts with the simulation, so it is late after any later departure
         is_flow = tag.lower().endswith("flow")
         depart = attributes.get("begin", "0") if is_flow else attributes.get("depart", "")
-        if self._additional or not depart[:1].isdigit():  # an additional file is loaded whole: order is free
+        if self._additional or not depart[:1].isdigit():  # additional files are loaded at once, in any order
             return
         when = time_of(depart, self._path, f"{tag}.depart")
         if when < self._last_depart:
@@ -265,7 +262,7 @@ class _DemandReader(Reader):
 
     @property
     def _parent(self) -> str:
-        """The tag that the present element is in."""
+        """The tag of the parent of the present element."""
         return self._owners[-1][0] if self._owners else ""
 
     def _use(self, kind: str, used: str, tag: str, name: str, owner: str, line: int) -> None:

@@ -1,4 +1,4 @@
-"""Read a SUMO net as a stream: refuse what would crash or mislead SUMO, keep what routes are checked by."""
+"""Reads a SUMO net as a stream: refuses faults that crash or mislead SUMO, keeps names to check routes."""
 
 import re
 from collections import Counter
@@ -17,14 +17,14 @@ _CROSSING = re.compile(r":(.+)_c\d+")  # netconvert's name for the crossings of 
 
 @dataclass(frozen=True, slots=True)
 class Net:
-    """What is left of a net after reading: names and how they connect, no geometry."""
+    """The names and connections of a net, without geometry."""
 
     path: Path
     lanes: Mapping[str, int]  # edge -> number of lanes; internal edges (":...") included
     junctions: frozenset[str]
-    links: frozenset[tuple[str, str]]  # (edge, edge) pairs that a connection joins
-    ends: Mapping[str, tuple[str, str]] = field(default_factory=dict)  # edge -> junctions it joins
-    signals: Mapping[str, int] = field(default_factory=dict)  # tlLogic -> signals that its connections need
+    links: frozenset[tuple[str, str]]  # (edge, edge) pairs joined by a connection
+    ends: Mapping[str, tuple[str, str]] = field(default_factory=dict)  # edge -> start and end junction
+    signals: Mapping[str, int] = field(default_factory=dict)  # tlLogic -> number of needed signals
     warnings: tuple[str, ...] = ()
 
     def has_lane(self, lane: str) -> bool:
@@ -34,14 +34,13 @@ class Net:
 
 
 def read_net(path: Path, progress: Progress | None = None) -> Net:
-    """The net `path`, checked; `progress` in bytes.
+    """Check the net `path`; `progress` in bytes.
 
     Raises:
-        BadInput: what `cosim.files.xml_input.scan` refuses; no `version` (SUMO crashes); NaN, infinite or
-            negative numbers; lanes whose speed limit is 0; gaps in lane indices; connections
-            to lanes that are not there; junctions whose right-of-way table does not fit their connections
-            (SUMO crashes too); signals without a program or with a malformed one; lanes on the other side
-            than `lefthand` says.
+        BadInput: a file that `cosim.files.xml_input.scan` refuses; no `version` (SUMO crashes); NaN, infinite
+            or negative numbers; speed limits of 0; gaps in lane indices; connections to missing lanes;
+            right-of-way tables that do not fit the connections of their junctions (SUMO crashes too);
+            signals without a program or with a malformed one; lanes that contradict `lefthand`.
     """
     reader = _NetReader(path)
     scan(path, ("net",), reader.start, reader.end, progress=progress)
@@ -54,8 +53,8 @@ class _NetReader(Reader):
     def __init__(self, path: Path) -> None:
         super().__init__(path)
         self._lanes: dict[str, int] = {}
-        self._origins: dict[str, str] = {}  # edge -> junction it comes from; not for internal ones
-        self._ends: dict[str, str] = {}  # edge -> junction it leads to
+        self._origins: dict[str, str] = {}  # edge -> start junction, without internal edges
+        self._ends: dict[str, str] = {}  # edge -> end junction
         self._junctions: dict[str, str] = {}  # junction -> type
         self._requests: Counter[str] = Counter()  # junction -> rows of its right-of-way table
         self._inside: dict[str, list[str]] = {}  # junction -> its internal lanes
@@ -66,7 +65,7 @@ class _NetReader(Reader):
         self._signalled: dict[str, dict[int, int]] = {}  # tlLogic -> its link indices -> line
         self._lit: set[str] = set()  # junctions with a signalled connection
         self._hands = Hands(path)
-        self._opposite: list[str] = []  # lanes from which a vehicle may overtake on the opposite side
+        self._opposite: list[str] = []  # edges that allow overtaking on the opposite side
 
     def start(self, tag: str, attributes: dict[str, str], line: int) -> None:
         if tag == "net":
@@ -104,7 +103,7 @@ class _NetReader(Reader):
             self._edge = None
 
     def finish(self) -> Net:
-        """The net, once every connection is known to join lanes that are there."""
+        """The net. Raises BadInput if a connection joins missing lanes."""
         net = Net(
             path=self._path,
             lanes=self._lanes,
@@ -141,11 +140,11 @@ class _NetReader(Reader):
             self._lit.add(self._ends[edge])
 
     def _check_signals(self, net: Net) -> None:
-        """Every signalled connection has a program, with a signal for it in every phase."""
+        """Check that every signalled connection has a program with a signal for it in every phase."""
         known = {name for name, _ in self._signals.programs}
         for name, indices in self._signalled.items():
             if self._junctions.get(name) in PHASELESS:
-                continue  # SUMO makes a program for these
+                continue  # SUMO generates their programs
             lowest = min(indices)
             if name not in known:
                 self._refuse("connection", "tl", name, "no such tlLogic in the net", "", indices[lowest])
@@ -156,7 +155,7 @@ class _NetReader(Reader):
         check_lengths(self._path, self._signals.programs, net.signals)
 
     def _unlit(self) -> Iterator[str]:
-        """Junctions called signalled whose connections have no signal: SUMO drives them by right of way."""
+        """Warn of traffic-light junctions without signalled connections: SUMO applies right of way there."""
         through = {self._ends[a] for a, b, *_ in self._links if a in self._ends and not b.startswith(":")}
         kinds = {name for name, kind in self._junctions.items() if kind.startswith("traffic_light")}
         if dark := sorted((kinds & through) - self._lit):
@@ -213,7 +212,7 @@ class _NetReader(Reader):
             self._hands.lane(self._edge, attributes["shape"])
 
     def _request(self, attributes: dict[str, str], line: int) -> None:
-        """A row of the right-of-way table: SUMO uses its entries as indices."""
+        """Check a row of the right-of-way table: SUMO uses its entries as indices."""
         due = self._requests[self._junction]
         self._requests[self._junction] += 1
         for name, allowed in (("index", (str(due),)), ("cont", ("0", "1", "false", "true"))):
@@ -222,7 +221,7 @@ class _NetReader(Reader):
                 self._refuse("request", name, attributes[name], problem_, self._junction, line)
 
     def _check_ends(self) -> None:
-        """Every edge runs from a junction that is there to one that is there."""
+        """Check that every edge begins and ends at an existing junction."""
         for place, ends in (("edge.from", self._origins), ("edge.to", self._ends)):
             for edge, junction in ends.items():
                 if junction not in self._junctions:
@@ -230,7 +229,7 @@ class _NetReader(Reader):
                     raise BadInput(problem_, file=self._path, field=place, value=junction)
 
     def _check_inside(self) -> None:
-        """A lane inside a junction that a connection uses must lead out of it: SUMO does not check it."""
+        """Check that every internal lane of a connection leads out of its junction; SUMO does not."""
         leaving = {link for link in self._links if link[0].startswith(":")}
         with_via = {self._ends[a] for (a, *_), (_, via) in self._links.items() if via and a in self._ends}
         for (a, b, _, j), (line, via) in self._links.items():
@@ -245,7 +244,7 @@ class _NetReader(Reader):
                 self._refuse("connection", "via", "", f"is missing, {a} to {b}", "", line)
 
     def _check_junctions(self, connections: Mapping[str, int], net: Net) -> None:
-        """A junction's right-of-way table has one row for each connection through it (and crossing)."""
+        """Check that a right-of-way table has one row per connection and crossing of its junction."""
         crossings = Counter(m[1] for m in map(_CROSSING.fullmatch, self._lanes) if m)
         for junction, rows in self._requests.items():
             wanted = connections.get(junction, 0) + crossings[junction]

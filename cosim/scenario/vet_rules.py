@@ -1,8 +1,8 @@
-"""What the numbers in SUMO's files may be: tables for nets, vehicle types and vehicles, and one check.
+"""Permitted numbers in SUMO's files: tables for nets, vehicle types and vehicles, and one check.
 
-Taken from SUMO 1.28's own schemas (net_file.xsd, route.xsd), which SUMO does not apply to most inputs: it
-accepts NaN, infinities and negative speeds silently (docs/reference/sumo.md). Words such as
-`departPos="random"` are legal where the schema has them; SUMO itself refuses other words.
+Source: SUMO 1.28's schemas (net_file.xsd, route.xsd), which SUMO does not apply to most inputs. It accepts
+NaN, infinities and negative speeds silently (docs/reference/sumo.md). Words such as `departPos="random"` are
+legal where the schema has them; SUMO itself refuses other words.
 """
 
 import math
@@ -19,7 +19,7 @@ from cosim.errors import BadInput, Range
 class Number(Range):
     """The range of a numeric attribute."""
 
-    words: bool = False  # text that is not a number is SUMO's to judge
+    words: bool = False  # text that is not a number is left to SUMO
     time: bool = False  # H:M:S is legal too
     distribution: bool = False  # "normc(1,0.1,0.2,2)" is legal too
     whole: bool = False  # digits only
@@ -36,7 +36,7 @@ WORD_OR_TIME = Number(0.0, words=True, time=True)
 WORD_OR_NON_NEGATIVE = Number(0.0, words=True)
 WORD_OR_FINITE = Number(words=True)
 
-_NOT_A_SHAPE = re.compile(r"[^0-9eE+\-., \t\r\n]")  # NaN and inf have letters that no coordinate has
+_NOT_A_SHAPE = re.compile(r"[^0-9eE+\-., \t\r\n]")  # NaN and inf contain letters that no coordinate has
 _CALL = re.compile(r"\s*[A-Za-z]\w*\((.*)\)\s*", re.DOTALL)
 
 
@@ -49,7 +49,7 @@ def words(names: str) -> frozenset[str]:
     return frozenset(names.split())
 
 
-# Vehicle classes that drive no road, and those whose drivers an AV does not replace.
+# Vehicle classes off the road, and classes that an AV does not replace.
 OFF_ROAD = words(
     "rail rail_urban rail_electric rail_fast tram subway ship aircraft drone container cable_car"
 )
@@ -73,7 +73,7 @@ _NET: Mapping[str, Mapping[str, Number]] = {
 _SHAPES = _each(Number(shape=True), "shape customShape outlineShape")
 NET = {tag: {**_SHAPES, **rules} for tag, rules in _NET.items()}
 
-# Lane-change attributes of SUMO 1.28. The first group moves LC2013; the second only SL2015.
+# Lane-change attributes of SUMO 1.28. The first group affects LC2013; the second only SL2015.
 LC2013 = words(
     "lcStrategic lcStrategicLookahead lcCooperative lcCooperativeSpeed lcCooperativeRoundabout lcSpeedGain "
     "lcSpeedGainRight lcSpeedGainLookahead lcSpeedGainRemainTime lcSpeedGainUrgency lcKeepRight "
@@ -97,7 +97,7 @@ JUNCTION_MODEL = (
     "jmIgnoreFoeSpeed jmIgnoreFoeProb jmIgnoreJunctionFoeProb jmSigmaMinor jmStoplineGap jmStoplineGapMinor "
     "jmTimegapMinor jmExtraGap jmAdvance jmStopSignWait jmAllwayStopWait"
 )
-_CAR_FOLLOWING = (  # every remaining number of SUMO's car-following models: only finiteness is demanded
+_CAR_FOLLOWING = (  # all other numbers of SUMO's car-following models: only finiteness is required
     "delta adaptTime adaptFactor tmp1 tmp2 tmp3 tmp4 tmp5 tauLast apProb k phi security estimation "
     "speedControlGain speedControlMinGap gapClosingControlGainSpeed gapClosingControlGainSpace "
     "gapControlGainSpeed gapControlGainSpace collisionAvoidanceGainSpeed collisionAvoidanceGainSpace "
@@ -128,7 +128,7 @@ VEHICLE_TYPE: Mapping[str, Number] = {
     "speedFactor": Number(0.0, distribution=True),
     "impatience": WORD_OR_FINITE,
 }
-# Further attributes of a vType that are text; any other name is a slip of the pen worth a warning.
+# Text attributes of a vType; any other name is probably a typing error and causes a warning.
 VEHICLE_TYPE_TEXT = words(
     "id refId vClass emissionClass maneuverAngleTimes guiShape color carFollowModel laneChangeModel "
     "latAlignment hasDriverState imgFile osgFile trainType vehdynamics maxvehpreview Mflatness Mbegin "
@@ -163,7 +163,7 @@ DEMAND: Mapping[str, Mapping[str, Number]] = {
     "personFlow": _DRIVING,
     "container": _DRIVING,
     "containerFlow": _DRIVING,
-    "interval": {},  # calibrators, rerouters and flows share the name: SUMO's to judge
+    "interval": {},  # used by calibrators, rerouters and flows: left to SUMO
     "route": {
         **_each(NON_NEGATIVE, "probability repeat"),
         **_each(FINITE, "cost"),
@@ -185,7 +185,7 @@ def some(names: Sequence[str]) -> str:
 
 
 def seconds(value: str | None) -> float:
-    """A time of SUMO's in s; NaN for none."""
+    """A SUMO time in s; NaN if invalid."""
     try:
         parts = [float(part) for part in (value or "").split(":")]
     except ValueError:
@@ -194,7 +194,7 @@ def seconds(value: str | None) -> float:
 
 
 def problem(value: str, rule: Number) -> str | None:
-    """What is wrong with `value` under `rule`; None when it is fine."""
+    """The fault of `value` under `rule`; None if it is valid."""
     if rule.shape:
         return "holds something that is not a finite number" if _NOT_A_SHAPE.search(value) else None
     try:
@@ -216,24 +216,24 @@ def _problem_of_text(value: str, rule: Number) -> str | None:
 
 
 class Place(NamedTuple):
-    """Where an attribute stands, for the error about it."""
+    """The position of an attribute, for error messages."""
 
     file: Path
     field: str  # tag.attribute
-    owner: str  # id of the element, "" where it has none
+    owner: str  # id of the element, "" without one
     line: int
 
     def __str__(self) -> str:
         return f"{self.owner}, line {self.line}" if self.owner else f"line {self.line}"
 
     def wrong(self, problem: str, value: str) -> BadInput:
-        """The error; a long value is cut, for a shape may have a thousand points."""
+        """The error; a long value is shortened, since a shape may have a thousand points."""
         shown = value if len(value) <= 80 else f"{value[:77]}..."
         return BadInput(f"{problem} ({self})", file=self.file, field=self.field, value=shown)
 
 
 class Reader:
-    """What the handlers of one pass over an XML file share."""
+    """Base class of the handlers of one pass over an XML file."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -241,7 +241,7 @@ class Reader:
     def _check(
         self, tag: str, attributes: Mapping[str, str], rules: Mapping[str, Number], owner: str, line: int
     ) -> None:
-        """Refuse the first attribute that is not as its rule wants it."""
+        """Refuse the first attribute that violates its rule."""
         for name, value in attributes.items():
             if name in rules and (wrong := problem(value, rules[name])):
                 self._refuse(tag, name, value, wrong, owner, line)

@@ -1,4 +1,4 @@
-"""Read traffic light programs of a net or additional file: what SUMO would refuse, or misread silently."""
+"""Checks traffic light programs of a net or additional file for faults that SUMO refuses or misreads."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -7,16 +7,16 @@ from cosim.errors import BadInput
 from cosim.scenario.vet_rules import Place, Reader, seconds
 
 STATES = frozenset("rugGyYsoO")  # a signal's letters in a phase (SUMO, Simulation/Traffic_Lights)
-OFF = "off"  # a type, and a program's name: the signal is switched off
-PHASELESS = frozenset({"rail_signal", "rail_crossing", OFF})  # types that have none, or make their own
+OFF = "off"  # a type and a programID: the signal is switched off
+PHASELESS = frozenset({"rail_signal", "rail_crossing", OFF})  # types without phases in the file
 
 
 class SignalReader(Reader):
-    """The handlers of one pass, for the elements tlLogic and phase; `programs` is what they found."""
+    """The handlers of one pass for the elements tlLogic and phase; `programs` is the result."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
-        self.programs: dict[tuple[str, str], int] = {}  # (id, programID) -> signals of each phase, 0 of none
+        self.programs: dict[tuple[str, str], int] = {}  # (id, programID) -> signals per phase
         self._owner = ""
         self._needs_phases = False
         self._opened: Place | None = None
@@ -63,7 +63,7 @@ class SignalReader(Reader):
 
 
 def check_lengths(path: Path, programs: Mapping[tuple[str, str], int], needed: Mapping[str, int]) -> None:
-    """Raises BadInput where a program of `path` has fewer signals than its connections need, by id."""
+    """Raises BadInput if a program of `path` has fewer signals than its connections need, by id."""
     for (name, program), signals in programs.items():
         if 0 < signals < needed.get(name, 0):
             problem = (

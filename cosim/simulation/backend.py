@@ -1,7 +1,7 @@
-"""SUMO's calls as this process makes them: libsumo's, unless it joins a SUMO that somebody else started.
+"""SUMO's API for this process: libsumo, or a TraCI client when joining a running SUMO.
 
-There is one simulation per process, so there is one such object, `sumo`. libsumo and traci have the same
-calls with the same types and values.
+There is one simulation per process, hence one object, `sumo`. libsumo and traci have the same calls with the
+same types and values.
 """
 
 from collections.abc import Callable
@@ -16,7 +16,7 @@ NAMES = (
 
 
 class Backend:
-    """The domains by SUMO's names, and SUMO's exceptions; bound to libsumo at first."""
+    """SUMO's domains and exceptions by their names; initially bound to libsumo."""
 
     edge: Any
     junction: Any
@@ -36,18 +36,18 @@ class Backend:
         self.bind(libsumo)
 
     def bind(self, source: Any) -> None:
-        """Call `source` from now on: libsumo, or a `cosim.simulation.client.Client`."""
+        """Direct all calls to `source`: libsumo, or a `cosim.simulation.client.Client`."""
         self.source = source
         for name in NAMES:
             setattr(self, name, getattr(source, name))
 
     @property
     def errors(self) -> tuple[type[Exception], ...]:
-        """Everything that a call raises: the second of SUMO's two is not one of the first."""
+        """All exceptions of a call: FatalTraCIError is no subclass of TraCIException."""
         return self.TraCIException, self.FatalTraCIError
 
     def getter(self, domain: str, name: str) -> Callable[[str], Any]:
-        """`DOMAIN.getNAME`: the compiled one, since libsumo's Python wrappers double the cost of a read."""
+        """`DOMAIN.getNAME`, compiled if possible: libsumo's Python wrappers double the cost of a read."""
         if self.source is libsumo:
             found: Callable[[str], Any] = getattr(libsumo._libsumo, f"{domain}_get{name}")
         else:

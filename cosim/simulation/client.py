@@ -1,8 +1,8 @@
-"""A connection to a SUMO that somebody else started: traci's calls, with what every step needs subscribed.
+"""A TraCI connection to a running SUMO: traci's calls, with the values of every step subscribed.
 
-A call over the socket costs a hundred times what libsumo's does. So SUMO sends with every step what is asked
-of every vehicle, of signals and of the simulation; what is asked of AVs alone it sends of those of whom it
-was asked once; and commands to vehicles wait until the next call that needs an answer, to go in one message.
+A call over the socket costs a hundred times as much as one of libsumo. So values of all vehicles, signals and
+the simulation are subscribed. AV values are subscribed per vehicle, after its first query. Commands to
+vehicles are queued and sent in one message with the next call that needs an answer.
 """
 
 import contextlib
@@ -20,9 +20,9 @@ from traci.storage import Storage
 from cosim.errors import BadInput, SimulationEnded, SimulationError
 
 RETRY = 0.2  # s between attempts to connect
-EVERYWHERE = 1e6  # m around a junction
+CONTEXT_RADIUS = 1e6  # m around a junction: the whole net
 
-# Getters of libsumo and traci -> SUMO's variable (https://sumo.dlr.de/docs/TraCI), by whom they are asked of.
+# Getters of libsumo and traci -> SUMO's variable (https://sumo.dlr.de/docs/TraCI), by subscription.
 VEHICLES = {
     "getPosition": tc.VAR_POSITION,
     "getAngle": tc.VAR_ANGLE,
@@ -41,8 +41,8 @@ AVS = {
     "getRoadID": tc.VAR_ROAD_ID,
     "getRouteIndex": tc.VAR_ROUTE_INDEX,
 }
-# Asked of all AVs at once when one is asked about: variable, the form of its parameters, all of them.
-AT_TIMES: Mapping[str, tuple[int, str, Sequence[tuple[float, ...]]]] = {
+# Queried for all AVs at once when one AV is queried: variable, format and all values of its parameters.
+ON_DEMAND: Mapping[str, tuple[int, str, Sequence[tuple[float, ...]]]] = {
     "getLaneChangeState": (tc.CMD_CHANGELANE, "i", ((1,), (-1,))),
     "getNextLinks": (tc.VAR_NEXT_LINKS, "", ((),)),
     "getFollower": (tc.VAR_FOLLOWER, "d", ((60.0,),)),
@@ -63,25 +63,25 @@ SIMULATION = {
     "getStopEndingVehiclesIDList": tc.VAR_STOP_ENDING_VEHICLES_IDS,
     "getPendingVehicles": tc.VAR_PENDING_VEHICLES,
 }
-# How SUMO sends them of one vehicle: of each the variable, a status of 0, its type and its value.
-_NUMBERS = len(VEHICLES) - 2  # but for the position and the lane
+# The message of one vehicle: per variable its id, a status of 0, the type and the value.
+_NUMBERS = len(VEHICLES) - 2  # without position and lane
 _ROW, _SIZE = struct.Struct(f"!3s2d{_NUMBERS * '3sd'}3si"), struct.Struct("!i")
 _TYPES = (tc.POSITION_2D, *[tc.TYPE_DOUBLE] * _NUMBERS, tc.TYPE_STRING)
 _HEADS = tuple(bytes((variable, 0, kind)) for variable, kind in zip(VEHICLES.values(), _TYPES, strict=True))
-Row = tuple[Any, ...]  # the values, in their order
-# Commands that change nothing of the above before the next step; after any other one SUMO is asked anew.
-LATER = {"setSpeed", "setTau", "setMinGap", "setSpeedMode", "setLaneChangeMode", "changeLaneRelative"}
+Row = tuple[Any, ...]  # values in the order of `VEHICLES`
+# Commands that change no subscribed value before the next step; after any other, values are queried again.
+LAZY_COMMANDS = {"setSpeed", "setTau", "setMinGap", "setSpeedMode", "setLaneChangeMode", "changeLaneRelative"}
 
 
 class Client:
-    """One client among others of a running SUMO; an interface for `cosim.simulation.backend`.
+    """One of several clients of a running SUMO; an interface for `cosim.simulation.backend`.
 
     Args:
-        host, port: where SUMO listens; tried for `timeout` s.
-        order: the place among its clients, different for each: higher ones act later, and win a conflict.
-        timeout: s that SUMO may take to answer (it waits for all other clients).
+        host, port: SUMO's address; tried for `timeout` s.
+        order: unique rank among the clients; a higher rank acts later and wins a conflict.
+        timeout: s that SUMO may take to answer, including its wait for the other clients.
 
-    Raises BadInput where nobody listens. Any call raises SimulationEnded when the connection is lost.
+    Raises BadInput if no SUMO listens there. Any call raises SimulationEnded when the connection is lost.
     """
 
     TraCIException, FatalTraCIError, constants = TraCIException, FatalTraCIError, tc
@@ -107,25 +107,25 @@ class Client:
         self.vehicle = _Vehicles(c)
 
     def simulationStep(self) -> None:
-        """Send the commands, wait for everybody else, drive one step."""
+        """Send the commands, wait for the other clients, drive one step."""
         self._connection.flush()
-        with contextlib.redirect_stdout(io.StringIO()):  # traci says there what it misses of who was removed
+        with contextlib.redirect_stdout(io.StringIO()):  # traci prints missing values of removed vehicles
             self._connection.simulationStep()
-        if not self.simulation.came:  # no word of what was subscribed
+        if not self.simulation.results:  # the subscriptions are gone
             raise SimulationEnded("its owner has loaded another simulation")
-        here, came = self.vehicle.stepped(), self.simulation.came[""]
-        departed = came[tc.VAR_DEPARTED_VEHICLES_IDS]
-        came[tc.VAR_DEPARTED_VEHICLES_IDS] = tuple(name for name in departed if name in here)
+        here, results = self.vehicle.stepped(), self.simulation.results[""]
+        departed = results[tc.VAR_DEPARTED_VEHICLES_IDS]
+        results[tc.VAR_DEPARTED_VEHICLES_IDS] = tuple(name for name in departed if name in here)
 
     def close(self) -> None:
-        """Leave: SUMO goes on with the others."""
+        """Disconnect; SUMO continues with its other clients."""
         for last in (self._connection.flush, self.vehicle.unsubscribe, self._connection.close):
             with contextlib.suppress(TraCIException, FatalTraCIError, SimulationEnded):
                 last()
 
 
 class _Connection(Connection):  # type: ignore[misc]  # traci is not typed
-    """traci's connection with a limit on every answer; commands to vehicles wait for `flush`."""
+    """traci's connection with a timeout for every answer; commands to vehicles wait for `flush`."""
 
     _socket: Any
     _queue: list[int]
@@ -133,13 +133,13 @@ class _Connection(Connection):  # type: ignore[misc]  # traci is not typed
 
     def __init__(self, host: str, port: int, timeout: float) -> None:
         self._waits = self._gathers = False
-        self.everybody: dict[str, Row] = {}  # what came of every vehicle with the last step
+        self.vehicle_rows: dict[str, Row] = {}  # vehicle -> values of the last step
         super().__init__(host, port, None, None, False)
         self._timeout = timeout
         self._socket.settimeout(timeout)
 
     def flush(self) -> None:
-        """Send the commands that wait. One to a vehicle that somebody else has removed counts for nothing."""
+        """Send the queued commands; those to vehicles removed by another client are ignored."""
         if self._queue:
             try:
                 self._sendExact()
@@ -148,7 +148,7 @@ class _Connection(Connection):  # type: ignore[misc]  # traci is not typed
                     raise
 
     def ask(self, command: int, variable: int, form: str, asked: Sequence[tuple[Any, ...]]) -> list[Any]:
-        """The same getter of many in one message, each with (object, parameters in `form`): the values."""
+        """Call one getter for many objects in one message. `asked`: object and parameters, in `form`."""
         self.flush()
         self._gathers = True
         try:
@@ -183,7 +183,7 @@ class _Connection(Connection):  # type: ignore[misc]  # traci is not typed
             self._waits = False
 
     def _readSubscription(self, result: Any) -> Any:
-        """traci's, but for the rows of all vehicles: its own reader takes many times as long."""
+        """As traci, with a reader for vehicle rows that is many times faster."""
         begin = result._pos
         result.readLength()
         if result.read("!B")[0] == tc.RESPONSE_SUBSCRIBE_JUNCTION_CONTEXT:
@@ -191,7 +191,7 @@ class _Connection(Connection):  # type: ignore[misc]  # traci is not typed
             domain, variables, count = result.read("!BBi")
             if domain == tc.CMD_GET_VEHICLE_VARIABLE and variables == len(VEHICLES):
                 with contextlib.suppress(struct.error):
-                    self.everybody, result._pos = _rows(result._content, result._pos, count)
+                    self.vehicle_rows, result._pos = _rows(result._content, result._pos, count)
                     return junction, tc.RESPONSE_SUBSCRIBE_JUNCTION_CONTEXT
         result._pos = begin
         return super()._readSubscription(result)
@@ -212,7 +212,7 @@ class _Connection(Connection):  # type: ignore[misc]  # traci is not typed
             self._lose(f"no answer for {self._timeout:g} s: SUMO waits for all of its clients")
         except OSError:
             self._lose("SUMO has gone")
-        except BaseException:  # interrupted: what comes next would be this answer
+        except BaseException:  # interrupted: the next read would get this answer
             self._drop()
             raise
 
@@ -243,8 +243,8 @@ def _connect(host: str, port: int, timeout: float) -> _Connection:
         except ConnectionRefusedError:
             if time.monotonic() > until:
                 raise BadInput(
-                    f"no SUMO listens there (tried for {timeout:g} s); one that drives already takes nobody "
-                    "in: it waits at its start for --num-clients",
+                    f"no SUMO listens there (tried for {timeout:g} s); a running SUMO accepts no further "
+                    "clients: at its start it waits for --num-clients",
                     value=f"{host}:{port}",
                 ) from None
             time.sleep(RETRY)
@@ -253,7 +253,7 @@ def _connect(host: str, port: int, timeout: float) -> _Connection:
 
 
 def _rows(content: bytes, at: int, count: int) -> tuple[dict[str, Row], int]:
-    """`VEHICLES` of `count` vehicles from byte `at` on; where they end. Raises struct.error for others."""
+    """`VEHICLES` of `count` vehicles from byte `at`, and the end byte. Raises struct.error for other data."""
     found: dict[str, Row] = {}
     for _ in range(count):
         end = at + 4 + _SIZE.unpack_from(content, at)[0]
@@ -267,11 +267,11 @@ def _rows(content: bytes, at: int, count: int) -> tuple[dict[str, Row], int]:
 
 
 class _Domain:
-    """One of traci's domains: a getter of what is subscribed answers from what came with the last step."""
+    """One of traci's domains, whose getters answer from the subscription results of the last step."""
 
     def __init__(self, domain: Any, subscribed: Mapping[str, int]) -> None:
         self._domain = domain
-        self.came: dict[str, dict[int, Any]] = domain.getAllSubscriptionResults()  # traci keeps this object
+        self.results: dict[str, dict[int, Any]] = domain.getAllSubscriptionResults()  # updated in place
         for name, variable in subscribed.items():
             setattr(self, name, self._getter(name, variable))
 
@@ -281,59 +281,57 @@ class _Domain:
         return found
 
     def _getter(self, name: str, variable: int) -> Callable[..., Any]:
-        return lambda of="": self.came[of][variable]
+        return lambda of="": self.results[of][variable]
 
 
 class _Vehicles(_Domain):
-    """Those of `AVS` are subscribed of who is asked about."""
+    """The vehicle domain; `AVS` are subscribed for a vehicle at its first query."""
 
     def __init__(self, connection: _Connection) -> None:
         super().__init__(connection.vehicle, AVS)
         self._connection, self._junctions = connection, connection.junction
         self._junction: str = self._junctions.getIDList()[0]
         self._junctions.subscribeContext(
-            self._junction, tc.CMD_GET_VEHICLE_VARIABLE, EVERYWHERE, list(VEHICLES.values())
+            self._junction, tc.CMD_GET_VEHICLE_VARIABLE, CONTEXT_RADIUS, list(VEHICLES.values())
         )
         self._ids: tuple[str, ...] | None = None
-        self._avs: set[str] = set()  # who was asked about
-        self._told: dict[
-            tuple[Any, ...], Any
-        ] = {}  # (variable, AV, parameters) -> value, since the last step
+        self._avs: set[str] = set()  # vehicles with subscribed `AVS`
+        self._cached: dict[tuple[Any, ...], Any] = {}  # (variable, AV, parameters) -> value of this step
         for column, name in enumerate(VEHICLES):
             setattr(self, name, self._row_getter(name, column))
-        for name, (variable, form, parameters) in AT_TIMES.items():
+        for name, (variable, form, parameters) in ON_DEMAND.items():
             setattr(self, name, self._common_getter(variable, form, parameters))
 
     def stepped(self) -> set[str]:
-        """A step was driven: who is on the road now that it is our turn (others may have removed some)."""
+        """Call after a step: the vehicles on the road; other clients may have removed some."""
         self._ids = self._domain.getIDList()
         here = set(self._ids)
-        self._told.clear()
-        for vehicle in self._connection.everybody.keys() - here:
-            del self._connection.everybody[vehicle]
-            self.came.pop(vehicle, None)
+        self._cached.clear()
+        for vehicle in self._connection.vehicle_rows.keys() - here:
+            del self._connection.vehicle_rows[vehicle]
+            self.results.pop(vehicle, None)
         return here
 
     def unsubscribe(self) -> None:
-        """SUMO would send it to the other clients for ever."""
-        self._junctions.unsubscribeContext(self._junction, tc.CMD_GET_VEHICLE_VARIABLE, EVERYWHERE)
+        """End the subscription: SUMO would otherwise go on computing it for the other clients."""
+        self._junctions.unsubscribeContext(self._junction, tc.CMD_GET_VEHICLE_VARIABLE, CONTEXT_RADIUS)
 
     def getIDList(self) -> tuple[str, ...]:
-        """Everybody on the road."""
+        """All vehicles on the road."""
         if self._ids is None:
             self._ids = tuple(self._domain.getIDList())
         return self._ids
 
     def __getattr__(self, name: str) -> Any:
         call = getattr(self._domain, name)
-        if name.startswith(("set", "remove")) and name not in LATER:
+        if name.startswith(("set", "remove")) and name not in LAZY_COMMANDS:
 
             def found(vehicle: str, *values: Any) -> None:
-                if name == "remove" and vehicle in self._avs:  # else each client is told that it is missed
+                if name == "remove" and vehicle in self._avs:  # else every client gets an error message
                     self._domain.unsubscribe(vehicle)
                 call(vehicle, *values)
-                self._connection.everybody.pop(vehicle, None)
-                self.came.pop(vehicle, None)
+                self._connection.vehicle_rows.pop(vehicle, None)
+                self.results.pop(vehicle, None)
                 self._ids = None
 
         else:
@@ -346,12 +344,12 @@ class _Vehicles(_Domain):
     ) -> Callable[..., Any]:
         def get(vehicle: str, *parameters: float) -> Any:
             key = (variable, vehicle, *parameters)
-            if key not in self._told:
+            if key not in self._cached:
                 avs = {vehicle, *(self._avs & set(self.getIDList()))}
                 asked = [(one, *values) for one in avs for values in every]
                 found = self._connection.ask(tc.CMD_GET_VEHICLE_VARIABLE, variable, form, asked)
-                self._told.update(((variable, *one), v) for one, v in zip(asked, found, strict=True))
-            return self._told[key]
+                self._cached.update(((variable, *one), v) for one, v in zip(asked, found, strict=True))
+            return self._cached[key]
 
         return get
 
@@ -360,7 +358,7 @@ class _Vehicles(_Domain):
 
         def get(vehicle: str) -> Any:
             try:
-                return connection.everybody[vehicle][column]
+                return connection.vehicle_rows[vehicle][column]
             except KeyError:
                 return ask(vehicle)
 
@@ -371,12 +369,12 @@ class _Vehicles(_Domain):
 
         def get(vehicle: str) -> Any:
             try:
-                return self.came[vehicle][variable]
+                return self.results[vehicle][variable]
             except KeyError:
-                if vehicle in self._avs:  # it was changed since the last step
+                if vehicle in self._avs:  # a command changed the vehicle since the last step
                     return ask(vehicle)
                 self._domain.subscribe(vehicle, list(AVS.values()))
                 self._avs.add(vehicle)
-                return self.came[vehicle][variable]
+                return self.results[vehicle][variable]
 
         return get

@@ -1,11 +1,11 @@
-"""Converts SUMO's positions, angles and types of vehicles to ours; needs no SUMO: file readers use it too."""
+"""Converts SUMO's positions, angles and vType names; needs no SUMO, so file readers use it too."""
 
 import numpy as np
 import numpy.typing as npt
 
 from cosim.types import Floats
 
-# The types of AVs in SUMO's outputs begin so, and nobody else's: then follows the name of their own type.
+# Prefix of AV types in SUMO's outputs, and of no other types; the name of the original type follows.
 OURS = "cosim."
 AV_TYPE = f"{OURS}av."
 
@@ -22,8 +22,8 @@ def centres(
 
 
 def type_names(vehicle_type: str) -> tuple[str, ...]:
-    """The type as SUMO writes it, then what it was made of: `type@vehicle` is one vehicle's own copy,
-    `type/class` one of ours, `cosim.av.type` that of an AV."""
+    """The type as SUMO writes it, then the types it is derived from: `type@vehicle` is one vehicle's copy,
+    `type/class` has a Table II driver, `cosim.av.type` is an AV's."""
     of_copy = vehicle_type.partition("@")[0]
     ours = of_copy.rpartition("/")[0] or of_copy  # a user's types may have slashes too
     return vehicle_type, of_copy, ours, of_copy.removeprefix(AV_TYPE), ours.removeprefix(AV_TYPE)

@@ -1,4 +1,4 @@
-"""SUMO's conventions end here: front bumper and degrees clockwise from north become centre and radians."""
+"""Converts SUMO's data: front bumper and degrees clockwise from north become centre and radians."""
 
 import re
 from collections import Counter
@@ -19,18 +19,18 @@ from cosim.simulation.backend import sumo
 from cosim.simulation.conventions import centres
 from cosim.types import Actor, Bytes, Due, Events, Floats, Kind, Snapshot
 
-# Of every vehicle.
+# Getters of every vehicle.
 READ = (
     *("Position", "Angle", "Speed", "Acceleration", "LaneID", "LanePosition"),
     *("TimeLoss", "CO2Emission"),  # s, mg/s
 )
-# The same of persons, of whose acceleration SUMO says nothing. No lane is theirs: they walk beside, along,
-# against and across those of vehicles.
-NOT_OF_PERSONS: tuple[Callable[[str], Any], ...] = (
+# Substitutes for persons: SUMO has no acceleration of persons, and persons have no lane. They walk beside,
+# along, against and across the lanes of vehicles.
+PERSON_DEFAULTS: tuple[Callable[[str], Any], ...] = (
     *(lambda _: 0.0, lambda _: "", lambda _: 0.0),
     *(lambda _: 0.0, lambda _: 0.0),
 )
-PERSON = "person:"  # a person's name in a snapshot: this and its id, which may be a vehicle's too
+PERSON = "person:"  # prefix of a person's id in a snapshot: a vehicle may have the same id
 GIVE_WAY = "mswZ"  # link states: minor, stop, all-way stop, zipper (SUMO, Networks/SUMO_Road_Networks)
 # link states at a stop line without signals (SUMO, Networks/SUMO_Road_Networks)
 RULES = {"m": Rule.YIELD, "s": Rule.STOP, "w": Rule.ALL_WAY_STOP, "=": Rule.EQUAL, "Z": Rule.ZIPPER}
@@ -55,41 +55,41 @@ ACTORS = {
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """What does not change while a vehicle drives."""
+    """Constants of a vehicle."""
 
     kind: Kind
     mission: bool
     length: float  # m
     width: float  # m
     actor: Actor = Actor.CAR
-    guessed: bool = False  # a mission vehicle that nobody named
+    guessed: bool = False  # a mission vehicle guessed from the net
 
 
 class SnapshotReader:
     """Reads every vehicle with plain getters (measured faster than subscriptions, docs/reference/sumo.md)."""
 
     def __init__(self, road: RoadMap, variable: Iterable[int] = ()) -> None:
-        """`variable`: the lanes whose speed limit may change."""
+        """`variable`: lanes with a changeable speed limit."""
         self._lane_index = road.index
         self._variable = [(k, road.lanes[k].id, road.lanes[k].speed_limit) for k in variable]
         self._limit_of = sumo.getter("lane", "MaxSpeed")
         self._edges = road.contact.edges
         self._lights = Counter(light for light, _ in road.signals)  # -> how many signals, in their order
         self._of_vehicles = tuple(sumo.getter("vehicle", name) for name in READ)
-        self._of_persons = (*(sumo.getter("person", name) for name in READ[:3]), *NOT_OF_PERSONS)
+        self._of_persons = (*(sumo.getter("person", name) for name in READ[:3]), *PERSON_DEFAULTS)
         self._ids: tuple[str, ...] | None = None
         self._persons: tuple[str, ...] | None = None
         # kind, mission, length m, width m, actor [n] of `_ids`
         self._static: tuple[np.ndarray, ...] = ()
 
     def bodies_changed(self) -> None:
-        """Build the constant columns anew at the next read (a new episode, a new mission vehicle)."""
+        """Rebuild the constant columns at the next read (new episode, new mission vehicle)."""
         self._ids = None
         self.persons_changed()
 
     def persons_changed(self) -> None:
-        """Ask anew at the next read who is there: SUMO looks through all that it has loaded, which of a flow
-        are those of the whole day."""
+        """Query the persons again at the next read. The query is slow: SUMO searches all loaded persons, with
+        a flow those of the whole day."""
         self._persons = None
 
     def read(
@@ -98,8 +98,8 @@ class SnapshotReader:
         """One snapshot of every vehicle and every walking person on the road, sorted by id.
 
         Args:
-            bodies: what is constant of each vehicle that has departed, by id; new persons are added.
-            events: what happened since the last snapshot.
+            bodies: constants of every departed vehicle, by id; new persons are added.
+            events: events since the last snapshot.
             waiting: see `Snapshot`.
         """
         persons = self._walking() if sumo.person.getIDCount() else {}
@@ -156,21 +156,21 @@ class SnapshotReader:
         )
 
     def _walking(self) -> dict[str, str]:
-        """Name -> SUMO's id of everybody on foot: neither in a vehicle or waiting for one, nor busy
-        elsewhere."""
+        """Name -> SUMO's id of every walking person: not riding, not waiting for a ride, at no other
+        stage."""
         get, on_foot = sumo.person, sumo.constants.STAGE_WALKING
         if self._persons is None:
             self._persons = get.getIDList()
         return {PERSON + i: i for i in self._persons if get.getStage(i).type == on_foot}
 
     def _signals(self) -> Bytes:
-        """[s] the state of every signal; a light may have states for more links than there are."""
+        """[s] the state of every signal; a traffic light may have more states than links."""
         get = sumo.trafficlight
         states = (get.getRedYellowGreenState(light)[:count] for light, count in self._lights.items())
         return np.frombuffer("".join(states).encode(), np.uint8)
 
     def _switches(self) -> Floats:
-        """[s] s until the next phase of every signal's light."""
+        """[s] s until the next phase of every signal's traffic light."""
         get, now = sumo.trafficlight.getNextSwitch, sumo.simulation.getTime()
         left = np.array([get(light) for light in self._lights], np.float64) - now
         return np.repeat(left, np.fromiter(self._lights.values(), np.int64))
@@ -182,10 +182,10 @@ def _person(person: str) -> Body:
 
 
 def read_road(zones: Sequence[Zone], scenario_file: object) -> RoadMap:
-    """The loaded net as a RoadMap (m, m/s): every lane that a motor vehicle may use.
+    """The loaded net as a RoadMap (m, m/s): every lane that is open to motor vehicles.
 
     Args:
-        zones: the conflict zones by their edges; without any, minor approaches and ending lanes make one.
+        zones: conflict zones by their edges; if empty, minor approaches and ending lanes form one.
         scenario_file: named in errors.
 
     Raises:
@@ -230,7 +230,7 @@ def read_road(zones: Sequence[Zone], scenario_file: object) -> RoadMap:
 def _links(
     lanes: Sequence[Lane], place: Mapping[str, int]
 ) -> tuple[tuple[Link, ...], tuple[tuple[str, int], ...]]:
-    """Every link with its rule and foes; and the (traffic light, link index) of every signal."""
+    """Every link with its rule and foes, and the (traffic light, link index) of every signal."""
     get, lights = sumo.lane, sumo.trafficlight
     signals: list[tuple[str, int]] = []
     signal_of: dict[tuple[str, str], int] = {}  # (origin, target) -> index into `signals`
@@ -241,7 +241,7 @@ def _links(
     requests = _requests()
     links: list[Link] = []
     row_of: dict[str, int] = {}  # the last lane of a link inside its junction -> the link
-    yields: list[tuple[str, ...]] = []  # per link: such lanes of the links that go first
+    yields: list[tuple[str, ...]] = []  # per link: the last lanes of the links with priority over it
     for lane in lanes:
         for target, _, _, _, via, state, *_ in () if lane.internal else get.getLinks(lane.id):
             if target not in place:
@@ -250,17 +250,17 @@ def _links(
             last = via
             while last and (inner := next((way[4] for way in get.getLinks(last) if way[0] == target), "")):
                 last = inner
-            before, met = requests.get(last, ((), ()))
+            before, foes = requests.get(last, ((), ()))
             rule = RULES.get(state, Rule.PRIORITY) if signal < 0 else Rule.YIELD if before else Rule.PRIORITY
             row_of[last] = len(links)
-            yields.append(tuple(name for name in before if name in met))
+            yields.append(tuple(name for name in before if name in foes))
             links.append(Link(place[lane.id], place.get(via, -1), place[target], signal, rule))
     found = [tuple(row_of[name] for name in names if name in row_of) for names in yields]
     return tuple(replace(k, foes=f) for k, f in zip(links, found, strict=True)), tuple(signals)
 
 
 def _closed(lanes: Sequence[Lane]) -> tuple[Lane, ...]:
-    """A lane of every edge that has none for motor vehicles: footpaths, cycleways, rails."""
+    """One lane of every edge closed to motor vehicles: footpaths, cycleways, rails."""
     get, known = sumo.lane, {lane.edge for lane in lanes}
     found = []
     for edge in sumo.edge.getIDList():
@@ -276,8 +276,8 @@ def _closed(lanes: Sequence[Lane]) -> tuple[Lane, ...]:
 
 
 def _requests() -> dict[str, tuple[tuple[str, ...], tuple[str, ...]]]:
-    """Of the loaded net's right-of-way tables, which SUMO's calls give per lane only: the last lane of a link
-    inside its junction -> those of the links that go first, and those of the links that it meets."""
+    """The right-of-way tables of the net file, since TraCI has them per lane only. The last internal lane of
+    a link -> such lanes of the links with priority over it, and of all conflicting links (foes)."""
     found: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {}
     inside: list[str] = []
 
@@ -285,13 +285,13 @@ def _requests() -> dict[str, tuple[tuple[str, ...], tuple[str, ...]]]:
         if tag == "junction":
             inside[:] = attributes.get("intLanes", "").split()
         elif tag == "request" and int(attributes["index"]) < len(inside):
-            before, met = (
+            before, foes = (
                 tuple(
                     name for name, bit in zip(inside, reversed(attributes[row]), strict=False) if bit == "1"
                 )
                 for row in ("response", "foes")
             )
-            found[inside[int(attributes["index"])]] = before, met
+            found[inside[int(attributes["index"])]] = before, foes
 
     scan(Path(sumo.simulation.getOption("net-file")), ("net",), start)
     return found
@@ -314,13 +314,13 @@ def _crossings(place: Mapping[str, int], signals: Sequence[tuple[str, int]]) -> 
 
 
 def may_change(lane: str, offset: int, vehicle_class: str) -> bool:
-    """Whether SUMO lets a vehicle of this class leave the lane to that side (+1 left), if there is a lane."""
+    """Whether SUMO permits this vehicle class a lane change to that side (+1 left), given a lane there."""
     return not lane.startswith(":") and vehicle_class in sumo.lane.getChangePermissions(lane, offset)
 
 
 def _beside(lane: str, place: Mapping[str, int], offset: int) -> int:
-    """The lane to that side (+1 left) that a car may change to, -1 without one: a command that SUMO will
-    refuse is seen beforehand. Lanes closed to cars are asked on behalf of those that may use them."""
+    """The lane to that side (+1 left) that a car may change to; -1: none, SUMO would refuse the command. For
+    lanes closed to cars, the permitted vehicle classes decide."""
     edge, _, number = lane.rpartition("_")
     other = f"{edge}_{int(number) + offset}"
     if other not in place:
@@ -331,9 +331,9 @@ def _beside(lane: str, place: Mapping[str, int], offset: int) -> int:
 
 
 def struggling_lanes(road: RoadMap) -> frozenset[int]:
-    """Lanes whose driver needs the help of others: they end beside others that go on, or must give way.
+    """Lanes on which drivers depend on others: the lane ends beside a continuing one, or must yield.
 
-    This is how the mission vehicle of a user's own net is found when none is named.
+    Used to guess the mission vehicle of a user's own net.
     """
     return frozenset(
         i for i, lane in enumerate(road.lanes) if not lane.internal and _needs_help(lane, road.lanes)
@@ -348,7 +348,7 @@ def _needs_help(lane: Lane, lanes: Sequence[Lane]) -> bool:
 
 
 def _struggling_zone(road: RoadMap) -> ConflictZone:
-    """Without a scenario.yaml the conflict lies where a minor approach or an ending lane meets others."""
+    """The conflict zone without a scenario.yaml: the lanes entered from minor approaches and ending lanes."""
     ways = [road.lanes[i] for i in struggling_lanes(road)]
     entered = (o for way in ways for o in way.successors or (way.left, way.right) if o >= 0)
     return ConflictZone("found", frozenset(entered))

@@ -1,8 +1,8 @@
-"""The types that vehicles drive as in place of their own: the vehicle is theirs, the driver is not.
+"""Derived vTypes: the body of a vehicle's own vType with another driver.
 
-Which drivers there will be is known before SUMO starts, and `cosim.scenario.vehicle_types` writes a type for
-each. A type that no file has (made by another TraCI program, or in a SUMO that somebody else started) is
-derived while SUMO drives, from what its calls can read and set.
+The drivers are known before SUMO starts, and `cosim.scenario.vehicle_types` writes a vType for each. A vType
+that no file has is derived at run time, from the attributes that TraCI can read and set. That happens for
+vTypes made by another TraCI client, or in a SUMO that cosim did not start.
 """
 
 import sumo_scenarios
@@ -14,11 +14,11 @@ from cosim.simulation.backend import sumo
 from cosim.simulation.conventions import AV_TYPE
 from cosim.types import Preset
 
-# sumo_scenarios/types.add.xml: an IDM; one that brakes comfortably, and one that brakes late
+# sumo_scenarios/types.add.xml: IDM; IDM with comfortable braking; IDM with late braking
 IDM_TYPE, LAWFUL_TYPE, LATE_TYPE = "cosim.idm", "cosim.av.lawful", "cosim.av.late"
-EMERGENCY_DECELERATION = 9.0  # m/s2, the limit of the tyres (SUMO's default)
+EMERGENCY_DECELERATION = 9.0  # m/s2, tyre limit (SUMO's default)
 
-# What a type keeps that is derived while SUMO drives: getters and setters of sumo.vehicletype, in this order.
+# Attributes kept by a vType derived at run time: getters and setters of sumo.vehicletype, in this order.
 BODY = (
     *("VehicleClass", "Length", "Width", "Height", "MaxSpeed", "ShapeClass", "Color"),
     *("EmissionClass", "Mass", "SpeedFactor", "Impatience", "BoardingDuration", "Scale"),
@@ -27,19 +27,19 @@ BODY = (
 _BODY_ATTRIBUTES = frozenset(
     {"vClass", "guiShape", "speedDev"}
     | {name[0].lower() + name[1:] for name in BODY}
-    | {"id", "probability"}  # which describe no vehicle
+    | {"id", "probability"}  # no vehicle attributes
 )
 
 
 def suffix(base: str) -> str:
-    """What the name of a type ends with that drives as type `base`."""
+    """Suffix of the name of a vType with the driver of type `base`."""
     return f"/{base.rpartition('.')[2]}"
 
 
 def drivers(scenario: Scenario, av_types: frozenset[str]) -> tuple[Driver, ...]:
-    """Everybody who may drive a vehicle of `scenario` in place of its type's own driver.
+    """The drivers that may replace those of the vTypes in `scenario`.
 
-    `av_types`: the types that are meant where the scenario's fleet is one by type.
+    `av_types`: the vTypes of AVs, for a fleet chosen by type.
     """
     base = {
         name: {key: value for key, value in kind.attributes.items() if key != "id"}
@@ -47,7 +47,7 @@ def drivers(scenario: Scenario, av_types: frozenset[str]) -> tuple[Driver, ...]:
     }
     found = []
     if scenario.fleet != Fleet():
-        # in our worlds an AV drives as its type says, one of a user's file, or of no type, by IDM
+        # in a scenario folder an AV drives as its vType says; in a .sumocfg, or without a vType, by IDM
         avs, idm = av_types or None, base[IDM_TYPE]
         found.append(Driver(AV_TYPE, "", {} if scenario.built_in else idm, avs, fallback=idm))
         if scenario.preset == Preset.LAWFUL:
@@ -62,13 +62,13 @@ def drivers(scenario: Scenario, av_types: frozenset[str]) -> tuple[Driver, ...]:
 
 
 def table_ii(driver: DriverClass, step: float) -> dict[str, float]:
-    """A class of Table II as attributes of a type; it acts in every step (s) of the simulation."""
+    """A Table II class as vType attributes, acting in every simulation `step` (s)."""
     idm = driver.idm
     return {
         "tau": idm.time_headway,
         "minGap": idm.minimum_gap,
         "accel": idm.max_acceleration,
-        # before decel: SUMO warns when it is below the comfortable one
+        # before decel: SUMO warns if emergencyDecel is below decel
         "emergencyDecel": max(EMERGENCY_DECELERATION, idm.comfortable_deceleration),
         "decel": idm.comfortable_deceleration,
         "apparentDecel": idm.comfortable_deceleration,
@@ -77,7 +77,7 @@ def table_ii(driver: DriverClass, step: float) -> dict[str, float]:
 
 
 def own_type(vehicle: str) -> str:
-    """The type of a vehicle; of its own copy of one (`type@vehicle`) the type."""
+    """The vType of a vehicle, without the suffix of its own copy (`type@vehicle`)."""
     kind: str = sumo.vehicle.getTypeID(vehicle)
     return kind.removesuffix(f"@{vehicle}")
 
@@ -92,15 +92,15 @@ def is_known(name: str) -> bool:
 
 
 def not_derived(kind: WrittenType) -> set[str]:
-    """What a type that is derived while SUMO drives does not have of this one."""
+    """Attributes of this vType that a vType derived at run time lacks."""
     own = {name for name in kind.attributes if name not in _BODY_ATTRIBUTES and not describes_driver(name)}
     return own | {"parameters" for tag, _ in kind.children if tag == "param"}
 
 
 def derive(name: str, own: str, base: str) -> None:
-    """Make type `name` where no file has: type `own`, as far as SUMO's calls can tell, driven as `base`.
+    """Make vType `name` at run time: body of `own`, as far as TraCI can read it, driver of `base`.
 
-    Raises BadInput where the base type has not been loaded and the type's own driver is no IDM.
+    Raises BadInput if `base` has not been loaded and `own` does not use IDM.
     """
     get = sumo.vehicletype
     if is_known(base):

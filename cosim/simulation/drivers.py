@@ -1,4 +1,4 @@
-"""Makes each HV in SUMO drive like its class of Table II (`cosim.scenario.behaviors`)."""
+"""Assigns each HV in SUMO a driver class of Table II (`cosim.scenario.behaviors`)."""
 
 import hashlib
 
@@ -12,10 +12,10 @@ LARGEST_DRAW = 1.0 - 1e-12  # in (0, 1): the division rounds up to 1 for the lar
 
 
 class Drivers:
-    """Gives every HV of an episode its class; a new object per episode (types vanish with a reload).
+    """Assigns every HV of an episode its class; a new object per episode (a reload drops the types).
 
-    The draw is a hash of (seed, vehicle id): it does not depend on who departs first, so that two episodes
-    of one seed under different AV policies meet the same drivers.
+    The draw is a hash of (seed, vehicle id), independent of the order of departures. So two episodes of one
+    seed have the same drivers under different AV policies.
     """
 
     def __init__(
@@ -31,12 +31,12 @@ class Drivers:
                 value=driver_model,
             )
         self.behavior, self.driver_model, self.seed = behavior, driver_model, seed
-        self.classes: dict[str, str] = {}  # vehicle -> class, of all HVs so far
+        self.classes: dict[str, str] = {}  # HV -> class, of all departed HVs
         self.mobil = MobilDriving(self.behaviors.mobil_period) if driver_model == MOBIL else None
         self._types: set[str] = set()  # known to SUMO
 
     def draws(self, vehicle: str) -> tuple[float, float, float]:
-        """Three uniform numbers in (0, 1) of one vehicle: for its class, desired speed and phase."""
+        """Three uniform numbers in (0, 1) for a vehicle's class, desired speed and MOBIL phase."""
         key = f"{self.seed}/behavior/{vehicle}".encode()
         digest = hashlib.blake2b(key, digest_size=24).digest()
         a, b, c = (
@@ -45,14 +45,14 @@ class Drivers:
         return a, b, c
 
     def apply(self, vehicle: str) -> str:
-        """Make one departed HV drive like its class; returns the class ("as-is": nothing is touched)."""
+        """Apply the driver class to a departed HV; return the class ("as-is": nothing changes)."""
         if self.behavior == AS_IS:
             return AS_IS
         u_class, u_speed, u_phase = self.draws(vehicle)
         driver = self.behaviors.draw(self.behavior, u_class)
         set_ = sumo.vehicle
         set_.setType(vehicle, self._type(own_type(vehicle), driver))
-        # setType leaves the lane-change parameters of the old type in place (SUMO 1.28): set each of them.
+        # setType keeps the lane-change parameters of the old type (SUMO 1.28): set each of them.
         for key, value in driver.lc2013:
             set_.setParameter(vehicle, f"laneChangeModel.{key}", repr(value))
         set_.setSpeedFactor(vehicle, self.behaviors.desired_speed.draw(u_speed))
@@ -62,12 +62,12 @@ class Drivers:
         return driver.name
 
     def drop(self, vehicle: str) -> None:
-        """The vehicle crashed: it changes lanes no more."""
+        """The vehicle crashed: no further lane changes."""
         if self.mobil is not None:
             self.mobil.drop(vehicle)
 
     def pause(self, vehicle: str) -> None:
-        """It makes no lane changes of its own until `resume`."""
+        """Suspend the vehicle's MOBIL lane changes until `resume`."""
         if self.mobil is not None:
             self.mobil.paused.add(vehicle)
 
@@ -82,7 +82,7 @@ class Drivers:
             self.mobil.step()
 
     def _type(self, original: str, driver: DriverClass) -> str:
-        """The vehicle type of a class with a vehicle's own type."""
+        """The vType that combines an original vType with a driver class."""
         name = f"{original}/{driver.name}"
         if name not in self._types:
             self._types.add(name)
@@ -91,12 +91,12 @@ class Drivers:
         return name
 
     def _derive(self, name: str, original: str, driver: DriverClass) -> None:
-        """While SUMO drives: see `cosim.simulation.derived_types`."""
+        """Derive the vType at run time: see `cosim.simulation.derived_types`."""
         draft, set_ = f"{name}/draft", sumo.vehicletype
         derive(draft, original, IDM_TYPE)
         for parameter, value in table_ii(driver, sumo.simulation.getDeltaT()).items():
             getattr(set_, f"set{parameter[0].upper()}{parameter[1:]}")(draft, value)
         set_.setSpeedDeviation(draft, 0.0)
-        # SUMO's IDM keeps the 2 sqrt(a b) of its construction: setAccel and setDecel change a and b, but
-        # not d* (measured: -0.06 instead of -0.44 m/s2). Copying the type constructs the model anew.
+        # SUMO's IDM computes 2 sqrt(a b) once, at construction: setAccel and setDecel do not update d*
+        # (measured: -0.06 instead of -0.44 m/s2). Copying the type constructs the model anew.
         set_.copy(draft, name)

@@ -1,4 +1,4 @@
-"""An in-memory Simulator without SUMO: a straight road, IDM followers, commanded AVs. For your tests."""
+"""An in-memory Simulator without SUMO, for tests: a straight road, IDM drivers, commanded AVs."""
 
 import copy
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ LATERAL_SPEED = LANE_WIDTH / 2.0  # m/s: a lane change takes 2 s
 
 @dataclass(slots=True)
 class FakeVehicle:
-    """One vehicle of the fake simulator; `x` is the front bumper's place along the road in m."""
+    """One vehicle of the fake simulator; `x`: m along the road, of the front bumper."""
 
     id: str
     x: float
@@ -25,13 +25,13 @@ class FakeVehicle:
     speed: float  # m/s
     is_av: bool = False
     mission: bool = False
-    desired: float = 25.0  # m/s, of an HV (and of an AV without a command)
-    target: float | None = None  # m/s, once commanded
-    asks: float | None = None  # m/s2, in its place
-    goal_lane: int = -1  # while a lane change is under way
+    desired: float = 25.0  # m/s, desired speed without a command
+    target: float | None = None  # m/s, commanded speed
+    asks: float | None = None  # m/s2, commanded acceleration, in place of `target`
+    goal_lane: int = -1  # target of the active lane change; -1: none
     offset: float = 0.0  # m, lateral, from the centre of `lane`
     accel: float = 0.0
-    time_loss: float = 0.0  # s, against its desired speed
+    time_loss: float = 0.0  # s, relative to the desired speed
     length: float = 5.0
     width: float = 2.0
 
@@ -39,7 +39,7 @@ class FakeVehicle:
 class FakeSimulator:
     """`cosim.types.Simulator` on a straight road of `lanes` lanes and `length` m.
 
-    `vehicles` start each episode as given; `seed` only jitters their places by +-1 m.
+    `vehicles` start each episode as given; `seed` only shifts their positions by at most 1 m.
     """
 
     courtesy = 1.0
@@ -70,7 +70,7 @@ class FakeSimulator:
         return (self._snapshot(),)
 
     def advance(self, commands: Sequence[Command]) -> tuple[tuple[Receipt, ...], tuple[Snapshot, ...]]:
-        """Hold the commands for one decision."""
+        """Apply the commands for one decision."""
         named = {c.vehicle for c in commands}
         for v in self._vehicles.values():
             if v.id not in named:
@@ -81,7 +81,7 @@ class FakeSimulator:
     def ahead(
         self, frames: int, commands: Sequence[Command] = (), *, errors: bool = False
     ) -> tuple[Snapshot, ...]:
-        """The next frames; nobody errs."""
+        """A counterfactual rollout; without driver errors."""
         other = copy.copy(self)
         other._vehicles, other._hit = copy.deepcopy(self._vehicles), set(self._hit)
         other._arrived = [*self._arrived]
@@ -98,17 +98,17 @@ class FakeSimulator:
         return tuple(found)
 
     def route(self, vehicle: str) -> tuple[str, ...]:
-        """The one edge there is."""
+        """The only edge."""
         return ("road",)
 
     def commanded(self, vehicle: str) -> tuple[float | None, int]:
-        """Target speed in m/s and the lane change under way."""
+        """Target speed in m/s and the active lane change."""
         v = self._vehicles[vehicle]
         return v.target, 0 if v.goal_lane < 0 else int(np.sign(v.goal_lane - v.lane))
 
     @property
     def tilted(self) -> tuple[float, dict[str, list[float]]]:
-        """Nobody errs."""
+        """No driver errors."""
         return 0.0, {}
 
     def counts(self) -> dict[str, int]:

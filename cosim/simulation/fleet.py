@@ -1,4 +1,4 @@
-"""Decides which vehicles are AVs and mission vehicles, and gives each departed vehicle its driver."""
+"""Selects AVs and mission vehicles, and assigns each departed vehicle its driver."""
 
 import math
 import re
@@ -16,14 +16,14 @@ from cosim.simulation.derived_types import IDM_TYPE, derive, is_known, own_type
 from cosim.simulation.drivers import Drivers
 from cosim.types import Actor, Kind, Preset
 
-# presets.md, Policies: what an AV drives with while it has no command (egoistic IDM).
+# presets.md, Policies: IDM of an AV without a command (egoistic).
 AV_IDM = {"tau": 0.8, "minGap": 2.0, "accel": 3.0, "decel": 7.0}  # s, m, m/s2
 AV_LANE_CHANGE = {
     "laneChangeModel.lcCooperative": "0",
     "laneChangeModel.lcCooperativeSpeed": "0",
     "laneChangeModel.lcKeepRight": "0",
 }
-# What a vehicle keeps when its type changes: getters and setters of sumo.vehicle, in this order.
+# Vehicle attributes kept at a change of vType: getters and setters of sumo.vehicle, set in this order.
 KEPT = (
     *("Length", "Width", "Height", "MaxSpeed", "SpeedFactor", "VehicleClass"),
     *("ShapeClass", "EmissionClass", "Mass"),
@@ -31,7 +31,7 @@ KEPT = (
 
 
 class Fleet:
-    """Decides for every vehicle that departs; the draws depend on (seed, id) only, never on the order."""
+    """The fleet of an episode; draws depend on (seed, id) only, never on the order of departures."""
 
     def __init__(
         self,
@@ -40,17 +40,17 @@ class Fleet:
         av_parameters: Mapping[str, str],
         av_types: frozenset[str] = frozenset(),
     ) -> None:
-        """`av_types`: the types that are meant where the scenario's fleet is one by type."""
+        """`av_types`: the vTypes of AVs, for a fleet chosen by type."""
         self._scenario = scenario
         self._drivers = drivers
         self._idm = {name: _number(name, av_parameters.get(name, usual)) for name, usual in AV_IDM.items()}
         others = {key: text for key, text in av_parameters.items() if key not in AV_IDM}
         self._av_parameters = {**AV_LANE_CHANGE, **others}
-        self._meant = av_types or {scenario.fleet.type}
-        self._av_types: set[str] = set()  # of AVs, known to SUMO
+        self._fleet_types = av_types or {scenario.fleet.type}
+        self._av_types: set[str] = set()  # AV vTypes known to SUMO
 
     def depart(self, vehicle: str, seed: int) -> Body:
-        """A vehicle departed: give it its driver; what it is."""
+        """Assign a departed vehicle its driver; return its constants."""
         get, s = sumo.vehicle, self._scenario
         is_av = self.is_av(vehicle, seed)
         if is_av:
@@ -66,7 +66,7 @@ class Fleet:
         return Body(Kind.AV if is_av else Kind.HV, s.mission.includes(vehicle), *size, actor)
 
     def _take_av_type(self, vehicle: str) -> None:
-        """In our worlds an AV drives as its type says, one of a user's file by IDM."""
+        """Set the AV's vType: as its type says in a scenario folder, IDM in a user's .sumocfg."""
         own, ours = own_type(vehicle), self._scenario.built_in
         name = AV_TYPE + own
         if name not in self._av_types:
@@ -77,15 +77,15 @@ class Fleet:
             sumo.vehicle.setType(vehicle, name)
         else:
             set_type(vehicle, name)
-            mean = sumo.vehicletype.getSpeedFactor(own)  # not a draw about it
+            mean = sumo.vehicletype.getSpeedFactor(own)  # the mean, without SUMO's random draw
             sumo.vehicle.setSpeedFactor(vehicle, mean)
             limit = sumo.lane.getMaxSpeed(sumo.vehicle.getLaneID(vehicle))
             if self._scenario.preset == Preset.LAWFUL and sumo.vehicle.getSpeed(vehicle) > limit:
-                sumo.vehicle.setPreviousSpeed(vehicle, limit)  # its file asks for more
+                sumo.vehicle.setPreviousSpeed(vehicle, limit)  # the file's departSpeed exceeds the limit
 
     def is_av(self, vehicle: str, seed: int) -> bool:
-        """Whether a vehicle that waits or has just departed is an AV; once it has its driver, type says no
-        more."""
+        """Whether a waiting or just departed vehicle is an AV. Not valid later: the driver changes the
+        vType."""
         rule = self._scenario.fleet
         if self._scenario.mission.includes(vehicle):
             return False
@@ -95,14 +95,14 @@ class Fleet:
             drawn = uniform(seed, "av", vehicle) < rule.penetration
             return drawn and sumo.vehicle.getVehicleClass(vehicle) not in NOT_CARS
         if rule.type is not None:
-            return own_type(vehicle) in self._meant
+            return own_type(vehicle) in self._fleet_types
         return False
 
 
 def set_type(vehicle: str, name: str) -> None:
-    """Give a vehicle another type; what it has of its own (`type@vehicle`) stays.
+    """Change a vehicle's vType but keep its own attributes (`type@vehicle`).
 
-    `setType` replaces the car-following model (Krauss in most files); nothing else can.
+    Only `setType` replaces the car-following model (Krauss in most files).
     """
     get = sumo.vehicle
     kept = {field: getattr(get, f"get{field}")(vehicle) for field in KEPT}

@@ -1,4 +1,4 @@
-"""What would come: the simulation goes on in a copy of this process, while the real one stands still."""
+"""Counterfactual rollouts: the simulation continues in a copy of this process, and the original waits."""
 
 import os
 import pickle
@@ -12,13 +12,13 @@ Answer = TypeVar("Answer")
 
 
 def forked(work: Callable[[], Answer]) -> Answer:
-    """What `work` returns, done in a copy of this process, which then is no more.
+    """The result of `work`, run in a short-lived copy of this process (os.fork).
 
-    libsumo holds its state in memory, so a copy of the process is a copy of the simulation (SUMO's own
-    saveState leaves lane changes under way and the states of car-following models out). The copy has one
-    thread: `work` may use torch only where that has one thread too. Its answer is pickled.
+    libsumo holds its state in memory, so a copy of the process is a copy of the simulation. SUMO's saveState
+    omits active lane changes and the states of car-following models. The copy has one thread, so `work` may
+    use torch only with one thread. The result is pickled.
 
-    Raises what `work` raised, if that is a CosimError; else SimulationError.
+    Raises a CosimError of `work`; else SimulationError.
     """
     ours, theirs = os.pipe()
     child = os.fork()
@@ -26,7 +26,7 @@ def forked(work: Callable[[], Answer]) -> Answer:
         code = 1
         try:
             os.close(ours)
-            signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
+            signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles interrupts
             answer: object
             try:
                 answer = work()
@@ -36,7 +36,7 @@ def forked(work: Callable[[], Answer]) -> Answer:
                 pickle.dump(answer, pipe, pickle.HIGHEST_PROTOCOL)
             code = 0
         finally:
-            os._exit(code)  # nothing of the parent's is flushed or cleaned up twice
+            os._exit(code)  # skips the parent's flushes and exit handlers
     os.close(theirs)
     try:
         with os.fdopen(ours, "rb") as pipe:
@@ -48,7 +48,7 @@ def forked(work: Callable[[], Answer]) -> Answer:
         _, status = os.waitpid(child, 0)
     if status:
         raise SimulationError(f"the forked simulation failed (wait status {status})")
-    result: Answer | CosimError = pickle.loads(text)  # our own copy's, not a file
+    result: Answer | CosimError = pickle.loads(text)  # trusted: from this process's own copy
     if isinstance(result, CosimError):
         raise result
     return result

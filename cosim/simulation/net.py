@@ -1,4 +1,4 @@
-"""A net alone, read by SUMO into a RoadMap: for files of traffic that was driven elsewhere."""
+"""Reads a net with SUMO into a RoadMap, for trajectory files without a running simulation."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from cosim.simulation.stderr import SumoStderr
 
 
 class NetReader:
-    """Runs in a `cosim.workers.worker.Worker`, since a bad net can crash the process. Vet the net before."""
+    """Runs in a `cosim.workers.worker.Worker`, since a bad net can crash the process; vet the net first."""
 
     def __init__(self, net: Path) -> None:
         stderr = SumoStderr()
@@ -28,7 +28,7 @@ class NetReader:
         self._net = net
 
     def road(self) -> RoadMap:
-        """Every lane that a motor vehicle may use."""
+        """The map of every lane that is open to motor vehicles."""
         return read_road((), self._net)
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""A simulation that other TraCI programs share: ours, which they connect to, or theirs, which we join."""
+"""A simulation shared with other TraCI clients: started by cosim, or started elsewhere and joined."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from cosim.simulation.net import NetReader
 from cosim.simulation.sumo import GIVES_UP, SumoSimulator
 from cosim.types import OnCollision, Snapshot, Timing
 
-# Options that decide what figures mean, as `cosim run` sets them.
+# SUMO options on which the figures depend, with the values that `cosim run` sets.
 OURS = {
     "lanechange.duration": USUAL["lanechange.duration"],
     **FORCED,
@@ -36,11 +36,11 @@ OURS = {
 
 
 class SharedSimulator(SumoSimulator):
-    """What both ways have in common: it ends when somebody else says so."""
+    """The common part of both ways: another client or SUMO's owner may end the simulation."""
 
     _SHARED = True
-    _LOST = ""  # what it means that SUMO fails; "": what the client says
-    _over = False  # nothing more can be asked of SUMO
+    _LOST = ""  # message for a failure of SUMO; "": the client's own message
+    _over = False  # SUMO answers no more calls
 
     def _simulate(self) -> None:
         before = sumo.simulation.getTime()
@@ -57,7 +57,7 @@ class SharedSimulator(SumoSimulator):
             self._end("the last TraCI program has left")
         here = set(sumo.vehicle.getIDList())
         for name in [name for name in self._commander.controlled if name not in here]:
-            self._commander.drop(name)  # another program has removed it
+            self._commander.drop(name)  # removed by another client
 
     def _end(self, why: str) -> NoReturn:
         self._over = True
@@ -65,9 +65,9 @@ class SharedSimulator(SumoSimulator):
 
 
 class ServingSimulator(SharedSimulator):
-    """SUMO in this process, which `clients` TraCI programs drive together with us at `port`.
+    """SUMO in this process, controlled together with `clients` other TraCI clients at `port`.
 
-    `reset` waits until all of them have connected: in a process that somebody watches.
+    `reset` blocks until all clients have connected, so another process has to supervise it.
     """
 
     _LOST = "a TraCI program broke its connection off"
@@ -78,8 +78,8 @@ class ServingSimulator(SharedSimulator):
         super().__init__(scenario, **settings)
 
     def reset(self, seed: int) -> tuple[Snapshot, ...]:
-        """As alone, once the others have come. Raises SimulationEnded when they leave in the warm-up."""
-        self._stop()  # `libsumo.load` hangs where there are clients
+        """Reset after all clients have connected. Raises SimulationEnded if they leave in the warm-up."""
+        self._stop()  # `libsumo.load` hangs with clients
         self._remote, self._over = self._serves, False
         return super().reset(seed)
 
@@ -87,7 +87,7 @@ class ServingSimulator(SharedSimulator):
         return [*super()._arguments(seed), *self._remote]
 
     def _variable(self) -> list[int]:
-        """Other programs may change any of them."""
+        """All lanes: another client may change any speed limit."""
         return list(range(len(self.road.lanes)))
 
     def _explain(self, error: Exception, *, starting: bool = False) -> Exception:
@@ -98,7 +98,7 @@ class ServingSimulator(SharedSimulator):
 
 
 class LentFleet(Fleet):
-    """AVs that are given back as they were."""
+    """A fleet whose AVs get their original vTypes back at the end."""
 
     def __init__(self, *settings: Any) -> None:
         super().__init__(*settings)
@@ -111,7 +111,7 @@ class LentFleet(Fleet):
         super()._take_av_type(vehicle)
 
     def hand_back(self) -> None:
-        """Every AV on the road is again what it was when it departed."""
+        """Restore vType, speed factor and parameters of every AV on the road."""
         give = sumo.vehicle
         for vehicle in self._own.keys() & set(give.getIDList()):
             kind, factor, parameters = self._own[vehicle]
@@ -122,9 +122,9 @@ class LentFleet(Fleet):
 
 
 class TraciSimulator(SharedSimulator):
-    """A SUMO that somebody else started. One episode, from where it stands; `close` hands the AVs back.
+    """A SUMO that cosim did not start. One episode, from its present time; `close` restores the AVs.
 
-    `leave` set to a reason ends it before the next step.
+    A reason set in `leave` ends the episode before the next step.
     """
 
     _FLEET = LentFleet
@@ -135,7 +135,7 @@ class TraciSimulator(SharedSimulator):
         super().__init__(scenario, **settings)
 
     def close(self) -> None:
-        """Give every AV its own driver back, and leave."""
+        """Restore the AVs and disconnect."""
         if sumo.source is self._client:
             if not self._over:
                 with contextlib.suppress(*sumo.errors, SimulationEnded):
@@ -145,8 +145,8 @@ class TraciSimulator(SharedSimulator):
         super().close()
 
     def write_outputs(self, files: Mapping[str, Path]) -> None:
-        """They are the owner's to ask for."""
-        raise BadInput("SUMO's outputs are written by who starts it", field="--output")
+        """Refused: outputs belong to SUMO's owner."""
+        raise BadInput("a joined SUMO writes outputs only for its owner", field="--output")
 
     def _hand_back(self) -> None:
         fleet = getattr(self, "_fleet", None)
@@ -161,11 +161,11 @@ class TraciSimulator(SharedSimulator):
         return _readable_types(scenario)
 
     def _given(self, scenario: Scenario, folder: Path) -> Scenario:
-        """SUMO has its files."""
+        """The scenario unchanged: SUMO has already read its files."""
         return scenario
 
     def _open(self) -> None:
-        reader = NetReader(self._scenario.net)  # in this process: over the socket each call takes 0.1 ms
+        reader = NetReader(self._scenario.net)  # in this process, as a call over the socket takes 0.1 ms
         try:
             self._read_net()
         finally:
@@ -173,7 +173,7 @@ class TraciSimulator(SharedSimulator):
         sumo.bind(self._client)
 
     def _load(self, seed: int) -> None:
-        """It is loaded."""
+        """Nothing to do: the joined SUMO is loaded."""
 
     def _simulate(self) -> None:
         if self.leave:
@@ -185,7 +185,7 @@ class TraciSimulator(SharedSimulator):
 
 
 def lost(scenario: Scenario) -> list[str]:
-    """What AVs of a joined SUMO are not as its files say: warnings, as far as these can be read here."""
+    """Warnings about vType attributes that AVs of a joined SUMO lose, as far as its files are readable."""
     found, fleet = _readable_types(scenario), scenario.fleet
     if not drivers(scenario, frozenset()):
         return []
@@ -201,7 +201,7 @@ def lost(scenario: Scenario) -> list[str]:
 
 
 def _readable_types(scenario: Scenario) -> VehicleTypes:
-    """As far as the files of a joined SUMO are found right: it is SUMO that judges them."""
+    """The vTypes of a joined SUMO's files; none if a file is invalid here, since SUMO has accepted it."""
     try:
         return vehicle_types(scenario)
     except BadInput:
@@ -209,9 +209,9 @@ def _readable_types(scenario: Scenario) -> VehicleTypes:
 
 
 def theirs(client: Client, net: str | None = None) -> tuple[Scenario, int]:
-    """What a joined SUMO simulates, as a scenario, and its seed; `net`: where its net lies on this machine.
+    """The scenario and seed of a joined SUMO; `net`: path of its net on this machine.
 
-    Files that cannot be read here are left out. Raises BadInput: no net to read, a step length that does not
+    Files that cannot be read here are left out. Raises BadInput: no readable net, a step length that does not
     divide a frame, a sublane model, AV types not loaded, vehicles on the road already.
     """
     place, option = client.place, client.simulation.getOption

@@ -55,21 +55,21 @@ from cosim.types import (
     Traffic,
 )
 
-ONE_SPEED = {"default.speeddev": "0"}  # our drivers' speeds are drawn by `cosim.scenario.behaviors`
+ONE_SPEED = {"default.speeddev": "0"}  # `cosim.scenario.behaviors` draws the desired speeds instead
 QUIET = {
     "no-step-log": "true",
     "no-warnings": "true",
     "duration-log.disable": "true",
     "xml-validation": "never",  # cosim.scenario.vet has read the files already
 }
-# SUMO's message in the middle of a run, where it loads routes, about a vehicle that cannot depart as written.
+# SUMO's messages during a run, when it loads routes, about a vehicle that cannot depart as written.
 WRONG_DEMAND = re.compile(
     r"[Ii]nvalid depart|Departure \w+ .*for vehicle|has no valid route|No connection between edge|[Pp]erson '"
 )
-NO_FILES = {"device.ssm.file": NOWHERE}  # a type may have this device: a file for every vehicle
-GIVES_UP = "max-depart-delay"  # SUMO drops vehicles that waited so long, without a message
-DERIVED = "types.add.xml"  # what drives as another type than its own
-NOBODY: Mapping[str, float] = MappingProxyType({})
+NO_FILES = {"device.ssm.file": NOWHERE}  # a vType with this device would write a file per vehicle
+GIVES_UP = "max-depart-delay"  # SUMO drops vehicles that waited longer, without a message
+DERIVED = "types.add.xml"  # file of the derived vTypes
+NO_FORCED: Mapping[str, float] = MappingProxyType({})
 
 _in_use = False
 
@@ -77,13 +77,13 @@ _in_use = False
 class SumoSimulator:
     """`cosim.types.Simulator` on SUMO. Raises SimulationInUse when this process already holds one.
 
-    `history` frames are returned by `reset`, so that an agent starts with a full past.
+    `reset` returns `history` frames, so that an agent starts with a full history.
     """
 
     # set before the first `reset`:
-    compensator: Compensator | None = None  # for the sensing that needs one
+    compensator: Compensator | None = None  # for sensing with latency compensation
     courtesy: float = 1.0  # of commanded AVs in preset `lawful`: SUMO's lcCooperative, 0 to 1
-    _SHARED = False  # whether other programs change things too
+    _SHARED = False  # whether other TraCI clients control the simulation too
     _FLEET: type[Fleet] = Fleet
 
     def __init__(
@@ -96,7 +96,7 @@ class SumoSimulator:
                 "use one process per simulation (cosim.envs and cosim.open do)"
             )
         check(scenario)
-        self._steps_late = _steps_late(scenario)
+        self._latency_steps = _latency_steps(scenario)
         self._types = self._types_of(scenario)
         fleet = scenario.fleet.type
         self._av_types = frozenset() if fleet is None else self._types.named(fleet)
@@ -107,7 +107,7 @@ class SumoSimulator:
         self._stderr = SumoStderr()
         self._started = self._closed = False
         self._outputs: dict[str, Path] = {}
-        self._looks_inside = CHECKS_INSIDE in {c.option for c in scenario.changed}  # as we ask, not the file
+        self._checks_inside = CHECKS_INSIDE in {c.option for c in scenario.changed}  # not by the file
         _in_use = True
         timing = scenario.timing
         self._steps_per_frame = round(timing.frame / timing.step)
@@ -124,7 +124,7 @@ class SumoSimulator:
         self._entries = EntryWatcher(self.road, scenario.timing.step, self._SHARED)
 
     def reset(self, seed: int) -> tuple[Snapshot, ...]:
-        """Load the episode `seed` anew, drive the warm-up; the last `history` frames, newest last."""
+        """Load the episode of `seed` and drive the warm-up; return the last `history` frames, newest last."""
         self._load(seed)
         self._seed = seed
         self._drivers = Drivers(self._scenario.behavior, self._scenario.driver_model, seed)
@@ -138,9 +138,9 @@ class SumoSimulator:
         self._routes: dict[str, tuple[str, ...]] = {}
         self._detector = CollisionDetector()
         errors = self._scenario.errors
-        # with errors humans hit humans, and an episode that only an AV's crash ends goes on
+        # with human errors, human drivers collide too, and only an AV's collision ends the episode
         goes_on = self._scenario.on_collision == OnCollision.CONTINUE or errors is not None
-        # as it is, SUMO does with those who crashed what the file asks for
+        # in as-is traffic the file's collision.action decides what happens to crashed vehicles
         goes_on = goes_on and self._scenario.traffic == Traffic.CONTROLLED
         self._wrecks = Wrecks(self._commander, self._drivers) if goes_on else None
         self._errors = (
@@ -161,8 +161,8 @@ class SumoSimulator:
         self._entries.reset()
         self._mission_found = not self._scenario.mission.guessed
         self._inserted = 0
-        self._stopped: set[str] = set()  # at a stop of their plan
-        self._waiting: dict[str, Due] = {}  # due and not inserted, whether SUMO has dropped them or not
+        self._stopped: set[str] = set()  # vehicles at a <stop>
+        self._waiting: dict[str, Due] = {}  # due but not inserted, including those dropped by SUMO
         self._acting: Sequence[Command] = ()
         self._receipts: tuple[Receipt, ...] = ()
         self._happened: list[tuple[Any, ...]] = []  # per step since the last frame: the fields of Events
@@ -179,12 +179,12 @@ class SumoSimulator:
         return tuple(frames) or (self._snapshot(),)
 
     def advance(self, commands: Sequence[Command]) -> tuple[tuple[Receipt, ...], tuple[Snapshot, ...]]:
-        """Hold the commands for one decision; one snapshot per frame. Raises SimulationError.
+        """Apply the commands for one decision; one snapshot per frame. Raises SimulationError.
 
-        With a `decision_latency` they act that much later: those before are held until then, and the
-        receipts are theirs.
+        With a `decision_latency` the commands act that much later. Until then the previous commands hold, and
+        the receipts belong to those.
         """
-        late = self._steps_late
+        late = self._latency_steps
         with self._stderr:
             if not late:
                 self._act(commands)
@@ -196,16 +196,16 @@ class SumoSimulator:
         return receipts, frames
 
     def _act(self, commands: Sequence[Command]) -> None:
-        """From now on these commands hold."""
+        """Apply these commands from now on."""
         now = sumo.simulation.getTime()
         self._commander.release(commands)
         self._acting = commands
         self._receipts = tuple(self._commander.take(c, now) for c in commands)
 
     def _drive(
-        self, steps: int, forced: Mapping[str, float] = NOBODY, *, driven: int = 0
+        self, steps: int, forced: Mapping[str, float] = NO_FORCED, *, driven: int = 0
     ) -> tuple[Snapshot, ...]:
-        """As commanded; one snapshot per frame. `forced`: see `ahead`; `driven`: steps since a decision."""
+        """Advance; one snapshot per frame. `forced`: see `ahead`; `driven`: steps since the decision."""
         frames = []
         for k in range(driven + 1, driven + steps + 1):
             self._commander.drive()
@@ -223,26 +223,26 @@ class SumoSimulator:
         commands: Sequence[Command] = (),
         *,
         errors: bool = False,
-        forced: Mapping[str, float] = NOBODY,
+        forced: Mapping[str, float] = NO_FORCED,
     ) -> tuple[Snapshot, ...]:
-        """The next `frames` frames if every AV went on as it is commanded, those of `commands` as these say.
+        """A counterfactual rollout of `frames` frames: the present commands hold, except for `commands`.
 
-        SUMO drives on in a copy of this process (`cosim.simulation.fork`); here nothing changes. `errors`:
-        whether human errors that have not begun may begin; those under way go on. `forced`: AVs that
-        accelerate by so many m/s2 (down to -`MAX_DECEL`), whatever they are commanded or their car would do.
+        SUMO continues in a copy of this process (`cosim.simulation.fork`); this process does not change.
+        `errors`: whether new human errors may begin; active ones continue. `forced`: AV -> acceleration in
+        m/s2 (down to -`MAX_DECEL`), which overrides commands and car-following model.
 
-        Raises SimulationError, and BadInput where the copy would write SUMO's outputs too, or speak to the
-        programs that share the simulation.
+        Raises SimulationError. Raises BadInput if the copy would also write SUMO's outputs, or talk to other
+        TraCI clients.
         """
         if self._outputs or self._SHARED:
             why = "other programs share it" if self._SHARED else "SUMO writes outputs of its own"
-            raise BadInput(f"nobody can look ahead in this simulation: {why}", file=self._scenario.config)
+            raise BadInput(f"rollouts are impossible in this simulation: {why}", file=self._scenario.config)
         return forked(partial(self._drive_on, frames, commands, errors, forced))
 
     def _drive_on(
         self, frames: int, commands: Sequence[Command], errors: bool, forced: Mapping[str, float]
     ) -> tuple[Snapshot, ...]:
-        """In the copy."""
+        """The rollout, in the copy of the process."""
         if self._errors is not None and not errors:
             self._errors.hold()
         with self._stderr:
@@ -252,7 +252,7 @@ class SumoSimulator:
             return self._drive(frames * self._steps_per_frame, forced)
 
     def route(self, vehicle: str) -> tuple[str, ...]:
-        """The edges still ahead, the present one first."""
+        """The remaining edges of the route, the present one first."""
         index = max(sumo.vehicle.getRouteIndex(vehicle), 0)
         edges = self._routes.get(vehicle)
         if edges is None:
@@ -260,7 +260,7 @@ class SumoSimulator:
         return edges[index:] if index else edges
 
     def commanded(self, vehicle: str) -> tuple[float | None, int]:
-        """Target speed in m/s (None where none is known) and the lane change under way."""
+        """Target speed in m/s (None: unknown) and the lane change under way."""
         state = self._commander.controlled.get(vehicle)
         if state is None:
             return self._commander.heads_for(vehicle), 0
@@ -268,12 +268,12 @@ class SumoSimulator:
 
     @property
     def tilted(self) -> tuple[float, dict[str, list[float]]]:
-        """Of this episode's errors: log(q / p); case -> those begun near AVs, and the sum of p."""
+        """Of this episode's errors: log(q / p); case -> number begun near AVs, and the sum of p."""
         return (0.0, {}) if self._errors is None else self._errors.tilted
 
     def counts(self) -> dict[str, int]:
-        """Vehicles since the start: `inserted`, and `waiting` at the last frame: due and not inserted, also
-        those that SUMO has dropped (`max-depart-delay`)."""
+        """Vehicle counts: `inserted` since the start, and `waiting` at the last frame. Waiting vehicles are
+        due but not inserted, including those dropped by SUMO (`max-depart-delay`)."""
         return {"inserted": self._inserted, "waiting": len(self._waiting)}
 
     def write_outputs(self, files: Mapping[str, Path]) -> None:
@@ -281,7 +281,7 @@ class SumoSimulator:
         self._outputs = dict(files)
 
     def finish_outputs(self) -> None:
-        """End SUMO, which makes its files whole, and ask for no more; the next `reset` starts it again."""
+        """End SUMO, which completes its files; the next `reset` starts SUMO without outputs."""
         self._outputs = {}
         self._stop()
 
@@ -292,7 +292,7 @@ class SumoSimulator:
                 libsumo.close()
 
     def driver_classes(self) -> dict[str, str]:
-        """Each HV's class of Table II (none where the traffic is as it is): for drawing, not for policies."""
+        """Each HV's Table II class (empty in as-is traffic): for drawing, not for policies."""
         return dict(self._drivers.classes)
 
     def close(self) -> None:
@@ -311,10 +311,10 @@ class SumoSimulator:
         return vehicle_types(scenario)
 
     def _given(self, scenario: Scenario, folder: Path) -> Scenario:
-        """The scenario as SUMO gets it, some of its files as copies in `folder`."""
+        """The scenario passed to SUMO, with edited copies of some files in `folder`."""
         ours = drivers(scenario, self._av_types)
         if not scenario.ships:
-            # a user's detectors would write beside the scenario, and workers overwrite one another's files
+            # a user's detectors would write beside the scenario, and workers would overwrite the files
             scenario = disable_outputs(scenario, folder, partial(self._types.also, drivers=ours))
         if not ours:
             return scenario
@@ -328,7 +328,7 @@ class SumoSimulator:
         return [k for k, lane in enumerate(self.road.lanes) if lane.id in may or lane.edge in may]
 
     def _open(self) -> None:
-        """Read what stays the same in all episodes."""
+        """Read the parts that are equal in all episodes."""
         self._load(seed=0)
         self._read_net()
 
@@ -377,7 +377,7 @@ class SumoSimulator:
 
     def _explain(self, error: Exception, *, starting: bool = False) -> Exception:
         words = " ".join((self._stderr.take() or str(error)).split())
-        if starting:  # everything SUMO refuses before the first step is wrong input
+        if starting:  # an error before the first step is wrong input
             return BadInput(f"SUMO refuses it: {words}", file=self._scenario.config)
         warned = "".join(f"; found before: {warning}" for warning in self._scenario.warnings)
         if WRONG_DEMAND.search(words):
@@ -386,7 +386,7 @@ class SumoSimulator:
         return SimulationError(f"{self._scenario.config}: SUMO failed: {words}{warned}")
 
     def _simulate(self) -> None:
-        """One step of SUMO's own."""
+        """One simulation step of SUMO."""
         try:
             sumo.simulationStep()
         except sumo.errors as error:
@@ -431,13 +431,13 @@ class SumoSimulator:
         self._stopped.update(simulation.getStopStartingVehiclesIDList())
         self._stopped.difference_update(simulation.getStopEndingVehiclesIDList())
         if self._gives_up:
-            self._look_who_waits()
+            self._update_waiting()
         self._drivers.step(now)
         if self._errors is not None:
             self._errors.step(now)
 
-    def _look_who_waits(self) -> None:
-        """Where SUMO gives up, whoever was seen waiting and is not inserted still waits."""
+    def _update_waiting(self) -> None:
+        """Update the vehicles waiting for insertion, including those that SUMO has given up."""
         pending = sumo.simulation.getPendingVehicles()
         if not self._gives_up and self._waiting:
             self._waiting = {name: self._waiting[name] for name in pending if name in self._waiting}
@@ -448,7 +448,7 @@ class SumoSimulator:
                     self._waiting[name] = Due(since, self._fleet.is_av(name, self._seed))
 
     def _crashed(self, collisions: list[Collision]) -> list[Collision]:
-        """Make wrecks of their vehicles where the episode goes on; the same collisions, attributed."""
+        """Attribute the collisions to human errors; in a continuing episode their vehicles become wrecks."""
         if self._errors is not None and collisions:
             collisions = self._errors.attribute(collisions)
         if self._wrecks is not None:
@@ -458,18 +458,18 @@ class SumoSimulator:
         return collisions
 
     def _overlooked(self, collision: Collision) -> bool:
-        """Whether it is of two humans inside a junction, which the file does not have SUMO check.
+        """Whether two HVs collided inside a junction, which the user's file does not have SUMO check.
 
-        Many nets have lanes there that lie too close. They drive on, as they would without AVs.
+        Many nets have lanes there that lie too close. Both HVs drive on, as they would without AVs.
         """
         avs = collision.collider_is_av or collision.victim_is_av
-        return self._looks_inside and collision.kind == INSIDE and not avs and self._errors is None
+        return self._checks_inside and collision.kind == INSIDE and not avs and self._errors is None
 
     def _snapshot(self) -> Snapshot:
         happened = (tuple(chain.from_iterable(field)) for field in zip(*self._happened, strict=True))
         events = replace(Events(*happened), stopped=tuple(sorted(self._stopped)))
         self._happened.clear()
-        self._look_who_waits()
+        self._update_waiting()
         snapshot = self._reader.read(self._bodies, events, dict(self._waiting))
         if not self._mission_found:
             snapshot = self._find_mission(snapshot)
@@ -498,7 +498,7 @@ class SumoSimulator:
         return snapshot
 
     def _goal(self) -> tuple[frozenset[int], frozenset[int]]:
-        """Lanes on which the mission is fulfilled; lanes that make a vehicle the mission vehicle."""
+        """Goal lanes of the mission, and lanes on which an HV becomes the mission vehicle."""
         mission, lanes = self._scenario.mission, self.road.lanes
         if mission.kind == "auto":
             struggling = struggling_lanes(self.road)
@@ -514,7 +514,7 @@ class SumoSimulator:
         return frozenset(i for i, lane in enumerate(lanes) if lane.edge in mission.goal), frozenset()
 
     def _find_mission(self, snapshot: Snapshot) -> Snapshot:
-        """Without a named one: the first HV (by id) that drives on a lane that ends or must give way."""
+        """Guess the mission vehicle: the first HV (by id) on a lane that ends or must yield."""
         humans = np.flatnonzero(snapshot.kind == Kind.HV)
         row = next((k for k in humans if snapshot.lane[k] in self._struggling), None)
         if row is None:
@@ -526,8 +526,8 @@ class SumoSimulator:
         return self._reader.read(self._bodies, snapshot.events, snapshot.waiting)
 
 
-def _steps_late(scenario: Scenario) -> int:
-    """Steps until a decision acts. Raises BadInput where that is longer than until the next one."""
+def _latency_steps(scenario: Scenario) -> int:
+    """Steps from a decision to its effect. Raises BadInput if that exceeds the decision period."""
     if scenario.sensing is None:
         return 0
     latency, timing = scenario.sensing.parameters.decision_latency, scenario.timing
@@ -538,7 +538,7 @@ def _steps_late(scenario: Scenario) -> int:
 
 
 def _buildings(level: Parameters) -> list[Floats]:
-    """The outlines [.,2] m of the polygons that hide what is behind them."""
+    """The outlines [.,2] m of the polygons that occlude sensors."""
     if not level.line_of_sight:
         return []
     shapes, wanted = sumo.polygon, level.buildings

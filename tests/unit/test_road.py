@@ -42,7 +42,7 @@ def test_a_route_makes_a_lane_that_does_not_follow_it_a_dead_end() -> None:
 def test_routes_that_lead_the_same_way_share_a_path_and_not_all_are_remembered(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(cosim.road, "REMEMBERED", 5)
+    monkeypatch.setattr(cosim.road, "MAX_CACHED_PATHS", 5)
     road = merge_road()
     paths = {id(road.path(0, ("in", "out", f"far{k}"))) for k in range(20)}
     assert len(paths) == 1

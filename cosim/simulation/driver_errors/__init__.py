@@ -1,1 +1,1 @@
-"""Errors of human drivers and of persons on foot: one class a kind, and the trials of all."""
+"""Errors of human drivers and pedestrians: one class per kind, and the trials."""

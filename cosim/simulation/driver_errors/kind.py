@@ -1,4 +1,4 @@
-"""What every kind of error does: whether it can begin, how it begins, goes on and ends."""
+"""The interface of every error kind: eligibility, begin, step and end of an error."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
@@ -10,38 +10,38 @@ from cosim.simulation.driver_errors.surroundings import Place, Surroundings
 from cosim.simulation.drivers import Drivers
 from cosim.types import HumanError
 
-MIN_SPEED = 1.0  # m/s: a slower driver does not err by driving on
+MIN_SPEED = 1.0  # m/s; slower vehicles are not eligible for errors of moving drivers
 MAX_JUNCTION_TIME = 10.0  # s for driving through a junction
-# SUMO's speed mode (Change_Vehicle_State): what a driver who errs no longer heeds
+# bits of SUMO's speed mode (TraCI/Change_Vehicle_State): the checks that an error switches off
 MAX_ACCEL, MAX_DECEL, RIGHT_OF_WAY, RED_LIGHT, INSIDE_JUNCTION = 2, 4, 8, 16, 32
-BLIND = 0  # neither speed nor lane-change mode heeds others; own lane changes are off
+BLIND = 0  # speed or lane-change mode without any check; own lane changes are off
 
 
 class Chance(NamedTuple):
     """An error that can begin now."""
 
-    whom: str  # the vehicle that it would meet; "": none
-    found: Any = None  # by `eligible`, for `begin`
+    other: str  # the vehicle that the error would affect; "": none
+    found: Any = None  # passed from `eligible` to `begin`
 
 
 class Trial(NamedTuple):
-    """A trial of a manoeuvre."""
+    """A Bernoulli trial of a manoeuvre."""
 
     rate: float  # probability
-    which: str  # second or manoeuvre that its number is drawn for
-    once: bool  # whether this is the one trial of a manoeuvre, however many seconds it takes
+    which: str  # second or manoeuvre: part of the key of the random draw
+    once: bool  # one trial per manoeuvre, not one per second
 
 
 @dataclass(slots=True)
 class UnderWay:
-    """One error under way, and what is given back when it ends."""
+    """An active error, and the state to restore at its end."""
 
     error: HumanError
-    modes: tuple[int, int] = (0, 0)  # speed mode and lane-change mode before
-    deceleration: float | None = None  # m/s2, of a driver who holds (0) or lowers its speed
-    swerves: tuple[float, int] | None = None  # s, when it changes back, and to which side
-    leaves: str = ""  # it ends when the vehicle has left this edge and the junction behind it
-    heeds: dict[str, str] | None = None  # what a person heeded before
+    modes: tuple[int, int] = (0, 0)  # speed mode and lane-change mode before the error
+    deceleration: float | None = None  # m/s2; 0 holds the speed, None leaves it to SUMO
+    swerve_back: tuple[float, int] | None = None  # time of the change back, s, and its side
+    entry_edge: str = ""  # the error ends beyond this edge and the junction that follows it
+    before: dict[str, str] | None = None  # a person's junction model before the error
 
 
 class ErrorKind:
@@ -49,102 +49,102 @@ class ErrorKind:
 
     Args:
         config: rate and magnitudes (`cosim.scenario.human_errors`).
-        around: what is around a driver.
-        drivers: the driver models, which pause where an error drives.
+        around: the surroundings of the drivers.
+        drivers: the driver models, which pause during an error.
         seed: root seed.
         step: s, of the simulation.
     """
 
     name: ClassVar[str]
-    every_second: ClassVar[bool] = False  # drawn every second for every driver; others belong to a manoeuvre
-    meets_anybody: ClassVar[bool] = False  # whom it meets is not known before
+    every_second: ClassVar[bool] = False  # one trial per second and driver; else one per manoeuvre
+    other_unknown: ClassVar[bool] = False  # the affected vehicle is not known in advance
 
     def __init__(self, config: Any, around: Surroundings, drivers: Drivers, seed: int, step: float) -> None:
         self.config, self._around, self._drivers, self._seed, self._step = config, around, drivers, seed, step
 
-    def trial(self, who: str, place: Place, now: float) -> Trial | None:
-        """The trial of a manoeuvre of `who`, who is at `place`; None where there is none in this second."""
+    def trial(self, driver: str, place: Place, now: float) -> Trial | None:
+        """The trial of the driver's manoeuvre at `place`; None without a trial in this second."""
         return None
 
-    def forget(self, who: str) -> None:
-        """`who` is inside a junction, or has left the road."""
+    def forget(self, driver: str) -> None:
+        """The vehicle is inside a junction or has left the road."""
 
-    def eligible(self, who: str, now: float) -> Chance | None:
-        """Whether it can begin; it never depends on a draw."""
+    def eligible(self, driver: str, now: float) -> Chance | None:
+        """The error that can begin now, or None. Never depends on a random draw."""
         raise NotImplementedError
 
-    def begin(self, who: str, now: float, chance: Chance) -> UnderWay:
-        """It begins."""
+    def begin(self, driver: str, now: float, chance: Chance) -> UnderWay:
+        """Begin the error."""
         raise NotImplementedError
 
-    def step(self, who: str, under_way: UnderWay, now: float) -> bool:
-        """It goes on for a simulation step; whether it is over."""
+    def step(self, driver: str, under_way: UnderWay, now: float) -> bool:
+        """Continue for one simulation step; return whether the error is over."""
         return now >= under_way.error.until - 1e-6
 
-    def end(self, who: str, under_way: UnderWay) -> None:
-        """Give back what was taken."""
+    def end(self, driver: str, under_way: UnderWay) -> None:
+        """Restore the state before the error."""
         raise NotImplementedError
 
-    def draw(self, who: str, *which: str) -> float:
-        """A number in [0, 1)."""
-        return uniform(self._seed, "error", self.name, who, *which)
+    def draw(self, driver: str, *which: str) -> float:
+        """A uniform number in [0, 1), hashed from seed, kind, driver and `which`."""
+        return uniform(self._seed, "error", self.name, driver, *which)
 
-    def magnitude(self, span: Span, who: str, now: float, what: str) -> float:
-        """A magnitude of an error that begins now."""
+    def magnitude(self, span: Span, driver: str, now: float, what: str) -> float:
+        """A magnitude, drawn uniformly from `span`, of an error that begins now."""
         low, high = span
-        return low + (high - low) * self.draw(who, f"{round(now)}", what)
+        return low + (high - low) * self.draw(driver, f"{round(now)}", what)
 
-    def begun(self, who: str, now: float, length: float, what: str, near: str) -> UnderWay:
-        """One that begins now and lasts `length` s at most."""
-        return UnderWay(HumanError(now, who, self.name, now + length, what, near))
+    def begun(self, driver: str, now: float, length: float, what: str, near: str) -> UnderWay:
+        """An error that begins now and lasts at most `length` s."""
+        return UnderWay(HumanError(now, driver, self.name, now + length, what, near))
 
 
 class DriverError(ErrorKind):
-    """One of a driver: its vehicle is taken from the driver model as far as the error asks for it."""
+    """An error that takes a vehicle from its driver model."""
 
-    def take(self, who: str, under_way: UnderWay, speed_mode: int | None, lane_mode: int = BLIND) -> None:
-        """Take the vehicle (`speed_mode` None: not its speed)."""
+    def take(self, driver: str, under_way: UnderWay, speed_mode: int | None, lane_mode: int = BLIND) -> None:
+        """Set the modes and pause the driver model. `speed_mode` None: SUMO keeps the speed."""
         vehicle = sumo.vehicle
-        under_way.modes = vehicle.getSpeedMode(who), vehicle.getLaneChangeMode(who)
+        under_way.modes = vehicle.getSpeedMode(driver), vehicle.getLaneChangeMode(driver)
         if speed_mode is not None:
-            vehicle.setSpeedMode(who, speed_mode)
-        vehicle.setLaneChangeMode(who, lane_mode)
-        self._drivers.pause(who)
+            vehicle.setSpeedMode(driver, speed_mode)
+        vehicle.setLaneChangeMode(driver, lane_mode)
+        self._drivers.pause(driver)
 
-    def slow(self, who: str, deceleration: float) -> None:
-        """One step slower; 0 holds the speed."""
-        sumo.vehicle.setSpeed(who, max(self._around.speed_of(who) - deceleration * self._step, 0.0))
+    def brake_once(self, driver: str, deceleration: float) -> None:
+        """Brake for one simulation step; a `deceleration` of 0 m/s2 holds the speed."""
+        sumo.vehicle.setSpeed(driver, max(self._around.speed_of(driver) - deceleration * self._step, 0.0))
 
-    def slows(self, who: str, under_way: UnderWay, deceleration: float) -> UnderWay:
-        """It slows down; it still sees its leader and the signals, and may brake harder for them."""
-        self.take(who, under_way, sumo.vehicle.getSpeedMode(who) & ~(MAX_ACCEL | MAX_DECEL))
+    def brake(self, driver: str, under_way: UnderWay, deceleration: float) -> UnderWay:
+        """Begin to brake. SUMO still brakes harder for leaders and signals."""
+        self.take(driver, under_way, sumo.vehicle.getSpeedMode(driver) & ~(MAX_ACCEL | MAX_DECEL))
         under_way.deceleration = deceleration
-        self.slow(who, deceleration)
+        self.brake_once(driver, deceleration)
         return under_way
 
-    def drives_on(self, who: str, now: float, ignored: int, what: str, near: str) -> UnderWay:
-        """It heeds nothing of `ignored` until it is through the junction ahead."""
-        under_way = self.begun(who, now, MAX_JUNCTION_TIME, what, near)
-        self.take(who, under_way, sumo.vehicle.getSpeedMode(who) & ~ignored | INSIDE_JUNCTION)
-        under_way.leaves = sumo.vehicle.getRoadID(who)
+    def drive_through(self, driver: str, now: float, ignored: int, what: str, near: str) -> UnderWay:
+        """Switch off the `ignored` bits of the speed mode until the next junction is passed."""
+        under_way = self.begun(driver, now, MAX_JUNCTION_TIME, what, near)
+        self.take(driver, under_way, sumo.vehicle.getSpeedMode(driver) & ~ignored | INSIDE_JUNCTION)
+        under_way.entry_edge = sumo.vehicle.getRoadID(driver)
         return under_way
 
-    def step(self, who: str, under_way: UnderWay, now: float) -> bool:
+    def step(self, driver: str, under_way: UnderWay, now: float) -> bool:
         """See `ErrorKind.step`."""
-        if super().step(who, under_way, now):
+        if super().step(driver, under_way, now):
             return True
-        if under_way.leaves:
-            edge = sumo.vehicle.getRoadID(who)
-            if bool(edge) and edge != under_way.leaves and edge[0] != ":":
+        if under_way.entry_edge:
+            edge = sumo.vehicle.getRoadID(driver)
+            if bool(edge) and edge != under_way.entry_edge and edge[0] != ":":
                 return True
         if under_way.deceleration:
-            self.slow(who, under_way.deceleration)
+            self.brake_once(driver, under_way.deceleration)
         return False
 
-    def end(self, who: str, under_way: UnderWay) -> None:
+    def end(self, driver: str, under_way: UnderWay) -> None:
         """See `ErrorKind.end`."""
         if under_way.deceleration is not None:
-            sumo.vehicle.setSpeed(who, -1.0)
-        sumo.vehicle.setSpeedMode(who, under_way.modes[0])
-        sumo.vehicle.setLaneChangeMode(who, under_way.modes[1])
-        self._drivers.resume(who)
+            sumo.vehicle.setSpeed(driver, -1.0)
+        sumo.vehicle.setSpeedMode(driver, under_way.modes[0])
+        sumo.vehicle.setLaneChangeMode(driver, under_way.modes[1])
+        self._drivers.resume(driver)

@@ -1,4 +1,4 @@
-"""Lets human drivers and persons err: one trial per driver and second or per manoeuvre, drawn from hashes."""
+"""Human errors of an episode: one trial per driver and second or per manoeuvre, drawn from hashes."""
 
 import math
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ from cosim.simulation.driver_errors.tilted import Tilted
 from cosim.simulation.drivers import Drivers
 from cosim.types import REMEMBERED, Collision, HumanError, Kind
 
-# In the order of their trials: those of every second, then those of manoeuvres, then those of persons.
+# In the order of their trials: per second, per manoeuvre, then of persons.
 KINDS: tuple[type[ErrorKind], ...] = (
     driving.Inattention,
     driving.HardBraking,
@@ -35,11 +35,11 @@ KINDS: tuple[type[ErrorKind], ...] = (
 
 
 class HumanErrors:
-    """The errors of one episode. `step`: of the simulation, s.
+    """The errors of one episode. `step`: s, of the simulation.
 
-    A trial holds a number hashed from (root seed, kind, who, second or manoeuvre) against the kind's rate, so
-    draws are equal under every policy. An error begins where it was drawn and can begin; whether it can
-    never depends on the draw. Nobody errs before `begin`: the warm-up is as without errors.
+    A trial compares a number hashed from (root seed, kind, driver, second or manoeuvre) with the kind's rate.
+    So draws are equal under every policy. An error begins if the trial succeeds and the driver is eligible.
+    Eligibility never depends on the draw. No error begins before `begin`, so none in the warm-up.
     """
 
     def __init__(
@@ -55,22 +55,22 @@ class HumanErrors:
         self._every_second = [kind for kind in self._kinds if kind.every_second]
         self._step_out = next((kind for kind in self._kinds if isinstance(kind, crossing.StepOut)), None)
         others = (*self._every_second, self._step_out)
-        self._of_manoeuvres = [kind for kind in self._kinds if kind not in others]
+        self._per_manoeuvre = [kind for kind in self._kinds if kind not in others]
         self._rates = np.array([kind.config.rate for kind in self._every_second])  # [k]
         self._tilted = Tilted(tilt, seed)
         self._raised = np.array([self._tilted.raises(kind.name) for kind in self._every_second], bool)  # [k]
         self._avs: set[str] = set()
-        self._streams: dict[str, Any] = {}  # HV on the road -> [k] its streams of draws
+        self._streams: dict[str, Any] = {}  # HV on the road -> [k] random streams
         self._under_way: dict[str, tuple[ErrorKind, UnderWay]] = {}
-        self._ended: dict[str, float] = {}  # drivers who erred before -> s, when that ended
-        self._tried: set[tuple[str, str, str]] = set()  # manoeuvres: kind, HV, which
+        self._ended: dict[str, float] = {}  # driver -> end of the last error, s
+        self._tried: set[tuple[str, str, str]] = set()  # kind, HV, `Trial.which`
         self._happened: list[HumanError] = []
-        self._next: float | None = None  # s, of the next trials
+        self._next: float | None = None  # s, time of the next trials
 
-    # ---- what the simulator tells
+    # ---- calls of the simulator
 
     def begin(self, now: float) -> None:
-        """The counted time begins: the first trials are a second later."""
+        """The counted time begins; the first trials follow 1 s later."""
         self._next = now + 1.0
 
     def hold(self) -> None:
@@ -86,7 +86,7 @@ class HumanErrors:
             self._streams[name] = np.array(streams, np.uint64)
 
     def drop(self, name: str) -> None:
-        """It has left the road, crashed, or is driven otherwise from now on; it is left as it is."""
+        """The vehicle left the road, crashed, or got another driver; its state is not restored."""
         self._avs.discard(name)
         self._streams.pop(name, None)
         self._forget(name)
@@ -96,7 +96,7 @@ class HumanErrors:
             self._drivers.resume(name)
 
     def restore(self) -> None:
-        """End every error under way now; everybody drives as before it."""
+        """End every active error now and restore the drivers."""
         for name in [*self._under_way]:
             self._end(name)
 
@@ -106,32 +106,32 @@ class HumanErrors:
             try:
                 if kind.step(name, under_way, now):
                     self._end(name)
-            except sumo.TraCIException:  # taken off the road, neither arrived nor crashed
+            except sumo.TraCIException:  # removed, neither arrived nor crashed
                 self.drop(name)
         if self._next is not None and now >= self._next - 1e-6:
             self._next += 1.0
             self._trials(now)
 
     def take(self) -> tuple[HumanError, ...]:
-        """The errors that began since this was asked last."""
+        """The errors that began since the last call."""
         found = tuple(self._happened)
         self._happened.clear()
         return found
 
     def attribute(self, collisions: Sequence[Collision]) -> list[Collision]:
-        """The same, each with `human_error_involved`: whether the collider, the victim, or the vehicle just
-        ahead of either errs, or did at most `REMEMBERED` s before."""
-        return [replace(c, human_error_involved=self._had_a_part(c)) for c in collisions]
+        """The collisions with `human_error_involved` set: whether collider, victim or a leader of either has
+        an active error, or had one at most `REMEMBERED` s before."""
+        return [replace(c, human_error_involved=self._involves_error(c)) for c in collisions]
 
     @property
     def tilted(self) -> tuple[float, dict[str, list[float]]]:
-        """The logarithm of the episode's ratio of probabilities, and its weighed trials by case."""
+        """The log likelihood ratio of the episode, and its weighted trials by case."""
         return self._tilted.log_ratio, self._tilted.weighed
 
     # ---- trials
 
     def _trials(self, now: float) -> None:
-        """Those of one second."""
+        """The trials of one second."""
         second, on_road = round(now), frozenset(sumo.vehicle.getIDList())
         for name in self._streams.keys() - on_road:
             self.drop(name)
@@ -144,31 +144,31 @@ class HumanErrors:
             if self._tilted.active:
                 looked_at |= np.outer([self._tilted.weighs(name) for name in names], self._raised)
             for row, k in np.argwhere(looked_at).tolist():
-                self._try(self._every_second[k], names[row], self._rates[k], drawn[row, k], now)
-        if self._of_manoeuvres:
+                self._run_trial(self._every_second[k], names[row], self._rates[k], drawn[row, k], now)
+        if self._per_manoeuvre:
             for name in names:
                 self._manoeuvres(name, now)
         if self._step_out is not None and sumo.person.getIDCount():
             for person in sumo.person.getIDList():
                 if sumo.person.getWaitingTime(person) > 0.0:
-                    kind, who = self._step_out, PERSON + person
-                    self._try(kind, who, kind.config.rate, kind.draw(who, f"{second}"), now)
+                    kind, name = self._step_out, PERSON + person
+                    self._run_trial(kind, name, kind.config.rate, kind.draw(name, f"{second}"), now)
 
-    def _try(self, kind: ErrorKind, who: str, rate: float, drawn: float, now: float) -> None:
-        """One trial. Whether the error can begin is looked at only where that decides."""
-        if not (drawn < rate or self._tilted.weighs(who)) or who in self._under_way:
+    def _run_trial(self, kind: ErrorKind, name: str, rate: float, drawn: float, now: float) -> None:
+        """One trial. Eligibility is checked only if the result depends on it."""
+        if not (drawn < rate or self._tilted.weighs(name)) or name in self._under_way:
             return
-        chance = kind.eligible(who, now)
+        chance = kind.eligible(name, now)
         if chance is None:
             return
-        meets_av = chance.whom in self._avs or kind.meets_anybody
-        if drawn < self._tilted.probability(who, kind.name, rate, drawn, meets_av):
-            under_way = kind.begin(who, now, chance)
-            self._under_way[who] = kind, under_way
+        meets_av = chance.other in self._avs or kind.other_unknown
+        if drawn < self._tilted.probability(name, kind.name, rate, drawn, meets_av):
+            under_way = kind.begin(name, now, chance)
+            self._under_way[name] = kind, under_way
             self._happened.append(under_way.error)
 
     def _manoeuvres(self, name: str, now: float) -> None:
-        """Where it must give way, is at a signal, or its lane does not go on."""
+        """Trials at stop lines, signals and lane ends."""
         lane = self._around.lane_of(name)
         if not lane or lane[0] == ":":
             self._forget(name)
@@ -176,7 +176,7 @@ class HumanErrors:
         place = self._around.place(lane, name)
         if place is None:
             return
-        for kind in self._of_manoeuvres:
+        for kind in self._per_manoeuvre:
             trial = kind.trial(name, place, now)
             if trial is None:
                 continue
@@ -185,12 +185,12 @@ class HumanErrors:
                 if key in self._tried:
                     continue
                 self._tried.add(key)
-            self._try(kind, name, trial.rate, kind.draw(name, trial.which), now)
+            self._run_trial(kind, name, trial.rate, kind.draw(name, trial.which), now)
 
     # ---- inside
 
     def _forget(self, name: str) -> None:
-        for kind in self._of_manoeuvres:
+        for kind in self._per_manoeuvre:
             kind.forget(name)
 
     def _end(self, name: str) -> None:
@@ -198,10 +198,10 @@ class HumanErrors:
         self._ended[name] = sumo.simulation.getTime()
         kind.end(name, under_way)
 
-    def _had_a_part(self, collision: Collision) -> bool:
+    def _involves_error(self, collision: Collision) -> bool:
         now = collision.time
         pair = [collision.collider, collision.victim]
         return any(
-            who in self._under_way or now - self._ended.get(who, -math.inf) <= REMEMBERED
-            for who in (*pair, *filter(None, map(leader, pair)))
+            name in self._under_way or now - self._ended.get(name, -math.inf) <= REMEMBERED
+            for name in (*pair, *filter(None, map(leader, pair)))
         )
